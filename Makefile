@@ -1,0 +1,41 @@
+# Each target works alone on a fresh Debian or Ubuntu with Python 3.11 or newer; `make PYTHON=/path/to/python3 setup` chooses one.
+# ONLY=group restricts accuracy and benchmark to one group; ARGS="-k camera" goes to pytest.
+
+PYTHON ?=
+ONLY ?=
+ARGS ?=
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint slow accuracy benchmark
+
+help:  ## show this
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 18
+
+setup: $(INSTALLED)  ## make .venv and install everything that demo and tests need; the others call it
+	@:
+
+$(INSTALLED): pyproject.toml constraints.txt .ci/setup
+	@PYTHON="$(PYTHON)" bash .ci/setup
+	@touch $@
+
+demo: setup  ## render a phantom, reconstruct its surface, compare with the truth
+	@$(BIN)/sonotwin demo
+
+test: lint  ## check style and types, then run the fast tests
+	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
+
+lint: setup  ## check style and types
+	@$(BIN)/ruff check --quiet .
+	@$(BIN)/ruff format --check --quiet .
+	@$(BIN)/pyrefly check --summary=none --output-format min-text
+
+slow: setup  ## run the slow tests
+	@$(BIN)/python -m pytest -m slow $(ARGS)
+
+accuracy: setup  ## measure errors against the ground truth and the paper's figures
+	@$(BIN)/sonotwin accuracy $(if $(ONLY),only=$(ONLY))
+
+benchmark: setup  ## measure speed
+	@$(BIN)/python -m benchmarks $(ONLY)
