@@ -1,0 +1,215 @@
+"""Pattern sequences: one definition that the projector shows and that the decoder reads.
+
+A sequence is a list of parts, shown in order. Every pattern varies along one projector axis only and is a function of the
+projector coordinate x in px (pixel centres at integers), with values from 0 to 1.
+"""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Axis = Literal["columns", "rows"]  # which projector coordinate the pattern encodes
+Unwrapping = Literal["centre_line", "gray", "heterodyne"]
+Image = NDArray[np.float32]
+
+
+class Part(BaseModel):
+    """Base of the parts: immutable, and refuses unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Fringes(Part):
+    """N-step fringes `I_k = (1 + cos(phase + shift_k)) / 2`, `phase = 2 pi (x - origin) / pitch`."""
+
+    kind: Literal["fringes"] = "fringes"
+    axis: Axis = "columns"
+    pitch: float = Field(gt=1)  # projector px a period
+    steps: int = Field(ge=3)  # phase shifts
+    first: int = 0  # index of the first shift: shift_k = 2 pi (first + k) / steps, k = 0 .. steps-1
+    origin: float | None = None  # projector px where the phase is zero; the centre of the axis if not given
+    waveform: Literal["sine", "binary"] = "sine"  # binary fringes become sinusoidal by defocus
+
+    @property
+    def count(self) -> int:
+        """Number of images."""
+        return self.steps
+
+    @property
+    def shifts(self) -> NDArray[np.float64]:
+        """Phase shifts : (steps,) rad."""
+        return 2 * np.pi * (self.first + np.arange(self.steps)) / self.steps
+
+    def zero(self, length: int) -> float:
+        """Projector coordinate of phase zero on an axis of `length` px."""
+        return (length - 1) / 2 if self.origin is None else self.origin
+
+    def profiles(self, length: int) -> Image:
+        """The patterns along their axis : (steps, length)."""
+        phase = 2 * np.pi * (np.arange(length) - self.zero(length)) / self.pitch
+        wave = np.cos(phase + self.shifts[:, None])
+        if self.waveform == "binary":
+            return (wave >= 0).astype(np.float32)
+        return ((1 + wave) / 2).astype(np.float32)
+
+
+class GrayCode(Part):
+    """Reflected Gray code of the period number `floor((x - start) / pitch)`, most significant bit first.
+
+    The complementary bit is the finest bit of the same code at half the pitch: its borders lie in the middle of the periods,
+    so that the period number can be read safely at the period borders.
+    """
+
+    kind: Literal["gray"] = "gray"
+    axis: Axis = "columns"
+    pitch: float = Field(gt=1)  # projector px a period, that of the fringes to be unwrapped
+    bits: int = Field(ge=1, le=12)
+    start: float | None = None  # projector px where period 0 begins; if not given, where the code is centred on the axis
+    complementary: bool = False  # one more image, the next bit
+    inverted: bool = False  # every image is followed by its inverse
+
+    @property
+    def count(self) -> int:
+        """Number of images."""
+        return (self.bits + self.complementary) * (2 if self.inverted else 1)
+
+    def origin(self, length: int) -> float:
+        """Projector coordinate at which period 0 begins, on an axis of `length` px."""
+        return length / 2 - 0.5 - 2 ** (self.bits - 1) * self.pitch if self.start is None else self.start
+
+    def profiles(self, length: int) -> Image:
+        """The patterns along their axis : (count, length)."""
+        offset = np.arange(length) - self.origin(length)
+        bits = [gray_bit(offset / self.pitch, self.bits - 1 - i) for i in range(self.bits)]
+        if self.complementary:
+            bits.append(gray_bit(2 * offset / self.pitch, 0))
+        patterns = np.array(bits, np.float32)
+        if self.inverted:
+            patterns = np.stack([patterns, 1 - patterns], axis=1).reshape(-1, length)
+        return patterns
+
+
+class CentreLine(Part):
+    """One bright line whose projector coordinate is known."""
+
+    kind: Literal["centre_line"] = "centre_line"
+    axis: Axis = "columns"
+    width: float = Field(default=2, gt=0)  # projector px
+    position: float | None = None  # projector px of its middle; the centre of the axis if not given
+
+    @property
+    def count(self) -> int:
+        """Number of images."""
+        return 1
+
+    def middle(self, length: int) -> float:
+        """Projector coordinate of the line's middle, on an axis of `length` px."""
+        return (length - 1) / 2 if self.position is None else self.position
+
+    def profiles(self, length: int) -> Image:
+        """The pattern along its axis : (1, length); a pixel counts as far as the line covers it."""
+        left = np.arange(length) - 0.5
+        low, high = self.middle(length) - self.width / 2, self.middle(length) + self.width / 2
+        return np.clip(np.minimum(left + 1, high) - np.maximum(left, low), 0, 1).astype(np.float32)[None]
+
+
+class Uniform(Part):
+    """The whole field at one level: fully lit, or black."""
+
+    kind: Literal["uniform"] = "uniform"
+    axis: Axis = "columns"
+    level: float = Field(default=1, ge=0, le=1)
+
+    @property
+    def count(self) -> int:
+        """Number of images."""
+        return 1
+
+    def profiles(self, length: int) -> Image:
+        """The pattern along its axis : (1, length)."""
+        return np.full((1, length), self.level, np.float32)
+
+
+AnyPart = Annotated[Fringes | GrayCode | CentreLine | Uniform, Field(discriminator="kind")]
+
+
+class Patterns(BaseModel):
+    """A sequence of patterns and how its fringes are unwrapped.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        If a key is unknown, or the parts don't serve the unwrapping that is asked for.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    projector_size: tuple[int, int]  # width, height, px
+    unwrap: Unwrapping
+    parts: tuple[AnyPart, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Patterns":
+        if not self.axes:
+            raise ValueError("parts: expected at least one set of fringes, found none")
+        for axis in self.axes:
+            fringes = [part for part in self.parts if isinstance(part, Fringes) and part.axis == axis]
+            if self.unwrap == "heterodyne":
+                if len(fringes) < 2:
+                    raise ValueError(
+                        f"parts: heterodyne unwrapping of {axis} expects two or more sets of fringes, found {len(fringes)}"
+                    )
+                continue
+            if len(fringes) != 1:
+                raise ValueError(f"parts: {self.unwrap} unwrapping of {axis} expects one set of fringes, found {len(fringes)}")
+            wanted = GrayCode if self.unwrap == "gray" else CentreLine
+            guides = [part for part in self.parts if isinstance(part, wanted) and part.axis == axis]
+            if len(guides) != 1:
+                raise ValueError(f"parts: {self.unwrap} unwrapping of {axis} expects one part of that kind, found {len(guides)}")
+            if isinstance(guides[0], GrayCode) and guides[0].pitch != fringes[0].pitch:
+                raise ValueError(
+                    f"parts: Gray code and fringes of {axis} expect one pitch, found {guides[0].pitch:g} and {fringes[0].pitch:g}"
+                )
+        return self
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """The axes that carry fringes, columns first."""
+        axes: tuple[Axis, ...] = ("columns", "rows")
+        return tuple(axis for axis in axes if any(isinstance(part, Fringes) and part.axis == axis for part in self.parts))
+
+    @property
+    def count(self) -> int:
+        """Number of images in the sequence."""
+        return sum(part.count for part in self.parts)
+
+    def length(self, axis: Axis) -> int:
+        """Projector px along an axis."""
+        return self.projector_size[0 if axis == "columns" else 1]
+
+    def slices(self) -> list[tuple[AnyPart, slice]]:
+        """Each part with its place in the sequence."""
+        ends = np.cumsum([part.count for part in self.parts])
+        return [(part, slice(int(end) - part.count, int(end))) for part, end in zip(self.parts, ends, strict=True)]
+
+    def profiles(self) -> list[tuple[Axis, bool, Image]]:
+        """Each image as (axis, whether it is binary, profile along the axis)."""
+        result: list[tuple[Axis, bool, Image]] = []
+        for part in self.parts:
+            binary = isinstance(part, GrayCode | CentreLine) or (isinstance(part, Fringes) and part.waveform == "binary")
+            result += [(part.axis, binary, profile) for profile in part.profiles(self.length(part.axis))]
+        return result
+
+    def images(self) -> Image:
+        """The whole sequence as projector images : (count, height, width), from 0 to 1, before the projector's gamma."""
+        width, height = self.projector_size
+        rows = [profile[None, :] if axis == "columns" else profile[:, None] for axis, _, profile in self.profiles()]
+        return np.stack([np.broadcast_to(row, (height, width)) for row in rows])
+
+
+def gray_bit(period: NDArray[np.float64], bit: int) -> NDArray[np.bool_]:
+    """Bit `bit` (0 is the finest) of the reflected Gray code of floor(period); zero outside the code's range below."""
+    number = np.floor(period).astype(np.int64)
+    return ((number ^ (number >> 1)) >> bit & 1).astype(bool)

@@ -1,0 +1,36 @@
+"""Rigid transforms as 4x4 matrices on column vectors, named `to_from`: `world_from_target @ target_from_image`."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Build a 4x4 transform from a (3, 3) rotation matrix and a (3,) translation in mm."""
+    result = np.eye(4)
+    result[:3, :3] = rotation
+    result[:3, 3] = np.asarray(translation, float).ravel()
+    return result
+
+
+def from_rotation_vector(vector: ArrayLike, translation: ArrayLike) -> Array:
+    """Build a 4x4 transform from a (3,) rotation vector in rad (axis times angle) and a (3,) translation in mm."""
+    return transform(Rotation.from_rotvec(np.asarray(vector, float)).as_matrix(), translation)
+
+
+def apply(to_from: Array, points: ArrayLike) -> Array:
+    """Move points : (..., 3) mm, by a 4x4 transform."""
+    return np.asarray(points, float) @ to_from[:3, :3].T + to_from[:3, 3]
+
+
+def rotate(to_from: Array, directions: ArrayLike) -> Array:
+    """Turn directions : (..., 3), by the rotation of a 4x4 transform, leaving its translation out."""
+    return np.asarray(directions, float) @ to_from[:3, :3].T
+
+
+def invert(to_from: Array) -> Array:
+    """Return `from_to`, the inverse of a rigid transform."""
+    rotation = to_from[:3, :3].T
+    return transform(rotation, -rotation @ to_from[:3, 3])

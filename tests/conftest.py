@@ -1,0 +1,34 @@
+"""Fixtures that tests of all packages share."""
+
+import os
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from recon.rig import Rig
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """A generator seeded by the test's name: the same in each run, another one for each test and parameter."""
+    return np.random.default_rng(zlib.crc32(request.node.name.encode()))
+
+
+@pytest.fixture(scope="session")
+def rig() -> Rig:
+    """The rig of Meza et al. 2021."""
+    return Rig.model_validate(yaml.safe_load((ROOT / "conf/rig/meza2021.yaml").read_text(encoding="utf-8")))
+
+
+@pytest.fixture(scope="session")
+def real() -> Path:
+    """The folder of real recordings: `SONOTWIN_REAL`, else `shared/real` beside the clone; skips the test without it."""
+    folder = Path(os.environ.get("SONOTWIN_REAL") or ROOT.parent / "shared" / "real")
+    if not folder.is_dir():
+        pytest.skip(f"no real recordings in {folder}; SONOTWIN_REAL names another folder")
+    return folder
