@@ -1,0 +1,171 @@
+"""Where a wrapped phase continues from pixel to pixel, and how far an order may be carried along it.
+
+A step of the surface is a jump of the phase. It is looked for with an antisymmetric stencil along rows and columns: the phase
+difference over three pixels less what the slopes two pixels further out predict. Curvature and a crease in the middle drop out
+of it; what is left is the jump (less whole periods), third derivatives and noise of 2.7 sigma. The mean over three neighbours
+beside each other, for which any border is straight enough, sees smaller jumps still.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+Flags = NDArray[np.uint8]
+
+VOID, INCOMPLETE, TORN, CLEAN = 0, 1, 2, 3  # not measured; too near a gap to tell; next to a jump; continuous both ways
+
+SLACK = 0.008  # cycle (0.05 rad) of mismatch that third derivatives and texture may cause
+SIGMAS = 4.5  # of the stencil's noise; one in 150 000 comparisons fails by chance
+STENCIL_NOISE = 2.7 / (2 * math.pi)  # cycle a rad: sqrt(2 (1.75^2 + 0.75^2)) = 2.69
+REACH = 8  # px that an order is carried along clean pixels, less than two cells of the unwrapping
+BLIND_REACH = 4  # px that it is carried where the stencil is incomplete: the stencil's own reach
+
+
+@njit(inline="always")
+def wrap(cycles):
+    """The difference of two phases in cycles, to [-0.5, 0.5)."""
+    return cycles - np.floor(cycles + np.float32(0.5))
+
+
+@njit(cache=True, parallel=True)
+def continuity(phase, sigma, valid):
+    """Classify pixels by the continuity of their phase.
+
+    Parameters
+    ----------
+    phase : (h, w) float32, cycles
+    sigma : (h, w) float32, rad
+    valid : (h, w) bool
+
+    Returns
+    -------
+    flags : (h, w) uint8
+        VOID, INCOMPLETE, TORN or CLEAN.
+    """
+    height, width = phase.shape
+    across = np.full((height, width), np.float32(np.nan))  # mismatch at the pair (u, u+1), cycles; NaN where incomplete
+    down = np.full((height, width), np.float32(np.nan))  # at the pair (v, v+1)
+    outside = np.float32(0.75)
+    for v in prange(height):
+        p = phase[v]
+        for u in range(3, width - 4):
+            inner = wrap(p[u] - p[u - 1]) + wrap(p[u + 1] - p[u]) + wrap(p[u + 2] - p[u + 1])
+            outer = wrap(p[u - 1] - p[u - 2]) + wrap(p[u - 2] - p[u - 3]) + wrap(p[u + 3] - p[u + 2]) + wrap(p[u + 4] - p[u + 3])
+            across[v, u] = wrap(inner - outside * outer)
+        run = 0
+        for u in range(width):
+            run = run + 1 if valid[v, u] else 0
+            if u >= 4 and run < 8:
+                across[v, u - 4] = np.nan
+        if v < 3 or v >= height - 4:
+            continue
+        a, b, c, d = phase[v - 3], phase[v - 2], phase[v - 1], phase[v]
+        e, f, g, h = phase[v + 1], phase[v + 2], phase[v + 3], phase[v + 4]
+        for u in range(width):
+            inner = wrap(d[u] - c[u]) + wrap(e[u] - d[u]) + wrap(f[u] - e[u])
+            outer = wrap(c[u] - b[u]) + wrap(b[u] - a[u]) + wrap(g[u] - f[u]) + wrap(h[u] - g[u])
+            down[v, u] = wrap(inner - outside * outer)
+        for k in range(-3, 5):
+            for u in range(width):
+                if not valid[v + k, u]:
+                    down[v, u] = np.nan
+    jumps = np.empty((height, width), np.uint8)  # bit 0 torn across, 1 torn down, 2 incomplete across, 3 incomplete down
+    single, triple = np.float32(SIGMAS * STENCIL_NOISE), np.float32(SIGMAS * STENCIL_NOISE / math.sqrt(3))
+    slack = np.float32(SLACK)
+    for v in prange(height):
+        above, below = max(v - 1, 0), min(v + 1, height - 1)
+        for u in range(width):
+            left, right = max(u - 1, 0), min(u + 1, width - 1)
+            s = sigma[v, u]
+            x, y = across[v, u], down[v, u]
+            x3 = (across[above, u] + x + across[below, u]) / 3
+            y3 = (down[v, left] + y + down[v, right]) / 3
+            torn = np.uint8(abs(x) > slack + single * s or abs(x3) > slack + triple * s)
+            torn |= np.uint8(2) * np.uint8(abs(y) > slack + single * s or abs(y3) > slack + triple * s)
+            jumps[v, u] = torn | np.uint8(4) * np.uint8(np.isnan(x)) | np.uint8(8) * np.uint8(np.isnan(y))
+    return _combine(jumps, valid)
+
+
+@njit(cache=True, parallel=True)
+def _combine(jumps, valid):
+    """A pixel is torn if any stencil is whose middle it touches, incomplete if any is; clean otherwise."""
+    height, width = valid.shape
+    flags = np.zeros((height, width), np.uint8)
+    for v in prange(height):
+        seen = np.zeros(width, np.uint8)
+        for k in range(-2, 2):
+            y = min(max(v + k, 0), height - 1)
+            for u in range(width):
+                seen[u] |= jumps[y, u] & np.uint8(2 | 8)
+            for u in range(2, width - 1):
+                seen[u] |= jumps[v, u + k] & np.uint8(1 | 4)
+        seen[:2] |= np.uint8(4)
+        seen[width - 1] |= np.uint8(4)
+        for u in range(width):
+            if valid[v, u]:
+                flags[v, u] = TORN if seen[u] & 3 else (INCOMPLETE if seen[u] & 12 else CLEAN)
+    return flags
+
+
+@njit(cache=True, parallel=True)
+def carry(order, known, phase, sigma, flags, wanted, reach):
+    """Carry orders from known pixels to their neighbours, as far as the phase follows the slope it had among the known ones.
+
+    Looks along the row and the column, both ways, up to `reach` px. A pixel gets an order if at least one way leads to it over
+    continuous pixels and no two ways contradict each other.
+
+    Parameters
+    ----------
+    order : (h, w) int32
+    known : (h, w) bool, where the order is known
+    phase : (h, w) float32, cycles
+    sigma : (h, w) float32, rad
+    flags : (h, w) uint8, of `continuity`; VOID and TORN pixels are neither crossed nor filled
+    wanted : int, least flag of a pixel to be filled or crossed
+    reach : int, px
+
+    Returns
+    -------
+    order, known
+        Copies with the new ones in.
+    """
+    height, width = phase.shape
+    filled, found = order.copy(), known.copy()
+    for v in prange(height):
+        for u in range(width):
+            if known[v, u] or flags[v, u] == TORN or flags[v, u] == VOID or flags[v, u] < wanted:
+                continue
+            candidate, ways, clash = 0, 0, False
+            for way in range(4):
+                dv, du = (0, 0, 1, -1)[way], (1, -1, 0, 0)[way]
+                distance = 0
+                for step in range(1, reach + 1):
+                    y, x = v + step * dv, u + step * du
+                    if not (0 <= y < height and 0 <= x < width) or flags[y, x] == TORN or flags[y, x] == VOID:
+                        break
+                    if known[y, x]:
+                        distance = step
+                        break
+                y, x = v + distance * dv, u + distance * du
+                yy, xx = y + 2 * dv, x + 2 * du
+                if distance == 0 or not (0 <= yy < height and 0 <= xx < width) or not known[yy, xx]:
+                    continue
+                start = order[y, x] + phase[y, x]
+                slope = (start - order[yy, xx] - phase[yy, xx]) / 2
+                total, smooth = start, True
+                tolerance = SLACK + SIGMAS * 2.5 * sigma[v, u] / (2 * math.pi)
+                for step in range(distance - 1, -1, -1):
+                    change = wrap(phase[v + step * dv, u + step * du] - phase[v + (step + 1) * dv, u + (step + 1) * du] - slope)
+                    smooth = smooth and abs(change) < tolerance
+                    total += slope + change
+                if not smooth or abs(total - start - distance * slope) > 2 * tolerance:
+                    continue
+                here = int(math.floor(total - phase[v, u] + 0.5))
+                clash = clash or (ways > 0 and here != candidate)
+                candidate, ways = here, ways + 1
+            if ways > 0 and not clash:
+                filled[v, u], found[v, u] = candidate, True
+    return filled, found

@@ -1,0 +1,262 @@
+"""From the images of a pattern sequence to projector coordinates, with their predicted noise."""
+
+import logging
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from recon import continuity, graycode, heterodyne, spatial
+from recon.errors import InputError
+from recon.graycode import Orders
+from recon.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns
+from recon.phase import DEFAULT_NOISE, NOISE_SAMPLES, Fringe, Noise, estimate_noise, pseudo_inverse, sample_pixels, wrapped_phase
+
+log = logging.getLogger(__name__)
+
+Image = NDArray[np.float32]
+
+DARKEST = 4.0  # DN of 255: default of the least modulation
+WORST_SIGMA = 0.3  # rad of predicted phase noise: beyond, orders can't be decided
+LIT_SHARE = 0.002  # share of the image that must carry fringes
+SATURATED_SHARE = 0.5  # share of the lit image that may be saturated
+HARMONIC_SHARE = 0.08  # of the modulation, found in the high harmonics: more is not an N-step sequence
+LINE_SHARE = 0.3  # share of the fringes' area that may be lit in the image of a line
+WRONG_BORDERS = 0.06  # share of the period borders at which the order may jump
+MIN_SIGHTINGS = 10  # rows in which the line must be seen
+
+
+class Status(IntEnum):
+    """What became of a pixel."""
+
+    OK = 0
+    DARK = 1  # too little modulation
+    SATURATED = 2  # at full scale in a fringe image
+    UNREACHABLE = 3  # a surface that the centre line doesn't reach
+    UNCERTAIN = 4  # the order can't be told: a tear, a border, contradicting bits or pitches
+    OUTSIDE = 5  # decoded to a coordinate beyond the projector's image
+
+
+@dataclass(frozen=True)
+class ProjectorMap:
+    """Projector coordinates seen by a camera. All images (h, w)."""
+
+    columns: Image | None  # projector px, NaN where unknown; None if not encoded
+    rows: Image | None
+    sigma_columns: Image | None  # projector px, predicted standard deviation, NaN where unknown
+    sigma_rows: Image | None
+    modulation: Image  # DN, of the first axis
+    offset: Image  # DN
+    phase: Image  # rad, wrapped, of the first axis
+    status: NDArray[np.uint8]  # Status; OK where every encoded axis is
+    noise: Noise  # of one image, measured or given
+    summary: dict[str, int]  # pixels by status in lower case; regions, islands, disputed with a centre line
+
+
+def decode(
+    images: NDArray,
+    patterns: Patterns,
+    *,
+    bits: int = 8,
+    noise: Noise | None = None,
+    min_modulation_dn: float | None = None,
+    name: str = "images",
+) -> ProjectorMap:
+    """Decode a camera's images of a pattern sequence.
+
+    The projector coordinate is `x = origin + pitch * (phase / 2 pi + k)`, its noise `pitch / (2 pi) * sigma_phase`.
+
+    Parameters
+    ----------
+    images : (n, h, w) uint8 or uint16, DN
+        One an image of the sequence, in its order.
+    patterns : Patterns
+        The sequence.
+    bits : int
+        Full scale is `2**bits - 1`.
+    noise : Noise, optional
+        Of one image. If not given it is measured from fringes of eight or more steps; with fewer steps a default stands in.
+    min_modulation_dn : float, optional
+        Fringes weaker than this are dark; 4 DN of 255 if not given.
+    name : str
+        Of the images, for messages, such as `surface/cam1`.
+
+    Raises
+    ------
+    InputError
+        If the number of images is wrong, they are black or saturated, or they do not follow the sequence.
+    """
+    images = np.asarray(images)
+    if images.ndim != 3 or len(images) != patterns.count:
+        raise InputError(f"{name}: expected {patterns.count} grey images of one size, found an array of shape {images.shape}")
+    full = 2.0**bits - 1
+    least = DARKEST * full / 255 if min_modulation_dn is None else min_modulation_dn
+    parts = patterns.slices()
+    noise = noise or _measured_noise(images, parts, full) or DEFAULT_NOISE.scaled(full / 255)
+    axes: dict[Axis, tuple[Image, Image]] = {}
+    fringes: dict[Axis, Fringe] = {}
+    status = np.zeros(images.shape[1:], np.uint8)
+    counts: dict[str, int] = {}
+    for axis in patterns.axes:
+        sets = []
+        for part, place in parts:
+            if isinstance(part, Fringes) and part.axis == axis:
+                fringe = wrapped_phase(images[place], part.shifts, noise=noise, saturation=full)
+                _check_fringes(images[place], part, fringe, least, noise, name, place.start)
+                sets.append((part, fringe))
+        part, fringe = min(sets, key=lambda pair: pair[0].pitch)
+        stage = _quality([f for _, f in sets], least)
+        guides = [
+            (p, images[place], place.start) for p, place in parts if isinstance(p, GrayCode | CentreLine) and p.axis == axis
+        ]
+        orders, unreachable, found = _orders(patterns, axis, sets, guides, stage == Status.OK, noise, name)
+        counts |= found
+        x, sigma = _coordinates(fringe.phase, fringe.sigma, orders.order, orders.trusted, unreachable, stage,
+                                part.zero(patterns.length(axis)), part.pitch, patterns.length(axis))  # fmt: skip
+        if patterns.unwrap != "centre_line":
+            _check_bits(x, fringe.phase, part.pitch, name)
+        axes[axis], fringes[axis] = (x, sigma), fringe
+        status = np.where(status == Status.OK, stage, status)
+    first = fringes[patterns.axes[0]]
+    columns, rows = axes.get("columns", (None, None)), axes.get("rows", (None, None))
+    pixels = np.bincount(status.ravel(), minlength=len(Status)).tolist()
+    summary = {s.name.lower(): pixels[s] for s in Status} | counts
+    return ProjectorMap(
+        columns[0], rows[0], columns[1], rows[1], first.modulation, first.offset, first.phase, status, noise, summary
+    )
+
+
+def _measured_noise(images: NDArray, parts: list[tuple[AnyPart, slice]], full: float) -> Noise | None:
+    """The noise measured on the first fringes that allow it."""
+    for part, place in parts:
+        if isinstance(part, Fringes) and (found := estimate_noise(images[place], part.shifts, saturation=full)) is not None:
+            return found
+    return None
+
+
+def _quality(fringes: list[Fringe], least: float) -> NDArray[np.uint8]:
+    """OK, DARK or SATURATED : (h, w), the worst over the sets of fringes."""
+    dark = np.zeros(fringes[0].phase.shape, bool)
+    saturated = dark.copy()
+    for fringe in fringes:
+        dark |= (fringe.modulation < least) | (fringe.sigma > WORST_SIGMA)
+        saturated |= fringe.saturated
+    return np.where(saturated, np.uint8(Status.SATURATED), np.where(dark, np.uint8(Status.DARK), np.uint8(Status.OK)))
+
+
+def _check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, noise: Noise, name: str, start: int) -> None:
+    """Refuse black, saturated and out-of-order fringes."""
+    place = f"{name}: images {start} to {start + part.steps - 1}"
+    samples = sample_pixels(images, NOISE_SAMPLES)
+    swing = np.ptp(samples, axis=0)
+    if np.mean(swing > 2 * least) < LIT_SHARE:
+        if np.median(samples) > 0.9 * float(np.iinfo(images.dtype).max if images.dtype != np.float32 else samples.max()):
+            raise InputError(f"{place} are saturated all over; expected fringes, found one level: shorten the exposure")
+        raise InputError(
+            f"{place} hold no fringes: expected a modulation of {least:.0f} DN or more, found {fringe.modulation.mean():.1f} DN on average"
+        )
+    lit = fringe.saturated.sum() + np.count_nonzero(fringe.modulation > least)
+    if fringe.saturated.sum() > SATURATED_SHARE * lit:
+        share = 100 * fringe.saturated.mean()
+        raise InputError(
+            f"{place} are saturated in {share:.0f} % of the pixels, expected less than half of the lit ones: shorten the exposure"
+        )
+    _check_order(samples[:, swing > 2 * least], part, noise, place, start)
+
+
+def _check_order(samples: Image, part: Fringes, noise: Noise, place: str, start: int) -> None:
+    """Refuse images that don't follow the N-step sequence: swapped images put power into the high temporal harmonics.
+
+    A projector's gamma fills harmonic 2, binary fringes the odd ones; those are not looked at.
+    """
+    n = part.steps
+    harmonics = [k for k in range(3, n // 2 + 1) if part.waveform == "sine" or (n % 2 == 0 and k % 2 == 0)]
+    if not harmonics:
+        return
+    time = 2 * np.pi * np.outer(harmonics, np.arange(n)) / n
+    power = ((np.cos(time) @ samples) ** 2 + (np.sin(time) @ samples) ** 2) * (2 / n) ** 2  # amplitude^2, DN^2
+    expected = 4 / n * (noise.read_variance + noise.gain * samples.mean(axis=0))  # of noise alone
+    spread = 2 * samples.var(axis=0)  # amplitude^2 of a sinusoid
+    strange = np.sqrt(np.clip(power.mean(axis=0) - 4 * expected, 0, None) / spread)
+    if np.median(strange) < HARMONIC_SHARE:
+        return
+    solve = pseudo_inverse(part.shifts)
+    design = np.stack([np.ones(n), np.cos(part.shifts), -np.sin(part.shifts)], axis=1)
+    residual = np.sqrt(np.mean((samples - design @ (solve @ samples)) ** 2, axis=1))
+    worst = ", ".join(str(start + i) for i in np.flatnonzero(residual > 0.7 * residual.max()))
+    raise InputError(f"{place} do not follow the {n}-step sequence, worst in {worst}: are they in the manifest's order?")
+
+
+def _orders(patterns, axis, sets, guides, valid, noise, name) -> tuple[Orders, NDArray[np.bool_], dict[str, int]]:
+    """Fringe orders by the sequence's way of unwrapping, where no line reaches, and what there is to count."""
+    length = patterns.length(axis)
+    nowhere = np.zeros(valid.shape, bool)
+    part, fringe = min(sets, key=lambda pair: pair[0].pitch)
+    if patterns.unwrap == "heterodyne":
+        return heterodyne.fringe_order(sets, length), nowhere, {}
+    guide, images, start = guides[0]
+    if patterns.unwrap == "gray":
+        orders = graycode.fringe_order(images, guide, part, fringe, length, noise)
+        return orders, nowhere, {}
+    return _from_line(guide, images[0], part, fringe, valid, length, axis, f"{name}: image {start}")
+
+
+def _from_line(line: CentreLine, image: NDArray, part: Fringes, fringe: Fringe, valid, length: int, axis: Axis, place: str):
+    """Orders by the centre line; for rows everything is turned, so that the line stands upright."""
+    bright = np.mean((image > fringe.offset)[valid]) if valid.any() else 0.0
+    if bright > LINE_SHARE:
+        raise InputError(
+            f"{place} is bright over {100 * bright:.0f} % of the fringes, expected one line: is it in the manifest's order?"
+        )
+    turned = axis == "rows"
+    if turned:
+        fringe = Fringe(
+            *(np.ascontiguousarray(getattr(fringe, f).T) for f in ("phase", "modulation", "offset", "sigma", "saturated"))
+        )
+        image, valid = np.ascontiguousarray(image.T), np.ascontiguousarray(valid.T)
+    turns = (line.middle(length) - part.zero(length)) / part.pitch
+    found = spatial.unwrap(fringe, valid, image, turns, line.width / part.pitch)
+    if found.votes < MIN_SIGHTINGS:
+        raise InputError(f"{place} shows no centre line: expected it in {MIN_SIGHTINGS} rows or more, found it in {found.votes}")
+    order, known, unreachable = (m.T if turned else m for m in (found.order, found.known, found.unreachable))
+    return Orders(order, known), unreachable, {"regions": found.regions, "islands": found.islands, "disputed": found.disputed}
+
+
+@njit(cache=True, parallel=True)
+def _coordinates(phase, sigma, order, trusted, unreachable, status, origin, pitch, length):
+    """Projector coordinates and their noise, NaN where unknown; writes the reasons into `status`."""
+    height, width = phase.shape
+    x, sx = np.full((height, width), np.nan, np.float32), np.full((height, width), np.nan, np.float32)
+    for v in prange(height):
+        for u in range(width):
+            if status[v, u] != 0:
+                continue
+            if not trusted[v, u]:
+                status[v, u] = 3 if unreachable[v, u] else 4
+                continue
+            value = origin + pitch * (phase[v, u] / (2 * np.pi) + order[v, u])
+            if value < -0.5 or value > length - 0.5:
+                status[v, u] = 5
+                continue
+            x[v, u], sx[v, u] = value, pitch / (2 * np.pi) * sigma[v, u]
+    return x, sx
+
+
+def _check_bits(x: Image, phase: Image, pitch: float, name: str) -> None:
+    """Refuse orders that jump where the phase continues: a sign of bits in the wrong order, at the borders of the periods.
+
+    A step of the surface breaks the phase as well, but for the few that come near a whole number of periods.
+    """
+    x, phase = x[::4], phase[::4]
+    jump = np.abs(np.diff(x, axis=1)) > pitch / 2
+    turn = np.diff(phase, axis=1)
+    continues = np.abs(turn - 2 * np.pi * np.rint(turn / (2 * np.pi))) < 0.6  # rad
+    borders = np.count_nonzero(continues & (np.abs(turn) > np.pi) & np.isfinite(x[:, 1:] - x[:, :-1]))
+    wrong = np.count_nonzero(continues & jump)
+    if wrong > max(WRONG_BORDERS * borders, 20):
+        share = 100 * wrong / max(borders, wrong)
+        raise InputError(
+            f"{name}: fringe orders jump at {share:.0f} % of the period borders, expected nearly none: are the images in the manifest's order?"
+        )

@@ -1,0 +1,481 @@
+"""Spatial unwrapping from a projected centre line: surfaces that continue to the line get its absolute fringe order.
+
+A wrapped phase can be followed across a surface, not across a jump. Pixels are gathered into cells of 4x4 that are continuous
+in themselves; cells into basins, cut off at bottlenecks; basins into regions, where most of their common border is continuous.
+Two surfaces that touch in the image with a varying jump between them agree by chance wherever the jump passes a whole number
+of periods: that opening in an otherwise torn border is a bottleneck, and is refused. The line then gives each region its
+absolute order, by vote. A region without the line is reported as unreachable, one whose votes disagree as disputed.
+
+Only a jump that is a whole number of periods (within the noise) along most of the border between two surfaces can fool this,
+as it fools anything that sees the phase alone: Gray code or a second pitch is needed there.
+"""
+
+import heapq
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from recon import continuity
+from recon.continuity import CLEAN, INCOMPLETE, TORN, VOID, wrap
+from recon.phase import Fringe
+
+CELL = 4  # px; a cell's side
+BOTTLENECK = 1  # cells; a basin whose half width is more than its outlet's by more than this is cut off there
+CONTINUOUS = 0.85  # share of the common border of two basins that must be continuous for them to be one region
+MARGIN_CELLS = 3  # cells that a basin grows into torn ground, so that neighbours across a tear meet
+LINE_LEVEL = 0.25  # of full light: brighter is the line
+VOTES = 5  # rows in which the line must be seen on a region
+AGREEMENT = 0.85  # share of the votes that must name one order
+RESIDUAL = 0.2  # cycle that a vote may be off a whole order
+NONE = 127  # no offset between two cells
+
+Flags = NDArray[np.uint8]
+Integers = NDArray[np.int32]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Unwrapped:
+    """Absolute fringe orders from the centre line."""
+
+    order: Integers  # (h, w)
+    known: Mask  # (h, w) where the order holds
+    unreachable: Mask  # (h, w) continuous surface that no line reaches
+    regions: int  # with the line
+    islands: int  # without
+    disputed: int  # in which the line's votes disagree
+    votes: int  # sightings of the line on continuous surface
+
+
+@dataclass(frozen=True)
+class Borders:
+    """How basins touch: the number of continuous contacts by order offset (q less p), and of torn ones."""
+
+    continuous: dict[tuple[int, int], Counter]  # (p, q), p < q
+    torn: Counter  # of (p, q), p < q
+
+
+def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: float) -> Unwrapped:
+    """Unwrap along the surface, starting from the centre line.
+
+    Parameters
+    ----------
+    fringe : Fringe
+        The decoded fringes, (h, w); the line may run in any direction but along the rows.
+    valid : (h, w) bool
+        Pixels with enough modulation.
+    line : (h, w), DN
+        The image of the line.
+    turns : float, cycles
+        The absolute phase of the line's middle: (line - origin) / pitch.
+    width : float, cycles
+        The line's width.
+
+    Returns
+    -------
+    Unwrapped
+        With `votes` zero if the line is nowhere to be seen; that is for the caller to judge.
+    """
+    phase = fringe.phase * np.float32(1 / (2 * np.pi))
+    flags = continuity.continuity(phase, fringe.sigma, valid)
+    relative, state, right, down = _cells(phase, flags)
+    distance = _distance(state)
+    basin, offset, broken = _flood(distance, right, down)
+    basin, broken, count = _number(basin, broken)
+    sightings, values = _sight(line, fringe.offset, fringe.modulation, fringe.sigma, valid, phase, relative, basin, offset, turns, width)
+    votes: dict[int, Counter] = defaultdict(Counter)
+    for place, value in zip(sightings.tolist(), values.tolist(), strict=True):
+        votes[place][value] += 1
+    ground = _grow(state, basin)
+    region, lift, absolute, disputed = _regions(count, _borders(state, ground, offset, right, down), votes, broken)
+    base = np.array([absolute.get(r, 0) for r in region.tolist()], np.int32)
+    resolved = np.array([r in absolute for r in region.tolist()], bool)
+    contested = np.array([r in disputed for r in region.tolist()], bool)
+    cells = offset + np.append(base + lift, 0)[basin].astype(np.int32)
+    home = np.where(basin >= 0, np.append(region, -1)[basin], -1).astype(np.int32)
+    frontier = _frontier(np.where(ground >= 0, np.append(region, -1)[ground], -1))
+    # A continuous cell right at the frontier may hold pixels of both surfaces; no order is carried within two cells of it.
+    closed = _leaks(distance, home, cells, right, down) | _dilated(frontier, 1) | ((basin < 0) & _dilated(frontier, 2))
+    reached = (basin >= 0) & np.append(resolved, False)[basin] & ~closed
+    island = (basin >= 0) & ~np.append(resolved | contested, True)[basin] & ~closed
+    order, known, unreachable = _to_pixels(relative, flags, basin, cells, reached, island, closed)
+    order, known = continuity.carry(order, known, phase, fringe.sigma, flags, CLEAN, continuity.REACH)
+    order, known = continuity.carry(order, known, phase, fringe.sigma, flags, INCOMPLETE, continuity.BLIND_REACH)
+    islands = len(set(region.tolist()) - set(absolute) - disputed)
+    return Unwrapped(order, known, unreachable, len(absolute), islands, len(disputed), len(values))
+
+
+@njit(cache=True, parallel=True)
+def _cells(phase, flags):
+    """Orders of the pixels relative to their cell's first, the cells' state, and the offsets to the cells right and below."""
+    rows, columns = phase.shape[0] // CELL, phase.shape[1] // CELL
+    relative = np.zeros(phase.shape, np.int8)
+    state = np.zeros((rows, columns), np.uint8)
+    right, down = np.full((rows, columns), NONE, np.int8), np.full((rows, columns), NONE, np.int8)
+    for i in prange(rows):
+        for j in range(columns):
+            clean, torn, void = 0, 0, 0
+            for v in range(i * CELL, i * CELL + CELL):
+                for u in range(j * CELL, j * CELL + CELL):
+                    clean += flags[v, u] == CLEAN
+                    torn += flags[v, u] == TORN
+                    void += flags[v, u] == VOID
+            if clean < CELL * CELL:
+                state[i, j] = TORN if torn > 0 else (VOID if 2 * void > CELL * CELL else INCOMPLETE)
+                continue
+            state[i, j] = CLEAN
+            for v in range(i * CELL, i * CELL + CELL):
+                u = j * CELL
+                if v > i * CELL:
+                    relative[v, u] = relative[v - 1, u] - np.floor(phase[v, u] - phase[v - 1, u] + np.float32(0.5))
+                for u in range(j * CELL + 1, j * CELL + CELL):
+                    relative[v, u] = relative[v, u - 1] - np.floor(phase[v, u] - phase[v, u - 1] + np.float32(0.5))
+    for i in prange(rows):
+        for j in range(columns):
+            if state[i, j] != CLEAN:
+                continue
+            if j + 1 < columns and state[i, j + 1] == CLEAN:
+                right[i, j] = _offset(phase, relative, i * CELL, j * CELL + CELL - 1, 1, 0)
+            if i + 1 < rows and state[i + 1, j] == CLEAN:
+                down[i, j] = _offset(phase, relative, i * CELL + CELL - 1, j * CELL, 0, 1)
+    return relative, state, right, down
+
+
+@njit(inline="always")
+def _offset(phase, relative, v, u, du, dv):
+    """The offset on which all pixel pairs between two cells agree, NONE if they don't; (v, u) is the first cell's first pair."""
+    result = NONE
+    for k in range(CELL):
+        y, x = v + k * du, u + k * dv
+        step = relative[y, x] - np.floor(phase[y + dv, x + du] - phase[y, x] + np.float32(0.5)) - relative[y + dv, x + du]
+        if k > 0 and step != result:
+            return NONE
+        result = int(step)
+    return result
+
+
+@njit(cache=True)
+def _distance(state):
+    """Chessboard distance of each cell to the nearest that is not continuous, in cells; the image's edge is no obstacle."""
+    rows, columns = state.shape
+    distance = np.empty((rows, columns), np.int32)
+    for i in range(rows):
+        for j in range(columns):
+            nearest = rows + columns if state[i, j] == CLEAN else 0
+            for di, dj in ((0, -1), (-1, -1), (-1, 0), (-1, 1)):
+                if i + di >= 0 and 0 <= j + dj < columns:
+                    nearest = min(nearest, distance[i + di, j + dj] + 1)
+            distance[i, j] = nearest
+    for i in range(rows - 1, -1, -1):
+        for j in range(columns - 1, -1, -1):
+            nearest = distance[i, j]
+            for di, dj in ((0, 1), (1, 1), (1, 0), (1, -1)):
+                if i + di < rows and 0 <= j + dj < columns:
+                    nearest = min(nearest, distance[i + di, j + dj] + 1)
+            distance[i, j] = nearest
+    return distance
+
+
+@njit(inline="always")
+def _find(parent, shift, cell):
+    """Root of a cell and the cell's order less the root's."""
+    root, total = cell, 0
+    while parent[root] != root:
+        total += shift[root]
+        root = parent[root]
+    node, rest = cell, total
+    while parent[node] != root:
+        above, step = parent[node], shift[node]
+        parent[node], shift[node] = root, rest
+        node, rest = above, rest - step
+    return root, total
+
+
+@njit(cache=True)
+def _flood(distance, right, down):
+    """Gather cells into basins, from the widest places to the narrow ones: a watershed of the distance to the nearest gap.
+
+    Two basins that meet are one unless the narrower is wider than their meeting place by more than BOTTLENECK on each side.
+
+    Returns
+    -------
+    basin : (rows, columns) int32, the root cell's index, -1 where not continuous
+    offset : (rows, columns) int32, order less the root's
+    broken : (rows, columns) bool, cells whose contacts within their basin contradict each other
+    """
+    rows, columns = distance.shape
+    count = rows * columns
+    parent, shift = np.arange(count).astype(np.int32), np.zeros(count, np.int32)
+    peak = distance.copy().ravel()
+    seen = np.zeros(count, np.bool_)
+    flat = distance.ravel()
+    for cell in np.argsort(-flat, kind="mergesort"):
+        level = flat[cell]
+        if level == 0:
+            break
+        seen[cell] = True
+        i, j = cell // columns, cell % columns
+        for way in range(4):
+            if way == 0:
+                near, step = (cell + 1, right[i, j]) if j + 1 < columns else (-1, NONE)
+            elif way == 1:
+                near, step = (cell - 1, right[i, j - 1]) if j > 0 else (-1, NONE)
+            elif way == 2:
+                near, step = (cell + columns, down[i, j]) if i + 1 < rows else (-1, NONE)
+            else:
+                near, step = (cell - columns, down[i - 1, j]) if i > 0 else (-1, NONE)
+            if step == NONE or not seen[near]:
+                continue
+            a, shift_a = _find(parent, shift, cell)
+            b, shift_b = _find(parent, shift, near)
+            if a == b or min(peak[a], peak[b]) > level + BOTTLENECK:
+                continue
+            difference = int(step) if way % 2 == 0 else -int(step)  # of `near` less that of `cell`
+            if peak[a] >= peak[b]:
+                parent[b], shift[b] = a, shift_a + difference - shift_b
+            else:
+                parent[a], shift[a] = b, shift_b - difference - shift_a
+    basin, offset = np.full((rows, columns), -1, np.int32), np.zeros((rows, columns), np.int32)
+    broken = np.zeros((rows, columns), np.bool_)
+    for cell in range(count):
+        if flat[cell] > 0:
+            root, total = _find(parent, shift, cell)
+            basin[cell // columns, cell % columns], offset[cell // columns, cell % columns] = root, total
+    for i in range(rows):
+        for j in range(columns):
+            if right[i, j] != NONE and basin[i, j] == basin[i, j + 1] and offset[i, j + 1] - offset[i, j] != right[i, j]:
+                broken[i, j] = True
+            if down[i, j] != NONE and basin[i, j] == basin[i + 1, j] and offset[i + 1, j] - offset[i, j] != down[i, j]:
+                broken[i, j] = True
+    return basin, offset, broken
+
+
+def _number(basin: Integers, broken: Mask) -> tuple[Integers, set[int], int]:
+    """Number the basins from 0; returns the new map, the broken basins and how many there are."""
+    inside = basin >= 0
+    roots, numbers = np.unique(basin[inside], return_inverse=True)
+    numbered = np.full(basin.shape, -1, np.int32)
+    numbered[inside] = numbers
+    return numbered, set(numbered[broken].tolist()), len(roots)
+
+
+@njit(cache=True)
+def _sight(line, offset, modulation, sigma, valid, phase, relative, basin, cell_order, turns, width):
+    """Sightings of the line on continuous ground: the basin, and the absolute order of the basin's root cell."""
+    rows, columns = basin.shape
+    places, values = [np.int32(0) for _ in range(0)], [np.int32(0) for _ in range(0)]
+    for v in range(rows * CELL):
+        u = 0
+        while u < columns * CELL:
+            start, weight, moment, extent = u, 0.0, 0.0, 0.0
+            while u < columns * CELL and valid[v, u]:
+                level = (line[v, u] - max(offset[v, u] - modulation[v, u], np.float32(0))) / (2 * modulation[v, u])
+                if level < LINE_LEVEL + 4 * sigma[v, u]:
+                    break
+                if u > start:
+                    extent += abs(wrap(phase[v, u] - phase[v, u - 1]))
+                weight += level
+                moment += level * u
+                u += 1
+            if u - start >= 2 and extent < 1.5 * width + 0.3:
+                middle = moment / weight
+                near = int(np.floor(middle + 0.5))
+                place = basin[v // CELL, near // CELL]
+                if place >= 0:
+                    other = near + 1 if middle > near else near - 1
+                    here = phase[v, near] + abs(middle - near) * wrap(phase[v, other] - phase[v, near])
+                    whole = np.floor(turns - here + 0.5)
+                    if abs(turns - here - whole) < RESIDUAL:
+                        places.append(place)
+                        values.append(np.int32(whole) - relative[v, near] - cell_order[v // CELL, near // CELL])
+            u = max(u, start + 1)
+    return np.array(places), np.array(values)
+
+
+def _borders(state: Flags, ground: Integers, offset: Integers, right: NDArray[np.int8], down: NDArray[np.int8]) -> Borders:
+    """Count the contacts between basins that have grown into the torn ground between them."""
+    continuous: dict[tuple[int, int], Counter] = defaultdict(Counter)
+    torn: Counter = Counter()
+    for steps, here, there in ((right, np.s_[:, :-1], np.s_[:, 1:]), (down, np.s_[:-1], np.s_[1:])):
+        p, q, step = ground[here], ground[there], steps[here]
+        meet = (p != q) & (p >= 0) & (q >= 0)
+        jump = step + offset[here] - offset[there]  # order of q's root less that of p's, as the two cells see it
+        rip = meet & (step == NONE) & ((state[here] == TORN) | (state[there] == TORN) | ((state[here] == CLEAN) & (state[there] == CLEAN)))
+        for a, b, k in zip(p[meet & (step != NONE)].tolist(), q[meet & (step != NONE)].tolist(), jump[meet & (step != NONE)].tolist(), strict=True):
+            continuous[min(a, b), max(a, b)][k if a < b else -k] += 1
+        torn.update((min(a, b), max(a, b)) for a, b in zip(p[rip].tolist(), q[rip].tolist(), strict=True))
+    return Borders(continuous, torn)
+
+
+@njit(cache=True)
+def _grow(state, basin):
+    """Let the basins grow into torn cells, one ring a pass; a cell in reach of several takes the first it meets."""
+    rows, columns = basin.shape
+    ground = basin.copy()
+    for _ in range(MARGIN_CELLS):
+        before = ground.copy()
+        for i in range(rows):
+            for j in range(columns):
+                if before[i, j] >= 0 or state[i, j] == VOID:
+                    continue
+                for di, dj in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+                    if 0 <= i + di < rows and 0 <= j + dj < columns and before[i + di, j + dj] >= 0:
+                        ground[i, j] = before[i + di, j + dj]
+                        break
+    return ground
+
+
+def _regions(
+    count: int, borders: Borders, votes: dict[int, Counter], broken: set[int]
+) -> tuple[Integers, Integers, dict[int, int], set[int]]:
+    """Join basins into regions over continuous borders, the longest first, and anchor them by the line's votes.
+
+    Returns
+    -------
+    region : (count,) int32, the region of each basin, named by one of its basins
+    lift : (count,) int32, the order of each basin's root less that of its region's
+    absolute : the absolute order of each region's root, for regions with the line
+    disputed : regions whose votes disagree, or whose inside contradicts itself
+    """
+    region, lift = np.arange(count, dtype=np.int32), np.zeros(count, np.int32)
+    members = {p: [p] for p in range(count)}
+    anchored = {p: order for p, tally in votes.items() if (order := _verdict(tally)) is not None}
+    refused = broken | {p for p, tally in votes.items() if tally.total() >= VOTES and p not in anchored}
+    links: dict[int, dict[int, Counter]] = defaultdict(dict)
+    torn: dict[int, Counter] = defaultdict(Counter)
+    for (p, q), offsets in borders.continuous.items():
+        if not {p, q} & refused:
+            links[p][q], links[q][p] = Counter(offsets), Counter({-k: n for k, n in offsets.items()})
+    for (p, q), n in borders.torn.items():
+        torn[p][q] += n
+        torn[q][p] += n
+
+    def proposal(p: int, q: int) -> tuple[float, int] | None:
+        """How strongly p and q are one surface, and the order of q's root less p's; None if they can't be."""
+        offsets = links[p][q]
+        if p in anchored and q in anchored:
+            k = anchored[q] - anchored[p]
+            return (offsets[k], k) if offsets[k] else None
+        k, n = offsets.most_common(1)[0]
+        share = n / (offsets.total() + torn[p][q])
+        return (n * share, k) if share >= CONTINUOUS else None
+
+    age = [0] * count
+    queue: list[tuple[float, int, int, int]] = []
+
+    def propose(p: int, q: int) -> None:
+        if (found := proposal(p, q)) is not None:
+            heapq.heappush(queue, (-found[0], p, q, age[p] + age[q]))
+
+    for p, q in borders.continuous:
+        if q in links[p]:
+            propose(p, q)
+    while queue:
+        _, p, q, born = heapq.heappop(queue)
+        if q not in links[p] or born != age[p] + age[q]:
+            continue
+        _, k = proposal(p, q) or (0, 0)
+        if len(members[p]) < len(members[q]):
+            p, q, k = q, p, -k
+        for basin in members[q]:
+            region[basin], lift[basin] = p, lift[basin] + k
+        members[p] += members.pop(q)
+        if q in anchored:
+            anchored.setdefault(p, anchored.pop(q) - k)
+        del links[p][q], links[q][p]
+        for other, n in torn.pop(q, Counter()).items():
+            torn[p][other] += n
+            torn[other][p] += n
+        for other, offsets in links.pop(q).items():
+            moved = Counter({step + k: n for step, n in offsets.items()})
+            del links[other][q]
+            links[p][other] = links[p].get(other, Counter()) + moved
+            links[other][p] = Counter({-step: n for step, n in links[p][other].items()})
+        age[p] += 1
+        for other in links[p]:
+            propose(p, other)
+
+    absolute, disputed = {}, set()
+    for name, basins in members.items():
+        tally: Counter = Counter()
+        for basin in basins:
+            for order, n in votes.get(basin, Counter()).items():
+                tally[order - int(lift[basin])] += n
+        verdict = _verdict(tally)
+        if refused & set(basins) or (verdict is None and tally.total() >= VOTES):
+            disputed.add(name)
+        elif verdict is not None:
+            absolute[name] = verdict
+    return region, lift, absolute, disputed
+
+
+def _verdict(tally: Counter) -> int | None:
+    """The order that nearly all votes name, None if too few vote or they disagree."""
+    if tally.total() < VOTES:
+        return None
+    order, n = tally.most_common(1)[0]
+    return order if n >= AGREEMENT * tally.total() else None
+
+
+@njit(cache=True)
+def _leaks(distance, home, cells, right, down):
+    """Cells near a continuous contact that was refused: the jump between the two surfaces lies somewhere in the opening.
+
+    The opening is as wide as the contact is far from the nearest gap, on both sides; the border can bulge that far.
+    """
+    rows, columns = distance.shape
+    leaking = np.zeros((rows, columns), np.bool_)
+    for i in range(rows):
+        for j in range(columns):
+            for way in range(2):
+                step = down[i, j] if way else right[i, j]
+                if step == NONE:
+                    continue
+                y, x = (i + 1, j) if way else (i, j + 1)
+                if home[i, j] == home[y, x] and cells[y, x] - cells[i, j] == step:
+                    continue
+                reach = min(distance[i, j], distance[y, x]) + 2
+                for a in range(max(i - reach, 0), min(y + reach + 1, rows)):
+                    for b in range(max(j - reach, 0), min(x + reach + 1, columns)):
+                        leaking[a, b] = True
+    return leaking
+
+
+def _frontier(home: Integers) -> Mask:
+    """Cells at the border between the grounds of two regions."""
+    border = np.zeros(home.shape, bool)
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        meet = (home[here] != home[there]) & (home[here] >= 0) & (home[there] >= 0)
+        border[here] |= meet
+        border[there] |= meet
+    return border
+
+
+def _dilated(mask: Mask, cells: int) -> Mask:
+    """The mask, grown by a number of cells all round."""
+    side = 2 * cells + 1
+    return cv2.dilate(mask.view(np.uint8), np.ones((side, side), np.uint8)).view(bool)
+
+
+@njit(cache=True, parallel=True)
+def _to_pixels(relative, flags, basin, cells, reached, island, closed):
+    """Orders of the cells to their pixels. Islands, leaks and frontiers are marked in the flags, so that no order is carried into them."""
+    height, width = flags.shape
+    rows, columns = basin.shape
+    order = np.zeros((height, width), np.int32)
+    known, unreachable = np.zeros((height, width), np.bool_), np.zeros((height, width), np.bool_)
+    for v in prange(rows * CELL):
+        for u in range(columns * CELL):
+            i, j = v // CELL, u // CELL
+            if reached[i, j]:
+                order[v, u], known[v, u] = cells[i, j] + relative[v, u], True
+            elif closed[i, j]:
+                flags[v, u] = min(flags[v, u], np.uint8(TORN))
+            elif basin[i, j] >= 0:
+                unreachable[v, u] = island[i, j]
+                flags[v, u] = VOID
+    return order, known, unreachable

@@ -1,0 +1,76 @@
+"""A plain camera for tests: it sees a given projector coordinate at each pixel. No optics, so that truth is exact."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.patterns import Patterns
+from recon.phase import Noise
+
+NOISE = Noise(0.5, 0.033)  # DN^2, DN
+
+
+def photograph(
+    patterns: Patterns,
+    maps: dict[str, NDArray],
+    rng: np.random.Generator,
+    *,
+    light: NDArray | float = 180.0,
+    ambient: NDArray | float = 8.0,
+    blur: float = 0.5,
+    gamma: float = 1.0,
+    noise: Noise = NOISE,
+) -> NDArray[np.uint8]:
+    """Images : (n, h, w) uint8 of a scene whose pixels see the projector coordinates `maps[axis]` : (h, w) px, NaN in shadow.
+
+    `light` is what a fully lit pixel adds to the `ambient`, DN; `blur` the projector's defocus, sigma in projector px. Rounding
+    adds 1/12 DN^2; the noise given is the sum.
+    """
+    oversample = 8
+    images = []
+    for axis, binary, profile in patterns.profiles():
+        length = patterns.length(axis)
+        fine = np.repeat(np.asarray(profile, float) ** (1.0 if binary else gamma), oversample)
+        offsets = np.arange(-6 * oversample, 6 * oversample + 1)
+        kernel = np.exp(-0.5 * (offsets / (max(blur, 0.05) * oversample)) ** 2)
+        if not binary:  # grey levels vary slowly: interpolate them, so that the map's truth isn't quantised to the raster
+            fine = np.interp((np.arange(length * oversample) + 0.5) / oversample - 0.5, np.arange(length), np.asarray(profile, float) ** gamma)
+        fine = np.convolve(np.pad(fine, len(offsets) // 2, mode="edge"), kernel / kernel.sum(), mode="valid")
+        x = maps[axis]
+        level = np.interp(np.nan_to_num(x, nan=-1e9), (np.arange(length * oversample) + 0.5) / oversample - 0.5, fine, left=0, right=0)
+        level[np.isnan(x)] = 0
+        image = np.asarray(ambient) + np.asarray(light) * level
+        image = image + rng.normal(size=image.shape) * np.sqrt(np.maximum(noise.read_variance - 1 / 12 + noise.gain * image, 0))
+        images.append(np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    return np.stack(images)
+
+
+def breast(shape: tuple[int, int] = (1024, 1280), middle: float = 639.5) -> NDArray[np.float64]:
+    """Projector columns : (h, w) of a dome on a table, with the shadow of its flank; jumps at the shadow's border."""
+    height, width = shape
+    v, u = np.mgrid[:height, :width].astype(float)
+    z = np.sqrt(np.clip(1 - ((u - 0.5 * width) / (0.36 * width)) ** 2 - ((v - 0.5 * height) / (0.4 * height)) ** 2, 0, None))
+    x = middle + 0.55 * (u - width / 2) + 0.02 * (v - height / 2) + 0.032 * width * z
+    shadow = (z == 0) & (u > 0.7 * width) & (((u - 0.56 * width) / (0.36 * width)) ** 2 + ((v - 0.5 * height) / (0.4 * height)) ** 2 < 1)
+    x[shadow] = np.nan
+    return x
+
+
+def island(rng: np.random.Generator, shape: tuple[int, int] = (480, 640), middle: float = 639.5) -> tuple[NDArray, NDArray]:
+    """A slanted background with the line, and a nearer object off the line, in shadow on one side and touching on the other.
+
+    Returns the projector columns : (h, w), NaN in shadow, and the object's mask : (h, w). The jump along the touching border
+    varies, passing whole numbers of periods.
+    """
+    height, width = shape
+    v, u = np.mgrid[:height, :width].astype(float)
+    x = middle + 0.55 * (u - 0.35 * width) + rng.uniform(-0.05, 0.05) * (v - height / 2)
+    x += rng.uniform(0, 3) * np.sin(2 * np.pi * (u / width * rng.uniform(0.3, 1.5) + rng.uniform()))
+    a, b = rng.uniform(0.08, 0.16) * width, rng.uniform(0.15, 0.3) * height
+    cu, cv = rng.uniform(0.65, 0.75) * width, rng.uniform(0.4, 0.6) * height
+    power = rng.choice([2, 8])  # an ellipse, or nearly a box
+    inside = np.abs((u - cu) / a) ** power + np.abs((v - cv) / b) ** power < 1
+    raised = x + rng.uniform(6, 60) + rng.uniform(-0.12, 0.12) * (v - cv) + rng.uniform(-0.1, 0.1) * (u - cu)
+    shadow = (np.abs((u - cu - 0.35 * a) / a) ** power + np.abs((v - cv) / b) ** power < 1) & ~inside
+    x = np.where(inside, raised, x)
+    x[shadow] = np.nan
+    return x, inside

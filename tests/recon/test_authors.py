@@ -1,0 +1,68 @@
+"""The rig authors' layout is written so that their formulas decode it, and read back as it was."""
+
+import numpy as np
+import pytest
+
+from recon import authors, rigid
+from recon.calibration import Calibration
+from recon.camera import Camera
+from recon.capture import SurfaceCapture
+from recon.errors import InputError
+
+
+@pytest.fixture
+def surface() -> SurfaceCapture:
+    """The projector's own columns as the camera's, so that truth is the pixel's number."""
+    matrix = np.array([[1500.0, 0, 600], [0, 1500, 10], [0, 0, 1]])
+    pose = rigid.from_rotation_vector([0, -0.2, 0.01], [150, 3, 20])
+    optics = Calibration(
+        {"cam1": Camera((1280, 24), matrix, np.zeros(5)), "projector": Camera((1280, 800), matrix, np.full(5, 0.01), pose)}
+    )
+    images = np.round(20 + 200 * authors.patterns().images()[:, :24]).astype(np.uint8)
+    return SurfaceCapture(images, authors.patterns(), 8, optics, "rig")
+
+
+def test_it_comes_back(surface, tmp_path):
+    mask = np.random.default_rng(0).random((24, 1280)) > 0.5
+    authors.write(tmp_path / "rig", surface, mask)
+    found, found_mask = authors.read(tmp_path / "rig")
+    assert np.array_equal(found.images, surface.images) and np.array_equal(found_mask, mask)
+    assert found.patterns == surface.patterns and found.name == "rig"
+    for name, camera in surface.calibration.cameras.items():
+        assert found.calibration.cameras[name].size == camera.size
+        assert np.allclose(found.calibration.cameras[name].camera_from_world, camera.camera_from_world, atol=1e-12)
+        assert np.array_equal(found.calibration.cameras[name].distortion, camera.distortion)
+
+
+def test_their_formula_finds_the_column(surface):
+    """phase = -atan2(sum I sin, sum I cos) for shifts 2 pi k / 8, k = 1 to 8; x = 12 phase / 2 pi + 639.5."""
+    fringes, shifts = surface.images[1:9].astype(float), 2 * np.pi * np.arange(1, 9) / 8
+    phase = -np.arctan2(np.tensordot(np.sin(shifts), fringes, 1), np.tensordot(np.cos(shifts), fringes, 1))
+    difference = 12 / (2 * np.pi) * phase + (1280 - 1) / 2 - np.arange(1280)
+    assert np.abs(difference - 12 * np.round(difference / 12)).max() < 0.01, "rounding to whole digital numbers"
+
+
+def test_images_between_are_left_out_and_order_is_natural(surface, tmp_path):
+    """Their folders hold further images between the fringes and the fully lit one, without a mask."""
+    authors.write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
+    images = tmp_path / "rig" / "SLdata" / "images"
+    (images / "9.png").rename(images / "12.png")
+    for extra in (9, 10, 11):
+        (images / f"{extra}.png").write_bytes((images / "0.png").read_bytes())
+    (tmp_path / "rig" / "SLdata" / "mask.png").unlink()
+    found, mask = authors.read(tmp_path / "rig")
+    assert np.array_equal(found.images, surface.images) and mask.all()
+
+
+def test_missing_images_are_named(surface, tmp_path):
+    authors.write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
+    (tmp_path / "rig" / "SLdata" / "images" / "3.png").unlink()
+    with pytest.raises(InputError, match="images: expected at least 10 PNG images, found 9"):
+        authors.read(tmp_path / "rig")
+
+
+def test_other_patterns_are_not_theirs(surface, tmp_path):
+    other = SurfaceCapture(surface.images, surface.patterns, 10, surface.calibration, "rig")
+    with pytest.raises(ValueError, match="8-bit capture of the authors' patterns"):
+        authors.write(tmp_path / "rig", other, np.ones((24, 1280), bool))
+    assert not (tmp_path / "rig").exists()

@@ -1,0 +1,149 @@
+"""Calibration files of every dialect come back as they were, and bad ones are refused in one line."""
+
+import cv2
+import numpy as np
+import pytest
+
+from recon import authors, calibration, rigid
+from recon.calibration import Calibration
+from recon.camera import Camera
+from recon.errors import InputError
+
+SIZES = {"cam1": (1280, 1024), "cam2": (1280, 1024), "projector": (1280, 800)}
+
+
+def device(name: str, seed: int, coefficients: int = 5) -> Camera:
+    rng = np.random.default_rng(seed)
+    matrix = np.array([[3320.0 + rng.normal(), 0, 618.0], [0, 3331 + rng.normal(), 523], [0, 0, 1]])
+    pose = np.eye(4) if name == "cam1" else rigid.from_rotation_vector(rng.normal(0, 0.2, 3), rng.normal(0, 100, 3))
+    return Camera(SIZES[name], matrix, rng.normal(0, 0.05, coefficients), pose)
+
+
+@pytest.fixture
+def optics() -> Calibration:
+    return Calibration({"cam1": device("cam1", 1), "cam2": device("cam2", 2, 14), "projector": device("projector", 3, 8)})
+
+
+def same(a: Camera, b: Camera) -> bool:
+    parts = ((a.matrix, b.matrix), (a.distortion, b.distortion), (a.camera_from_world, b.camera_from_world))
+    return a.size == b.size and all(np.allclose(x, y, rtol=0, atol=1e-12) for x, y in parts)
+
+
+def write_storage(path, values):
+    storage = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)
+    for key, value in values.items():
+        storage.write(key, value)
+    storage.release()
+
+
+def slmaster(optics: Calibration) -> dict:
+    camera, projector = optics.cameras["cam1"], optics.cameras["projector"]
+    rotation, translation = projector.camera_from_world[:3, :3].copy(), projector.camera_from_world[:3, 3:].copy()
+    matrices = {"M1": camera.matrix, "D1": camera.distortion.reshape(1, -1), "S": np.array([[1280.0], [1024.0]])}
+    return matrices | {"M4": projector.matrix, "D4": projector.distortion.reshape(1, -1), "Rlp": rotation, "Tlp": translation}
+
+
+def test_own_format_comes_back(optics, tmp_path):
+    calibration.write(tmp_path / "optics.yaml", optics)
+    found = calibration.read(tmp_path / "optics.yaml").cameras
+    assert list(found) == list(optics.cameras)
+    assert all(same(found[name], camera) for name, camera in optics.cameras.items())
+    first = (tmp_path / "optics.yaml").read_bytes()
+    calibration.write(tmp_path / "optics.yaml", optics)
+    assert (tmp_path / "optics.yaml").read_bytes() == first and len(list(tmp_path.iterdir())) == 1
+
+
+def test_own_format_is_opencvs(optics, tmp_path):
+    """Any OpenCV program finds the values by name."""
+    calibration.write(tmp_path / "optics.yaml", optics)
+    storage = cv2.FileStorage(str(tmp_path / "optics.yaml"), cv2.FileStorage_READ)
+    node = storage.getNode("projector")
+    assert np.array_equal(node.getNode("matrix").mat(), optics.cameras["projector"].matrix)
+    assert [node.getNode("size").at(i).real() for i in range(2)] == [1280, 800]
+
+
+def test_a_camera_without_distortion_comes_back_as_such_in_effect(tmp_path):
+    plain = Camera((64, 48), np.diag([50.0, 50, 1]), np.zeros(0))
+    calibration.write(tmp_path / "optics.yaml", Calibration({"cam1": plain}))
+    assert not calibration.read(tmp_path / "optics.yaml").cameras["cam1"].distortion.any()
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+def test_slmaster_dialect(optics, tmp_path, suffix):
+    write_storage(tmp_path / f"calibration.{suffix}", slmaster(optics))
+    found = calibration.read(tmp_path / f"calibration.{suffix}", SIZES).cameras
+    assert same(found["cam1"], optics.cameras["cam1"]) and same(found["projector"], optics.cameras["projector"])
+
+
+@pytest.mark.parametrize(
+    ("name", "second"), [("cam1_proj_params.npz", "projector"), ("cam1_cam2_params.npz", "cam2"), ("StereoParams.xml", "cam2")]
+)
+def test_authors_dialects(optics, tmp_path, name, second):
+    values = authors.parameters(optics, second)
+    if name.endswith("npz"):
+        np.savez(tmp_path / name, **values)
+    else:
+        write_storage(tmp_path / name, {key: np.ascontiguousarray(value) for key, value in values.items()})
+    found = calibration.read(tmp_path / name, SIZES).cameras
+    assert list(found) == ["cam1", second]
+    assert same(found["cam1"], optics.cameras["cam1"]) and same(found[second], optics.cameras[second])
+
+
+def test_the_fundamental_matrix_holds_the_epipolar_constraint(optics):
+    """Distortion-free pixels of the same point: x2' F x1 = 0, in units of the distance to the epipolar line, px."""
+    points = np.random.default_rng(0).uniform((-100, -80, 600), (100, 80, 700), (50, 3))
+    first, second = (optics.cameras[name] for name in ("cam1", "projector"))
+    pixels = []
+    for camera in (first, second):
+        local = rigid.apply(camera.camera_from_world, points)
+        pixels.append(local / local[:, 2:] @ camera.matrix.T)
+    lines = pixels[0] @ authors.parameters(optics)["F"].T
+    assert np.abs((pixels[1] * lines).sum(axis=1) / np.linalg.norm(lines[:, :2], axis=1)).max() < 1e-6
+
+
+def without(values, key):
+    return {name: value for name, value in values.items() if name != key}
+
+
+@pytest.mark.parametrize(
+    ("fault", "complaint"),
+    [
+        (lambda v: without(v, "Tlp"), "Tlp: expected a matrix, found none"),
+        (lambda v: v | {"M1": np.full((3, 3), np.nan)}, "cam1.matrix: expected a finite 3x3 matrix"),
+        (lambda v: v | {"D4": np.zeros((1, 7))}, "projector.distortion: expected 0, 4, 5, 8, 12 or 14"),
+        (lambda v: v | {"Rlp": 2 * np.eye(3)}, "projector.camera_from_world: expected a rotation matrix"),
+        (lambda v: v | {"Rlp": np.eye(2)}, "Rlp, Tlp: expected a 3x3 rotation"),
+        (lambda v: v | {"S": np.array([[0.0], [10.0]])}, "S: expected the camera's width and height"),
+        (lambda v: v | {"M4": "text"}, "M4: expected a matrix, found something else"),
+        (lambda v: {"A": np.eye(3)}, "expected schema, or M1 and M4, or K1 and K2, found A"),
+    ],
+)
+def test_wrong_values_are_refused_in_one_line(optics, tmp_path, fault, complaint):
+    path = tmp_path / "calibration.yml"
+    write_storage(path, fault(slmaster(optics)))
+    with pytest.raises(InputError) as refusal:
+        calibration.read(path, SIZES)
+    assert str(refusal.value).startswith(f"{path}: {complaint}") and "\n" not in str(refusal.value)
+
+
+def test_damaged_files_are_refused_in_one_line(optics, tmp_path):
+    """Cut at every tenth of its length, or not a calibration at all."""
+    calibration.write(tmp_path / "optics.yaml", optics)
+    whole = (tmp_path / "optics.yaml").read_bytes()
+    np.savez(tmp_path / "a.npz", **authors.parameters(optics))
+    archive = (tmp_path / "a.npz").read_bytes()
+    cut = [data[: len(data) * i // 10] for data in (whole, archive) for i in range(1, 10)]
+    newer = whole.replace(b"sonotwin-optics/1", b"sonotwin-optics/2")
+    path = tmp_path / "damaged.yaml"
+    for data in [b"", b"hello", b"\xff\xfe\x00", b"%YAML:1.0\n---\n- 3\n", b"PK\x03\x04", newer, *cut]:
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=r"^[^\n]*damaged\.yaml: [^\n]*expected [^\n]*found [^\n]*$"):
+            calibration.read(path)
+
+
+def test_a_missing_file_or_size_is_named(optics, tmp_path):
+    with pytest.raises(InputError, match=r"none\.yaml: expected a calibration file, found no such file"):
+        calibration.read(tmp_path / "none.yaml")
+    write_storage(tmp_path / "c.yml", slmaster(optics))
+    with pytest.raises(InputError, match="expected a file that stores the image size of projector"):
+        calibration.read(tmp_path / "c.yml")
