@@ -1,0 +1,103 @@
+"""What a scene is made of: meshes with materials, and the ground-truth primitives to fit against.
+
+World is the frame of camera 1, lengths in mm: z points away from the camera into the scene, x right and y down in the image.
+"""
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """The plane through a point, with its unit normal towards the camera."""
+
+    name: str
+    point: Array  # (3,), mm
+    normal: Array  # (3,), unit
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """A sphere."""
+
+    name: str
+    centre: Array  # (3,), mm
+    radius: float  # mm
+
+
+@dataclass(frozen=True, eq=False)
+class Cylinder:
+    """An infinite circular cylinder: a point of its axis, the unit direction of the axis, the radius."""
+
+    name: str
+    point: Array  # (3,), mm
+    axis: Array  # (3,), unit
+    radius: float  # mm
+
+
+Shape: TypeAlias = Plane | Sphere | Cylinder
+
+
+@dataclass(frozen=True)
+class Material:
+    """How a surface reflects light of the projector's wavelength (525 nm): a diffuse body, perhaps under a glossy coat.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range.
+    """
+
+    reflectance: float  # diffuse albedo, 0 to 1
+    roughness: float | None = None  # GGX alpha of a dielectric coat (rough plastic); None is purely diffuse
+    ior: float = 1.5  # refractive index of the coat
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.reflectance <= 1:
+            raise ValueError(f"reflectance: expected 0 to 1, found {self.reflectance}")
+        if self.roughness is not None and not 0 < self.roughness <= 1:
+            raise ValueError(f"roughness: expected more than 0, up to 1, found {self.roughness}")
+        if not self.ior >= 1:
+            raise ValueError(f"ior: expected at least 1, found {self.ior}")
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """A closed body in the world.
+
+    Raises
+    ------
+    ValueError
+        If `albedo` doesn't have one value from 0 to 1 for each vertex.
+    """
+
+    name: str
+    mesh: trimesh.Trimesh  # in the world, mm, watertight, normals outwards
+    material: Material
+    albedo: NDArray[np.float32] | None = None  # (n_vertices,), replaces material.reflectance where given
+    smooth: bool = True  # interpolated vertex normals (curved), or flat faces
+    inside: bool = False  # hidden within another thing: optics leave it out, ultrasound sees it
+    primitive: Sphere | None = None  # the exact shape that the mesh approximates, for a renderer that has one
+
+    def __post_init__(self) -> None:
+        if self.albedo is None:
+            return
+        if self.albedo.shape != (len(self.mesh.vertices),):
+            raise ValueError(f"{self.name}: albedo: expected {len(self.mesh.vertices)} values, found shape {self.albedo.shape}")
+        if not ((self.albedo >= 0) & (self.albedo <= 1)).all():
+            raise ValueError(f"{self.name}: albedo: expected values from 0 to 1")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Things in front of the rig, and the shapes that measurements of them are fitted with."""
+
+    name: str
+    things: tuple[Thing, ...]
+    shapes: tuple[Shape, ...] = ()
