@@ -1,0 +1,86 @@
+"""The sensor against EMVA 1288: photon transfer, dark noise, fixed pattern, clipping; and its determinism."""
+
+import numpy as np
+import pytest
+
+from twin.sensor import Exposure, auto_exposure, digitise, electrons_per_radiance, expose, fixed_pattern, noise_dn
+
+WAVELENGTH = 525.0
+
+
+def shots(device, radiance: float, count: int = 40, bits: int = 10, seed: int = 1) -> np.ndarray:
+    images = np.full((count, 64, 64), radiance, np.float32)
+    return expose(images, device, "cam1", WAVELENGTH, Exposure(0.01, 1.0, bits), np.random.SeedSequence(seed)).astype(float)
+
+
+def radiance_for(device, electrons: float) -> float:
+    return electrons / electrons_per_radiance(device, WAVELENGTH) / 0.01
+
+
+def test_electrons_by_hand(rig):
+    """Photons on a pixel by the formula of a thin lens, photon by photon."""
+    device = rig.cam1
+    image_distance = 3320 * 4.8e-3
+    irradiance = np.pi / 4 * (16 / device.lens.f_number / image_distance) ** 2  # W/mm^2 for 1 W/mm^2/sr
+    photons = irradiance * 4.8e-3**2 / (6.62607015e-34 * 299792458 / 525e-9)
+    assert electrons_per_radiance(device, WAVELENGTH) == pytest.approx(photons * device.sensor.quantum_efficiency, rel=1e-6)
+
+
+@pytest.mark.parametrize("electrons", [0, 500, 3000, 6000])
+def test_temporal_noise_is_predicted(rig, electrons):
+    """The variance over 40 images of one scene is the model's, from the dark to near saturation (5 standard errors)."""
+    images = shots(rig.cam1, radiance_for(rig.cam1, electrons))
+    dark = fixed_pattern(rig.cam1.sensor, (64, 64), "cam1")[1].mean() + rig.cam1.sensor.dark_current_e_per_s * 0.01
+    predicted = noise_dn(np.float32(electrons + dark), rig.cam1.sensor, Exposure(0.01, 1.0, 10)) ** 2
+    variance = images.var(axis=0, ddof=1).mean()
+    assert variance == pytest.approx(
+        predicted, rel=5 * np.sqrt(2 / (39 * 64 * 64)) + 0.005
+    )  # 0.5 %: rounding is not quite uniform
+
+
+def test_spatial_noise(rig):
+    """Averaged over time, pixels differ by DSNU in the dark and by PRNU in the light."""
+    sensor = rig.cam1.sensor
+    scale = (1024 - 4 * sensor.black_level_dn) / sensor.saturation_e
+    dark = shots(rig.cam1, 0.0).mean(axis=0)
+    light = shots(rig.cam1, radiance_for(rig.cam1, 4000)).mean(axis=0)
+    assert dark.std() == pytest.approx(sensor.dsnu_e * scale, rel=0.15)
+    assert (light - dark).std() == pytest.approx(np.hypot(4000 * sensor.prnu, np.sqrt(4000 / 40)) * scale, rel=0.1)
+
+
+def test_response_is_linear(rig):
+    """Twice the light gives twice the signal above the dark."""
+    dark, one, two = (shots(rig.cam1, radiance_for(rig.cam1, e)).mean() for e in (0, 1500, 3000))
+    assert (two - dark) / (one - dark) == pytest.approx(2, rel=0.005)
+
+
+def test_clipping(rig):
+    """Too much light fills the range and no more; less than nothing is zero."""
+    assert shots(rig.cam1, radiance_for(rig.cam1, 1e5), count=1, bits=8).min() == 255
+    assert digitise(np.full((2, 2), -1e4, np.float32), rig.cam1.sensor, Exposure(0.01)).max() == 0
+
+
+@pytest.mark.parametrize(("bits", "dtype"), [(8, np.uint8), (10, np.uint16)])
+def test_bits(rig, bits, dtype):
+    """The image has the bits that are asked for: the ADC's most significant ones."""
+    images = np.full((1, 8, 8), radiance_for(rig.cam1, 5000), np.float32)
+    numbers = expose(images, rig.cam1, "cam1", WAVELENGTH, Exposure(0.01, 1.0, bits), np.random.SeedSequence(1))
+    assert numbers.dtype == dtype
+    assert 0.55 < numbers.mean() / 2**bits < 0.75
+
+
+def test_auto_exposure(rig, rng):
+    """The brightest image's bright end comes to the level that is asked for."""
+    radiance = np.float32(rng.uniform(0, 3e-7, (3, 128, 128)))
+    time_s = auto_exposure(radiance, rig.cam1, WAVELENGTH, level=0.8, percentile=99)
+    images = expose(radiance, rig.cam1, "cam1", WAVELENGTH, Exposure(time_s), np.random.SeedSequence(1))
+    assert np.percentile(images, 99) / 255 == pytest.approx(0.8, abs=0.03)
+
+
+def test_seed_decides_and_cameras_differ(rig):
+    """The same seed gives the same bytes; another seed other noise; another camera another fixed pattern."""
+    first, again, other = (shots(rig.cam1, 1e-7, 2, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).mean() > 0.5
+    assert (first[0] != first[1]).mean() > 0.5
+    assert np.corrcoef(*(fixed_pattern(rig.cam1.sensor, (64, 64), name)[0].ravel() for name in ("cam1", "cam2")))[0, 1] < 0.1

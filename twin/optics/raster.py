@@ -1,0 +1,99 @@
+"""The projector's raster: what its micromirrors send out, and the table from which the ray tracer reads it.
+
+All patterns of a sequence vary along one axis, so their light is kept as profiles along that axis, finely sampled and blurred
+by the lens's point spread. Defocus is not in here: it comes from tracing through the lens.
+"""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from recon.patterns import Axis, Patterns
+from recon.rig import ProjectorDevice
+
+OVERSAMPLING = 16  # table entries a projector px; read with linear interpolation
+MARGIN = 8  # projector px of the table beyond either end of the raster
+PACKET = 4  # pattern values fetched by one gather
+AXES: tuple[Axis, Axis] = ("columns", "rows")
+
+Profiles = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Light:
+    """What a projector sends out for a sequence of patterns, 1 for a pixel that is fully on."""
+
+    size: tuple[int, int]  # width, height, px
+    axes: tuple[Axis, ...]  # (n,) along which each pattern varies
+    profiles: tuple[Profiles, ...]  # (n,) of (length of the axis,)
+    blur_px: float  # standard deviation of the lens's point spread in focus
+
+    @classmethod
+    def of(cls, patterns: Patterns, device: ProjectorDevice) -> "Light":
+        """Patterns as a rig's projector shows them: grey values pass its gamma, binary ones don't; black is 1/contrast."""
+        black = 1 / device.contrast
+        emitted = []
+        for _, binary, values in patterns.profiles():
+            on = values if binary else (np.round(values * 255) / 255) ** device.gamma
+            emitted.append(np.float32(black + (1 - black) * on))
+        return cls(
+            patterns.projector_size, tuple(axis for axis, _, _ in patterns.profiles()), tuple(emitted), device.lens.blur_px
+        )
+
+    def fine_profiles(self, axis: Axis) -> Profiles:
+        """Profiles of the patterns of one axis behind the lens : (patterns of that axis, (length + 2 MARGIN) * OVERSAMPLING).
+
+        Entry i lies at projector coordinate `(i + 1/2) / OVERSAMPLING - 1/2 - MARGIN`.
+        """
+        rows = [profile for kind, profile in zip(self.axes, self.profiles, strict=True) if kind == axis]
+        mirrors = np.repeat(np.pad(np.array(rows), ((0, 0), (MARGIN, MARGIN))), OVERSAMPLING, axis=1)
+        return gaussian_filter1d(mirrors, self.blur_px * OVERSAMPLING, axis=1, mode="constant") if self.blur_px else mirrors
+
+
+@dataclass(frozen=True)
+class LightTable:
+    """Light of N patterns at any projector coordinate, one coordinate's values side by side in memory."""
+
+    size: tuple[int, int]  # width, height, px
+    order: tuple[int, ...]  # (n,) place of each pattern among the values looked up: columns first, then rows
+    tables: dict[Axis, tuple[mi.Float, int]]  # values, padded to whole packets a coordinate, and number of patterns
+
+    @classmethod
+    def of(cls, light: Light) -> "LightTable":
+        """Lay out the light of a sequence."""
+        tables = {}
+        for axis in AXES:
+            if axis in light.axes:
+                fine = light.fine_profiles(axis)
+                padded = np.pad(fine, ((0, -len(fine) % PACKET), (0, 0)))
+                tables[axis] = mi.Float(np.ascontiguousarray(padded.T).ravel()), len(fine)
+        places = sorted(range(len(light.axes)), key=lambda k: AXES.index(light.axes[k]))  # stable: keeps the order within an axis
+        return cls(light.size, tuple(int(k) for k in np.argsort(places)), tables)
+
+    @property
+    def count(self) -> int:
+        """Number of patterns."""
+        return len(self.order)
+
+    def lookup(self, pixel: mi.Point2f, active: mi.Bool) -> list[mi.Float]:
+        """Light of each pattern at projector coordinates in px; none outside the raster."""
+        width, height = self.size
+        active &= (pixel.x > -0.5) & (pixel.x < width - 0.5) & (pixel.y > -0.5) & (pixel.y < height - 0.5)
+        values: list[mi.Float] = []
+        for axis, (table, count) in self.tables.items():
+            packets = -(-count // PACKET)
+            position = ((pixel.x if axis == "columns" else pixel.y) + 0.5 + MARGIN) * OVERSAMPLING - 0.5
+            below = dr.floor(position)
+            fraction = position - below
+            first = mi.UInt32(below) * packets
+            axis_values: list[mi.Float] = []
+            for packet in range(packets):
+                low = dr.gather(mi.Vector4f, table, first + packet, active)
+                high = dr.gather(mi.Vector4f, table, first + packets + packet, active)
+                axis_values.extend(dr.lerp(low, high, fraction))
+            values += axis_values[:count]
+        return [values[k] for k in self.order]

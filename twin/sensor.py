@@ -1,0 +1,114 @@
+"""An image sensor by the EMVA 1288 model: photons, electrons, digital numbers.
+
+Photons arrive as a Poisson process and free electrons with the quantum efficiency; dark current adds more; each pixel has its
+own response (PRNU) and dark signal (DSNU); reading adds dark noise; gain, black level, clipping and the ADC make a number.
+"""
+
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import c as LIGHT_SPEED
+from scipy.constants import h as PLANCK
+
+from recon.rig import CameraDevice, Sensor
+
+Images = NDArray[np.float32]
+Numbers = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How an image is taken."""
+
+    time_s: float
+    gain: float = 1.0  # 1 fills the ADC's range with `saturation_e` electrons
+    bits: Literal[8, 10, 12] = 8  # of the image; at most the ADC's
+
+
+def electrons_per_radiance(device: CameraDevice, wavelength_nm: float) -> float:
+    """Electrons a second that a radiance of 1 W/mm^2/sr on the axis frees in one pixel.
+
+    The exit pupil of diameter D at the image distance v = focal_px * pixel gives the irradiance `pi/4 (D/v)^2 L`.
+    """
+    pixel_mm = device.sensor.pixel_um * 1e-3
+    image_distance = device.optics.focal_px[0] * pixel_mm
+    power = np.pi / 4 * (device.lens.aperture_mm / image_distance) ** 2 * pixel_mm**2
+    return float(power * wavelength_nm * 1e-9 / (PLANCK * LIGHT_SPEED) * device.sensor.quantum_efficiency)
+
+
+def auto_exposure(
+    radiance: Images, device: CameraDevice, wavelength_nm: float, *, level: float = 0.9, percentile: float = 99.9
+) -> float:
+    """Exposure time in s, to the microsecond, that brings the brightest image's percentile to a level of full scale at gain 1.
+
+    radiance : (n, h, w), W/mm^2/sr. A scene without light gets 1 s.
+    """
+    brightest = max(float(np.percentile(image[::4, ::4], percentile)) for image in radiance)
+    if brightest <= 0:
+        return 1.0
+    seconds = level * device.sensor.saturation_e / (brightest * electrons_per_radiance(device, wavelength_nm))
+    return max(round(seconds, 6), 1e-6)
+
+
+def expose(
+    radiance: Images, device: CameraDevice, name: str, wavelength_nm: float, exposure: Exposure, seed: np.random.SeedSequence
+) -> Numbers:
+    """Take images.
+
+    Parameters
+    ----------
+    radiance : (n, h, w) float32, W/mm^2/sr
+        What the renderer says arrives at each pixel.
+    name : str
+        The device's name: the same camera has the same PRNU and DSNU in every image and every capture.
+    seed : SeedSequence
+        Of the temporal noise; image k has its own stream, whatever the number of threads.
+
+    Returns
+    -------
+    (n, h, w) uint8, or uint16 for more than 8 bits
+    """
+    response, dark = fixed_pattern(device.sensor, radiance.shape[1:], name)
+    scale = np.float32(electrons_per_radiance(device, wavelength_nm) * exposure.time_s)
+    dark = dark + np.float32(device.sensor.dark_current_e_per_s * exposure.time_s)
+
+    def take(image: Images, stream: np.random.SeedSequence) -> Numbers:
+        generator = np.random.default_rng(stream)
+        electrons = generator.poisson(np.maximum(image * scale * response, 0) + dark).astype(np.float32)
+        electrons += generator.standard_normal(electrons.shape, np.float32) * np.float32(device.sensor.dark_noise_e)
+        return digitise(electrons, device.sensor, exposure)
+
+    with ThreadPoolExecutor() as pool:
+        return np.stack(list(pool.map(take, radiance, seed.spawn(len(radiance)))))
+
+
+def fixed_pattern(sensor: Sensor, shape: tuple[int, ...], name: str) -> tuple[Images, Images]:
+    """Response (mean 1, PRNU) and dark signal in electrons (DSNU, an offset that keeps it positive) of each pixel : (h, w)."""
+    generator = np.random.default_rng(zlib.crc32(name.encode()))
+    response = 1 + np.float32(sensor.prnu) * generator.standard_normal(shape, np.float32)
+    dark = np.float32(sensor.dsnu_e) * np.maximum(generator.standard_normal(shape, np.float32) + 3, 0)
+    return response, dark
+
+
+def number_per_electron(sensor: Sensor, exposure: Exposure) -> float:
+    """System gain: digital numbers of the image for one electron."""
+    return exposure.gain * (2**exposure.bits - 2 ** (exposure.bits - 8) * sensor.black_level_dn) / sensor.saturation_e
+
+
+def digitise(electrons: Images, sensor: Sensor, exposure: Exposure) -> Numbers:
+    """Electrons to digital numbers: gain, black level, clipping, ADC, and the image's most significant bits."""
+    dropped = sensor.adc_bits - exposure.bits
+    counts = sensor.black_level_dn * 2 ** (sensor.adc_bits - 8) + electrons * np.float32(
+        number_per_electron(sensor, exposure) * 2**dropped
+    )
+    numbers = np.clip(np.rint(counts), 0, 2**sensor.adc_bits - 1).astype(np.uint16) >> dropped
+    return numbers.astype(np.uint8) if exposure.bits == 8 else numbers
+
+
+def noise_dn(electrons: Images, sensor: Sensor, exposure: Exposure) -> Images:
+    """Temporal noise that the model predicts for a mean number of electrons : standard deviation in digital numbers."""
+    return np.sqrt(number_per_electron(sensor, exposure) ** 2 * (electrons + sensor.dark_noise_e**2) + 1 / 12)  # 1/12: rounding

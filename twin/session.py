@@ -1,0 +1,147 @@
+"""A measuring session in the twin: from a rig, a scene and a pattern sequence to a capture folder and its ground truth."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from recon import atomic, calibration, capture
+from recon.calibration import Calibration
+from recon.patterns import Fringes, Patterns
+from recon.rig import CameraDevice, Rig
+from scenes.things import Scene
+from twin.optics.instruments import CameraOptics, ProjectorOptics
+from twin.optics.raster import Light
+from twin.optics.transport import Engine, Images, render
+from twin.optics.truth import SurfaceTruth, surface_truth
+from twin.optics.world import build_world, visible
+from twin.sensor import Exposure, Numbers, auto_exposure, electrons_per_radiance, expose, noise_dn, number_per_electron
+
+TRUTH_MARKER = "scene.json"
+CameraName = Literal["cam1", "cam2"]
+
+
+class Shooting(BaseModel):
+    """How the cameras take their images."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    exposure_s: Annotated[float, Field(gt=0)] | None = None  # if not given, set for the scene: see level
+    level: Annotated[float, Field(gt=0, le=1)] = (
+        0.9  # of full scale, that auto-exposure gives the brightest thousandth of the pixels
+    )
+    gain: Annotated[float, Field(gt=0)] = 1.0  # linear; 1 fills the range with the sensor's saturation charge
+    bits: Literal[8, 10, 12] = 8  # of the images; at most the sensor's ADC has
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera's share of a rendered surface capture."""
+
+    images: Numbers  # (n, h, w)
+    exposure: Exposure
+    truth: SurfaceTruth
+    limit_px: (
+        Images  # (h, w) standard deviation of the projector coordinate that the sensor's noise alone allows; inf in the dark
+    )
+
+
+def shoot(rig: Rig, scene: Scene, patterns: Patterns, camera: CameraName, engine: Engine, shooting: Shooting, seed: int) -> View:
+    """Render what one camera sees of a pattern sequence, and take the images with its sensor.
+
+    The same seed gives the same bytes. Rendering noise, sensor noise and the two cameras draw from separate streams.
+    """
+    device: CameraDevice = getattr(rig, camera)
+    light_seed, sensor_seed = np.random.SeedSequence([seed, ("cam1", "cam2").index(camera)]).spawn(2)
+    world = build_world(scene)
+    radiance = render(
+        world,
+        CameraOptics.of(device),
+        ProjectorOptics.of(rig.projector),
+        Light.of(patterns, rig.projector),
+        engine,
+        int(light_seed.generate_state(1)[0]),
+    )
+    wavelength = rig.projector.wavelength_nm
+    time_s = shooting.exposure_s or auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
+    exposure = Exposure(time_s, shooting.gain, shooting.bits)
+    return View(
+        expose(radiance, device, camera, wavelength, exposure, sensor_seed),
+        exposure,
+        surface_truth(world, device.optics.camera(), rig.projector.optics.camera()),
+        noise_limit_px(radiance, patterns, device, wavelength, exposure),
+    )
+
+
+def noise_limit_px(
+    radiance: Images, patterns: Patterns, device: CameraDevice, wavelength_nm: float, exposure: Exposure
+) -> Images:
+    """Standard deviation of the decoded projector coordinate that the sensor's noise alone allows : (h, w) px, inf in the dark.
+
+    The noise of each noise-free image of the finest N-step fringes, carried through the least-squares phase: a change dI_k
+    turns the phase by `-2/(N B) sin(phase + shift_k) dI_k`.
+    """
+    fringes, place = min(
+        ((part, place) for part, place in patterns.slices() if isinstance(part, Fringes)), key=lambda found: found[0].pitch
+    )
+    per_second = np.float32(electrons_per_radiance(device, wavelength_nm) * exposure.time_s)
+    electrons = [image * per_second for image in radiance[place]]
+    waves = np.exp(-1j * fringes.shifts)
+    phasor = 2 / fringes.steps * sum(wave * image for wave, image in zip(waves, electrons, strict=True))
+    dark = device.sensor.dark_current_e_per_s * exposure.time_s
+    variance = sum(
+        (2 / fringes.steps * np.sin(np.angle(phasor) + shift) * noise_dn(image + dark, device.sensor, exposure)) ** 2
+        for shift, image in zip(fringes.shifts, electrons, strict=True)
+    )
+    modulation = np.abs(phasor) * number_per_electron(device.sensor, exposure)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.float32(fringes.pitch / (2 * np.pi) * np.sqrt(variance) / modulation)
+
+
+def calibration_of(rig: Rig) -> Calibration:
+    """The rig's true calibration."""
+    devices = {"cam1": rig.cam1, "cam2": rig.cam2, "projector": rig.projector}
+    return Calibration({name: device.optics.camera() for name, device in devices.items()})
+
+
+def write_session(
+    out: Path, rig: Rig, scene: Scene, patterns: Patterns, views: Mapping[CameraName, View], settings: Mapping[str, object]
+) -> None:
+    """Write `out/truth/`, then `out/capture/`, each whole or not at all.
+
+    settings : what the session was rendered from; kept with the truth as `settings.json`.
+    """
+    optics = calibration_of(rig)
+    with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
+        (folder / "surface").mkdir()
+        (folder / "calibration").mkdir()
+        calibration.write(folder / "calibration" / "optics.yaml", optics)
+        for camera, view in views.items():
+            arrays: dict[str, NDArray] = {field.name: getattr(view.truth, field.name) for field in fields(view.truth)}
+            np.savez(folder / "surface" / f"{camera}.npz", **arrays, limit_px=view.limit_px)
+        _write_json(folder / "settings.json", settings)
+        _write_json(folder / TRUTH_MARKER, describe(scene))
+    devices = {"projector": capture.Device(size=patterns.projector_size)}
+    for camera, view in views.items():
+        size, exposure = view.images.shape[:0:-1], view.exposure
+        devices[camera] = capture.Device(size=size, bits=exposure.bits, exposure_s=exposure.time_s, gain=exposure.gain)
+    images: dict[str, Numbers] = {camera: view.images for camera, view in views.items()}
+    capture.write_surface(out / "capture", images, patterns, optics, devices, scene.name)
+
+
+def describe(scene: Scene) -> dict:
+    """What evaluation needs to know of a scene: the visible things by number, and the primitives to fit."""
+    shapes = []
+    for shape in scene.shapes:
+        values = {key: np.asarray(value).tolist() for key, value in asdict(shape).items()}
+        shapes.append({"kind": type(shape).__name__.lower(), **values})
+    return {"name": scene.name, "things": [thing.name for thing in visible(scene)], "shapes": shapes}
+
+
+def _write_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
