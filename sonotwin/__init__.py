@@ -1,0 +1,1 @@
+"""The command line of sonotwin: `sonotwin VERB [field=value ...]`."""

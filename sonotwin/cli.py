@@ -1,0 +1,138 @@
+"""The command `sonotwin VERB [field=value ...]`: the table of verbs, their help, and what a mistake looks like.
+
+Verbs are imported when they are called, so that `sonotwin --help` is instant and a verb needs only the packages that it uses.
+Exit status: 0 done, 2 a mistake of the user or of the installation (one line on stderr), 130 interrupted.
+"""
+
+import ast
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+from recon.errors import InputError
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A verb of the command line."""
+
+    name: str
+    summary: str  # one line, for `sonotwin --help`
+
+    @property
+    def module(self) -> str:
+        """The module with the verb's docstring, `Config` and `run`."""
+        return f"sonotwin.verbs.{self.name}"
+
+
+VERBS = (  # in the order in which a person meets them
+    Verb("doctor", "check this installation and say what to do about each problem"),
+    Verb("demo", "render a phantom, reconstruct its surface, compare with the truth"),
+    Verb("render", "render a capture of a scene with its ground truth"),
+    Verb("surface", "reconstruct the surface from a capture, rendered or real"),
+    Verb("evaluate", "compare a surface with a rendered capture's ground truth"),
+    Verb("accuracy", "measure errors of the twin's rig and compare with the paper's figures"),
+)
+
+USAGE = """\
+usage: sonotwin VERB [field=value ...]
+       sonotwin VERB --help
+
+{verbs}
+
+Fields and their defaults are in conf/VERB.yaml, shown by `sonotwin VERB --help`; nested ones are written with dots, and
+group=choice takes another file of a group: `rig=meza2021 rig.projector.gamma=1.0`. In a shell, put a path with blanks in
+quotes: `sonotwin surface "out=outputs/my run"`.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    try:
+        return _run(sys.argv[1:] if arguments is None else list(arguments))
+    except InputError as error:
+        return _complain(str(error))
+    except ModuleNotFoundError as error:
+        hint = _how_to_install(error.name or "")
+        if hint is None:
+            raise
+        return _complain(hint)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        return _complain(f"{error.filename}: {error.strerror}")
+    except KeyboardInterrupt:
+        return _complain("interrupted", status=130)
+
+
+def _run(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        width = max(len(verb.name) for verb in VERBS)
+        print(USAGE.format(verbs="\n".join(f"  {verb.name:{width}}  {verb.summary}" for verb in VERBS)), end="")
+        return 0
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"sonotwin {version('sonotwin')}")
+        return 0
+    verb = _find(arguments[0])
+    overrides = arguments[1:]
+    if "-h" in overrides or "--help" in overrides:
+        print(_help(verb))
+        return 0
+    for override in overrides:
+        if override.startswith("-"):
+            raise InputError(f"{verb.name}: {override}: unknown option; fields are given as field=value")
+    module = import_module(verb.module)
+    from sonotwin import config
+
+    module.run(config.load(verb.name, overrides, module.Config))
+    return 0
+
+
+def _find(name: str) -> Verb:
+    for verb in VERBS:
+        if verb.name == name:
+            return verb
+    names = [verb.name for verb in VERBS]
+    close = get_close_matches(name, names, n=1)
+    advice = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(names)}"
+    raise InputError(f"{name}: unknown verb; {advice}")
+
+
+def _help(verb: Verb) -> str:
+    """Give the verb's docstring, its YAML and the choices of its groups, read without importing the verb."""
+    spec = find_spec(verb.module)
+    if spec is None or spec.origin is None:
+        raise InputError(f"{verb.name}: this installation lacks {verb.module}")
+    text = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or verb.summary
+    parts = [f"usage: sonotwin {verb.name} [field=value ...]", text]
+    from sonotwin import config
+
+    path = config.folder() / f"{verb.name}.yaml"
+    if path.is_file():
+        parts.append(f"{path}:\n\n" + "".join(f"  {line}\n" for line in path.read_text(encoding="utf-8").splitlines()).rstrip())
+    choices = config.groups(verb.name)
+    if choices:
+        parts.append("choices:\n\n" + "\n".join(f"  {group}={'|'.join(names)}" for group, names in choices.items()))
+    return "\n\n".join(parts)
+
+
+def _complain(message: str, status: int = 2) -> int:
+    print(f"sonotwin: {' '.join(message.splitlines())}", file=sys.stderr)
+    return status
+
+
+def _how_to_install(module: str) -> str | None:
+    """Say how to get a missing package, or None if it is none of sonotwin's requirements."""
+    from sonotwin.doctor import extra_of
+
+    extra = extra_of(module)
+    if extra is None:
+        return None
+    wanted = "sonotwin" if extra == "core" else f"sonotwin[{extra}]"
+    return f"the Python package {module.partition('.')[0]} is missing; pip install '{wanted}'"

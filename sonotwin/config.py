@@ -1,0 +1,167 @@
+"""From YAML files and overrides on the command line to a verb's validated `Config`.
+
+The files are those of `conf/`: `conf/VERB.yaml` has a verb's fields, and each folder beside it is a group of choices. Hydra
+composes them; pydantic validates what comes out; the mistakes that either finds become one line each.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from recon.errors import InputError, one_line
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def folder() -> Path:
+    """Find the folder of YAML files: inside the package in a wheel, beside it in a clone."""
+    package = Path(__file__).resolve().parent
+    inside = package / "conf"
+    return inside if inside.is_dir() else package.parent / "conf"
+
+
+def groups(verb: str) -> dict[str, list[str]]:
+    """Name the choices of each group that the verb's defaults list uses, such as `{"rig": ["meza2021"]}`."""
+    import yaml
+
+    path = folder() / f"{verb}.yaml"
+    if not path.is_file():
+        return {}
+    defaults = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("defaults", [])
+    entries = [key for entry in defaults if isinstance(entry, dict) for key in entry]
+    names = [re.sub(r"^(override |optional )*/?|@.*$", "", entry) for entry in entries]
+    return {name: sorted(choice.stem for choice in (folder() / name).glob("*.yaml")) for name in names}
+
+
+def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
+    """Compose a verb's configuration and validate it.
+
+    Parameters
+    ----------
+    verb : str
+        Names `conf/VERB.yaml`; a verb without that file starts from no fields.
+    overrides : sequence of str
+        Hydra's `field=value`, `group=choice`, `+new=value`, `~field`. A value that isn't in Hydra's grammar, such as a path
+        with a comma, a bracket or an accent, is taken as it stands; quotes force text: `out='"12"'`.
+    model : type
+        The verb's pydantic model.
+
+    Raises
+    ------
+    InputError
+        One line that names the verb, the field, what was expected and what was found.
+    """
+    composed = compose(verb, overrides)
+    try:
+        return model.model_validate(composed)
+    except ValidationError as error:
+        raise InputError(f"{verb}: {describe(error, model)}") from error
+
+
+def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Compose `conf/VERB.yaml` with the overrides into a plain, resolved dictionary; raises InputError as `load` does."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.errors import ConfigCompositionException, MissingConfigException
+    from omegaconf import MissingMandatoryValue, OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    name = verb if (folder() / f"{verb}.yaml").is_file() else None
+    plain = [override for override in overrides if override.partition("=")[0] in _fields_named_like_groups(verb)]
+    quoted = [_literal_if_not_grammar(verb, override) for override in overrides if override not in plain]
+    with initialize_config_dir(str(folder()), version_base=None):
+        try:
+            composed = hydra_compose(name, quoted)
+            for override in plain:
+                field, _, value = override.partition("=")
+                OmegaConf.update(composed, field, None if value == "null" else value.strip("'\""))
+            result = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
+        except MissingConfigException as error:
+            group, _, choice = str(error.missing_cfg_file).rpartition("/")
+            raise InputError(f"{verb}: {group}: {_expected_one_of(choice, error.options or [])}") from error
+        except ConfigCompositionException as error:
+            unknown = re.search(r"Could not override '([^']+)'", str(error))
+            if unknown is None:
+                raise InputError(f"{verb}: {_first_line(error)}") from error
+            known = list(_keys(OmegaConf.to_container(hydra_compose(name)))) if name else []
+            raise InputError(f"{verb}: {unknown[1]}: {_unknown_key(unknown[1], known)}") from error
+        except MissingMandatoryValue as error:
+            raise InputError(f"{verb}: {error.full_key}: needs a value; give {error.full_key}=...") from error
+        except OmegaConfBaseException as error:
+            raise InputError(f"{verb}: {error.full_key}: {_first_line(error)}") from error
+    assert isinstance(result, dict)
+    return {str(key): value for key, value in result.items()}
+
+
+def _fields_named_like_groups(verb: str) -> set[str]:
+    """Fields of a verb that share a group's name without being choices of it: Hydra would take `patterns=FILE` for a choice."""
+    import yaml
+
+    path = folder() / f"{verb}.yaml"
+    fields = yaml.safe_load(path.read_text(encoding="utf-8")) or {} if path.is_file() else {}
+    return {field for field in fields if (folder() / field).is_dir()} - set(groups(verb))
+
+
+def describe(error: ValidationError, model: type[BaseModel]) -> str:
+    """Say the first of pydantic's complaints in one line: the field, what was expected, what was found, and how to mend it."""
+    first, *others = error.errors(include_url=False)
+    field = ".".join(str(part) for part in first["loc"])
+    match first["type"]:
+        case "extra_forbidden":
+            text = f"{field}: {_unknown_key(field, list(model.model_fields))}"
+        case "missing":
+            text = f"{field}: needs a value; give {field}=..."
+        case _:
+            text = one_line(error)
+    return text + (f" (and {len(others)} more)" if others else "")
+
+
+def _literal_if_not_grammar(verb: str, override: str) -> str:
+    """Quote an override's value where Hydra can't read it, or would take it for a sweep over several values."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    key, equals, value = override.partition("=")
+    if not key.startswith("~") and not (key and equals):
+        raise InputError(f"{verb}: {override}: expected field=value")
+    try:
+        if not OverridesParser.create().parse_override(override).is_sweep_override():
+            return override
+    except HydraException as error:
+        if value[:1] in ("[", "{", "'", '"') or not re.fullmatch(r"[+~]*[\w./@:-]+", key):
+            raise InputError(f"{verb}: {override}: can't be read as field=value: {_first_line(error)}") from error
+    return f"{key}='{_escape(value)}'"
+
+
+def _escape(text: str) -> str:
+    """Escape text for single quotes: in Hydra's grammar backslashes count only in front of a quote."""
+    return re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), text)
+
+
+def _expected_one_of(found: str, choices: Sequence[str]) -> str:
+    return f"expected one of {', '.join(choices) or 'nothing'}, found {found}" + _did_you_mean(found, choices)
+
+
+def _unknown_key(key: str, known: Sequence[str]) -> str:
+    return "unknown key" + _did_you_mean(key, known)
+
+
+def _did_you_mean(word: str, known: Sequence[str]) -> str:
+    close = get_close_matches(word, known, n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _keys(tree: Any, prefix: str = "") -> Iterator[str]:
+    """Dotted names of all fields of a nested dictionary."""
+    if isinstance(tree, Mapping):
+        for key, value in tree.items():
+            yield f"{prefix}{key}"
+            yield from _keys(value, f"{prefix}{key}.")
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0]

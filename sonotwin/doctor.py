@@ -1,0 +1,173 @@
+"""Looks at the installation: Python, machine, packages, LLVM, GPU, caches. Imports nothing that could end the process."""
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from twin import llvm
+
+OLDEST_PYTHON = (3, 11)
+EXTRAS = ("twin", "train", "dev")
+MODULES = {  # where a package isn't imported by the name that it is installed by
+    "hydra-core": "hydra",
+    "opencv-contrib-python-headless": "cv2",
+    "pytest-xdist": "xdist",
+    "scikit-image": "skimage",
+}
+BROUGHT_BY = {"drjit": "mitsuba", "omegaconf": "hydra"}  # imported by us, required by what we require
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    part: str  # core, twin, train, dev: who needs it; or machine
+    what: str
+    state: Literal["ok", "absent", "unused", "problem"]  # absent: not there, and the core does without
+    found: str
+    remedy: str = ""
+
+
+def examine() -> list[Finding]:
+    """Look at everything; takes some seconds, most of them for importing the packages in another process."""
+    return [*_system(), *_packages(), *_llvm(), *_gpu(), *_folders()]
+
+
+def extra_of(module: str) -> str | None:
+    """Name the part, "core" or an extra, that a missing module belongs to; None if it is none of sonotwin's requirements."""
+    top = module.partition(".")[0]
+    top = BROUGHT_BY.get(top, top)
+    return next((part for part, name, _ in requirements() if MODULES.get(name, name) == top), None)
+
+
+def requirements() -> Iterator[tuple[str, str, str]]:
+    """Yield sonotwin's own requirements: part ("core" or the extra), package, version range."""
+    from packaging.requirements import Requirement
+
+    for line in importlib.metadata.requires("sonotwin") or []:
+        requirement = Requirement(line)
+        marker = requirement.marker
+        if marker is None or marker.evaluate({"extra": ""}):
+            yield "core", requirement.name, str(requirement.specifier)
+            continue
+        for extra in EXTRAS:
+            if marker.evaluate({"extra": extra}):
+                yield extra, requirement.name, str(requirement.specifier)
+
+
+def _system() -> Iterator[Finding]:
+    text = f"{platform.python_version()} at {sys.executable}"
+    if sys.version_info >= OLDEST_PYTHON:
+        yield Finding("core", "Python", "ok", text)
+    else:
+        yield Finding("core", "Python", "problem", text, "install Python 3.11 or newer")
+    yield Finding("machine", "system", "ok", _system_name())
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    yield Finding("machine", "size", "ok", f"{cores} cores, {memory:.0f} GiB of memory")
+
+
+def _system_name() -> str:
+    if hasattr(platform, "freedesktop_os_release") and Path("/etc/os-release").exists():
+        return f"{platform.freedesktop_os_release().get('PRETTY_NAME', 'Linux')}, {platform.machine()}"
+    return f"{platform.platform()}, {platform.machine()}"
+
+
+def _packages() -> Iterator[Finding]:
+    from packaging.specifiers import SpecifierSet
+
+    wanted = list(requirements())
+    installed = {name: _version(name) for _, name, _ in wanted}
+    broken = _failing_imports([MODULES.get(name, name) for _, name, _ in wanted if installed[name] is not None])
+    for part, name, accepted in wanted:
+        remedy = f"pip install 'sonotwin{'' if part == 'core' else f'[{part}]'}'"
+        found = installed[name]
+        failure = broken.get(MODULES.get(name, name))
+        if found is None:
+            yield Finding(part, name, "problem" if part == "core" else "absent", "not installed", remedy)
+        elif not SpecifierSet(accepted).contains(found, prereleases=True):
+            yield Finding(part, name, "problem", f"{found}, expected {accepted}", remedy)
+        elif failure is not None:
+            again = f"pip install --force-reinstall {name}"
+            yield Finding(part, name, "problem", f"{found}, can't be imported: {failure}", again)
+        else:
+            yield Finding(part, name, "ok", found)
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _failing_imports(modules: list[str]) -> dict[str, str]:
+    """Import modules in one other process, which may crash; returns the reason for each that fails."""
+    program = """
+import importlib, sys
+for name in sys.argv[1:]:
+    print("trying", name, flush=True)
+    try:
+        importlib.import_module(name)
+    except (ImportError, OSError) as error:
+        print("failed", name, " ".join(str(error).split()), flush=True)
+print("done")
+"""
+    done = subprocess.run([sys.executable, "-c", program, *modules], capture_output=True, text=True, check=False)
+    lines = done.stdout.splitlines()
+    failures = {line.split()[1]: line.split(maxsplit=2)[-1] for line in lines if line.startswith("failed ")}
+    if lines and lines[-1].startswith("trying "):
+        crashed = lines[-1].split()[1]
+        failures[crashed] = f"the process ended with status {done.returncode}"
+        failures |= _failing_imports(modules[modules.index(crashed) + 1 :])
+    return failures
+
+
+def _llvm() -> Iterator[Finding]:
+    if _version("drjit") is None:
+        yield Finding("twin", "LLVM", "absent", "not looked for: DrJit is not installed")
+        return
+    chosen = False
+    for verdict in llvm.survey():
+        if not verdict.works:
+            yield Finding("twin", "LLVM", "unused", f"{verdict.path} rejected: {verdict.reason}")
+        elif not chosen:
+            chosen = True
+            yield Finding("twin", "LLVM", "ok", f"{verdict.path} chosen: {verdict.reason}")
+    if not chosen:
+        yield Finding("twin", "LLVM", "problem", "none that DrJit works with", llvm.advice())
+
+
+def _gpu() -> Iterator[Finding]:
+    count = llvm.nvidia_gpus()
+    variant = os.environ.get("SONOTWIN_VARIANT") or ("cuda_ad_mono" if count else "llvm_ad_mono")
+    gpus = f"{count} NVIDIA GPU{'s' if count > 1 else ''}" if count else "no NVIDIA GPU with driver and OptiX, not needed"
+    yield Finding("twin", "GPU", "ok" if count else "absent", gpus)
+    if variant in llvm.VARIANTS:
+        yield Finding("twin", "variant", "ok", variant)
+    else:
+        remedy = f"unset SONOTWIN_VARIANT, or set it to {' or '.join(llvm.VARIANTS)}"
+        yield Finding("twin", "variant", "problem", f"SONOTWIN_VARIANT={variant}", remedy)
+
+
+def _folders() -> Iterator[Finding]:
+    places = {
+        "cache": llvm.cache_file().parent,
+        "kernel cache": Path.home() / ".drjit",
+        "working folder": Path.cwd(),
+        "temporary folder": Path(tempfile.gettempdir()),
+    }
+    for what, place in places.items():
+        existing = next(path for path in (place, *place.parents) if path.exists())
+        if os.access(existing, os.W_OK):
+            yield Finding("machine", what, "ok", f"{place} can be written")
+        else:
+            remedy = "make it writable, or set HOME: programs start slower without" if "cache" in what else "choose another one"
+            yield Finding("machine", what, "problem", f"{place} can't be written", remedy)

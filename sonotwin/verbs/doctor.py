@@ -1,0 +1,43 @@
+"""Check this installation: what works, what does not, and what to do about it.
+
+Reads nothing and writes nothing but a small file in the user's cache folder, which remembers the verdict on an LLVM that had
+to be tried. Takes some seconds. Exit status 0 if the core can be used, else 2; the twin and the training may be missing.
+
+    sonotwin doctor
+"""
+
+from pydantic import BaseModel, ConfigDict
+from rich.console import Console
+
+from recon.errors import InputError
+from sonotwin import doctor
+
+STYLES = {"ok": "green", "absent": "yellow", "unused": "dim", "problem": "bold red"}
+
+
+class Config(BaseModel):
+    """The verb takes no fields."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+def run(config: Config) -> None:
+    """Print the findings, then what to do about each problem.
+
+    Raises
+    ------
+    InputError
+        If the core can't be used.
+    """
+    findings = doctor.examine()
+    console = Console(soft_wrap=True, highlight=False)
+    for finding in findings:
+        console.print(f"{finding.part:8}{finding.what:32}", end="")
+        console.print(f"{finding.state:9}", style=STYLES[finding.state], end="")
+        console.print(finding.found, markup=False)
+    for finding in findings:
+        if finding.remedy:
+            console.print(f"{finding.part} {finding.what}: {finding.remedy}", markup=False)
+    broken = [finding.what for finding in findings if finding.part == "core" and finding.state == "problem"]
+    if broken:
+        raise InputError(f"doctor: the core can't be used, because of {', '.join(broken)}")

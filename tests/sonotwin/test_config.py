@@ -1,0 +1,116 @@
+"""From YAML and overrides to a validated configuration, and the one line for each way to get it wrong."""
+
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from pydantic import BaseModel, ConfigDict, Field
+
+from recon.errors import InputError
+from sonotwin import config
+
+SURFACE = """\
+defaults:
+  - rig: narrow
+  - _self_
+capture: ???       # folder to read
+out: outputs/x     # folder to write
+pitch: 12          # projector px
+unwrap: gray       # how
+"""
+
+
+class Rig(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    gamma: float = Field(gt=0)
+
+
+class Surface(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    rig: Rig
+    capture: Path
+    out: Path
+    pitch: float = Field(gt=1)
+    unwrap: Literal["gray", "centre_line"]
+
+
+@pytest.fixture(autouse=True)
+def conf(tmp_path, monkeypatch):
+    (tmp_path / "rig").mkdir()
+    (tmp_path / "surface.yaml").write_text(SURFACE)
+    (tmp_path / "rig" / "narrow.yaml").write_text("gamma: 2.2\n")
+    (tmp_path / "rig" / "wide.yaml").write_text("gamma: 1.0\n")
+    monkeypatch.setattr(config, "folder", lambda: tmp_path)
+
+
+def load(*overrides: str) -> Surface:
+    return config.load("surface", ["capture=c", *overrides], Surface)
+
+
+def test_defaults_groups_and_fields():
+    assert load().rig.gamma == 2.2
+    assert load("rig=wide").rig.gamma == 1.0
+    assert load("rig=wide", "rig.gamma=1.8", "pitch=18").rig.gamma == 1.8
+    assert config.groups("surface") == {"rig": ["narrow", "wide"]}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "outputs/my run",
+        "/data/Müller, Zoë/run (2)",
+        "a=b",
+        "~/x",
+        "C:/captures/one",
+        "it's",
+        "back\\slash é",
+        "é\\",
+        "é\\'",
+        "a,b",
+        "#1",
+    ],
+)
+def test_paths_are_taken_as_they_stand(path):
+    """Blanks are Hydra's own; the rest isn't in its grammar."""
+    assert load(f"out={path}").out == Path(path)
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("pitchh=3", "surface: pitchh: unknown key; did you mean pitch?"),
+        ("rig.gama=3", "surface: rig.gama: unknown key; did you mean rig.gamma?"),
+        ("+extra=3", "surface: extra: unknown key"),
+        ("rig=narow", "surface: rig: expected one of narrow, wide, found narow; did you mean narrow?"),
+        ("pitch=0", "surface: pitch: expected greater than 1, found 0"),
+        ("unwrap=grey", "surface: unwrap: expected 'gray' or 'centre_line', found 'grey'"),
+        ("~pitch", "surface: pitch: needs a value; give pitch=..."),
+        ("capture=???", "surface: capture: needs a value; give capture=..."),
+        ("outputs/demo", "surface: outputs/demo: expected field=value"),
+        ("=3", "surface: =3: expected field=value"),
+    ],
+)
+def test_mistakes_name_key_expected_and_found(override, line):
+    with pytest.raises(InputError) as caught:
+        load(override)
+    assert str(caught.value) == line
+
+
+@pytest.mark.parametrize("override", ["out=[a", "pitch=${nothing}", "pitch.x=3", "out='open", "sur face=3", "rig@other=wide"])
+def test_nonsense_is_one_line(override):
+    with pytest.raises(InputError, match=r"^surface: [^\n]+$"):
+        load(override)
+
+
+def test_further_mistakes_are_counted():
+    with pytest.raises(InputError, match=r"\(and 1 more\)$"):
+        load("pitch=0", "unwrap=x")
+
+
+def test_a_verb_without_file_has_no_fields():
+    class Empty(BaseModel):
+        model_config = ConfigDict(extra="forbid")
+
+    assert config.load("nothing", [], Empty) == Empty()
+    with pytest.raises(InputError, match="nothing: x: unknown key"):
+        config.load("nothing", ["x=1"], Empty)

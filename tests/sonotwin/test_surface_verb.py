@@ -1,0 +1,207 @@
+"""`sonotwin surface`, from a capture or a bare folder to files, on the ideal image of a tilted plane."""
+
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from recon import calibration, capture, primitives, rigid
+from recon.calibration import Calibration
+from recon.camera import Camera
+from recon.capture import Device, Manifest, SurfacePart
+from recon.patterns import CentreLine, Fringes, GrayCode, Patterns
+from sonotwin.cli import main
+
+SIZE, PROJECTOR = (320, 256), (640, 400)
+SEQUENCES = {
+    "centre_line": Patterns(projector_size=PROJECTOR, unwrap="centre_line", parts=(CentreLine(), Fringes(pitch=12, steps=8))),
+    "gray": Patterns(
+        projector_size=PROJECTOR,
+        unwrap="gray",
+        parts=(Fringes(pitch=20, steps=8, origin=9.5), GrayCode(pitch=20, bits=5, start=-0.5, complementary=True)),
+    ),
+}
+TILT = rigid.from_rotation_vector([0.2, -0.3, 0], [0, 0, 660])  # world from the plane z = 0
+
+
+@pytest.fixture
+def optics() -> Calibration:
+    lens = np.array([-0.1, 0.2, 0.0005, -0.0005, 0])
+    camera = Camera(SIZE, np.array([[830.0, 0, 158], [0, 832, 127], [0, 0, 1]]), lens)
+    pose = rigid.from_rotation_vector(np.deg2rad([0, -12.5, -1]), [148.0, 0, 15])
+    projector = Camera(PROJECTOR, np.array([[960.0, 0, 315], [0, 963, 200], [0, 0, 1]]), lens / 2, pose)
+    return Calibration({"cam1": camera, "projector": projector})
+
+
+def photograph(patterns: Patterns, optics: Calibration) -> np.ndarray:
+    """What camera 1 sees of the patterns on the plane, with 1 DN of noise."""
+    camera, projector = optics.cameras["cam1"], optics.cameras["projector"]
+    rays, normal = camera.rays(camera.pixel_grid()), TILT[:3, 2]
+    points = rays * ((normal @ TILT[:3, 3]) / (rays @ normal))[..., None]
+    column = projector.project(points)[..., 0]
+    profiles = np.array([profile for _, _, profile in patterns.profiles()], float)
+    seen = np.array([np.interp(column, np.arange(len(profile)), profile) for profile in profiles])
+    noise = np.random.default_rng(0).normal(0, 1, seen.shape)
+    return np.clip(np.round(25 + 180 * seen + noise), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(params=SEQUENCES)
+def shots(request, optics, tmp_path) -> tuple[Path, np.ndarray, Patterns]:
+    patterns = SEQUENCES[request.param]
+    images = photograph(patterns, optics)
+    devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
+    capture.write_surface(tmp_path / "capture", {"cam1": images}, patterns, optics, devices)
+    return tmp_path / "capture", images, patterns
+
+
+def test_a_capture_becomes_a_surface(shots, tmp_path, capsys):
+    folder = shots[0]
+    out = tmp_path / "surface"
+    assert main(["surface", f"capture={folder}", f"out={out}"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["decode", "unwrap", "triangulate", "wrote"]
+    assert sorted(path.name for path in out.iterdir()) == ["metrics.json", "points.npz", "surface.glb", "surface.ply"]
+
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["points"] > 0.95 * SIZE[0] * SIZE[1]
+    assert 85 < metrics["modulation_median_dn"] < 95 and metrics["saturated_fraction"] == 0
+    assert {"seconds_read", "seconds_decode", "seconds_triangulate", "seconds_mesh"} <= metrics.keys()
+
+    fit = primitives.fit_plane(trimesh.load(out / "surface.ply", process=False).vertices)
+    assert np.linalg.norm(np.cross(fit.shape.normal, TILT[:3, 2])) < 1e-3
+    assert 0.5 < fit.rms * abs(fit.shape.normal[2]) / metrics["predicted_rms_mm"] < 1.5, "prediction and scatter"
+    with np.load(out / "points.npz") as points:
+        assert points["points"].shape == (SIZE[1], SIZE[0], 3)
+        assert np.isfinite(points["sigma"]).sum() == metrics["points"]
+        assert {"modulation", "status"} <= set(points)
+
+
+def test_a_bare_folder_gives_the_same(shots, optics, tmp_path):
+    folder, _, patterns = shots
+    (tmp_path / "sequence.yaml").write_text(patterns.model_dump_json())
+    calibration.write(tmp_path / "optics.yaml", optics)
+    source = [
+        f"images={folder / 'surface' / 'cam1'}",
+        f"patterns={tmp_path / 'sequence.yaml'}",
+        f"calibration={tmp_path / 'optics.yaml'}",
+    ]
+    assert main(["surface", *source, f"out={tmp_path / 'a'}"]) == 0
+    assert main(["surface", f"capture={folder}", f"out={tmp_path / 'b'}"]) == 0
+    assert (tmp_path / "a" / "surface.ply").read_bytes() == (tmp_path / "b" / "surface.ply").read_bytes()
+
+
+def test_results_are_replaced_but_other_folders_are_not(shots, tmp_path, capsys):
+    folder = shots[0]
+    out = tmp_path / "surface"
+    for _ in range(2):
+        assert main(["surface", f"capture={folder}", f"out={out}"]) == 0
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "mine.txt").write_text("mine")
+    capsys.readouterr()
+    assert main(["surface", f"capture={folder}", f"out={other}"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and "found other files" in captured.err
+    assert [path.name for path in other.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ([], "expected capture, or images with patterns and calibration, found none of them"),
+        (["images=a"], "expected capture, or images with patterns and calibration, found images"),
+        (["capture=a", "images=b"], "expected capture, or images with patterns and calibration, found both: images"),
+        (["capture=nowhere"], "nowhere/manifest.json: expected a file, found none"),
+        (["images=a", "patterns=nowhere.yaml", "calibration=c"], "nowhere.yaml: expected a file, found none"),
+        (["capture=nowhere", "limits.max_sigma=-1"], "limits.max_sigma"),
+    ],
+)
+def test_a_mistake_is_one_line(arguments, complaint, tmp_path, capsys):
+    assert main(["surface", *arguments, f"out={tmp_path / 'out'}"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and complaint in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_place_that_cannot_be_written_to_is_said_first(tmp_path, capsys):
+    """A file where the folder's parent should be; said before the missing capture is."""
+    (tmp_path / "file").write_text("")
+    assert main(["surface", "capture=nowhere", f"out={tmp_path / 'file' / 'out'}"]) == 2
+    assert "expected a place to write to" in capsys.readouterr().err
+
+
+def test_darkness_is_said(optics, tmp_path, capsys):
+    devices = {"cam1": Device(size=SIZE), "projector": Device(size=PROJECTOR)}
+    black = np.zeros((9, SIZE[1], SIZE[0]), np.uint8)
+    capture.write_surface(tmp_path / "capture", {"cam1": black}, SEQUENCES["centre_line"], optics, devices)
+    assert main(["surface", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_a_real_relief(real, tmp_path):
+    """A plaster relief under somebody else's projector: most of it, where it stood, and smooth."""
+    source = real / "fringe_capture"
+    fields = [f"images={source}", "patterns=twelve_step_gray", f"calibration={source / 'calibration.yml'}"]
+    assert main(["surface", *fields, f"out={tmp_path / 'out'}"]) == 0
+    with np.load(tmp_path / "out" / "points.npz") as file:
+        depth = file["points"][..., 2]
+    depth_known = depth[np.isfinite(depth)]
+    assert depth_known.size >= 210_000
+    low, high = np.percentile(depth_known, [0.1, 99.9])
+    assert low > 690 and high < 780
+    bends = (depth[:, :-2] - 2 * depth[:, 1:-1] + depth[:, 2:]) / np.sqrt(6)
+    assert 1.4826 * np.nanmedian(np.abs(bends)) < 0.5, "scatter of neighbours, mm; the sequence's own noise is 0.35"
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "captures.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", PAGE, flags=re.M | re.S)
+
+
+def test_the_page_names_every_field():
+    for model, prefix in ((Manifest, ""), (Device, "devices.*."), (SurfacePart, "surface.")):
+        for name, field in model.model_fields.items():
+            assert f"| `{prefix}{field.alias or name}` |" in PAGE
+
+
+@pytest.mark.slow
+def test_the_page_runs(rig, tmp_path, monkeypatch):
+    """Every manifest, pattern file and command of docs/captures.md, in a folder that holds what the page talks about."""
+    optics = Calibration({"cam1": rig.cam1.optics.camera(), "projector": rig.projector.optics.camera()})
+    calibration.write(tmp_path / "optics.yaml", optics)
+    (manifest,) = (json.loads(text) for text in blocks("json"))
+    patterns = Patterns.model_validate(manifest["surface"]["patterns"])
+    named = [tmp_path / "shots" / name for name in manifest["surface"]["images"]["cam1"]]
+    (tmp_path / "wrapped").mkdir()
+    (tmp_path / "wrapped" / "manifest.json").write_text(json.dumps(manifest))
+    devices = {"cam1": Device(size=(1280, 1024)), "projector": Device(size=(1280, 800))}
+    pictures = photograph(patterns, optics)
+    capture.write_surface(tmp_path / "capture", {"cam1": pictures}, patterns, optics, devices)
+    paper = capture.read_patterns(Path(__file__).parents[2] / "conf" / "patterns" / "paper_surface.yaml")
+    monkeypatch.chdir(tmp_path)
+
+    commands = [line for text in blocks("sh") for line in text.splitlines()]
+    assert len(commands) == 4
+    for command in commands:
+        shutil.rmtree("shots", ignore_errors=True)
+        if "images=shots" in command:
+            capture.write_images([tmp_path / "shots" / f"{i}.png" for i in range(paper.count)], photograph(paper, optics))
+        else:
+            capture.write_images(named, pictures)
+        program, *arguments = shlex.split(command)
+        assert program == "sonotwin" and main(arguments) == 0
+        assert json.loads(Path("surface/metrics.json").read_text())["points"] > 500_000
+
+    (text,) = blocks("yaml")
+    Path("sequence.yaml").write_text(text)
+    sequence = capture.read_patterns(Path("sequence.yaml"))
+    shutil.rmtree("shots")
+    capture.write_images([tmp_path / "shots" / f"{i}.png" for i in range(sequence.count)], photograph(sequence, optics))
+    assert main(["surface", "images=shots", "patterns=sequence.yaml", "calibration=optics.yaml", "out=surface"]) == 0

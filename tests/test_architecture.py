@@ -1,0 +1,73 @@
+"""Which package may import which: the pipeline must run on a PC that has no renderer."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+OURS = {"recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks", "tests"}
+RENDERER = {"mitsuba", "drjit"}
+MAY_IMPORT = {"recon": {"recon"}, "scenes": {"scenes", "recon"}, "trainers": {"trainers", "recon"}}
+
+
+def imported(path: Path) -> set[str]:
+    """Top-level names of all modules that a file imports anywhere, in functions too."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
+    return {name.partition(".")[0] for name in names}
+
+
+def modules(package: str) -> list[str]:
+    """Dotted names of a package's modules."""
+    paths = sorted((ROOT / package).rglob("*.py"))
+    return [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths]
+
+
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_imports_go_one_way(package):
+    forbidden = (OURS - MAY_IMPORT[package]) | RENDERER
+    offences = {str(path): bad for path in (ROOT / package).rglob("*.py") if (bad := imported(path) & forbidden)}
+    assert not offences
+
+
+def test_recon_runs_where_the_rest_is_missing():
+    """Every module of recon is imported by a Python that refuses the others, whoever asks for them."""
+    blocked = sorted((OURS - {"recon"}) | RENDERER | {"torch"})
+    program = f"""
+import importlib, sys
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {blocked}:
+            raise ImportError("refused: " + name)
+sys.meta_path.insert(0, Refuse())
+for name in {modules("recon")}:
+    importlib.import_module(name)
+print("imported")
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "imported\n"), done.stderr
+
+
+def test_help_imports_nothing_heavy():
+    """`sonotwin --help` and the help of a verb come without numpy, Mitsuba or what takes long to import."""
+    program = """
+import sys
+from sonotwin.cli import main
+assert main(["--help"]) == 0 and main(["doctor", "--help"]) == 0
+print(sorted({"numpy", "scipy", "cv2", "numba", "rich", "mitsuba", "drjit", "hydra"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines()[-1] == "[]", done.stderr
+
+
+def test_no_drawers_and_no_long_modules():
+    """A module past 400 lines is two topics, and a drawer called utils is none."""
+    paths = [path for package in OURS - {"tests", "benchmarks"} for path in (ROOT / package).rglob("*.py")]
+    drawers = [path for path in paths if path.stem in ("utils", "util", "common", "misc", "base", "helpers")]
+    long = [path for path in paths if len(path.read_text(encoding="utf-8").splitlines()) > 400]
+    assert not drawers
+    assert not long
