@@ -1,0 +1,103 @@
+"""The demonstration, whole: from a command to a report; small here, and at full size among the slow tests."""
+
+import json
+import re
+
+import pytest
+
+from recon.errors import InputError
+from sonotwin.cli import main
+from sonotwin.verbs.demo import commands
+from twin import demo
+from twin.demo import Step
+
+SMALL = (  # camera 1 at half its size: fringes of ten pixels a period
+    "rig.cam1.optics.size=[640,512]",
+    "rig.cam1.optics.focal_px=[1660.0,1665.5]",
+    "rig.cam1.optics.centre_px=[308.75,261.25]",
+    "rig.cam1.sensor.pixel_um=9.6",
+    "engine.samples=4",
+    "scene.edge_mm=1.5",
+)
+MADE = ("report.html", "surface.ply", "surface.glb", "metrics.json", "capture/manifest.json", "truth/scene.json")
+
+
+def figures(folder):
+    return json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+
+
+def test_a_small_demonstration_runs_through(tmp_path, capsys):
+    out = tmp_path / "demo"
+    assert main(["demo", *SMALL, f"out={out}"]) == 0
+    assert not [name for name in MADE if not (out / name).is_file()]
+    metrics = figures(out)
+    # With four samples a pixel rendering noise adds to the sensor's; at this size edges are a larger part of the image.
+    assert metrics["surface_interior_rms_mm"] < 3 * metrics["limit_rms_mm"]
+    assert metrics["coverage"] > 0.9 and metrics["gross_error_fraction"] < 0.01
+    assert all(f"seconds_{name}" in metrics for name in ("render", "surface", "evaluate", "report", "decode", "demo"))
+    last = capsys.readouterr().out.splitlines()[-4:]
+    assert [line.split()[0] for line in last] == ["measured", "accuracy", "coverage", "look"]
+    assert str(out / "report.html") in last[-1]
+
+
+@pytest.mark.slow
+def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path):
+    out = tmp_path / "demo"
+    assert main(["demo", f"out={out}"]) == 0
+    metrics = figures(out)
+    assert metrics["surface_interior_rms_mm"] < 1.1 * metrics["limit_rms_mm"]
+    assert metrics["surface_rms_mm"] < 0.1  # better than the paper's planes
+    assert metrics["coverage"] > 0.98 and metrics["gross_error_fraction"] < 1e-4
+    assert metrics["z_std"] == pytest.approx(1, abs=0.1)
+    assert metrics["seconds_demo"] < 300
+    assert (out / "report.html").stat().st_size < 12e6
+
+
+def silent(_):
+    pass
+
+
+def step(name, works=True, makes=()):
+    def work(folder, figures):
+        for made in makes:
+            (folder / made).write_text(name, encoding="utf-8")
+        if not works:
+            raise KeyboardInterrupt
+        return {name: len(figures)}
+
+    return Step(name, f"do {name}", work, makes)
+
+
+def test_steps_see_the_figures_before_them(tmp_path):
+    told = []
+    metrics = demo.play([step("first"), step("second")], tmp_path / "demo", {"seed": 3}, told.append)
+    assert told == ["1/2 do first", "2/2 do second"]
+    assert (metrics["first"], metrics["second"]) == (0, 2)  # its figure, and its seconds
+    assert metrics == figures(tmp_path / "demo")
+    assert json.loads((tmp_path / "demo" / "demo.json").read_text(encoding="utf-8")) == {"seed": 3}
+
+
+def test_a_run_that_was_killed_leaves_nothing_to_the_next(tmp_path):
+    """A first run is complete, a second dies halfway and leaves a temporary folder, a third starts clean."""
+    folder = tmp_path / "demo"
+    demo.play([step("render"), step("report", makes=("report.html",))], folder, {}, silent)
+    (folder / ".truth.77.new").mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        demo.play([step("render", works=False), step("report", makes=("report.html",))], folder, {}, silent)
+    assert sorted(path.name for path in folder.iterdir()) == ["demo.json"]  # no old report beside a new capture
+    demo.play([step("render"), step("report", makes=("report.html",))], folder, {}, silent)
+    assert sorted(path.name for path in folder.iterdir()) == ["demo.json", "metrics.json", "report.html"]
+
+
+def test_other_peoples_files_are_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
+    with pytest.raises(InputError, match="found other files"):
+        demo.play([step("render")], tmp_path, {}, silent)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_the_report_repeats_the_settings_that_were_given(tmp_path):
+    lines = commands(tmp_path / "a b", "cam1", ["demo", "scene=sphere", "out=elsewhere"])
+    assert [re.split(r"\s", line)[1] for line in lines] == ["demo", "render", "surface", "evaluate"]
+    assert "scene=sphere" in lines[0] and "scene=sphere" in lines[1] and "elsewhere" not in "".join(lines)
+    assert f"'out={tmp_path / 'a b'}'" in lines[1]

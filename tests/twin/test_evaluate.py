@@ -1,0 +1,179 @@
+"""Errors that are put into a perfect reconstruction come out as they were put in."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.decode import ProjectorMap
+from recon.errors import InputError
+from recon.phase import DEFAULT_NOISE
+from recon.triangulate import triangulate
+from scenes.things import Cylinder
+from sonotwin.cli import main
+from twin import evaluate
+
+SIGMA = 0.03  # mm along the ray
+
+
+@pytest.fixture(scope="module")
+def truth(session):
+    return evaluate.read_truth(session.folder / "truth")
+
+
+@pytest.fixture
+def rays(truth):
+    return truth.camera.rays(truth.camera.pixel_grid())
+
+
+@pytest.fixture
+def perfect(truth):
+    """The true points where the truth is lit."""
+    return np.where(truth.lit[..., None], np.float64(truth.points), np.nan)
+
+
+def measured(points, truth, sigma=SIGMA):
+    comparison = evaluate.compare(np.float32(points), np.full(truth.lit.shape, sigma, np.float32), truth)
+    return evaluate.measure(np.float32(points), comparison, truth)
+
+
+def test_a_perfect_reconstruction_has_no_error(truth, perfect):
+    metrics = measured(perfect, truth)
+    assert metrics["surface_rms_mm"] < 1e-4  # float32 at 700 mm resolves 6e-5 mm
+    assert (metrics["coverage"], metrics["gross_error_fraction"], metrics["false_points"]) == (1, 0, 0)
+    assert metrics["points"] == truth.lit.sum()
+
+
+def test_a_shift_outwards_is_a_positive_bias_and_nothing_else(truth, perfect):
+    metrics = measured(perfect + 0.05 * truth.normals, truth)
+    for name in ("surface_bias_mm", "surface_rms_mm", "surface_median_abs_mm", "thing_ball_rms_mm", "thing_wall_rms_mm"):
+        assert metrics[name] == pytest.approx(0.05, abs=1e-4)
+    assert metrics["sphere_ball_radius_error_mm"] == pytest.approx(0.05, abs=1e-3)
+    assert metrics["sphere_ball_rms_mm"] < 1e-3 and metrics["plane_wall_rms_mm"] < 1e-3
+
+
+def test_noise_along_the_ray_is_predicted_and_standardised(truth, perfect, rays, rng):
+    """Points with the noise that they predict have z of unit spread, and an RMS as predicted, obliquely seen parts included."""
+    metrics = measured(perfect + SIGMA * rng.standard_normal((*truth.lit.shape, 1)) * rays, truth)
+    margin = 5 / np.sqrt(2 * truth.lit.sum())  # five standard deviations of a sample's standard deviation
+    assert metrics["z_std"] == pytest.approx(1, abs=margin)
+    assert metrics["z_robust_std"] == pytest.approx(1, abs=2 * margin)  # a median is noisier
+    assert metrics["surface_rms_mm"] == pytest.approx(metrics["predicted_rms_mm"], rel=margin)
+    assert metrics["predicted_rms_mm"] < SIGMA  # the error is measured across the surface, the noise lies along the ray
+
+
+def test_gross_errors_are_counted_and_kept_out_of_the_noise(truth, perfect, rays, rng):
+    spoilt = np.zeros(truth.lit.shape, bool)
+    spoilt.flat[rng.choice(np.flatnonzero(truth.lit), 200, replace=False)] = True
+    metrics = measured(perfect + np.where(spoilt, 20.0, 0.01)[..., None] * rays, truth)
+    assert metrics["gross_error_fraction"] == pytest.approx(200 / truth.lit.sum())
+    assert metrics["surface_rms_without_gross_mm"] < 0.0101
+    assert metrics["surface_rms_mm"] > 0.5
+    assert metrics["surface_median_abs_mm"] < 0.0101
+    assert metrics["surface_bias_mm"] < 0  # farther from the camera is inside
+
+
+def test_missing_pixels_lower_the_coverage_and_points_in_the_shadow_are_false(truth, perfect):
+    points = perfect.copy()
+    points[:128] = np.nan
+    shadow = np.argwhere(~truth.lit)[:40]
+    points[tuple(shadow.T)] = truth.points[tuple(shadow.T)]
+    metrics = measured(points, truth)
+    assert metrics["coverage"] == pytest.approx(truth.lit[128:].sum() / truth.lit.sum())
+    assert metrics["false_points"] == 40
+    assert metrics["points"] == truth.lit[128:].sum() + 40
+
+
+def test_the_interior_leaves_out_errors_at_the_edges(truth, perfect, rays):
+    """Spoil the pixels within two pixels of the ball's outline; the interior doesn't notice, the rest does."""
+    ball = truth.objects == 0
+    grown = [np.roll(ball, (j, i), (0, 1)) for j in range(-2, 3) for i in range(-2, 3)]
+    rim = np.any(grown, axis=0) & ~np.all(grown, axis=0)
+    metrics = measured(perfect + 0.9 * rim[..., None] * rays, truth)
+    assert metrics["surface_rms_mm"] > 0.05
+    assert metrics["surface_interior_rms_mm"] < 1e-4
+    interior = evaluate.compare(np.float32(perfect), np.ones(truth.lit.shape, np.float32), truth).interior
+    assert interior.sum() > 0.8 * truth.lit.sum()
+
+
+def test_the_limit_is_what_a_noisy_projector_coordinate_does_to_the_surface(truth, session, rng):
+    """Move the true coordinate by the sensor's noise, find the points again without the code under test, and compare spreads."""
+    with np.load(session.folder / "truth" / "surface" / "cam1.npz") as archive:
+        columns = np.where(truth.lit, archive["projector"][..., 0], np.nan)
+    shape = truth.lit.shape
+    noise = np.where(truth.lit, truth.limit_px, 0) * rng.standard_normal(shape)
+    nothing = np.zeros(shape, np.float32)
+    noisy = np.float32(columns + noise)
+    found = ProjectorMap(
+        noisy,
+        None,
+        np.full(shape, 0.1, np.float32),
+        None,
+        nothing,
+        nothing,
+        nothing,
+        np.zeros(shape, np.uint8),
+        DEFAULT_NOISE,
+        {},
+    )
+    points = triangulate(found, truth.camera, truth.projector)
+    only_columns = replace(truth, axes=("columns",))
+    comparison = evaluate.compare(points.points, points.sigma, only_columns)
+    z = comparison.error[comparison.compared] / comparison.limit[comparison.compared]
+    assert np.std(z) == pytest.approx(1, abs=5 / np.sqrt(2 * z.size) + 0.005)  # float32 columns add half a percent at most
+
+
+def test_a_cylinder_is_fitted_to_what_lies_on_it(rng):
+    axis = np.array([0.6, 0.8, 0.0])
+    across, up = np.array([-0.8, 0.6, 0.0]), np.array([0.0, 0.0, -1.0])
+    angle, along = rng.uniform(-1, 1, 2000), rng.uniform(-40, 40, 2000)
+    points = (
+        np.array([3.0, 4.0, 660.0])
+        + np.outer(along, axis)
+        + 30.2 * (np.outer(np.cos(angle), up) + np.outer(np.sin(angle), across))
+    )
+    metrics = evaluate.fit(Cylinder("tube", np.array([3.0, 4.0, 660.0]), axis, 30.0), points)
+    assert metrics["cylinder_tube_radius_error_mm"] == pytest.approx(0.2, abs=1e-6)
+    assert metrics["cylinder_tube_angle_error_deg"] < 1e-4
+
+
+def test_the_command_writes_its_figures_and_a_picture(session, truth, perfect, tmp_path, capsys):
+    surface = tmp_path / "surface"
+    surface.mkdir()
+    np.savez(
+        surface / "points.npz",
+        points=np.float32(perfect + 0.05 * truth.normals),
+        sigma=np.full(truth.lit.shape, SIGMA, np.float32),
+    )
+    assert main(["evaluate", f"surface={surface}", f"truth={session.folder / 'truth'}"]) == 0
+    metrics = json.loads((surface / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    assert metrics["surface_bias_mm"] == pytest.approx(0.05, abs=1e-4)
+    assert (surface / "evaluation" / "error_map.png").read_bytes().startswith(b"\x89PNG")
+    assert "RMS 0.050 mm" in capsys.readouterr().out
+
+
+def test_mistakes_are_named(session, perfect, tmp_path):
+    def complaint(truth_folder):
+        with pytest.raises(InputError) as caught:
+            evaluate.read_truth(truth_folder)
+        return str(caught.value)
+
+    assert "scene.json: expected a file of the twin's ground truth, found none" in complaint(tmp_path)
+    broken = tmp_path / "truth"
+    shutil.copytree(session.folder / "truth", broken)
+    np.savez(broken / "surface" / "cam1.npz", points=np.zeros((4, 5, 3), np.float32))
+    assert "cam1.npz: normals: expected an array, found none" in complaint(broken)
+    (broken / "surface" / "cam1.npz").write_bytes(b"PK but no archive")
+    assert "expected an npz file of plain arrays" in complaint(broken)
+    (broken / "scene.json").write_text("{", encoding="utf-8")
+    assert "scene.json: expected JSON" in complaint(broken)
+
+
+def test_sizes_must_match_and_something_must_be_seen(truth, perfect):
+    sigma = np.ones(truth.lit.shape, np.float32)
+    with pytest.raises(InputError, match="expected 320x256 as the truth has, found 320x100"):
+        evaluate.compare(np.float32(perfect[:100]), sigma[:100], truth)
+    with pytest.raises(InputError, match="found none"):
+        evaluate.compare(np.full(perfect.shape, np.nan, np.float32), sigma, truth)

@@ -1,0 +1,135 @@
+"""The report, read as a person reads it: opened in a browser from the file alone."""
+
+import base64
+import html
+import json
+import re
+import shutil
+import subprocess
+
+import cv2
+import numpy as np
+import pytest
+
+from recon import decode, triangulate
+from recon.capture import read_surface
+from twin import evaluate, figures, report
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+WATCH = """<script>
+const complaints = [];
+console.error = (...parts) => complaints.push(parts.join(" "));
+window.addEventListener("error", event => complaints.push(event.message));
+window.addEventListener("unhandledrejection", event => complaints.push(String(event.reason)));
+</script>"""
+TELL = """<script>
+(async () => {
+  const view = document.getElementById("surface"), wait = () => new Promise(resolve => setTimeout(resolve, 20));
+  while (!view.dataset.drawn && !complaints.length) await wait();
+  const pictures = {};
+  for (const button of document.querySelectorAll("[data-colour]")) {
+    button.click();
+    await wait();
+    pictures[button.dataset.colour] = await Plotly.toImage(view, { format: "png", width: 480, height: 360 });
+  }
+  const fetched = performance.getEntriesByType("resource").map(entry => entry.name).filter(name => !name.startsWith("data:"));
+  const broken = [...document.images].filter(image => image.src && !image.naturalWidth).length;
+  const answer = document.createElement("pre");
+  answer.id = "answer";
+  answer.textContent = JSON.stringify({ complaints, pictures, fetched, broken, wide: document.documentElement.scrollWidth });
+  document.body.append(answer);
+})();
+</script>"""
+
+
+@pytest.fixture(scope="module")
+def written(session, tmp_path_factory):
+    """A report of the drawn session: its text."""
+    folder = tmp_path_factory.mktemp("report")
+    shots = read_surface(session.folder / "capture")
+    points = triangulate.triangulate(decode.decode(shots.images, shots.patterns), session.camera, session.projector)
+    np.savez(folder / "points.npz", points=points.points, sigma=points.sigma)
+    story = report.read(session.folder / "capture", session.folder / "truth", folder / "points.npz")
+    metrics = evaluate.measure(story.points, story.comparison, story.truth)
+    report.write(folder / "report.html", story, metrics, [("surface.ply", "the <mesh>")], ["sonotwin demo 'out=a b'"])
+    return (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_report_says_what_was_measured(written):
+    shown = html.unescape(re.sub("<[^>]*>", " ", re.sub("<(script|style|svg).*?</\\1>", "", written, flags=re.DOTALL)))
+    for text in (
+        "Paper, limit, here",
+        "0.101 to 0.131 mm",
+        "0.045 mm",
+        "not measured",
+        "Wrapped phase",
+        "Gray code",
+        "the <mesh>",
+    ):
+        assert text in shown
+    assert "sonotwin demo 'out=a b'" in shown
+    assert re.search(r"Sphere, error of the radius\s+0.045 mm\s+0.\d{4} mm", shown)
+    assert re.search(r"Cylinder, error of the radius\s+0.10 mm\s+not in this scene", shown)
+
+
+def test_the_report_stands_alone(written):
+    """Nothing is loaded from elsewhere, and the file can be sent by mail."""
+    page = re.sub("<script>.*?</script>", "", written, flags=re.DOTALL)
+    assert not re.findall(r"""(?:src|href)=["'](?!data:|#)|url\((?!#)|@import""", page)
+    assert len(written) < 12e6
+
+
+def test_the_report_opens_in_a_browser(written, tmp_path):
+    """No complaint, no request, no broken picture; the surface is drawn, and its colours can be changed."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        pytest.skip(f"no browser found among {', '.join(BROWSERS)}; `apt-get install chromium` brings one")
+    page = tmp_path / "report.html"
+    page.write_text(written.replace("<head>", "<head>" + WATCH, 1).replace("</body>", TELL + "</body>"), encoding="utf-8")
+    quiet = ("--no-sandbox", "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1280,900")
+    command = [browser, "--headless=new", *quiet, *SOFTWARE_WEBGL, "--virtual-time-budget=30000", "--dump-dom", page.as_uri()]
+    dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    found = re.search('<pre id="answer">(.*?)</pre>', dom, flags=re.DOTALL)
+    assert found, "the page's scripts did not come to their end"
+    answer = json.loads(html.unescape(found[1]))
+    assert (answer["complaints"], answer["fetched"], answer["broken"]) == ([], [], 0)
+    assert answer["wide"] <= 1280
+    pictures = {name: decoded(url) for name, url in answer["pictures"].items()}
+    assert set(pictures) == {"error", "depth", "plain"}
+    for picture in pictures.values():
+        middle = picture[90:270, 120:360]
+        assert (middle[..., 3] > 0).mean() > 0.3, "no surface in the middle of the view"
+        assert middle[..., :3].std() > 5
+    assert np.abs(pictures["error"].astype(int) - pictures["depth"]).mean() > 3
+    assert np.abs(pictures["plain"].astype(int) - pictures["depth"]).mean() > 3
+
+
+def decoded(url):
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    return picture
+
+
+def test_colours_are_those_of_the_scale_and_holes_are_transparent():
+    picture = figures.Scale("gray", -1, 1)(np.array([[-1, 0, 1, 7, np.nan]], np.float32))
+    assert picture[0, :4, 0].tolist() == [0, 128, 255, 255]
+    assert picture[0, :, 3].tolist() == [255, 255, 255, 255, 0]
+
+
+def test_a_histogram_keeps_to_the_colour_of_the_page(rng):
+    drawing = figures.histogram(rng.standard_normal(5000), figures.standard_normal(4), "z", 4)
+    assert drawing.startswith("<svg") and "currentColor" in drawing and "#000000" not in drawing
+
+
+def test_densities_integrate_to_one(rng):
+    for curve in (figures.standard_normal(6), figures.noise_mixture(rng.uniform(0.02, 0.05, 1000), 0.3, "noise")):
+        assert np.trapezoid(curve.density, curve.x) == pytest.approx(1, abs=1e-3)
+
+
+def test_local_means_ignore_what_is_masked():
+    values = np.full((20, 20), 0.5, np.float32)
+    values[5, 5] = np.nan
+    mean = report.local_mean(values, np.isfinite(values), 5)
+    assert np.isnan(mean[5, 5])
+    assert np.allclose(np.delete(mean.ravel(), 105), 0.5)

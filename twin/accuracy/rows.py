@@ -1,0 +1,80 @@
+"""Rows of the tables of accuracy and speed: measured by a function, kept as JSON, shown in the docs."""
+
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+
+from recon import atomic
+from recon.errors import InputError
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number, beside what is asked of it and what physics allows."""
+
+    id: str
+    what: str
+    measured: float
+    bar: float  # what is asked
+    limit: float | None  # what physics allows, or the peer's figure
+    unit: str
+    at_least: bool = False  # whether the bar is a least value; else it is a largest one
+    seconds: float = 0.0  # that the measurement took
+
+    @property
+    def ok(self) -> bool:
+        """Whether the bar is met; a figure that is not a number never is."""
+        return self.measured >= self.bar if self.at_least else self.measured <= self.bar
+
+
+Measurement = Callable[[], Sequence[Row]]
+
+
+def measure(measurements: Sequence[Measurement]) -> Iterator[Row]:
+    """Run measurements one by one; their time is shared evenly by the rows that they give."""
+    for measurement in measurements:
+        start = perf_counter()
+        rows = measurement()
+        seconds = (perf_counter() - start) / len(rows)
+        for row in rows:
+            yield Row(**{**asdict(row), "seconds": round(seconds, 2)})
+
+
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows as JSON: a list of `{id, what, measured, bar, limit, unit, ok, seconds}`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    keys = ("id", "what", "measured", "bar", "limit", "unit", "ok", "seconds")
+    records = [{key: getattr(row, key) for key in keys} for row in rows]
+    with atomic.new_file(path) as temporary:
+        temporary.write_text(json.dumps(records, indent=2) + "\n", encoding="utf-8")
+
+
+def table(rows: Sequence[Row], limit: str) -> str:
+    """Rows as a Markdown table; `limit` heads the column of what they are compared with."""
+    lines = [f"| id | what | measured | bar | {limit} | unit | ok |", "|---|---|---|---|---|---|---|"]
+    for row in rows:
+        bar = f"{'>=' if row.at_least else '<='} {row.bar:.4g}"
+        beside = "" if row.limit is None else f"{row.limit:.4g}"
+        lines.append(
+            f"| {row.id} | {row.what} | {row.measured:.4g} | {bar} | {beside} | {row.unit} | {'yes' if row.ok else '**no**'} |"
+        )
+    return "\n".join(lines)
+
+
+def refresh(document: Path, group: str, text: str) -> None:
+    """Replace what stands between `<!-- GROUP -->` and `<!-- /GROUP -->` in a document.
+
+    Raises
+    ------
+    InputError
+        If the document has no such place.
+    """
+    place = re.compile(rf"(<!-- {group} -->\n).*?(<!-- /{group} -->)", re.DOTALL)
+    before = document.read_text(encoding="utf-8")
+    if not place.search(before):
+        raise InputError(f"{document}: expected a place <!-- {group} --> ... <!-- /{group} -->, found none")
+    with atomic.new_file(document) as temporary:
+        temporary.write_text(place.sub(lambda match: f"{match[1]}\n{text}\n\n{match[2]}", before), encoding="utf-8")

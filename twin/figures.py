@@ -1,0 +1,173 @@
+"""Figures of a measurement: arrays in; pictures, drawings and 3-D views out, for a page or a file of their own.
+
+Pictures carry no lettering and drawings take the colour of the text around them, so that both suit a light and a dark page.
+"""
+
+import base64
+import io
+from dataclasses import dataclass
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from plotly import graph_objects
+
+Map = NDArray[np.float32]  # (h, w)
+Mask = NDArray[np.bool_]  # (h, w)
+Colours = NDArray[np.uint8]  # (h, w, 4) red, green, blue, opacity
+
+DIVERGING, CYCLIC, SEQUENTIAL = "RdBu_r", "twilight", "viridis"
+QUALITY = 88  # of WebP: no visible loss in sensor noise
+TEXT = "#0a0b0c"  # stands for the page's text colour until the drawing is in the page
+VERTICES = 60_000  # of a 3-D view; a laptop without a graphics card turns these smoothly
+LONGEST = 6.0  # times the median: a longer triangle spans a tear
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A colour map over a range of values."""
+
+    colours: str  # matplotlib's name
+    low: float
+    high: float
+
+    def __call__(self, values: Map) -> Colours:
+        """Colour values : (h, w); NaN becomes transparent."""
+        lookup = np.uint8(255 * matplotlib.colormaps[self.colours](np.arange(256)))
+        scaled = (np.nan_to_num(values, nan=self.low) - self.low) / (self.high - self.low)
+        coloured = lookup[np.uint8(np.clip(np.rint(255 * scaled), 0, 255))]
+        coloured[np.isnan(values), 3] = 0
+        return coloured
+
+    def gradient(self, stops: int = 13) -> list[str]:
+        """Colours at equal distances from low to high, as `rgb(...)`."""
+        rgb = np.rint(255 * matplotlib.colormaps[self.colours](np.linspace(0, 1, stops))[:, :3]).astype(int)
+        return [f"rgb({r},{g},{b})" for r, g, b in rgb]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A probability density along x."""
+
+    x: NDArray[np.float64]
+    density: NDArray[np.float64]
+    label: str
+
+
+def grey(image: NDArray, full: float, gamma: float = 1.0) -> Colours:
+    """An image : (h, w) as grey, black at 0 and white at `full`; gamma above 1 lifts the shadows."""
+    levels = np.uint8(np.rint(255 * np.clip(np.asarray(image, np.float32) / full, 0, 1) ** (1 / gamma)))
+    return np.dstack([levels, levels, levels, np.full_like(levels, 255)])
+
+
+def webp(picture: Colours) -> str:
+    """A picture as the data URI of a WebP image."""
+    _, data = cv2.imencode(".webp", cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
+    return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+
+
+def error_map_png(error: Map, interior: Mask, half_range: float = 0.1) -> bytes:
+    """Map of signed errors : (h, w) mm with its colour bar, as a PNG file for itself; edges are left out."""
+    figure = Figure(figsize=(8, 5.4), dpi=160, layout="constrained")
+    axes = figure.add_subplot()
+    masked = np.where(interior, error, np.nan)
+    drawn = axes.imshow(masked, cmap=DIVERGING, vmin=-half_range, vmax=half_range, interpolation="nearest")
+    axes.set(facecolor="0.85", xlabel="camera column, px", ylabel="camera row, px")
+    figure.colorbar(drawn, label="error, mm, positive outwards", extend="both")
+    file = io.BytesIO()
+    figure.savefig(file, format="png")
+    return file.getvalue()
+
+
+def histogram(values: NDArray, expected: Curve, unit: str, half_range: float) -> str:
+    """Histogram of values as an SVG drawing, with the density that theory expects as a line."""
+    bins = np.linspace(-half_range, half_range, 101)
+    density = np.histogram(values, bins)[0] / (len(values) * np.diff(bins))
+    highest = max(density.max(), expected.density.max())
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "sonotwin", "font.size": 10}):
+        figure = Figure(figsize=(5.2, 3.1), layout="constrained")
+        axes = figure.add_subplot()
+        axes.stairs(density, bins, fill=True, color="#5b8db8", alpha=0.55, label="measured")
+        axes.plot(expected.x, expected.density, color="#c8553d", linewidth=1.6, label=expected.label)
+        axes.set(xlabel=unit, xlim=(-half_range, half_range), ylim=(0, 1.15 * highest), yticks=[])
+        axes.legend(frameon=False, labelcolor=TEXT, fontsize=9)
+        axes.spines[["left", "top", "right"]].set_visible(False)
+        axes.spines["bottom"].set_color(TEXT)
+        axes.tick_params(colors=TEXT)
+        axes.xaxis.label.set_color(TEXT)
+        return _inline_svg(figure)
+
+
+def standard_normal(half_range: float) -> Curve:
+    """The standard normal distribution."""
+    x = np.linspace(-half_range, half_range, 301)
+    return Curve(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), "standard normal")
+
+
+def noise_mixture(sigma: NDArray, half_range: float, label: str) -> Curve:
+    """What errors of different predicted sigma : (n,) give together: the mean of their normal distributions."""
+    x = np.linspace(-half_range, half_range, 301)
+    levels = np.quantile(sigma, (np.arange(200) + 0.5) / 200).astype(float)
+    return Curve(x, (np.exp(-((x / levels[:, None]) ** 2) / 2) / (levels[:, None] * np.sqrt(2 * np.pi))).mean(axis=0), label)
+
+
+def surface_view(points: Map, error: Map, half_range: float = 0.1) -> str:
+    """A surface to be turned, as the JSON of a plotly figure: vertices thinned out evenly, coloured by their error.
+
+    Parameters
+    ----------
+    points : (h, w, 3), mm
+        Organised by the camera's pixels, NaN where none. The camera looks along z, y is down.
+    error : (h, w), mm
+        Signed; points without it are left out.
+    half_range : float, mm
+        The colours span plus and minus this.
+    """
+    shown = np.isfinite(points).all(axis=-1) & np.isfinite(error)
+    stride = max(1, int(np.ceil(np.sqrt(np.count_nonzero(shown) / VERTICES))))
+    coarse = (slice(stride // 2, None, stride),) * 2
+    vertices, triangles = _triangulated(np.where(shown[coarse][..., None], points[coarse], np.float32(np.nan)))
+    mesh = graph_objects.Mesh3d(
+        **dict(zip("xyz", vertices.T, strict=True)),
+        **dict(zip("ijk", triangles.T, strict=True)),
+        intensity=error[coarse][shown[coarse]],
+        colorscale=[[k / 12, colour] for k, colour in enumerate(Scale(DIVERGING, -1, 1).gradient())],
+        cmin=-half_range,
+        cmax=half_range,
+        colorbar={"title": {"text": "error, mm", "side": "right"}, "thickness": 10, "len": 0.6, "outlinewidth": 0},
+        lighting={"ambient": 0.6, "diffuse": 0.65, "specular": 0.12, "roughness": 0.7, "fresnel": 0.05},
+        lightposition={"x": -2000, "y": 3000, "z": -4000},
+        hovertemplate="x %{x:.1f}<br>y %{y:.1f}<br>z %{z:.1f} mm<br>error %{intensity:.3f} mm<extra></extra>",
+    )
+    axis = {"showbackground": False, "showspikes": False, "zeroline": False, "nticks": 6}
+    up = {"x": True, "y": "reversed", "z": "reversed"}  # a half turn that puts the camera above
+    view = {
+        "aspectmode": "data",
+        "camera": {"eye": {"x": -0.6, "y": -1.5, "z": 1.05}, "center": {"x": 0.02, "y": -0.05, "z": -0.22}},
+        **{f"{name}axis": axis | {"title": {"text": f"{name}, mm"}, "autorange": up[name]} for name in "xyz"},
+    }
+    layout = {"scene": view, "margin": {"l": 0, "r": 0, "t": 0, "b": 0}, "paper_bgcolor": "rgba(0,0,0,0)"}
+    return graph_objects.Figure(mesh, layout, skip_invalid=False).to_json()
+
+
+def _triangulated(points: Map) -> tuple[Map, NDArray[np.int32]]:
+    """Vertices : (n, 3) and triangles : (m, 3) of a grid of points : (h, w, 3) with holes, less the long ones across a tear."""
+    known = np.isfinite(points).all(axis=-1)
+    number = np.cumsum(known).reshape(known.shape).astype(np.int32) - 1
+    first, second = slice(None, -1), slice(1, None)
+    corners = [(first, first), (first, second), (second, first), (second, second)]
+    a, b, c, d = (points[corner] for corner in corners)
+    reach = np.max([np.linalg.norm(p - q, axis=-1) for p, q in ((a, b), (a, c), (b, d), (c, d), (b, c))], axis=0)
+    whole = np.isfinite(reach)
+    whole[whole] = reach[whole] < LONGEST * np.median(reach[whole]) if whole.any() else False
+    ia, ib, ic, id_ = (number[corner][whole] for corner in corners)
+    return points[known], np.concatenate([np.stack([ia, ic, ib], axis=1), np.stack([ib, ic, id_], axis=1)])
+
+
+def _inline_svg(figure: Figure) -> str:
+    file = io.StringIO()
+    figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    text = file.getvalue()
+    return text[text.index("<svg") :].replace(TEXT, "currentColor")
