@@ -1,7 +1,7 @@
 """From the images of a pattern sequence to projector coordinates, with their predicted noise."""
 
-import logging
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import numpy as np
@@ -12,14 +12,16 @@ from recon import continuity, graycode, heterodyne, spatial
 from recon.errors import InputError
 from recon.graycode import Orders
 from recon.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns
-from recon.phase import DEFAULT_NOISE, NOISE_SAMPLES, Fringe, Noise, estimate_noise, pseudo_inverse, sample_pixels, wrapped_phase
-
-log = logging.getLogger(__name__)
+from recon.phase import DEFAULT_NOISE, Fringe, Noise, estimate_noise, pseudo_inverse, sample_pixels, wrapped_phase
 
 Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Measured = tuple[Fringes, Fringe]
+Guide = tuple[GrayCode | CentreLine, NDArray, int]  # the part, its images, the first one's place in the sequence
 
 DARKEST = 4.0  # DN of 255: default of the least modulation
 WORST_SIGMA = 0.3  # rad of predicted phase noise: beyond, orders can't be decided
+CHECK_SAMPLES = 10_000  # pixels looked at to judge a sequence
 LIT_SHARE = 0.002  # share of the image that must carry fringes
 SATURATED_SHARE = 0.5  # share of the lit image that may be saturated
 HARMONIC_SHARE = 0.08  # of the modulation, found in the high harmonics: more is not an N-step sequence
@@ -37,6 +39,9 @@ class Status(IntEnum):
     UNREACHABLE = 3  # a surface that the centre line doesn't reach
     UNCERTAIN = 4  # the order can't be told: a tear, a border, contradicting bits or pitches
     OUTSIDE = 5  # decoded to a coordinate beyond the projector's image
+
+
+OK, UNREACHABLE, UNCERTAIN, OUTSIDE = (int(s) for s in (Status.OK, Status.UNREACHABLE, Status.UNCERTAIN, Status.OUTSIDE))  # for Numba
 
 
 @dataclass(frozen=True)
@@ -98,13 +103,13 @@ def decode(
     axes: dict[Axis, tuple[Image, Image]] = {}
     fringes: dict[Axis, Fringe] = {}
     status = np.zeros(images.shape[1:], np.uint8)
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for axis in patterns.axes:
         sets = []
         for part, place in parts:
             if isinstance(part, Fringes) and part.axis == axis:
                 fringe = wrapped_phase(images[place], part.shifts, noise=noise, saturation=full)
-                _check_fringes(images[place], part, fringe, least, noise, name, place.start)
+                _check_fringes(images[place], part, fringe, least, full, noise, f"{name}: images {place.start} to {place.stop - 1}", place.start)
                 sets.append((part, fringe))
         part, fringe = min(sets, key=lambda pair: pair[0].pitch)
         stage = _quality([f for _, f in sets], least)
@@ -112,7 +117,7 @@ def decode(
             (p, images[place], place.start) for p, place in parts if isinstance(p, GrayCode | CentreLine) and p.axis == axis
         ]
         orders, unreachable, found = _orders(patterns, axis, sets, guides, stage == Status.OK, noise, name)
-        counts |= found
+        counts.update(found)
         x, sigma = _coordinates(fringe.phase, fringe.sigma, orders.order, orders.trusted, unreachable, stage,
                                 part.zero(patterns.length(axis)), part.pitch, patterns.length(axis))  # fmt: skip
         if patterns.unwrap != "centre_line":
@@ -122,7 +127,7 @@ def decode(
     first = fringes[patterns.axes[0]]
     columns, rows = axes.get("columns", (None, None)), axes.get("rows", (None, None))
     pixels = np.bincount(status.ravel(), minlength=len(Status)).tolist()
-    summary = {s.name.lower(): pixels[s] for s in Status} | counts
+    summary = {s.name.lower(): pixels[s] for s in Status} | dict(counts)
     return ProjectorMap(
         columns[0], rows[0], columns[1], rows[1], first.modulation, first.offset, first.phase, status, noise, summary
     )
@@ -146,24 +151,21 @@ def _quality(fringes: list[Fringe], least: float) -> NDArray[np.uint8]:
     return np.where(saturated, np.uint8(Status.SATURATED), np.where(dark, np.uint8(Status.DARK), np.uint8(Status.OK)))
 
 
-def _check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, noise: Noise, name: str, start: int) -> None:
+def _check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, full: float, noise: Noise, place: str, start: int) -> None:
     """Refuse black, saturated and out-of-order fringes."""
-    place = f"{name}: images {start} to {start + part.steps - 1}"
-    samples = sample_pixels(images, NOISE_SAMPLES)
+    samples = sample_pixels(images, CHECK_SAMPLES)
     swing = np.ptp(samples, axis=0)
     if np.mean(swing > 2 * least) < LIT_SHARE:
-        if np.median(samples) > 0.9 * float(np.iinfo(images.dtype).max if images.dtype != np.float32 else samples.max()):
-            raise InputError(f"{place} are saturated all over; expected fringes, found one level: shorten the exposure")
-        raise InputError(
-            f"{place} hold no fringes: expected a modulation of {least:.0f} DN or more, found {fringe.modulation.mean():.1f} DN on average"
-        )
-    lit = fringe.saturated.sum() + np.count_nonzero(fringe.modulation > least)
-    if fringe.saturated.sum() > SATURATED_SHARE * lit:
-        share = 100 * fringe.saturated.mean()
-        raise InputError(
-            f"{place} are saturated in {share:.0f} % of the pixels, expected less than half of the lit ones: shorten the exposure"
-        )
-    _check_order(samples[:, swing > 2 * least], part, noise, place, start)
+        if np.median(samples) > 0.95 * full:
+            raise InputError(f"{place} are saturated all over, expected fringes: shorten the exposure")
+        raise InputError(f"{place} hold no fringes: expected a modulation of {least:.0f} DN or more, found {np.median(swing) / 2:.1f} DN")
+    saturated, lit = np.count_nonzero(fringe.saturated), np.count_nonzero(fringe.saturated | (fringe.modulation > least))
+    if saturated > SATURATED_SHARE * lit:
+        share = 100 * saturated / lit
+        raise InputError(f"{place} are saturated in {share:.0f} % of the lit pixels, expected less than half: shorten the exposure")
+    useful = (swing > 2 * least) & (samples.max(axis=0) < full)
+    if useful.any():
+        _check_order(samples[:, useful], part, noise, place, start)
 
 
 def _check_order(samples: Image, part: Fringes, noise: Noise, place: str, start: int) -> None:
@@ -189,7 +191,9 @@ def _check_order(samples: Image, part: Fringes, noise: Noise, place: str, start:
     raise InputError(f"{place} do not follow the {n}-step sequence, worst in {worst}: are they in the manifest's order?")
 
 
-def _orders(patterns, axis, sets, guides, valid, noise, name) -> tuple[Orders, NDArray[np.bool_], dict[str, int]]:
+def _orders(
+    patterns: Patterns, axis: Axis, sets: list[Measured], guides: list[Guide], valid: Mask, noise: Noise, name: str
+) -> tuple[Orders, Mask, dict[str, int]]:
     """Fringe orders by the sequence's way of unwrapping, where no line reaches, and what there is to count."""
     length = patterns.length(axis)
     nowhere = np.zeros(valid.shape, bool)
@@ -197,24 +201,26 @@ def _orders(patterns, axis, sets, guides, valid, noise, name) -> tuple[Orders, N
     if patterns.unwrap == "heterodyne":
         return heterodyne.fringe_order(sets, length), nowhere, {}
     guide, images, start = guides[0]
-    if patterns.unwrap == "gray":
-        orders = graycode.fringe_order(images, guide, part, fringe, length, noise)
-        return orders, nowhere, {}
-    return _from_line(guide, images[0], part, fringe, valid, length, axis, f"{name}: image {start}")
+    if isinstance(guide, CentreLine):
+        return _from_line(guide, images[0], part, fringe, valid, length, axis, f"{name}: image {start}")
+    orders = graycode.fringe_order(images, guide, part, fringe, length, noise)
+    if not guide.complementary:  # a fifth of the pixels lies too near the period borders: fill in from both sides
+        cycles = fringe.phase * np.float32(1 / (2 * np.pi))
+        flags = continuity.continuity(cycles, fringe.sigma, valid)
+        orders = Orders(*continuity.carry(orders.order, orders.trusted & valid, cycles, fringe.sigma, flags, continuity.CLEAN, continuity.REACH))
+    return orders, nowhere, {}
 
 
-def _from_line(line: CentreLine, image: NDArray, part: Fringes, fringe: Fringe, valid, length: int, axis: Axis, place: str):
+def _from_line(
+    line: CentreLine, image: NDArray, part: Fringes, fringe: Fringe, valid: Mask, length: int, axis: Axis, place: str
+) -> tuple[Orders, Mask, dict[str, int]]:
     """Orders by the centre line; for rows everything is turned, so that the line stands upright."""
     bright = np.mean((image > fringe.offset)[valid]) if valid.any() else 0.0
     if bright > LINE_SHARE:
-        raise InputError(
-            f"{place} is bright over {100 * bright:.0f} % of the fringes, expected one line: is it in the manifest's order?"
-        )
+        raise InputError(f"{place} is bright over {100 * bright:.0f} % of the fringes, expected one line: is it in the manifest's order?")
     turned = axis == "rows"
     if turned:
-        fringe = Fringe(
-            *(np.ascontiguousarray(getattr(fringe, f).T) for f in ("phase", "modulation", "offset", "sigma", "saturated"))
-        )
+        fringe = Fringe(*(np.ascontiguousarray(getattr(fringe, f.name).T) for f in fields(fringe)))
         image, valid = np.ascontiguousarray(image.T), np.ascontiguousarray(valid.T)
     turns = (line.middle(length) - part.zero(length)) / part.pitch
     found = spatial.unwrap(fringe, valid, image, turns, line.width / part.pitch)
@@ -231,14 +237,14 @@ def _coordinates(phase, sigma, order, trusted, unreachable, status, origin, pitc
     x, sx = np.full((height, width), np.nan, np.float32), np.full((height, width), np.nan, np.float32)
     for v in prange(height):
         for u in range(width):
-            if status[v, u] != 0:
+            if status[v, u] != OK:
                 continue
             if not trusted[v, u]:
-                status[v, u] = 3 if unreachable[v, u] else 4
+                status[v, u] = UNREACHABLE if unreachable[v, u] else UNCERTAIN
                 continue
             value = origin + pitch * (phase[v, u] / (2 * np.pi) + order[v, u])
             if value < -0.5 or value > length - 0.5:
-                status[v, u] = 5
+                status[v, u] = OUTSIDE
                 continue
             x[v, u], sx[v, u] = value, pitch / (2 * np.pi) * sigma[v, u]
     return x, sx

@@ -22,7 +22,8 @@ def one_line(error: ValidationError) -> str:
         text = f"expected no such field, found {_brief(found)}"
     elif kind == "value_error":
         text = message.removeprefix("Value error, ")
-        return f"{field}.{text}" if field else text
+        if field and not text.startswith("expected"):  # a model's own check names the field within it
+            return f"{field}.{text}"
     else:
         expected = message.removeprefix("Input should be ").removeprefix("a valid ")
         text = f"expected {expected}, found {_brief(found)}"

@@ -14,6 +14,12 @@ MIN_STEPS_FOR_NOISE = 8  # below eight steps no temporal harmonic is free of the
 NOISE_SAMPLES = 60_000  # pixels looked at; enough for 1 % in the variance
 
 
+PI, HALF_PI = np.float32(np.pi), np.float32(np.pi / 2)
+# atan(t) / t as a polynomial in t^2: least squares at Chebyshev nodes of [0, 1].
+ATAN = tuple(np.float32(c) for c in (1.0, -0.33333284, 0.1999823, -0.14261574, 0.10940199, -0.08372064, 0.05746356, -0.03071751,
+                                     0.01068072, -0.0017437012))  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Noise:
     """Photon-transfer noise of a camera: `variance = read_variance + gain * intensity`, in DN^2 and DN."""
@@ -90,10 +96,7 @@ def pseudo_inverse(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @njit(inline="always")
 def _arctangent(y, x):
-    """Angle of (x, y) in (-pi, pi], to 3e-7 rad in float32; branch-free, so that a row is computed with vector instructions.
-
-    Source of the coefficients: least-squares fit of atan(t) / t by a polynomial in t^2 at Chebyshev nodes of [0, 1].
-    """
+    """Angle of (x, y) in (-pi, pi], to 3e-7 rad in float32; branch-free, so that a row is computed with vector instructions."""
     ax, ay = abs(x), abs(y)
     t = min(ax, ay) / max(max(ax, ay), np.float32(1e-30))
     q = t * t
@@ -104,15 +107,6 @@ def _arctangent(y, x):
     angle = HALF_PI - angle if ay > ax else angle
     angle = PI - angle if x < 0 else angle
     return -angle if y < 0 else angle
-
-
-def _arctangent_coefficients() -> tuple[np.float32, ...]:
-    q = (1 + np.cos(np.pi * (np.arange(400) + 0.5) / 400)) / 2
-    return tuple(np.float32(c) for c in np.polynomial.Polynomial.fit(q, np.arctan(np.sqrt(q)) / np.sqrt(q), 9).convert().coef)
-
-
-ATAN = _arctangent_coefficients()
-PI, HALF_PI = np.float32(np.pi), np.float32(np.pi / 2)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

@@ -1,0 +1,56 @@
+"""`sonotwin render`: what it writes, and what it refuses before it renders."""
+
+import json
+
+import pytest
+
+from sonotwin.cli import main
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["scene=brest"], "scene: expected one of board, breast,"),
+        (["scene.radius_mm=3"], "scene.radius_mm: unknown key"),
+        (["scene=sphere", "scene.radius_mm=-3"], "radius_mm: expected greater than 0, found -3"),
+        (["patterns=paper"], "patterns: expected one of"),
+        (["patterns.unwrap=luck"], "patterns.unwrap: expected"),
+        (["patterns.projector_size=[1920,1080]"], "patterns.projector_size: expected the rig's [1280, 800], found [1920, 1080]"),
+        (["rig.projector.gama=2"], "rig.projector.gama: unknown key; did you mean rig.projector.gamma?"),
+        (["rig.cam1.sensor.quantum_efficiency=1.4"], "rig.cam1.sensor.quantum_efficiency: expected less than or equal to 1, found 1.4"),
+        (["rig.cam1.optics.distortion=[0.1]"], "rig.cam1.optics.distortion: expected 0, 4, 5, 8, 12 or 14 coefficients, found 1"),
+        (["engine.samples=12"], "engine.samples: expected a power of two, found 12"),
+        (["shooting.bits=12"], "shooting.bits: expected at most the 10 of cam1's ADC, found 12"),
+        (["cameras=[cam3]"], "cameras.0: expected 'cam1' or 'cam2', found 'cam3'"),
+        (["seed=-1"], "seed: expected greater than or equal to 0, found -1"),
+    ],
+)
+def test_nonsense_is_refused_by_name(arguments, complaint, tmp_path, capsys):
+    """One line, exit status 2, nothing written."""
+    assert main(["render", f"out={tmp_path / 'out'}", *arguments]) == 2
+    message = capsys.readouterr().err
+    assert complaint in message and message.count("\n") == 1 and message.startswith("sonotwin: ")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_place_that_is_taken_is_refused_before_rendering(tmp_path, capsys):
+    """A folder with other files, or a file, is left as it is."""
+    (tmp_path / "out" / "truth").mkdir(parents=True)
+    (tmp_path / "out" / "truth" / "thesis.tex").write_text("years of work")
+    assert main(["render", f"out={tmp_path / 'out'}"]) == 2
+    assert "expected a new or empty folder" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["truth"]
+    (tmp_path / "file").write_text("")
+    assert main(["render", f"out={tmp_path / 'file'}"]) == 2
+    assert str(tmp_path / "file") in capsys.readouterr().err
+
+
+def test_both_cameras(tmp_path, capsys):
+    """Each camera has its images and its truth; 10-bit images are announced as such."""
+    fields = ["scene=plane", "engine.samples=2", "cameras=[cam1,cam2]", "shooting.bits=10", "shooting.exposure_s=0.02"]
+    assert main(["render", f"out={tmp_path / 'out'}", *fields]) == 0
+    manifest = json.loads((tmp_path / "out" / "capture" / "manifest.json").read_text())
+    assert sorted(manifest["surface"]["images"]) == ["cam1", "cam2"]
+    assert manifest["devices"]["cam2"] == {"size": [1280, 1024], "bits": 10, "exposure_s": 0.02, "gain": 1.0}
+    assert sorted(path.name for path in (tmp_path / "out" / "truth" / "surface").iterdir()) == ["cam1.npz", "cam2.npz"]
+    assert "exposure 20.00 ms" in capsys.readouterr().out
