@@ -24,6 +24,7 @@ demo: setup  ## render a phantom, reconstruct its surface, compare with the trut
 	@$(BIN)/sonotwin demo
 
 test: lint  ## check style and types, then run the fast tests
+	@bash .ci/browser
 	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
 
 lint: setup  ## check style and types

@@ -46,9 +46,9 @@ def ladder(pitches: Sequence[float], length: float) -> list[Step]:
     first = _beats(singles)
     # The third-order beat serves three pitches of nearly the same size (12, 13, 14 px).
     candidates = {step.weights: step for step in singles + first + (_beats(first) if len(pitches) > 2 else [])}.values()
-    starts = [step for step in candidates if step.pitch >= length]
+    starts = [step for step in candidates if _span(step) >= length]
     if not starts:
-        widest = max(step.pitch for step in candidates)
+        widest = max(_span(step) for step in candidates)
         raise InputError(
             f"patterns: pitches {_listed(pitches)} px are unambiguous over {widest:.0f} px, expected {length:.0f} px or more"
         )
@@ -73,6 +73,11 @@ def _beats(steps: list[Step]) -> list[Step]:
                 weights = tuple(a - b for a, b in zip(fine.weights, coarse.weights, strict=True))
                 result.append(Step(1 / (1 / fine.pitch - 1 / coarse.pitch), weights))
     return result
+
+
+def _span(step: Step) -> float:
+    """Projector px on which a wave is unambiguous: its pitch, less what noise can carry over both ends."""
+    return step.pitch * (1 - SIGMAS * PLANNED_SIGMA * float(np.linalg.norm(step.weights)) / np.pi)
 
 
 def _margin(coarse: Step, fine: Step) -> float:

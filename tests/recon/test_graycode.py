@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from fringe_scenes import NOISE, photograph
+from tests.recon.fringe_scenes import NOISE, photograph
 
 from recon.graycode import fringe_order
 from recon.patterns import Fringes, GrayCode, Patterns
