@@ -14,15 +14,20 @@ DARKEST = 4.0  # DN of modulation
 REFINEMENTS = 4  # of the point along its ray; each divides the error by some hundred
 
 
-def reconstruct(images: NDArray[np.uint8], patterns: Patterns, camera: Camera, projector: Camera) -> tuple[Array, Array]:
-    """Projector columns : (h, w) px and points : (h, w, 3) mm of a centre line followed by N-step fringes."""
+def reconstruct(
+    images: NDArray[np.uint8], patterns: Patterns, rays: Array, centre: Array, projector: Camera
+) -> tuple[Array, Array]:
+    """Projector columns : (h, w) px and points : (h, w, 3) mm of a centre line followed by N-step fringes.
+
+    rays : (h, w, 3), unit, and centre : (3,) mm, of the camera in the world.
+    """
     line, fringes = patterns.parts
     assert isinstance(line, CentreLine) and isinstance(fringes, Fringes)
     phase, modulation, offset = wrapped_phase(images[1:].astype(float), fringes.shifts)
     bright = (images[0] - offset) / np.maximum(modulation, 1)
     seeds = (bright > 0.5) & (np.abs(phase) < np.pi / 2) & (modulation > DARKEST)
     columns = fringes.zero(patterns.length("columns")) + fringes.pitch / (2 * np.pi) * flood(phase, modulation > DARKEST, seeds)
-    return columns, triangulate(columns, camera, projector)
+    return columns, triangulate(columns, rays, centre, projector)
 
 
 def wrapped_phase(images: Array, shifts: Array) -> tuple[Array, Array, Array]:
@@ -58,17 +63,16 @@ def flood(phase, valid, seeds):
     return result
 
 
-def triangulate(columns: Array, camera: Camera, projector: Camera) -> Array:
+def triangulate(columns: Array, rays: Array, centre: Array, projector: Camera) -> Array:
     """Points where the rays meet the projector's columns : (h, w, 3) mm."""
-    rays = camera.rays(camera.pixel_grid())
-    origin = rigid.apply(projector.camera_from_world, camera.centre)
+    origin = rigid.apply(projector.camera_from_world, centre)
     directions = rigid.rotate(projector.camera_from_world, rays)
 
     def meet(ideal: Array) -> Array:
         """Points where the rays meet columns of a lens without distortion."""
         x = (ideal - projector.matrix[0, 2]) / projector.matrix[0, 0]
         distance = (x * origin[2] - origin[0]) / (directions[..., 0] - x * directions[..., 2])
-        return camera.centre + distance[..., None] * rays
+        return centre + distance[..., None] * rays
 
     ideal = columns.copy()
     for _ in range(REFINEMENTS):

@@ -16,8 +16,8 @@ from recon.decode import ProjectorMap
 Float32 = NDArray[np.float32]
 
 MAX_STEPS = 15
-TOLERANCE = 1e-6  # projector px
-CURVATURE = 0.02  # 1/px: how much the slope may change a projector px; a secant step leaves the last two times this
+TOLERANCE = 1e-6  # projector px, of the solution
+LAST_STEP = 1e-3  # projector px: a secant step after one so short leaves far less than the tolerance
 SECANT = 1e-4  # mm: below it, two projections are too close to each other for their difference to give a slope
 SIGMA_FLOOR = 1e-6  # projector px: keeps weights finite where a map claims to be perfect
 
@@ -89,16 +89,9 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera) 
     return Triangulator(camera, projector)(projector_map)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _project(t, ox, oy, oz, ex, ey, ez, matrix, coefficients):
-    """Projector pixel of the ray's point at t."""
-    nearness = 1 / (oz + t * ez)
-    x, y = distort((ox + t * ex) * nearness, (oy + t * ey) * nearness, coefficients)
-    return matrix[0] * x + matrix[1] * y + matrix[2], matrix[3] * x + matrix[4] * y + matrix[5]
-
-
 @njit(cache=True, parallel=True, error_model="numpy")
 def _triangulate(rays, centre, projector, decoded, points, sigma):
+    """Solve all pixels of an image row side by side, without branches, so that they share vector instructions."""
     projector_from_world, matrix, coefficients = projector
     columns, sigma_columns, rows, sigma_rows = decoded
     height, width, _ = rays.shape
@@ -106,68 +99,63 @@ def _triangulate(rays, centre, projector, decoded, points, sigma):
     ox, oy, oz = rotation @ centre + translation
     has_columns, has_rows = columns.shape[0] == height, rows.shape[0] == height
     for j in prange(height):
+        ex, ey, ez, t, u, v, su, sv, wu, wv, column, row = np.empty((12, width))
+        certain = np.ones(width, np.bool_)
         for i in range(width):
-            points[j, i, 0] = points[j, i, 1] = points[j, i, 2] = sigma[j, i] = np.nan
-            column = float(columns[j, i]) if has_columns else np.nan
-            row = float(rows[j, i]) if has_rows else np.nan
             dx, dy, dz = rays[j, i, 0], rays[j, i, 1], rays[j, i, 2]
-            by_column, by_row = np.isfinite(column), np.isfinite(row)
-            if not (by_column or by_row) or not np.isfinite(dx):
-                continue
-            ex = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
-            ey = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz
-            ez = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
-
-            # weights of the two axes: the inverse variances
-            wu = wv = 0.0
-            known = True
-            if by_column:
-                s = float(sigma_columns[j, i])
-                known = s >= 0
-                wu = 1 / max(s, SIGMA_FLOOR) ** 2 if s >= 0 else 1.0
-            if by_row:
-                s = float(sigma_rows[j, i])
-                known = known and s >= 0
-                wv = 1 / max(s, SIGMA_FLOOR) ** 2 if s >= 0 else 1.0
-
+            ex[i] = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
+            ey[i] = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz
+            ez[i] = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
+        column[:], wu[:], row[:], wv[:] = 0, 0, 0, 0
+        if has_columns:
+            _weigh(columns[j], sigma_columns[j], column, wu, certain)
+        if has_rows:
+            _weigh(rows[j], sigma_rows[j], row, wv, certain)
+        for i in range(width):
             # start: where the ray meets the plane of the projector's column (or row), lens distortion left out
-            if wu * (matrix[0] * (ex * oz - ox * ez)) ** 2 >= wv * (matrix[4] * (ey * oz - oy * ez)) ** 2:
-                x = (column - matrix[2]) / matrix[0]
-                t = (x * oz - ox) / (ex - x * ez)
-            else:
-                y = (row - matrix[5]) / matrix[4]
-                t = (y * oz - oy) / (ey - y * ez)
-            z = oz + t * ez
-            if not (t > 0 and z > 0):
-                continue
-            su = (matrix[0] * (ex * oz - ox * ez) + matrix[1] * (ey * oz - oy * ez)) / (z * z)
-            sv = (matrix[3] * (ex * oz - ox * ez) + matrix[4] * (ey * oz - oy * ez)) / (z * z)
+            along_u, along_v = ex[i] * oz - ox * ez[i], ey[i] * oz - oy * ez[i]
+            x, y = (column[i] - matrix[2]) / matrix[0], (row[i] - matrix[5]) / matrix[4]
+            by_column, by_row = (x * oz - ox) / (ex[i] - x * ez[i]), (y * oz - oy) / (ey[i] - y * ez[i])
+            t[i] = by_column if wu[i] * (matrix[0] * along_u) ** 2 >= wv[i] * (matrix[4] * along_v) ** 2 else by_row
+            nearness = 1 / (oz + t[i] * ez[i])
+            su[i] = (matrix[0] * along_u + matrix[1] * along_v) * nearness * nearness
+            sv[i] = (matrix[3] * along_u + matrix[4] * along_v) * nearness * nearness
+            xd, yd = distort((ox + t[i] * ex[i]) * nearness, (oy + t[i] * ey[i]) * nearness, coefficients)
+            u[i], v[i] = matrix[0] * xd + matrix[1] * yd + matrix[2], matrix[3] * xd + matrix[4] * yd + matrix[5]
+        # Gauss-Newton; the slopes of the distorted projection come from its last two values
+        for _ in range(MAX_STEPS):
+            unsolved = 0
+            for i in range(width):
+                gradient = wu[i] * su[i] * (column[i] - u[i]) + wv[i] * sv[i] * (row[i] - v[i])
+                step = gradient / (wu[i] * su[i] * su[i] + wv[i] * sv[i] * sv[i])
+                t[i] += step
+                nearness = 1 / (oz + t[i] * ez[i])
+                xd, yd = distort((ox + t[i] * ex[i]) * nearness, (oy + t[i] * ey[i]) * nearness, coefficients)
+                un, vn = matrix[0] * xd + matrix[1] * yd + matrix[2], matrix[3] * xd + matrix[4] * yd + matrix[5]
+                far = abs(step) > SECANT
+                su[i] = (un - u[i]) / step if far else su[i]
+                sv[i] = (vn - v[i]) / step if far else sv[i]
+                u[i], v[i] = un, vn
+                unsolved += abs(step) * (abs(su[i]) + abs(sv[i])) > LAST_STEP
+            if unsolved == 0:
+                break
+        for i in range(width):
+            curvature = wu[i] * su[i] * su[i] + wv[i] * sv[i] * sv[i]
+            missing = (wu[i] * su[i] * (column[i] - u[i]) + wv[i] * sv[i] * (row[i] - v[i])) / curvature
+            solved = abs(missing) * (abs(su[i]) + abs(sv[i])) < TOLERANCE and t[i] > 0 and oz + t[i] * ez[i] > 0
+            distance = t[i] if solved else np.nan
+            points[j, i, 0] = centre[0] + distance * rays[j, i, 0]
+            points[j, i, 1] = centre[1] + distance * rays[j, i, 1]
+            points[j, i, 2] = centre[2] + distance * rays[j, i, 2]
+            sigma[j, i] = 1 / np.sqrt(curvature) if solved and certain[i] else np.nan
 
-            # Gauss-Newton; the slopes of the distorted projection come from its last two values
-            u, v = _project(t, ox, oy, oz, ex, ey, ez, matrix, coefficients)
-            converged = False
-            previous = 1.0  # px
-            for _ in range(MAX_STEPS):
-                gradient = 0.0
-                if by_column:
-                    gradient += wu * su * (column - u)
-                if by_row:
-                    gradient += wv * sv * (row - v)
-                step = gradient / (wu * su * su + wv * sv * sv)
-                size = abs(step) * max(abs(su) * by_column, abs(sv) * by_row)
-                t += step
-                if size * min(previous, 1.0) * CURVATURE < TOLERANCE:
-                    converged = True
-                    break
-                previous = size
-                u_new, v_new = _project(t, ox, oy, oz, ex, ey, ez, matrix, coefficients)
-                if abs(step) > SECANT:
-                    su, sv = (u_new - u) / step, (v_new - v) / step
-                u, v = u_new, v_new
-            if not (converged and t > 0 and oz + t * ez > 0):
-                continue
-            points[j, i, 0] = centre[0] + t * dx
-            points[j, i, 1] = centre[1] + t * dy
-            points[j, i, 2] = centre[2] + t * dz
-            if known:
-                sigma[j, i] = 1 / np.sqrt(wu * su * su + wv * sv * sv)
+
+@njit(inline="always", error_model="numpy")
+def _weigh(values, sigmas, value, weight, certain):
+    """One axis of an image row, ready for sums: weight 0 where it is unknown, 1 and not certain where it has no sigma."""
+    for i in range(value.size):
+        known, measured = np.isfinite(values[i]), sigmas[i] >= 0
+        value[i] = values[i] if known else 0.0
+        inverse = 1 / max(float(sigmas[i]), SIGMA_FLOOR) if measured else 1.0
+        weight[i] = inverse * inverse if known else 0.0
+        certain[i] &= measured or not known
