@@ -21,7 +21,7 @@ SLACK = 0.008  # cycle (0.05 rad) of mismatch that third derivatives and texture
 SIGMAS = 4.5  # of the stencil's noise; one in 150 000 comparisons fails by chance
 STENCIL_NOISE = 2.7 / (2 * math.pi)  # cycle a rad: sqrt(2 (1.75^2 + 0.75^2)) = 2.69
 REACH = 8  # px that an order is carried along clean pixels, less than two cells of the unwrapping
-BLIND_REACH = 4  # px that it is carried where the stencil is incomplete: the stencil's own reach
+BLIND_REACH = 5  # px that it is carried where the stencil is incomplete: the stencil's own reach
 
 
 @njit(inline="always")
@@ -163,7 +163,7 @@ def carry(order, known, phase, sigma, flags, wanted, reach):
                     total += slope + change
                 if not smooth or abs(total - start - distance * slope) > 2 * tolerance:
                     continue
-                here = int(math.floor(total - phase[v, u] + 0.5))
+                here = math.floor(total - phase[v, u] + 0.5)
                 clash = clash or (ways > 0 and here != candidate)
                 candidate, ways = here, ways + 1
             if ways > 0 and not clash:

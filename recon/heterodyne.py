@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.graycode import Orders
@@ -56,7 +55,7 @@ def ladder(pitches: Sequence[float], length: float) -> list[Step]:
     sigmas, path = best
     if sigmas < SIGMAS:
         raise InputError(
-            f"patterns: pitches {_listed(pitches)} px leave {sigmas:.1f} sigma at {PLANNED_SIGMA} rad of phase noise, expected {SIGMAS:g}"
+            f"patterns: pitches {_listed(pitches)} px leave {sigmas:.1f} sigma at {PLANNED_SIGMA} rad, expected {SIGMAS:g}"
         )
     return path
 

@@ -11,7 +11,7 @@ Image = NDArray[np.float32]
 
 QUANTISATION = 1 / 12  # DN^2, variance of rounding to whole digital numbers
 MIN_STEPS_FOR_NOISE = 8  # below eight steps no temporal harmonic is free of the projector's second and third
-NOISE_SAMPLES = 60_000  # pixels looked at; enough for 1 % in the variance
+NOISE_SAMPLES = 40_000  # pixels looked at; enough for 1 % in the variance
 
 
 PI, HALF_PI = np.float32(np.pi), np.float32(np.pi / 2)

@@ -10,7 +10,6 @@ Only a jump that is a whole number of periods (within the noise) along most of t
 as it fools anything that sees the phase alone: Gray code or a second pitch is needed there.
 """
 
-import heapq
 from collections import Counter, defaultdict
 from dataclasses import dataclass
 
@@ -22,14 +21,12 @@ from numpy.typing import NDArray
 from recon import continuity
 from recon.continuity import CLEAN, INCOMPLETE, TORN, VOID, wrap
 from recon.phase import Fringe
+from recon.regions import Borders, join
 
 CELL = 4  # px; a cell's side
 BOTTLENECK = 1  # cells; a basin whose half width is more than its outlet's by more than this is cut off there
-CONTINUOUS = 0.85  # share of the common border of two basins that must be continuous for them to be one region
 MARGIN_CELLS = 3  # cells that a basin grows into torn ground, so that neighbours across a tear meet
 LINE_LEVEL = 0.25  # of full light: brighter is the line
-VOTES = 5  # rows in which the line must be seen on a region
-AGREEMENT = 0.85  # share of the votes that must name one order
 RESIDUAL = 0.2  # cycle that a vote may be off a whole order
 NONE = 127  # no offset between two cells
 
@@ -49,14 +46,6 @@ class Unwrapped:
     islands: int  # without
     disputed: int  # in which the line's votes disagree
     votes: int  # sightings of the line on continuous surface
-
-
-@dataclass(frozen=True)
-class Borders:
-    """How basins touch: the number of continuous contacts by order offset (q less p), and of torn ones."""
-
-    continuous: dict[tuple[int, int], Counter]  # (p, q), p < q
-    torn: Counter  # of (p, q), p < q
 
 
 def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: float) -> Unwrapped:
@@ -86,18 +75,19 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     distance = _distance(state)
     basin, offset, broken = _flood(distance, right, down)
     basin, broken, count = _number(basin, broken)
-    sightings, values = _sight(line, fringe.offset, fringe.modulation, fringe.sigma, valid, phase, relative, basin, offset, turns, width)
+    light = (line, fringe.offset, fringe.modulation, fringe.sigma)
+    sightings, values = _sight(*light, valid, phase, relative, basin, offset, turns, width)
     votes: dict[int, Counter] = defaultdict(Counter)
     for place, value in zip(sightings.tolist(), values.tolist(), strict=True):
         votes[place][value] += 1
     ground = _grow(state, basin)
-    region, lift, absolute, disputed = _regions(count, _borders(state, ground, offset, right, down), votes, broken)
-    base = np.array([absolute.get(r, 0) for r in region.tolist()], np.int32)
-    resolved = np.array([r in absolute for r in region.tolist()], bool)
-    contested = np.array([r in disputed for r in region.tolist()], bool)
-    cells = offset + np.append(base + lift, 0)[basin].astype(np.int32)
-    home = np.where(basin >= 0, np.append(region, -1)[basin], -1).astype(np.int32)
-    frontier = _frontier(np.where(ground >= 0, np.append(region, -1)[ground], -1))
+    found = join(count, _borders(state, ground, offset, right, down), votes, broken)
+    base = np.array([found.absolute.get(r, 0) for r in found.region.tolist()], np.int32)
+    resolved = np.array([r in found.absolute for r in found.region.tolist()], bool)
+    contested = np.array([r in found.disputed for r in found.region.tolist()], bool)
+    cells = offset + np.append(base + found.lift, 0)[basin].astype(np.int32)
+    home = np.where(basin >= 0, np.append(found.region, -1)[basin], -1).astype(np.int32)
+    frontier = _frontier(np.where(ground >= 0, np.append(found.region, -1)[ground], -1))
     # A continuous cell right at the frontier may hold pixels of both surfaces; no order is carried within two cells of it.
     closed = _leaks(distance, home, cells, right, down) | _dilated(frontier, 1) | ((basin < 0) & _dilated(frontier, 2))
     reached = (basin >= 0) & np.append(resolved, False)[basin] & ~closed
@@ -105,8 +95,8 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     order, known, unreachable = _to_pixels(relative, flags, basin, cells, reached, island, closed)
     order, known = continuity.carry(order, known, phase, fringe.sigma, flags, CLEAN, continuity.REACH)
     order, known = continuity.carry(order, known, phase, fringe.sigma, flags, INCOMPLETE, continuity.BLIND_REACH)
-    islands = len(set(region.tolist()) - set(absolute) - disputed)
-    return Unwrapped(order, known, unreachable, len(absolute), islands, len(disputed), len(values))
+    islands = len(set(found.region.tolist()) - set(found.absolute) - found.disputed)
+    return Unwrapped(order, known, unreachable, len(found.absolute), islands, len(found.disputed), len(values))
 
 
 @njit(cache=True, parallel=True)
@@ -196,6 +186,21 @@ def _find(parent, shift, cell):
 
 
 @njit(cache=True)
+def _descending(distance):
+    """Indices of the cells from the greatest distance to the least: counting sort."""
+    top = distance.max()
+    start = np.zeros(top + 2, np.int64)
+    for value in distance:
+        start[top - value + 1] += 1
+    start = np.cumsum(start)
+    order = np.empty(distance.size, np.int32)
+    for cell, value in enumerate(distance):
+        order[start[top - value]] = cell
+        start[top - value] += 1
+    return order
+
+
+@njit(cache=True)
 def _flood(distance, right, down):
     """Gather cells into basins, from the widest places to the narrow ones: a watershed of the distance to the nearest gap.
 
@@ -213,7 +218,7 @@ def _flood(distance, right, down):
     peak = distance.copy().ravel()
     seen = np.zeros(count, np.bool_)
     flat = distance.ravel()
-    for cell in np.argsort(-flat, kind="mergesort"):
+    for cell in _descending(flat):
         level = flat[cell]
         if level == 0:
             break
@@ -304,8 +309,9 @@ def _borders(state: Flags, ground: Integers, offset: Integers, right: NDArray[np
         p, q, step = ground[here], ground[there], steps[here]
         meet = (p != q) & (p >= 0) & (q >= 0)
         jump = step + offset[here] - offset[there]  # order of q's root less that of p's, as the two cells see it
-        rip = meet & (step == NONE) & ((state[here] == TORN) | (state[there] == TORN) | ((state[here] == CLEAN) & (state[there] == CLEAN)))
-        for a, b, k in zip(p[meet & (step != NONE)].tolist(), q[meet & (step != NONE)].tolist(), jump[meet & (step != NONE)].tolist(), strict=True):
+        ripped = (state[here] == TORN) | (state[there] == TORN) | ((state[here] == CLEAN) & (state[there] == CLEAN))
+        whole, rip = meet & (step != NONE), meet & (step == NONE) & ripped
+        for a, b, k in zip(p[whole].tolist(), q[whole].tolist(), jump[whole].tolist(), strict=True):
             continuous[min(a, b), max(a, b)][k if a < b else -k] += 1
         torn.update((min(a, b), max(a, b)) for a, b in zip(p[rip].tolist(), q[rip].tolist(), strict=True))
     return Borders(continuous, torn)
@@ -327,98 +333,6 @@ def _grow(state, basin):
                         ground[i, j] = before[i + di, j + dj]
                         break
     return ground
-
-
-def _regions(
-    count: int, borders: Borders, votes: dict[int, Counter], broken: set[int]
-) -> tuple[Integers, Integers, dict[int, int], set[int]]:
-    """Join basins into regions over continuous borders, the longest first, and anchor them by the line's votes.
-
-    Returns
-    -------
-    region : (count,) int32, the region of each basin, named by one of its basins
-    lift : (count,) int32, the order of each basin's root less that of its region's
-    absolute : the absolute order of each region's root, for regions with the line
-    disputed : regions whose votes disagree, or whose inside contradicts itself
-    """
-    region, lift = np.arange(count, dtype=np.int32), np.zeros(count, np.int32)
-    members = {p: [p] for p in range(count)}
-    anchored = {p: order for p, tally in votes.items() if (order := _verdict(tally)) is not None}
-    refused = broken | {p for p, tally in votes.items() if tally.total() >= VOTES and p not in anchored}
-    links: dict[int, dict[int, Counter]] = defaultdict(dict)
-    torn: dict[int, Counter] = defaultdict(Counter)
-    for (p, q), offsets in borders.continuous.items():
-        if not {p, q} & refused:
-            links[p][q], links[q][p] = Counter(offsets), Counter({-k: n for k, n in offsets.items()})
-    for (p, q), n in borders.torn.items():
-        torn[p][q] += n
-        torn[q][p] += n
-
-    def proposal(p: int, q: int) -> tuple[float, int] | None:
-        """How strongly p and q are one surface, and the order of q's root less p's; None if they can't be."""
-        offsets = links[p][q]
-        if p in anchored and q in anchored:
-            k = anchored[q] - anchored[p]
-            return (offsets[k], k) if offsets[k] else None
-        k, n = offsets.most_common(1)[0]
-        share = n / (offsets.total() + torn[p][q])
-        return (n * share, k) if share >= CONTINUOUS else None
-
-    age = [0] * count
-    queue: list[tuple[float, int, int, int]] = []
-
-    def propose(p: int, q: int) -> None:
-        if (found := proposal(p, q)) is not None:
-            heapq.heappush(queue, (-found[0], p, q, age[p] + age[q]))
-
-    for p, q in borders.continuous:
-        if q in links[p]:
-            propose(p, q)
-    while queue:
-        _, p, q, born = heapq.heappop(queue)
-        if q not in links[p] or born != age[p] + age[q]:
-            continue
-        _, k = proposal(p, q) or (0, 0)
-        if len(members[p]) < len(members[q]):
-            p, q, k = q, p, -k
-        for basin in members[q]:
-            region[basin], lift[basin] = p, lift[basin] + k
-        members[p] += members.pop(q)
-        if q in anchored:
-            anchored.setdefault(p, anchored.pop(q) - k)
-        del links[p][q], links[q][p]
-        for other, n in torn.pop(q, Counter()).items():
-            torn[p][other] += n
-            torn[other][p] += n
-        for other, offsets in links.pop(q).items():
-            moved = Counter({step + k: n for step, n in offsets.items()})
-            del links[other][q]
-            links[p][other] = links[p].get(other, Counter()) + moved
-            links[other][p] = Counter({-step: n for step, n in links[p][other].items()})
-        age[p] += 1
-        for other in links[p]:
-            propose(p, other)
-
-    absolute, disputed = {}, set()
-    for name, basins in members.items():
-        tally: Counter = Counter()
-        for basin in basins:
-            for order, n in votes.get(basin, Counter()).items():
-                tally[order - int(lift[basin])] += n
-        verdict = _verdict(tally)
-        if refused & set(basins) or (verdict is None and tally.total() >= VOTES):
-            disputed.add(name)
-        elif verdict is not None:
-            absolute[name] = verdict
-    return region, lift, absolute, disputed
-
-
-def _verdict(tally: Counter) -> int | None:
-    """The order that nearly all votes name, None if too few vote or they disagree."""
-    if tally.total() < VOTES:
-        return None
-    order, n = tally.most_common(1)[0]
-    return order if n >= AGREEMENT * tally.total() else None
 
 
 @njit(cache=True)
@@ -463,7 +377,10 @@ def _dilated(mask: Mask, cells: int) -> Mask:
 
 @njit(cache=True, parallel=True)
 def _to_pixels(relative, flags, basin, cells, reached, island, closed):
-    """Orders of the cells to their pixels. Islands, leaks and frontiers are marked in the flags, so that no order is carried into them."""
+    """Orders of the cells to their pixels.
+
+    Islands, leaks and frontiers are marked in the flags, so that no order is carried into them.
+    """
     height, width = flags.shape
     rows, columns = basin.shape
     order = np.zeros((height, width), np.int32)

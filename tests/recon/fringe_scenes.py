@@ -32,11 +32,12 @@ def photograph(
         fine = np.repeat(np.asarray(profile, float) ** (1.0 if binary else gamma), oversample)
         offsets = np.arange(-6 * oversample, 6 * oversample + 1)
         kernel = np.exp(-0.5 * (offsets / (max(blur, 0.05) * oversample)) ** 2)
+        places = (np.arange(length * oversample) + 0.5) / oversample - 0.5
         if not binary:  # grey levels vary slowly: interpolate them, so that the map's truth isn't quantised to the raster
-            fine = np.interp((np.arange(length * oversample) + 0.5) / oversample - 0.5, np.arange(length), np.asarray(profile, float) ** gamma)
+            fine = np.interp(places, np.arange(length), np.asarray(profile, float) ** gamma)
         fine = np.convolve(np.pad(fine, len(offsets) // 2, mode="edge"), kernel / kernel.sum(), mode="valid")
         x = maps[axis]
-        level = np.interp(np.nan_to_num(x, nan=-1e9), (np.arange(length * oversample) + 0.5) / oversample - 0.5, fine, left=0, right=0)
+        level = np.interp(np.nan_to_num(x, nan=-1e9), places, fine, left=0, right=0)
         level[np.isnan(x)] = 0
         image = np.asarray(ambient) + np.asarray(light) * level
         image = image + rng.normal(size=image.shape) * np.sqrt(np.maximum(noise.read_variance - 1 / 12 + noise.gain * image, 0))
@@ -45,17 +46,16 @@ def photograph(
 
 
 def breast(shape: tuple[int, int] = (1024, 1280), middle: float = 639.5) -> NDArray[np.float64]:
-    """Projector columns : (h, w) of a dome on a table, with the shadow of its flank; jumps at the shadow's border."""
+    """Projector columns : (h, w) of a smooth dome on a table, with the shadow of its flank; NaN in shadow."""
     height, width = shape
     v, u = np.mgrid[:height, :width].astype(float)
-    z = np.sqrt(np.clip(1 - ((u - 0.5 * width) / (0.36 * width)) ** 2 - ((v - 0.5 * height) / (0.4 * height)) ** 2, 0, None))
-    x = middle + 0.55 * (u - width / 2) + 0.02 * (v - height / 2) + 0.032 * width * z
-    shadow = (z == 0) & (u > 0.7 * width) & (((u - 0.56 * width) / (0.36 * width)) ** 2 + ((v - 0.5 * height) / (0.4 * height)) ** 2 < 1)
-    x[shadow] = np.nan
+    radius = np.hypot((u - 0.5 * width) / (0.36 * width), (v - 0.5 * height) / (0.45 * height))
+    x = middle + 0.55 * (u - width / 2) + 0.02 * (v - height / 2) + 0.04 * width * np.cos(np.pi / 2 * np.clip(radius, 0, 1)) ** 2
+    x[(np.hypot((u - 0.56 * width) / (0.36 * width), (v - 0.5 * height) / (0.45 * height)) < 1) & (radius > 1)] = np.nan
     return x
 
 
-def island(rng: np.random.Generator, shape: tuple[int, int] = (480, 640), middle: float = 639.5) -> tuple[NDArray, NDArray]:
+def island(rng: np.random.Generator, shape: tuple[int, int] = (320, 480), middle: float = 639.5) -> tuple[NDArray, NDArray]:
     """A slanted background with the line, and a nearer object off the line, in shadow on one side and touching on the other.
 
     Returns the projector columns : (h, w), NaN in shadow, and the object's mask : (h, w). The jump along the touching border
@@ -74,3 +74,12 @@ def island(rng: np.random.Generator, shape: tuple[int, int] = (480, 640), middle
     x = np.where(inside, raised, x)
     x[shadow] = np.nan
     return x, inside
+
+
+def whole_jumps(x: NDArray, inside: NDArray, pitch: float) -> float:
+    """Share of an object's touching border whose jump is a whole number of periods, to 0.4 rad: what no phase can see."""
+    jumps = []
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        jump = (x[there] - x[here])[inside[here] != inside[there]] / pitch
+        jumps += jump[np.isfinite(jump)].tolist()
+    return float(np.mean(np.abs(jumps - np.rint(jumps)) < 0.4 / (2 * np.pi)))

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from tests.recon.fringe_scenes import NOISE, photograph
 
 from recon.graycode import fringe_order
 from recon.patterns import Fringes, GrayCode, Patterns
 from recon.phase import wrapped_phase
+from tests.recon.fringe_scenes import NOISE, photograph
 
 
 def orders(code, fringes, x, rng, **light):

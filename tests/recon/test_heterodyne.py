@@ -54,7 +54,8 @@ def test_trusted_pixels_are_right_under_noise(rng, sigma):
 
 def test_contradicting_phases_are_refused(rng):
     """Unrelated phases in the three sets end anywhere between two orders; those near the middle are dropped."""
-    sets = [(Fringes(pitch=p, steps=8), measured(Fringes(pitch=p, steps=8), rng.uniform(0, 1279, (50, 60)), 0.01, rng)) for p in (12, 126, 1332)]
+    fringes = [Fringes(pitch=pitch, steps=8) for pitch in (12, 126, 1332)]
+    sets = [(f, measured(f, rng.uniform(0, 1279, (50, 60)), 0.01, rng)) for f in fringes]
     trusted = fringe_order(sets, 1280).trusted
     assert trusted.mean() < 0.6
 
@@ -63,7 +64,7 @@ def test_pitches_that_cannot_cover_the_axis_are_refused():
     with pytest.raises(InputError, match="unambiguous over 70 px, expected 1280"):
         ladder([12, 72], 1280)
     with pytest.raises(InputError, match="sigma"):
-        ladder([12, 12.11], 1280)
+        ladder([12, 12.1], 1280)
 
 
 def test_the_safest_way_is_taken():

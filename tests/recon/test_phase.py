@@ -55,7 +55,8 @@ def test_predicted_noise_is_the_noise(rng, n, uneven):
 def test_sigma_of_even_shifts_is_the_textbook_formula():
     """For equal noise in all images, sigma = sqrt(2 / N) * sigma_I / B."""
     shifts = 2 * np.pi * np.arange(8) / 8
-    found = wrapped_phase(fringes(np.full((1, 9), 0.7), shifts).astype(np.float32), shifts, noise=Noise(2.25, 0.0), saturation=255)
+    images = fringes(np.full((1, 9), 0.7), shifts).astype(np.float32)
+    found = wrapped_phase(images, shifts, noise=Noise(2.25, 0.0), saturation=255)
     assert found.sigma == pytest.approx(np.sqrt(2 / 8) * 1.5 / 80, rel=1e-4)
 
 
