@@ -90,6 +90,7 @@ def test_noise_is_measured_through_gamma(rng, n, truth):
     images = light * ((1 + np.cos(0.3 * u + 0.05 * v + shifts[:, None, None])) / 2) ** 2.2 + 3
     images[:, :60, :60] = 0
     found = estimate_noise(noisy(images, rng, truth), shifts)
+    assert found is not None
     for level in (20.0, 50.0, 90.0):
         assert found.read_variance + found.gain * level == pytest.approx(truth.read_variance + truth.gain * level, rel=0.05)
 

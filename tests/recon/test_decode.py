@@ -1,0 +1,172 @@
+"""From images to projector coordinates: round trips, predicted noise, and refusals of bad captures."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon.decode import Status, decode
+from recon.errors import InputError
+from recon.patterns import Patterns
+from recon.phase import Noise
+from tests.recon.fringe_scenes import NOISE, breast, photograph
+
+ROOT = Path(__file__).resolve().parents[2]
+SEQUENCES = ["paper_surface", "paper_calibration", "gray_surface", "multi_frequency", "twelve_step_gray"]
+SHAPE = (200, 260)
+
+
+def load(name: str) -> Patterns:
+    return Patterns(**yaml.safe_load((ROOT / f"conf/patterns/{name}.yaml").read_text(encoding="utf-8")))
+
+
+def smooth_maps(patterns, rng, shape=SHAPE):
+    """Arbitrary smooth maps of both axes, well inside the projector's image, across its middle."""
+    v, u = np.mgrid[: shape[0], : shape[1]].astype(float)
+    maps = {}
+    for axis, along, across in (("columns", u, v), ("rows", v, u)):
+        length = patterns.length(axis)
+        x = rng.uniform(0.4, 0.8) * (along - along.mean()) + rng.uniform(-0.2, 0.2) * (across - across.mean())
+        x += rng.uniform(0, 3) * np.sin(along / rng.uniform(20, 60) + across / rng.uniform(30, 90))
+        maps[axis] = (length - 1) / 2 + x
+    return maps
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+@settings(max_examples=6, deadline=None)
+@given(seed=st.integers(0, 2**31))
+def test_round_trip(name, seed):
+    """Pattern -> camera -> decode gives back the map to the predicted noise, for arbitrary smooth maps and each sequence."""
+    rng, patterns = np.random.default_rng(seed), load(name)
+    maps = smooth_maps(patterns, rng)
+    blur = 4.0 if name == "paper_calibration" else 0.6  # binary fringes are made to be defocused
+    found = decode(photograph(patterns, maps, rng, light=rng.uniform(60, 200), blur=blur), patterns)
+    ok = found.status == Status.OK
+    assert ok.mean() > 0.95
+    for axis, value, sigma in (("columns", found.columns, found.sigma_columns), ("rows", found.rows, found.sigma_rows)):
+        if axis not in patterns.axes:
+            assert value is None and sigma is None
+            continue
+        assert value is not None and sigma is not None
+        error = (value - maps[axis])[ok]
+        assert np.abs(error).max() < 6 * np.max(sigma[ok])
+        assert np.isnan(value[~np.isfinite(sigma)]).all()
+
+
+def test_predicted_coordinate_noise_is_the_noise(rng):
+    """Column errors, divided by their predicted sigma, are standard normal, with the noise measured from the capture."""
+    patterns = load("paper_surface")
+    x = breast((512, 640))
+    found = decode(photograph(patterns, {"columns": x}, rng, light=150), patterns)
+    ok = found.status == Status.OK
+    assert found.columns is not None and found.sigma_columns is not None
+    z = (found.columns - x)[ok] / found.sigma_columns[ok]
+    # 5 standard errors, and 2.5 % for the measured noise (5 % in variance).
+    assert abs(z.std() - 1) < 5 / np.sqrt(2 * z.size) + 0.025
+    assert found.noise.gain == pytest.approx(NOISE.gain, rel=0.1)
+
+
+def test_a_given_noise_is_used(rng):
+    patterns = load("gray_surface")
+    images = photograph(patterns, smooth_maps(patterns, rng), rng)
+    loud, quiet = (decode(images, patterns, noise=Noise(v, 0.0)) for v in (4.0, 1.0))
+    assert quiet.sigma_columns is not None
+    assert loud.sigma_columns == pytest.approx(2 * quiet.sigma_columns, rel=1e-4, nan_ok=True)
+
+
+def test_islands_are_no_obstacle_to_gray_code(rng):
+    """Steps that break spatial unwrapping leave Gray code and heterodyne untouched."""
+    u = np.mgrid[:200, :260][1].astype(float)
+    x = 639.5 + 0.55 * (u - 130) + 50 * ((u // 40) % 2)
+    for name in ("gray_surface", "multi_frequency"):
+        patterns = load(name)
+        found = decode(photograph(patterns, {"columns": x}, rng), patterns)
+        ok = found.status == Status.OK
+        assert ok.mean() > 0.97
+        assert np.abs(found.columns - x)[ok].max() < 1
+
+
+def test_status_says_why(rng):
+    """Dark, saturated and outside pixels are told apart."""
+    patterns = load("gray_surface")
+    u = np.mgrid[:200, :260][1].astype(float)
+    x = 1150 + 0.6 * u  # leaves the projector's image at the right
+    light = np.where(u < 40, 2.0, np.where(u < 80, 400.0, 150.0))
+    shown = np.clip(x, None, 1279.4)
+    found = decode(photograph(patterns, {"columns": shown}, rng, light=light), patterns)
+    assert np.mean(found.status[:, :40] == Status.DARK) > 0.99
+    assert np.mean(found.status[:, 42:78] == Status.SATURATED) > 0.99
+    assert np.mean(found.status[:, 82:200] == Status.OK) > 0.97
+    assert found.columns is not None
+    assert np.isnan(found.columns[found.status != Status.OK]).all()
+    assert sum(found.summary[s.name.lower()] for s in Status) == found.status.size
+
+
+def refused(images, patterns, match):
+    with pytest.raises(InputError, match=match) as caught:
+        decode(images, patterns, name="surface/cam1")
+    assert "\n" not in str(caught.value) and str(caught.value).startswith("surface/cam1")
+
+
+def test_black_saturated_and_missing_images_are_refused(rng):
+    patterns = load("paper_surface")
+    maps = smooth_maps(patterns, rng)
+    images = photograph(patterns, maps, rng)
+    refused(np.zeros_like(images), patterns, "images 1 to 8 hold no fringes")
+    refused(np.full_like(images, 255), patterns, "saturated")
+    refused(photograph(patterns, maps, rng, light=900.0), patterns, "saturated in .* shorten the exposure")
+    refused(images[:8], patterns, "expected 9 grey images")
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+@pytest.mark.parametrize("pair", [(1, 2), (3, 6), (4, 8), (5, 6), (2, 6)])
+def test_swapped_fringes_are_refused(rng, pair, gamma):
+    """Any two images of the sequence exchanged leave power where a sinusoid, even bent by gamma, has none."""
+    patterns = load("paper_surface")
+    images = photograph(patterns, smooth_maps(patterns, rng), rng, gamma=gamma)
+    images[list(pair)] = images[list(pair)[::-1]]
+    refused(images, patterns, f"8-step sequence, {pair[0]} and {pair[1]} look exchanged: are they in the manifest's order")
+
+
+def test_a_misplaced_or_missing_line_is_refused(rng):
+    patterns = load("paper_surface")
+    images = photograph(patterns, smooth_maps(patterns, rng), rng)
+    dark = images.copy()
+    dark[0] = 8
+    refused(dark, patterns, "image 0 shows no centre line")
+    refused(np.roll(images, -1, axis=0), patterns, "sequence|bright over")
+    repeated = images.copy()
+    repeated[0] = images[3]
+    refused(repeated, patterns, "image 0 is bright over")
+
+
+def test_swapped_bits_are_refused(rng):
+    """Two Gray images exchanged: orders jump where the phase continues."""
+    patterns = load("gray_surface")
+    x = 60 + 1160 * np.mgrid[:100, :1600][1] / 1600
+    images = photograph(patterns, {"columns": x}, rng)
+    for a, b in ((9, 10), (11, 13), (13, 14), (14, 15)):
+        swapped = images.copy()
+        swapped[[a, b]] = images[[b, a]]
+        refused(swapped, patterns, "fringe orders jump")
+
+
+def test_a_real_capture_decodes_smoothly(real):
+    """A plaster relief taken by others: no order error between neighbours, columns grow along the rows, little is lost."""
+    patterns = load("twelve_step_gray")
+    images = np.stack([cv2.imread(str(real / "fringe_capture" / f"{i:02d}.png"), cv2.IMREAD_GRAYSCALE) for i in range(18)])
+    found = decode(images, patterns)
+    steps = np.diff(found.columns, axis=1)
+    steps = steps[np.isfinite(steps)]
+    assert found.summary["ok"] > 200_000
+    assert found.summary["uncertain"] < 100
+    assert np.abs(steps).max() < 30
+    assert np.mean(steps > 0) > 0.99
+    swapped = images.copy()
+    swapped[[12, 13]] = images[[13, 12]]
+    with pytest.raises(InputError, match="fringe orders jump"):
+        decode(swapped, patterns)

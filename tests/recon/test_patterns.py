@@ -1,0 +1,84 @@
+"""Pattern sequences: do the files say what they mean, and do the patterns encode the coordinate?"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from recon.patterns import CentreLine, Fringes, GrayCode, Patterns
+
+ROOT = Path(__file__).resolve().parents[2]
+FILES = sorted((ROOT / "conf/patterns").glob("*.yaml"))
+COUNTS = {"paper_surface": 9, "paper_calibration": 50, "gray_surface": 16, "multi_frequency": 20, "twelve_step_gray": 18}
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda f: f.stem)
+def test_files_load_and_explain_each_field(file):
+    """Every sequence loads, has the images it announces, and each field of its first parts carries a comment."""
+    text = file.read_text(encoding="utf-8")
+    patterns = Patterns(**yaml.safe_load(text))
+    assert patterns.count == COUNTS.get(file.stem, patterns.count)
+    assert text.startswith("#")
+    assert f"{patterns.count} images" in text.split("projector_size")[0]
+    fields = [line for line in text.splitlines() if ":" in line and not line.startswith("#")]
+    explained = {line.split(":")[0].strip(" -") for line in fields if "#" in line}
+    assert {line.split(":")[0].strip(" -") for line in fields} - explained <= {"parts", "kind"}
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda f: f.stem)
+def test_images_are_the_profiles(file):
+    patterns = Patterns(**yaml.safe_load(file.read_text(encoding="utf-8")))
+    images = patterns.images()
+    assert images.shape == (patterns.count, *patterns.projector_size[::-1])
+    assert images.min() >= 0 and images.max() <= 1
+    assert patterns.slices()[-1][1].stop == patterns.count
+
+
+def test_fringes_carry_the_published_phase():
+    """The rig authors' formula, phase = -atan2(sum I sin, sum I cos), gives back x = pitch phase / 2 pi + (1280 - 1) / 2."""
+    fringes = Fringes(pitch=12, steps=8, first=1)
+    profiles = fringes.profiles(1280).astype(float)
+    s = fringes.shifts[:, None]
+    phase = -np.arctan2((profiles * np.sin(s)).sum(axis=0), (profiles * np.cos(s)).sum(axis=0))
+    x = 12 * phase / (2 * np.pi) + (1280 - 1) / 2
+    off = (x - np.arange(1280)) / 12
+    assert off == pytest.approx(np.rint(off), abs=1e-6)
+
+
+def test_neighbouring_periods_differ_in_one_bit():
+    """A Gray code: along the axis, one image at most changes from one pixel to the next, the complementary bit included."""
+    code = GrayCode(pitch=12, bits=7, complementary=True)
+    changes = np.abs(np.diff(code.profiles(1280), axis=1)).sum(axis=0)
+    assert changes.max() == 1
+    assert np.count_nonzero(changes) == pytest.approx(1280 / 6, abs=1)
+
+
+def test_inverted_images_are_the_inverse():
+    profiles = GrayCode(pitch=12, bits=4, inverted=True).profiles(200)
+    assert (profiles[0::2] + profiles[1::2] == 1).all()
+
+
+@pytest.mark.parametrize("width", [1, 2, 3])
+def test_line_is_where_it_says(width):
+    """Its light is its width, its centroid its position."""
+    line = CentreLine(width=width)
+    profile = line.profiles(1280)[0].astype(float)
+    assert profile.sum() == pytest.approx(width)
+    assert (profile * np.arange(1280)).sum() / profile.sum() == pytest.approx(639.5)
+
+
+@pytest.mark.parametrize(
+    ("unwrap", "parts", "message"),
+    [
+        ("gray", [{"kind": "fringes", "pitch": 12, "steps": 8}], "one part of that kind, found 0"),
+        ("heterodyne", [{"kind": "fringes", "pitch": 12, "steps": 8}], "two or more sets"),
+        ("gray", [{"kind": "gray", "pitch": 12, "bits": 7}], "at least one set of fringes"),
+        ("gray", [{"kind": "fringes", "pitch": 12, "steps": 8}, {"kind": "gray", "pitch": 18, "bits": 7}], "one pitch"),
+        ("centre_line", [{"kind": "fringes", "pitch": 12, "steps": 8, "colour": 1}], "Extra inputs"),
+    ],
+)
+def test_sequences_that_cannot_be_unwrapped_are_refused(unwrap, parts, message):
+    with pytest.raises(ValidationError, match=message):
+        Patterns(projector_size=(1280, 800), unwrap=unwrap, parts=parts)
