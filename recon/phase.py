@@ -148,9 +148,10 @@ def _fit(images, weights, quadratic, read, gain, saturation):
 def estimate_noise(images: NDArray, shifts: ArrayLike, *, saturation: float = 255) -> Noise | None:
     """Measure the camera's noise from the fringes themselves.
 
-    A sinusoid fills the mean and the first temporal harmonic of an evenly shifted sequence. Harmonics 2 and 3 also hold the
-    projector's non-linearity (gamma), which dies out quickly: the highest n // 6 harmonics are noise, nearly alone (for gamma
-    2.2 the fourth is 0.14 % of the modulation). Their power against the mean intensity is the photon-transfer line.
+    A sinusoid fills the mean and the first temporal harmonic of an evenly shifted sequence. The others hold noise, the same in
+    each, and what the projector and the lamp add: harmonics 2 and 3 its non-linearity (gamma; the fourth is 0.14 % of the
+    modulation for gamma 2.2), odd ones the edges of binary fringes, any of them its flicker. Since all that can only add, the
+    quietest harmonic is the noise; its power against the mean intensity is the photon-transfer line.
 
     Parameters
     ----------
@@ -175,16 +176,16 @@ def estimate_noise(images: NDArray, shifts: ArrayLike, *, saturation: float = 25
     samples = samples[:, (samples.max(axis=0) < saturation) & (samples.min(axis=0) > 0)]
     if samples.shape[1] < 500:
         return None
-    bins = range(n // 2 - max(1, n // 6) + 1, n // 2 + 1)
-    time = 2 * np.pi * np.arange(n) / n
-    waves = [
-        wave(k * time) * (1 if 2 * k == n else np.sqrt(2))
-        for k in bins
-        for wave in (np.cos, np.sin)
-        if 2 * k < n or wave is np.cos
-    ]
-    residuals = np.array(waves, np.float32) @ samples / np.float32(np.sqrt(n))  # (m, pixels), each of the variance of one image
-    return _photon_transfer(samples.mean(axis=0), residuals)
+    quietest = min((_harmonic(samples, k) for k in range(2, n // 2 + 1)), key=lambda values: np.median(np.abs(values)))
+    return _photon_transfer(samples.mean(axis=0), quietest)
+
+
+def _harmonic(samples: Image, k: int) -> Image:
+    """Temporal harmonic k of samples : (n, pixels), as one or two rows that have the variance of one image."""
+    n = len(samples)
+    angle = 2 * np.pi * k * np.arange(n) / n
+    waves = [np.cos(angle)] if 2 * k == n else [np.sqrt(2) * np.cos(angle), np.sqrt(2) * np.sin(angle)]
+    return np.array(waves, np.float32) @ samples / np.float32(np.sqrt(n))
 
 
 def sample_pixels(images: NDArray, count: int) -> Image:

@@ -95,6 +95,17 @@ def test_noise_is_measured_through_gamma(rng, n, truth):
         assert found.read_variance + found.gain * level == pytest.approx(truth.read_variance + truth.gain * level, rel=0.05)
 
 
+def test_noise_is_measured_through_flicker(rng):
+    """A lamp whose flicker beats with the sequence fills one high harmonic in every pixel: that is not the camera's noise."""
+    n, truth = 12, Noise(0.5, 0.033)
+    shifts = 2 * np.pi * np.arange(n) / n
+    flicker = 1 + 0.03 * np.cos(5 * shifts + 0.4)
+    images = flicker[:, None, None] * (100 + 60 * np.cos(0.3 * np.arange(640) + shifts[:, None, None])) * np.ones((512, 1))
+    found = estimate_noise(noisy(images, rng, truth), shifts)
+    assert found is not None
+    assert found.read_variance + found.gain * 100 == pytest.approx(truth.read_variance + truth.gain * 100, rel=0.05)
+
+
 def test_too_few_steps_measure_no_noise(rng):
     """Below eight steps each temporal harmonic holds the projector's non-linearity too."""
     for n in (3, 4, 6):

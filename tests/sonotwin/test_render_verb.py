@@ -17,7 +17,10 @@ from sonotwin.cli import main
         (["patterns.unwrap=luck"], "patterns.unwrap: expected"),
         (["patterns.projector_size=[1920,1080]"], "patterns.projector_size: expected the rig's [1280, 800], found [1920, 1080]"),
         (["rig.projector.gama=2"], "rig.projector.gama: unknown key; did you mean rig.projector.gamma?"),
-        (["rig.cam1.sensor.quantum_efficiency=1.4"], "rig.cam1.sensor.quantum_efficiency: expected less than or equal to 1, found 1.4"),
+        (
+            ["rig.cam1.sensor.quantum_efficiency=1.4"],
+            "rig.cam1.sensor.quantum_efficiency: expected less than or equal to 1, found 1.4",
+        ),
         (["rig.cam1.optics.distortion=[0.1]"], "rig.cam1.optics.distortion: expected 0, 4, 5, 8, 12 or 14 coefficients, found 1"),
         (["engine.samples=12"], "engine.samples: expected a power of two, found 12"),
         (["shooting.bits=12"], "shooting.bits: expected at most the 10 of cam1's ADC, found 12"),

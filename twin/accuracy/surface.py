@@ -1,4 +1,4 @@
-"""How true the fringe-projection surface is: the paper's planes and sphere, the breast, unwrapping under stress, a real relief."""
+"""How true the surface is: the paper's planes and sphere, the breast, unwrapping under stress, and a real relief."""
 
 import os
 from dataclasses import dataclass, fields
