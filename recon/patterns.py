@@ -30,7 +30,7 @@ class Fringes(Part):
     steps: int = Field(ge=3)  # phase shifts
     first: int = 0  # index of the first shift: shift_k = 2 pi (first + k) / steps, k = 0 .. steps-1
     origin: float | None = None  # projector px where the phase is zero; the centre of the axis if not given
-    waveform: Literal["sine", "binary"] = "sine"  # binary fringes become sinusoidal by defocus
+    waveform: Literal["sine", "binary"] = "sine"  # binary fringes become sinusoidal by defocus; see `profiles` for their origin
 
     @property
     def count(self) -> int:
@@ -47,12 +47,16 @@ class Fringes(Part):
         return (length - 1) / 2 if self.origin is None else self.origin
 
     def profiles(self, length: int) -> Image:
-        """The patterns along their axis : (steps, length)."""
-        phase = 2 * np.pi * (np.arange(length) - self.zero(length)) / self.pitch
-        wave = np.cos(phase + self.shifts[:, None])
+        """The patterns along their axis : (steps, length).
+
+        Binary fringes light whole pixels. With an odd number of them lit a period, the origin must be a pixel's centre, with
+        an even number the border of two; else all lie half a pixel off.
+        """
+        turns = (np.arange(length) - self.zero(length)) / self.pitch + self.shifts[:, None] / (2 * np.pi)
         if self.waveform == "binary":
-            return (wave >= 0).astype(np.float32)
-        return ((1 + wave) / 2).astype(np.float32)
+            quarter = np.round(turns + 0.25, 9)  # a pixel right on an edge must not be left to rounding: half a period is lit
+            return (quarter - np.floor(quarter) < 0.5).astype(np.float32)
+        return ((1 + np.cos(2 * np.pi * turns)) / 2).astype(np.float32)
 
 
 class GrayCode(Part):

@@ -176,7 +176,7 @@ def estimate_noise(images: NDArray, shifts: ArrayLike, *, saturation: float = 25
     samples = samples[:, (samples.max(axis=0) < saturation) & (samples.min(axis=0) > 0)]
     if samples.shape[1] < 500:
         return None
-    quietest = min((_harmonic(samples, k) for k in range(2, n // 2 + 1)), key=lambda values: np.median(np.abs(values)))
+    quietest = min((_harmonic(samples, k) for k in range(2, n // 2 + 1)), key=lambda values: np.mean(np.abs(values)))
     return _photon_transfer(samples.mean(axis=0), quietest)
 
 

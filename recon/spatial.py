@@ -6,8 +6,9 @@ Two surfaces that touch in the image with a varying jump between them agree by c
 of periods: that opening in an otherwise torn border is a bottleneck, and is refused. The line then gives each region its
 absolute order, by vote. A region without the line is reported as unreachable, one whose votes disagree as disputed.
 
-Only a jump that is a whole number of periods (within the noise) along most of the border between two surfaces can fool this,
-as it fools anything that sees the phase alone: Gray code or a second pitch is needed there.
+Only a jump that is a whole number of periods (within the noise, some 0.2 to 0.4 rad) along most of the border between two
+surfaces, or along an opening as wide as the smaller of them, can fool this, as it fools anything that sees the phase alone: Gray
+code or a second pitch is needed there. Gaps (shadow, dark spots) every few pixels leave no continuous cell and cost coverage.
 """
 
 from collections import Counter, defaultdict

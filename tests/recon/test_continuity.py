@@ -17,7 +17,7 @@ def wrapped(absolute, rng):
 def test_curved_ground_is_clean(rng):
     """A bowl with a crease, as steep as the rig's flanks: chance alone tears, less than one pixel in a thousand."""
     v, u = np.mgrid[:300, :300].astype(float)
-    absolute = 0.1 * u + ((u - 150) ** 2 + (v - 150) ** 2) / 4000 + 0.02 * np.abs(v - 100)
+    absolute = 0.1 * u + ((u - 150) ** 2 + (v - 150) ** 2) / 4000 + 0.003 * np.abs(v - 100)
     flags = continuity(*wrapped(absolute, rng), np.ones(u.shape, bool))
     assert np.mean(flags == TORN) < 1e-3
     assert (flags[5:-6, 5:-6] != INCOMPLETE).all()

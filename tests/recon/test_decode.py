@@ -46,7 +46,8 @@ def test_round_trip(name, seed):
     blur = 4.0 if name == "paper_calibration" else 0.6  # binary fringes are made to be defocused
     found = decode(photograph(patterns, maps, rng, light=rng.uniform(60, 200), blur=blur), patterns)
     ok = found.status == Status.OK
-    assert ok.mean() > 0.95
+    # Without the complementary bit the period borders that meet the image's frame are lost.
+    assert ok.mean() > (0.92 if name == "paper_calibration" else 0.95)
     for axis, value, sigma in (("columns", found.columns, found.sigma_columns), ("rows", found.rows, found.sigma_rows)):
         if axis not in patterns.axes:
             assert value is None and sigma is None

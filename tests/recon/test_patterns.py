@@ -47,6 +47,25 @@ def test_fringes_carry_the_published_phase():
     assert off == pytest.approx(np.rint(off), abs=1e-6)
 
 
+@pytest.mark.parametrize(("pitch", "origin"), [(18, 640.0), (18, 639.5), (16, 639.5), (12, 639.5)])
+def test_binary_fringes_light_half_of_each_period(pitch, origin):
+    """Whole pixels, as many lit as dark in each period and each image, also where an edge falls on a pixel's centre."""
+    profiles = Fringes(pitch=pitch, steps=pitch, origin=origin, waveform="binary").profiles(80 * pitch)
+    assert (profiles.reshape(pitch, 80, pitch).sum(axis=2) == pitch // 2).all()
+
+
+def test_calibration_fringes_are_unbiased():
+    """The fundamental of the calibration's binary patterns has the phase of the coordinate, to a thousandth of a pixel."""
+    patterns = Patterns(**yaml.safe_load((ROOT / "conf/patterns/paper_calibration.yaml").read_text(encoding="utf-8")))
+    for part in patterns.parts:
+        if isinstance(part, Fringes):
+            length = patterns.length(part.axis)
+            profiles, s = part.profiles(length).astype(float), part.shifts[:, None]
+            phase = np.arctan2(-(profiles * np.sin(s)).sum(axis=0), (profiles * np.cos(s)).sum(axis=0))
+            off = (part.zero(length) + part.pitch * phase / (2 * np.pi) - np.arange(length)) / part.pitch
+            assert off == pytest.approx(np.rint(off), abs=1e-3 / part.pitch)
+
+
 def test_neighbouring_periods_differ_in_one_bit():
     """A Gray code: along the axis, one image at most changes from one pixel to the next, the complementary bit included."""
     code = GrayCode(pitch=12, bits=7, complementary=True)
