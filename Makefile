@@ -3,12 +3,13 @@
 
 PYTHON ?=
 ONLY ?=
+REAL := $(or $(SONOTWIN_REAL),$(wildcard ../shared/real))
 ARGS ?=
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint slow accuracy benchmark
+.PHONY: help setup demo test lint slow accuracy benchmark clean
 
 help:  ## show this
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -36,7 +37,11 @@ slow: setup  ## run the slow tests
 	@$(BIN)/python -m pytest -m slow $(ARGS)
 
 accuracy: setup  ## measure errors against the ground truth and the paper's figures
-	@$(BIN)/sonotwin accuracy $(if $(ONLY),only=$(ONLY))
+	@$(BIN)/sonotwin accuracy document=docs/accuracy.md $(if $(ONLY),only=$(ONLY)) $(if $(REAL),real=$(REAL))
 
 benchmark: setup  ## measure speed
 	@$(BIN)/python -m benchmarks $(ONLY)
+
+clean:  ## delete compiled code and results; .venv stays
+	@rm -rf outputs .pytest_cache .ruff_cache
+	@find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +

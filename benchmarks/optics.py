@@ -42,7 +42,7 @@ def one_pass_against_many() -> list[Row]:
     def ours(count: int) -> float:
         light = Light.of(sequence(count), rig.projector)
         optics = CameraOptics.of(rig.cam1), ProjectorOptics.of(rig.projector)
-        render(world, *optics, light, Engine(samples=2), seed=0)  # compiles
+        render(world, *optics, light, Engine(samples=SAMPLES), seed=0)  # compiles
         times = []
         for seed in range(3):
             start = perf_counter()

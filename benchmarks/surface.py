@@ -6,14 +6,15 @@ from time import perf_counter
 import numpy as np
 
 from benchmarks import plain
+from recon.capture import read_patterns
 from recon.decode import decode
 from recon.rig import Rig
 from recon.surface import clean
 from recon.triangulate import Triangulator
 from scenes.catalogue import build_scene
-from sonotwin.config import compose
+from sonotwin.config import compose, folder
 from twin.accuracy.rows import Measurement, Row
-from twin.accuracy.surface import ENGINE, sequence
+from twin.accuracy.surface import ENGINE
 from twin.session import Shooting, calibration_of, shoot
 
 REPEATS = 15
@@ -27,7 +28,7 @@ def measurements() -> list[Measurement]:
 def nine_images() -> list[Row]:
     """Row h: the paper's sequence of the breast, 1280x1024. Both have the calibrated camera's rays in a table."""
     rig = Rig.model_validate(compose("render", ["out=unused"])["rig"])
-    patterns = sequence("paper_surface")
+    patterns = read_patterns(folder() / "patterns" / "paper_surface.yaml")
     images = shoot(rig, build_scene({"kind": "breast"}), patterns, "cam1", ENGINE, Shooting(), seed=1).images
     cameras = calibration_of(rig).cameras
     camera, projector = cameras["cam1"], cameras["projector"]

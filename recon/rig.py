@@ -6,7 +6,7 @@ World is the frame of camera 1. Every field has a unit; nonsense is refused with
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from recon import rigid
 from recon.camera import DISTORTION_LENGTHS, Camera
@@ -16,6 +16,8 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
+
+FOCAL_TOLERANCE = 0.05  # a lens's nominal focal length against the calibrated one
 
 
 class Part(BaseModel):
@@ -93,6 +95,17 @@ class CameraDevice(Part):
     optics: Optics
     lens: Lens
     sensor: Sensor
+    serial: Annotated[int, Field(ge=0)]  # tells one camera's fixed pattern (PRNU, DSNU) from another's
+
+    @model_validator(mode="after")
+    def _one_focal_length(self) -> "CameraDevice":
+        calibrated = self.optics.focal_px[0] * self.sensor.pixel_um * 1e-3
+        if abs(self.lens.focal_length_mm / calibrated - 1) > FOCAL_TOLERANCE:
+            raise ValueError(
+                f"lens.focal_length_mm: expected within {100 * FOCAL_TOLERANCE:.0f} % of focal_px * pixel_um = {calibrated:.2f} mm, "
+                f"found {self.lens.focal_length_mm:g}"
+            )
+        return self
 
 
 class ProjectorDevice(Part):

@@ -62,9 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         return _complain(hint)
     except OSError as error:
-        if error.filename is None:
+        if error.errno is None:
             raise
-        return _complain(f"{error.filename}: {error.strerror}")
+        return _complain(f"{error.filename or 'output'}: {error.strerror}")
     except KeyboardInterrupt:
         return _complain("interrupted", status=130)
 
@@ -90,8 +90,7 @@ def _run(arguments: list[str]) -> int:
     module = import_module(verb.module)
     from sonotwin import config
 
-    module.run(config.load(verb.name, overrides, module.Config))
-    return 0
+    return module.run(config.load(verb.name, overrides, module.Config)) or 0
 
 
 def _find(name: str) -> Verb:

@@ -14,6 +14,7 @@ import json
 import os
 import platform
 import re
+import signal
 import site
 import subprocess
 import sys
@@ -231,13 +232,16 @@ def _try(path: Path) -> Verdict:
     else:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         verdict = Verdict(str(path), version(path), False, f"was tried and failed: {last}")
-    _remember(path, verdict)
+    if done.returncode != -signal.SIGKILL:  # someone else's doing, such as a lack of memory
+        _remember(path, verdict)
     return verdict
 
 
 def _remembered(path: Path) -> Verdict | None:
-    known = _read_cache().get(_identity(path))
-    return Verdict(**known) if known else None
+    try:
+        return Verdict(**_read_cache()[_identity(path)])
+    except (KeyError, TypeError):  # not tried yet, or remembered by another version
+        return None
 
 
 def _remember(path: Path, verdict: Verdict) -> None:
@@ -252,9 +256,10 @@ def _remember(path: Path, verdict: Verdict) -> None:
 
 def _read_cache() -> dict:
     try:
-        return json.loads(cache_file().read_text())
-    except (OSError, json.JSONDecodeError):
+        content = json.loads(cache_file().read_text())
+    except (OSError, ValueError):
         return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _identity(path: Path) -> str:

@@ -4,7 +4,6 @@ Photons arrive as a Poisson process and free electrons with the quantum efficien
 own response (PRNU) and dark signal (DSNU); reading adds dark noise; gain, black level, clipping and the ADC make a number.
 """
 
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
@@ -54,44 +53,41 @@ def auto_exposure(
     return max(round(seconds, 6), 1e-6)
 
 
-def expose(
-    radiance: Images, device: CameraDevice, name: str, wavelength_nm: float, exposure: Exposure, seed: np.random.SeedSequence
-) -> Numbers:
+def expose(radiance: Images, device: CameraDevice, wavelength_nm: float, exposure: Exposure, seed: int) -> Numbers:
     """Take images.
 
     Parameters
     ----------
     radiance : (n, h, w) float32, W/mm^2/sr
         What the renderer says arrives at each pixel.
-    name : str
-        The device's name: the same camera has the same PRNU and DSNU in every image and every capture.
-    seed : SeedSequence
-        Of the temporal noise; image k has its own stream, whatever the number of threads.
+    seed : int
+        Of the temporal noise; image k has its own stream, whatever the number of threads. PRNU and DSNU come from the camera's
+        serial number: they are the same in every image and every capture.
 
     Returns
     -------
     (n, h, w) uint8, or uint16 for more than 8 bits
     """
-    response, dark = fixed_pattern(device.sensor, radiance.shape[1:], name)
+    sensor = device.sensor
+    response, offset = fixed_pattern(sensor, radiance.shape[1:], device.serial)
     scale = np.float32(electrons_per_radiance(device, wavelength_nm) * exposure.time_s)
-    dark = dark + np.float32(device.sensor.dark_current_e_per_s * exposure.time_s)
+    dark = np.float32(sensor.dark_current_e_per_s * exposure.time_s)
 
     def take(image: Images, stream: np.random.SeedSequence) -> Numbers:
         generator = np.random.default_rng(stream)
         electrons = generator.poisson(np.maximum(image * scale * response, 0) + dark).astype(np.float32)
-        electrons += generator.standard_normal(electrons.shape, np.float32) * np.float32(device.sensor.dark_noise_e)
-        return digitise(electrons, device.sensor, exposure)
+        electrons += offset + np.float32(sensor.dark_noise_e) * generator.standard_normal(electrons.shape, np.float32)
+        return digitise(electrons, sensor, exposure)
 
     with ThreadPoolExecutor() as pool:
-        return np.stack(list(pool.map(take, radiance, seed.spawn(len(radiance)))))
+        return np.stack(list(pool.map(take, radiance, np.random.SeedSequence(seed).spawn(len(radiance)))))
 
 
-def fixed_pattern(sensor: Sensor, shape: tuple[int, ...], name: str) -> tuple[Images, Images]:
-    """Response (mean 1, PRNU) and dark signal in electrons (DSNU, an offset that keeps it positive) of each pixel : (h, w)."""
-    generator = np.random.default_rng(zlib.crc32(name.encode()))
+def fixed_pattern(sensor: Sensor, shape: tuple[int, ...], serial: int) -> tuple[Images, Images]:
+    """Response (mean 1, PRNU) and offset in electrons (mean 0, DSNU) of each pixel : (h, w)."""
+    generator = np.random.default_rng(serial)
     response = 1 + np.float32(sensor.prnu) * generator.standard_normal(shape, np.float32)
-    dark = np.float32(sensor.dsnu_e) * np.maximum(generator.standard_normal(shape, np.float32) + 3, 0)
-    return response, dark
+    return response, np.float32(sensor.dsnu_e) * generator.standard_normal(shape, np.float32)
 
 
 def number_per_electron(sensor: Sensor, exposure: Exposure) -> float:

@@ -1,6 +1,7 @@
 """A measuring session in the twin: from a rig, a scene and a pattern sequence to a capture folder and its ground truth."""
 
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -12,8 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from recon import atomic, calibration, capture
 from recon.calibration import Calibration
+from recon.errors import InputError
 from recon.patterns import Fringes, Patterns
-from recon.rig import CameraDevice, Rig
+from recon.rig import CameraDevice, Positive, Rig
 from scenes.things import Scene
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.raster import Light
@@ -31,11 +33,9 @@ class Shooting(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    exposure_s: Annotated[float, Field(gt=0)] | None = None  # if not given, set for the scene: see level
-    level: Annotated[float, Field(gt=0, le=1)] = (
-        0.9  # of full scale, that auto-exposure gives the brightest thousandth of the pixels
-    )
-    gain: Annotated[float, Field(gt=0)] = 1.0  # linear; 1 fills the range with the sensor's saturation charge
+    exposure_s: Positive | None = None  # if not given, set for the scene: see level
+    level: Annotated[float, Field(gt=0, le=1)] = 0.9  # of full scale, for the brightest thousandth of the pixels
+    gain: Positive = 1.0  # linear; 1 fills the range with the sensor's saturation charge
     bits: Literal[8, 10, 12] = 8  # of the images; at most the sensor's ADC has
 
 
@@ -57,21 +57,27 @@ def shoot(rig: Rig, scene: Scene, patterns: Patterns, camera: CameraName, engine
     The same seed gives the same bytes. Rendering noise, sensor noise and the two cameras draw from separate streams.
     """
     device: CameraDevice = getattr(rig, camera)
-    light_seed, sensor_seed = np.random.SeedSequence([seed, ("cam1", "cam2").index(camera)]).spawn(2)
+    light_seed, sensor_seed = np.random.SeedSequence([seed, ("cam1", "cam2").index(camera)]).generate_state(2).tolist()
+    optics = CameraOptics.of(device)
+    unreached = np.count_nonzero(np.isnan(optics.transmission))
+    if unreached:
+        raise InputError(
+            f"rig.{camera}.optics.distortion: expected a ray for every pixel, found {unreached} px that no ray reaches"
+        )
     world = build_world(scene)
     radiance = render(
         world,
-        CameraOptics.of(device),
+        optics,
         ProjectorOptics.of(rig.projector),
         Light.of(patterns, rig.projector),
         engine,
-        int(light_seed.generate_state(1)[0]),
+        light_seed,
     )
     wavelength = rig.projector.wavelength_nm
     time_s = shooting.exposure_s or auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
     exposure = Exposure(time_s, shooting.gain, shooting.bits)
     return View(
-        expose(radiance, device, camera, wavelength, exposure, sensor_seed),
+        expose(radiance, device, wavelength, exposure, sensor_seed),
         exposure,
         surface_truth(world, device.optics.camera(), rig.projector.optics.camera()),
         noise_limit_px(radiance, patterns, device, wavelength, exposure),
@@ -81,26 +87,35 @@ def shoot(rig: Rig, scene: Scene, patterns: Patterns, camera: CameraName, engine
 def noise_limit_px(
     radiance: Images, patterns: Patterns, device: CameraDevice, wavelength_nm: float, exposure: Exposure
 ) -> Images:
-    """Standard deviation of the decoded projector coordinate that the sensor's noise alone allows : (h, w) px, inf in the dark.
+    """Standard deviation of the decoded projector column and row that the sensor's noise alone allows : (h, w, 2) px.
 
-    The noise of each noise-free image of the finest N-step fringes, carried through the least-squares phase: a change dI_k
-    turns the phase by `-2/(N B) sin(phase + shift_k) dI_k`.
+    Infinite in the dark, and for an axis without fringes; of several pitches the finest counts.
     """
-    fringes, place = min(
-        ((part, place) for part, place in patterns.slices() if isinstance(part, Fringes)), key=lambda found: found[0].pitch
-    )
-    per_second = np.float32(electrons_per_radiance(device, wavelength_nm) * exposure.time_s)
-    electrons = [image * per_second for image in radiance[place]]
-    waves = np.exp(-1j * fringes.shifts)
-    phasor = 2 / fringes.steps * sum(wave * image for wave, image in zip(waves, electrons, strict=True))
+    electrons = radiance * np.float32(electrons_per_radiance(device, wavelength_nm) * exposure.time_s)
+    limits = np.full((*radiance.shape[1:], 2), np.inf, np.float32)
+    for number, axis in enumerate(("columns", "rows")):
+        sets = [(part, place) for part, place in patterns.slices() if isinstance(part, Fringes) and part.axis == axis]
+        if sets:
+            fringes, place = min(sets, key=lambda pair: pair[0].pitch)
+            sigma = phase_limit(electrons[place], fringes.shifts, device, exposure)
+            limits[..., number] = fringes.pitch / (2 * np.pi) * sigma
+    return limits
+
+
+def phase_limit(electrons: Images, shifts: NDArray[np.float64], device: CameraDevice, exposure: Exposure) -> Images:
+    """Standard deviation of the least-squares phase : (h, w) rad, from noise-free N-step images : (n, h, w) electrons.
+
+    The noise of each image carried through the fit: a change dI_k turns the phase by `-2/(N B) sin(phase + shift_k) dI_k`.
+    """
+    count = len(shifts)
+    phasor = 2 / count * sum(wave * image for wave, image in zip(np.exp(-1j * shifts), electrons, strict=True))
     dark = device.sensor.dark_current_e_per_s * exposure.time_s
     variance = sum(
-        (2 / fringes.steps * np.sin(np.angle(phasor) + shift) * noise_dn(image + dark, device.sensor, exposure)) ** 2
-        for shift, image in zip(fringes.shifts, electrons, strict=True)
+        (2 / count * np.sin(np.angle(phasor) + shift) * noise_dn(image + dark, device.sensor, exposure)) ** 2
+        for shift, image in zip(shifts, electrons, strict=True)
     )
-    modulation = np.abs(phasor) * number_per_electron(device.sensor, exposure)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.float32(fringes.pitch / (2 * np.pi) * np.sqrt(variance) / modulation)
+        return np.sqrt(variance) / (np.abs(phasor) * number_per_electron(device.sensor, exposure))
 
 
 def calibration_of(rig: Rig) -> Calibration:
@@ -112,11 +127,14 @@ def calibration_of(rig: Rig) -> Calibration:
 def write_session(
     out: Path, rig: Rig, scene: Scene, patterns: Patterns, views: Mapping[CameraName, View], settings: Mapping[str, object]
 ) -> None:
-    """Write `out/truth/`, then `out/capture/`, each whole or not at all.
+    """Write `out/truth/`, then `out/capture/`, each whole or not at all; an old capture goes first, so that no two sessions mix.
 
     settings : what the session was rendered from; kept with the truth as `settings.json`.
     """
     optics = calibration_of(rig)
+    for folder, marker in ((out / "truth", TRUTH_MARKER), (out / "capture", capture.MANIFEST)):
+        atomic.check_folder(folder, marker)
+    shutil.rmtree(out / "capture", ignore_errors=True)
     with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
         (folder / "surface").mkdir()
         (folder / "calibration").mkdir()

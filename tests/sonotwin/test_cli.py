@@ -101,6 +101,7 @@ def test_a_mistake_in_a_process_of_its_own():
         (ModuleNotFoundError("...", name="drjit"), "the Python package drjit is missing; pip install 'sonotwin[twin]'"),
         (ModuleNotFoundError("...", name="cv2"), "the Python package cv2 is missing; pip install 'sonotwin'"),
         (PermissionError(13, "Permission denied", "out/surface.ply"), "out/surface.ply: Permission denied"),
+        (OSError(28, "No space left on device"), "output: No space left on device"),
     ],
 )
 def test_mistakes_become_one_line(error, line, failing, capsys):

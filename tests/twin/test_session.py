@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from recon import calibration, capture
+from recon.errors import InputError
 from recon.patterns import Fringes
 from recon.phase import Noise, wrapped_phase
 from scenes.catalogue import build_scene
@@ -78,6 +79,23 @@ def test_same_seed_same_bytes(session, small_rig, tmp_path):
     assert other["capture/surface/cam1/0003.png"] != digest(session)["capture/surface/cam1/0003.png"]
 
 
+def test_a_lens_that_leaves_pixels_dark_is_refused(small_rig):
+    """A fold of the distortion within the image has no rays beyond it: said by name, not a NaN in the end."""
+    optics = small_rig.cam1.optics.model_copy(update={"focal_px": (200.0, 200.0), "distortion": (-0.35, 0.0, 0.0, 0.0)})
+    rig = small_rig.model_copy(update={"cam1": small_rig.cam1.model_copy(update={"optics": optics})})
+    with pytest.raises(InputError, match=r"rig.cam1.optics.distortion: expected a ray for every pixel, found \d+ px"):
+        shoot(rig, build_scene({"kind": "plane"}), paper_surface((1280, 800)), "cam1", Engine(samples=2), Shooting(), 1)
+
+
+def test_a_killed_session_does_not_mix_with_an_old_one(small_rig, tmp_path, monkeypatch):
+    """If writing stops after the new truth, the old capture is gone rather than beside it."""
+    write(small_rig, tmp_path, seed=1)
+    monkeypatch.setattr(capture, "write_surface", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        write(small_rig, tmp_path, seed=2)
+    assert not (tmp_path / "capture").exists()
+
+
 def test_noise_limit_is_the_noise(small_rig):
     """The phase of repeated exposures scatters as `limit_px` says (3 %)."""
     scene, patterns = build_scene({"kind": "plane"}), paper_surface((1280, 800))
@@ -90,10 +108,12 @@ def test_noise_limit_is_the_noise(small_rig):
         Light.of(patterns, small_rig.projector), Engine(samples=4), light_seed,
     )  # fmt: skip
     exposure = Exposure(auto_exposure(radiance, device, wavelength))
-    limit = noise_limit_px(radiance, patterns, device, wavelength, exposure)
+    limits = noise_limit_px(radiance, patterns, device, wavelength, exposure)
+    assert np.isinf(limits[..., 1]).all()  # no fringes along the rows
+    limit = limits[..., 0]
     phases = []
     for seed in range(16):
-        images = expose(radiance[1:], device, "cam1", wavelength, exposure, np.random.SeedSequence(seed))
+        images = expose(radiance[1:], device, wavelength, exposure, seed)
         phases.append(wrapped_phase(images, fringes.shifts, noise=Noise(0, 0), saturation=255).phase)
     spread = np.angle(np.exp(1j * (np.array(phases) - phases[0])))
     deviation = (spread - spread.mean(axis=0)) * fringes.pitch / (2 * np.pi)

@@ -1,5 +1,7 @@
 """How true the light transport is: against Mitsuba's own integrator, and against geometry."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +11,7 @@ from recon.phase import Noise, wrapped_phase
 from recon.rig import Rig
 from scenes.catalogue import build_scene
 from scenes.things import Scene
-from twin.accuracy.rows import Measurement, Row
+from twin.accuracy.rows import Measurement, Row, Setup
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.raster import OVERSAMPLING, Light
 from twin.optics.reference import ideal_rig, mitsuba_scene, render_pattern
@@ -18,15 +20,19 @@ from twin.optics.truth import surface_truth
 from twin.optics.world import build_world
 
 BLOCK = 4  # px; z-scores are taken of block means, which are close to normal
-COMPARED = (0, 2, 5)  # patterns of the paper's sequence: the centre line and two fringe images
+EDGES = 1.1  # allowance on the spread of z-scores: blocks with an edge are less normal than smooth ones
 REALISTIC_14 = (-0.11, 0.25, 0.0004, -0.0006, 0.02, 0.01, -0.02, 0.005, 0.001, -0.0005, -0.0008, 0.0004, 0.01, -0.008)
 STRONG_14 = (-0.28, 0.12, 0.002, -0.003, -0.02, 0.05, 0.02, 0.01, 0.004, -0.002, 0.003, 0.001, 0.04, -0.03)
 
 
-def measurements(rig: Rig) -> list[Measurement]:
+def measurements(setup: Setup) -> list[Measurement]:
     """The rows of the group, at full size."""
+    rig = setup.rig
     return [
-        lambda: [row for kind in ("plane", "breast") for row in against_mitsuba(rig, build_scene({"kind": kind}), 0.5, 128, 16)],
+        *(
+            lambda kind=kind: against_mitsuba(rig, build_scene({"kind": kind}), 0.5, 128, 16, range(9))
+            for kind in ("plane", "breast")
+        ),
         lambda: [phase_error(rig, samples=16)],
         lambda: [round_trip(name, coefficients) for name, coefficients in (("realistic", REALISTIC_14), ("strong", STRONG_14))],
     ]
@@ -38,41 +44,40 @@ def paper_surface(projector_size: tuple[int, int]) -> Patterns:
     return Patterns(projector_size=projector_size, unwrap="centre_line", parts=parts)
 
 
-def against_mitsuba(rig: Rig, scene: Scene, scale: float, samples: int, repeats: int) -> list[Row]:
+def against_mitsuba(rig: Rig, scene: Scene, scale: float, samples: int, repeats: int, patterns: Sequence[int]) -> list[Row]:
     """Row a: z-scores of the difference to Mitsuba's `path`, pinholes and direct light."""
-    z = mitsuba_z_scores(rig, scene, scale, samples, repeats)
-    # The variances come from `repeats` renders each, so z follows Student's t with 2 (repeats - 1) degrees of freedom.
-    freedom = 2 * (repeats - 1)
+    z = z_scores(*both_renders(rig, scene, scale, samples, repeats, patterns))
+    # Mitsuba's independent samples have nearly all of the variance, so z follows Student's t with repeats - 1 degrees of freedom.
+    spread = float(np.sqrt((repeats - 1) / (repeats - 3)))
+    what = f"{scene.name}, {len(patterns)} patterns"
     return [
-        Row(
-            "a",
-            f"{scene.name}: spread of z-scores against Mitsuba",
-            float(z.std()),
-            1.1,
-            float(np.sqrt(freedom / (freedom - 2))),
-            "sigma",
-        ),
-        Row("a", f"{scene.name}: mean z-score against Mitsuba", abs(float(z.mean())), 0.1, 0.0, "sigma"),
+        Row("a", f"{what}: spread of z-scores against Mitsuba", float(z.std()), EDGES * spread, spread, "sigma"),
+        Row("a", f"{what}: mean z-score against Mitsuba", abs(float(z.mean())), 0.1, 0.0, "sigma"),
     ]
 
 
-def mitsuba_z_scores(rig: Rig, scene: Scene, scale: float, samples: int, repeats: int) -> NDArray[np.float64]:
-    """Difference between our render and Mitsuba's, in standard errors, one value a block of pixels and pattern.
-
-    Both render `repeats` times with independent seeds, from which their variances are estimated.
-    """
+def both_renders(
+    rig: Rig, scene: Scene, scale: float, samples: int, repeats: int, patterns: Sequence[int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Block means of our renders and of Mitsuba's : (repeats, patterns, h, w) each, with independent seeds."""
     camera, projector = ideal_rig(rig, scale)
     light = Light.of(paper_surface(projector.camera.size), rig.projector)
     ours_world, peer_world = build_world(scene), mitsuba_scene(scene, camera, projector, OVERSAMPLING)
-    engine = Engine(samples=samples)
-    ours = np.stack([block_means(render(ours_world, CameraOptics.pinhole(camera), projector, light, engine, seed))[list(COMPARED)]
-                     for seed in range(repeats)])  # fmt: skip
-    peer = np.stack([[block_means(render_pattern(peer_world, light, pattern, samples, 1000 + seed)) for pattern in COMPARED]
-                     for seed in range(repeats)])  # fmt: skip
-    error = np.sqrt((ours.var(axis=0, ddof=1) + peer.var(axis=0, ddof=1)) / repeats)
-    difference = ours.mean(axis=0) - peer.mean(axis=0)
-    bright = peer.mean(axis=0) > 0.02 * peer.mean(axis=0).max()  # where there is next to no light the means are not normal
-    return difference[bright] / error[bright]
+    optics, engine = CameraOptics.pinhole(camera), Engine(samples=samples)
+    ours = [block_means(render(ours_world, optics, projector, light, engine, seed))[list(patterns)] for seed in range(repeats)]
+    peer = [
+        [block_means(render_pattern(peer_world, light, pattern, samples, 1000 + seed)) for pattern in patterns]
+        for seed in range(repeats)
+    ]
+    return np.stack(ours), np.stack(peer)
+
+
+def z_scores(ours: NDArray[np.float64], peer: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Difference of two renders' means over repeats (the first axis), in standard errors, where there is light."""
+    error = np.sqrt((ours.var(axis=0, ddof=1) + peer.var(axis=0, ddof=1)) / len(peer))
+    mean = peer.mean(axis=0)
+    bright = mean > 0.02 * mean.max()  # where there is next to no light the means are not normal
+    return (ours.mean(axis=0) - mean)[bright] / error[bright]
 
 
 def block_means(images: Images) -> NDArray[np.float64]:

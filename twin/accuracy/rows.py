@@ -2,13 +2,15 @@
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
 from recon import atomic
 from recon.errors import InputError
+from recon.patterns import Patterns
+from recon.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,15 @@ class Row:
 Measurement = Callable[[], Sequence[Row]]
 
 
+@dataclass(frozen=True)
+class Setup:
+    """What measurements are made with."""
+
+    rig: Rig
+    sequences: Mapping[str, Patterns]  # by their names in conf/patterns
+    real: Path | None = None  # folder of real recordings
+
+
 def measure(measurements: Sequence[Measurement]) -> Iterator[Row]:
     """Run measurements one by one; their time is shared evenly by the rows that they give."""
     for measurement in measurements:
@@ -40,7 +51,7 @@ def measure(measurements: Sequence[Measurement]) -> Iterator[Row]:
         rows = measurement()
         seconds = (perf_counter() - start) / len(rows)
         for row in rows:
-            yield Row(**{**asdict(row), "seconds": round(seconds, 2)})
+            yield replace(row, seconds=round(seconds, 2))
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:
@@ -64,17 +75,24 @@ def table(rows: Sequence[Row], limit: str) -> str:
     return "\n".join(lines)
 
 
-def refresh(document: Path, group: str, text: str) -> None:
-    """Replace what stands between `<!-- GROUP -->` and `<!-- /GROUP -->` in a document.
+def check_place(document: Path, group: str) -> None:
+    """Check that a document has a place for a group's table.
 
     Raises
     ------
     InputError
-        If the document has no such place.
+        If it has none, or is no file.
     """
-    place = re.compile(rf"(<!-- {group} -->\n).*?(<!-- /{group} -->)", re.DOTALL)
-    before = document.read_text(encoding="utf-8")
-    if not place.search(before):
+    if not document.is_file():
+        raise InputError(f"{document}: expected a Markdown file, found none")
+    if not re.search(rf"<!-- {group} -->\n.*?<!-- /{group} -->", document.read_text(encoding="utf-8"), re.DOTALL):
         raise InputError(f"{document}: expected a place <!-- {group} --> ... <!-- /{group} -->, found none")
+
+
+def refresh(document: Path, group: str, text: str) -> None:
+    """Replace what stands between `<!-- GROUP -->` and `<!-- /GROUP -->` in a document; see `check_place`."""
+    check_place(document, group)
+    before = document.read_text(encoding="utf-8")
+    place = re.compile(rf"(<!-- {group} -->\n).*?(<!-- /{group} -->)", re.DOTALL)
     with atomic.new_file(document) as temporary:
         temporary.write_text(place.sub(lambda match: f"{match[1]}\n{text}\n\n{match[2]}", before), encoding="utf-8")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from recon.rig import NotNegative
 from twin.optics.instruments import CameraOptics, ProjectorOptics, light_point, sample_rays
 from twin.optics.raster import Light, LightTable
 from twin.optics.sampling import PairedPoints
@@ -27,7 +28,7 @@ class Engine(BaseModel):
 
     samples: int = Field(default=16, ge=2, le=65536)  # paths a pixel, a power of two
     bounces: int = Field(default=1, ge=1, le=16)  # reflections between projector and camera; 1 is direct light
-    room_lux: float = Field(default=0.0, ge=0)  # illuminance on an unshadowed surface, even from all sides
+    room_lux: NotNegative = 0.0  # illuminance on an unshadowed surface, even from all sides
 
     @field_validator("samples")
     @classmethod

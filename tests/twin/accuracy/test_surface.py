@@ -1,9 +1,22 @@
 """The rows of the accuracy tables, as far as they are quick, and the statistic for surfaces without truth."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from recon.capture import read_patterns
 from twin.accuracy import optics, surface
+from twin.accuracy.rows import Setup
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture
+def setup(rig) -> Setup:
+    """The rig and the sequences of `conf/patterns`."""
+    return Setup(rig, {path.stem: read_patterns(path) for path in (ROOT / "conf" / "patterns").glob("*.yaml")})
 
 
 def check(rows) -> None:
@@ -12,32 +25,29 @@ def check(rows) -> None:
 
 
 @pytest.mark.parametrize("pose", [0, 4])
-def test_planes_of_the_paper(rig, pose):
+def test_planes_of_the_paper(setup, pose):
     """Nearest and farthest plane: RMS within 1.25 of what noise allows, errors as large as predicted."""
-    check(surface.planes(rig, pose))
+    check(surface.planes(setup, pose))
 
 
-def test_sphere_of_the_paper(rig):
+def test_sphere_of_the_paper(setup):
     """Radius within 0.02 mm, RMS within 0.04 mm."""
-    check(surface.sphere(rig))
+    check(surface.sphere(setup))
 
 
-def test_breast(rig):
+def test_breast(setup):
     """Coverage, RMS, and hardly a point off by more than 1 mm."""
-    check(surface.breast(rig))
+    check(surface.breast(setup))
 
 
-def test_no_wrong_order_survives(rig):
+def test_no_wrong_order_survives(setup):
     """Deep steps and shadows: no point on a wrong order, and what the centre line doesn't reach is said to be so."""
-    check(surface.orders_under_stress(rig))
+    check(surface.orders_under_stress(setup))
 
 
-def test_real_relief():
+def test_real_relief(setup, real):
     """A recording of others: enough points, in the right depth, and sigma as large as the local residual."""
-    folder = surface.real_folder()
-    if folder is None:
-        pytest.skip("no real recordings; SONOTWIN_REAL names their folder")
-    check(surface.real_capture(folder))
+    check(surface.real_capture(replace(setup, real=real)))
 
 
 @pytest.mark.parametrize(("name", "coefficients"), [("realistic", optics.REALISTIC_14), ("strong", optics.STRONG_14)])

@@ -66,7 +66,7 @@ def test_projector_lights_nothing_behind_it(rig):
 
 
 def test_camera_rays_are_recons(rig, rng):
-    """Through the lens's centre, rays at any offset within a pixel are recon's, to 1e-4 px."""
+    """Through the lens's centre, rays at any offset within a pixel are recon's, as far as float32 carries."""
     camera = rig.cam2.optics.camera()
     strong = Camera(camera.size, camera.matrix, np.array(STRONG_14), camera.camera_from_world)
     optics = CameraOptics(strong, 2.0, 660.0, 0.0, np.ones(camera.size[::-1], np.float32))

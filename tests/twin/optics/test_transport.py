@@ -79,30 +79,25 @@ def test_defocus_lowers_the_modulation_as_a_disc_does(depth):
     assert modulation(aperture) / modulation(0.0) == pytest.approx(expected, abs=0.004)
 
 
-@pytest.mark.parametrize("kind", ["plane", "breast"])
-def test_every_pattern_matches_mitsuba(rig, kind):
+@pytest.fixture(scope="module", params=["plane", "breast"])
+def renders(rig, request):
+    """Ours and Mitsuba's: the centre line and two fringe images at a quarter of the size."""
+    return optics.both_renders(rig, build_scene({"kind": request.param}), 0.25, samples=32, repeats=8, patterns=(0, 2, 5))
+
+
+def test_patterns_match_mitsuba(renders):
     """Pinholes and direct light: the difference to Mitsuba's path integrator is its Monte Carlo error and no more."""
-    z = optics.mitsuba_z_scores(rig, build_scene({"kind": kind}), scale=0.25, samples=32, repeats=8)
-    # Student's t with 14 degrees of freedom has a spread of 1.08, rather more where blocks hold an edge
-    assert z.std() < 1.25
-    assert abs(z.mean()) < 6 * z.std() / np.sqrt(z.size) + 0.05
-    assert (np.abs(z) > 6).mean() < 2e-3
+    z = optics.z_scores(*renders)
+    # Student's t with 7 degrees of freedom (Mitsuba's samples have nearly all of the variance) has a spread of 1.18
+    assert z.std() < optics.EDGES * np.sqrt(7 / 5)
+    assert abs(z.mean()) < 0.1
+    assert (np.abs(z) > 8).mean() < 2e-3
 
 
-def test_z_scores_see_one_per_cent(rig):
-    """The comparison would notice light that is wrong by 1 %."""
-    camera, projector = ideal_rig(rig, 0.125)
-    wrong = ProjectorOptics(projector.camera, 0.0, 1.0, 0.0, projector.plane_irradiance * 1.01)
-    light = Light.of(optics.paper_surface(projector.camera.size), rig.projector)
-    scene = build_scene({"kind": "plane"})
-    ours = [
-        render(build_world(scene), CameraOptics.pinhole(camera), wrong, light, Engine(samples=32), seed)[2].mean()
-        for seed in range(4)
-    ]
-    peer_world = mitsuba_scene(scene, camera, projector, 16)
-    peer = [render_pattern(peer_world, light, 2, 32, seed).mean() for seed in range(4)]
-    error = np.sqrt((np.var(ours, ddof=1) + np.var(peer, ddof=1)) / 4)
-    assert (np.mean(ours) - np.mean(peer)) / error > 10
+def test_one_per_cent_would_be_seen(renders):
+    """The same comparison fails if our light is wrong by 1 %."""
+    ours, peer = renders
+    assert optics.z_scores(1.01 * ours, peer).mean() > 1
 
 
 def test_interreflection_matches_mitsuba(rig):
