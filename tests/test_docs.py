@@ -51,3 +51,16 @@ def test_make_targets_exist():
     targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     named = set(re.findall(r"(?:^|`)make (\w+)", text, re.MULTILINE))
     assert "demo" in named and named <= targets
+
+
+def test_the_physics_page_computes_its_figures(monkeypatch, capsys):
+    """The program in section 8 runs in the repository's root and prints the figures that the text gives."""
+    monkeypatch.chdir(ROOT)
+    page = (ROOT / "docs" / "physics-optics.md").read_text(encoding="utf-8")
+    (program,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    exec(compile(program, "physics-optics.md", "exec"), {})
+    printed = capsys.readouterr().out
+    for figure in ("2.17 W/sr", "11.4 ms", "1.86 DN", "10.3 mrad", "0.0197 px", "0.1232"):
+        assert figure in printed
+    for figure in ("2.17 W/sr", "11.4 ms", "1.86 DN", "10.3 mrad", "0.0197 px", "0.123 px"):
+        assert figure in page
