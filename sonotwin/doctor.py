@@ -19,7 +19,7 @@ MODULES = {  # where a package isn't imported by the name that it is installed b
     "hydra-core": "hydra",
     "opencv-contrib-python-headless": "cv2",
     "pytest-xdist": "xdist",
-    "scikit-image": "skimage",
+    "pyyaml": "yaml",
 }
 BROUGHT_BY = {"drjit": "mitsuba", "omegaconf": "hydra"}  # imported by us, required by what we require
 
