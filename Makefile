@@ -42,6 +42,6 @@ accuracy: setup  ## measure errors against the ground truth and the paper's figu
 benchmark: setup  ## measure speed
 	@$(BIN)/python -m benchmarks $(ONLY)
 
-clean:  ## delete compiled code and results; .venv stays
-	@rm -rf outputs .pytest_cache .ruff_cache
+clean:  ## delete compiled code and caches; .venv and outputs stay
+	@rm -rf .pytest_cache .ruff_cache
 	@find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +

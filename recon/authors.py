@@ -6,7 +6,6 @@ left out. Pitch 12 projector px, phase shifts 2 pi k / 8 for k = 1 to 8, project
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,7 +77,7 @@ def write(folder: Path, surface: SurfaceCapture, mask: NDArray[np.bool_]) -> Non
     with atomic.new_folder(folder, PARAMETERS) as temporary:
         structured_light = temporary / "SLdata"
         capture.write_images([structured_light / "images" / f"{i}.png" for i in range(len(surface.images))], surface.images)
-        cv2.imwrite(str(structured_light / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
+        capture.write_images([structured_light / "mask.png"], np.where(mask, 255, 0).astype(np.uint8)[None])
         np.savez(temporary / PARAMETERS, **parameters(surface.calibration))
 
 

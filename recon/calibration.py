@@ -6,8 +6,6 @@
   device 2 is, the content doesn't say: the projector if the file's name has `proj` in it, else camera 2.
 """
 
-import io
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from recon import atomic, rigid
+from recon import arrays, atomic, rigid
 from recon.camera import Array, Camera
 from recon.errors import InputError
 
@@ -50,7 +48,8 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
     except OSError as error:
         raise InputError(f"{path}: expected a calibration file, found {(error.strerror or 'none').lower()}") from None
     if data.startswith(b"PK"):
-        return _stereo_pair(path, _npz_matrices(path, data), sizes or {})
+        matrices = arrays.read(path, dict.fromkeys(STEREO_KEYS, arrays.Form("fiu")))
+        return _stereo_pair(path, {key: value.astype(float) for key, value in matrices.items()}, sizes or {})
     storage = _open(path, data)
     try:
         keys = storage.root().keys() if storage.root().isMap() else []
@@ -93,6 +92,8 @@ def _own(path: Path, storage: cv2.FileStorage) -> Calibration:
         if name == "schema":
             continue
         node = storage.getNode(name)
+        if not node.isMap():
+            raise InputError(f"{path}: {name}: expected size, matrix, distortion and camera_from_world, found something else")
         values = {key: _matrix(path, f"{name}.{key}", node.getNode(key)) for key in ("matrix", "distortion", "camera_from_world")}
         size = node.getNode("size")
         lengths = [size.at(i) for i in range(size.size())] if size.isSeq() else []
@@ -100,6 +101,8 @@ def _own(path: Path, storage: cv2.FileStorage) -> Calibration:
             raise InputError(f"{path}: {name}.size: expected width and height in px, found something else")
         width, height = (int(length.real()) for length in lengths)
         cameras[name] = _camera(path, name, (width, height), values["matrix"], values["distortion"], values["camera_from_world"])
+    if not cameras:
+        raise InputError(f"{path}: expected at least one device, found none")
     return Calibration(cameras)
 
 
@@ -162,17 +165,3 @@ def _matrix(path: Path, name: str, node: cv2.FileNode) -> Array:
     if value is None:
         raise InputError(f"{path}: {name}: expected a matrix, found something else")
     return np.asarray(value, float)
-
-
-def _npz_matrices(path: Path, data: bytes) -> dict[str, Array]:
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            values = {key: archive[key] for key in STEREO_KEYS if key in archive}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile):
-        raise InputError(f"{path}: expected an npz file of plain arrays, found other or damaged data") from None
-    for key in STEREO_KEYS:
-        if key not in values:
-            raise InputError(f"{path}: {key}: expected a matrix, found none")
-        if values[key].dtype.kind not in "fiu":
-            raise InputError(f"{path}: {key}: expected numbers, found {values[key].dtype}")
-    return {key: value.astype(float) for key, value in values.items()}

@@ -16,8 +16,10 @@ from recon import rigid
 Array = NDArray[np.float64]
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
+EXACT = 1e-9  # of matrix entries that are zero or one by definition; they come from text files
 NEWTON_STEPS = 20
 NEWTON_TOLERANCE = 1e-13  # normalised image coordinates: far below a thousandth of a pixel at any focal length
+SLOPE_STEP = 1e-6  # normalised image coordinates: to each side, of the Jacobian by central differences
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,8 @@ class Camera:
     Raises
     ------
     ValueError
-        If a shape is wrong, a value is not finite, or a focal length is not positive.
+        If a shape is wrong, a value is not finite, a focal length is not positive, or a matrix is not of its form, as when it is
+        transposed.
     """
 
     size: tuple[int, int]  # width, height, px
@@ -47,6 +50,10 @@ class Camera:
         object.__setattr__(self, "distortion", distortion)
         if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0:
             raise ValueError(f"matrix: expected positive focal lengths, found {self.matrix[0, 0]:g}, {self.matrix[1, 1]:g}")
+        if not np.allclose(self.matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], rtol=0, atol=EXACT):
+            raise ValueError(f"matrix: expected the form [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {self.matrix.tolist()}")
+        if not np.allclose(self.camera_from_world[3], [0, 0, 0, 1], rtol=0, atol=EXACT):
+            raise ValueError(f"camera_from_world: expected 0 0 0 1 as the last row, found {self.camera_from_world[3].tolist()}")
         rotation = self.camera_from_world[:3, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
             raise ValueError("camera_from_world: expected a rotation matrix in its upper left 3x3 block")
@@ -111,15 +118,17 @@ def tilt_matrix(tau_x: float, tau_y: float) -> Array:
     return onto_sensor @ rotation
 
 
-@njit(cache=True, inline="always")
-def distort(x, y, k):
-    """Distort one normalised point by the coefficients k : (21,) of `Camera.coefficients`."""
+def distorted(x, y, k):
+    """Distort a normalised point by the coefficients k : (21,) of `Camera.coefficients`; anything with arithmetic will do."""
     r2 = x * x + y * y
     radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
     xd = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x) + r2 * (k[8] + r2 * k[9])
     yd = y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y + r2 * (k[10] + r2 * k[11])
     w = k[18] * xd + k[19] * yd + k[20]
     return (k[12] * xd + k[13] * yd + k[14]) / w, (k[15] * xd + k[16] * yd + k[17]) / w
+
+
+distort = njit(cache=True, inline="always")(distorted)
 
 
 @njit(cache=True, parallel=True)
@@ -130,10 +139,23 @@ def _distort_all(points, k):
     return result
 
 
+@njit(cache=True, inline="always")
+def _slopes(x, y, k):
+    """Jacobian of the distortion at (x, y): dxd/dx, dxd/dy, dyd/dx, dyd/dy."""
+    right, left = distort(x + SLOPE_STEP, y, k), distort(x - SLOPE_STEP, y, k)
+    below, above = distort(x, y + SLOPE_STEP, k), distort(x, y - SLOPE_STEP, k)
+    scale = 1 / (2 * SLOPE_STEP)
+    return (
+        (right[0] - left[0]) * scale,
+        (below[0] - above[0]) * scale,
+        (right[1] - left[1]) * scale,
+        (below[1] - above[1]) * scale,
+    )
+
+
 @njit(cache=True, parallel=True)
 def _undistort_all(points, k):
     result = np.empty_like(points)
-    step = 1e-6  # for the Jacobian by central differences
     for i in prange(points.shape[0]):
         u, v = points[i, 0], points[i, 1]
         x, y = u, v
@@ -144,27 +166,14 @@ def _undistort_all(points, k):
             error = max(abs(ex), abs(ey))
             if not error > NEWTON_TOLERANCE:
                 break
-            x1, y1 = distort(x + step, y, k)
-            x0, y0 = distort(x - step, y, k)
-            x3, y3 = distort(x, y + step, k)
-            x2, y2 = distort(x, y - step, k)
-            a, c = (x1 - x0) / (2 * step), (y1 - y0) / (2 * step)
-            b, d = (x3 - x2) / (2 * step), (y3 - y2) / (2 * step)
+            a, b, c, d = _slopes(x, y, k)
             determinant = a * d - b * c
             x += (d * ex - b * ey) / determinant
             y += (a * ey - c * ex) / determinant
-        if error < 1e-10 and x * u + y * v >= 0 and determinant_positive(x, y, k, step):  # on the near side of the fold
+        a, b, c, d = _slopes(x, y, k)
+        # past the fold of a polynomial a root is not a ray: the distortion mirrors there, or throws to the other side
+        if error < 1e-10 and x * u + y * v >= 0 and a * d - b * c > 0:
             result[i, 0], result[i, 1] = x, y
         else:
             result[i, 0], result[i, 1] = np.nan, np.nan
     return result
-
-
-@njit(cache=True, inline="always")
-def determinant_positive(x, y, k, step):
-    """Whether the distortion keeps orientation at (x, y): past the fold of a polynomial a root is not a ray."""
-    x1, y1 = distort(x + step, y, k)
-    x0, y0 = distort(x - step, y, k)
-    x3, y3 = distort(x, y + step, k)
-    x2, y2 = distort(x, y - step, k)
-    return (x1 - x0) * (y3 - y2) - (x3 - x2) * (y1 - y0) > 0

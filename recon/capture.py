@@ -46,7 +46,7 @@ class Record(BaseModel):
 class Device(Record):
     """A camera or the projector, as it was set."""
 
-    size: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]  # width, height, px
+    size: tuple[Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)]]  # width, height, px
     bits: Literal[8, 10, 12] = 8  # of the digital numbers; 10 and 12 are stored right-aligned in 16-bit PNG
     exposure_s: Annotated[float, Field(gt=0)] | None = None
     gain: Annotated[float, Field(gt=0)] | None = None  # linear; 1 is the sensor's base gain
@@ -77,12 +77,19 @@ class Manifest(Record):
     surface: SurfacePart | None = None
 
     @model_validator(mode="after")
-    def _known_devices(self) -> "Manifest":
-        for camera in self.surface.images if self.surface else ():
+    def _fitting_devices(self) -> "Manifest":
+        if self.surface is None:
+            return self
+        for camera in self.surface.images:
             if camera not in self.devices:
                 raise ValueError(
                     f"surface.images.{camera}: expected one of the devices {', '.join(self.devices)}, found {camera}"
                 )
+        wanted = self.surface.patterns.projector_size
+        if "projector" in self.devices and (found := self.devices["projector"].size) != wanted:
+            raise ValueError(
+                f"devices.projector.size: expected {wanted[0]}x{wanted[1]} as in surface.patterns, found {found[0]}x{found[1]}"
+            )
         return self
 
 
@@ -110,6 +117,8 @@ def read_manifest(folder: Path) -> Manifest:
         content = json.loads(_read_bytes(path), parse_constant=lambda value: _refuse_constant(path, value))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected JSON, found {error}") from None
+    except RecursionError:
+        raise InputError(f"{path}: expected JSON, found values nested too deeply") from None
     return _validated(Manifest, content, path)
 
 
@@ -174,6 +183,8 @@ def read_patterns(path: Path) -> Patterns:
         content = yaml.safe_load(_read_bytes(path))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected YAML, found {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise InputError(f"{path}: expected YAML, found values nested too deeply") from None
     return _validated(Patterns, content, path)
 
 
@@ -222,12 +233,20 @@ def write_surface(
 
 
 def write_images(paths: Sequence[Path], images: Images) -> None:
-    """Write grey PNG images : (n, h, w), making the folders."""
+    """Write grey PNG images : (n, h, w), making the folders.
+
+    Raises
+    ------
+    OSError
+        If one can't be encoded or written.
+    """
     for folder in {path.parent for path in paths}:
         folder.mkdir(parents=True, exist_ok=True)
 
     def write(path: Path, image: Images) -> None:
-        _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
+        encoded, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
+        if not encoded:
+            raise OSError(f"{path}: the PNG encoder failed")
         path.write_bytes(data.tobytes())
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -14,10 +14,16 @@ class InputError(ValueError):
 def one_line(error: ValidationError) -> str:
     """The first fault that pydantic found, as `field: expected ..., found ...`."""
     first = error.errors()[0]
-    field = ".".join(str(piece) for piece in first["loc"])
-    kind, message, found = first["type"], first["msg"], first["input"]
-    if kind == "missing":
+    place, kind, message, found = first["loc"], first["type"], first["msg"], first["input"]
+    if kind.startswith("union_tag"):  # at fault is the field that tells which of several models is meant
+        place += (first["ctx"]["discriminator"].strip("'"),)
+    field = ".".join(str(piece) for piece in place)
+    if kind in ("missing", "union_tag_not_found"):
         text = "expected a value, found none"
+    elif kind == "union_tag_invalid":
+        text = f"expected one of {first['ctx']['expected_tags']}, found {first['ctx']['tag']!r}"
+    elif kind in ("model_type", "model_attributes_type"):
+        text = f"expected a map of fields, found {_brief(found)}"
     elif kind == "extra_forbidden":
         text = f"expected no such field, found {_brief(found)}"
     elif kind == "value_error":

@@ -16,6 +16,7 @@ from recon.camera import Array
 
 AXES_TRIED = 200  # starting directions of a cylinder's axis: about 10 deg apart, well inside the basin of convergence
 START_POINTS = 500  # points that choose among them
+CURVED = 5.0  # standard deviations by which a sphere must be curved: below, its radius is chance
 
 
 @dataclass(frozen=True)
@@ -88,15 +89,14 @@ def fit_sphere(points: ArrayLike) -> Fit[Sphere]:
     Raises
     ------
     ValueError
-        If there are too few points, they are not finite, or lie in a plane.
+        If there are too few points, they are not finite, or lie in a plane as far as their scatter tells: if a sphere doesn't
+        fit them significantly better (F test of the one parameter more, 5 standard deviations).
     """
     points = _checked(points, 5)
     middle = points.mean(axis=0)
     local = points - middle
     system = np.column_stack([2 * local, np.ones(len(local))])
     (x, y, z, w), _, rank, _ = np.linalg.lstsq(system, (local**2).sum(axis=1), rcond=1e-9)
-    if rank < 4:
-        raise ValueError("points: expected a piece of a sphere, found points in a plane")
     start = np.array([x, y, z, np.sqrt(w + x * x + y * y + z * z)])
 
     def distances(p: Array) -> Array:
@@ -106,6 +106,9 @@ def fit_sphere(points: ArrayLike) -> Fit[Sphere]:
         away = local - p[:3]
         return np.column_stack([-away / np.linalg.norm(away, axis=1, keepdims=True), -np.ones(len(local))])
 
+    off_plane, off_sphere = np.linalg.svd(local, compute_uv=False)[2] ** 2, (distances(start) ** 2).sum()
+    if rank < 4 or off_plane - off_sphere <= CURVED**2 * off_sphere / (len(local) - 4):
+        raise ValueError("points: expected a piece of a sphere, found points in a plane")
     solution, residuals, covariance = _solve(distances, start, jacobian)
     return Fit(Sphere(middle + solution[:3], float(solution[3])), residuals, covariance)
 

@@ -101,10 +101,8 @@ class CameraDevice(Part):
     def _one_focal_length(self) -> "CameraDevice":
         calibrated = self.optics.focal_px[0] * self.sensor.pixel_um * 1e-3
         if abs(self.lens.focal_length_mm / calibrated - 1) > FOCAL_TOLERANCE:
-            raise ValueError(
-                f"lens.focal_length_mm: expected within {100 * FOCAL_TOLERANCE:.0f} % of focal_px * pixel_um = {calibrated:.2f} mm, "
-                f"found {self.lens.focal_length_mm:g}"
-            )
+            expected = f"within {100 * FOCAL_TOLERANCE:.0f} % of focal_px * pixel_um = {calibrated:.2f} mm"
+            raise ValueError(f"lens.focal_length_mm: expected {expected}, found {self.lens.focal_length_mm:g}")
         return self
 
 

@@ -58,7 +58,7 @@ def clean(point_map: PointMap, camera: Camera, modulation: ArrayLike | None = No
     """
     limits = limits or Limits()
     distance, step = _distances(point_map.points, camera)
-    noise = np.nan_to_num(NOISE * np.sqrt(np.float32(2)) * point_map.sigma)
+    noise = _difference(point_map.sigma)
     distance[point_map.sigma > limits.max_sigma * step] = np.nan
     distance[_bump(distance) > noise + limits.outlier_steps * step] = np.nan
     distance[_torn(distance, noise, step, limits.max_slope, limits.max_bend, limits.min_tear)] = np.nan
@@ -90,8 +90,7 @@ def mesh(point_map: PointMap, camera: Camera, max_slope: float = Limits.max_slop
         as `vertex_attributes["sigma_mm"]`.
     """
     distance, step = _distances(point_map.points, camera)
-    noise = np.nan_to_num(NOISE * np.sqrt(np.float32(2)) * point_map.sigma)
-    faces = _triangles(distance, max_slope * step + noise)
+    faces = _triangles(distance, max_slope * step + _difference(point_map.sigma))
     used = np.zeros(distance.size, bool)
     used[faces] = True
     faces = (np.cumsum(used) - 1)[faces]
@@ -105,6 +104,11 @@ def _distances(points: Float32, camera: Camera) -> tuple[Float32, Float32]:
     """Distance of each point from the camera's centre, and its sampling step : (h, w) mm each."""
     distance = _norms(points, camera.centre.astype(np.float32))
     return distance, distance * np.float32(2 / (camera.matrix[0, 0] + camera.matrix[1, 1]))
+
+
+def _difference(sigma: Float32) -> Float32:
+    """How far the distances of two points of sigma : (h, w) mm may differ by noise alone : (h, w) mm; 0 where it is NaN."""
+    return np.nan_to_num(NOISE * np.sqrt(np.float32(2)) * sigma)
 
 
 @njit(cache=True, parallel=True)

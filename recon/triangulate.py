@@ -46,19 +46,14 @@ class Triangulator:
 
     def __call__(self, projector_map: ProjectorMap) -> PointMap:
         """Triangulate a map of the camera's size; see `triangulate`."""
-        height, width, _ = self._rays.shape
-        nothing = np.full((1, 1), np.nan, np.float32)
-        columns, sigma_columns, rows, sigma_rows = (
-            nothing if axis is None else axis
-            for axis in (projector_map.columns, projector_map.sigma_columns, projector_map.rows, projector_map.sigma_rows)
+        shape = self._rays.shape[:2]
+        decoded = (
+            *_axis("columns", projector_map.columns, projector_map.sigma_columns, shape),
+            *_axis("rows", projector_map.rows, projector_map.sigma_rows, shape),
         )
-        for axis in (columns, rows):
-            if axis is not nothing and axis.shape != (height, width):
-                raise ValueError(f"projector map: expected {width}x{height}, found {axis.shape[1]}x{axis.shape[0]}")
-        points = np.empty((height, width, 3), np.float32)
-        sigma = np.empty((height, width), np.float32)
+        points = np.empty((*shape, 3), np.float32)
+        sigma = np.empty(shape, np.float32)
         projector = (self.projector.camera_from_world, self._matrix, self.projector.coefficients)
-        decoded = (columns, sigma_columns, rows, sigma_rows)
         _triangulate(self._rays, np.ascontiguousarray(self.camera.centre), projector, decoded, points, sigma)
         return PointMap(points, sigma)
 
@@ -84,9 +79,22 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera) 
     Raises
     ------
     ValueError
-        If the map has another size than the camera.
+        If a coordinate or a sigma has another size than the camera.
     """
     return Triangulator(camera, projector)(projector_map)
+
+
+def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:
+    """One axis and its sigma for compiled code: empty where the axis is not known, NaN where only the sigma isn't."""
+    if coordinate is None:
+        nothing = np.empty((0, 0), np.float32)
+        return nothing, nothing
+    if sigma is None:
+        sigma = np.full(shape, np.nan, np.float32)
+    for part, found in ((name, coordinate.shape), (f"sigma_{name}", sigma.shape)):
+        if found != shape:
+            raise ValueError(f"projector map: {part}: expected an image of shape {shape}, found {found}")
+    return coordinate, sigma
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -97,7 +105,7 @@ def _triangulate(rays, centre, projector, decoded, points, sigma):
     height, width, _ = rays.shape
     rotation, translation = projector_from_world[:3, :3].copy(), projector_from_world[:3, 3].copy()
     ox, oy, oz = rotation @ centre + translation
-    has_columns, has_rows = columns.shape[0] == height, rows.shape[0] == height
+    has_columns, has_rows = columns.shape == (height, width), rows.shape == (height, width)
     for j in prange(height):
         ex, ey, ez, t, u, v, su, sv, wu, wv, column, row = np.empty((12, width))
         certain = np.ones(width, np.bool_)

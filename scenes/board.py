@@ -13,6 +13,7 @@ from scipy.spatial import Delaunay
 from recon import rigid
 from recon.rig import Fraction, NotNegative, Part, Positive, Vector
 from scenes import solids
+from scenes.noise import Seed
 from scenes.things import Material, Scene, Thing
 
 Array = rigid.Array
@@ -20,6 +21,7 @@ Array = rigid.Array
 SIDES = 256  # of a disc's outline: a radius of 4.5 mm is met within 0.0004 mm
 CELL_MM = 4.0  # of the ground's triangles, small enough to follow a warp
 THICKNESS_MM = 3.0
+MAX_ERRORS = 4  # standard deviations that a print error reaches in x and in y; room for them is kept between circles
 
 
 class Config(Part):
@@ -36,14 +38,15 @@ class Config(Part):
     print_error_mm: Annotated[float, Field(ge=0, le=1)] = 0.0  # standard deviation of each centre, in x and in y
     white: Fraction = 0.75  # reflectance of paper
     black: Fraction = 0.05  # reflectance of printed ink
-    seed: int = 1  # of the print errors
+    seed: Seed = 1  # of the print errors
 
     @model_validator(mode="after")
     def _fits(self) -> "Config":
-        room = np.sqrt(2) * self.spacing_mm - 8 * self.print_error_mm
+        nearest = np.sqrt(2) * (self.spacing_mm - 2 * MAX_ERRORS * self.print_error_mm)  # two centres, along the diagonal
+        room = nearest / (1 + np.sin(np.pi / SIDES) / 2)  # leaves half a side of the outline between two discs
         if self.diameter_mm >= room:
             raise ValueError(f"diameter_mm: expected less than {room:.4g} to keep circles apart, found {self.diameter_mm:g}")
-        if self.diameter_mm / 2 + 5 * self.print_error_mm >= self.margin_mm:
+        if self.diameter_mm / 2 + (MAX_ERRORS + 1) * self.print_error_mm >= self.margin_mm:
             raise ValueError(f"margin_mm: expected more than half of diameter_mm, found {self.margin_mm:g}")
         return self
 
@@ -82,7 +85,7 @@ def build(config: Config) -> Scene:
 
 def _printed(config: Config) -> Array:
     errors = np.random.default_rng(config.seed).standard_normal((config.rows * config.columns, 2))
-    errors = np.clip(errors, -4, 4)  # the room between circles is checked for four standard deviations
+    errors = np.clip(errors, -MAX_ERRORS, MAX_ERRORS)
     return object_points(config)[:, :2] + config.print_error_mm * errors
 
 

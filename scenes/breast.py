@@ -17,7 +17,7 @@ from recon.errors import InputError
 from recon.rig import Finite, Fraction, NotNegative, Part, Positive, Vector
 from scenes import solids
 from scenes.dome import Dome, Form, dome
-from scenes.noise import smooth_noise
+from scenes.noise import Seed, smooth_noise
 from scenes.table import table
 from scenes.things import Material, Scene, Thing
 from scenes.tumour import tumour
@@ -64,7 +64,7 @@ class Config(Part):
         Tumour(size_mm=12.0, centre_mm=(22.0, -22.0, 19.0)),
     )
     tissue_mm: NotNegative = 5.0  # least tissue between a tumour and the skin or the base
-    seed: int = 7
+    seed: Seed = 7
 
     @model_validator(mode="after")
     def _proportions(self) -> "Config":

@@ -6,6 +6,7 @@ from pydantic import model_validator
 from recon import rigid
 from recon.rig import Finite, Fraction, Part, Positive
 from scenes import solids
+from scenes.noise import Seed
 from scenes.table import table
 from scenes.things import Cylinder, Material, Scene, Thing
 
@@ -20,7 +21,7 @@ class Config(Part):
     middle_mm: tuple[Finite, Finite] = (4.0, -2.0)  # x, y of the middle of the outer axis
     table_mm: Positive = 700.0  # z of the table's top, on which the outer cylinder lies
     reflectance: Fraction = 0.6
-    seed: int = 1  # of the table's grain
+    seed: Seed = 1  # of the table's grain
 
     @model_validator(mode="after")
     def _within(self) -> "Config":

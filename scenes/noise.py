@@ -1,9 +1,13 @@
 """Smooth random fields, for skin relief, mottled colour and wood grain."""
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 Array = NDArray[np.float64]
+Seed = Annotated[int, Field(ge=0)]
 
 
 def smooth_noise(points: Array, wavelength: float, rng: np.random.Generator, waves: int = 64) -> Array:

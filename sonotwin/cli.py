@@ -5,6 +5,8 @@ Exit status: 0 done, 2 a mistake of the user or of the installation (one line on
 """
 
 import ast
+import os
+import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -53,7 +55,12 @@ quotes: `sonotwin surface "out=outputs/my run"`.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     try:
-        return _run(sys.argv[1:] if arguments is None else list(arguments))
+        status = _run(sys.argv[1:] if arguments is None else list(arguments))
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:  # the reader, such as `head`, has seen enough; nothing more may be flushed at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except InputError as error:
         return _complain(str(error))
     except ModuleNotFoundError as error:
@@ -133,5 +140,5 @@ def _how_to_install(module: str) -> str | None:
     extra = extra_of(module)
     if extra is None:
         return None
-    wanted = "sonotwin" if extra == "core" else f"sonotwin[{extra}]"
-    return f"the Python package {module.partition('.')[0]} is missing; pip install '{wanted}'"
+    wanted = "." if extra == "core" else f".[{extra}]"
+    return f"the Python package {module.partition('.')[0]} is missing; run pip install '{wanted}' in sonotwin's folder"

@@ -57,7 +57,7 @@ def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
     """
     composed = compose(verb, overrides)
     try:
-        return model.model_validate(composed)
+        return model.model_validate(composed, context={"overrides": overrides})
     except ValidationError as error:
         raise InputError(f"{verb}: {describe(error, model)}") from error
 

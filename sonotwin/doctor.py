@@ -87,7 +87,7 @@ def _packages() -> Iterator[Finding]:
     installed = {name: _version(name) for _, name, _ in wanted}
     broken = _failing_imports([MODULES.get(name, name) for _, name, _ in wanted if installed[name] is not None])
     for part, name, accepted in wanted:
-        remedy = f"pip install 'sonotwin{'' if part == 'core' else f'[{part}]'}'"
+        remedy = f"pip install '.{'' if part == 'core' else f'[{part}]'}' in sonotwin's folder"
         found = installed[name]
         failure = broken.get(MODULES.get(name, name))
         if found is None:

@@ -1,7 +1,9 @@
 """The demonstration, whole: from a command to a report; small here, and at full size among the slow tests."""
 
+import html
 import json
 import re
+from pathlib import Path
 
 import pytest
 
@@ -35,7 +37,14 @@ def test_a_small_demonstration_runs_through(tmp_path, capsys):
     assert metrics["surface_interior_rms_mm"] < 3 * metrics["limit_rms_mm"]
     assert metrics["coverage"] > 0.9 and metrics["gross_error_fraction"] < 0.01
     assert all(f"seconds_{name}" in metrics for name in ("render", "surface", "evaluate", "report", "decode", "demo"))
-    last = capsys.readouterr().out.splitlines()[-4:]
+    printed = capsys.readouterr().out.splitlines()
+    wrote = [re.fullmatch(r"wrote +(.*)/\{(.*)\}", line) for line in printed if line.startswith("wrote")]
+    assert len(wrote) == 3
+    assert all((Path(folder) / name).exists() for folder, names in (line.groups() for line in wrote) for name in names.split(","))
+    assert (out / "surface.ply").read_bytes() == (out / "surface" / "surface.ply").read_bytes()
+    report = html.unescape((out / "report.html").read_text(encoding="utf-8"))
+    assert f"sonotwin render '{SMALL[0]}' '{SMALL[1]}'" in report, "the settings, though this was no command line"
+    last = printed[-4:]
     assert [line.split()[0] for line in last] == ["measured", "accuracy", "coverage", "look"]
     assert str(out / "report.html") in last[-1]
 
@@ -57,15 +66,16 @@ def silent(_):
     pass
 
 
-def step(name, works=True, makes=()):
+def step(name, works=True, makes=(), refines=(), figure=None):
     def work(folder, figures):
         for made in makes:
-            (folder / made).write_text(name, encoding="utf-8")
+            if "." in made:
+                (folder / made).write_text(name, encoding="utf-8")
         if not works:
             raise KeyboardInterrupt
-        return {name: len(figures)}
+        return {figure or name: len(figures)}
 
-    return Step(name, f"do {name}", work, makes)
+    return Step(name, f"do {name}", work, makes, refines)
 
 
 def test_steps_see_the_figures_before_them(tmp_path):
@@ -78,15 +88,39 @@ def test_steps_see_the_figures_before_them(tmp_path):
 
 
 def test_a_run_that_was_killed_leaves_nothing_to_the_next(tmp_path):
-    """A first run is complete, a second dies halfway and leaves a temporary folder, a third starts clean."""
+    """A first run is complete, a second dies halfway, killed ones have left temporary folders and files, a third starts clean."""
     folder = tmp_path / "demo"
-    demo.play([step("render"), step("report", makes=("report.html",))], folder, {}, silent)
-    (folder / ".truth.77.new").mkdir()
+    report = step("report", makes=("report.html",))
+    demo.play([step("render", makes=("truth",)), report], folder, {}, silent)
+    (folder / ".truth.4194305.new").mkdir()
+    (folder / ".report.4194305.new.html").write_text("half")
+    (folder / ".demo.4194305.new.json").write_text("half")
     with pytest.raises(KeyboardInterrupt):
-        demo.play([step("render", works=False), step("report", makes=("report.html",))], folder, {}, silent)
+        demo.play([step("render", works=False, makes=("truth",)), report], folder, {}, silent)
     assert sorted(path.name for path in folder.iterdir()) == ["demo.json"]  # no old report beside a new capture
-    demo.play([step("render"), step("report", makes=("report.html",))], folder, {}, silent)
+    demo.play([step("render"), report], folder, {}, silent)
     assert sorted(path.name for path in folder.iterdir()) == ["demo.json", "metrics.json", "report.html"]
+
+
+def test_hidden_files_of_others_stay(tmp_path):
+    """What isn't a step's own temporary is nobody's to delete."""
+    folder = tmp_path / "demo"
+    report = step("report", makes=("report.html",))
+    demo.play([report], folder, {}, silent)
+    others = {".git", ".notes.2024.md", ".report.html", ".other.4194305.new"}
+    for name in others:
+        (folder / name).mkdir()
+    demo.play([report], folder, {}, silent)
+    assert others < {path.name for path in folder.iterdir()}
+
+
+def test_a_figure_has_one_meaning(tmp_path):
+    """A step that contradicts an earlier one is stopped, unless it is there to know better."""
+    first, second = step("first", figure="points"), step("second", figure="points")
+    with pytest.raises(ValueError, match="second: points: expected 0 as before, found 2"):
+        demo.play([first, second], tmp_path / "a", {}, silent)
+    better = step("second", figure="points", refines=("points",))
+    assert demo.play([first, better], tmp_path / "b", {}, silent)["points"] == 2
 
 
 def test_other_peoples_files_are_left_alone(tmp_path):
@@ -97,7 +131,7 @@ def test_other_peoples_files_are_left_alone(tmp_path):
 
 
 def test_the_report_repeats_the_settings_that_were_given(tmp_path):
-    lines = commands(tmp_path / "a b", "cam1", ["demo", "scene=sphere", "out=elsewhere"])
+    lines = commands(tmp_path / "a b", "cam1", ["scene=sphere", "out=elsewhere"])
     assert [re.split(r"\s", line)[1] for line in lines] == ["demo", "render", "surface", "evaluate"]
     assert "scene=sphere" in lines[0] and "scene=sphere" in lines[1] and "elsewhere" not in "".join(lines)
     assert f"'out={tmp_path / 'a b'}'" in lines[1]

@@ -28,7 +28,7 @@ def test_the_readme_runs(tmp_path, monkeypatch):
     assert len(recipes) >= 4
     for recipe in recipes:
         assert main(recipe) == 0, recipe
-    assert Path("outputs/f4/surface/evaluation/metrics.json").is_file()
+    assert Path("outputs/sphere/surface/evaluation/metrics.json").is_file()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -1,18 +1,15 @@
 """A demonstration: named steps that work in one folder, one after the other, each adding its figures to those before it."""
 
 import json
-import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from recon import atomic
-
-Metrics = dict[str, float | int]
+from recon import atomic, metrics
+from recon.metrics import Metrics
 
 MARKER = "demo.json"  # by which the folder of a demonstration is known
-METRICS = "metrics.json"
 
 
 @dataclass(frozen=True)
@@ -22,7 +19,8 @@ class Step:
     name: str  # a verb, in one word
     does: str  # what a person reads while it runs
     work: Callable[[Path, Mapping[str, float | int]], Mapping[str, float | int]]  # (folder, figures so far) -> its own figures
-    makes: Sequence[str] = ()  # files at the top of the folder
+    makes: Sequence[str] = ()  # files and folders at the top of the folder
+    refines: Sequence[str] = ()  # figures of earlier steps that it knows better
 
 
 def play(steps: Sequence[Step], folder: Path, settings: Mapping[str, object], announce: Callable[[str], None]) -> Metrics:
@@ -42,31 +40,37 @@ def play(steps: Sequence[Step], folder: Path, settings: Mapping[str, object], an
     ------
     InputError
         If the folder holds something else, or can't be written to.
+    ValueError
+        If a step contradicts a figure of an earlier one that it doesn't refine.
     """
     atomic.check_folder(folder, MARKER)
     folder.mkdir(parents=True, exist_ok=True)
     with atomic.new_file(folder / MARKER) as temporary:
         temporary.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
-    _clear(folder, [METRICS, *(name for step in steps for name in step.makes)])
-    metrics: Metrics = {}
+    _clear(folder, [metrics.FILE, *(name for step in steps for name in step.makes)])
+    found: Metrics = {}
     beginning = time.perf_counter()
     for number, step in enumerate(steps, 1):
         announce(f"{number}/{len(steps)} {step.does}")
         start = time.perf_counter()
-        metrics |= step.work(folder, metrics)
-        metrics[f"seconds_{step.name}"] = round(time.perf_counter() - start, 2)
-    metrics["seconds_demo"] = round(time.perf_counter() - beginning, 2)
-    with atomic.new_file(folder / METRICS) as temporary:
-        temporary.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    return metrics
+        new = dict(step.work(folder, found))
+        new[f"seconds_{step.name}"] = round(time.perf_counter() - start, 2)
+        for name in (new.keys() & found.keys()) - set(step.refines):
+            if new[name] != found[name]:
+                raise ValueError(f"{step.name}: {name}: expected {found[name]} as before, found {new[name]}")
+        found |= new
+    found["seconds_demo"] = round(time.perf_counter() - beginning, 2)
+    metrics.write(folder / metrics.FILE, found)
+    return found
 
 
 def _clear(folder: Path, names: Sequence[str]) -> None:
-    """Remove results of an earlier run, and the temporary files and folders of one that was killed."""
-    for name in names:
-        (folder / name).unlink(missing_ok=True)
-    for leftover in folder.glob(".*"):
-        if leftover.is_dir():
-            shutil.rmtree(leftover)
-        else:
-            leftover.unlink()
+    """Remove the files that an earlier run made, and what one that was killed left while it made them.
+
+    Folders stay: the step that makes one replaces it.
+    """
+    atomic.remove_leftovers(folder / MARKER)
+    for path in (folder / name for name in names):
+        atomic.remove_leftovers(path)
+        if not path.is_dir():
+            path.unlink(missing_ok=True)

@@ -5,7 +5,6 @@ outwards. Ground truth is read here and in the report, nowhere else.
 """
 
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,17 +12,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from recon import calibration, primitives
+from recon import arrays, calibration, primitives
+from recon.arrays import Form
 from recon.camera import Array, Camera
-from recon.errors import InputError, one_line
-from recon.patterns import Axis, Patterns
+from recon.errors import InputError
+from recon.metrics import Metrics
 from scenes.things import Cylinder, Plane, Shape, Sphere
 
 Map = NDArray[np.float32]  # (h, w)
 Mask = NDArray[np.bool_]  # (h, w)
-Metrics = dict[str, float | int]
 
 GROSS_MM = 1.0  # along the ray: a wrong fringe order moves a point by tens of mm, noise by hundredths
 EDGE_PX = 3  # width of the band along discontinuities that the interior leaves out
@@ -33,7 +31,18 @@ ON_SHAPE_MM = 0.1  # truth nearer than this to a shape is of that shape; meshes 
 LEAST_FITTED = 100  # points; fewer say nothing about a shape
 MOST_FITTED = 100_000  # points, evenly chosen; more would change a radius by less than 1e-4 mm and take long
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
-SHAPES = {"plane": Plane, "sphere": Sphere, "cylinder": Cylinder}
+FITTED = {  # figures of a fit
+    "plane": ("rms_mm", "angle_error_deg"),
+    "sphere": ("rms_mm", "radius_error_mm", "centre_error_mm"),
+    "cylinder": ("rms_mm", "radius_error_mm", "angle_error_deg"),
+}
+TRUTH = {
+    "points": Form("f", (None, None, 3)),
+    "normals": Form("f", (None, None, 3)),
+    "objects": Form("u", (None, None)),
+    "lit": Form("b", (None, None)),
+    "limit_px": Form("f", (None, None, 2)),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +53,10 @@ class Truth:
     normals: Map  # (h, w, 3) unit, outwards
     objects: NDArray[np.uint8]  # number of the thing; none of `things` where the ray meets nothing
     lit: Mask  # the projector sees the point too
-    limit_px: Map  # standard deviation of the projector coordinate that the sensor's noise alone allows
+    limit_px: Map  # (h, w, 2) standard deviation of the projector's column and row that the sensor's noise alone allows;
+    # inf where an axis carried no fringes
     camera: Camera
     projector: Camera
-    axes: tuple[Axis, ...]  # that carried fringes
     scene: str
     things: tuple[str, ...]
     shapes: tuple[Shape, ...]  # to be fitted
@@ -63,6 +72,7 @@ class Comparison:
     limit: Map  # standard deviation of `error` that the sensor's noise alone allows; wherever the truth is lit
     compared: Mask  # a point, where the truth is lit
     interior: Mask  # compared, and away from discontinuities of the truth
+    gross: Mask  # a point, lit or not, that is far from all truth around its pixel
 
 
 def read_truth(folder: Path, camera: str = "cam1") -> Truth:
@@ -75,31 +85,25 @@ def read_truth(folder: Path, camera: str = "cam1") -> Truth:
     """
     folder = Path(folder)
     described = _read_json(folder / "scene.json")
-    settings = _read_json(folder / "settings.json")
     path = folder / "surface" / f"{camera}.npz"
-    arrays = read_arrays(path, {"points": 3, "normals": 3, "objects": 2, "lit": 2, "limit_px": 2})
+    maps = arrays.read(path, TRUTH)
     optics = calibration.read(folder / "calibration" / "optics.yaml").cameras
     for name in (camera, "projector"):
         if name not in optics:
             raise InputError(f"{folder / 'calibration' / 'optics.yaml'}: expected {name}, found {', '.join(optics) or 'none'}")
     size = optics[camera].size
-    for name, array in arrays.items():
+    for name, array in maps.items():
         if array.shape[:2] != size[::-1]:
             raise InputError(f"{path}: {name}: expected {size[0]}x{size[1]}, found {array.shape[1]}x{array.shape[0]}")
     try:
-        patterns = Patterns.model_validate(settings.get("patterns"))
-    except ValidationError as error:
-        raise InputError(f"{folder / 'settings.json'}: patterns.{one_line(error)}") from None
-    try:
-        scene, things = str(described["name"]), tuple(described["things"])
+        scene, things = str(described["name"]), tuple(str(thing) for thing in described["things"])
         shapes = tuple(_shape(entry) for entry in described["shapes"])
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{folder / 'scene.json'}: expected name, things and shapes, found them damaged at {error}") from None
     return Truth(
-        **arrays,
+        **maps,
         camera=optics[camera],
         projector=optics["projector"],
-        axes=patterns.axes,
         scene=scene,
         things=things,
         shapes=shapes,
@@ -114,8 +118,8 @@ def read_points(path: Path) -> tuple[Map, Map]:
     InputError
         If the file is missing or damaged, or the two have different sizes.
     """
-    arrays = read_arrays(path, {"points": 3, "sigma": 2})
-    points, sigma = arrays["points"], arrays["sigma"]
+    maps = arrays.read(path, {"points": Form("f", (None, None, 3)), "sigma": Form("f", (None, None))})
+    points, sigma = maps["points"], maps["sigma"]
     if points.shape != (*sigma.shape, 3):
         raise InputError(f"{path}: expected points of shape {(*sigma.shape, 3)} to fit sigma, found {points.shape}")
     return points, sigma
@@ -135,7 +139,9 @@ def compare(points: Map, sigma: Map, truth: Truth) -> Comparison:
     -------
     Comparison
         Distances along the ray become distances from the surface by the cosine between ray and normal. The limit is
-        `limit_px |cos| / |du/dt|`, with the slope of the projector coordinate u along the ray by central differences.
+        `|cos| / sqrt((du/dt / limit_u)^2 + (dv/dt / limit_v)^2)`, as triangulation weights the axes, with the slopes of the
+        projector's column u and row v along the ray by central differences. A point is gross if its distance along the ray
+        differs by more than 1 mm from those of all true points in the 3x3 pixels around its own.
 
     Raises
     ------
@@ -145,35 +151,35 @@ def compare(points: Map, sigma: Map, truth: Truth) -> Comparison:
     if points.shape != truth.points.shape or sigma.shape != truth.lit.shape:
         (height, width), (wanted_height, wanted_width) = points.shape[:2], truth.lit.shape
         raise InputError(f"points: expected {wanted_width}x{wanted_height} as the truth has, found {width}x{height}")
-    compared = np.isfinite(points).all(axis=-1) & truth.lit
+    there = np.isfinite(points).all(axis=-1)
+    compared = there & truth.lit
     if not compared.any():
         raise InputError(f"points: expected some of {np.count_nonzero(truth.lit)} px that camera and projector see, found none")
     rays = truth.camera.rays(truth.camera.pixel_grid())
     cosine = np.abs((truth.normals * rays).sum(axis=-1))
     offset = np.where(compared[..., None], points - truth.points, np.nan)
-    slope = _projector_slope(truth.points, rays, truth)
     with np.errstate(divide="ignore", invalid="ignore"):
-        limit = np.where(truth.lit, truth.limit_px * cosine / slope, np.nan)
+        limit = cosine / np.linalg.norm(_projector_slopes(rays, truth) / truth.limit_px, axis=-1)
     return Comparison(
         error=np.float32((offset * truth.normals).sum(axis=-1)),
         along_ray=np.float32((offset * rays).sum(axis=-1)),
         predicted=np.where(compared, np.float32(sigma * cosine), np.float32(np.nan)),
-        limit=np.float32(limit),
+        limit=np.where(truth.lit, np.float32(limit), np.float32(np.nan)),
         compared=compared,
         interior=compared & away_from_edges(truth),
+        gross=there & ~_near_truth(points, truth),
     )
 
 
 def measure(points: Map, comparison: Comparison, truth: Truth) -> Metrics:
-    """Put a comparison into numbers, with their units in their names.
+    """Put a comparison into numbers, with their units in their names; NaN is a figure that nothing could be said of.
 
-    Root mean squares are over all compared points unless the name says otherwise. `gross` points are off by more than 1 mm
-    along the ray; the z statistics and the fits leave them out. `interior` is more than 3 px from any edge of the truth.
+    Root mean squares are over all compared points unless the name says otherwise. `without_gross`, the bias, the z statistics
+    and the fits leave out points that are off by more than 1 mm along their own ray. `gross_error_fraction` is of all points,
+    lit or not. `interior` is more than 3 px from any edge of the truth, and `false` points are as far from all that is lit.
     """
     there, compared, error = np.isfinite(points).all(axis=-1), comparison.compared, comparison.error
-    gross = compared & (np.abs(comparison.along_ray) > GROSS_MM)
-    fine = compared & ~gross
-    known = fine & (comparison.predicted > 0) & np.isfinite(comparison.predicted)
+    fine, known = fine_points(comparison), points_with_prediction(comparison)
     z = error[known] / comparison.predicted[known]
     limit = comparison.limit[compared]
     metrics: Metrics = {
@@ -183,47 +189,52 @@ def measure(points: Map, comparison: Comparison, truth: Truth) -> Metrics:
         "surface_bias_mm": _mean(error[fine]),
         "surface_median_abs_mm": _median(np.abs(error[compared])),
         "coverage": float(compared.sum() / truth.lit.sum()),
-        "gross_error_fraction": float(gross.sum() / compared.sum()),
+        "gross_error_fraction": float(comparison.gross.sum() / there.sum()),
         "predicted_rms_mm": rms(comparison.predicted[known]),
         "limit_rms_mm": rms(limit[np.isfinite(limit)]),
         "z_std": float(np.std(z)) if z.size else np.nan,
         "z_robust_std": NORMAL_MAD * _median(np.abs(z - _median(z))),
         "points": int(there.sum()),
-        "false_points": int((there & ~truth.lit).sum()),
+        "false_points": int((there & (_distance_px(truth.lit) > EDGE_PX)).sum()),
     }
     for number, name in enumerate(truth.things):
         metrics[f"thing_{name}_rms_mm"] = rms(error[compared & (truth.objects == number)])
     for shape in truth.shapes:
         on_shape = fine & (np.abs(_distance(shape, truth.points)) < ON_SHAPE_MM)
         chosen = np.float64(points[on_shape])
-        if len(chosen) >= LEAST_FITTED:
-            metrics |= fit(shape, chosen[:: -(-len(chosen) // MOST_FITTED)])
-            metrics[f"{type(shape).__name__.lower()}_{shape.name}_limit_rms_mm"] = rms(comparison.limit[on_shape])
-    return {key: value for key, value in metrics.items() if np.isfinite(value)}
+        metrics |= fit(shape, chosen[:: max(1, -(-len(chosen) // MOST_FITTED))])
+        metrics[f"{shape_key(shape)}_limit_rms_mm"] = rms(comparison.limit[on_shape])
+    return metrics
+
+
+def fine_points(comparison: Comparison) -> Mask:
+    """Compared points that are not off by more than 1 mm along their own ray : (h, w)."""
+    return comparison.compared & (np.abs(comparison.along_ray) <= GROSS_MM)
+
+
+def points_with_prediction(comparison: Comparison) -> Mask:
+    """Fine points that have a predicted standard deviation : (h, w)."""
+    return fine_points(comparison) & (comparison.predicted > 0) & np.isfinite(comparison.predicted)
+
+
+def shape_key(shape: Shape) -> str:
+    """What the names of a shape's figures begin with, such as `sphere_ball`."""
+    return f"{type(shape).__name__.lower()}_{shape.name}"
+
+
+def things(metrics: Metrics) -> dict[str, float]:
+    """RMS error of each thing in mm, by its name, from the figures of `measure`."""
+    return {key[len("thing_") : -len("_rms_mm")]: value for key, value in metrics.items() if key.startswith("thing_")}
 
 
 def fit(shape: Shape, points: Array) -> Metrics:
-    """Fit a shape's kind to measured points : (n, 3) mm, and compare with the shape, as one does without ground truth."""
-    match shape:
-        case Plane(name=name):
-            plane = primitives.fit_plane(points)
-            cosine = min(abs(float(plane.shape.normal @ shape.normal)), 1.0)
-            return {f"plane_{name}_rms_mm": plane.rms, f"plane_{name}_angle_error_deg": float(np.rad2deg(np.arccos(cosine)))}
-        case Sphere(name=name):
-            sphere = primitives.fit_sphere(points)
-            return {
-                f"sphere_{name}_rms_mm": sphere.rms,
-                f"sphere_{name}_radius_error_mm": sphere.shape.radius - shape.radius,
-                f"sphere_{name}_centre_error_mm": float(np.linalg.norm(sphere.shape.centre - shape.centre)),
-            }
-        case Cylinder(name=name):
-            cylinder = primitives.fit_cylinder(points)
-            cosine = min(abs(float(cylinder.shape.axis @ shape.axis)), 1.0)
-            return {
-                f"cylinder_{name}_rms_mm": cylinder.rms,
-                f"cylinder_{name}_radius_error_mm": cylinder.shape.radius - shape.radius,
-                f"cylinder_{name}_angle_error_deg": float(np.rad2deg(np.arccos(cosine))),
-            }
+    """Fit a shape's kind to measured points : (n, 3) mm, and compare with the shape, as one does without ground truth.
+
+    NaN if there are too few points.
+    """
+    names = FITTED[type(shape).__name__.lower()]
+    values = _fitted(shape, points) if len(points) >= LEAST_FITTED else len(names) * (np.nan,)
+    return {f"{shape_key(shape)}_{name}": value for name, value in zip(names, values, strict=True)}
 
 
 def away_from_edges(truth: Truth) -> Mask:
@@ -239,7 +250,7 @@ def away_from_edges(truth: Truth) -> Mask:
         edge |= (truth.objects[here] != truth.objects[there]) | (truth.lit[here] != truth.lit[there])
         smooth[here][edge] = 0
         smooth[there][edge] = 0
-    return cv2.distanceTransform(smooth, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > EDGE_PX
+    return _distance_px(smooth == 0) > EDGE_PX
 
 
 def rms(values: NDArray) -> float:
@@ -247,28 +258,46 @@ def rms(values: NDArray) -> float:
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64)))) if values.size else np.nan
 
 
-def read_arrays(path: Path, dimensions: Mapping[str, int]) -> dict[str, NDArray]:
-    """Read named arrays with the numbers of dimensions given from an npz file; InputError if that can't be done."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in dimensions if name in archive}
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file, found none") from None
-    except (ValueError, EOFError, zipfile.BadZipFile, OSError):
-        raise InputError(f"{path}: expected an npz file of plain arrays, found other or damaged data") from None
-    for name, count in dimensions.items():
-        if name not in arrays:
-            raise InputError(f"{path}: {name}: expected an array, found none")
-        if arrays[name].ndim != count:
-            raise InputError(f"{path}: {name}: expected {count} dimensions, found {arrays[name].ndim}")
-    return arrays
-
-
-def _projector_slope(points: Map, rays: Array, truth: Truth) -> Array:
-    """Change of the projector coordinates that carried fringes, along the camera's ray : (h, w) px/mm."""
+def _projector_slopes(rays: Array, truth: Truth) -> Array:
+    """Change of the projector's column and row along the camera's ray at the true points : (h, w, 2) px/mm."""
     half = DIFFERENCE_MM * rays
-    change = (truth.projector.project(points + half) - truth.projector.project(points - half)) / (2 * DIFFERENCE_MM)
-    return np.linalg.norm(change[..., [("columns", "rows").index(axis) for axis in truth.axes]], axis=-1)
+    return (truth.projector.project(truth.points + half) - truth.projector.project(truth.points - half)) / (2 * DIFFERENCE_MM)
+
+
+def _near_truth(points: Map, truth: Truth) -> Mask:
+    """Points no farther than 1 mm, along the ray, from a true point in the 3x3 pixels around : (h, w)."""
+    height, width = truth.lit.shape
+    distance, true = (np.linalg.norm(p - truth.camera.centre, axis=-1) for p in (points, truth.points))
+    around = np.pad(true, 1, constant_values=np.nan)
+    near = np.zeros((height, width), bool)
+    for j, i in np.ndindex(3, 3):
+        near |= np.abs(distance - around[j : j + height, i : i + width]) <= GROSS_MM
+    return near
+
+
+def _distance_px(mask: Mask) -> Map:
+    """Distance of each pixel to the nearest of a mask : (h, w) px."""
+    return cv2.distanceTransform(np.uint8(~mask), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+
+
+def _fitted(shape: Shape, points: Array) -> tuple[float, ...]:
+    """The figures of `FITTED` for a shape's kind."""
+    match shape:
+        case Plane():
+            plane = primitives.fit_plane(points)
+            return plane.rms, _angle_deg(plane.shape.normal, shape.normal)
+        case Sphere():
+            sphere = primitives.fit_sphere(points)
+            off_centre = float(np.linalg.norm(sphere.shape.centre - shape.centre))
+            return sphere.rms, sphere.shape.radius - shape.radius, off_centre
+        case Cylinder():
+            cylinder = primitives.fit_cylinder(points)
+            return cylinder.rms, cylinder.shape.radius - shape.radius, _angle_deg(cylinder.shape.axis, shape.axis)
+
+
+def _angle_deg(first: Array, second: Array) -> float:
+    """Angle between two unit vectors of either sign."""
+    return float(np.rad2deg(np.arccos(min(abs(float(first @ second)), 1.0))))
 
 
 def _distance(shape: Shape, points: Map) -> Array:
@@ -283,8 +312,23 @@ def _distance(shape: Shape, points: Map) -> Array:
 
 
 def _shape(entry: Mapping) -> Shape:
-    values = {key: np.asarray(value) if isinstance(value, list) else value for key, value in entry.items() if key != "kind"}
-    return SHAPES[entry["kind"]](**values)
+    """A shape as `scene.json` has it; KeyError, TypeError or ValueError if it is none."""
+
+    def vector(field: str) -> Array:
+        value = np.asarray(entry[field], float)
+        if value.shape != (3,) or not np.isfinite(value).all():
+            raise ValueError(f"{field} {entry[field]}")
+        return value
+
+    name = str(entry["name"])
+    match entry["kind"]:
+        case "plane":
+            return Plane(name, vector("point"), vector("normal"))
+        case "sphere":
+            return Sphere(name, vector("centre"), float(entry["radius"]))
+        case "cylinder":
+            return Cylinder(name, vector("point"), vector("axis"), float(entry["radius"]))
+    raise ValueError(f"kind {entry['kind']}")
 
 
 def _mean(values: NDArray) -> float:

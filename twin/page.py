@@ -36,8 +36,8 @@ class Section:
     blocks: Sequence[str]  # HTML
 
 
-def render(opening: Opening, sections: Iterable[Section], footer: str, *, views: bool) -> str:
-    """The page as HTML text; `views` brings the program that draws 3-D views along (5 MB)."""
+def render(opening: Opening, sections: Iterable[Section], footer: str) -> str:
+    """The page as HTML text, with the program that draws 3-D views in it (5 MB)."""
     numbers = "".join(
         f"<div><dt>{_text(label)}</dt><dd>{value} <small>{unit}</small></dd></div>" for label, value, unit in opening.figures
     )
@@ -51,7 +51,7 @@ def render(opening: Opening, sections: Iterable[Section], footer: str, *, views:
         opening=top,
         sections="\n".join(parts),
         footer=_text(footer),
-        scripts=f"<script>{get_plotlyjs()}</script>" if views else "",
+        scripts=f"<script>{get_plotlyjs()}</script>",
     )
 
 
@@ -79,7 +79,7 @@ def view(name: str, plotly_json: str, caption: str) -> str:
 
 
 def grid(blocks: Iterable[str], arrangement: str = "") -> str:
-    """Blocks beside each other as far as the page is wide enough; `four` makes them smaller, `two` larger."""
+    """Blocks beside each other as far as the page is wide enough; `two` makes them larger."""
     return f'<div class="grid {arrangement}">' + "\n".join(blocks) + "</div>"
 
 

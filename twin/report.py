@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from recon import atomic, capture, decode
 from recon.capture import Manifest, SurfaceCapture
-from recon.decode import ProjectorMap
+from recon.decode import ProjectorMap, Status
+from recon.metrics import Metrics, shown
 from recon.patterns import CentreLine, Fringes, GrayCode, Uniform
 from twin import evaluate, figures, page
-from twin.evaluate import GROSS_MM, Comparison, Metrics, Truth
+from twin.evaluate import GROSS_MM, Comparison, Truth
 from twin.figures import CYCLIC, DIVERGING, SEQUENTIAL, Scale
 from twin.page import Opening, Section
 
@@ -84,7 +85,7 @@ def write(
         settings(measurement, metrics),
         Section("Files, and how to make them again", [page.table(("file", "what is in it"), outputs), page.commands(commands)]),
     ]
-    text = page.render(opening(measurement, metrics), sections, FOOTER, views=True)
+    text = page.render(opening(measurement, metrics), sections, FOOTER)
     with atomic.new_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -99,9 +100,11 @@ def opening(measurement: Measurement, metrics: Metrics) -> Opening:
     """The title, the result in one sentence, and the figures that matter."""
     scene = TITLES.get(measurement.truth.scene, measurement.truth.scene).replace("_", " ")
     here, limit = metrics["surface_rms_mm"], metrics["limit_rms_mm"]
+    factor = f", {here / limit:.2f} times what the camera’s noise alone would leave" if np.isfinite(limit) else ""
+    things = ", ".join(f"{name} {shown(value, '.3f')}" for name, value in evaluate.things(metrics).items())
     result = (
         f"From {measurement.shots.patterns.count} images, {page.count(metrics['points'])} points of the surface were measured to "
-        f"{here:.3f} mm RMS of the true one, {here / limit:.2f} times what the camera’s noise alone would leave."
+        f"{here:.3f} mm RMS of the true one ({things}){factor}."
     )
     return Opening(
         "fringe projection, digital twin",
@@ -109,8 +112,8 @@ def opening(measurement: Measurement, metrics: Metrics) -> Opening:
         result,
         (
             ("error, RMS", f"{here:.3f}", "mm"),
-            ("limit by noise, RMS", f"{limit:.3f}", "mm"),
-            ("away from edges, RMS", f"{metrics['surface_interior_rms_mm']:.3f}", "mm"),
+            ("limit by noise, RMS", shown(limit, ".3f"), "mm"),
+            ("away from edges, RMS", shown(metrics["surface_interior_rms_mm"], ".3f"), "mm"),
             ("coverage", f"{100 * metrics['coverage']:.1f}", "%"),
             (f"errors above {GROSS_MM:g} mm", f"{100 * metrics['gross_error_fraction']:.3f}", "%"),
         ),
@@ -119,20 +122,19 @@ def opening(measurement: Measurement, metrics: Metrics) -> Opening:
 
 def surface(measurement: Measurement) -> Section:
     """The surface in 3-D."""
-    shown = figures.surface_view(measurement.points, measurement.comparison.error, ERROR_MM)
+    view = figures.surface_view(measurement.points, measurement.comparison.error, ERROR_MM)
     caption = "Drag to turn, scroll to come nearer. Red lies outside the true surface, blue inside; equal scales on all axes."
-    return Section("The surface", [page.view("surface", shown, caption)])
+    return Section("The surface", [page.view("surface", view, caption)])
 
 
 def errors(measurement: Measurement, metrics: Metrics) -> Section:
     """Where the errors are, and whether they are what the points' own sigma says."""
     comparison = measurement.comparison
-    fine = comparison.compared & (np.abs(comparison.along_ray) <= GROSS_MM) & (comparison.predicted > 0)
-    error, predicted = comparison.error[fine], comparison.predicted[fine]
+    known = evaluate.points_with_prediction(comparison)
+    error, predicted = comparison.error[known], comparison.predicted[known]
     scale = Scale(DIVERGING, -ERROR_MM, ERROR_MM)
     systematic = Scale(DIVERGING, -SYSTEMATIC_MM, SYSTEMATIC_MM)
-    sigma = Scale(SEQUENTIAL, 0, _round_up(float(np.quantile(predicted, 0.99))))
-    half = _round_up(float(3.5 * np.sqrt(np.mean(predicted.astype(float) ** 2))))
+    sigma = Scale(SEQUENTIAL, 0, _round_up(float(np.quantile(predicted, 0.99))) if predicted.size else ERROR_MM)
     maps = [
         page.picture(
             scale(np.where(comparison.interior, comparison.error, np.float32(np.nan))),
@@ -152,12 +154,26 @@ def errors(measurement: Measurement, metrics: Metrics) -> Section:
             sigma(comparison.predicted), "Predicted", "Standard deviation that the images’ own noise lets expect.", sigma, "mm"
         ),
     ]
-    here = metrics["surface_rms_mm"]
-    histograms = [
+    if predicted.size:
+        compared = page.grid(histograms(error, predicted, metrics), "two")
+    else:
+        compared = page.paragraph(f"No point is both within {GROSS_MM:g} mm of the truth and has a prediction to compare with.")
+    text = (
+        "The error of a point is its distance from the plane that touches the true surface where the pixel’s ray meets it. "
+        "If the light is well modelled, it is noise, and the points know how much of it they carry."
+    )
+    return Section("Errors", [page.paragraph(text), page.grid(maps), compared])
+
+
+def histograms(error: NDArray[np.float32], predicted: NDArray[np.float32], metrics: Metrics) -> list[str]:
+    """Drawings of errors : (n,) mm against their predicted standard deviations : (n,) mm, n > 0."""
+    half = _round_up(float(3.5 * np.sqrt(np.mean(predicted.astype(float) ** 2))))
+    here, bias = metrics["surface_rms_mm"], metrics["surface_bias_mm"]
+    return [
         page.drawing(
             figures.histogram(error, figures.noise_mixture(predicted, half, "predicted noise"), "error, mm", half),
             "Errors in mm",
-            f"RMS {here:.4f} mm; predicted {metrics['predicted_rms_mm']:.4f} mm; bias {metrics['surface_bias_mm']:+.4f} mm.",
+            f"RMS {here:.4f} mm; predicted {metrics['predicted_rms_mm']:.4f} mm; bias {bias:+.4f} mm.",
         ),
         page.drawing(
             figures.histogram(error / predicted, figures.standard_normal(5), "error / predicted standard deviation", 5),
@@ -165,11 +181,6 @@ def errors(measurement: Measurement, metrics: Metrics) -> Section:
             f"Standard deviation {metrics['z_std']:.3f}, robust {metrics['z_robust_std']:.3f}; 1 if the prediction is right.",
         ),
     ]
-    text = (
-        "The error of a point is its distance from the plane that touches the true surface where the pixel’s ray meets it. "
-        "If the light is well modelled, it is noise, and the points know how much of it they carry."
-    )
-    return Section("Errors", [page.paragraph(text), page.grid(maps), page.grid(histograms, "two")])
 
 
 def images(measurement: Measurement) -> Section:
@@ -179,26 +190,25 @@ def images(measurement: Measurement) -> Section:
     fringes = next(place for part, place in parts if isinstance(part, Fringes))
     mean = stack[fringes].mean(axis=0)
     scene = figures.grey(mean, float(np.quantile(mean, 0.999)), gamma=2.2)
-    shown = [page.picture(scene, "The scene", f"Mean of {fringes.stop - fringes.start} fringe images; shadows lifted.")]
+    pictures = [page.picture(scene, "The scene", f"Mean of {fringes.stop - fringes.start} fringe images; shadows lifted.")]
     for part, place in parts:
         match part:
             case Fringes():
                 for k in np.linspace(0, part.steps, FRINGES_SHOWN, endpoint=False).astype(int):
                     shift = np.rad2deg(part.shifts[k])
                     detail = f"Shift {shift:.0f}°, {part.pitch:g} projector px a period."
-                    shown.append(
-                        page.picture(figures.grey(stack[place.start + k], full), f"Fringes {k + 1} of {part.steps}", detail)
-                    )
+                    picture = figures.grey(stack[place.start + k], full)
+                    pictures.append(page.picture(picture, f"Fringes {k + 1} of {part.steps}", detail))
             case CentreLine():
                 detail = f"{part.width:g} px wide; numbers the fringes."
-                shown.append(page.picture(figures.grey(stack[place.start], full), "Centre line", detail))
+                pictures.append(page.picture(figures.grey(stack[place.start], full), "Centre line", detail))
             case GrayCode():
                 detail = f"Coarsest of {part.bits} bits; numbers the fringes."
-                shown.append(page.picture(figures.grey(stack[place.start], full), "Gray code", detail))
+                pictures.append(page.picture(figures.grey(stack[place.start], full), "Gray code", detail))
             case Uniform():
                 detail = f"Level {part.level:g}."
-                shown.append(page.picture(figures.grey(stack[place.start], full), "Uniform light", detail))
-    return Section("What the camera saw", [page.grid(shown)])
+                pictures.append(page.picture(figures.grey(stack[place.start], full), "Uniform light", detail))
+    return Section("What the camera saw", [page.grid(pictures)])
 
 
 def decoding(measurement: Measurement) -> Section:
@@ -215,8 +225,8 @@ def decoding(measurement: Measurement) -> Section:
     order = np.rint((coordinate - fringes.zero(patterns.length(axis))) / fringes.pitch - found.phase / (2 * np.pi))
     orders, columns = _span(order, usable), _span(coordinate, usable)
     strength = Scale("gray", 0, _round_up(float(np.quantile(found.modulation, 0.995))))
-    seen = found.modulation >= decode.DARKEST
-    shown = [
+    seen = found.status != Status.DARK
+    stages = [
         page.picture(
             cycle(np.where(seen, found.phase, np.float32(np.nan))), "Wrapped phase", "Least squares over the steps.", cycle, "rad"
         ),
@@ -226,15 +236,15 @@ def decoding(measurement: Measurement) -> Section:
             strength(found.modulation), "Modulation", "Amplitude of the fringes: the signal against the noise.", strength, "DN"
         ),
     ]
-    return Section("From fringes to coordinates", [page.grid(shown, "two")])
+    return Section("From fringes to coordinates", [page.grid(stages, "two")])
 
 
 def beside_the_paper(metrics: Metrics) -> Section:
     """The paper's figures, the limit and ours."""
-    limit = f"{metrics['limit_rms_mm']:.4f} mm"
+    limit, interior = (shown(metrics[name], ".4f", " mm") for name in ("limit_rms_mm", "surface_interior_rms_mm"))
     rows = [
         ("Surface against its true shape, RMS", "not measured: shown only", limit, f"{metrics['surface_rms_mm']:.4f} mm"),
-        ("the same, away from edges", "not measured", limit, f"{metrics['surface_interior_rms_mm']:.4f} mm"),
+        ("the same, away from edges", "not measured", limit, interior),
         _fitted(metrics, "Plane, RMS of the fit", "plane", "rms"),
         _fitted(metrics, "Sphere, error of the radius", "sphere", "radius_error"),
         _fitted(metrics, "Sphere, RMS of the fit", "sphere", "rms"),
@@ -263,7 +273,7 @@ def settings(measurement: Measurement, metrics: Metrics) -> Section:
             "modulation",
             f"median {np.median(found.modulation[seen]):.1f} DN, weakest 1 % {np.quantile(found.modulation[seen], 0.01):.1f} DN",
         ),
-        ("saturated", f"{100 * np.mean(found.status == decode.Status.SATURATED):.2f} % of the image"),
+        ("saturated", f"{100 * np.mean(found.status == Status.SATURATED):.2f} % of the image"),
         ("noise, measured", f"variance {found.noise.read_variance:.3f} DN² + {found.noise.gain:.4f} DN × intensity"),
         (
             "points",
@@ -289,8 +299,8 @@ def _fitted(metrics: Metrics, what: str, kind: str, figure: str) -> tuple[str, s
         for key in metrics
         if re.fullmatch(f"{kind}_.*_limit_rms_mm", key)
     ]
-    here = ", ".join(f"{abs(metrics[f'{kind}_{name}_{figure}_mm']):.4f} mm" for name in names)
-    limit = ", ".join(f"{metrics[f'{kind}_{name}_limit_rms_mm']:.4f} mm" for name in names) if figure == "rms" else ""
+    here = ", ".join(shown(abs(metrics[f"{kind}_{name}_{figure}_mm"]), ".4f", " mm") for name in names)
+    limit = ", ".join(shown(metrics[f"{kind}_{name}_limit_rms_mm"], ".4f", " mm") for name in names) if figure == "rms" else ""
     return what, PAPER[f"{kind}_{figure}"], limit, here or NOT_HERE
 
 

@@ -44,8 +44,9 @@ def run(config: Config) -> int:
         If a place to write to, or the real recordings, are not there.
     """
     groups = [config.only] if config.only else get_args(Group)
-    for group in groups if config.document else ():
-        rows.check_place(config.document, group)
+    if config.document:
+        for group in groups:
+            rows.check_place(config.document, group)
     if config.real and not config.real.is_dir():
         raise InputError(f"accuracy: real: expected a folder of recordings, found none at {config.real}")
     config.out.mkdir(parents=True, exist_ok=True)

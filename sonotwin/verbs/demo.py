@@ -9,23 +9,26 @@ interrupted is simply started again.
     sonotwin demo scene=sphere patterns=gray_surface out=outputs/sphere
 """
 
-import json
 import os
 import shlex
-import sys
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 from rich.console import Console
 
+from recon import atomic, metrics
+from recon.metrics import Metrics, shown
 from sonotwin.verbs import evaluate, render, surface
 from twin import demo, report, session
-from twin.demo import Metrics, Step
+from twin.demo import Step
+from twin.evaluate import things
 
 Figures = Mapping[str, float | int]
 
+MESHES = ("surface.ply", "surface.glb")
 OUTPUTS = (
     ("report.html", "this page"),
     ("surface.ply", "the surface: triangles, normals and predicted sigma of each vertex, in mm"),
@@ -43,6 +46,12 @@ class Config(render.Config):
     """Fields of `conf/demo.yaml`: those of `conf/render.yaml`, for one camera."""
 
     cameras: Annotated[list[session.CameraName], Field(min_length=1, max_length=1)]
+    _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
+
+    def model_post_init(self, context: Any) -> None:
+        """Keep the overrides, for the commands that the report shows."""
+        if context:
+            self._overrides = context["overrides"]
 
 
 def run(config: Config) -> None:
@@ -55,11 +64,11 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     steps = surface_steps(config)
-    metrics = demo.play(
+    found = demo.play(
         steps, config.out, config.model_dump(mode="json"), lambda text: console.print(text, style="bold cyan", markup=False)
     )
     console.print()
-    for line in summary(config, metrics):
+    for line in summary(config, found):
         console.print(line, markup=False)
 
 
@@ -73,31 +82,32 @@ def surface_steps(config: Config) -> list[Step]:
 
     def reconstruction(folder: Path, _: Figures) -> Figures:
         surface.run(surface.Config(capture=folder / "capture", out=folder / "surface", camera=camera))
-        for name in ("surface.ply", "surface.glb"):
-            os.replace(folder / "surface" / name, folder / name)
-        return _figures(folder / "surface" / surface.METRICS)
+        for name in MESHES:
+            _offer(folder / "surface" / name, folder / name)
+        return metrics.read(folder / "surface" / metrics.FILE)
 
     def comparison(folder: Path, _: Figures) -> Figures:
         places = {"surface": folder / "surface", "truth": folder / "truth", "out": folder / "evaluation"}
         evaluate.run(evaluate.Config(**places, camera=camera))
-        return _figures(folder / "evaluation" / evaluate.METRICS)
+        return metrics.read(folder / "evaluation" / metrics.FILE)
 
     def telling(folder: Path, figures: Figures) -> Figures:
         story = report.read(folder / "capture", folder / "truth", folder / "surface" / "points.npz", camera)
-        report.write(folder / "report.html", story, dict(figures), OUTPUTS, commands(folder, camera, sys.argv[1:]))
+        report.write(folder / "report.html", story, dict(figures), OUTPUTS, commands(folder, camera, config._overrides))
         return {}
 
     return [
-        Step("render", f"render {config.patterns.count} images of the scene and its truth", rendering),
-        Step("surface", "reconstruct the surface from the images", reconstruction, ("surface.ply", "surface.glb")),
-        Step("evaluate", "compare it with the truth", comparison),
+        Step("render", f"render {config.patterns.count} images of the scene and its truth", rendering, ("capture", "truth")),
+        Step("surface", "reconstruct the surface from the images", reconstruction, ("surface", *MESHES)),
+        # its prediction is of the points that have a truth, by the true normals
+        Step("evaluate", "compare it with the truth", comparison, ("evaluation",), refines=("predicted_rms_mm",)),
         Step("report", "write the report", telling, ("report.html",)),
     ]
 
 
-def commands(folder: Path, camera: str, arguments: Sequence[str]) -> list[str]:
-    """The command lines that do the steps one by one, with the settings given to `sonotwin demo` on its own command line."""
-    given = [argument for argument in arguments[1:] if not argument.startswith("out=")] if arguments[:1] == ["demo"] else []
+def commands(folder: Path, camera: str, overrides: Sequence[str]) -> list[str]:
+    """The command lines that do the same at once and step by step, with the settings that `sonotwin demo` was given."""
+    given = [override for override in overrides if not override.startswith("out=")]
     lines = (
         ["demo", *given, f"out={folder}"],
         ["render", *given, f"out={folder}"],
@@ -113,19 +123,25 @@ def commands(folder: Path, camera: str, arguments: Sequence[str]) -> list[str]:
     return [shlex.join(["sonotwin", *line]) for line in lines]
 
 
-def summary(config: Config, metrics: Metrics) -> list[str]:
+def summary(config: Config, found: Metrics) -> list[str]:
     """What, how well, how much of it, and where to look."""
-    out, points = config.out, f"{metrics['points']:,}".replace(",", " ")
+    out, points = config.out, f"{found['points']:,}".replace(",", " ")
+    parts = ", ".join(f"{name} {shown(value, '.3f')}" for name, value in things(found).items())
     return [
-        f"measured    {points} points of the {config.scene['kind']} from {config.patterns.count} images, "
-        f"in {metrics['seconds_demo']:.0f} s",
-        f"accuracy    {metrics['surface_rms_mm']:.3f} mm RMS; "
-        f"the camera's noise alone would leave {metrics['limit_rms_mm']:.3f} mm",
-        f"coverage    {100 * metrics['coverage']:.1f} % of what camera and projector both see; "
-        f"{100 * metrics['gross_error_fraction']:.3f} % of the points are off by more than 1 mm",
+        f"measured    {points} points of the scene ({config.scene['kind']}) from {config.patterns.count} images, "
+        f"in {found['seconds_demo']:.0f} s",
+        f"accuracy    {shown(found['surface_rms_mm'], '.3f', ' mm')} RMS ({parts}); "
+        f"the camera's noise alone would leave {shown(found['limit_rms_mm'], '.3f', ' mm')}",
+        f"coverage    {100 * found['coverage']:.1f} % of what camera and projector both see; "
+        f"{100 * found['gross_error_fraction']:.3f} % of the points are off by more than 1 mm",
         f"look at     {out / 'report.html'}; the surface is in {out / 'surface.ply'} and {out / 'surface.glb'}",
     ]
 
 
-def _figures(path: Path) -> Figures:
-    return json.loads(path.read_text(encoding="utf-8"))
+def _offer(source: Path, path: Path) -> None:
+    """Give a file a second place, without a second copy where the file system can do that."""
+    with atomic.new_file(path) as temporary:
+        try:
+            os.link(source, temporary)
+        except OSError:
+            shutil.copyfile(source, temporary)

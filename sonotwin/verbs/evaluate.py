@@ -6,16 +6,15 @@ error_map.png into the folder `out`, by default evaluation/ in the surface's fol
     sonotwin evaluate surface=outputs/sphere/surface truth=outputs/sphere/truth
 """
 
-import json
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from recon import atomic
+from recon import atomic, metrics
+from recon.metrics import Metrics, shown
 from twin import evaluate, figures
 
-METRICS = "metrics.json"
-ERROR_MAP = "error_map.png"
+ERROR_MAP = "error_map.png"  # by which the folder of an evaluation is known
 
 
 class Config(BaseModel):
@@ -38,22 +37,24 @@ def run(config: Config) -> None:
         If surface or truth are missing, damaged, or don't fit together; or `out` can't be written to.
     """
     out = config.out or config.surface / "evaluation"
-    atomic.check_folder(out, METRICS)
+    atomic.check_folder(out, ERROR_MAP, inputs=(config.surface, config.truth))
     truth = evaluate.read_truth(config.truth, config.camera)
     points, sigma = evaluate.read_points(config.surface / "points.npz")
     comparison = evaluate.compare(points, sigma, truth)
-    metrics = evaluate.measure(points, comparison, truth)
-    with atomic.new_folder(out, METRICS) as folder:
+    found = evaluate.measure(points, comparison, truth)
+    with atomic.new_folder(out, ERROR_MAP) as folder:
         (folder / ERROR_MAP).write_bytes(figures.error_map_png(comparison.error, comparison.interior))
-        (folder / METRICS).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    print(f"evaluate    {describe(metrics)}")
-    print(f"wrote       {out}/{{{METRICS},{ERROR_MAP}}}")
+        metrics.write(folder / metrics.FILE, found)
+    print(f"evaluate    {describe(found)}")
+    print(f"wrote       {out}/{{{metrics.FILE},{ERROR_MAP}}}")
 
 
-def describe(metrics: evaluate.Metrics) -> str:
+def describe(found: Metrics) -> str:
     """Accuracy beside its limit, and coverage, in one line."""
+    everywhere, interior, limit = (
+        shown(found[f"{name}_rms_mm"], ".3f", " mm") for name in ("surface", "surface_interior", "limit")
+    )
     return (
-        f"surface RMS {metrics['surface_rms_mm']:.3f} mm, {metrics['surface_interior_rms_mm']:.3f} mm away from edges; "
-        f"the sensor's limit {metrics['limit_rms_mm']:.3f} mm; coverage {100 * metrics['coverage']:.1f} %, "
-        f"gross errors {100 * metrics['gross_error_fraction']:.3f} %"
+        f"surface RMS {everywhere}, {interior} away from edges; the sensor's limit {limit}; "
+        f"coverage {100 * found['coverage']:.1f} %, gross errors {100 * found['gross_error_fraction']:.3f} %"
     )

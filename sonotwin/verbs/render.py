@@ -2,7 +2,7 @@
 
 Reads the rig, the scene, the patterns and the engine's settings from conf/. Writes OUT/capture/, which the pipeline reads like
 any hardware's, and OUT/truth/, which only evaluation opens: points, normals, projector coordinates, the true calibration.
-Takes about five seconds a camera for nine patterns on two cores, and once some ten seconds more to compile.
+Takes about five seconds a camera for nine patterns on two cores, and once ten seconds more to compile.
 
     sonotwin render scene=sphere patterns=gray_surface out=outputs/sphere
 """
@@ -64,5 +64,5 @@ def run(config: Config) -> None:
             f"render      {camera}, {config.patterns.count} patterns, {config.engine.samples} samples/px, "
             f"exposure {view.exposure.time_s * 1e3:.2f} ms, {perf_counter() - start:.1f} s"
         )
-    session.write_session(config.out, config.rig, scene, config.patterns, views, config.model_dump(mode="json"))
+    session.write_session(config.out, config.rig, scene, config.patterns, views, config.model_dump(mode="json", exclude={"out"}))
     console.print(f"wrote       {config.out}/{{capture,truth}}", markup=False)

@@ -9,23 +9,25 @@ metrics.json into the folder `out`; results that are there already are replaced.
     sonotwin surface images=shots patterns=paper_surface calibration=optics.yaml out=outputs/shots
 """
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from pydantic import BaseModel, ConfigDict
 
-from recon import atomic, capture, decode, meshes, surface
+from recon import atomic, capture, decode, meshes, metrics, surface
+from recon.camera import Camera
 from recon.capture import SurfaceCapture
 from recon.decode import ProjectorMap, Status
 from recon.errors import InputError
+from recon.metrics import Metrics, shown
 from recon.triangulate import PointMap, Triangulator
 from sonotwin import config as configuration
 
-METRICS = "metrics.json"
+POINTS = "points.npz"  # by which the folder of a surface is known
 
 
 class Config(BaseModel):
@@ -64,7 +66,7 @@ def run(config: Config) -> None:
     InputError
         If the input is incomplete or damaged, `out` can't be written to, or nothing is seen by both devices.
     """
-    atomic.check_folder(config.out, METRICS)
+    atomic.check_folder(config.out, POINTS, inputs=sources(config))
     watch = Stopwatch()
     with watch.stage("read"):
         shots = read(config)
@@ -81,23 +83,22 @@ def run(config: Config) -> None:
         raw = triangulate(found)
     with watch.stage("clean"):
         cleaned = surface.clean(raw, camera, found.modulation, config.limits)
-    metrics = measure(found, raw, cleaned)
-    if not metrics["points"]:
+    if not np.isfinite(cleaned.points).any():
         raise InputError(f"{shots.name}: expected a surface that camera and projector both see, found no point of it")
-    points, sigma = f"{metrics['points']:,}".replace(",", " "), metrics["predicted_rms_mm"]
-    print(f"triangulate {points} points, predicted sigma {sigma:.3f} mm, {metrics['removed_px']} px removed as unsure")
-
     with watch.stage("mesh"):
         mesh = surface.mesh(cleaned, camera, config.limits.max_slope)
-    with atomic.new_folder(config.out, METRICS) as folder:
+    figures = measure(found, raw, cleaned) | {"predicted_rms_mm": predicted_rms(mesh, camera), "triangles": len(mesh.faces)}
+    points, sigma = f"{figures['points']:,}".replace(",", " "), shown(figures["predicted_rms_mm"], ".3f", " mm")
+    print(f"triangulate {points} points, predicted sigma {sigma}, {figures['removed_px']} px removed as unsure")
+
+    with atomic.new_folder(config.out, POINTS) as folder:
         with watch.stage("write"):
             meshes.write_ply(folder / "surface.ply", mesh)
             meshes.write_glb(folder / "surface.glb", mesh)
             images = {"points": cleaned.points, "sigma": cleaned.sigma, "modulation": found.modulation, "status": found.status}
-            np.savez_compressed(folder / "points.npz", **images)
-        text = json.dumps(metrics | {"triangles": len(mesh.faces)} | watch.seconds, indent=2)
-        (folder / METRICS).write_text(text + "\n", encoding="utf-8")
-    print(f"wrote       {config.out}/{{surface.ply,surface.glb,points.npz,{METRICS}}}")
+            np.savez_compressed(folder / POINTS, **images)
+        metrics.write(folder / metrics.FILE, figures | watch.seconds)
+    print(f"wrote       {config.out}/{{surface.ply,surface.glb,{POINTS},{metrics.FILE}}}")
 
 
 def read(config: Config) -> SurfaceCapture:
@@ -118,6 +119,12 @@ def read(config: Config) -> SurfaceCapture:
         found = ", ".join(given) or "none of them"
         raise InputError(f"surface: expected capture, or images with patterns and calibration, found {found}")
     return capture.read_bare(config.images, patterns_file(config.patterns), config.calibration, config.camera)
+
+
+def sources(config: Config) -> list[Path]:
+    """What the fields name to be read."""
+    patterns = None if config.patterns is None else patterns_file(config.patterns)
+    return [path for path in (config.capture, config.images, patterns, config.calibration) if path is not None]
 
 
 def patterns_file(name: str) -> Path:
@@ -145,7 +152,7 @@ def _counted(number: int, thing: str) -> str:
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
-def measure(found: ProjectorMap, raw: PointMap, cleaned: PointMap) -> dict[str, float]:
+def measure(found: ProjectorMap, raw: PointMap, cleaned: PointMap) -> Metrics:
     """Figures of a reconstruction, each named with its unit."""
     before, after = np.isfinite(raw.points[..., 0]), np.isfinite(cleaned.points[..., 0])
     points = int(after.sum())
@@ -155,6 +162,17 @@ def measure(found: ProjectorMap, raw: PointMap, cleaned: PointMap) -> dict[str, 
         "unreachable_px": found.summary["unreachable"],
         "uncertain_px": found.summary["uncertain"],
         "saturated_fraction": found.summary["saturated"] / found.status.size,
-        "predicted_rms_mm": float(np.sqrt(np.mean(cleaned.sigma[after].astype(float) ** 2))) if points else 0.0,
-        "modulation_median_dn": float(np.median(found.modulation[after])) if points else 0.0,
+        "modulation_median_dn": float(np.median(found.modulation[after])),
     }
+
+
+def predicted_rms(mesh: trimesh.Trimesh, camera: Camera) -> float:
+    """Root mean square of the predicted standard deviations across the surface, mm; NaN if there are none.
+
+    Sigma lies along the camera's ray; its part along the vertex normal moves the surface.
+    """
+    offset = mesh.vertices - camera.centre
+    cosine = (offset * mesh.vertex_normals).sum(axis=1) / np.linalg.norm(offset, axis=1)
+    across = mesh.vertex_attributes["sigma_mm"].astype(float) * cosine
+    known = across[np.isfinite(across)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else np.nan

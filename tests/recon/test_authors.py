@@ -1,5 +1,6 @@
 """The rig authors' layout is written so that their formulas decode it, and read back as it was."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -59,6 +60,19 @@ def test_missing_images_are_named(surface, tmp_path):
     (tmp_path / "rig" / "SLdata" / "images" / "3.png").unlink()
     with pytest.raises(InputError, match="images: expected at least 10 PNG images, found 9"):
         authors.read(tmp_path / "rig")
+
+
+def test_a_mask_that_cannot_be_written_leaves_nothing(surface, tmp_path, monkeypatch):
+    encode = cv2.imencode
+
+    def all_but_masks(suffix, image, *options):
+        return (False, None) if set(np.unique(image)) <= {0, 255} else encode(suffix, image, *options)
+
+    monkeypatch.setattr(cv2, "imencode", all_but_masks)
+    monkeypatch.setattr(cv2, "imwrite", lambda *_: False)
+    with pytest.raises(OSError, match=r"mask.png: the PNG encoder failed"):
+        authors.write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
+    assert not list(tmp_path.iterdir())
 
 
 def test_other_patterns_are_not_theirs(surface, tmp_path):

@@ -132,13 +132,32 @@ def test_damaged_files_are_refused_in_one_line(optics, tmp_path):
     whole = (tmp_path / "optics.yaml").read_bytes()
     np.savez(tmp_path / "a.npz", **authors.parameters(optics))
     archive = (tmp_path / "a.npz").read_bytes()
-    cut = [data[: len(data) * i // 10] for data in (whole, archive) for i in range(1, 10)]
+    np.savez_compressed(tmp_path / "a.npz", **authors.parameters(optics))
+    spoilt = bytearray((tmp_path / "a.npz").read_bytes())
+    spoilt[60:80] = 20 * b"\xff"  # within the first matrix
+    cut = [bytes(spoilt), *(data[: len(data) * i // 10] for data in (whole, archive) for i in range(1, 10))]
     newer = whole.replace(b"sonotwin-optics/1", b"sonotwin-optics/2")
     path = tmp_path / "damaged.yaml"
     for data in [b"", b"hello", b"\xff\xfe\x00", b"%YAML:1.0\n---\n- 3\n", b"PK\x03\x04", newer, *cut]:
         path.write_bytes(data)
         with pytest.raises(InputError, match=r"^[^\n]*damaged\.yaml: [^\n]*expected [^\n]*found [^\n]*$"):
             calibration.read(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("", "expected at least one device, found none"),
+        ("cam1: 3\n", "cam1: expected size, matrix, distortion and camera_from_world, found something else"),
+        ("cam1: [ 1, 2 ]\n", "cam1: expected size, matrix, distortion and camera_from_world, found something else"),
+    ],
+)
+def test_a_file_of_ours_without_devices_is_refused(tmp_path, content, complaint):
+    path = tmp_path / "optics.yaml"
+    path.write_text(f'%YAML:1.0\n---\nschema: "sonotwin-optics/1"\n{content}')
+    with pytest.raises(InputError) as refusal:
+        calibration.read(path)
+    assert str(refusal.value) == f"{path}: {complaint}"
 
 
 def test_a_missing_file_or_size_is_named(optics, tmp_path):

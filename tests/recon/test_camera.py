@@ -74,10 +74,14 @@ def test_unreachable_pixels_give_nan():
     [
         ({"matrix": np.eye(2)}, "matrix"),
         ({"matrix": np.diag([-1.0, 1, 1])}, "matrix"),
+        ({"matrix": MATRIX.T}, "matrix"),
+        ({"matrix": MATRIX * 2}, "matrix"),
+        ({"matrix": MATRIX + np.array([[0, 0, 0], [0.1, 0, 0], [0, 0, 0]])}, "matrix"),
         ({"distortion": np.zeros(6)}, "distortion"),
         ({"distortion": np.array([np.nan, 0, 0, 0])}, "distortion"),
         ({"camera_from_world": np.full((4, 4), np.nan)}, "camera_from_world"),
         ({"camera_from_world": np.diag([1.0, 1, -1, 1])}, "camera_from_world"),
+        ({"camera_from_world": rigid.from_rotation_vector([0.1, 0, 0], [1.0, 2, 3]).T}, "camera_from_world"),
     ],
 )
 def test_nonsense_is_refused_by_name(change, field):

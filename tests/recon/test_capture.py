@@ -86,6 +86,14 @@ def test_a_failed_write_leaves_nothing(tmp_path, optics, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_image_that_cannot_be_encoded_is_no_capture(tmp_path, optics, monkeypatch):
+    """OpenCV says so in a flag."""
+    monkeypatch.setattr(cv2, "imencode", lambda *_: (False, np.zeros(0, np.uint8)))
+    with pytest.raises(OSError, match=r"0\.png: the PNG encoder failed"):
+        write(tmp_path / "capture", optics)
+    assert list(tmp_path.iterdir()) == []
+
+
 def edit(folder: Path, change) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     change(manifest)
@@ -141,8 +149,20 @@ FAULTS = {
         lambda f: (f / "calibration" / "optics.yaml").unlink(),
         "optics.yaml: expected a calibration file, found no such file",
     ),
+    "nested": (
+        lambda f: (f / "manifest.json").write_text("[" * 100_000),
+        "manifest.json: expected JSON, found values nested too deeply",
+    ),
+    "tiny": (
+        lambda f: edit(f, lambda m: m["devices"]["cam1"].update(size=[64, 4])),
+        "manifest.json: devices.cam1.size.1: expected greater than or equal to 8, found 4",
+    ),
+    "two sizes of projector": (
+        lambda f: edit(f, lambda m: m["devices"]["projector"].update(size=[1280, 800])),
+        "manifest.json: devices.projector.size: expected 128x80 as in surface.patterns, found 1280x800",
+    ),
     "other projector": (
-        lambda f: edit(f, lambda m: m["surface"]["patterns"].update(projector_size=[1280, 800])),
+        lambda f: edit(f, lambda m: (m["devices"].pop("projector"), m["surface"]["patterns"].update(projector_size=[1280, 800]))),
         "optics.yaml: expected projector of 1280x800 px, found 128x80",
     ),
     "other camera": (
@@ -243,6 +263,7 @@ def test_faults_of_a_bare_folder(bare):
         capture.read_bare(images.with_name("nowhere"), patterns, optics)
     for content, complaint in {
         "parts: [": "expected YAML",
+        "[" * 10_000: "expected YAML, found values nested too deeply",
         "parts: []": "projector_size: expected a value, found none",
         "projector_size: [.nan, 2]\nunwrap: gray\nparts: []": r"projector_size.0: expected a finite number",
     }.items():

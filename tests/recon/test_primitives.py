@@ -88,6 +88,19 @@ def test_too_little_is_refused(fit_shape, points):
         fit_shape(points)
 
 
-def test_a_plane_is_no_sphere():
-    with pytest.raises(ValueError, match="in a plane"):
-        primitives.fit_sphere(np.random.default_rng(5).uniform(-1, 1, (50, 3)) * (1, 1, 0))
+@pytest.mark.parametrize("noise", [0, 1e-6, 0.05, 1.0])
+def test_a_plane_is_no_sphere(noise):
+    """Nor are noisy points of one: they would give a sphere of a chance radius. Each of 50 would pass once in a million."""
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        flat = np.column_stack([rng.uniform(-20, 20, (100, 2)), rng.normal(0, noise, 100)])
+        with pytest.raises(ValueError, match="in a plane"):
+            primitives.fit_sphere(rigid.apply(POSE, flat))
+
+
+def test_a_slight_curvature_is_a_sphere():
+    """A cap 40 wide and 0.2 high, above a noise of 0.02: its radius of 1000 is known to a few per cent."""
+    rng = np.random.default_rng(6)
+    x, y = rng.uniform(-20, 20, (2, 400))
+    fit = primitives.fit_sphere(np.column_stack([x, y, np.sqrt(1000**2 - x**2 - y**2) + rng.normal(0, 0.02, 400)]))
+    assert abs(fit.shape.radius - 1000) < 5 * np.sqrt(fit.covariance[3, 3]) < 200

@@ -125,5 +125,27 @@ def test_one_triangulator_serves_many_maps(devices):
 
 
 def test_a_map_of_another_size_is_refused(devices):
-    with pytest.raises(ValueError, match="expected 160x128, found 10x20"):
+    with pytest.raises(ValueError, match=r"columns: expected an image of shape \(128, 160\), found \(20, 10\)"):
         triangulate(Map(columns=np.zeros((20, 10)), sigma_columns=np.ones((20, 10))), *devices)
+
+
+def test_a_sigma_of_another_size_is_refused(devices):
+    with pytest.raises(ValueError, match=r"sigma_rows: expected an image of shape \(128, 160\), found \(128, 10\)"):
+        triangulate(Map(rows=np.zeros((128, 160)), sigma_rows=np.ones((128, 10))), *devices)
+
+
+@pytest.mark.parametrize("axis", ["columns", "rows"])
+def test_a_camera_of_one_row_needs_one_axis_only(devices, axis):
+    camera, projector = devices
+    line = Camera((SIZE[0], 1), camera.matrix, camera.distortion, camera.camera_from_world)
+    points = surface_points(line)
+    result = triangulate(Map(**coordinates(points, projector, axis), **sigmas((1, SIZE[0]), **{axis: 0.02})), line, projector)
+    assert np.abs(result.points - points).max() < 1e-4 and np.isfinite(result.sigma).all()
+
+
+@pytest.mark.parametrize("axes", ["columns", "rows", "columns rows"])
+def test_an_axis_without_sigma_gives_points_and_no_sigma(devices, axes):
+    camera, projector = devices
+    points = surface_points(camera)
+    result = triangulate(Map(**coordinates(points, projector, axes)), camera, projector)
+    assert np.abs(result.points - points).max() < 1e-4 and np.isnan(result.sigma).all()

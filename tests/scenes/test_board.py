@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from recon import rigid
 from scenes import board
@@ -60,6 +61,28 @@ def test_any_board_is_closed_and_its_circles_are_where_it_says(columns, rows, sp
     distance = np.linalg.norm(discs.vertices[:, None] - board.circle_centres(config), axis=2).min(axis=1)
     front = len(discs.vertices) // 2
     assert distance[:front].max() == pytest.approx(config.diameter_mm / 2, abs=1e-9)
+
+
+def largest_discs(print_error: float) -> board.Config:
+    """The board with the largest discs that are accepted, to 0.01 mm."""
+    for diameter in np.arange(21.3, 10, -0.01):
+        try:
+            return board.Config(columns=3, rows=5, spacing_mm=15, margin_mm=15, diameter_mm=diameter, print_error_mm=print_error)
+        except ValidationError:
+            continue
+    raise AssertionError("no diameter is accepted")
+
+
+@pytest.mark.parametrize("print_error", [0, 0.3])
+def test_discs_as_large_as_allowed_stay_apart(monkeypatch, print_error):
+    """Every other row is moved towards the next, by the largest errors in x and in y; half a side of the outline is left."""
+    config = largest_discs(print_error)
+    error = 2 * board.MAX_ERRORS * print_error * (np.arange(15) // 3 % 2)[:, None]
+    monkeypatch.setattr(board, "_printed", lambda config: board.object_points(config)[:, :2] + error)
+    ground, discs = (thing.mesh for thing in board.build(config).things)
+    assert ground.is_watertight and discs.is_watertight and discs.body_count == 15
+    nearest = np.sqrt(2) * (15 - 2 * board.MAX_ERRORS * print_error)
+    assert nearest - config.diameter_mm > config.diameter_mm / 2 * np.sin(np.pi / board.SIDES)
 
 
 def test_the_printed_centres_scatter_as_asked():

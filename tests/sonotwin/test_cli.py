@@ -83,6 +83,14 @@ def test_unknown_key(capsys):
     assert complaint(capsys, "doctor", "pitchh=3") == "doctor: pitchh: unknown key"
 
 
+def test_a_reader_that_has_seen_enough():
+    """`sonotwin --help | head -1` ends without a traceback."""
+    done = subprocess.run(
+        f"{sys.executable} -m sonotwin surface --help | head -1", shell=True, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.count("\n") == 1 and done.stderr == ""
+
+
 def test_a_mistake_in_a_process_of_its_own():
     """No traceback, status 2, one line."""
     done = subprocess.run([sys.executable, "-m", "sonotwin", "doctr"], capture_output=True, text=True, check=False)
@@ -96,10 +104,13 @@ def test_a_mistake_in_a_process_of_its_own():
         (InputError("a.png: expected 8-bit grey,\nfound RGB"), "a.png: expected 8-bit grey, found RGB"),
         (
             ModuleNotFoundError("...", name="mitsuba.python"),
-            "the Python package mitsuba is missing; pip install 'sonotwin[twin]'",
+            "the Python package mitsuba is missing; run pip install '.[twin]' in sonotwin's folder",
         ),
-        (ModuleNotFoundError("...", name="drjit"), "the Python package drjit is missing; pip install 'sonotwin[twin]'"),
-        (ModuleNotFoundError("...", name="cv2"), "the Python package cv2 is missing; pip install 'sonotwin'"),
+        (
+            ModuleNotFoundError("...", name="drjit"),
+            "the Python package drjit is missing; run pip install '.[twin]' in sonotwin's folder",
+        ),
+        (ModuleNotFoundError("...", name="cv2"), "the Python package cv2 is missing; run pip install '.' in sonotwin's folder"),
         (PermissionError(13, "Permission denied", "out/surface.ply"), "out/surface.ply: Permission denied"),
         (OSError(28, "No space left on device"), "output: No space left on device"),
     ],

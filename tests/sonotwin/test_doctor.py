@@ -46,14 +46,14 @@ def test_a_missing_core_package_is_status_2(monkeypatch, capsys):
     assert cli.main(["doctor"]) == 2
     captured = capsys.readouterr()
     assert captured.err == "sonotwin: doctor: the core can't be used, because of scipy\n"
-    assert "core scipy: pip install 'sonotwin'" in captured.out
+    assert "core scipy: pip install '.' in sonotwin's folder" in captured.out
 
 
 def test_a_missing_twin_is_status_0(monkeypatch, capsys):
     real = doctor._version
     monkeypatch.setattr(doctor, "_version", lambda name: None if name in ("mitsuba", "drjit") else real(name))
     assert cli.main(["doctor"]) == 0
-    assert "twin mitsuba: pip install 'sonotwin[twin]'" in capsys.readouterr().out
+    assert "twin mitsuba: pip install '.[twin]' in sonotwin's folder" in capsys.readouterr().out
 
 
 def test_a_package_that_crashes_does_not_take_the_doctor_along(tmp_path, monkeypatch):

@@ -81,9 +81,8 @@ def draw(session: Session, rng: np.random.Generator) -> None:
         objects=np.where(on_ball, 0, 1).astype(np.uint8),
         projector=np.float32(pixels),
         lit=lit,
-        limit_px=np.where(lit, sigma, np.inf).astype(np.float32),
+        limit_px=np.where(lit[..., None], [sigma, np.inf], np.inf).astype(np.float32),  # no fringes along the rows
     )
-    (truth / "settings.json").write_text(json.dumps({"patterns": patterns.model_dump(mode="json")}), encoding="utf-8")
     (truth / "scene.json").write_text(
         json.dumps({"name": "drawn", "things": ["ball", "wall"], "shapes": SHAPES}), encoding="utf-8"
     )

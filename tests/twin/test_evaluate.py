@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from recon.phase import DEFAULT_NOISE
 from recon.triangulate import triangulate
 from scenes.things import Cylinder
 from sonotwin.cli import main
+from sonotwin.verbs.evaluate import describe
 from twin import evaluate
 
 SIGMA = 0.03  # mm along the ray
@@ -78,12 +80,53 @@ def test_gross_errors_are_counted_and_kept_out_of_the_noise(truth, perfect, rays
 def test_missing_pixels_lower_the_coverage_and_points_in_the_shadow_are_false(truth, perfect):
     points = perfect.copy()
     points[:128] = np.nan
-    shadow = np.argwhere(~truth.lit)[:40]
-    points[tuple(shadow.T)] = truth.points[tuple(shadow.T)]
+    deep = np.argwhere(cv2.erode(np.uint8(~truth.lit), np.ones((9, 9))) > 0)[:40]  # 9 px reach farther than 3 px all around
+    points[tuple(deep.T)] = truth.points[tuple(deep.T)]
     metrics = measured(points, truth)
     assert metrics["coverage"] == pytest.approx(truth.lit[128:].sum() / truth.lit.sum())
     assert metrics["false_points"] == 40
     assert metrics["points"] == truth.lit[128:].sum() + 40
+    assert metrics["gross_error_fraction"] == 0, "they are where the surface is"
+
+
+def test_wrong_points_where_nothing_is_lit_are_gross(truth, perfect, rays):
+    """All points of the shadow put 20 mm behind the surface: none of them is compared, all of them are counted."""
+    dark = ~truth.lit & (cv2.erode(np.uint8(truth.objects == 1), np.ones((3, 3))) > 0)  # on the wall, away from the ball
+    assert dark.sum() > 100
+    metrics = measured(np.where(dark[..., None], truth.points + 20 * rays, perfect), truth)
+    assert metrics["gross_error_fraction"] == pytest.approx(dark.sum() / (dark.sum() + truth.lit.sum()))
+    assert metrics["surface_rms_mm"] < 1e-4
+
+
+def test_a_point_on_the_neighbours_surface_is_not_gross(truth, perfect, rays):
+    """A pixel of the ball's outline that sees the wall is off by tens of mm, but on a true surface: no wrong fringe order."""
+    wall = (truth.objects == 1) & truth.lit
+    rim = (truth.objects == 0) & truth.lit & (cv2.dilate(np.uint8(wall), np.ones((3, 3))) > 0)
+    to_wall = truth.points[wall][0, 2] / rays[..., 2]
+    assert rim.sum() > 20
+    metrics = measured(np.where(rim[..., None], to_wall[..., None] * rays, perfect), truth)
+    assert metrics["gross_error_fraction"] == 0
+    assert metrics["surface_rms_mm"] > 0.1 and metrics["surface_rms_without_gross_mm"] < 1e-4
+
+
+def test_little_to_go_by_leaves_figures_unknown(truth, perfect, rays, session, tmp_path, capsys):
+    """Three points, all of them gross: every name is there as ever, null where nothing can be said; the command says unknown."""
+    points = np.full(perfect.shape, np.nan)
+    few = np.argwhere(truth.lit & (truth.objects == 1))[:3]  # beside the image's border
+    points[tuple(few.T)] = (perfect + 20 * rays)[tuple(few.T)]
+    sigma = np.full(truth.lit.shape, np.nan, np.float32)
+    np.savez(tmp_path / "points.npz", points=np.float32(points), sigma=sigma)
+    edgy = replace(truth, objects=np.uint8(np.indices(truth.lit.shape).sum(axis=0) % 2))  # an edge everywhere: no interior
+    metrics = evaluate.measure(np.float32(points), evaluate.compare(np.float32(points), sigma, edgy), edgy)
+    assert metrics.keys() == measured(perfect, truth).keys()
+    unknown = {name for name, value in metrics.items() if np.isnan(value)}
+    assert {"surface_interior_rms_mm", "predicted_rms_mm", "z_std", "sphere_ball_rms_mm", "plane_wall_angle_error_deg"} <= unknown
+    assert metrics["gross_error_fraction"] == 1
+
+    assert main(["evaluate", f"surface={tmp_path}", f"truth={session.folder / 'truth'}"]) == 0
+    text = (tmp_path / "evaluation" / "metrics.json").read_text(encoding="utf-8")
+    assert json.loads(text)["z_std"] is None and "NaN" not in text
+    assert "unknown" in describe(metrics) and "nan" not in capsys.readouterr().out
 
 
 def test_the_interior_leaves_out_errors_at_the_edges(truth, perfect, rays):
@@ -98,19 +141,23 @@ def test_the_interior_leaves_out_errors_at_the_edges(truth, perfect, rays):
     assert interior.sum() > 0.8 * truth.lit.sum()
 
 
-def test_the_limit_is_what_a_noisy_projector_coordinate_does_to_the_surface(truth, session, rng):
-    """Move the true coordinate by the sensor's noise, find the points again without the code under test, and compare spreads."""
+@pytest.mark.parametrize(("column_px", "row_px"), [(0.05, None), (0.2, 0.02), (None, 0.005)])
+def test_the_limit_is_what_noisy_projector_coordinates_do_to_the_surface(truth, session, rng, column_px, row_px):
+    """Move the true coordinates by noise, find the points again without the code under test, and compare spreads.
+
+    Of the two axes the coarser counts less. The projector stands beside the camera, so rows say little of the depth.
+    """
     with np.load(session.folder / "truth" / "surface" / "cam1.npz") as archive:
-        columns = np.where(truth.lit, archive["projector"][..., 0], np.nan)
+        pixels = np.where(truth.lit[..., None], archive["projector"], np.nan)
     shape = truth.lit.shape
-    noise = np.where(truth.lit, truth.limit_px, 0) * rng.standard_normal(shape)
+    noisy, sigma = [], []
+    for axis, level in enumerate((column_px, row_px)):
+        noisy.append(None if level is None else np.float32(pixels[..., axis] + level * rng.standard_normal(shape)))
+        sigma.append(None if level is None else np.full(shape, level, np.float32))
     nothing = np.zeros(shape, np.float32)
-    noisy = np.float32(columns + noise)
     found = ProjectorMap(
-        noisy,
-        None,
-        np.full(shape, 0.1, np.float32),
-        None,
+        *noisy,
+        *sigma,
         nothing,
         nothing,
         nothing,
@@ -119,8 +166,8 @@ def test_the_limit_is_what_a_noisy_projector_coordinate_does_to_the_surface(trut
         {},
     )
     points = triangulate(found, truth.camera, truth.projector)
-    only_columns = replace(truth, axes=("columns",))
-    comparison = evaluate.compare(points.points, points.sigma, only_columns)
+    limits = np.broadcast_to([np.inf if level is None else level for level in (column_px, row_px)], (*shape, 2))
+    comparison = evaluate.compare(points.points, points.sigma, replace(truth, limit_px=limits))
     z = comparison.error[comparison.compared] / comparison.limit[comparison.compared]
     assert np.std(z) == pytest.approx(1, abs=5 / np.sqrt(2 * z.size) + 0.005)  # float32 columns add half a percent at most
 
@@ -154,6 +201,28 @@ def test_the_command_writes_its_figures_and_a_picture(session, truth, perfect, t
     assert "RMS 0.050 mm" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("out", ["surface", "truth", "."])
+def test_the_command_never_writes_over_what_it_reads(out, session, perfect, truth, tmp_path, capsys):
+    """Nor over a surface that is not its own, which has a metrics.json too."""
+    (tmp_path / "surface").mkdir()
+    sigma = np.full(truth.lit.shape, SIGMA, np.float32)
+    np.savez(tmp_path / "surface" / "points.npz", points=np.float32(perfect), sigma=sigma)
+    shutil.copytree(session.folder / "truth", tmp_path / "truth")
+    for folder in (tmp_path, tmp_path / "surface", tmp_path / "truth"):
+        for name in ("metrics.json", "error_map.png"):
+            (folder / name).write_text("{}")
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["evaluate", f"surface={tmp_path / 'surface'}", f"truth={tmp_path / 'truth'}", f"out={tmp_path / out}"]) == 2
+    assert capsys.readouterr().err.count("expected a folder apart from what is read") == 1
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "metrics.json").write_text("{}")
+    elsewhere = f"out={tmp_path / 'elsewhere'}"
+    assert main(["evaluate", f"surface={tmp_path / 'surface'}", f"truth={tmp_path / 'truth'}", elsewhere]) == 2
+    assert "found other files" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "elsewhere")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_mistakes_are_named(session, perfect, tmp_path):
     def complaint(truth_folder):
         with pytest.raises(InputError) as caught:
@@ -167,6 +236,12 @@ def test_mistakes_are_named(session, perfect, tmp_path):
     assert "cam1.npz: normals: expected an array, found none" in complaint(broken)
     (broken / "surface" / "cam1.npz").write_bytes(b"PK but no archive")
     assert "expected an npz file of plain arrays" in complaint(broken)
+    shutil.copy(session.folder / "truth" / "surface" / "cam1.npz", broken / "surface")
+    scene = json.loads((broken / "scene.json").read_text(encoding="utf-8"))
+    ball = scene["shapes"][0]
+    for shape in (3, "ball", {}, ball | {"kind": "cube"}, ball | {"radius": "big"}, ball | {"centre": [1, 2]}):
+        (broken / "scene.json").write_text(json.dumps(scene | {"shapes": [shape]}), encoding="utf-8")
+        assert "scene.json: expected name, things and shapes" in complaint(broken)
     (broken / "scene.json").write_text("{", encoding="utf-8")
     assert "scene.json: expected JSON" in complaint(broken)
 

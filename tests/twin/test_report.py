@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -44,13 +45,19 @@ TELL = """<script>
 
 
 @pytest.fixture(scope="module")
-def written(session, tmp_path_factory):
-    """A report of the drawn session: its text."""
-    folder = tmp_path_factory.mktemp("report")
+def story(session, tmp_path_factory):
+    """What is told of the drawn session."""
+    path = tmp_path_factory.mktemp("points") / "points.npz"
     shots = read_surface(session.folder / "capture")
     points = triangulate.triangulate(decode.decode(shots.images, shots.patterns), session.camera, session.projector)
-    np.savez(folder / "points.npz", points=points.points, sigma=points.sigma)
-    story = report.read(session.folder / "capture", session.folder / "truth", folder / "points.npz")
+    np.savez(path, points=points.points, sigma=points.sigma)
+    return report.read(session.folder / "capture", session.folder / "truth", path)
+
+
+@pytest.fixture(scope="module")
+def written(story, tmp_path_factory):
+    """A report of the drawn session: its text."""
+    folder = tmp_path_factory.mktemp("report")
     metrics = evaluate.measure(story.points, story.comparison, story.truth)
     report.write(folder / "report.html", story, metrics, [("surface.ply", "the <mesh>")], ["sonotwin demo 'out=a b'"])
     return (folder / "report.html").read_text(encoding="utf-8")
@@ -71,6 +78,30 @@ def test_the_report_says_what_was_measured(written):
     assert "sonotwin demo 'out=a b'" in shown
     assert re.search(r"Sphere, error of the radius\s+0.045 mm\s+0.\d{4} mm", shown)
     assert re.search(r"Cylinder, error of the radius\s+0.10 mm\s+not in this scene", shown)
+
+
+def test_a_report_of_next_to_nothing_is_written(story, tmp_path):
+    """Three points, all of them wrong by 20 mm and without a prediction: the page says what is unknown."""
+    points = np.full_like(story.points, np.nan)
+    few = tuple(np.argwhere(story.truth.lit)[:3].T)
+    points[few] = story.truth.points[few] + np.float32([0, 0, 20])
+    comparison = evaluate.compare(points, np.full_like(points[..., 0], np.nan), story.truth)
+    thin = replace(story, points=points, comparison=comparison)
+    report.write(tmp_path / "report.html", thin, evaluate.measure(points, comparison, story.truth), [], [])
+    text = re.sub("<script.*?</script>", "", (tmp_path / "report.html").read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert "unknown" in text and "has a prediction to compare with" in text and not re.search(r"\bnan\b", text)
+
+
+def test_the_dark_of_ten_bits_has_no_phase(story, monkeypatch):
+    """Four of 1023 levels are noise where four of 255 are a signal: what the decoder takes for dark is shown as such."""
+    images = np.uint16(np.rint(story.shots.images * (1023 / 255)))
+    found = decode.decode(images, story.shots.patterns, bits=10)
+    drawn = {}
+    monkeypatch.setattr(report.page, "picture", lambda colours, caption, *rest: drawn.setdefault(caption, colours) is None or "")
+    report.decoding(replace(story, shots=replace(story.shots, images=images, bits=10), found=found))
+    shown = drawn["Wrapped phase"][..., 3] > 0
+    assert (found.modulation[found.status == decode.Status.DARK] > 4).any()
+    assert np.array_equal(shown, found.status != decode.Status.DARK)
 
 
 def test_the_report_stands_alone(written):

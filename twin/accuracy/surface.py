@@ -52,7 +52,6 @@ def experiment(rig: Rig, scene: Scene, patterns: Patterns, seed: int = 1, engine
         limit_px=view.limit_px,
         camera=cameras["cam1"],
         projector=cameras["projector"],
-        axes=patterns.axes,
         scene=scene.name,
         things=tuple(thing.name for thing in visible(scene)),
         shapes=scene.shapes,

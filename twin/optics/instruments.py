@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon import rigid
-from recon.camera import Camera, distort
+from recon.camera import Camera, distorted
 from recon.rig import CameraDevice, Lens, ProjectorDevice
 
 Images = NDArray[np.float32]
@@ -108,7 +108,7 @@ def light_point(projector: ProjectorOptics, point: mi.Point3f, lens: mi.Point2f)
 
 def _project(camera: Camera, local: mi.Point3f) -> tuple[mi.Point2f, mi.Float]:
     """Project points of the device's frame to pixels; also their squared distance from the image's middle, 1 at a corner."""
-    x, y = distort.py_func(local.x / local.z, local.y / local.z, camera.coefficients.tolist())
+    x, y = distorted(local.x / local.z, local.y / local.z, camera.coefficients.tolist())
     (fx, skew, cx), (_, fy, cy) = camera.matrix[0], camera.matrix[1]
     pixel = mi.Point2f(float(fx) * x + float(skew) * y + float(cx), float(fy) * y + float(cy))
     middle, corner2 = _middle_and_corner2(camera)

@@ -1,0 +1,37 @@
+"""What pydantic finds wrong becomes one line that a user can act on."""
+
+import pytest
+from pydantic import ValidationError
+
+from recon.errors import one_line
+from recon.patterns import Patterns
+
+GOOD = {"projector_size": (128, 80), "unwrap": "centre_line", "parts": [{"kind": "centre_line"}]}
+FRINGES = {"kind": "fringes", "pitch": 12, "steps": 4}
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"parts": [FRINGES, {"kind": "grey"}]},
+         "parts.1.kind: expected one of 'fringes', 'gray', 'centre_line', 'uniform', found 'grey'"),
+        ({"parts": [{"pitch": 12}]}, "parts.0.kind: expected a value, found none"),
+        ({"parts": [3]}, "parts.0: expected a map of fields, found 3"),
+        ({"parts": [FRINGES | {"pitch": "wide"}]},
+         "parts.0.fringes.pitch: expected number, unable to parse string as a number, found 'wide'"),
+        ({"parts": [FRINGES | {"phase": 1}]}, "parts.0.fringes.phase: expected no such field, found 1"),
+        ({"parts": [{"kind": "centre_line"}]}, "parts: expected at least one set of fringes, found none"),
+        ({"unwrap": "guess"}, "unwrap: expected 'centre_line', 'gray' or 'heterodyne', found 'guess'"),
+    ],
+)  # fmt: skip
+def test_a_fault_in_one_line(change, line):
+    with pytest.raises(ValidationError) as fault:
+        Patterns.model_validate(GOOD | change)
+    assert one_line(fault.value) == line
+
+
+@pytest.mark.parametrize("content", [3, None, "text", []])
+def test_something_that_is_no_map(content):
+    with pytest.raises(ValidationError) as fault:
+        Patterns.model_validate(content)
+    assert one_line(fault.value) == f"expected a map of fields, found {content!r}"
