@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Flags = NDArray[np.uint8]
 
-VOID, INCOMPLETE, TORN, CLEAN = 0, 1, 2, 3  # not measured; too near a gap to tell; next to a jump; continuous both ways
+VOID, TORN, INCOMPLETE, CLEAN = 0, 1, 2, 3  # not measured; next to a jump; too near a gap to tell; continuous both ways
 
 SLACK = 0.008  # cycle (0.05 rad) of mismatch that third derivatives and texture may cause
 SIGMAS = 4.5  # of the stencil's noise; one in 150 000 comparisons fails by chance
@@ -43,7 +43,7 @@ def continuity(phase, sigma, valid):
     Returns
     -------
     flags : (h, w) uint8
-        VOID, INCOMPLETE, TORN or CLEAN.
+        VOID, TORN, INCOMPLETE or CLEAN.
     """
     height, width = phase.shape
     across = np.full((height, width), np.float32(np.nan))  # mismatch at the pair (u, u+1), cycles; NaN where incomplete
@@ -123,8 +123,8 @@ def carry(order, known, phase, sigma, flags, wanted, reach):
     known : (h, w) bool, where the order is known
     phase : (h, w) float32, cycles
     sigma : (h, w) float32, rad
-    flags : (h, w) uint8, of `continuity`; VOID and TORN pixels are neither crossed nor filled
-    wanted : int, least flag of a pixel to be filled or crossed
+    flags : (h, w) uint8, of `continuity`
+    wanted : int, least flag of a pixel to be filled, crossed or started from: CLEAN or INCOMPLETE
     reach : int, px
 
     Returns
@@ -136,7 +136,7 @@ def carry(order, known, phase, sigma, flags, wanted, reach):
     filled, found = order.copy(), known.copy()
     for v in prange(height):
         for u in range(width):
-            if known[v, u] or flags[v, u] == TORN or flags[v, u] == VOID or flags[v, u] < wanted:
+            if known[v, u] or flags[v, u] < wanted:
                 continue
             candidate, ways, clash = 0, 0, False
             for way in range(4):
@@ -144,7 +144,7 @@ def carry(order, known, phase, sigma, flags, wanted, reach):
                 distance = 0
                 for step in range(1, reach + 1):
                     y, x = v + step * dv, u + step * du
-                    if not (0 <= y < height and 0 <= x < width) or flags[y, x] == TORN or flags[y, x] == VOID:
+                    if not (0 <= y < height and 0 <= x < width) or flags[y, x] < wanted:
                         break
                     if known[y, x]:
                         distance = step

@@ -1,34 +1,29 @@
 """From the images of a pattern sequence to projector coordinates, with their predicted noise."""
 
-import itertools
 from collections import Counter
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from typing import Literal
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from recon import continuity, graycode, heterodyne, spatial
+from recon import continuity, graycode, heterodyne, plausibility, spatial
 from recon.errors import InputError
 from recon.graycode import Orders
 from recon.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns
-from recon.phase import DEFAULT_NOISE, Fringe, Noise, estimate_noise, sample_pixels, wrapped_phase
+from recon.phase import DEFAULT_NOISE, Fringe, Noise, estimate_noise, wrapped_phase
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+NoiseSource = Literal["given", "measured", "assumed"]
 Measured = tuple[Fringes, Fringe]
 Guide = tuple[GrayCode | CentreLine, NDArray, int]  # the part, its images, the first one's place in the sequence
 
 DARKEST = 4.0  # DN of 255: default of the least modulation
+SMALLEST = 8  # px, an image's shorter side: what continuity is told from
 WORST_SIGMA = 0.3  # rad of predicted phase noise: beyond, orders can't be decided
-CHECK_SAMPLES = 10_000  # pixels looked at to judge a sequence
-LIT_SHARE = 0.002  # share of the image that must carry fringes
-SATURATED_SHARE = 0.5  # share of the lit image that may be saturated
-HARMONIC_SHARE = 0.08  # of the modulation, found in the high harmonics: more is not an N-step sequence
-LINE_SHARE = 0.3  # share of the fringes' area that may be lit in the image of a line
-WRONG_BORDERS = 0.06  # share of the period borders at which the order may jump
-MIN_SIGHTINGS = 10  # rows in which the line must be seen
 
 
 class Status(IntEnum):
@@ -58,8 +53,9 @@ class ProjectorMap:
     offset: Image  # DN
     phase: Image  # rad, wrapped, of the first axis
     status: NDArray[np.uint8]  # Status; OK where every encoded axis is
-    noise: Noise  # of one image, measured or given
+    noise: Noise  # of one image
     summary: dict[str, int]  # pixels by status in lower case; regions, islands, disputed with a centre line
+    noise_source: NoiseSource = "given"  # by the caller, measured on the fringes, or assumed, as they are too few to measure it
 
 
 def decode(
@@ -84,7 +80,8 @@ def decode(
     bits : int
         Full scale is `2**bits - 1`.
     noise : Noise, optional
-        Of one image. If not given it is measured from fringes of eight or more steps; with fewer steps a default stands in.
+        Of one image. If not given it is measured from fringes of eight or more steps; with fewer steps a default stands in;
+        the map's `noise_source` says which.
     min_modulation_dn : float, optional
         Fringes weaker than this are dark; 4 DN of 255 if not given.
     name : str
@@ -93,15 +90,18 @@ def decode(
     Raises
     ------
     InputError
-        If the number of images is wrong, they are black or saturated, or they do not follow the sequence.
+        If the number or the size of the images is wrong, they are black or saturated, or they do not follow the sequence.
     """
     images = np.asarray(images)
     if images.ndim != 3 or len(images) != patterns.count:
         raise InputError(f"{name}: expected {patterns.count} grey images of one size, found an array of shape {images.shape}")
+    if min(images.shape[1:]) < SMALLEST:
+        found = f"{images.shape[2]}x{images.shape[1]}"
+        raise InputError(f"{name}: expected images of {SMALLEST}x{SMALLEST} px or more, found {found}")
     full = 2.0**bits - 1
     least = DARKEST * full / 255 if min_modulation_dn is None else min_modulation_dn
     parts = patterns.slices()
-    noise = noise or _measured_noise(images, parts, full) or DEFAULT_NOISE.scaled(full / 255)
+    noise, source = _noise(images, parts, full, noise)
     axes: dict[Axis, tuple[Image, Image]] = {}
     fringes: dict[Axis, Fringe] = {}
     status = np.zeros(images.shape[1:], np.uint8)
@@ -112,7 +112,7 @@ def decode(
             if isinstance(part, Fringes) and part.axis == axis:
                 fringe = wrapped_phase(images[place], part.shifts, noise=noise, saturation=full)
                 where = f"{name}: images {place.start} to {place.stop - 1}"
-                _check_fringes(images[place], part, fringe, least, full, where, place.start)
+                plausibility.check_fringes(images[place], part, fringe, least, full, where, place.start)
                 sets.append((part, fringe))
         part, fringe = min(sets, key=lambda pair: pair[0].pitch)
         stage = _quality([f for _, f in sets], least)
@@ -123,8 +123,6 @@ def decode(
         counts.update(found)
         x, sigma = _coordinates(fringe.phase, fringe.sigma, orders.order, orders.trusted, unreachable, stage,
                                 part.zero(patterns.length(axis)), part.pitch, patterns.length(axis))  # fmt: skip
-        if patterns.unwrap != "centre_line":
-            _check_bits(x, fringe.phase, part.pitch, name)
         axes[axis], fringes[axis] = (x, sigma), fringe
         status = np.where(status == Status.OK, stage, status)
     first = fringes[patterns.axes[0]]
@@ -132,16 +130,18 @@ def decode(
     pixels = np.bincount(status.ravel(), minlength=len(Status)).tolist()
     summary = {s.name.lower(): pixels[s] for s in Status} | dict(counts)
     return ProjectorMap(
-        columns[0], rows[0], columns[1], rows[1], first.modulation, first.offset, first.phase, status, noise, summary
+        columns[0], rows[0], columns[1], rows[1], first.modulation, first.offset, first.phase, status, noise, summary, source
     )
 
 
-def _measured_noise(images: NDArray, parts: list[tuple[AnyPart, slice]], full: float) -> Noise | None:
-    """The noise measured on the first fringes that allow it."""
+def _noise(images: NDArray, parts: list[tuple[AnyPart, slice]], full: float, given: Noise | None) -> tuple[Noise, NoiseSource]:
+    """The noise given, else measured on the first fringes that allow it, else a common camera's."""
+    if given is not None:
+        return given, "given"
     for part, place in parts:
         if isinstance(part, Fringes) and (found := estimate_noise(images[place], part.shifts, saturation=full)) is not None:
-            return found
-    return None
+            return found, "measured"
+    return DEFAULT_NOISE.scaled(full / 255), "assumed"
 
 
 def _quality(fringes: list[Fringe], least: float) -> NDArray[np.uint8]:
@@ -154,52 +154,6 @@ def _quality(fringes: list[Fringe], least: float) -> NDArray[np.uint8]:
     return np.where(saturated, np.uint8(Status.SATURATED), np.where(dark, np.uint8(Status.DARK), np.uint8(Status.OK)))
 
 
-def _check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, full: float, place: str, start: int) -> None:
-    """Refuse black, saturated and out-of-order fringes."""
-    samples, beside = (sample_pixels(view, CHECK_SAMPLES) for view in (images[:, :, :-1], images[:, :, 1:]))
-    swing = np.ptp(samples, axis=0)
-    if np.mean(swing > 2 * least) < LIT_SHARE:
-        if np.median(samples) > 0.95 * full:
-            raise InputError(f"{place} are saturated all over, expected fringes: shorten the exposure")
-        level = np.median(swing) / 2
-        raise InputError(f"{place} hold no fringes: expected a modulation of {least:.0f} DN or more, found {level:.1f} DN")
-    saturated, lit = np.count_nonzero(fringe.saturated), np.count_nonzero(fringe.saturated | (fringe.modulation > least))
-    if saturated > SATURATED_SHARE * lit:
-        share = 100 * saturated / lit
-        raise InputError(f"{place} are saturated in {share:.0f} % of the lit pixels, expected under half: shorten the exposure")
-    useful = (swing > 2 * least) & (samples.max(axis=0) < full)
-    if useful.any():
-        _check_order(samples[:, useful], beside[:, useful], part, place, start)
-
-
-def _check_order(samples: Image, beside: Image, part: Fringes, place: str, start: int) -> None:
-    """Refuse images that don't follow the N-step sequence: swapped images put power into the high temporal harmonics.
-
-    A projector's gamma fills harmonic 2, binary fringes the odd ones; those are not looked at. Noise differs between the
-    samples and the pixels beside them, swapped images do not: their product is free of noise.
-    """
-    n = part.steps
-    harmonics = [k for k in range(3, n // 2 + 1) if part.waveform == "sine" or (n % 2 == 0 and k % 2 == 0)]
-    if not harmonics:
-        return
-    spread = np.sum((samples - samples.mean(axis=0)) * (beside - beside.mean(axis=0)))
-
-    def strange(order: NDArray[np.intp]) -> float:
-        time = 2 * np.pi * np.outer(harmonics, np.arange(n)) / n
-        waves = np.concatenate([np.cos(time), np.sin(time)])[:, order]
-        return float(np.sqrt(max(np.sum((waves @ samples) * (waves @ beside)) * 2 / n / max(spread, 1.0), 0.0)))
-
-    if strange(np.arange(n)) < HARMONIC_SHARE:
-        return
-    best, suspects = HARMONIC_SHARE, ""
-    for a, b in itertools.combinations(range(n), 2):
-        order = np.arange(n)
-        order[[a, b]] = b, a
-        if (left := strange(order)) < best:
-            best, suspects = left, f", {start + a} and {start + b} look exchanged"
-    raise InputError(f"{place} do not follow the {n}-step sequence{suspects}: are they in the manifest's order?")
-
-
 def _orders(
     patterns: Patterns, axis: Axis, sets: list[Measured], guides: list[Guide], valid: Mask, noise: Noise, name: str
 ) -> tuple[Orders, Mask, dict[str, int]]:
@@ -208,11 +162,15 @@ def _orders(
     nowhere = np.zeros(valid.shape, bool)
     part, fringe = min(sets, key=lambda pair: pair[0].pitch)
     if patterns.unwrap == "heterodyne":
-        return heterodyne.fringe_order(sets, length), nowhere, {}
+        orders = heterodyne.fringe_order(sets, length)
+        plausibility.check_pitches(orders.trusted, valid, f"{name}: fringes of {axis}")
+        return orders, nowhere, {}
     guide, images, start = guides[0]
     if isinstance(guide, CentreLine):
         return _from_line(guide, images[0], part, fringe, valid, length, axis, f"{name}: image {start}")
-    orders = graycode.fringe_order(images, guide, part, fringe, length, noise)
+    orders, residual = graycode.fringe_order(images, guide, part, fringe, length, noise)
+    place = f"{name}: images {start} to {start + guide.count - 1}"
+    plausibility.check_code(orders.order, residual, guide, part, fringe.phase, valid, length, place)
     if not guide.complementary:  # a fifth of the pixels lies too near the period borders: fill in from both sides
         cycles = fringe.phase * np.float32(1 / (2 * np.pi))
         flags = continuity.continuity(cycles, fringe.sigma, valid)
@@ -225,19 +183,14 @@ def _from_line(
     line: CentreLine, image: NDArray, part: Fringes, fringe: Fringe, valid: Mask, length: int, axis: Axis, place: str
 ) -> tuple[Orders, Mask, dict[str, int]]:
     """Orders by the centre line; for rows everything is turned, so that the line stands upright."""
-    bright = np.mean((image > fringe.offset)[valid]) if valid.any() else 0.0
-    if bright > LINE_SHARE:
-        raise InputError(
-            f"{place} is bright over {100 * bright:.0f} % of the fringes, not a line: is it in the manifest's order?"
-        )
+    plausibility.check_light(image, fringe, valid, place)
     turned = axis == "rows"
     if turned:
         fringe = Fringe(*(np.ascontiguousarray(getattr(fringe, f.name).T) for f in fields(fringe)))
         image, valid = np.ascontiguousarray(image.T), np.ascontiguousarray(valid.T)
     turns = (line.middle(length) - part.zero(length)) / part.pitch
     found = spatial.unwrap(fringe, valid, image, turns, line.width / part.pitch)
-    if found.votes < MIN_SIGHTINGS:
-        raise InputError(f"{place} shows no centre line: expected it in {MIN_SIGHTINGS} rows or more, found it in {found.votes}")
+    plausibility.check_line(found.sightings, found.votes, found.residual, place)
     order, known, unreachable = (m.T if turned else m for m in (found.order, found.known, found.unreachable))
     return Orders(order, known), unreachable, {"regions": found.regions, "islands": found.islands, "disputed": found.disputed}
 
@@ -260,21 +213,3 @@ def _coordinates(phase, sigma, order, trusted, unreachable, status, origin, pitc
                 continue
             x[v, u], sx[v, u] = value, pitch / (2 * np.pi) * sigma[v, u]
     return x, sx
-
-
-def _check_bits(x: Image, phase: Image, pitch: float, name: str) -> None:
-    """Refuse orders that jump where the phase continues: a sign of bits in the wrong order, at the borders of the periods.
-
-    A step of the surface breaks the phase as well, but for the few that come near a whole number of periods.
-    """
-    x, phase = x[::4], phase[::4]
-    jump = np.abs(np.diff(x, axis=1)) > pitch / 2
-    turn = np.diff(phase, axis=1)
-    continues = np.abs(turn - 2 * np.pi * np.rint(turn / (2 * np.pi))) < 0.6  # rad
-    borders = np.count_nonzero(continues & (np.abs(turn) > np.pi) & np.isfinite(x[:, 1:] - x[:, :-1]))
-    wrong = np.count_nonzero(continues & jump)
-    if wrong > max(WRONG_BORDERS * borders, 20):
-        share = 100 * wrong / max(borders, wrong)
-        raise InputError(
-            f"{name}: fringe orders jump at {share:.0f} % of the period borders: are the images in the manifest's order?"
-        )

@@ -11,7 +11,7 @@ from recon.graycode import Orders
 from recon.patterns import Fringes
 from recon.phase import Fringe
 
-REJECT = 0.35  # cycle from the nearest whole order: beyond, the phases contradict each other
+SLACK = 0.1  # cycle from the nearest whole order, besides noise: beyond, the phases contradict each other
 SIGMAS = 5.0  # a decision must stand this many sigmas away from its tipping point
 PLANNED_SIGMA = 0.02  # rad of phase noise that a sequence must stand, when its ladder is planned
 
@@ -102,7 +102,7 @@ def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> Orders:
     """Fringe order k of the finest pitch, so that `x = origin + pitch * (phase / 2 pi + k)`.
 
     Each rung of the ladder gives a coordinate that the next one refines. A pixel is not trusted where a phase ends further
-    than 0.35 cycle, or closer than five predicted sigmas to the tipping point, from a whole order.
+    than 0.1 cycle and five predicted sigmas from a whole order, or closer than five sigmas to the tipping point.
 
     Parameters
     ----------
@@ -152,8 +152,8 @@ def _climb(phases, sigmas, lead, pitch, weights, middle, origin):
                 variance = 0.0
                 for i in range(n):
                     variance += ((pitch[r - 1] / pitch[r] * weights[r - 1, i] - weights[r, i]) * sigmas[i, v, u]) ** 2
-                residual = abs(whole - nearest)
-                if residual > REJECT or (0.5 - residual) * 2 * np.pi < SIGMAS * np.sqrt(variance):
+                residual, doubt = abs(whole - nearest), SIGMAS * np.sqrt(variance) / (2 * np.pi)
+                if residual > SLACK + doubt or residual > 0.5 - doubt:
                     sure = False
                 x = pitch[r] * (cycles + nearest)
             order[v, u] = np.floor((middle + x - origin) / pitch[rungs - 1] - phases[0, v, u] / (2 * np.pi) + 0.5)

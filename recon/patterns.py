@@ -13,12 +13,15 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 Axis = Literal["columns", "rows"]  # which projector coordinate the pattern encodes
 Unwrapping = Literal["centre_line", "gray", "heterodyne"]
 Image = NDArray[np.float32]
+Side = Annotated[int, Field(ge=8, le=20000)]  # px
+
+MISPLACED = 0.05  # projector px that binary fringes may lie off their origin
 
 
 class Part(BaseModel):
-    """Base of the parts: immutable, and refuses unknown keys."""
+    """Base of the parts: immutable, refuses unknown keys and numbers that are none."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Fringes(Part):
@@ -57,6 +60,13 @@ class Fringes(Part):
             quarter = np.round(turns + 0.25, 9)  # a pixel right on an edge must not be left to rounding: half a period is lit
             return (quarter - np.floor(quarter) < 0.5).astype(np.float32)
         return ((1 + np.cos(2 * np.pi * turns)) / 2).astype(np.float32)
+
+    def displacement(self, length: int) -> float:
+        """Projector px by which the patterns' fundamental lies off its place, in the mean over an axis of `length` px."""
+        profiles, s = self.profiles(length).astype(float), self.shifts[:, None]
+        wave = (profiles * np.exp(-1j * s)).sum(axis=0)
+        ideal = np.exp(2j * np.pi * (np.arange(length) - self.zero(length)) / self.pitch)
+        return float(np.angle(np.mean(ideal * wave.conj())) * self.pitch / (2 * np.pi))
 
 
 class GrayCode(Part):
@@ -148,9 +158,9 @@ class Patterns(BaseModel):
         If a key is unknown, or the parts don't serve the unwrapping that is asked for.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    projector_size: tuple[int, int]  # width, height, px
+    projector_size: tuple[Side, Side]  # width, height, px
     unwrap: Unwrapping
     parts: tuple[AnyPart, ...] = Field(min_length=1)
 
@@ -165,6 +175,9 @@ class Patterns(BaseModel):
                     raise ValueError(
                         f"parts: heterodyne unwrapping of {axis} expects two or more sets of fringes, found {len(fringes)}"
                     )
+                if len({part.pitch for part in fringes}) < len(fringes):
+                    pitches = ", ".join(f"{part.pitch:g}" for part in fringes)
+                    raise ValueError(f"parts: heterodyne unwrapping of {axis} expects different pitches, found {pitches} px")
                 continue
             if len(fringes) != 1:
                 raise ValueError(f"parts: {self.unwrap} unwrapping of {axis} expects one set of fringes, found {len(fringes)}")
@@ -175,6 +188,24 @@ class Patterns(BaseModel):
             if isinstance(guides[0], GrayCode) and guides[0].pitch != fringes[0].pitch:
                 raise ValueError(
                     f"parts: Gray code and fringes of {axis} expect one pitch, found {guides[0].pitch:g} and {fringes[0].pitch:g}"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _in_place(self) -> "Patterns":
+        for part in self.parts:
+            length = self.length(part.axis)
+            if isinstance(part, GrayCode):
+                begin = part.origin(length)
+                end = begin + 2**part.bits * part.pitch
+                if begin > 0 or end < length - 0.5:
+                    raise ValueError(
+                        f"parts: Gray code of {part.axis} covers {begin:g} to {end:g} px, expected 0 to {length - 1} or more"
+                    )
+            if isinstance(part, Fringes) and part.waveform == "binary" and abs(off := part.displacement(length)) > MISPLACED:
+                raise ValueError(
+                    f"parts: binary fringes of {part.axis} lie {off:+.2f} px off their origin of {part.zero(length):g}, "
+                    f"expected another, such as {part.zero(length) + off:g}"
                 )
         return self
 
@@ -214,6 +245,6 @@ class Patterns(BaseModel):
 
 
 def gray_bit(period: NDArray[np.float64], bit: int) -> NDArray[np.bool_]:
-    """Bit `bit` (0 is the finest) of the reflected Gray code of floor(period); zero outside the code's range below."""
+    """Bit `bit` (0 is the finest) of the reflected Gray code of floor(period); below zero the code is mirrored."""
     number = np.floor(period).astype(np.int64)
     return ((number ^ (number >> 1)) >> bit & 1).astype(bool)

@@ -19,17 +19,15 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from recon import continuity
+from recon import basins, continuity
+from recon.basins import CELL, NONE
 from recon.continuity import CLEAN, INCOMPLETE, TORN, VOID, wrap
 from recon.phase import Fringe
 from recon.regions import Borders, join
 
-CELL = 4  # px; a cell's side
-BOTTLENECK = 1  # cells; a basin whose half width is more than its outlet's by more than this is cut off there
 MARGIN_CELLS = 3  # cells that a basin grows into torn ground, so that neighbours across a tear meet
 LINE_LEVEL = 0.25  # of full light: brighter is the line
 RESIDUAL = 0.2  # cycle that a vote may be off a whole order
-NONE = 127  # no offset between two cells
 
 Flags = NDArray[np.uint8]
 Integers = NDArray[np.int32]
@@ -46,7 +44,9 @@ class Unwrapped:
     regions: int  # with the line
     islands: int  # without
     disputed: int  # in which the line's votes disagree
-    votes: int  # sightings of the line on continuous surface
+    votes: int  # sightings of the line on continuous surface that name an order
+    sightings: int  # all of them
+    residual: float  # cycle, in +-0.5, by which the line lies off the fringes, in the median over the sightings
 
 
 def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: float) -> Unwrapped:
@@ -68,18 +68,20 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     Returns
     -------
     Unwrapped
-        With `votes` zero if the line is nowhere to be seen; that is for the caller to judge.
+        With `sightings` zero if the line is nowhere to be seen, `residual` far from zero if the fringes are not what they are
+        taken for; both are for the caller to judge.
     """
     phase = fringe.phase * np.float32(1 / (2 * np.pi))
     flags = continuity.continuity(phase, fringe.sigma, valid)
-    relative, state, right, down = _cells(phase, flags)
-    distance = _distance(state)
-    basin, offset, broken = _flood(distance, right, down)
-    basin, broken, count = _number(basin, broken)
+    relative, state, right, down = basins.gather(phase, flags)
+    distance = basins.depth(state)
+    basin, offset, broken = basins.flood(distance, right, down)
+    basin, broken, count = basins.number(basin, broken)
     light = (line, fringe.offset, fringe.modulation, fringe.sigma)
-    sightings, values = _sight(*light, valid, phase, relative, basin, offset, turns, width)
+    places, values, residuals = _sight(*light, valid, phase, relative, basin, offset, turns, width)
+    near = np.abs(residuals) < RESIDUAL
     votes: dict[int, Counter] = defaultdict(Counter)
-    for place, value in zip(sightings.tolist(), values.tolist(), strict=True):
+    for place, value in zip(places[near].tolist(), values[near].tolist(), strict=True):
         votes[place][value] += 1
     ground = _grow(state, basin)
     found = join(count, _borders(state, ground, offset, right, down), votes, broken)
@@ -97,183 +99,15 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     order, known = continuity.carry(order, known, phase, fringe.sigma, flags, CLEAN, continuity.REACH)
     order, known = continuity.carry(order, known, phase, fringe.sigma, flags, INCOMPLETE, continuity.BLIND_REACH)
     islands = len(set(found.region.tolist()) - set(found.absolute) - found.disputed)
-    return Unwrapped(order, known, unreachable, len(found.absolute), islands, len(found.disputed), len(values))
-
-
-@njit(cache=True, parallel=True)
-def _cells(phase, flags):
-    """Orders of the pixels relative to their cell's first, the cells' state, and the offsets to the cells right and below."""
-    rows, columns = phase.shape[0] // CELL, phase.shape[1] // CELL
-    relative = np.zeros(phase.shape, np.int8)
-    state = np.zeros((rows, columns), np.uint8)
-    right, down = np.full((rows, columns), NONE, np.int8), np.full((rows, columns), NONE, np.int8)
-    for i in prange(rows):
-        for j in range(columns):
-            clean, torn, void = 0, 0, 0
-            for v in range(i * CELL, i * CELL + CELL):
-                for u in range(j * CELL, j * CELL + CELL):
-                    clean += flags[v, u] == CLEAN
-                    torn += flags[v, u] == TORN
-                    void += flags[v, u] == VOID
-            if clean < CELL * CELL:
-                state[i, j] = TORN if torn > 0 else (VOID if 2 * void > CELL * CELL else INCOMPLETE)
-                continue
-            state[i, j] = CLEAN
-            for v in range(i * CELL, i * CELL + CELL):
-                u = j * CELL
-                if v > i * CELL:
-                    relative[v, u] = relative[v - 1, u] - np.floor(phase[v, u] - phase[v - 1, u] + np.float32(0.5))
-                for u in range(j * CELL + 1, j * CELL + CELL):
-                    relative[v, u] = relative[v, u - 1] - np.floor(phase[v, u] - phase[v, u - 1] + np.float32(0.5))
-    for i in prange(rows):
-        for j in range(columns):
-            if state[i, j] != CLEAN:
-                continue
-            if j + 1 < columns and state[i, j + 1] == CLEAN:
-                right[i, j] = _offset(phase, relative, i * CELL, j * CELL + CELL - 1, 1, 0)
-            if i + 1 < rows and state[i + 1, j] == CLEAN:
-                down[i, j] = _offset(phase, relative, i * CELL + CELL - 1, j * CELL, 0, 1)
-    return relative, state, right, down
-
-
-@njit(inline="always")
-def _offset(phase, relative, v, u, du, dv):
-    """The offset on which all pixel pairs between two cells agree, NONE if they don't; (v, u) is the first cell's first pair."""
-    result = NONE
-    for k in range(CELL):
-        y, x = v + k * du, u + k * dv
-        step = relative[y, x] - np.floor(phase[y + dv, x + du] - phase[y, x] + np.float32(0.5)) - relative[y + dv, x + du]
-        if k > 0 and step != result:
-            return NONE
-        result = int(step)
-    return result
-
-
-@njit(cache=True)
-def _distance(state):
-    """Chessboard distance of each cell to the nearest that is not continuous, in cells; the image's edge is no obstacle."""
-    rows, columns = state.shape
-    distance = np.empty((rows, columns), np.int32)
-    for i in range(rows):
-        for j in range(columns):
-            nearest = rows + columns if state[i, j] == CLEAN else 0
-            for di, dj in ((0, -1), (-1, -1), (-1, 0), (-1, 1)):
-                if i + di >= 0 and 0 <= j + dj < columns:
-                    nearest = min(nearest, distance[i + di, j + dj] + 1)
-            distance[i, j] = nearest
-    for i in range(rows - 1, -1, -1):
-        for j in range(columns - 1, -1, -1):
-            nearest = distance[i, j]
-            for di, dj in ((0, 1), (1, 1), (1, 0), (1, -1)):
-                if i + di < rows and 0 <= j + dj < columns:
-                    nearest = min(nearest, distance[i + di, j + dj] + 1)
-            distance[i, j] = nearest
-    return distance
-
-
-@njit(inline="always")
-def _find(parent, shift, cell):
-    """Root of a cell and the cell's order less the root's."""
-    root, total = cell, 0
-    while parent[root] != root:
-        total += shift[root]
-        root = parent[root]
-    node, rest = cell, total
-    while parent[node] != root:
-        above, step = parent[node], shift[node]
-        parent[node], shift[node] = root, rest
-        node, rest = above, rest - step
-    return root, total
-
-
-@njit(cache=True)
-def _descending(distance):
-    """Indices of the cells from the greatest distance to the least: counting sort."""
-    top = distance.max()
-    start = np.zeros(top + 2, np.int64)
-    for value in distance:
-        start[top - value + 1] += 1
-    start = np.cumsum(start)
-    order = np.empty(distance.size, np.int32)
-    for cell, value in enumerate(distance):
-        order[start[top - value]] = cell
-        start[top - value] += 1
-    return order
-
-
-@njit(cache=True)
-def _flood(distance, right, down):
-    """Gather cells into basins, from the widest places to the narrow ones: a watershed of the distance to the nearest gap.
-
-    Two basins that meet are one unless the narrower is wider than their meeting place by more than BOTTLENECK on each side.
-
-    Returns
-    -------
-    basin : (rows, columns) int32, the root cell's index, -1 where not continuous
-    offset : (rows, columns) int32, order less the root's
-    broken : (rows, columns) bool, cells whose contacts within their basin contradict each other
-    """
-    rows, columns = distance.shape
-    count = rows * columns
-    parent, shift = np.arange(count).astype(np.int32), np.zeros(count, np.int32)
-    peak = distance.copy().ravel()
-    seen = np.zeros(count, np.bool_)
-    flat = distance.ravel()
-    for cell in _descending(flat):
-        level = flat[cell]
-        if level == 0:
-            break
-        seen[cell] = True
-        i, j = cell // columns, cell % columns
-        for way in range(4):
-            if way == 0:
-                near, step = (cell + 1, right[i, j]) if j + 1 < columns else (-1, NONE)
-            elif way == 1:
-                near, step = (cell - 1, right[i, j - 1]) if j > 0 else (-1, NONE)
-            elif way == 2:
-                near, step = (cell + columns, down[i, j]) if i + 1 < rows else (-1, NONE)
-            else:
-                near, step = (cell - columns, down[i - 1, j]) if i > 0 else (-1, NONE)
-            if step == NONE or not seen[near]:
-                continue
-            a, shift_a = _find(parent, shift, cell)
-            b, shift_b = _find(parent, shift, near)
-            if a == b or min(peak[a], peak[b]) > level + BOTTLENECK:
-                continue
-            difference = int(step) if way % 2 == 0 else -int(step)  # of `near` less that of `cell`
-            if peak[a] >= peak[b]:
-                parent[b], shift[b] = a, shift_a + difference - shift_b
-            else:
-                parent[a], shift[a] = b, shift_b - difference - shift_a
-    basin, offset = np.full((rows, columns), -1, np.int32), np.zeros((rows, columns), np.int32)
-    broken = np.zeros((rows, columns), np.bool_)
-    for cell in range(count):
-        if flat[cell] > 0:
-            root, total = _find(parent, shift, cell)
-            basin[cell // columns, cell % columns], offset[cell // columns, cell % columns] = root, total
-    for i in range(rows):
-        for j in range(columns):
-            if right[i, j] != NONE and basin[i, j] == basin[i, j + 1] and offset[i, j + 1] - offset[i, j] != right[i, j]:
-                broken[i, j] = True
-            if down[i, j] != NONE and basin[i, j] == basin[i + 1, j] and offset[i + 1, j] - offset[i, j] != down[i, j]:
-                broken[i, j] = True
-    return basin, offset, broken
-
-
-def _number(basin: Integers, broken: Mask) -> tuple[Integers, set[int], int]:
-    """Number the basins from 0; returns the new map, the broken basins and how many there are."""
-    inside = basin >= 0
-    roots, numbers = np.unique(basin[inside], return_inverse=True)
-    numbered = np.full(basin.shape, -1, np.int32)
-    numbered[inside] = numbers
-    return numbered, set(numbered[broken].tolist()), len(roots)
+    sighted = int(np.count_nonzero(near)), len(values), _circular_median(residuals)
+    return Unwrapped(order, known, unreachable, len(found.absolute), islands, len(found.disputed), *sighted)
 
 
 @njit(cache=True)
 def _sight(line, offset, modulation, sigma, valid, phase, relative, basin, cell_order, turns, width):
-    """Sightings of the line on continuous ground: the basin, and the absolute order of the basin's root cell."""
+    """Sightings of the line on continuous ground: the basin, the absolute order of the basin's root cell, cycles off a whole."""
     rows, columns = basin.shape
-    places, values = [np.int32(0) for _ in range(0)], [np.int32(0) for _ in range(0)]
+    places, values, residuals = [np.int32(0) for _ in range(0)], [np.int32(0) for _ in range(0)], [0.0 for _ in range(0)]
     for v in range(rows * CELL):
         u = 0
         while u < columns * CELL:
@@ -295,11 +129,19 @@ def _sight(line, offset, modulation, sigma, valid, phase, relative, basin, cell_
                     other = near + 1 if middle > near else near - 1
                     here = phase[v, near] + abs(middle - near) * wrap(phase[v, other] - phase[v, near])
                     whole = np.floor(turns - here + 0.5)
-                    if abs(turns - here - whole) < RESIDUAL:
-                        places.append(place)
-                        values.append(np.int32(whole) - relative[v, near] - cell_order[v // CELL, near // CELL])
+                    places.append(place)
+                    values.append(np.int32(whole) - relative[v, near] - cell_order[v // CELL, near // CELL])
+                    residuals.append(turns - here - whole)
             u = max(u, start + 1)
-    return np.array(places), np.array(values)
+    return np.array(places), np.array(values), np.array(residuals)
+
+
+def _circular_median(cycles: NDArray[np.float64]) -> float:
+    """The median of values in +-0.5 that wrap around, 0 of none: about their mean direction."""
+    if not cycles.size:
+        return 0.0
+    middle = float(np.angle(np.mean(np.exp(2j * np.pi * cycles))) / (2 * np.pi))
+    return float(wrap(np.float64(middle + np.median(wrap(cycles - middle)))))
 
 
 def _borders(state: Flags, ground: Integers, offset: Integers, right: NDArray[np.int8], down: NDArray[np.int8]) -> Borders:

@@ -58,3 +58,25 @@ def test_orders_are_carried_along_the_slope_only(rng):
     known = (u < 20) | (u > 23)
     _, found = carry(split * known, known, phase, sigma, flags, CLEAN, REACH)
     assert found[:, 20:24].mean() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("wanted", "barrier", "crossed"),
+    [
+        (CLEAN, INCOMPLETE, False),
+        (INCOMPLETE, INCOMPLETE, True),
+        (CLEAN, TORN, False),
+        (INCOMPLETE, TORN, False),
+        (INCOMPLETE, VOID, False),
+    ],
+)
+def test_nothing_is_carried_across_lesser_pixels(rng, wanted, barrier, crossed):
+    """A band of 5 px that isn't as good as asked for stops an order, whatever lies beyond."""
+    u = np.mgrid[:40, :60][1].astype(float)
+    phase, sigma = wrapped(0.05 * u, rng)
+    truth = np.rint(0.05 * u - phase).astype(np.int32)
+    flags = np.full(phase.shape, CLEAN, np.uint8)
+    flags[:, 20:25] = barrier
+    known = u < 20
+    _, found = carry(truth * known, known, phase, sigma, flags, wanted, REACH)
+    assert found[:, 25:27].any() == crossed

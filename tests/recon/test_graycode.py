@@ -5,7 +5,7 @@ import pytest
 
 from recon.graycode import fringe_order
 from recon.patterns import Fringes, GrayCode, Patterns
-from recon.phase import wrapped_phase
+from recon.phase import Noise, wrapped_phase
 from tests.recon.fringe_scenes import NOISE, photograph
 
 
@@ -14,7 +14,7 @@ def orders(code, fringes, x, rng, **light):
     patterns = Patterns(projector_size=(1280, 800), unwrap="gray", parts=(fringes, code))
     images = photograph(patterns, {"columns": x}, rng, **light)
     fringe = wrapped_phase(images[: fringes.steps], fringes.shifts, noise=NOISE, saturation=255)
-    found = fringe_order(images[fringes.steps :], code, fringes, fringe, 1280, NOISE)
+    found, _ = fringe_order(images[fringes.steps :], code, fringes, fringe, 1280, NOISE)
     return fringes.zero(1280) + fringes.pitch * (fringe.phase / (2 * np.pi) + found.order), found.trusted
 
 
@@ -54,4 +54,45 @@ def test_two_uncertain_bits_are_refused(rng):
     images = photograph(patterns, {"columns": rng.uniform(100, 1100, (50, 60))}, rng)
     fringe = wrapped_phase(images[:8], fringes.shifts, noise=NOISE, saturation=255)
     grey = np.broadcast_to(np.rint(fringe.offset).astype(np.uint8), (8, 50, 60))
-    assert not fringe_order(grey, code, fringes, fringe, 1280, NOISE).trusted.any()
+    assert not fringe_order(grey, code, fringes, fringe, 1280, NOISE)[0].trusted.any()
+
+
+def test_a_doubtful_bit_is_trusted_only_if_it_does_not_matter(rng):
+    """A bit of middling grey, far from its border, can be read either way: trusted where both ways lead to one order."""
+    fringes, code = Fringes(pitch=18, steps=18), GrayCode(pitch=18, bits=7)
+    patterns = Patterns(projector_size=(1280, 800), unwrap="gray", parts=(fringes, code))
+    x = rng.uniform(10, 1270, (100, 120))
+    images = photograph(patterns, {"columns": x}, rng, noise=Noise(0.1, 0.0))  # quieter than the decoder believes
+    fringe = wrapped_phase(images[:18], fringes.shifts, noise=NOISE, saturation=255)
+    for bit in range(7):
+        doubtful = images[18:].copy()
+        doubtful[bit] = 8 + 90
+        found, _ = fringe_order(doubtful, code, fringes, fringe, 1280, NOISE)
+        decoded = fringes.zero(1280) + 18 * (fringe.phase / (2 * np.pi) + found.order)
+        assert (np.abs(decoded - x)[found.trusted] < 1).all()
+        assert found.trusted.mean() < 0.01
+
+
+def test_gamma_does_not_move_the_threshold(rng):
+    """Grey fringes pass the gamma and are darker in the mean than half of white: the bits' borders must not follow them.
+
+    Blurred over nearly half a period, a border that moved costs trust, and what is trusted is wrong in 6 pixels of 10 000; in
+    its place it is wrong where noise beats the 3 sigma of a sure bit.
+    """
+    x = rng.uniform(30, 1250, (200, 300))
+    decoded, trusted = orders(GrayCode(pitch=12, bits=7), Fringes(pitch=12, steps=18), x, rng, blur=5.0, gamma=2.2)
+    assert np.mean(np.abs(decoded - x)[trusted] > 2) < 2e-4
+    assert trusted.mean() == pytest.approx(0.8, abs=0.02)
+
+
+@pytest.mark.parametrize(("pitch", "start"), [(12, None), (12, -140.3), (10, 0.0), (9, -3.0)])
+def test_residuals_spread_evenly(rng, pitch, start):
+    """Cells half a period wide: the phase is at most a quarter period from their middle, as often on either side."""
+    fringes, code = Fringes(pitch=pitch, steps=8), GrayCode(pitch=pitch, bits=8, start=start, complementary=True)
+    patterns = Patterns(projector_size=(1280, 800), unwrap="gray", parts=(fringes, code))
+    images = photograph(patterns, {"columns": rng.uniform(10, 1270, (200, 300))}, rng)
+    fringe = wrapped_phase(images[:8], fringes.shifts, noise=NOISE, saturation=255)
+    _, residual = fringe_order(images[8:], code, fringes, fringe, 1280, NOISE)
+    assert abs(residual.mean()) < 0.005  # five standard errors are 0.003
+    assert np.mean(np.abs(residual) > 0.25) < 0.06
+    assert np.std(residual) == pytest.approx(0.25 / np.sqrt(3), rel=0.05)

@@ -53,11 +53,14 @@ def test_trusted_pixels_are_right_under_noise(rng, sigma):
 
 
 def test_contradicting_phases_are_refused(rng):
-    """Unrelated phases in the three sets end anywhere between two orders; those near the middle are dropped."""
+    """Unrelated phases in the three sets end anywhere between two orders; only those near a whole order are kept.
+
+    Each of the two rungs keeps twice 0.1 cycle and five sigmas, 0.105 rad at 0.01 rad of phase noise magnified by 10.5.
+    """
     fringes = [Fringes(pitch=pitch, steps=8) for pitch in (12, 126, 1332)]
     sets = [(f, measured(f, rng.uniform(0, 1279, (50, 60)), 0.01, rng)) for f in fringes]
     trusted = fringe_order(sets, 1280).trusted
-    assert trusted.mean() < 0.6
+    assert trusted.mean() == pytest.approx((2 * (0.1 + 5 * 0.105 / (2 * np.pi))) ** 2, abs=0.035)  # 5 standard errors
 
 
 def test_pitches_that_cannot_cover_the_axis_are_refused():

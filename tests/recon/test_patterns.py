@@ -95,9 +95,63 @@ def test_line_is_where_it_says(width):
         ("heterodyne", [{"kind": "fringes", "pitch": 12, "steps": 8}], "two or more sets"),
         ("gray", [{"kind": "gray", "pitch": 12, "bits": 7}], "at least one set of fringes"),
         ("gray", [{"kind": "fringes", "pitch": 12, "steps": 8}, {"kind": "gray", "pitch": 18, "bits": 7}], "one pitch"),
+        ("heterodyne", [{"kind": "fringes", "pitch": 12, "steps": 8}] * 2, "expects different pitches, found 12, 12 px"),
+        ("centre_line", [{"kind": "fringes", "pitch": np.inf, "steps": 8}], "finite number"),
+        ("centre_line", [{"kind": "fringes", "pitch": 12, "steps": 8, "origin": np.nan}], "finite number"),
         ("centre_line", [{"kind": "fringes", "pitch": 12, "steps": 8, "colour": 1}], "Extra inputs"),
     ],
 )
 def test_sequences_that_cannot_be_unwrapped_are_refused(unwrap, parts, message):
     with pytest.raises(ValidationError, match=message):
         Patterns(projector_size=(1280, 800), unwrap=unwrap, parts=parts)
+
+
+@pytest.mark.parametrize(
+    ("bits", "start", "covers"),
+    [
+        (5, None, "447.5 to 831.5"),
+        (7, 12.0, "12 to 1548"),
+        (7, -300.0, "-300 to 1236"),
+        (7, 0.0, None),
+        (7, -0.5, None),
+        (7, -200, None),
+    ],
+)
+def test_a_code_that_misses_part_of_the_axis_is_refused(bits, start, covers):
+    """Beyond its range the code repeats itself mirrored: it would be decoded, wrongly."""
+
+    def sequence():
+        return Patterns(
+            projector_size=(1280, 800),
+            unwrap="gray",
+            parts=(Fringes(pitch=12, steps=8), GrayCode(pitch=12, bits=bits, start=start)),
+        )
+
+    if covers is None:
+        assert sequence().count == 8 + bits
+        return
+    with pytest.raises(ValidationError, match=f"parts: Gray code of columns covers {covers} px, expected 0 to 1279"):
+        sequence()
+
+
+@pytest.mark.parametrize(
+    ("pitch", "origin", "off"), [(18, None, True), (18, 640, False), (16, None, False), (16, 640, True), (9, None, False)]
+)
+def test_binary_fringes_half_a_pixel_off_are_refused(pitch, origin, off):
+    """An odd number of lit pixels has a pixel in its middle, an even number a border."""
+
+    def sequence():
+        fringes = Fringes(pitch=pitch, steps=pitch, origin=origin, waveform="binary")
+        return Patterns(projector_size=(1280, 800), unwrap="centre_line", parts=(CentreLine(), fringes))
+
+    if not off:
+        assert sequence().count == pitch + 1
+        return
+    with pytest.raises(ValidationError, match=r"binary fringes of columns lie [+-]0\.50 px off"):
+        sequence()
+
+
+@pytest.mark.parametrize("size", [(-5, 0), (7, 800), (1280, 20001)])
+def test_projectors_of_impossible_size_are_refused(size):
+    with pytest.raises(ValidationError, match="than or equal"):
+        Patterns(projector_size=size, unwrap="centre_line", parts=(CentreLine(), Fringes(pitch=12, steps=8)))

@@ -30,7 +30,7 @@ def measurements(setup: Setup) -> list[Measurement]:
     rig = setup.rig
     return [
         *(
-            lambda kind=kind: against_mitsuba(rig, build_scene({"kind": kind}), 0.5, 128, 16, range(9))
+            lambda kind=kind: against_mitsuba(rig, build_scene({"kind": kind}), 0.5, 32, 16, range(9))
             for kind in ("plane", "breast")
         ),
         lambda: [phase_error(rig, samples=16)],

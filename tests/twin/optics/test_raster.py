@@ -44,7 +44,7 @@ def test_no_light_outside(rig, patterns):
 
 def test_gamma_for_grey_only(rig):
     """Grey levels pass the gamma, binary patterns don't; black is 1/contrast."""
-    parts = (Fringes(pitch=16, steps=4), GrayCode(pitch=16, bits=6), Uniform(level=0.5))
+    parts = (Fringes(pitch=16, steps=4), GrayCode(pitch=16, bits=7), Uniform(level=0.5))
     light = Light.of(Patterns(projector_size=(1280, 800), unwrap="gray", parts=parts), rig.projector)
     black = 1 / rig.projector.contrast
     assert light.profiles[-1][0] == pytest.approx(black + (1 - black) * (128 / 255) ** rig.projector.gamma, rel=1e-5)
