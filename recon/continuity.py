@@ -68,25 +68,27 @@ def continuity(phase, sigma, valid):
             inner = wrap(d[u] - c[u]) + wrap(e[u] - d[u]) + wrap(f[u] - e[u])
             outer = wrap(c[u] - b[u]) + wrap(b[u] - a[u]) + wrap(g[u] - f[u]) + wrap(h[u] - g[u])
             down[v, u] = wrap(inner - outside * outer)
-        for k in range(-3, 5):
-            for u in range(width):
-                if not valid[v + k, u]:
-                    down[v, u] = np.nan
-    jumps = np.empty((height, width), np.uint8)  # bit 0 torn across, 1 torn down, 2 incomplete across, 3 incomplete down
-    single, triple = np.float32(SIGMAS * STENCIL_NOISE), np.float32(SIGMAS * STENCIL_NOISE / math.sqrt(3))
-    slack = np.float32(SLACK)
-    for v in prange(height):
-        above, below = max(v - 1, 0), min(v + 1, height - 1)
+        whole = valid[v - 3] & valid[v - 2] & valid[v - 1] & valid[v] & valid[v + 1] & valid[v + 2] & valid[v + 3] & valid[v + 4]
         for u in range(width):
-            left, right = max(u - 1, 0), min(u + 1, width - 1)
-            s = sigma[v, u]
-            x, y = across[v, u], down[v, u]
-            x3 = (across[above, u] + x + across[below, u]) / 3
-            y3 = (down[v, left] + y + down[v, right]) / 3
-            torn = np.uint8(abs(x) > slack + single * s or abs(x3) > slack + triple * s)
-            torn |= np.uint8(2) * np.uint8(abs(y) > slack + single * s or abs(y3) > slack + triple * s)
-            jumps[v, u] = torn | np.uint8(4) * np.uint8(np.isnan(x)) | np.uint8(8) * np.uint8(np.isnan(y))
+            down[v, u] = down[v, u] if whole[u] else np.float32(np.nan)
+    jumps = np.empty((height, width), np.uint8)
+    for v in prange(height):
+        over, here, under = across[max(v - 1, 0)], across[v], across[min(v + 1, height - 1)]
+        for u in range(1, width - 1):  # the first and last column apart: without limits on u this takes vector instructions
+            jumps[v, u] = _judge(over[u], here[u], under[u], down[v, u - 1], down[v, u], down[v, u + 1], sigma[v, u])
+        for u, left, right in ((0, 0, min(1, width - 1)), (width - 1, max(width - 2, 0), width - 1)):
+            jumps[v, u] = _judge(over[u], here[u], under[u], down[v, left], down[v, u], down[v, right], sigma[v, u])
     return _combine(jumps, valid)
+
+
+@njit(inline="always")
+def _judge(over, x, under, left, y, right, s):
+    """Bit 0 torn across, 1 torn down, 2 incomplete across, 3 incomplete down; from the mismatches at a pixel and beside it."""
+    single = np.float32(SLACK) + np.float32(SIGMAS * STENCIL_NOISE) * s
+    triple = np.float32(SLACK) + np.float32(SIGMAS * STENCIL_NOISE / math.sqrt(3)) * s
+    torn = np.uint8((abs(x) > single) | (abs(over + x + under) > 3 * triple))
+    torn |= np.uint8(2) * np.uint8((abs(y) > single) | (abs(left + y + right) > 3 * triple))
+    return torn | np.uint8(4) * np.uint8(x != x) | np.uint8(8) * np.uint8(y != y)
 
 
 @njit(cache=True, parallel=True)
