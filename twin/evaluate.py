@@ -230,10 +230,13 @@ def things(metrics: Metrics) -> dict[str, float]:
 def fit(shape: Shape, points: Array) -> Metrics:
     """Fit a shape's kind to measured points : (n, 3) mm, and compare with the shape, as one does without ground truth.
 
-    NaN if there are too few points.
+    NaN if there are too few points, or they don't determine the shape: a piece of a sphere too small to be told from a plane.
     """
     names = FITTED[type(shape).__name__.lower()]
-    values = _fitted(shape, points) if len(points) >= LEAST_FITTED else len(names) * (np.nan,)
+    try:
+        values = _fitted(shape, points) if len(points) >= LEAST_FITTED else len(names) * (np.nan,)
+    except ValueError:
+        values = len(names) * (np.nan,)
     return {f"{shape_key(shape)}_{name}": value for name, value in zip(names, values, strict=True)}
 
 

@@ -46,9 +46,7 @@ class View:
     images: Numbers  # (n, h, w)
     exposure: Exposure
     truth: SurfaceTruth
-    limit_px: (
-        Images  # (h, w) standard deviation of the projector coordinate that the sensor's noise alone allows; inf in the dark
-    )
+    limit_px: Images  # (h, w, 2) see `noise_limit_px`
 
 
 def shoot(rig: Rig, scene: Scene, patterns: Patterns, camera: CameraName, engine: Engine, shooting: Shooting, seed: int) -> View:

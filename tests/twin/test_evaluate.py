@@ -12,7 +12,7 @@ from recon.decode import ProjectorMap
 from recon.errors import InputError
 from recon.phase import DEFAULT_NOISE
 from recon.triangulate import triangulate
-from scenes.things import Cylinder
+from scenes.things import Cylinder, Sphere
 from sonotwin.cli import main
 from sonotwin.verbs.evaluate import describe
 from twin import evaluate
@@ -252,3 +252,10 @@ def test_sizes_must_match_and_something_must_be_seen(truth, perfect):
         evaluate.compare(np.float32(perfect[:100]), sigma[:100], truth)
     with pytest.raises(InputError, match="found none"):
         evaluate.compare(np.full(perfect.shape, np.nan, np.float32), sigma, truth)
+
+
+def test_a_shape_that_the_points_do_not_determine_is_unknown(rng):
+    """Of a sphere so large that its piece is a plane within the noise, nothing is said; the evaluation goes on."""
+    points = np.column_stack([rng.uniform(-10, 10, (500, 2)), rng.normal(650, 0.05, 500)])
+    found = evaluate.fit(Sphere("planet", np.array([0.0, 0.0, 1e6]), 1e6), points)
+    assert len(found) == 3 and np.isnan(list(found.values())).all()

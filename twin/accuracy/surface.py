@@ -23,7 +23,6 @@ from twin.optics.world import visible
 from twin.session import Shooting, View, calibration_of, shoot
 
 ENGINE = Engine(samples=16, room_lux=20)
-PAPER_PLANES_MM = 0.131  # the largest RMS of the paper's five planes; the least is 0.101
 PAPER_SPHERE_RADIUS_MM, PAPER_SPHERE_RMS_MM = 0.045, 0.040
 REAL_DEPTH_MM = (690.0, 780.0)
 WINDOW = 9  # px; patches of the real surface in which noise is told from shape by a quadratic fit
