@@ -92,7 +92,7 @@ def surface_steps(config: Config) -> list[Step]:
         return metrics.read(folder / "evaluation" / metrics.FILE)
 
     def telling(folder: Path, figures: Figures) -> Figures:
-        story = report.read(folder / "capture", folder / "truth", folder / "surface" / "points.npz", camera)
+        story = report.read(folder / "capture", folder / "truth", folder / "surface" / surface.POINTS, camera)
         report.write(folder / "report.html", story, dict(figures), OUTPUTS, commands(folder, camera, config._overrides))
         return {}
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict
 
 from recon import atomic, metrics
 from recon.metrics import Metrics, shown
+from sonotwin.verbs.surface import POINTS
 from twin import evaluate, figures
 
 ERROR_MAP = "error_map.png"  # by which the folder of an evaluation is known
@@ -39,7 +40,7 @@ def run(config: Config) -> None:
     out = config.out or config.surface / "evaluation"
     atomic.check_folder(out, ERROR_MAP, inputs=(config.surface, config.truth))
     truth = evaluate.read_truth(config.truth, config.camera)
-    points, sigma = evaluate.read_points(config.surface / "points.npz")
+    points, sigma = evaluate.read_points(config.surface / POINTS)
     comparison = evaluate.compare(points, sigma, truth)
     found = evaluate.measure(points, comparison, truth)
     with atomic.new_folder(out, ERROR_MAP) as folder:
