@@ -1,4 +1,4 @@
-"""The layout of the rig authors' public program: `SLdata/images`, `SLdata/mask.png` and `cam1_proj_params.npz`.
+"""The layout of the rig authors' public program: `SLdata/images`, `SLdata/mask.png` and the files of pairs of devices.
 
 The images in natural order are the centre line, the eight fringe images and, last, the fully lit one; others in between are
 left out. Pitch 12 projector px, phase shifts 2 pi k / 8 for k = 1 to 8, projector column (width - 1) / 2 at phase zero.
@@ -6,12 +6,13 @@ left out. Pitch 12 projector px, phase shifts 2 pi k / 8 for k = 1 to 8, project
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recon import atomic, calibration, capture, rigid
 from recon.calibration import Calibration
-from recon.camera import Array
+from recon.camera import Array, Camera
 from recon.capture import Size, SurfaceCapture
 from recon.errors import InputError
 from recon.patterns import CentreLine, Fringes, Patterns, Uniform
@@ -20,6 +21,8 @@ STEPS = 8
 PITCH = 12.0  # projector px
 PROJECTOR_SIZE = (1280, 800)  # px; their files don't store it
 PARAMETERS = "cam1_proj_params.npz"
+STEREO_PARAMETERS = "cam1_cam2_params.npz"
+STEREO_XML = "StereoParams.xml"  # the same, as OpenCV FileStorage
 
 
 def patterns(projector_size: Size = PROJECTOR_SIZE) -> Patterns:
@@ -81,6 +84,23 @@ def write(folder: Path, surface: SurfaceCapture, mask: NDArray[np.bool_]) -> Non
         np.savez(temporary / PARAMETERS, **parameters(surface.calibration))
 
 
+def write_parameters(folder: Path, optics: Calibration) -> list[str]:
+    """Write the files of all pairs of camera 1 with another device into a folder that is there; returns their names."""
+    written = []
+    if "projector" in optics.cameras:
+        np.savez(folder / PARAMETERS, **parameters(optics))
+        written.append(PARAMETERS)
+    if "cam2" in optics.cameras:
+        pair = parameters(optics, "cam2")
+        np.savez(folder / STEREO_PARAMETERS, **pair)
+        storage = cv2.FileStorage(".xml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+        for name, value in pair.items():
+            storage.write(name, np.ascontiguousarray(value))  # a view would lose its strides
+        (folder / STEREO_XML).write_text(storage.releaseAndGetString(), encoding="utf-8")
+        written += [STEREO_PARAMETERS, STEREO_XML]
+    return written
+
+
 def parameters(optics: Calibration, second: str = "projector") -> dict[str, Array]:
     """Their names for a pair of devices: K1, dist1, K2, dist2, R, t (second from camera 1, mm) and the fundamental matrix F."""
     first, other = optics.cameras["cam1"], optics.cameras[second]
@@ -90,10 +110,15 @@ def parameters(optics: Calibration, second: str = "projector") -> dict[str, Arra
     fundamental = np.linalg.inv(other.matrix).T @ cross @ rotation @ np.linalg.inv(first.matrix)
     return {
         "K1": first.matrix,
-        "dist1": first.distortion.reshape(1, -1),
+        "dist1": _distortion(first),
         "K2": other.matrix,
-        "dist2": other.distortion.reshape(1, -1),
+        "dist2": _distortion(other),
         "R": rotation,
         "t": t.reshape(3, 1),
         "F": fundamental / fundamental[2, 2],
     }
+
+
+def _distortion(camera: Camera) -> Array:
+    """Coefficients : (1, 4 or more). OpenCV's files can't hold an empty matrix, so no distortion is four zeros."""
+    return camera.distortion.reshape(1, -1) if camera.distortion.size else np.zeros((1, 4))

@@ -1,6 +1,7 @@
 """Calibration files: sonotwin's own `optics.yaml` and the dialects of others, recognised by their content.
 
-- own: OpenCV FileStorage YAML; for every device a map of `size`, `matrix`, `distortion` and `camera_from_world`.
+- own: OpenCV FileStorage YAML; for every device a map of `size`, `matrix`, `distortion` and `camera_from_world`; and, if known,
+  `parameters`, their names, and `covariance`.
 - camera and projector of SLMaster: FileStorage with M1, D1 (camera), M4, D4 (projector), Rlp, Tlp (projector from camera), S.
 - stereo pair of the rig's authors: npz, or FileStorage XML, with K1, dist1, K2, dist2, R, t. Device 1 is camera 1; which
   device 2 is, the content doesn't say: the projector if the file's name has `proj` in it, else camera 2.
@@ -16,10 +17,35 @@ import numpy as np
 from recon import arrays, atomic, rigid
 from recon.camera import Array, Camera
 from recon.errors import InputError
+from recon.projection import DISTORTION, MATRIX, MOTION
 
 SCHEMA = "sonotwin-optics/1"
 SLMASTER_KEYS = ("M1", "D1", "M4", "D4", "Rlp", "Tlp", "S")
 STEREO_KEYS = ("K1", "dist1", "K2", "dist2", "R", "t")
+OWN_KEYS = ("schema", "parameters", "covariance")  # any other is a device
+
+WORLD = "cam1"  # the device whose frame the world is: it has no pose
+SYMMETRIC = 1e-9  # of a covariance, relative to the standard deviations: it comes from a text file
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Covariance of a calibration's parameters, by their names.
+
+    A name is `DEVICE.PARAMETER`: `fx fy cx cy` in px; `k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tau_x tau_y`; and for all devices but
+    the world's `rx ry rz` in rad and `tx ty tz` in mm, a turn and a shift of the calibrated `device_from_world`:
+    `R = exp([r]) R_calibrated`, `t = t_calibrated + (tx, ty, tz)`. Parameters that were held fixed have no name here.
+    """
+
+    names: tuple[str, ...]  # (g,)
+    covariance: Array  # (g, g)
+
+    def sigma(self, name: str) -> float:
+        """Standard deviation of one parameter; zero if it was held fixed."""
+        if name not in self.names:
+            return 0.0
+        k = self.names.index(name)
+        return float(np.sqrt(self.covariance[k, k]))
 
 
 @dataclass(frozen=True)
@@ -27,6 +53,7 @@ class Calibration:
     """The calibrated devices by name: `cam1`, `cam2`, `projector`. World is the frame of camera 1."""
 
     cameras: Mapping[str, Camera]
+    uncertainty: Uncertainty | None = None
 
 
 def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Calibration:
@@ -78,6 +105,12 @@ def write(path: Path, calibration: Calibration) -> None:
         storage.write("distortion", camera.distortion.reshape(1, -1) if camera.distortion.size else np.zeros((1, 4)))
         storage.write("camera_from_world", camera.camera_from_world)
         storage.endWriteStruct()
+    if calibration.uncertainty is not None:
+        storage.startWriteStruct("parameters", cv2.FileNode_SEQ)
+        for name in calibration.uncertainty.names:
+            storage.write("", name)
+        storage.endWriteStruct()
+        storage.write("covariance", calibration.uncertainty.covariance)
     text = storage.releaseAndGetString()
     with atomic.new_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -89,7 +122,7 @@ def _own(path: Path, storage: cv2.FileStorage) -> Calibration:
         raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
     cameras = {}
     for name in storage.root().keys():
-        if name == "schema":
+        if name in OWN_KEYS:
             continue
         node = storage.getNode(name)
         if not node.isMap():
@@ -103,7 +136,34 @@ def _own(path: Path, storage: cv2.FileStorage) -> Calibration:
         cameras[name] = _camera(path, name, (width, height), values["matrix"], values["distortion"], values["camera_from_world"])
     if not cameras:
         raise InputError(f"{path}: expected at least one device, found none")
-    return Calibration(cameras)
+    return Calibration(cameras, _uncertainty(path, storage, cameras))
+
+
+def _uncertainty(path: Path, storage: cv2.FileStorage, cameras: Mapping[str, Camera]) -> Uncertainty | None:
+    node = storage.getNode("parameters")
+    if node.empty() and storage.getNode("covariance").empty():
+        return None
+    entries = [node.at(i) for i in range(node.size())] if node.isSeq() else []
+    if not entries or not all(entry.isString() for entry in entries):
+        raise InputError(f"{path}: parameters: expected names of the covariance's parameters, found something else")
+    names = tuple(entry.string() for entry in entries)
+    known = {f"{device}.{name}" for device in cameras for name in MATRIX + DISTORTION + (MOTION if device != WORLD else ())}
+    wrong = next((name for k, name in enumerate(names) if name not in known or name in names[:k]), None)
+    if wrong is not None:
+        raise InputError(f"{path}: parameters: expected a device's parameter like projector.fx, each once, found {wrong}")
+    covariance = _matrix(path, "covariance", storage.getNode("covariance"))
+    expected = f"{path}: covariance: expected {len(names)}x{len(names)} variances and covariances of the parameters, found"
+    if covariance.shape != (len(names), len(names)):
+        raise InputError(f"{expected} shape {covariance.shape}")
+    if not np.isfinite(covariance).all():
+        raise InputError(f"{expected} values that are not finite")
+    sigma = np.sqrt(np.abs(np.diag(covariance)))
+    scale = np.outer(sigma, sigma) + np.finfo(float).tiny
+    if (np.abs(covariance - covariance.T) > SYMMETRIC * scale).any():
+        raise InputError(f"{expected} a matrix that is not symmetric")
+    if np.diag(covariance).min() < 0 or (np.abs(covariance) > (1 + SYMMETRIC) * scale).any():
+        raise InputError(f"{expected} a variance below zero or a correlation beyond one")
+    return Uncertainty(names, (covariance + covariance.T) / 2)
 
 
 def _slmaster(path: Path, values: Mapping[str, Array], sizes: Mapping[str, tuple[int, int]]) -> Calibration:

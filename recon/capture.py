@@ -1,10 +1,8 @@
-"""Captures: the folder that devices or the twin write and the pipeline reads, with a manifest of what is in it.
+"""Captures: the folder that devices or the twin write and the pipeline reads; its images, and its surface part.
 
-`manifest.json` says which devices took part, which patterns were shown and which image belongs to which. Everything is
-checked on load; a fault is an `InputError` of one line that names the file, what was expected and what was found.
+Everything is checked on load; a fault is an `InputError` of one line that names the file, what was expected and what was found.
 """
 
-import json
 import os
 import re
 import struct
@@ -13,84 +11,24 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
 
 import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from recon import atomic, calibration
 from recon.calibration import Calibration
-from recon.errors import InputError, one_line
+from recon.errors import InputError
+from recon.manifest import MANIFEST, SCHEMA, Device, Manifest, SurfacePart, read_bytes, read_manifest, validated, write_manifest
 from recon.patterns import Patterns
 
 Images = NDArray[np.uint8] | NDArray[np.uint16]
 Size = tuple[int, int]  # width, height, px
-Model = TypeVar("Model", bound=BaseModel)
 
-SCHEMA: Literal["sonotwin-capture/1"] = "sonotwin-capture/1"
-MANIFEST = "manifest.json"
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOURS = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}
 PNG_COMPRESSION = 1  # sensor noise hardly compresses: higher levels cost time and save a few percent
-
-
-class Record(BaseModel):
-    """Base of the manifest's parts: immutable, and refuses unknown keys and numbers that are not finite."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Device(Record):
-    """A camera or the projector, as it was set."""
-
-    size: tuple[Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)]]  # width, height, px
-    bits: Literal[8, 10, 12] = 8  # of the digital numbers; 10 and 12 are stored right-aligned in 16-bit PNG
-    exposure_s: Annotated[float, Field(gt=0)] | None = None
-    gain: Annotated[float, Field(gt=0)] | None = None  # linear; 1 is the sensor's base gain
-
-
-class SurfacePart(Record):
-    """The fringe sequence: what was projected and what each camera saw, in the same order."""
-
-    patterns: Patterns
-    images: dict[str, tuple[str, ...]]  # camera: paths relative to the manifest's root
-
-    @model_validator(mode="after")
-    def _one_image_a_pattern(self) -> "SurfacePart":
-        for camera, paths in self.images.items():
-            if len(paths) != self.patterns.count:
-                raise ValueError(f"images.{camera}: expected {self.patterns.count} images, one a pattern, found {len(paths)}")
-        return self
-
-
-class Manifest(Record):
-    """`manifest.json`. Parts are optional: a capture need not hold all of them."""
-
-    version: Literal["sonotwin-capture/1"] = Field(alias="schema")
-    name: str = ""
-    root: str = "."  # folder of the images: absolute, or relative to the manifest
-    devices: dict[str, Device]
-    calibration: str | None = None  # relative to the manifest's folder
-    surface: SurfacePart | None = None
-
-    @model_validator(mode="after")
-    def _fitting_devices(self) -> "Manifest":
-        if self.surface is None:
-            return self
-        for camera in self.surface.images:
-            if camera not in self.devices:
-                raise ValueError(
-                    f"surface.images.{camera}: expected one of the devices {', '.join(self.devices)}, found {camera}"
-                )
-        wanted = self.surface.patterns.projector_size
-        if "projector" in self.devices and (found := self.devices["projector"].size) != wanted:
-            raise ValueError(
-                f"devices.projector.size: expected {wanted[0]}x{wanted[1]} as in surface.patterns, found {found[0]}x{found[1]}"
-            )
-        return self
 
 
 @dataclass(frozen=True)
@@ -104,26 +42,8 @@ class SurfaceCapture:
     name: str
 
 
-def read_manifest(folder: Path) -> Manifest:
-    """Read and check the manifest of a capture folder, leaving the files that it names alone.
-
-    Raises
-    ------
-    InputError
-        If it is missing, not JSON, of another version, or a field is wrong.
-    """
-    path = Path(folder) / MANIFEST
-    try:
-        content = json.loads(_read_bytes(path), parse_constant=lambda value: _refuse_constant(path, value))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected JSON, found {error}") from None
-    except RecursionError:
-        raise InputError(f"{path}: expected JSON, found values nested too deeply") from None
-    return _validated(Manifest, content, path)
-
-
-def read_surface(folder: Path, camera: str = "cam1") -> SurfaceCapture:
-    """Read one camera's fringe sequence from a capture folder.
+def read_surface(folder: Path, camera: str = "cam1", calibration_file: Path | None = None) -> SurfaceCapture:
+    """Read one camera's fringe sequence from a capture folder, with a calibration from elsewhere if one is given.
 
     Raises
     ------
@@ -135,10 +55,11 @@ def read_surface(folder: Path, camera: str = "cam1") -> SurfaceCapture:
     if manifest.surface is None or camera not in manifest.surface.images:
         found = ", ".join(manifest.surface.images) if manifest.surface else "no surface part"
         raise InputError(f"{folder / MANIFEST}: expected surface images of {camera}, found {found or 'none'}")
-    if manifest.calibration is None:
+    if calibration_file is None and manifest.calibration is None:
         raise InputError(f"{folder / MANIFEST}: expected calibration, the path of a calibration file, found none")
     device = manifest.devices[camera]
-    optics = _fitting_calibration(folder / manifest.calibration, camera, device.size, manifest.surface.patterns)
+    source = Path(calibration_file or folder / str(manifest.calibration))
+    optics = _fitting_calibration(source, camera, device.size, manifest.surface.patterns)
     root = folder / manifest.root
     images = read_images([root / path for path in manifest.surface.images[camera]], device.size, device.bits)
     return SurfaceCapture(images, manifest.surface.patterns, device.bits, optics, manifest.name or folder.resolve().name)
@@ -163,7 +84,7 @@ def read_bare(images_dir: Path, patterns_file: Path, calibration_file: Path, cam
         raise InputError(
             f"{images_dir}: expected {patterns.count} PNG images, one a pattern of {patterns_file}, found {len(paths)}"
         )
-    width, height, depth, _ = png_header(paths[0], _read_bytes(paths[0]))
+    width, height, depth, _ = png_header(paths[0], read_bytes(paths[0]))
     optics = _fitting_calibration(Path(calibration_file), camera, (width, height), patterns)
     images = read_images(paths, (width, height), 12 if depth == 16 else 8)
     bits = 8 if depth != 16 else 10 if images.max() < 1 << 10 else 12
@@ -180,12 +101,12 @@ def read_patterns(path: Path) -> Patterns:
     """
     path = Path(path)
     try:
-        content = yaml.safe_load(_read_bytes(path))
+        content = yaml.safe_load(read_bytes(path))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected YAML, found {' '.join(str(error).split())}") from None
     except RecursionError:
         raise InputError(f"{path}: expected YAML, found values nested too deeply") from None
-    return _validated(Patterns, content, path)
+    return validated(Patterns, content, path)
 
 
 def write_surface(
@@ -228,8 +149,7 @@ def write_surface(
         calibration.write(temporary / "calibration" / "optics.yaml", optics)
         for camera, stack in images.items():
             write_images([temporary / path for path in paths[camera]], stack)
-        text = manifest.model_dump_json(indent=2, by_alias=True, exclude_none=True)
-        (temporary / MANIFEST).write_text(text + "\n", encoding="utf-8")
+        write_manifest(temporary, manifest)
 
 
 def write_images(paths: Sequence[Path], images: Images) -> None:
@@ -273,7 +193,7 @@ def read_images(paths: Sequence[Path], size: Size, bits: int) -> Images:
 
 def read_image(path: Path, size: Size, bits: int) -> Images:
     """Read one grey PNG image : (h, w); see `read_images`."""
-    data = _read_bytes(path)
+    data = read_bytes(path)
     width, height, depth, colour = png_header(path, data)
     stored = 8 if bits == 8 else 16
     if (width, height) != size or depth != stored or colour != "grey":
@@ -288,7 +208,7 @@ def read_image(path: Path, size: Size, bits: int) -> Images:
 
 def image_size(path: Path) -> Size:
     """Width and height of a PNG file, in px; checked as in `png_header`."""
-    return png_header(path, _read_bytes(path))[:2]
+    return png_header(path, read_bytes(path))[:2]
 
 
 def png_header(path: Path, data: bytes) -> tuple[int, int, int, str]:
@@ -335,23 +255,3 @@ def _fitting_calibration(path: Path, camera: str, size: Size, patterns: Patterns
         if found != wanted:
             raise InputError(f"{path}: expected {name} of {wanted[0]}x{wanted[1]} px, found {found[0]}x{found[1]}")
     return optics
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file, found none") from None
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable file, found {error.strerror}") from None
-
-
-def _refuse_constant(path: Path, value: str) -> None:
-    raise InputError(f"{path}: expected finite numbers, found {value}")
-
-
-def _validated(model: type[Model], content: object, path: Path) -> Model:
-    try:
-        return model.model_validate(content)
-    except ValidationError as error:
-        raise InputError(f"{path}: {one_line(error)}") from None

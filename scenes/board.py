@@ -4,6 +4,7 @@ The white ground has round holes and each disc fills one, sharing its vertices, 
 right, y down, z away from the viewer, origin at the first circle.
 """
 
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -11,6 +12,7 @@ from pydantic import Field, model_validator
 from scipy.spatial import Delaunay
 
 from recon import rigid
+from recon.boards import AsymmetricCircles
 from recon.rig import Fraction, NotNegative, Part, Positive, Vector
 from scenes import solids
 from scenes.noise import Seed
@@ -38,6 +40,7 @@ class Config(Part):
     print_error_mm: Annotated[float, Field(ge=0, le=1)] = 0.0  # standard deviation of each centre, in x and in y
     white: Fraction = 0.75  # reflectance of paper
     black: Fraction = 0.05  # reflectance of printed ink
+    roughness: Annotated[float, Field(gt=0, le=1)] | None = None  # GGX alpha of a glossy coat, which glares; None is matt
     seed: Seed = 1  # of the print errors
 
     @model_validator(mode="after")
@@ -51,16 +54,22 @@ class Config(Part):
         return self
 
 
-def object_points(config: Config) -> Array:
-    """Centres of the circles as designed : (columns * rows, 3) mm in the board's frame, in OpenCV's order."""
-    row, column = np.divmod(np.arange(config.rows * config.columns), config.columns)
-    return np.column_stack([2 * column + row % 2, row, np.zeros(row.size)]) * config.spacing_mm
+def design(config: Config) -> AsymmetricCircles:
+    """The board as it was meant, which is all that a calibration knows."""
+    return AsymmetricCircles(
+        columns=config.columns, rows=config.rows, spacing_mm=config.spacing_mm, diameter_mm=config.diameter_mm
+    )
+
+
+def printed_centres(config: Config) -> Array:
+    """Centres of the circles as printed on the warped board : (columns * rows, 3) mm in the board's frame, in OpenCV's order."""
+    centres = _printed(config)
+    return np.column_stack([centres, _saddle(config, centres)])
 
 
 def circle_centres(config: Config) -> Array:
     """Centres of the circles as printed on the warped board : (columns * rows, 3) mm in the world, in the same order."""
-    centres = _printed(config)
-    return rigid.apply(world_from_board(config), np.column_stack([centres, _saddle(config, centres)]))
+    return rigid.apply(world_from_board(config), printed_centres(config))
 
 
 def world_from_board(config: Config) -> Array:
@@ -72,21 +81,26 @@ def world_from_board(config: Config) -> Array:
 
 def build(config: Config) -> Scene:
     """The white ground and the black discs. There is no shape to fit: see `circle_centres`."""
-    points, triangles, black = _print(config)
     world = world_from_board(config)
-    things = []
+    return Scene("board", tuple(replace(thing, mesh=solids.moved(thing.mesh, world)) for thing in things(config)))
+
+
+def things(config: Config) -> tuple[Thing, Thing]:
+    """Ground and discs in the board's frame."""
+    points, triangles, black = _print(config)
+    parts = []
     for name, chosen, reflectance in (("ground", ~black, config.white), ("discs", black, config.black)):
         used, faces = np.unique(triangles[chosen], return_inverse=True)
         part = points[used]
         mesh = solids.slab(part, faces.reshape(-1, 3), THICKNESS_MM, _saddle(config, part))
-        things.append(Thing(name, solids.moved(mesh, world), Material(reflectance), smooth=False))
-    return Scene("board", tuple(things))
+        parts.append(Thing(name, mesh, Material(reflectance, config.roughness), smooth=False))
+    return parts[0], parts[1]
 
 
 def _printed(config: Config) -> Array:
     errors = np.random.default_rng(config.seed).standard_normal((config.rows * config.columns, 2))
     errors = np.clip(errors, -MAX_ERRORS, MAX_ERRORS)
-    return object_points(config)[:, :2] + config.print_error_mm * errors
+    return design(config).points()[:, :2] + config.print_error_mm * errors
 
 
 def _middle(config: Config) -> Array:

@@ -4,6 +4,8 @@ import os
 import zlib
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one core a worker; before NumPy is loaded
+
 import numpy as np
 import pytest
 import yaml

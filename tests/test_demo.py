@@ -9,7 +9,8 @@ import pytest
 
 from recon.errors import InputError
 from sonotwin.cli import main
-from sonotwin.verbs.demo import commands
+from sonotwin.config import compose
+from sonotwin.verbs.demo import Config, commands
 from twin import demo
 from twin.demo import Step
 
@@ -20,8 +21,9 @@ SMALL = (  # camera 1 at half its size: fringes of ten pixels a period
     "rig.cam1.sensor.pixel_um=9.6",
     "engine.samples=4",
     "scene.edge_mm=1.5",
+    "poses.count=4",
 )
-MADE = ("report.html", "surface.ply", "surface.glb", "metrics.json", "capture/manifest.json", "truth/scene.json")
+MADE = ("report.html", "surface.ply", "surface.glb", "metrics.json", "calibration/calibration.html", "truth/scene.json")
 
 
 def figures(folder):
@@ -30,29 +32,31 @@ def figures(folder):
 
 def test_a_small_demonstration_runs_through(tmp_path, capsys):
     out = tmp_path / "demo"
-    assert main(["demo", *SMALL, f"out={out}"]) == 0
+    assert main(["demo", *SMALL, f"out={out}", f"board={tmp_path / 'board'}"]) == 0
     assert not [name for name in MADE if not (out / name).is_file()]
     metrics = figures(out)
     # With four samples a pixel rendering noise adds to the sensor's; at this size edges are a larger part of the image.
     assert metrics["surface_interior_rms_mm"] < 3 * metrics["limit_rms_mm"]
     assert metrics["coverage"] > 0.9 and metrics["gross_error_fraction"] < 0.01
-    assert all(f"seconds_{name}" in metrics for name in ("render", "surface", "evaluate", "report", "decode", "demo"))
+    steps = ("board", "calibrate", "render", "surface", "evaluate", "report", "demo")
+    assert all(f"seconds_{name}" in metrics for name in steps)
+    assert max(metrics[f"reprojection_rms_{name}_px"] for name in ("cam1", "cam2", "projector")) < 0.05
     printed = capsys.readouterr().out.splitlines()
     wrote = [re.fullmatch(r"wrote +(.*)/\{(.*)\}", line) for line in printed if line.startswith("wrote")]
-    assert len(wrote) == 3
+    assert len(wrote) == 5
     assert all((Path(folder) / name).exists() for folder, names in (line.groups() for line in wrote) for name in names.split(","))
     assert (out / "surface.ply").read_bytes() == (out / "surface" / "surface.ply").read_bytes()
     report = html.unescape((out / "report.html").read_text(encoding="utf-8"))
     assert f"sonotwin render '{SMALL[0]}' '{SMALL[1]}'" in report, "the settings, though this was no command line"
-    last = printed[-4:]
-    assert [line.split()[0] for line in last] == ["measured", "accuracy", "coverage", "look"]
+    last = printed[-5:]
+    assert [line.split()[0] for line in last] == ["measured", "accuracy", "calibrated", "coverage", "look"]
     assert str(out / "report.html") in last[-1]
 
 
 @pytest.mark.slow
 def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path):
     out = tmp_path / "demo"
-    assert main(["demo", f"out={out}"]) == 0
+    assert main(["demo", f"out={out}", f"board={tmp_path / 'board'}"]) == 0
     metrics = figures(out)
     assert metrics["surface_interior_rms_mm"] < 1.1 * metrics["limit_rms_mm"]
     assert metrics["surface_rms_mm"] < 0.1  # better than the paper's planes
@@ -131,7 +135,18 @@ def test_other_peoples_files_are_left_alone(tmp_path):
 
 
 def test_the_report_repeats_the_settings_that_were_given(tmp_path):
-    lines = commands(tmp_path / "a b", "cam1", ["scene=sphere", "out=elsewhere"])
+    overrides = ["scene=sphere", "out=elsewhere", "poses=paper"]
+    config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
+    lines = commands(tmp_path / "a b", config, overrides)
+    verbs = ["demo", "render", "calibrate-optics", "render", "surface", "evaluate"]
+    assert [re.split(r"\s", line)[1] for line in lines] == verbs
+    assert "scene=sphere" in lines[0] and "scene=sphere" in lines[3] and "elsewhere" not in "".join(lines)
+    assert "scene=board" in lines[1] and "poses=paper" in lines[1] and "poses=paper" not in lines[3]
+    assert f"'out={tmp_path / 'a b'}'" in lines[3] and "calibration=" in lines[4]
+
+
+def test_without_poses_nothing_is_calibrated(tmp_path):
+    config = Config.model_validate(compose("demo", ["poses=none"]), context={"overrides": []})
+    assert config.poses is None
+    lines = commands(tmp_path, config, [])
     assert [re.split(r"\s", line)[1] for line in lines] == ["demo", "render", "surface", "evaluate"]
-    assert "scene=sphere" in lines[0] and "scene=sphere" in lines[1] and "elsewhere" not in "".join(lines)
-    assert f"'out={tmp_path / 'a b'}'" in lines[1]

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon import atomic, capture, decode
+from recon import atomic, capture, decode, figures, page
 from recon.capture import Manifest, SurfaceCapture
 from recon.decode import ProjectorMap, Status
+from recon.figures import CYCLIC, DIVERGING, SEQUENTIAL, Scale
 from recon.metrics import Metrics, shown
+from recon.page import Opening, Section
 from recon.patterns import CentreLine, Fringes, GrayCode, Uniform
-from twin import evaluate, figures, page
+from twin import evaluate
 from twin.evaluate import GROSS_MM, Comparison, Truth
-from twin.figures import CYCLIC, DIVERGING, SEQUENTIAL, Scale
-from twin.page import Opening, Section
 
 ERROR_MM = 0.1  # colours of errors span plus and minus this
 SYSTEMATIC_MM = 0.02  # colours of averaged errors span plus and minus this

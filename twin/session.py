@@ -56,12 +56,7 @@ def shoot(rig: Rig, scene: Scene, patterns: Patterns, camera: CameraName, engine
     """
     device: CameraDevice = getattr(rig, camera)
     light_seed, sensor_seed = np.random.SeedSequence([seed, ("cam1", "cam2").index(camera)]).generate_state(2).tolist()
-    optics = CameraOptics.of(device)
-    unreached = np.count_nonzero(np.isnan(optics.transmission))
-    if unreached:
-        raise InputError(
-            f"rig.{camera}.optics.distortion: expected a ray for every pixel, found {unreached} px that no ray reaches"
-        )
+    optics = camera_optics(rig, camera)
     world = build_world(scene)
     radiance = render(
         world,
@@ -80,6 +75,23 @@ def shoot(rig: Rig, scene: Scene, patterns: Patterns, camera: CameraName, engine
         surface_truth(world, device.optics.camera(), rig.projector.optics.camera()),
         noise_limit_px(radiance, patterns, device, wavelength, exposure),
     )
+
+
+def camera_optics(rig: Rig, camera: CameraName) -> CameraOptics:
+    """A camera's optics.
+
+    Raises
+    ------
+    InputError
+        If there are pixels that no ray reaches.
+    """
+    optics = CameraOptics.of(getattr(rig, camera))
+    unreached = np.count_nonzero(np.isnan(optics.transmission))
+    if unreached:
+        raise InputError(
+            f"rig.{camera}.optics.distortion: expected a ray for every pixel, found {unreached} px that no ray reaches"
+        )
+    return optics
 
 
 def noise_limit_px(
@@ -140,8 +152,8 @@ def write_session(
         for camera, view in views.items():
             arrays: dict[str, NDArray] = {field.name: getattr(view.truth, field.name) for field in fields(view.truth)}
             np.savez(folder / "surface" / f"{camera}.npz", **arrays, limit_px=view.limit_px)
-        _write_json(folder / "settings.json", settings)
-        _write_json(folder / TRUTH_MARKER, describe(scene))
+        write_json(folder / "settings.json", settings)
+        write_json(folder / TRUTH_MARKER, describe(scene))
     devices = {"projector": capture.Device(size=patterns.projector_size)}
     for camera, view in views.items():
         size, exposure = view.images.shape[:0:-1], view.exposure
@@ -159,5 +171,6 @@ def describe(scene: Scene) -> dict:
     return {"name": scene.name, "things": [thing.name for thing in visible(scene)], "shapes": shapes}
 
 
-def _write_json(path: Path, content: object) -> None:
+def write_json(path: Path, content: object) -> None:
+    """Write a file of the truth."""
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -20,7 +20,7 @@ from recon.rig import Rig
 from sonotwin.config import folder
 from twin.accuracy import rows
 
-Group = Literal["optics", "surface"]
+Group = Literal["optics", "surface", "calibration"]
 
 
 class Config(BaseModel):

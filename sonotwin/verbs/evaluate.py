@@ -10,10 +10,10 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from recon import atomic, metrics
+from recon import atomic, figures, metrics
 from recon.metrics import Metrics, shown
 from sonotwin.verbs.surface import POINTS
-from twin import evaluate, figures
+from twin import evaluate
 
 ERROR_MAP = "error_map.png"  # by which the folder of an evaluation is known
 

@@ -6,6 +6,7 @@ metrics.json into the folder `out`; results that are there already are replaced.
 1280x1024 and some seconds to start; the first run ever also compiles, for about a minute.
 
     sonotwin surface capture=outputs/demo/capture out=outputs/demo/surface
+    sonotwin surface capture=shots calibration=calibration/optics.yaml out=outputs/shots
     sonotwin surface images=shots patterns=paper_surface calibration=optics.yaml out=outputs/shots
 """
 
@@ -111,10 +112,10 @@ def read(config: Config) -> SurfaceCapture:
     """
     bare = {"images": config.images, "patterns": config.patterns, "calibration": config.calibration}
     given = [name for name, value in bare.items() if value is not None]
-    if config.capture is not None and given:
-        raise InputError(f"surface: expected capture, or images with patterns and calibration, found both: {', '.join(given)}")
     if config.capture is not None:
-        return capture.read_surface(config.capture, config.camera)
+        if doubled := ", ".join(name for name in given if name != "calibration"):
+            raise InputError(f"surface: expected capture, or images with patterns and calibration, found both: {doubled}")
+        return capture.read_surface(config.capture, config.camera, config.calibration)
     if config.images is None or config.patterns is None or config.calibration is None:
         found = ", ".join(given) or "none of them"
         raise InputError(f"surface: expected capture, or images with patterns and calibration, found {found}")

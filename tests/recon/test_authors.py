@@ -1,10 +1,12 @@
 """The rig authors' layout is written so that their formulas decode it, and read back as it was."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from recon import authors, rigid
+from recon import authors, calibration, rigid
 from recon.calibration import Calibration
 from recon.camera import Camera
 from recon.capture import SurfaceCapture
@@ -80,3 +82,39 @@ def test_other_patterns_are_not_theirs(surface, tmp_path):
     with pytest.raises(ValueError, match="8-bit capture of the authors' patterns"):
         authors.write(tmp_path / "rig", other, np.ones((24, 1280), bool))
     assert not (tmp_path / "rig").exists()
+
+
+def test_the_files_of_pairs_come_back(surface, tmp_path):
+    """Each file alone gives its pair of devices; the XML is what the npz is."""
+    cameras = dict(surface.calibration.cameras)
+    cameras["cam2"] = Camera(
+        (1280, 24), cameras["cam1"].matrix, np.full(8, 0.02), rigid.from_rotation_vector([0, 0.3, 0], [-9, 1, 2])
+    )
+    written = authors.write_parameters(tmp_path, Calibration(cameras))
+    assert sorted(written) == sorted(path.name for path in tmp_path.iterdir())
+    sizes = {name: camera.size for name, camera in cameras.items()}
+    for file, second in (("cam1_proj_params.npz", "projector"), ("cam1_cam2_params.npz", "cam2"), ("StereoParams.xml", "cam2")):
+        found = calibration.read(tmp_path / file, sizes).cameras
+        assert list(found) == ["cam1", second]
+        for name, camera in found.items():
+            assert np.allclose(camera.matrix, cameras[name].matrix, atol=1e-12)
+            assert np.allclose(camera.distortion, cameras[name].distortion, atol=1e-12)
+            assert np.allclose(camera.camera_from_world, cameras[name].camera_from_world, atol=1e-12)
+    storage = cv2.FileStorage(str(tmp_path / "StereoParams.xml"), cv2.FileStorage_READ)
+    with np.load(tmp_path / "cam1_cam2_params.npz") as pair:
+        assert sorted(pair) == ["F", "K1", "K2", "R", "dist1", "dist2", "t"]
+        assert all(np.allclose(storage.getNode(name).mat(), pair[name], rtol=1e-12) for name in pair)
+
+
+def test_lenses_without_distortion_come_back(surface, tmp_path):
+    """OpenCV reads no empty matrix from its own files."""
+    ideal = {name: replace(camera, distortion=np.zeros(0)) for name, camera in surface.calibration.cameras.items()}
+    ideal["cam2"] = replace(ideal["projector"], size=(1280, 24))
+    for file in authors.write_parameters(tmp_path, Calibration(ideal)):
+        found = calibration.read(tmp_path / file, {name: camera.size for name, camera in ideal.items()}).cameras
+        assert all(not camera.distortion.any() for camera in found.values()), file
+
+
+def test_a_rig_without_second_camera_has_one_pair(surface, tmp_path):
+    assert authors.write_parameters(tmp_path, surface.calibration) == ["cam1_proj_params.npz"]
+    assert [path.name for path in tmp_path.iterdir()] == ["cam1_proj_params.npz"]

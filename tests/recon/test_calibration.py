@@ -3,9 +3,11 @@
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from recon import authors, calibration, rigid
-from recon.calibration import Calibration
+from recon.calibration import Calibration, Uncertainty
 from recon.camera import Camera
 from recon.errors import InputError
 
@@ -22,6 +24,16 @@ def device(name: str, seed: int, coefficients: int = 5) -> Camera:
 @pytest.fixture
 def optics() -> Calibration:
     return Calibration({"cam1": device("cam1", 1), "cam2": device("cam2", 2, 14), "projector": device("projector", 3, 8)})
+
+
+def uncertain(names: tuple[str, ...], seed: int = 0) -> Uncertainty:
+    """A covariance over many powers of ten, as those of focal lengths and of distortions are."""
+    rng = np.random.default_rng(seed)
+    mixed = rng.normal(size=(len(names), len(names) + 2)) * 10 ** rng.uniform(-6, 1, (len(names), 1))
+    return Uncertainty(names, mixed @ mixed.T)
+
+
+NAMES = ("cam1.fx", "cam1.k2", "cam2.tau_x", "cam2.rz", "projector.cy", "projector.tx")
 
 
 def same(a: Camera, b: Camera) -> bool:
@@ -60,6 +72,108 @@ def test_own_format_is_opencvs(optics, tmp_path):
     node = storage.getNode("projector")
     assert np.array_equal(node.getNode("matrix").mat(), optics.cameras["projector"].matrix)
     assert [node.getNode("size").at(i).real() for i in range(2)] == [1280, 800]
+
+
+def test_the_covariance_comes_back(optics, tmp_path):
+    path = tmp_path / "optics.yaml"
+    known = Calibration(optics.cameras, uncertain(NAMES))
+    calibration.write(path, known)
+    found = calibration.read(path)
+    assert list(found.cameras) == list(optics.cameras), "neither names nor covariance are taken for a device"
+    assert found.uncertainty.names == NAMES
+    assert np.array_equal(found.uncertainty.covariance, known.uncertainty.covariance)
+    storage = cv2.FileStorage(str(path), cv2.FileStorage_READ)
+    assert storage.getNode("parameters").at(3).string() == "cam2.rz"
+    assert storage.getNode("covariance").mat().shape == (6, 6)
+
+
+def test_a_file_from_before_covariances_has_none(optics, tmp_path):
+    calibration.write(tmp_path / "optics.yaml", optics)
+    assert "covariance" not in (tmp_path / "optics.yaml").read_text()
+    assert calibration.read(tmp_path / "optics.yaml").uncertainty is None
+
+
+@settings(max_examples=30, deadline=None)
+@given(data=st.data())
+def test_any_calibration_comes_back(data, tmp_path_factory):
+    """Whatever the numbers, however few or many parameters are uncertain."""
+    number = st.floats(-1e6, 1e6)
+    small = st.floats(-10, 10)
+    cameras = {}
+    for name in data.draw(st.sampled_from([("cam1",), ("cam1", "cam2"), ("cam1", "projector"), ("cam1", "cam2", "projector")])):
+        focal = data.draw(st.tuples(*[st.floats(1e-3, 1e6)] * 2))
+        matrix = np.array([[focal[0], data.draw(small), data.draw(number)], [0, focal[1], data.draw(number)], [0, 0, 1]])
+        count = data.draw(st.sampled_from([4, 5, 8, 12, 14]))
+        distortion = np.array(data.draw(st.lists(small, min_size=count, max_size=count)))
+        pose = rigid.from_rotation_vector(data.draw(st.tuples(small, small, small)), data.draw(st.tuples(number, number, number)))
+        size = data.draw(st.tuples(*[st.integers(1, 20000)] * 2))
+        cameras[name] = Camera(size, matrix, distortion, np.eye(4) if name == "cam1" else pose)
+    choice = [f"{device}.{name}" for device in cameras for name in ("fx", "fy", "cx", "cy", "k1", "k5", "tau_y")]
+    names = tuple(data.draw(st.lists(st.sampled_from(choice), min_size=1, unique=True)))
+    path = tmp_path_factory.mktemp("any") / "optics.yaml"
+    written = Calibration(cameras, uncertain(names, data.draw(st.integers(0, 1000))))
+    calibration.write(path, written)
+    found = calibration.read(path)
+    assert list(found.cameras) == list(cameras) and found.uncertainty.names == names
+    assert np.array_equal(found.uncertainty.covariance, written.uncertainty.covariance)
+    for name, camera in cameras.items():
+        assert found.cameras[name].size == camera.size
+        for part in ("matrix", "distortion", "camera_from_world"):
+            assert np.array_equal(getattr(found.cameras[name], part), getattr(camera, part))
+
+
+def test_a_standard_deviation_is_asked_for_by_name():
+    assert Uncertainty(("cam1.fx", "cam1.fy"), np.diag([4.0, 9.0])).sigma("cam1.fy") == 3
+    assert Uncertainty(("cam1.fx",), np.eye(1)).sigma("cam1.k1") == 0, "held fixed"
+
+
+def spoilt(names=("cam1.fx", "projector.rx"), covariance=((1.0, 0.5), (0.5, 2.0))) -> dict:
+    return {"parameters": list(names), "covariance": np.array(covariance)}
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"parameters": ["cam1.fx"]}, "covariance: expected a matrix, found none"),
+        ({"covariance": np.eye(2)}, "parameters: expected names of the covariance's parameters, found something else"),
+        ({"parameters": 3.0, "covariance": np.eye(1)}, "parameters: expected names of the covariance's parameters"),
+        ({"parameters": "cam1.fx", "covariance": np.eye(1)}, "parameters: expected names of the covariance's parameters"),
+        (spoilt(("cam1.fx", "cam3.fx")), "parameters: expected a device's parameter like projector.fx, each once, found cam3.fx"),
+        (spoilt(("cam1.fx", "cam1.focal")), "parameters: expected a device's parameter like projector.fx, each once"),
+        (spoilt(("cam1.fx", "cam1.rx")), "parameters: expected a device's parameter like projector.fx, each once, found cam1.rx"),
+        (spoilt(("cam1.fx", "cam1.fx")), "parameters: expected a device's parameter like projector.fx, each once, found cam1.fx"),
+        (
+            spoilt(covariance=np.eye(3)),
+            "covariance: expected 2x2 variances and covariances of the parameters, found shape (3, 3)",
+        ),
+        (
+            spoilt(covariance=[[1, 0.5], [0.4, 2]]),
+            "covariance: expected 2x2 variances and covariances of the parameters, found a mat",
+        ),
+        (
+            spoilt(covariance=[[np.nan, 0], [0, 1]]),
+            "covariance: expected 2x2 variances and covariances of the parameters, found val",
+        ),
+        (
+            spoilt(covariance=[[-1, 0], [0, 1]]),
+            "covariance: expected 2x2 variances and covariances of the parameters, found a vari",
+        ),
+        (
+            spoilt(covariance=[[1, 2], [2, 1]]),
+            "covariance: expected 2x2 variances and covariances of the parameters, found a variance",
+        ),
+    ],
+)
+def test_a_wrong_covariance_is_refused_in_one_line(optics, tmp_path, values, complaint):
+    path = tmp_path / "optics.yaml"
+    calibration.write(path, optics)
+    storage = cv2.FileStorage(str(path), cv2.FileStorage_APPEND)
+    for key, value in values.items():
+        storage.write(key, value)
+    storage.release()
+    with pytest.raises(InputError) as refusal:
+        calibration.read(path)
+    assert str(refusal.value).startswith(f"{path}: {complaint}") and "\n" not in str(refusal.value)
 
 
 def test_a_camera_without_distortion_comes_back_as_such_in_effect(tmp_path):
@@ -128,7 +242,7 @@ def test_wrong_values_are_refused_in_one_line(optics, tmp_path, fault, complaint
 
 def test_damaged_files_are_refused_in_one_line(optics, tmp_path):
     """Cut at every tenth of its length, or not a calibration at all."""
-    calibration.write(tmp_path / "optics.yaml", optics)
+    calibration.write(tmp_path / "optics.yaml", Calibration(optics.cameras, uncertain(NAMES)))
     whole = (tmp_path / "optics.yaml").read_bytes()
     np.savez(tmp_path / "a.npz", **authors.parameters(optics))
     archive = (tmp_path / "a.npz").read_bytes()

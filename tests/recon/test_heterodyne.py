@@ -64,7 +64,7 @@ def test_contradicting_phases_are_refused(rng):
 
 
 def test_pitches_that_cannot_cover_the_axis_are_refused():
-    with pytest.raises(InputError, match="unambiguous over 70 px, expected 1280"):
+    with pytest.raises(InputError, match="unambiguous over 72 px, expected 1280"):
         ladder([12, 72], 1280)
     with pytest.raises(InputError, match="sigma"):
         ladder([12, 12.1], 1280)

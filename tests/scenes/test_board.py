@@ -78,7 +78,7 @@ def test_discs_as_large_as_allowed_stay_apart(monkeypatch, print_error):
     """Every other row is moved towards the next, by the largest errors in x and in y; half a side of the outline is left."""
     config = largest_discs(print_error)
     error = 2 * board.MAX_ERRORS * print_error * (np.arange(15) // 3 % 2)[:, None]
-    monkeypatch.setattr(board, "_printed", lambda config: board.object_points(config)[:, :2] + error)
+    monkeypatch.setattr(board, "_printed", lambda config: board.design(config).points()[:, :2] + error)
     ground, discs = (thing.mesh for thing in board.build(config).things)
     assert ground.is_watertight and discs.is_watertight and discs.body_count == 15
     nearest = np.sqrt(2) * (15 - 2 * board.MAX_ERRORS * print_error)
@@ -87,7 +87,7 @@ def test_discs_as_large_as_allowed_stay_apart(monkeypatch, print_error):
 
 def test_the_printed_centres_scatter_as_asked():
     config = board.Config(rotation_deg=(0, 0, 0), print_error_mm=0.02)
-    designed = rigid.apply(board.world_from_board(config), board.object_points(config))
+    designed = rigid.apply(board.world_from_board(config), board.design(config).points())
     error = (board.circle_centres(config) - designed)[:, :2]
     assert error.std() == pytest.approx(0.02, rel=3 / np.sqrt(2 * error.size))  # three sigma of 88 draws
     np.testing.assert_array_equal(board.circle_centres(config), board.circle_centres(config))

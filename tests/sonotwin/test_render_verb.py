@@ -2,8 +2,10 @@
 
 import json
 
+import numpy as np
 import pytest
 
+from recon.board_capture import read_board
 from sonotwin.cli import main
 
 
@@ -25,6 +27,21 @@ from sonotwin.cli import main
         (["engine.samples=12"], "engine.samples: expected a power of two, found 12"),
         (["shooting.bits=12"], "shooting.bits: expected at most the 10 of cam1's ADC, found 12"),
         (["cameras=[cam3]"], "cameras.0: expected 'cam1' or 'cam2', found 'cam3'"),
+        (["poses=paper"], "poses: expected scene=board with them, found scene.kind breast"),
+        (["scene=board", "poses=papers"], "poses: expected one of demo, none, paper, found papers; did you mean paper?"),
+        (
+            ["scene=board", "poses=demo", "patterns=gray_surface"],
+            "patterns: expected fringes along both axes with poses, found none along rows",
+        ),
+        (
+            ["scene=board", "poses=demo", "patterns=paper_calibration", "cameras=[cam2]"],
+            "cameras: expected cam1, which sees the fringes of poses, found cam2",
+        ),
+        (
+            ["scene=board", "poses=demo", "patterns=paper_calibration", "scene.spacing_mm=40", "scene.margin_mm=20"],
+            "poses.depth_mm: expected room for the board in all views, found none at",
+        ),
+        (["scene=board", "poses=demo", "poses.tilt_deg=-3"], "poses.tilt_deg: expected greater than or equal to 0, found -3"),
         (["seed=-1"], "seed: expected greater than or equal to 0, found -1"),
     ],
 )
@@ -57,3 +74,20 @@ def test_both_cameras(tmp_path, capsys):
     assert manifest["devices"]["cam2"] == {"size": [1280, 1024], "bits": 10, "exposure_s": 0.02, "gain": 1.0}
     assert sorted(path.name for path in (tmp_path / "out" / "truth" / "surface").iterdir()) == ["cam1.npz", "cam2.npz"]
     assert "exposure 20.00 ms" in capsys.readouterr().out
+
+
+def test_a_board_in_poses(tmp_path, capsys):
+    """Two poses with warp and print errors: what the reader finds, and the truth beside it."""
+    fields = ["scene=board", "poses=demo", "poses.count=2", "patterns=paper_calibration", "cameras=[cam1,cam2]"]
+    fields += ["engine.samples=2", "scene.warp_mm=0.2", "scene.print_error_mm=0.02"]
+    assert main(["render", f"out={tmp_path / 'out'}", *fields]) == 0
+    found = read_board(tmp_path / "out" / "capture")
+    assert (found.poses, found.cameras) == (("00", "01"), ("cam1", "cam2"))
+    pose = found.pose(1)
+    assert pose.fringes.shape == (50, 1024, 1280) and pose.lit["cam2"].shape == (1024, 1280)
+    truth = np.load(tmp_path / "out" / "truth" / "board.npz")
+    assert truth["world_from_board"].shape == (2, 4, 4) and truth["pixels"].shape == (2, 44, 3, 2)
+    apart = truth["points"] - found.board.points()
+    assert 0.01 < apart[:, :2].std() < 0.04 and 0.1 < np.abs(apart[:, 2]).max() <= 0.2
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["capture", "truth"]
+    assert "2 poses, 50 patterns, 2 samples/px" in capsys.readouterr().out

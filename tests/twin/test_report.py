@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import decode, triangulate
+from recon import decode, figures, triangulate
 from recon.capture import read_surface
-from twin import evaluate, figures, report
+from twin import evaluate, report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")

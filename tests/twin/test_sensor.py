@@ -2,8 +2,19 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from twin.sensor import Exposure, auto_exposure, digitise, electrons_per_radiance, expose, fixed_pattern, noise_dn
+from twin.sensor import (
+    SMOOTHING_E,
+    Exposure,
+    auto_exposure,
+    digitise,
+    electrons_per_radiance,
+    expose,
+    fixed_pattern,
+    noise_dn,
+    read_out,
+)
 
 WAVELENGTH = 525.0
 
@@ -86,3 +97,26 @@ def test_seed_decides_and_cameras_differ(rig):
     assert rig.cam1.serial != rig.cam2.serial
     response = [fixed_pattern(camera.sensor, (64, 64), camera.serial)[0].ravel() for camera in (rig.cam1, rig.cam2)]
     assert np.corrcoef(*response)[0, 1] < 0.1
+
+
+@pytest.mark.parametrize("dark_noise", [SMOOTHING_E, 11.0])
+@pytest.mark.parametrize("electrons", [0.0, 3.0, 30.0, 300.0, 6000.0])
+def test_noise_drawn_in_one_is_shot_and_dark_noise(rng, electrons, dark_noise):
+    """Mean, variance, skewness and kurtosis are those of a Poisson number plus a normal one, and so is the distribution."""
+    count = 10**6
+    drawn = read_out(np.full((1000, count // 1000), electrons, np.float32), dark_noise, rng).ravel().astype(float)
+    variance = electrons + dark_noise**2
+    z = (drawn - electrons) / np.sqrt(variance)
+    assert abs(z.mean()) < 5 / np.sqrt(count)
+    assert abs(z.var() - 1) < 5 * np.sqrt(2 / count)
+    assert abs(stats.skew(z) - electrons / variance**1.5) < 5 * np.sqrt(6 / count)
+    assert abs(stats.kurtosis(z) - electrons / variance**2) < 5 * np.sqrt(24 / count)
+    apart = rng.poisson(electrons, count) + dark_noise * rng.standard_normal(count)
+    assert stats.ks_2samp(drawn, apart).pvalue > 1e-4
+
+
+def test_single_electrons_are_counted_where_dark_noise_is_low(rng):
+    """A sensor without dark noise reads whole electrons, and none in the dark."""
+    drawn = read_out(np.full((100, 100), 2.0, np.float32), 0.0, rng)
+    np.testing.assert_array_equal(drawn, np.rint(drawn))
+    assert abs((drawn == 0).mean() - np.exp(-2)) < 5 * np.sqrt(np.exp(-2) / 10**4)

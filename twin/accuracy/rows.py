@@ -29,7 +29,7 @@ class Row:
     @property
     def ok(self) -> bool:
         """Whether the bar is met; a figure that is not a number never is."""
-        return self.measured >= self.bar if self.at_least else self.measured <= self.bar
+        return bool(self.measured >= self.bar if self.at_least else self.measured <= self.bar)
 
 
 Measurement = Callable[[], Sequence[Row]]

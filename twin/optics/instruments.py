@@ -1,17 +1,21 @@
 """The twin's camera and projector: thin lenses with OpenCV distortion, in the ray tracer's arrays."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from recon import rigid
 from recon.camera import Camera, distorted
 from recon.rig import CameraDevice, Lens, ProjectorDevice
 
 Images = NDArray[np.float32]
+
+FOOTPRINT = 1 << 13  # entries of the table of a pixel's footprint; even, so that both halves mirror each other
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,7 @@ class CameraOptics:
         """A camera with a sharp image at any depth and no loss of light."""
         return cls(camera, 0.0, 1.0, 0.0, np.ones(camera.size[::-1], np.float32))
 
+    @cached_property
     def tables(self) -> tuple[mi.Point2f, mi.Vector2f, mi.Vector2f]:
         """Ideal coordinates x/z, y/z at each pixel's centre, and their change for one px in u and one px in v."""
         grid = self.camera.pixel_grid()
@@ -51,6 +56,31 @@ class CameraOptics:
             kind(*np.float32(table.reshape(-1, 2).T))
             for kind, table in ((mi.Point2f, centre), (mi.Vector2f, across), (mi.Vector2f, down))
         )
+
+    @cached_property
+    def footprint(self) -> mi.Float:
+        """Where, in px from a pixel's centre, lie evenly spaced fractions of the light that it gathers along one axis.
+
+        The inverse of the distribution of a uniform number plus a normal one; points of the unit square go through it to those of
+        pixel and blur together, and keep their even spacing.
+        """
+        sigma = self.blur_px
+        offset = np.linspace(-0.5 - 6 * sigma, 0.5 + 6 * sigma, 1 << 16)
+        right, left = (offset + 0.5) / sigma, (offset - 0.5) / sigma
+        below = sigma * (right * norm.cdf(right) + norm.pdf(right) - left * norm.cdf(left) - norm.pdf(left))
+        fractions = np.linspace(0, 1, FOOTPRINT)[FOOTPRINT // 2 :]
+        fractions[-1] -= 0.3 / FOOTPRINT  # not the end of the tail: the last cell's light is interpolated evenly up to there
+        half = np.interp(fractions, below, offset)
+        return mi.Float(np.float32(np.concatenate([-half[::-1], half])))
+
+    def spread(self, square: mi.Point2f) -> mi.Point2f:
+        """Points of the square [-1/2, 1/2]^2 spread over a pixel's footprint, px; opposite ones stay opposite."""
+        position = (square + 0.5) * (FOOTPRINT - 1)
+        below = dr.clip(dr.floor(position), 0, FOOTPRINT - 2)
+        first, fraction = mi.Point2u(below), position - below
+        low = mi.Point2f(*(dr.gather(mi.Float, self.footprint, index) for index in first))
+        high = mi.Point2f(*(dr.gather(mi.Float, self.footprint, index + 1) for index in first))
+        return dr.lerp(low, high, fraction)
 
 
 def sample_rays(optics: CameraOptics, tables: tuple, offset: mi.Point2f, lens: mi.Point2f) -> mi.Ray3f:

@@ -60,10 +60,25 @@ def render(scene: mi.Scene, camera: CameraOptics, projector: ProjectorOptics, li
     (n, h, w) float32
         Radiance that arrives at each pixel, W/mm^2/sr, times the lens's transmission.
     """
-    table = LightTable.of(light)
     width, height = camera.camera.size
-    pixel = dr.arange(mi.UInt32, width * height)
-    tables = camera.tables()
+    everywhere = np.arange(width * height, dtype=np.uint32)
+    return render_pixels(scene, camera, projector, light, engine, seed, everywhere).reshape(-1, height, width)
+
+
+def render_pixels(
+    scene: mi.Scene,
+    camera: CameraOptics,
+    projector: ProjectorOptics,
+    light: Light,
+    engine: Engine,
+    seed: int,
+    pixels: NDArray[np.uint32],
+) -> Images:
+    """Render some pixels : (m,) numbers `v * width + u`, as `render` does all : (n, m) float32, W/mm^2/sr."""
+    table = LightTable.of(light)
+    pixel = mi.UInt32(pixels)
+    centre, across, down = camera.tables
+    tables = dr.gather(mi.Point2f, centre, pixel), dr.gather(mi.Vector2f, across, pixel), dr.gather(mi.Vector2f, down, pixel)
     seed_word = dr.opaque(mi.UInt32, seed)
     samples = dr.opaque(mi.UInt32, engine.samples)
 
@@ -73,17 +88,17 @@ def render(scene: mi.Scene, camera: CameraOptics, projector: ProjectorOptics, li
         values, from_room = trace(scene, projector, table, engine, points, ray)
         return index + 1, [total + value for total, value in zip(sums, values, strict=True)], room + from_room
 
-    state = (mi.UInt32(0), [dr.zeros(mi.Float, width * height) for _ in range(table.count)], dr.zeros(mi.Float, width * height))
+    state = (mi.UInt32(0), [dr.zeros(mi.Float, len(pixels)) for _ in range(table.count)], dr.zeros(mi.Float, len(pixels)))
     _, sums, room = dr.while_loop(state, lambda index, sums, room: index < samples, body, label="samples")
     dr.eval(sums, room)
-    images = np.stack([np.asarray(total) for total in sums]).reshape(table.count, height, width)
-    return (images + np.asarray(room).reshape(height, width)) * (camera.transmission / np.float32(engine.samples))
+    scale = camera.transmission.ravel()[pixels] / np.float32(engine.samples)
+    return np.stack([(np.asarray(total) + np.asarray(room)) * scale for total in sums])
 
 
 def pixel_offset(camera: CameraOptics, points: PairedPoints) -> mi.Point2f:
     """Where in the image a sample lies, in px from its pixel's centre: within the pixel, spread by the lens's blur."""
     offset = points.mirrored_square()
-    return offset + points.mirrored_normal() * camera.blur_px if camera.blur_px > 0 else offset
+    return camera.spread(offset) if camera.blur_px > 0 else offset
 
 
 def trace(

@@ -1,8 +1,11 @@
 """Things become shapes of the ray tracer."""
 
+from collections.abc import Sequence
+
 import mitsuba as mi
 import numpy as np
 
+from recon import rigid
 from scenes.things import Material, Scene, Sphere, Thing
 
 RAMP = 1024  # texels of the texture that turns a texture coordinate into a reflectance
@@ -13,9 +16,28 @@ def build_world(scene: Scene) -> mi.Scene:
     return mi.load_dict({"type": "scene", **named_shapes(scene)})
 
 
+def move_things(world: mi.Scene, things: Sequence[Thing], to_from: rigid.Array) -> None:
+    """Put the meshes of a world, flat-faced and built from `things` in order, elsewhere: by a 4x4 transform of where these are.
+
+    A world that stays one, with its meshes moved, leaves the ray tracer's memory and compiled code as they are.
+    """
+    parameters = mi.traverse(world)
+    for key, thing in zip(named(things), things, strict=True):
+        if thing.smooth or thing.primitive is not None:
+            raise ValueError(f"{thing.name}: expected a mesh with flat faces")
+        parameters[f"{key}.vertex_positions"] = np.float32(rigid.apply(to_from, thing.mesh.vertices)).ravel()
+    parameters.update()
+
+
 def named_shapes(scene: Scene) -> dict[str, mi.Shape]:
     """The visible things as shapes, under names that keep their order."""
-    return {f"thing{k:03d}": to_shape(thing) for k, thing in enumerate(visible(scene))}
+    things = visible(scene)
+    return dict(zip(named(things), map(to_shape, things), strict=True))
+
+
+def named(things: Sequence[Thing]) -> list[str]:
+    """Names of shapes that keep their order."""
+    return [f"thing{k:03d}" for k in range(len(things))]
 
 
 def visible(scene: Scene) -> list[Thing]:

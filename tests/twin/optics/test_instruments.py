@@ -71,7 +71,7 @@ def test_camera_rays_are_recons(rig, rng):
     strong = Camera(camera.size, camera.matrix, np.array(STRONG_14), camera.camera_from_world)
     optics = CameraOptics(strong, 2.0, 660.0, 0.0, np.ones(camera.size[::-1], np.float32))
     offset = rng.uniform(-0.5, 0.5, 2)
-    ray = sample_rays(optics, optics.tables(), mi.Point2f(offset.tolist()), mi.Point2f(0, 0))
+    ray = sample_rays(optics, optics.tables, mi.Point2f(offset.tolist()), mi.Point2f(0, 0))
     expected = strong.rays(strong.pixel_grid() + offset).reshape(-1, 3)
     off_axis = np.linalg.norm(np.cross(np.asarray(ray.d, float).T, expected), axis=1)
     assert off_axis.max() * strong.matrix[0, 0] < 2e-3  # float32 directions: 1e-7 rad is 3e-4 px
@@ -82,7 +82,7 @@ def test_lens_points_meet_in_focus(rig):
     optics = CameraOptics(rig.cam1.optics.camera(), 2.0, 660.0, 0.0, np.ones((1024, 1280), np.float32))
     crossings = []
     for lens in ((0.0, 0.0), (1.0, 0.0), (-0.6, 0.8)):
-        ray = sample_rays(optics, optics.tables(), mi.Point2f(0.0, 0.0), mi.Point2f(*lens))
+        ray = sample_rays(optics, optics.tables, mi.Point2f(0.0, 0.0), mi.Point2f(*lens))
         origin, direction = np.asarray(ray.o, float).T, np.asarray(ray.d, float).T
         crossings.append(origin + direction * ((660 - origin[:, 2]) / direction[:, 2])[:, None])
     np.testing.assert_allclose(crossings[1], crossings[0], atol=2e-4)

@@ -12,8 +12,8 @@ from string import Template
 
 from plotly.offline import get_plotlyjs
 
-from twin import figures
-from twin.figures import Colours, Scale
+from recon import figures
+from recon.figures import Colours, Scale
 
 FOLDER = Path(__file__).parent
 
@@ -37,7 +37,8 @@ class Section:
 
 
 def render(opening: Opening, sections: Iterable[Section], footer: str) -> str:
-    """The page as HTML text, with the program that draws 3-D views in it (5 MB)."""
+    """The page as HTML text; if it has 3-D views, with the program that draws them in it (5 MB)."""
+    sections = list(sections)
     numbers = "".join(
         f"<div><dt>{_text(label)}</dt><dd>{value} <small>{unit}</small></dd></div>" for label, value, unit in opening.figures
     )
@@ -46,18 +47,24 @@ def render(opening: Opening, sections: Iterable[Section], footer: str) -> str:
         f'<p class="result">{_text(opening.result)}</p><dl class="figures">{numbers}</dl>'
     )
     parts = [f"<section><h2>{_text(section.title)}</h2>\n" + "\n".join(section.blocks) + "</section>" for section in sections]
-    return _template("report.html").substitute(
+    has_views = any('class="view"' in block for section in sections for block in section.blocks)
+    return _template("page.html").substitute(
         title=_text(opening.title),
         opening=top,
         sections="\n".join(parts),
         footer=_text(footer),
-        scripts=f"<script>{get_plotlyjs()}</script>",
+        scripts=f"<script>{get_plotlyjs()}</script>" if has_views else "",
     )
 
 
 def paragraph(text: str) -> str:
     """A paragraph of plain text."""
     return f"<p>{_text(text)}</p>"
+
+
+def notices(lines: Iterable[str]) -> str:
+    """What a reader must not miss, one item a line."""
+    return '<ul class="notices">' + "".join(f"<li>{_text(line)}</li>" for line in lines) + "</ul>"
 
 
 def picture(colours: Colours, caption: str, detail: str = "", scale: Scale | None = None, unit: str = "") -> str:

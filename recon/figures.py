@@ -5,12 +5,16 @@ Pictures carry no lettering and drawings take the colour of the text around them
 
 import base64
 import io
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import cv2
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 from numpy.typing import NDArray
 from plotly import graph_objects
 
@@ -20,7 +24,9 @@ Colours = NDArray[np.uint8]  # (h, w, 4) red, green, blue, opacity
 
 DIVERGING, CYCLIC, SEQUENTIAL = "RdBu_r", "twilight", "viridis"
 QUALITY = 88  # of WebP: no visible loss in sensor noise
+BARS, LINE = "#5b8db8", "#c8553d"  # what is measured, and what it is held against: both stand out from light and from dark
 TEXT = "#0a0b0c"  # stands for the page's text colour until the drawing is in the page
+ARROW = 0.04  # of an image's width: length of an arrow to be seen well
 VERTICES = 60_000  # of a 3-D view; a laptop without a graphics card turns these smoothly
 LONGEST = 6.0  # times the median: a longer triangle spans a tear
 
@@ -86,24 +92,74 @@ def histogram(values: NDArray, expected: Curve, unit: str, half_range: float) ->
     bins = np.linspace(-half_range, half_range, 101)
     density = np.histogram(values, bins)[0] / (len(values) * np.diff(bins))
     highest = max(density.max(), expected.density.max())
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "sonotwin", "font.size": 10}):
-        figure = Figure(figsize=(5.2, 3.1), layout="constrained")
-        axes = figure.add_subplot()
-        axes.stairs(density, bins, fill=True, color="#5b8db8", alpha=0.55, label="measured")
-        axes.plot(expected.x, expected.density, color="#c8553d", linewidth=1.6, label=expected.label)
-        axes.set(xlabel=unit, xlim=(-half_range, half_range), ylim=(0, 1.15 * highest), yticks=[])
-        axes.legend(frameon=False, labelcolor=TEXT, fontsize=9)
-        axes.spines[["left", "top", "right"]].set_visible(False)
-        axes.spines["bottom"].set_color(TEXT)
-        axes.tick_params(colors=TEXT)
-        axes.xaxis.label.set_color(TEXT)
-        return _inline_svg(figure)
+    figure, axes = _drawing(5.2, 3.1)
+    axes.stairs(density, bins, fill=True, color=BARS, alpha=0.55, label="measured")
+    axes.plot(expected.x, expected.density, color=LINE, linewidth=1.6, label=expected.label)
+    axes.set(xlabel=unit, xlim=(-half_range, half_range), ylim=(0, 1.15 * highest), yticks=[])
+    axes.locator_params(axis="x", nbins=6)
+    axes.legend(frameon=False, labelcolor=TEXT, fontsize=9)
+    axes.spines[["left", "top", "right"]].set_visible(False)
+    return _inline_svg(figure)
+
+
+def arrows(starts: NDArray, vectors: NDArray, size: tuple[int, int], magnification: float, colour: str = LINE) -> str:
+    """Vectors over an image plane of a size (width, height) px, as an SVG drawing.
+
+    Parameters
+    ----------
+    starts, vectors : (n, 2), px
+        Where each stands, marked by a dot, and where it points, drawn so many times longer.
+    """
+    figure, axes = _image_plane(size)
+    ends = starts + magnification * vectors
+    _strokes(axes, np.stack([starts, ends], axis=1), color=colour, linewidth=0.8)
+    _strokes(axes, _dotted(starts), color=TEXT, linewidth=1.3)
+    return _inline_svg(figure)
+
+
+def magnification(size: tuple[int, int], length: float) -> float:
+    """A round factor for `arrows` by which a vector of a length, px, becomes as long as suits an image of a size."""
+    wanted = ARROW * size[0] / max(length, 1e-9)
+    step = 10 ** np.floor(np.log10(wanted))
+    return float(step * max(k for k in (1, 2, 5) if k * step <= wanted))
+
+
+def dots(places: NDArray, values: NDArray, scale: Scale, size: tuple[int, int]) -> str:
+    """Dots at places : (n, 2) px of an image plane of a size (width, height), coloured by values : (n,), as an SVG drawing."""
+    figure, axes = _image_plane(size)
+    steps = 12  # colours that can be told apart; a path for each keeps the drawing small
+    level = np.clip((values - scale.low) / (scale.high - scale.low) * steps, 0, steps - 1).astype(int)
+    for k in range(steps):
+        chosen = places[level == k]
+        colour = matplotlib.colormaps[scale.colours]((k + 0.5) / steps)
+        _strokes(axes, _dotted(chosen), color=colour, linewidth=2.2)
+    return _inline_svg(figure)
+
+
+def outlines(shapes: NDArray, marks: Mapping[str, NDArray], labels: tuple[str, str]) -> str:
+    """Outlines : (p, c, 2) mm and named marks : (2,) mm in one plane with equal scales, y down, as an SVG drawing."""
+    everything = np.concatenate([np.reshape(shapes, (-1, 2)), *(np.reshape(mark, (1, 2)) for mark in marks.values())])
+    low, high = everything.min(axis=0) - 40, everything.max(axis=0) + 40
+    figure, axes = _drawing(5.2, float(np.clip(5.2 * (high[1] - low[1]) / (high[0] - low[0]), 2.5, 9)))
+    closed = np.concatenate([shapes, shapes[:, :1]], axis=1)
+    _strokes(axes, closed, color=BARS, linewidth=0.8)
+    for name, place in marks.items():
+        axes.plot(*place, "o", color=LINE, markersize=4)
+        axes.annotate(name, place, (7, 0), textcoords="offset points", va="center", color=TEXT, fontsize=9)
+    axes.set(xlabel=labels[0], ylabel=labels[1], xlim=(low[0], high[0]), ylim=(high[1], low[1]), aspect="equal")
+    axes.spines[["top", "right"]].set_visible(False)
+    return _inline_svg(figure)
 
 
 def standard_normal(half_range: float) -> Curve:
     """The standard normal distribution."""
+    return replace(normal(1.0, half_range), label="standard normal")
+
+
+def normal(sigma: float, half_range: float) -> Curve:
+    """The normal distribution of a standard deviation about zero."""
     x = np.linspace(-half_range, half_range, 301)
-    return Curve(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), "standard normal")
+    return Curve(x, np.exp(-((x / sigma) ** 2) / 2) / (sigma * np.sqrt(2 * np.pi)), "normal distribution")
 
 
 def noise_mixture(sigma: NDArray, half_range: float, label: str) -> Curve:
@@ -166,8 +222,44 @@ def _triangulated(points: Map) -> tuple[Map, NDArray[np.int32]]:
     return points[known], np.concatenate([np.stack([ia, ic, ib], axis=1), np.stack([ib, ic, id_], axis=1)])
 
 
+def _drawing(width: float, height: float) -> tuple[Figure, Axes]:
+    """Empty axes whose lines and letters take the colour of the text around them; width and height in inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.add_subplot()
+    for spine in axes.spines.values():
+        spine.set_color(TEXT)
+    axes.tick_params(colors=TEXT)
+    axes.xaxis.label.set_color(TEXT)
+    axes.yaxis.label.set_color(TEXT)
+    return figure, axes
+
+
+def _image_plane(size: tuple[int, int]) -> tuple[Figure, Axes]:
+    """Axes over an image of a size (width, height) px, v down."""
+    width, height = size
+    figure, axes = _drawing(5.2, 5.2 * height / width)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    axes.set(xticks=[0, width // 2, width - 1], yticks=[0, height // 2, height - 1])
+    return figure, axes
+
+
+def _dotted(places: NDArray) -> NDArray:
+    """Lines : (n, 2, 2) that are dots in effect; without any length they would be left out."""
+    return np.stack([places, places + np.array([0.01, 0.0])], axis=1)
+
+
+def _strokes(axes: Axes, lines: NDArray, **style: object) -> None:
+    """Draw lines : (n, k, 2), all as one path."""
+    codes = np.full(lines.shape[:2], Path.LINETO, np.uint8)
+    codes[:, 0] = Path.MOVETO
+    path = Path(lines.reshape(-1, 2), codes.ravel())
+    path.should_simplify = False
+    axes.add_patch(PathPatch(path, fill=False, capstyle="round", joinstyle="round", **style))
+
+
 def _inline_svg(figure: Figure) -> str:
     file = io.StringIO()
-    figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "sonotwin", "font.size": 10}):
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
     text = file.getvalue()
     return text[text.index("<svg") :].replace(TEXT, "currentColor")

@@ -1,0 +1,83 @@
+"""Synthetic photographs of calibration boards for tests: rays of sub-pixels meet the board's plane, then blur and noise."""
+
+import cv2
+import numpy as np
+
+from recon import rigid
+from recon.boards import AsymmetricCircles, Charuco, SymmetricCircles
+
+SUB = 4  # sub-pixels a pixel and axis
+
+
+def pose(board, distance, tilt=(0.0, 0.0), turn=0.0, centre=(0.0, 0.0)):
+    """world_from_board : (4, 4), the board's middle at a distance on the camera's axis, turned in its plane, then tilted."""
+    points = board.points()
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    rotation = cv2.Rodrigues(np.array([tilt[0], tilt[1], 0.0]))[0] @ cv2.Rodrigues(np.array([0, 0, turn]))[0]
+    result = np.eye(4)
+    result[:3, :3] = rotation
+    result[:3, 3] = [centre[0], centre[1], distance] - rotation @ middle
+    return result
+
+
+def shares(board, xy, footprint):
+    """How white the board is about (..., 2) mm: 1 on the ground, 0 on a disc or a black square, between them across a rim."""
+    if isinstance(board, AsymmetricCircles | SymmetricCircles):
+        return np.clip((_to_nearest(board, xy) - board.diameter_mm / 2) / footprint + 0.5, 0, 1)
+    if isinstance(board, Charuco):
+        return _of_charuco(board, xy)
+    squares = xy / board.square_mm
+    line = np.rint(squares)
+    signs = np.where(line % 2 == 0, 1, -1) * np.clip(2 * (squares - line) * board.square_mm / footprint, -1, 1)
+    inside = ((squares > -1) & (squares < [board.columns, board.rows])).all(axis=-1)
+    return np.where(inside, (1 - signs.prod(axis=-1)) / 2, 1.0)
+
+
+def _of_charuco(board, xy):
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    design = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_mm, board.marker_mm, dictionary)
+    scale = 16  # px/mm
+    picture = design.generateImage((int(board.columns * board.square_mm * scale), int(board.rows * board.square_mm * scale)))
+    at = np.floor((xy + board.square_mm) * scale).astype(int)
+    inside = ((at >= 0) & (at < picture.shape[::-1])).all(axis=-1)
+    at = np.clip(at, 0, np.array(picture.shape[::-1]) - 1)
+    return np.where(inside, picture[at[..., 1], at[..., 0]] / 255, 1.0)
+
+
+def _to_nearest(board, xy):
+    """Distance from the nearest disc's centre : (...) mm."""
+    step = board.spacing_mm
+    row = np.clip(np.rint(xy[..., 1] / step), 0, board.rows - 1)
+    if isinstance(board, SymmetricCircles):
+        column = np.clip(np.rint(xy[..., 0] / step), 0, board.columns - 1)
+        return np.hypot(xy[..., 0] - column * step, xy[..., 1] - row * step)
+    nearest = np.full(xy.shape[:-1], np.inf)
+    for nearby in (row - 1, row, row + 1):
+        odd = np.mod(nearby, 2)
+        column = np.clip(np.rint((xy[..., 0] / step - odd) / 2), 0, board.columns - 1)
+        away = np.hypot(xy[..., 0] - (2 * column + odd) * step, xy[..., 1] - nearby * step)
+        nearest = np.where((nearby >= 0) & (nearby < board.rows), np.minimum(nearest, away), nearest)
+    return nearest
+
+
+def view(board, camera, world_from_board, *, blur=0.7, dark=40.0, white=180.0, noise=0.0, rng=None, paint=None):
+    """Grey image : (h, w) float DN; `paint` may change the sub-sampled brightness, given the board's coordinates."""
+    width, height = camera.size
+    coarse = np.stack(np.meshgrid(np.linspace(-1, width, width + 2), np.linspace(-1, height, height + 2)), axis=-1)
+    board_from_world = rigid.invert(world_from_board)
+    rays = rigid.rotate(board_from_world, camera.rays(coarse))
+    origin = rigid.apply(board_from_world, camera.centre)
+    at = (origin + rays * (-origin[2] / rays[..., 2])[..., None])[..., :2]
+    fine = cv2.resize(at, None, fx=SUB, fy=SUB, interpolation=cv2.INTER_LINEAR)  # sub-pixels' centres, straight between pixels'
+    xy = fine[SUB:-SUB, SUB:-SUB]
+    along_v, along_u = np.diff(xy[:, :1], axis=0).mean(axis=(0, 1)), np.diff(xy[:1], axis=1).mean(axis=(0, 1))
+    footprint = np.sqrt(abs(along_u[0] * along_v[1] - along_u[1] * along_v[0]))
+    bright = dark + (white - dark) * shares(board, xy, footprint)
+    if paint is not None:
+        bright = paint(bright, xy)
+    if blur:
+        bright = cv2.GaussianBlur(bright.astype(np.float32), (0, 0), blur * SUB, borderType=cv2.BORDER_REPLICATE)
+    image = bright.reshape(height, SUB, width, SUB).mean(axis=(1, 3))
+    if noise:
+        image = np.rint(image + rng.normal(0, noise, image.shape))
+    return np.clip(image, 0, 255)

@@ -1,0 +1,192 @@
+"""`sonotwin calibrate-optics`, from a capture of a board to files, on synthetic photographs of two small cameras."""
+
+import contextlib
+import io
+import json
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon import board_capture, calibration, rigid
+from recon.boards import Chessboard
+from recon.calibration import Calibration
+from recon.camera import Camera
+from recon.manifest import BoardPart, Device
+from recon.sight import Sighting
+from sonotwin.cli import main
+from sonotwin.verbs.calibrate_optics import found_by
+from tests.recon import board_views
+
+SIZE = (320, 256)
+BOARD = Chessboard(columns=8, rows=6, square_mm=20)
+FILES = ["StereoParams.xml", "calibration.html", "cam1_cam2_params.npz", "metrics.json", "optics.yaml"]
+
+
+def cameras() -> dict[str, Camera]:
+    lens = np.array([-0.1, 0.1, 0.0, 0.0])
+    beside = rigid.from_rotation_vector(np.deg2rad([0, 15, 0]), [-172.0, -4, 45])
+    first = Camera(SIZE, np.array([[830.0, 0, 158], [0, 832, 127], [0, 0, 1]]), lens)
+    return {"cam1": first, "cam2": Camera(SIZE, np.array([[828.0, 0, 161], [0, 830, 126], [0, 0, 1]]), lens, beside)}
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory) -> Path:
+    """capture/ and truth/ of nine poses; in the last one camera 2's view is black."""
+    folder, rng = tmp_path_factory.mktemp("session"), np.random.default_rng(0)
+    poses = []
+    for number in range(9):
+        middle, tilt = rng.uniform(-20, 20, 2), rng.uniform(-0.5, 0.5, 2)
+        pose = board_views.pose(BOARD, rng.uniform(640, 720), tilt, rng.uniform(-0.2, 0.2), middle)
+        lit = {name: np.uint8(board_views.view(BOARD, camera, pose, noise=0.7, rng=rng)) for name, camera in cameras().items()}
+        if number == 8:
+            lit["cam2"][:] = 2
+        board_capture.write_pose(folder / "capture", f"{number:02d}", lit, {})
+        poses.append(board_capture.describe_pose(f"{number:02d}", list(lit), {}))
+    part = BoardPart(board=BOARD, poses=tuple(poses))
+    board_capture.write_manifest(folder / "capture", {name: Device(size=SIZE) for name in cameras()}, part, "small")
+    (folder / "truth" / "calibration").mkdir(parents=True)
+    calibration.write(folder / "truth" / "calibration" / "optics.yaml", Calibration(cameras()))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def calibrated(session) -> tuple[Path, list[str]]:
+    """The folder of a calibration, and what was said."""
+    out = session / "calibration"
+    fields = [f"capture={session / 'capture'}", f"truth={session / 'truth'}", f"out={out}", "distortion=radial2"]
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert main(["calibrate-optics", *fields]) == 0
+    return out, said.getvalue().splitlines()
+
+
+def test_a_capture_becomes_a_calibration(session, calibrated):
+    out, lines = calibrated
+    assert [line.split()[0] for line in lines][:3] == ["detect", "dropped", "adjust"] and lines[-1].startswith("wrote ")
+    assert re.fullmatch(r"detect +9 poses: cam1 9, cam2 8, \d+ s", lines[0])
+    assert lines[1].startswith("dropped     08 cam2: ")
+    assert any(line.startswith("error ") for line in lines)
+    assert sorted(path.name for path in out.iterdir()) == FILES
+
+    found, true = calibration.read(out / "optics.yaml"), cameras()
+    assert list(found.cameras) == ["cam1", "cam2"]
+    for name, camera in found.cameras.items():
+        sigma = found.uncertainty.sigma(f"{name}.fx")
+        assert abs(camera.matrix[0, 0] - true[name].matrix[0, 0]) < 4 * sigma < 20
+    figures = json.loads((out / "metrics.json").read_text())
+    assert figures["poses"] == 9 and figures["reprojection_rms_cam1_px"] < 0.15
+    assert figures["cam2_rotation_error_deg"] < 0.3 and figures["shape_error_rms_mm"] < 1
+    assert {"seconds_detect", "seconds_adjust", "scale_sigma_ppm", "cam2_translation_error_mm"} <= figures.keys()
+    for name in ("StereoParams.xml", "cam1_cam2_params.npz"):
+        pair = calibration.read(out / name, dict.fromkeys(("cam1", "cam2"), SIZE)).cameras["cam2"]
+        assert np.allclose(pair.camera_from_world, found.cameras["cam2"].camera_from_world, atol=1e-9)
+    page = (out / "calibration.html").read_text(encoding="utf-8")
+    assert f"sonotwin calibrate-optics capture={session / 'capture'}" in page and "distortion=radial2" in page, "to make it again"
+
+
+def test_opencv_programs_read_it(calibrated):
+    """A clinic's own program: a point through the matrices of the file is where the camera sees it."""
+    out, _ = calibrated
+    storage = cv2.FileStorage(str(out / "optics.yaml"), cv2.FileStorage_READ)
+    node = storage.getNode("cam2")
+    pose = node.getNode("camera_from_world").mat()
+    point = np.array([[10.0, -20, 650]])
+    seen, _ = cv2.projectPoints(
+        point, cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3], node.getNode("matrix").mat(), node.getNode("distortion").mat()
+    )
+    assert seen.ravel() == pytest.approx(calibration.read(out / "optics.yaml").cameras["cam2"].project(point).ravel(), abs=1e-6)
+
+
+def complaint(capsys, *fields: str) -> str:
+    assert main(["calibrate-optics", *fields]) == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.splitlines()
+    return line.removeprefix("sonotwin: ")
+
+
+@pytest.fixture
+def copied(session, tmp_path) -> Path:
+    shutil.copytree(session, tmp_path / "session")
+    return tmp_path / "session"
+
+
+def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(copied, tmp_path, capsys):
+    capture, out = copied / "capture", tmp_path / "out"
+    fields = [f"capture={capture}", f"out={out}"]
+    assert complaint(capsys, f"out={out}") == "calibrate-optics: capture: needs a value; give capture=..."
+    assert complaint(capsys, *fields, "distortion=fisheye").startswith("calibrate-optics: distortion: expected ")
+    assert complaint(capsys, *fields, "shape.in_plane_mm=-1").startswith("calibrate-optics: shape.in_plane_mm: expected ")
+    assert "expected a folder apart from what is read" in complaint(capsys, f"capture={capture}", f"out={copied}")
+    assert "expected a calibration file" in complaint(capsys, *fields, f"truth={tmp_path}")
+    calibration.write(copied / "truth" / "calibration" / "optics.yaml", Calibration({"cam1": cameras()["cam1"]}))
+    assert "expected cam2 of 320x256 px as in the capture" in complaint(capsys, *fields, f"truth={copied / 'truth'}")
+    image = capture / "board" / "03" / "cam1" / "lit.png"
+    image.write_bytes(image.read_bytes()[:-30])
+    assert complaint(capsys, *fields).startswith(f"{image}: expected a whole PNG image")
+    image.unlink()
+    assert complaint(capsys, *fields) == f"{image}: expected a file, found none"
+    assert not out.exists()
+
+
+def test_a_capture_without_a_board_or_that_one_camera_sees_is_refused(copied, tmp_path, capsys):
+    manifest = copied / "capture" / "manifest.json"
+    content = json.loads(manifest.read_text())
+    black = np.full((SIZE[1], SIZE[0]), 3, np.uint8)
+    for path in (copied / "capture" / "board").glob("*/cam2/lit.png"):
+        cv2.imwrite(str(path), black)
+    fields = [f"capture={copied / 'capture'}", f"out={tmp_path / 'out'}"]
+    assert complaint(capsys, *fields).startswith("small: expected two devices or more that see the board, found cam1 (cam2: ")
+    del content["board"]
+    manifest.write_text(json.dumps(content))
+    assert "expected board, the poses of a calibration board, found none" in complaint(capsys, *fields)
+    assert not (tmp_path / "out").exists()
+
+
+def test_reasons_are_told_though_nothing_can_be_calibrated(copied, tmp_path, capsys):
+    """What was not found is listed before the complaint; a camera that has no place in the calibration isn't looked through."""
+    capture = copied / "capture"
+    manifest = json.loads((capture / "manifest.json").read_text())
+    for pose in manifest["board"]["poses"]:
+        pose["lit"] = {"cam1": pose["lit"]["cam1"], "cam3": pose["lit"]["cam2"]}
+    manifest["devices"]["cam3"] = manifest["devices"]["cam2"]
+    (capture / "manifest.json").write_text(json.dumps(manifest))
+    cv2.imwrite(str(capture / "board" / "04" / "cam1" / "lit.png"), np.full((SIZE[1], SIZE[0]), 3, np.uint8))
+    assert main(["calibrate-optics", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 2
+    said = capsys.readouterr()
+    detect, dropped = said.out.splitlines()
+    assert re.fullmatch(r"detect +9 poses: cam1 8, \d+ s", detect)
+    assert dropped.startswith("dropped     04 cam1: ")
+    assert said.err.startswith("sonotwin: small: expected two devices or more that see the board, found cam1")
+
+
+def test_a_third_camera_is_warned_of(copied, tmp_path, capsys):
+    capture = copied / "capture"
+    manifest = json.loads((capture / "manifest.json").read_text())
+    for pose in manifest["board"]["poses"]:
+        pose["lit"]["cam3"] = pose["lit"]["cam2"]
+    manifest["devices"]["cam3"] = manifest["devices"]["cam2"]
+    (capture / "manifest.json").write_text(json.dumps(manifest))
+    assert main(["calibrate-optics", f"capture={capture}", f"out={tmp_path / 'out'}", "distortion=radial2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if "cam3" in line] == [
+        "warning     cam3: not calibrated, as only cam1, cam2, projector can be"
+    ]
+    assert list(calibration.read(tmp_path / "out" / "optics.yaml").cameras) == ["cam1", "cam2"]
+
+
+def test_a_device_counts_where_it_sees_points():
+    nowhere, somewhere = np.full((4, 2), np.nan), np.arange(8.0).reshape(4, 2)
+    sightings = [Sighting(name, {"cam1": somewhere, "cam2": at}, {}, nowhere) for name, at in (("a", nowhere), ("b", somewhere))]
+    assert found_by(sightings, {"cam1": SIZE, "cam2": SIZE}) == "2 poses: cam1 2, cam2 1"
+
+
+def test_other_folders_are_not_replaced(session, tmp_path, capsys):
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    found = complaint(capsys, f"capture={session / 'capture'}", f"out={out}")
+    assert "expected a new or empty folder or one with calibration.html" in found
+    assert [path.name for path in out.iterdir()] == ["mine.txt"]

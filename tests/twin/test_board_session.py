@@ -1,0 +1,180 @@
+"""A rendered calibration session: the circles are where the truth says, and stopping in between changes nothing."""
+
+import hashlib
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon import board_capture, rigid
+from recon.patterns import Fringes, GrayCode, Patterns
+from scenes import board, poses
+from twin import board_session
+from twin.board_session import Settings
+from twin.optics.transport import Engine, render
+from twin.sensor import electrons_per_radiance
+from twin.session import Shooting, calibration_of
+
+PATTERNS = Patterns(
+    projector_size=(1280, 800),
+    unwrap="gray",
+    parts=tuple(
+        part
+        for axis in ("columns", "rows")
+        for part in (Fringes(axis=axis, pitch=18, steps=3), GrayCode(axis=axis, pitch=18, bits=7))
+    ),
+)
+DESCRIBED = {"seed": 3}
+
+
+def shrunk(device, times: int):
+    """A camera with fewer, larger pixels."""
+    optics = device.optics.model_copy(update={
+        "size": tuple(length // times for length in device.optics.size),
+        "focal_px": tuple(f / times for f in device.optics.focal_px),
+        "centre_px": tuple((c - (times - 1) / 2) / times for c in device.optics.centre_px),
+    })  # fmt: skip
+    return device.model_copy(update={"optics": optics})
+
+
+@pytest.fixture(scope="module")
+def settings(rig) -> Settings:
+    small = rig.model_copy(update={"cam1": shrunk(rig.cam1, 4), "cam2": shrunk(rig.cam2, 4)})
+    chosen = poses.Config(count=3, margin_px=4, seed=6)
+    engine, shooting = Engine(samples=4, room_lux=20.0), Shooting()
+    return Settings(small, board.Config(), chosen, PATTERNS, ("cam1", "cam2"), engine, shooting, seed=3)
+
+
+def run(out: Path, settings: Settings, stop_after: int | None = None) -> list[int]:
+    """Render what is missing; returns the numbers of the poses that were."""
+    missing = board_session.missing_poses(out, settings, DESCRIBED)[:stop_after]
+    placed = board_session.place_all(settings)
+    stage = board_session.set_up(settings)
+    exposures = board_session.set_exposures(stage, settings)
+    for number in missing:
+        images = board_session.shoot_pose(stage, settings, exposures, number, placed[number])
+        board_session.write_pose(out, number, *images)
+    if stop_after is None:
+        board_session.finish(out, settings, exposures, placed)
+    return missing
+
+
+def digest(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def session(settings, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("board")
+    run(out, settings)
+    return out
+
+
+def test_the_circles_are_where_the_truth_says(session, settings):
+    """Dark discs, weighed by their darkness, against the outlines of the true ones."""
+    truth = np.load(session / "truth" / "board.npz")
+    read = board_capture.read_board(session / "capture")
+    turn = np.linspace(0, 2 * np.pi, 256, endpoint=False)
+    rim = settings.board.diameter_mm / 2 * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+    cameras = calibration_of(settings.rig).cameras
+    for k in range(len(read.poses)):
+        rims = rigid.apply(truth["world_from_board"][k], truth["points"][:, None] + rim)
+        for j, name in enumerate(("cam1", "cam2")):
+            image = read.pose(k).lit[name].astype(float)
+            error = []
+            for outline, centre in zip(cameras[name].project(rims), truth["pixels"][k, :, j], strict=True):
+                moments = cv2.moments(np.float32(outline[:, None]))
+                middle = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
+                assert np.linalg.norm(middle - centre) < 0.1  # the ellipse's middle is not quite the circle's
+                error.append(weighed(image, middle) - middle)
+            assert np.abs(np.mean(error, axis=0)).max() < 0.02
+            assert np.sqrt(np.mean(np.square(error))) < 0.06
+
+
+def weighed(image, middle) -> np.ndarray:
+    """Centre of the darkness in a window about a disc, against the plane of the white around it."""
+    u, v = np.rint(middle).astype(int)
+    half = 9
+    y, x = np.mgrid[v - half : v + half + 1, u - half : u + half + 1]
+    patch, distance = image[y, x], np.hypot(x - middle[0], y - middle[1])
+    white = distance > 7.5
+    columns = np.column_stack([np.ones(x.size), x.ravel() - u, y.ravel() - v])
+    plane = columns @ np.linalg.lstsq(columns[white.ravel()], patch[white], rcond=None)[0]
+    darkness = np.where(white, 0, 1 - patch / plane.reshape(x.shape))
+    return np.array([(darkness * x).sum(), (darkness * y).sum()]) / darkness.sum()
+
+
+def test_white_is_bright_and_not_saturated(session):
+    """One exposure serves all poses."""
+    read = board_capture.read_board(session / "capture")
+    brightest = [image.max() for k in range(len(read.poses)) for image in read.pose(k).lit.values()]
+    assert max(brightest) < 255 and min(brightest) > 140
+
+
+def test_a_stopped_session_goes_on(session, settings, tmp_path):
+    """The poses that were there are kept, and the set is the same bytes as one rendered in one go."""
+    run(tmp_path, settings, stop_after=1)
+    assert not (tmp_path / "capture").exists()
+    assert run(tmp_path, settings) == [1, 2]
+    assert digest(tmp_path) == digest(session)
+
+
+def test_other_settings_start_anew(settings, tmp_path):
+    """Poses of one session never mix with another's."""
+    run(tmp_path, settings, stop_after=1)
+    assert board_session.missing_poses(tmp_path, settings, DESCRIBED) == [1, 2]
+    assert board_session.missing_poses(tmp_path, settings, {"seed": 4}) == [0, 1, 2]
+
+
+@pytest.mark.slow
+def test_rendering_noise_at_edges_is_that_of_the_sensor(rig, settings):
+    """In images of full size, pixels at the circles' edges differ between two seeds by about their shot noise, at the nearest.
+
+    There the lens blurs most, and samples of pixel and lens together stratify least; in focus it is half of that.
+    """
+    full = replace(settings, rig=rig, cameras=("cam1",))
+    stage = board_session.set_up(full)
+    board_session.move_things(stage.world, stage.things, board_session.closest_pose(full))
+    optics, light = stage.cameras["cam1"], board_session.fully_on(stage.patterns)
+    images = []
+    for seed in (1, 2):
+        image = render(stage.world, optics, stage.projector, light, full.engine, seed)[0]
+        board_session.refine_edges(image, stage, optics, full.engine, seed)
+        images.append(image)
+    time_s = board_session.set_exposures(stage, full)["cam1"].time_s
+    electrons = np.array(images) * electrons_per_radiance(rig.cam1, rig.projector.wavelength_nm) * time_s
+    window = np.ones((3, 3), np.uint8)
+    edge = cv2.dilate(electrons[0], window) - cv2.erode(electrons[0], window) > electrons[0].max() / 2
+    noise = (electrons[0] - electrons[1])[edge].std() / np.sqrt(2)
+    assert edge.sum() > 10000
+    assert noise < 2 * np.sqrt(electrons[0][edge].mean())
+
+
+@pytest.mark.slow
+def test_a_glossy_board_glares(settings):
+    """With a coat some pose throws the projector's light into a camera, and a matt one never."""
+    settings = replace(settings, cameras=("cam2",), poses=settings.poses.model_copy(update={"count": 8}))
+    placed = board_session.place_all(settings)
+    brightest = {}
+    for roughness in (None, 0.1):
+        glossy = replace(settings, board=settings.board.model_copy(update={"roughness": roughness}))
+        stage = board_session.set_up(glossy)
+        exposures = board_session.set_exposures(stage, glossy)
+        shots = [board_session.shoot_pose(stage, glossy, exposures, k, pose)[0] for k, pose in enumerate(placed)]
+        brightest[roughness] = max(np.percentile(image, 99) for lit in shots for image in lit.values())
+    assert brightest[None] < 240
+    assert brightest[0.1] == 255
+
+
+def test_an_old_session_is_replaced(session, settings, tmp_path):
+    shutil.copytree(session, tmp_path / "again")
+    run(tmp_path / "again", replace(settings, seed=9))
+    assert sorted(path.name for path in (tmp_path / "again").iterdir()) == ["capture", "truth"]
+    assert digest(tmp_path / "again" / "capture") != digest(session / "capture")

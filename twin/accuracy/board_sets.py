@@ -1,0 +1,162 @@
+"""Sets of board sightings whose truth is known: of rendered images, or drawn as points with noise of a known size."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from time import perf_counter
+
+import numpy as np
+
+from recon import rigid
+from recon.boards import AsymmetricCircles
+from recon.bundle import Estimate
+from recon.calibrate import Result, Settings, calibrate, circle_offsets
+from recon.calibration import Calibration
+from recon.camera import Array, Camera
+from recon.observations import PROJECTOR, Observations, Size
+from recon.projection import linearise
+from recon.rig import Rig
+from recon.sight import Sighting, sight
+from scenes import board
+from scenes.poses import Config as Poses
+from scenes.poses import random_poses
+from twin import board_session
+from twin.board_session import CAMERAS, FRINGE_CAMERA
+from twin.sensor import Numbers
+from twin.session import calibration_of
+
+
+@dataclass(frozen=True)
+class BoardSet:
+    """What the devices saw of a board, and the truth."""
+
+    sightings: tuple[Sighting, ...]  # (p,)
+    board: AsymmetricCircles  # as designed
+    truth: Calibration
+    poses: Array  # (p, 4, 4) world_from_board
+    points: Array  # (n, 3) mm, the board as it is
+    lit: tuple[dict[str, Numbers], ...] = ()  # (p,) camera: (h, w) DN, of rendered sets
+    seconds: float = 0.0  # that finding the board and decoding took, rendering not counted
+
+    @property
+    def sizes(self) -> dict[str, Size]:
+        """Image sizes of the devices."""
+        return {name: camera.size for name, camera in self.truth.cameras.items()}
+
+    def first(self, count: int) -> "BoardSet":
+        """The first poses."""
+        return replace(self, sightings=self.sightings[:count], poses=self.poses[:count], lit=self.lit[:count])
+
+
+@cache
+def rendered(settings: board_session.Settings) -> BoardSet:
+    """Render a session pose by pose and find the board in each; of the images only the lit ones are kept."""
+    stage = board_session.set_up(settings)
+    placed = board_session.place_all(settings)
+    exposures = board_session.set_exposures(stage, settings)
+    bits: dict[str, int] = {camera: exposure.bits for camera, exposure in exposures.items()}
+    design = board.design(settings.board)
+    sightings, images, seconds = [], [], 0.0
+    for number, pose in enumerate(placed):
+        lit, fringes = board_session.shoot_pose(stage, settings, exposures, number, pose)
+        start = perf_counter()
+        name = board_session.pose_name(number)
+        sightings.append(sight(name, design, lit, fringes[FRINGE_CAMERA], settings.patterns, bits))
+        seconds += perf_counter() - start
+        images.append(lit)
+    centres = board.printed_centres(settings.board)
+    return BoardSet(tuple(sightings), design, calibration_of(settings.rig), placed, centres, tuple(images), seconds)
+
+
+def drawn(
+    truth: Calibration,
+    design: AsymmetricCircles,
+    poses: Array,
+    noise: Mapping[str, float],
+    rng: np.random.Generator,
+    points: Array | None = None,
+) -> BoardSet:
+    """What a detector of discs would report, with noise of known size.
+
+    Parameters
+    ----------
+    poses : (p, 4, 4)
+        world_from_board.
+    noise : device -> px
+        Standard deviation in u and v; for the projector that of the fringes alone, to which the camera's error at the pixel
+        where they are read is added.
+    points : (n, 3) mm, optional
+        The board as it is; as designed if not given.
+    """
+    points = design.points() if points is None else points
+    exact = exact_observations(truth.cameras, points, poses, noise)
+    errors = rng.standard_normal(exact.pixels.shape) * np.array([noise[name] for name in exact.devices])[:, None]
+    errors[:, :, exact.devices.index(PROJECTOR)] += np.einsum("pnij,pnj->pni", exact.gradient, errors[:, :, 0])
+    pixels = exact.pixels + circle_offsets(exact, Estimate(truth.cameras, poses, points), design) + errors
+    sightings = tuple(
+        Sighting(
+            exact.poses[p],
+            {name: pixels[p, :, d] for d, name in enumerate(exact.devices)},
+            {name: exact.covariance[p, :, d] for d, name in enumerate(exact.devices)},
+            exact.gradient[p],
+            {name: disc_radii(truth.cameras[name], pose, design) for name in CAMERAS},
+        )
+        for p, pose in enumerate(poses)
+    )
+    return BoardSet(sightings, design, truth, poses, points)
+
+
+@cache
+def recalibrated(rig: Rig, noise: tuple[tuple[str, float], ...], draws: int, count: int) -> tuple[tuple[BoardSet, Result], ...]:
+    """Calibrations of independent sets, with new poses and new noise each; five coefficients of distortion a device.
+
+    noise : (device, px) pairs, as in `drawn`.
+    """
+    truth, design = calibration_of(rig), board.design(board.Config())
+    results = []
+    for k in range(draws):
+        poses = random_poses(Poses(count=count, seed=100 + k), design, list(truth.cameras.values()))
+        seen = drawn(truth, design, poses, dict(noise), np.random.default_rng([7, k]))
+        results.append((seen, calibrate(seen.sightings, design, seen.sizes, Settings(distortion="brown"))))
+    return tuple(results)
+
+
+def exact_observations(cameras: Mapping[str, Camera], points: Array, poses: Array, noise: Mapping[str, float]) -> Observations:
+    """Where the devices see points : (n, 3) mm of the board, without noise, but with its covariance."""
+    world = [rigid.apply(pose, points) for pose in poses]
+    pixels = np.stack([[camera.project(at) for at in world] for camera in cameras.values()], axis=2)
+    covariance = np.array([noise[name] ** 2 * np.eye(2) for name in cameras])
+    gradient = [
+        on_board(cameras[PROJECTOR], pose, at) @ np.linalg.inv(on_board(cameras[FRINGE_CAMERA], pose, at))
+        for pose, at in zip(poses, world, strict=True)
+    ]
+    return Observations(
+        tuple(board_session.pose_name(k) for k in range(len(poses))),
+        tuple(cameras),
+        tuple(camera.size for camera in cameras.values()),
+        points,
+        pixels,
+        np.broadcast_to(covariance, (*pixels.shape, 2)).copy(),
+        np.array(gradient),
+    )
+
+
+def on_board(camera: Camera, pose: Array, world: Array) -> Array:
+    """How pixels change along the board's plane at points : (n, 3) mm in the world : (n, 2, 2) px/mm."""
+    return linearise(camera, world, ()).by_point @ pose[:3, :2]
+
+
+def disc_radii(camera: Camera, pose: Array, design: AsymmetricCircles) -> Array:
+    """Semi-axes of the discs' images, both the radius of a circle of the same area : (n, 2) px."""
+    magnified = np.abs(np.linalg.det(on_board(camera, pose, rigid.apply(pose, design.points()))))
+    return np.repeat(design.diameter_mm / 2 * np.sqrt(magnified)[:, None], 2, axis=1)
+
+
+def measured_noise(result: Result) -> tuple[tuple[str, float], ...]:
+    """Noise of a sighting in u and v, (device, px): as the detection predicts it, times what the residuals say of that."""
+    levels = []
+    for d, device in enumerate(result.observations.devices):
+        seen = result.observations.seen[:, :, d]
+        variance = np.trace(result.observations.covariance[:, :, d][seen], axis1=1, axis2=2).mean() / 2
+        levels.append((device, result.adjustment.noise[device] * float(np.sqrt(variance))))
+    return tuple(levels)

@@ -1,0 +1,241 @@
+"""A calibration session in the twin: the board in random poses, lit and under fringes, pose by pose.
+
+A pose that is done lies in `OUT/unfinished/`. A run that was stopped goes on from there if its settings are the same; the
+finished set then takes its place as `OUT/capture/` and `OUT/truth/`.
+"""
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import mitsuba as mi
+import numpy as np
+
+from recon import atomic, board_capture, calibration, capture, rigid
+from recon.manifest import BoardPart, Device
+from recon.patterns import Patterns
+from recon.rig import Rig
+from scenes import board, poses
+from scenes.things import Scene, Thing
+from twin.optics.instruments import CameraOptics, ProjectorOptics
+from twin.optics.raster import Light
+from twin.optics.transport import Engine, Images, render, render_pixels
+from twin.optics.world import build_world, move_things
+from twin.sensor import Exposure, Numbers, auto_exposure, expose
+from twin.session import TRUTH_MARKER, CameraName, Shooting, calibration_of, camera_optics, describe, write_json
+
+FRINGE_CAMERA: CameraName = "cam1"  # sees the fringes; others see the board lit only
+CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
+UNFINISHED = "unfinished"
+SETTINGS = "settings.json"
+
+EVEN_SAMPLES = 8  # paths for a pixel of an image without fringes, where all that it sees has one brightness
+EDGE_SAMPLES = 256  # paths for a pixel at the edge of a circle, which is half black, half white
+EDGE_RANGE = 0.1  # of the brightest pixel: contrast about a pixel that makes it one of an edge
+EDGE_WINDOW = 3  # px about a pixel
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What stays from pose to pose: the instruments, and the board in its own frame."""
+
+    rig: Rig
+    cameras: dict[CameraName, CameraOptics]
+    projector: ProjectorOptics
+    patterns: Light
+    things: tuple[Thing, ...]  # in the board's frame
+    world: mi.Scene  # the same things; moved from pose to pose
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that a session is rendered from."""
+
+    rig: Rig
+    board: board.Config
+    poses: poses.Config
+    patterns: Patterns
+    cameras: tuple[CameraName, ...]
+    engine: Engine
+    shooting: Shooting
+    seed: int
+
+
+def set_up(settings: Settings) -> Stage:
+    """Build the stage of a session."""
+    things = board.things(settings.board)
+    return Stage(
+        settings.rig,
+        {camera: camera_optics(settings.rig, camera) for camera in settings.cameras},
+        ProjectorOptics.of(settings.rig.projector),
+        Light.of(settings.patterns, settings.rig.projector),
+        things,
+        build_world(Scene("board", things)),
+    )
+
+
+def place_all(settings: Settings) -> rigid.Array:
+    """Poses `world_from_board` : (p, 4, 4) of a session; every device sees the whole board, whichever takes part."""
+    devices = list(calibration_of(settings.rig).cameras.values())
+    return poses.random_poses(settings.poses, board.design(settings.board), devices)
+
+
+def set_exposures(stage: Stage, settings: Settings) -> dict[CameraName, Exposure]:
+    """One exposure a camera for all poses, as one would set it: for the board held up close, turned to the projector.
+
+    Turned that way white is at its brightest, and a glossy coat throws its highlight back into the projector.
+    """
+    shooting, wavelength = settings.shooting, settings.rig.projector.wavelength_nm
+    exposures = {}
+    for camera, optics in stage.cameras.items():
+        device = getattr(settings.rig, camera)
+        time_s = shooting.exposure_s
+        if time_s is None:
+            move_things(stage.world, stage.things, closest_pose(settings))
+            radiance = render(stage.world, optics, stage.projector, fully_on(stage.patterns), settings.engine, 0)
+            time_s = auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
+        exposures[camera] = Exposure(time_s, shooting.gain, shooting.bits)
+    return exposures
+
+
+def closest_pose(settings: Settings) -> rigid.Array:
+    """The board at its nearest, in the middle of camera 1's view, turned to the projector : (4, 4)."""
+    optics = calibration_of(settings.rig).cameras
+    view = optics["cam1"]
+    axis = view.rays((np.array(view.size) - 1.0) / 2)
+    middle = axis * settings.poses.depth_mm[0] / axis[2]
+    away = middle - optics["projector"].centre
+    away /= np.linalg.norm(away)
+    across = np.cross([0.0, 1.0, 0.0], away)
+    across /= np.linalg.norm(across)
+    rotation = np.column_stack([across, np.cross(away, across), away])
+    points = board.design(settings.board).points()
+    return rigid.transform(rotation, middle - rotation @ points.mean(axis=0))
+
+
+def shoot_pose(
+    stage: Stage, settings: Settings, exposures: Mapping[CameraName, Exposure], number: int, world_from_board: rigid.Array
+) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
+    """Take the images of one pose: of each camera the lit board (h, w), of camera 1 the fringes (n, h, w).
+
+    They depend on the seed and the pose's number alone, whichever poses were rendered before.
+    """
+    move_things(stage.world, stage.things, world_from_board)
+    lit, fringes = {}, {}
+    for camera, optics in stage.cameras.items():
+        key = [settings.seed, number, CAMERAS.index(camera)]
+        light_seed, edge_seed, sensor_seed = np.random.SeedSequence(key).generate_state(3).tolist()
+        light, engine = with_fully_on(stage.patterns), settings.engine
+        if camera != FRINGE_CAMERA:
+            light, engine = fully_on(stage.patterns), engine.model_copy(update={"samples": EVEN_SAMPLES})
+        radiance = render(stage.world, optics, stage.projector, light, engine, light_seed)
+        refine_edges(radiance[-1], stage, optics, settings.engine, edge_seed)
+        device, wavelength = getattr(settings.rig, camera), settings.rig.projector.wavelength_nm
+        images = expose(radiance, device, wavelength, exposures[camera], sensor_seed)
+        lit[camera] = images[-1]
+        if camera == FRINGE_CAMERA:
+            fringes[camera] = images[:-1]
+    return lit, fringes
+
+
+def refine_edges(radiance: Images, stage: Stage, optics: CameraOptics, engine: Engine, seed: int) -> None:
+    """Render the pixels at edges of a lit image : (h, w) again, in place, with many samples.
+
+    A pixel is chosen by its neighbourhood and then gets a value of its own samples, so that the choice leaves no bias.
+    """
+    window = np.ones((EDGE_WINDOW, EDGE_WINDOW), np.uint8)
+    contrast = cv2.dilate(radiance, window) - cv2.erode(radiance, window)
+    pixels = np.flatnonzero(contrast > EDGE_RANGE * radiance.max()).astype(np.uint32)
+    finer = engine.model_copy(update={"samples": max(engine.samples, EDGE_SAMPLES)})
+    light = fully_on(stage.patterns)
+    radiance.ravel()[pixels] = render_pixels(stage.world, optics, stage.projector, light, finer, seed, pixels)[0]
+
+
+def fully_on(light: Light) -> Light:
+    """The projector with all pixels on."""
+    return replace(light, axes=("columns",), profiles=(np.ones(light.size[0], np.float32),))
+
+
+def with_fully_on(light: Light) -> Light:
+    """A sequence, and then all pixels on."""
+    on = fully_on(light)
+    return replace(light, axes=light.axes + on.axes, profiles=light.profiles + on.profiles)
+
+
+def pose_name(number: int) -> str:
+    """Name of a pose, by which its folder is called."""
+    return f"{number:02d}"
+
+
+def is_finished(out: Path, described: Mapping[str, object]) -> bool:
+    """Whether the session with these settings is there already, whole."""
+    kept = out / "truth" / SETTINGS
+    whole = kept.is_file() and (out / "capture" / capture.MANIFEST).is_file()
+    return whole and json.loads(kept.read_text(encoding="utf-8")) == described
+
+
+def missing_poses(out: Path, settings: Settings, described: Mapping[str, object]) -> list[int]:
+    """Numbers of the poses that are still to be rendered; what is left of a run with other settings is removed.
+
+    described : the settings, as they are kept with the truth.
+    """
+    for folder, marker in (("truth", TRUTH_MARKER), ("capture", capture.MANIFEST), (UNFINISHED, SETTINGS)):
+        atomic.check_folder(out / folder, marker)
+    kept = out / UNFINISHED / SETTINGS
+    if not kept.is_file() or json.loads(kept.read_text(encoding="utf-8")) != described:
+        with atomic.new_folder(out / UNFINISHED, SETTINGS) as folder:
+            write_json(folder / SETTINGS, described)
+    return [k for k in range(settings.poses.count) if not _pose_folder(out, k).is_dir()]
+
+
+def write_pose(out: Path, number: int, lit: Mapping[str, Numbers], fringes: Mapping[str, Numbers]) -> None:
+    """Keep one pose's images, whole or not at all."""
+    board_capture.write_pose(out / UNFINISHED / "capture", pose_name(number), lit, fringes)
+
+
+def finish(out: Path, settings: Settings, exposures: Mapping[CameraName, Exposure], placed: rigid.Array) -> None:
+    """Write manifest and truth, and put both folders in their places; an old capture goes first, so that no two sessions mix."""
+    unfinished = out / UNFINISHED
+    truth = unfinished / "truth"
+    shutil.rmtree(truth, ignore_errors=True)
+    (truth / "calibration").mkdir(parents=True)
+    optics = calibration_of(settings.rig)
+    calibration.write(truth / "calibration" / "optics.yaml", optics)
+    np.savez(truth / "board.npz", **board_truth(settings, placed))
+    write_json(truth / TRUTH_MARKER, describe(Scene("board", board.things(settings.board))))
+    shutil.copy(unfinished / SETTINGS, truth / SETTINGS)
+
+    names = [pose_name(k) for k in range(len(placed))]
+    counts: dict[str, int] = {FRINGE_CAMERA: settings.patterns.count}
+    records = tuple(board_capture.describe_pose(name, settings.cameras, counts) for name in names)
+    part = BoardPart(board=board.design(settings.board), patterns=settings.patterns, poses=records)
+    devices = {"projector": Device(size=settings.patterns.projector_size)}
+    for camera, exposure in exposures.items():
+        size = getattr(settings.rig, camera).optics.size
+        devices[camera] = Device(size=size, bits=exposure.bits, exposure_s=exposure.time_s, gain=exposure.gain)
+    board_capture.write_manifest(unfinished / "capture", devices, part, "board")
+
+    shutil.rmtree(out / "capture", ignore_errors=True)
+    shutil.rmtree(out / "truth", ignore_errors=True)
+    truth.rename(out / "truth")
+    (unfinished / "capture").rename(out / "capture")
+    shutil.rmtree(unfinished)
+
+
+def board_truth(settings: Settings, placed: rigid.Array) -> dict[str, np.ndarray]:
+    """What only evaluation may know: poses (p, 4, 4), printed centres (n, 3) mm, and where the three devices see these.
+
+    Pixels : (p, n, 3, 2) are those of the centres in cam1, cam2 and the projector, not of the middles of the ellipses.
+    """
+    centres = board.printed_centres(settings.board)
+    points = np.stack([rigid.apply(pose, centres) for pose in placed])
+    cameras = calibration_of(settings.rig).cameras
+    pixels = np.stack([cameras[name].project(points) for name in ("cam1", "cam2", "projector")], axis=2)
+    return {"world_from_board": placed, "points": centres, "pixels": pixels}
+
+
+def _pose_folder(out: Path, number: int) -> Path:
+    return out / UNFINISHED / "capture" / board_capture.pose_folder(pose_name(number))
