@@ -1,0 +1,30 @@
+"""The ultrasound probe's calibration: where the pixels of its B-scans lie in the frame of the target that it carries."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from recon import rigid
+from recon.calibration import Uncertainty
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ProbeCalibration:
+    """A calibrated probe. The image's frame: x along the array, y into the depth, origin at the centre of pixel (0, 0).
+
+    The uncertainty's names are `sx sy` in mm/px, and `rx ry rz` in rad and `tx ty tz` in mm, a turn and a shift of
+    `target_from_image`: `R = exp([r]) R_calibrated`, `t = t_calibrated + (tx, ty, tz)`.
+    """
+
+    target_from_image: Array  # (4, 4), mm
+    scale: Array  # (2,) sx, sy, mm/px
+    uncertainty: Uncertainty | None = None
+
+    def to_target(self, pixels: ArrayLike) -> Array:
+        """Pixels : (..., 2) of a B-scan, to points : (..., 3) mm in the target's frame."""
+        pixels = np.asarray(pixels, float)
+        plane = np.concatenate([pixels * self.scale, np.zeros_like(pixels[..., :1])], axis=-1)
+        return rigid.apply(self.target_from_image, plane)

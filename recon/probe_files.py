@@ -1,0 +1,141 @@
+"""Files of the probe's calibration: sonotwin's own `probe.yaml`, and the rig authors' `US_params.npz`.
+
+- own: OpenCV FileStorage YAML with `schema`, `target_from_image` (4x4, mm), `scale` (sx, sy in mm/px) and, if known,
+  `parameters`, their names as in `recon.probe`, and `covariance`.
+- the authors': npz with sx, sy and T_I_T, which is `target_from_image`.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon import arrays, atomic
+from recon.calibration import Uncertainty
+from recon.errors import InputError
+from recon.probe import ProbeCalibration
+
+Array = NDArray[np.float64]
+
+SCHEMA = "sonotwin-probe/1"
+PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
+AUTHORS = "US_params.npz"
+ORTHOGONAL = 1e-3  # of a rotation; files of few digits pass
+SYMMETRIC = 1e-9  # of a covariance, relative to the standard deviations: it comes from a text file
+
+
+def read(path: Path) -> ProbeCalibration:
+    """Read a probe's calibration of either kind, recognised by its content.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, of another kind, or a value is missing, not finite, no rotation or no scale.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: expected a probe's calibration, found {(error.strerror or 'none').lower()}") from None
+    if data.startswith(b"PK"):
+        return _authors(path)
+    try:
+        storage = cv2.FileStorage(data.decode("utf-8"), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+    except (cv2.error, SystemError, UnicodeDecodeError):
+        raise InputError(f"{path}: expected an npz file or OpenCV's YAML, XML or JSON, found other or damaged data") from None
+    try:
+        return _own(path, storage)
+    finally:
+        storage.release()
+
+
+def write(path: Path, calibration: ProbeCalibration) -> None:
+    """Write sonotwin's own format, whole or not at all. The suffix should be `.yaml`."""
+    storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+    storage.write("schema", SCHEMA)
+    storage.write("target_from_image", calibration.target_from_image)
+    storage.write("scale", np.asarray(calibration.scale, float).reshape(1, 2))
+    if calibration.uncertainty is not None:
+        storage.startWriteStruct("parameters", cv2.FileNode_SEQ)
+        for name in calibration.uncertainty.names:
+            storage.write("", name)
+        storage.endWriteStruct()
+        storage.write("covariance", calibration.uncertainty.covariance)
+    text = storage.releaseAndGetString()
+    with atomic.new_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_authors(path: Path, calibration: ProbeCalibration) -> None:
+    """Write the rig authors' `US_params.npz`, whole or not at all; it has no room for the uncertainty."""
+    sx, sy = calibration.scale
+    with atomic.new_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, sx=sx, sy=sy, T_I_T=calibration.target_from_image)
+
+
+def _authors(path: Path) -> ProbeCalibration:
+    number = arrays.Form("fiu")
+    values = arrays.read(path, {"sx": number, "sy": number, "T_I_T": arrays.Form("fiu", (4, 4))})
+    for name in ("sx", "sy"):
+        if values[name].size != 1:
+            raise InputError(f"{path}: {name}: expected one number, found {values[name].size}")
+    scale = np.array([values["sx"].item(), values["sy"].item()], float)
+    return _checked(path, "T_I_T", values["T_I_T"].astype(float), scale, None)
+
+
+def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
+    node = storage.getNode("schema") if storage.root().isMap() else None
+    found = node.string() if node is not None and node.isString() else "none"
+    if found != SCHEMA:
+        raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
+    pose, scale = _matrix(path, storage, "target_from_image"), _matrix(path, storage, "scale").ravel()
+    return _checked(path, "target_from_image", pose, scale, _uncertainty(path, storage))
+
+
+def _checked(path: Path, name: str, pose: Array, scale: Array, uncertainty: Uncertainty | None) -> ProbeCalibration:
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise InputError(f"{path}: {name}: expected a 4x4 rigid transform in mm, found shape {pose.shape} or values not finite")
+    turn = pose[:3, :3]
+    orthogonal = np.abs(turn @ turn.T - np.eye(3)).max() < ORTHOGONAL and np.abs(pose[3] - [0, 0, 0, 1]).max() < ORTHOGONAL
+    if not orthogonal or np.linalg.det(turn) < 0:
+        raise InputError(f"{path}: {name}: expected a 4x4 rigid transform, found a matrix with no right-handed rotation in it")
+    if scale.shape != (2,) or not np.isfinite(scale).all() or scale.min() <= 0:
+        raise InputError(f"{path}: scale: expected sx and sy above zero in mm/px, found {scale.tolist()}")
+    return ProbeCalibration(pose, scale, uncertainty)
+
+
+def _uncertainty(path: Path, storage: cv2.FileStorage) -> Uncertainty | None:
+    node = storage.getNode("parameters")
+    if node.empty() and storage.getNode("covariance").empty():
+        return None
+    entries = [node.at(i) for i in range(node.size())] if node.isSeq() else []
+    names = tuple(entry.string() for entry in entries if entry.isString())
+    if not names or len(names) < len(entries) or len(set(names)) < len(names) or not set(names) <= set(PARAMETERS):
+        raise InputError(f"{path}: parameters: expected some of {' '.join(PARAMETERS)}, each once, found something else")
+    covariance = _matrix(path, storage, "covariance")
+    expected = f"{path}: covariance: expected {len(names)}x{len(names)} variances and covariances of the parameters, found"
+    if covariance.shape != (len(names), len(names)):
+        raise InputError(f"{expected} shape {covariance.shape}")
+    if not np.isfinite(covariance).all():
+        raise InputError(f"{expected} values that are not finite")
+    sigma = np.sqrt(np.abs(np.diag(covariance)))
+    limit = np.outer(sigma, sigma) + np.finfo(float).tiny
+    if (np.abs(covariance - covariance.T) > SYMMETRIC * limit).any():
+        raise InputError(f"{expected} a matrix that is not symmetric")
+    if np.diag(covariance).min() < 0 or (np.abs(covariance) > (1 + SYMMETRIC) * limit).any():
+        raise InputError(f"{expected} a variance below zero or a correlation beyond one")
+    return Uncertainty(names, (covariance + covariance.T) / 2)
+
+
+def _matrix(path: Path, storage: cv2.FileStorage, name: str) -> Array:
+    node = storage.getNode(name)
+    if node.empty():
+        raise InputError(f"{path}: {name}: expected a matrix, found none")
+    try:
+        value = node.mat()
+    except (cv2.error, SystemError):
+        value = None
+    if value is None:
+        raise InputError(f"{path}: {name}: expected a matrix, found something else")
+    return np.asarray(value, float)
