@@ -31,6 +31,12 @@ def build_scene(config: Mapping[str, Any]) -> Scene:
     InputError
         If the kind is unknown, a key is unknown or missing, a value is out of range, or the parts don't fit together.
     """
+    module, parsed = parse_scene(config)
+    return module.build(parsed)
+
+
+def parse_scene(config: Mapping[str, Any]) -> tuple[ModuleType, Any]:
+    """The module of a scene's kind, and its checked `Config`; raises InputError as `build_scene` does."""
     if "kind" not in config:
         raise InputError(f"scene: kind: expected one of {', '.join(kinds())}, found none")
     kind = config["kind"]
@@ -38,10 +44,9 @@ def build_scene(config: Mapping[str, Any]) -> Scene:
     if module is None or not _is_scene(module):
         raise InputError(f"scene: kind: expected one of {', '.join(kinds())}, found {kind!r}")
     try:
-        parsed = module.Config(**{key: value for key, value in config.items() if key != "kind"})
+        return module, module.Config(**{key: value for key, value in config.items() if key != "kind"})
     except ValidationError as error:
         raise InputError(f"scene: {kind}: {one_line(error)}") from error
-    return module.build(parsed)
 
 
 def _modules() -> list[str]:

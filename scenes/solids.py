@@ -69,7 +69,7 @@ def rod(radius: float, length: float) -> trimesh.Trimesh:
 
 def ball(radius: float) -> trimesh.Trimesh:
     """A sphere about the origin, within `TOLERANCE_MM` of the true one."""
-    edge = 1.25 * 1.0515 * radius  # of the icosahedron, times the spread of edge lengths under subdivision
+    edge = 1.26 * 1.0515 * radius  # of the icosahedron, times the spread of edge lengths under subdivision
     sag = edge**2 / (6 * radius)  # of an equilateral facet below its circumscribed sphere
     subdivisions = max(3, int(np.ceil(0.5 * np.log2(sag / TOLERANCE_MM))))
     return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)

@@ -11,7 +11,7 @@ from recon.errors import InputError
 from scenes.catalogue import build_scene, kinds
 
 CONF = Path(__file__).parents[2] / "conf" / "scene"
-KINDS = ("board", "breast", "cylinders", "plane", "sphere", "two_objects")
+KINDS = ("board", "breast", "crosswire", "cylinders", "inner_cylinder", "plane", "sphere", "tank", "test_object", "two_objects")
 
 
 @pytest.fixture(scope="module", params=KINDS)

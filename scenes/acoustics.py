@@ -1,0 +1,97 @@
+"""What things are made of acoustically, and which thing is made of what.
+
+Values at room temperature (22 °C). Sources: [D] Duck 1990, Physical properties of tissue; [C] Culjat et al. 2010, A review of
+tissue substitutes for ultrasound imaging, Ultrasound Med. Biol. 36(6); [K] Kaye & Laby / ONDA tables of acoustic properties;
+[M] Marczak 1997 (water); [A] D'Astous & Foster 1986, Ultrasound Med. Biol. 12(10) (breast tissue).
+"""
+
+from dataclasses import dataclass
+
+from recon.errors import InputError
+from scenes.things import Scene, Thing
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """An acoustic medium.
+
+    Raises
+    ------
+    ValueError
+        If impedance or speed isn't positive, or a loss is negative.
+    """
+
+    impedance: float  # MRayl
+    speed: float  # m/s
+    attenuation: float  # dB/cm/MHz
+    echogenicity: float | None  # dB of the backscatter coefficient over `BACKSCATTER`; None is free of echoes
+    roughness: float = 0.0  # mm, standard deviation of its surface over less than a wavelength
+
+    def __post_init__(self) -> None:
+        if not (self.impedance > 0 and self.speed > 0):
+            raise ValueError(f"impedance and speed: expected more than 0, found {self.impedance} and {self.speed}")
+        if self.attenuation < 0 or self.roughness < 0:
+            raise ValueError(f"attenuation and roughness: expected 0 or more, found {self.attenuation} and {self.roughness}")
+
+
+BACKSCATTER = 1e-4  # 1/(mm sr), that is 1e-3 /(cm sr): of soft tissue near 7 MHz [D, A: 1e-4 to 1e-2 for fat to tumour]
+
+TISSUES = {
+    "water": Tissue(1.486, 1488.3, 0.0165, None),  # [M] at 22 °C; its 0.0022 dB/cm/MHz² [D] grow with the square, here at 7.5 MHz
+    "gel": Tissue(
+        1.55, 1520.0, 0.02, None
+    ),  # coupling gel: water with a few per cent of polymer; assumed between water and tissue
+    "silicone": Tissue(1.50, 1450.0, 0.6, 2.0, 0.01),  # body of a soft breast phantom: fat to gland [A, C], adipose speed 1450
+    "tumour": Tissue(1.58, 1530.0, 0.9, -12.0, 0.02),  # masses are darker, stiffer, faster and absorb more [A]
+    "gelatin": Tissue(1.60, 1540.0, 0.5, 0.0, 0.005),  # tissue-mimicking gelatin or agar with graphite [C], made for 1540 m/s
+    "cyst": Tissue(1.57, 1540.0, 0.05, None, 0.005),  # fluid, matched in speed
+    "bright": Tissue(1.61, 1540.0, 0.5, 6.0, 0.005),  # inclusions of a grey-scale test object
+    "dark": Tissue(1.59, 1540.0, 0.5, -6.0, 0.005),
+    "polymer": Tissue(3.2, 2700.0, 1.4, None, 0.001),  # acrylic glass, nylon and their like [K]
+    "steel": Tissue(46.0, 5900.0, 0.2, None, 0.002),  # [K]
+    "wood": Tissue(1.9, 3300.0, 8.0, -4.0, 0.03),  # assumed, across the grain: it absorbs all
+    "nylon": Tissue(2.9, 2600.0, 1.0, None, 0.01),  # wires and fishing line [K]
+}
+
+MADE_OF = {  # by the scene's kind, then by the thing's name without its number; "" is what surrounds them
+    "breast": {"": "gel", "breast": "silicone", "tumour": "tumour", "table": "wood"},
+    "cylinders": {"": "gel", "outer": "gelatin", "inner": "polymer", "table": "wood"},
+    "inner_cylinder": {"": "water", "inner": "polymer", "tank": "polymer"},
+    "crosswire": {"": "water", "wire": "nylon", "tank": "polymer"},
+    "tank": {"": "water", "tank": "polymer"},
+    "test_object": {
+        "": "gel",
+        "block": "gelatin",
+        "wire": "nylon",
+        "cyst": "cyst",
+        "bright": "bright",
+        "dark": "dark",
+    },
+}
+
+
+def surroundings(scene: Scene) -> Tissue:
+    """What lies between and around a scene's things."""
+    return TISSUES[_table(scene)[""]]
+
+
+def tissue_of(scene: Scene, thing: Thing) -> Tissue:
+    """What a thing of a scene is made of.
+
+    Raises
+    ------
+    InputError
+        If nobody has said so.
+    """
+    made_of, name = _table(scene), thing.name.rstrip("0123456789")
+    if name not in made_of:
+        raise InputError(
+            f"{scene.name}: {thing.name}: expected one of {', '.join(filter(None, made_of))}, found no tissue for it"
+        )
+    return TISSUES[made_of[name]]
+
+
+def _table(scene: Scene) -> dict[str, str]:
+    if scene.name not in MADE_OF:
+        raise InputError(f"scene: {scene.name}: expected one with acoustics ({', '.join(MADE_OF)}), found none for it")
+    return MADE_OF[scene.name]

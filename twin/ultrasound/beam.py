@@ -1,0 +1,119 @@
+"""The point spread: pulse in depth, two-way beam along the array and across the image plane, as a function of depth.
+
+Fresnel diffraction of the aperture, separable in the two directions. With `|H| = 1` in front of an endless unfocused aperture,
+
+    H(x, y) = (i lambda y)^(-1/2) ∫ A(s) exp(i k (x - s)²/(2 y) - i k s²/(2 F)) ds,
+
+the echo of a scatterer of scattering length f, received as the mean over an aperture of D mm, is `f lambda H_t H_r / D` in each
+direction, relative to that of a perfect mirror. A surface element dA of a mirror is a scatterer of length `R dA / lambda`.
+Source: Goodman, Introduction to Fourier Optics, chapter 4; reciprocity for the receiver.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.ultrasound.transducer import Transducer
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex64]
+
+NEAREST_MM = 2.0  # where the beam at the face is taken; Fresnel's approximation fails nearer
+ELEMENTS = 400  # points of the aperture in the integral
+OVERSAMPLING = 2  # axial samples a row of the image
+FAINT = 2e-3  # of the peak: the point spread ends there (-54 dB)
+EDGES = (0.03, 0.06)  # of the peak across the plane, two-way: the slice's end for surfaces and wires, and for scatterers
+REACH_MM = 4.0  # of the point spread along the array, at most
+STEP_MM = 0.025  # of the elevational table
+DEEPER = 1.2  # true depth that the tables reach, over the shown one
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """Tables of the point spread of one transducer. Depths in rows of the image as shown."""
+
+    lateral: Complex  # (h, taps) along the array, per row; taps odd, centred
+    reach: NDArray[np.int64]  # (h,) taps on either side that matter
+    axial: NDArray[np.float32]  # (h, taps) in depth, OVERSAMPLING samples a row; taps odd
+    elevation: Complex  # (m, n) two-way, at depth m DEPTH_STEP and offset n STEP_MM
+    half_mm: NDArray[np.float32]  # (m,) half thickness of the slice, for what is bright
+    core_mm: NDArray[np.float32]  # (m,) the same without side lobes, for scatterers
+    depth_step_mm: float
+    lateral_energy: Array  # (h,) of a line of scatterers along the array
+    elevation_energy: Array  # (h,)
+
+
+def diffracted(
+    offsets: Array, depth: float, aperture: float, focus: float, wavelength: float, apodised: bool
+) -> NDArray[np.complex128]:
+    """Field H : (n,) of an aperture at offsets : (n,) mm from its axis, at a depth; `apodised` by a Hann window."""
+    s = (np.arange(ELEMENTS) + 0.5) / ELEMENTS - 0.5
+    weight = (2 * np.cos(np.pi * s) ** 2 if apodised else np.ones(ELEMENTS)) * aperture / ELEMENTS
+    s = s * aperture
+    k = 2 * np.pi / wavelength
+    lens = weight * np.exp(1j * k * s**2 / 2 * (1 / depth - 1 / focus))
+    field = np.exp(-1j * k / depth * np.outer(offsets, s)) @ lens
+    return np.exp(1j * k * offsets**2 / (2 * depth)) * field / np.sqrt(1j * wavelength * depth)
+
+
+@lru_cache(maxsize=8)
+def beam(transducer: Transducer) -> Beam:
+    """Tables of a transducer's point spread; they depend on its figures alone and are kept."""
+    rows = transducer.rows_mm
+    lateral, reach = _lateral(transducer, rows)
+    depths = np.arange(0, DEEPER * transducer.depth_mm + 0.5, 0.25)
+    elevation, half, core = _elevation(transducer, depths)
+    energy = 2 * (np.abs(elevation) ** 2).sum(axis=1) * STEP_MM
+    return Beam(
+        lateral.astype(np.complex64),
+        reach,
+        _axial(transducer, rows).astype(np.float32),
+        elevation.astype(np.complex64),
+        half.astype(np.float32),
+        core.astype(np.float32),
+        0.25,
+        (np.abs(lateral) ** 2).sum(axis=1) * transducer.scale_mm_per_px[0],
+        np.interp(rows, depths, energy),
+    )
+
+
+def receive_aperture(transducer: Transducer, depth: Array | float) -> Array:
+    """Width of the dynamic receive aperture, mm, at a depth."""
+    return np.clip(np.asarray(depth) / transducer.receive_f_number, NEAREST_MM / 2, transducer.aperture_mm)
+
+
+def _lateral(transducer: Transducer, rows: Array) -> tuple[NDArray[np.complex128], NDArray[np.int64]]:
+    step, wavelength = transducer.scale_mm_per_px[0], transducer.wavelength_mm
+    taps = int(REACH_MM / step)
+    offsets = step * np.arange(-taps, taps + 1)
+    transmit = transducer.transmit_focus_mm / transducer.transmit_f_number
+    table = np.empty((len(rows), len(offsets)), complex)
+    for k, depth in enumerate(np.maximum(rows, NEAREST_MM)):
+        receive = float(receive_aperture(transducer, depth))
+        sent = diffracted(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
+        table[k] = sent * diffracted(offsets, depth, receive, depth, wavelength, apodised=True) / receive
+    level = np.abs(table) / np.abs(table).max(axis=1, keepdims=True)
+    seen = level >= FAINT
+    reach = np.maximum(np.abs(offsets / step * seen).max(axis=1).round().astype(np.int64), 1)
+    return table, reach
+
+
+def _elevation(transducer: Transducer, depths: Array) -> tuple[NDArray[np.complex128], Array, Array]:
+    offsets = np.arange(0, transducer.elevation_mm * 0.5 + 2.0, STEP_MM)
+    height = transducer.elevation_mm
+    table = np.empty((len(depths), len(offsets)), complex)
+    for k, depth in enumerate(np.maximum(depths, NEAREST_MM)):
+        one_way = diffracted(offsets, depth, height, transducer.elevation_focus_mm, transducer.wavelength_mm, apodised=False)
+        table[k] = one_way**2 / height
+    level = np.abs(table) / np.abs(table).max(axis=1, keepdims=True)
+    half, core = (np.where(level >= least, offsets, 0).max(axis=1) + STEP_MM for least in EDGES)
+    return table, half, core
+
+
+def _axial(transducer: Transducer, rows: Array) -> Array:
+    sigma = transducer.axial_sigma_mm(rows)[:, None]
+    step = transducer.scale_mm_per_px[1] / OVERSAMPLING
+    taps = int(np.ceil(3.3 * sigma.max() / step))
+    return np.exp(-((step * np.arange(-taps, taps + 1)) ** 2) / (2 * sigma**2))

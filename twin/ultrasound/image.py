@@ -1,0 +1,87 @@
+"""From echoes to grey levels: point spread, noise, gain over depth, envelope, logarithm, quantisation."""
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from scenes.acoustics import BACKSCATTER
+from twin.ultrasound.beam import OVERSAMPLING, Beam
+from twin.ultrasound.transducer import Transducer
+
+Array = NDArray[np.float64]
+Field = NDArray[np.complex64]
+
+
+def focused(field: Field, beam: Beam) -> Field:
+    """Echoes after pulse and beam : (h, w), from a field of echoes at their places: the coherent sum."""
+    return _along(_in_depth(field, beam.axial), beam.lateral, beam.reach)
+
+
+def reference_power(transducer: Transducer, beam: Beam) -> Array:
+    """Mean power : (h,) of the echo of the reference tissue, without attenuation; a perfect mirror has about 1."""
+    row = transducer.scale_mm_per_px[1] / OVERSAMPLING
+    pulse = (beam.axial**2).sum(axis=1) * row
+    return BACKSCATTER * transducer.wavelength_mm**2 * beam.lateral_energy * beam.elevation_energy * pulse
+
+
+def noise(transducer: Transducer, beam: Beam, rng: np.random.Generator) -> Field:
+    """Electronic noise : (h, w), of the same power at every depth, before the gain."""
+    height, width = transducer.image_size[::-1]
+    focus = np.interp(transducer.transmit_focus_mm, transducer.rows_mm, reference_power(transducer, beam))
+    sigma = np.sqrt(focus / 2) * 10 ** (transducer.noise_db / 20)
+    parts = rng.standard_normal((2, height, width), dtype=np.float32)
+    return np.float32(sigma) * (parts[0] + 1j * parts[1])
+
+
+def gain_over_depth(transducer: Transducer, beam: Beam) -> Array:
+    """Amplification : (h,) that shows the reference tissue, attenuated as assumed, with a mean power of 1 at every depth."""
+    loss = transducer.tgc_db_per_cm_mhz * transducer.frequency_mhz * transducer.rows_mm / 5
+    return 10 ** (np.minimum(loss, transducer.tgc_limit_db) / 20) / np.sqrt(reference_power(transducer, beam))
+
+
+def face(transducer: Transducer) -> Array:
+    """Ringing of the transducer itself : (h,), after the gain, over the reference tissue."""
+    if transducer.face_ring_mm == 0:
+        return np.zeros(transducer.image_size[1])
+    level = 10 ** ((transducer.face_ring_db - transducer.gain_db) / 20)
+    depth = transducer.rows_mm
+    ripple = 1 + 0.35 * np.cos(2 * np.pi * depth / (3.3 * transducer.wavelength_mm))
+    return level * ripple * np.exp(-depth / transducer.face_ring_mm)
+
+
+def grey(envelope: NDArray[np.float32], transducer: Transducer) -> NDArray[np.uint8]:
+    """Log-compressed grey levels : (h, w) of an envelope after the gain, where 1 is the reference tissue."""
+    db = 20 * np.log10(np.maximum(envelope, 1e-12)) + transducer.gain_db
+    levels = 2**transducer.bits - 1
+    steps = np.rint(levels * np.clip(1 + db / transducer.dynamic_range_db, 0, 1))
+    return np.rint(steps * (255 / levels)).astype(np.uint8)
+
+
+@njit(cache=True, parallel=True, fastmath=True)
+def _in_depth(field, axial):
+    lines, samples = field.shape
+    rows, taps = axial.shape
+    reach = taps // 2
+    result = np.zeros((rows, lines), np.complex64)
+    for line in prange(lines):
+        for r in range(rows):
+            total = np.complex64(0)
+            middle = OVERSAMPLING * r
+            for t in range(max(0, reach - middle), min(taps, samples - middle + reach)):
+                total += axial[r, t] * field[line, middle + t - reach]
+            result[r, line] = total
+    return result
+
+
+@njit(cache=True, parallel=True, fastmath=True)
+def _along(field, lateral, reach):
+    rows, lines = field.shape
+    taps = lateral.shape[1]
+    width, half = lines - taps + 1, taps // 2
+    result = np.zeros((rows, width), np.complex64)
+    for r in prange(rows):
+        for t in range(half - reach[r], half + reach[r] + 1):
+            weight = lateral[r, t]
+            for x in range(width):
+                result[r, x] += weight * field[r, x + t]
+    return result

@@ -1,0 +1,208 @@
+"""How a hand leads the probe: along a surface in contact with it, tilted, trembling; up and down over a tank's bottom; or from
+rest to rest about crossed wires.
+"""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.ndimage import gaussian_filter1d, map_coordinates
+from scipy.spatial.transform import Rotation
+
+from recon import probe_calibration, rigid
+from recon.errors import InputError
+from recon.rig import Finite, NotNegative, Part, Positive
+from recon.tracks import Track
+from twin.ultrasound.solids import Body, Solid
+from twin.ultrasound.transducer import Transducer
+
+Array = NDArray[np.float64]
+
+RATE_HZ = 100.0  # of the poses that make up a path
+SEARCH_MM = 0.1  # steps in which the surface is looked for
+FOOT_MM = 8.0  # width of the probe's foot across the array
+FOOT_POINTS = (21, 5)  # of the foot, along and across the array
+MOVE_S = 1.0  # from one rest to the next; over such a gap no pose is interpolated
+TOUCHING_MM = 2.0  # between the axes of two wires that cross
+
+
+class Hand(Part):
+    """How unsteady the hand is: Gaussian processes of a correlation time, in each of three axes."""
+
+    shift_mm: NotNegative = 0.15  # standard deviation
+    turn_deg: NotNegative = 0.6
+    correlation_s: Annotated[float, Field(gt=0.01)] = 0.15  # of the Gaussian that smooths them: tremor and drift below 3 Hz
+
+
+class SurfacePath(Part):
+    """A straight stroke over a surface that faces the cameras, seen along the world's z."""
+
+    kind: Literal["stroke"] = "stroke"
+    surface: str = ""  # name of the solid, where a scene has several
+    start_mm: tuple[Finite, Finite] = (4.0, -35.0)  # x, y in the world of the array's middle
+    end_mm: tuple[Finite, Finite] = (4.0, 30.0)
+    speed_mm_s: Positive = 10.0
+    turn_deg: Finite = 0.0  # of the array about the line of sight, from the world's x
+    tilt_deg: tuple[Finite, Finite] = (0.0, 0.0)  # off the surface's normal: in the image plane, and of the plane
+    standoff_mm: Finite = 0.0  # between the foot and the nearest point of the surface; negative presses into it
+    hand: Hand = Hand()
+
+
+class Bob(Part):
+    """Up and down at an uneven pace, as the lag between scanner and cameras is measured."""
+
+    kind: Literal["bob"] = "bob"
+    middle_mm: tuple[Finite, Finite, Finite] = (4.0, -2.0, 672.0)  # of the array's face, in the world
+    turn_deg: Finite = 0.0
+    height_mm: Positive = 8.0  # amplitude
+    seconds: Positive = 12.0
+    hand: Hand = Hand()
+
+
+class WirePath(Part):
+    """At rest in poses about two crossed wires, as the probe is calibrated: see `recon.probe_calibration.motion`."""
+
+    kind: Literal["wire"] = "wire"
+    count: Annotated[int, Field(ge=1, le=1000)] = 30  # poses, one image each
+    tilt_deg: Annotated[float, Field(ge=0, le=80)] = 35.0  # to all sides
+    roll_deg: Annotated[float, Field(ge=0, le=180)] = 180.0  # about the depth axis, both ways
+    rest_s: Annotated[float, Field(ge=0.1, le=60)] = 0.5  # in each pose; the image is taken in the middle
+
+
+def along_surface(path: SurfacePath, solid: Solid, transducer: Transducer, seed: int) -> Track:
+    """Poses `world_from_image` over time, from 0 ns, of a stroke over a solid.
+
+    The face touches the surface where it first meets it, square to the plane fitted to the surface under the foot.
+
+    Raises
+    ------
+    InputError
+        If the foot leaves the solid, or the stroke has no length.
+    """
+    start, end = np.array(path.start_mm), np.array(path.end_mm)
+    duration = float(np.linalg.norm(end - start)) / path.speed_mm_s
+    if duration < 2 / RATE_HZ:
+        raise InputError(f"path.end_mm: expected a stroke of some length, found {np.linalg.norm(end - start):g} mm")
+    count = int(duration * RATE_HZ) + 1
+    share = np.linspace(0, 1, count)
+    share = share * share * (3 - 2 * share)  # sets off and stops gently
+    faces = np.stack([_placed(path, start + s * (end - start), solid, transducer) for s in share])
+    return _led(faces, path.hand, transducer, seed)
+
+
+def bobbing(bob: Bob, transducer: Transducer, seed: int) -> Track:
+    """Poses `world_from_image` over time, from 0 ns, of a probe that looks along the world's z."""
+    times = np.arange(int(bob.seconds * RATE_HZ) + 1) / RATE_HZ
+    turned = 2 * np.pi * (0.35 * times + 0.35 * np.sin(0.9 * times))  # uneven: no two strokes last alike
+    faces = np.tile(np.eye(4), (len(times), 1, 1))
+    faces[:, :3, :3] = _upright(bob.turn_deg)
+    faces[:, :3, 3] = bob.middle_mm
+    faces[:, 2, 3] += bob.height_mm * np.sin(turned)
+    return _led(faces, bob.hand, transducer, seed)
+
+
+def crossing(body: Body) -> Array:
+    """Where two wires cross : (3,) mm in the world, the midpoint between their axes.
+
+    Raises
+    ------
+    InputError
+        If there are other than two wires, or they don't touch.
+    """
+    expected = "path: expected a scene of two crossed wires, such as scene=crosswire, found"
+    if len(body.wires) != 2:
+        raise InputError(f"{expected} {len(body.wires) or 'no'} wires")
+    ends = np.stack([wire.ends for wire in body.wires])
+    along = ends[:, 1] - ends[:, 0]
+    shares = np.linalg.lstsq(np.column_stack([along[0], -along[1]]), ends[1, 0] - ends[0, 0])[0]
+    nearest = ends[:, 0] + shares[:, None] * along
+    apart = float(np.linalg.norm(nearest[1] - nearest[0]))
+    if apart > TOUCHING_MM or (shares < 0).any() or (shares > 1).any():
+        raise InputError(f"{expected} two that don't touch")
+    return nearest.mean(axis=0)
+
+
+def about_crossing(path: WirePath, body: Body, transducer: Transducer) -> tuple[Track, NDArray[np.int64]]:
+    """Poses `world_from_image` over time, from 0 ns, at rest only; and the middles of the rests : (count,) ns.
+
+    The crossing appears at the pixels of the protocol, the delays of the medium's sound included.
+
+    Raises
+    ------
+    InputError
+        If the scene has no crossing.
+    """
+    wire = crossing(body)
+    turns, pixels = probe_calibration.motion(transducer.image_size, path.count, path.tilt_deg, path.roll_deg)
+    rotations = _upright(0.0) @ Rotation.from_euler("YXZ", turns[:, [1, 0, 2]], degrees=True).as_matrix()
+    true_scale = np.array(transducer.scale_mm_per_px) * [1.0, body.medium.speed / transducer.assumed_speed]
+    places = np.column_stack([pixels * true_scale, np.zeros(len(pixels))])
+    poses = [rigid.transform(turn, wire - turn @ place) for turn, place in zip(rotations, places, strict=True)]
+    steps = np.rint(np.linspace(0, path.rest_s, int(path.rest_s * RATE_HZ) + 1) * 1e9).astype(np.int64)
+    starts = np.rint(np.arange(path.count) * (path.rest_s + MOVE_S) * 1e9).astype(np.int64)
+    rests = Track((starts[:, None] + steps).ravel(), np.repeat(poses, len(steps), axis=0))
+    return rests, starts + steps[-1] // 2
+
+
+def _upright(turn_deg: float) -> Array:
+    """Axes of an image that looks along z : x along the array, y into the depth."""
+    array = Rotation.from_euler("z", turn_deg, degrees=True).apply([1.0, 0.0, 0.0])
+    depth = np.array([0.0, 0.0, 1.0])
+    return np.column_stack([array, depth, np.cross(array, depth)])
+
+
+def _placed(path: SurfacePath, place: Array, solid: Solid, transducer: Transducer) -> Array:
+    """Pose of the face's middle : (4, 4), in contact at a place (x, y)."""
+    axes = _upright(path.turn_deg)
+    along, across = np.meshgrid(
+        np.linspace(-0.5, 0.5, FOOT_POINTS[0]) * transducer.width_mm, np.linspace(-0.5, 0.5, FOOT_POINTS[1]) * FOOT_MM
+    )
+    foot = place + np.outer(along.ravel(), axes[:2, 0]) + np.outer(across.ravel(), axes[:2, 2])
+    height = top(solid, foot)
+    seen = np.isfinite(height)
+    if not np.isfinite(top(solid, place[None])[0]) or seen.sum() < 10:
+        raise InputError(
+            f"path: expected the probe over {solid.name}, found it beside at x, y = {place[0]:.1f}, {place[1]:.1f} mm"
+        )
+    design = np.column_stack([foot[seen] - place, np.ones(seen.sum())])
+    slope_x, slope_y, level = np.linalg.lstsq(design, height[seen], rcond=None)[0]
+    depth = np.array([-slope_x, -slope_y, 1.0]) / np.sqrt(slope_x**2 + slope_y**2 + 1)
+    array = axes[:, 0] - depth * (axes[:, 0] @ depth)
+    array /= np.linalg.norm(array)
+    turn = np.column_stack([array, depth, np.cross(array, depth)])
+    turn = turn @ Rotation.from_euler("zx", [path.tilt_deg[0], path.tilt_deg[1]], degrees=True).as_matrix()
+    surface = np.column_stack([foot[seen], height[seen]])
+    middle = np.array([*place, level])
+    under = (np.abs((surface - middle) @ turn[:, [0, 2]]) <= [transducer.width_mm / 2, FOOT_MM / 2]).all(axis=1)
+    gap = ((surface - middle) @ turn[:, 1])[under].min()
+    return rigid.transform(turn, middle + (gap - path.standoff_mm) * turn[:, 1])
+
+
+def top(solid: Solid, places: Array) -> Array:
+    """Z of a solid's side that faces the cameras, at x, y : (n, 2) mm; NaN beside it."""
+    low, high = solid.mesh.bounds[:, 2]
+    depths = np.arange(low - 1, high, SEARCH_MM)
+    points = np.concatenate([np.repeat(places, len(depths), axis=0), np.tile(depths, len(places))[:, None]], axis=1)
+    grid = ((points - solid.origin) / solid.spacing).T
+    distance = map_coordinates(solid.distance, grid, order=1, mode="constant", cval=1e3).reshape(len(places), -1)
+    first = (distance < 0).argmax(axis=1)
+    rows = np.arange(len(places))
+    before, after = distance[rows, np.maximum(first - 1, 0)], distance[rows, first]
+    share = before / np.where(before == after, 1, before - after)
+    return np.where(first > 0, depths[np.maximum(first - 1, 0)] + share * SEARCH_MM, np.nan)
+
+
+def _led(faces: Array, hand: Hand, transducer: Transducer, seed: int) -> Track:
+    """Poses of the image from those of the face's middle, with the hand's unsteadiness about it."""
+    rng = np.random.default_rng(seed)
+    wander = rng.standard_normal((2, len(faces), 3))
+    smooth = hand.correlation_s * RATE_HZ
+    wander = gaussian_filter1d(wander, smooth, axis=1, mode="wrap") * np.sqrt(2 * np.sqrt(np.pi) * smooth)  # of unit variance
+    corner = rigid.transform(np.eye(3), (-transducer.width_mm / 2, 0, 0))
+    moves = [
+        rigid.from_rotation_vector(np.deg2rad(hand.turn_deg) * turn, hand.shift_mm * shift) @ corner
+        for turn, shift in zip(*wander, strict=True)
+    ]
+    times = np.rint(np.arange(len(faces)) * 1e9 / RATE_HZ).astype(np.int64)
+    return Track(times, faces @ np.stack(moves))

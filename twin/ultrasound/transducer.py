@@ -1,0 +1,85 @@
+"""A linear array and the scanner behind it: their figures, with units."""
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from recon.rig import Finite, NotNegative, Part, Positive
+
+Array = NDArray[np.float64]
+Bandwidth = Annotated[float, Field(ge=0.05, le=1.5)]
+
+
+class Transducer(Part):
+    """A linear array, its beams, and what the scanner makes of the echoes; as conf/ultrasound/linear.yaml has it."""
+
+    image_size: tuple[Annotated[int, Field(ge=16, le=4096)], Annotated[int, Field(ge=16, le=4096)]] = (321, 408)
+    scale_mm_per_px: tuple[Positive, Positive] = (0.1229, 0.1225)  # sx, sy of the scanner, at its assumed speed
+    assumed_speed: Annotated[float, Field(ge=300, le=5000)] = 1540.0  # m/s
+    frequency_mhz: Annotated[float, Field(ge=0.5, le=40)] = 7.5
+    bandwidth: tuple[Bandwidth, Bandwidth] = (0.5, 0.4)  # -6 dB of an echo, over the frequency: at the face, at the image's end
+    transmit_focus_mm: Positive = 25.0
+    transmit_f_number: Positive = 3.0  # focus over aperture
+    receive_f_number: Positive = 2.0  # dynamic focus and aperture
+    aperture_mm: Positive = 19.2  # widest, in receive: 64 elements of 0.3 mm
+    elevation_mm: Positive = 4.5  # height of the elements
+    elevation_focus_mm: Positive = 22.0  # of the lens
+    reverberations: Annotated[int, Field(ge=0, le=5)] = 2  # repeats between a surface and the probe's face
+    face_reflection: Annotated[float, Field(ge=0, le=1)] = 0.3  # of amplitude, for an echo that comes back to the face
+    face_ring_mm: NotNegative = 0.35  # over which the ringing of the transducer itself falls to 1/e
+    face_ring_db: Finite = 4.0  # its level at the face over the brightest grey; -200 is none
+    refraction: bool = True
+    scatterers_per_mm3: Annotated[float, Field(ge=1, le=1000)] = 64.0
+    tgc_db_per_cm_mhz: NotNegative = 0.5  # attenuation that the gain makes up for
+    tgc_limit_db: NotNegative = 55.0  # most gain over depth
+    gain_db: Finite = -28.0  # grey level of the reference tissue (echogenicity 0 dB), under the brightest grey
+    noise_db: Finite = -58.0  # under the echo of the reference tissue at the transmit focus without attenuation
+    dynamic_range_db: Annotated[float, Field(ge=10, le=120)] = 60.0
+    bits: Annotated[int, Field(ge=1, le=8)] = 8
+
+    @model_validator(mode="after")
+    def _depth(self) -> "Transducer":
+        if self.scale_mm_per_px[1] > 2 * self.wavelength_mm:
+            raise ValueError(
+                f"scale_mm_per_px: expected a row of at most two wavelengths of {self.wavelength_mm:.3f} mm, "
+                f"found {self.scale_mm_per_px[1]:g}"
+            )
+        return self
+
+    @property
+    def wavelength_mm(self) -> float:
+        """At the assumed speed."""
+        return 1e-3 * self.assumed_speed / self.frequency_mhz
+
+    @property
+    def wavenumber(self) -> float:
+        """Radians a mm, one way, at the assumed speed."""
+        return 2 * np.pi / self.wavelength_mm
+
+    @property
+    def depth_mm(self) -> float:
+        """Of the image's last row, as shown."""
+        return self.scale_mm_per_px[1] * (self.image_size[1] - 1)
+
+    @property
+    def width_mm(self) -> float:
+        """From the first column to the last."""
+        return self.scale_mm_per_px[0] * (self.image_size[0] - 1)
+
+    @property
+    def rows_mm(self) -> Array:
+        """Shown depth of the image's rows : (h,)."""
+        return self.scale_mm_per_px[1] * np.arange(self.image_size[1])
+
+    def axial_sigma_mm(self, depth_mm: Array) -> Array:
+        """Standard deviation in depth of the echo's Gaussian envelope (amplitude).
+
+        A spectrum `exp(-(f-f0)²/(2 s²))` of full width B f0 at half amplitude (-6 dB) has s = B f0 / 2.355, and its pulse
+        lasts 1/(2 pi s); depth is c/2 times that.
+        """
+        near, far = self.bandwidth
+        share = np.clip(np.asarray(depth_mm) / max(self.depth_mm, 1e-9), 0, 1)
+        bandwidth_mhz = self.frequency_mhz * (near + (far - near) * share)
+        return 1e-3 * self.assumed_speed / 2 * np.sqrt(8 * np.log(2)) / (2 * np.pi * bandwidth_mhz)
