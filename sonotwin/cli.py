@@ -28,14 +28,19 @@ class Verb:
     @property
     def module(self) -> str:
         """The module with the verb's docstring, `Config` and `run`."""
-        return f"sonotwin.verbs.{self.name}"
+        return f"sonotwin.verbs.{self.name.replace('-', '_')}"
 
 
 VERBS = (  # in the order in which a person meets them
     Verb("doctor", "check this installation and say what to do about each problem"),
     Verb("demo", "render a phantom, reconstruct its surface, compare with the truth"),
     Verb("render", "render a capture of a scene with its ground truth"),
+    Verb("sweep", "render a freehand ultrasound sweep of a scene with its ground truth"),
+    Verb("calibrate-optics", "calibrate cameras and projector from images of a board, rendered or real"),
+    Verb("calibrate-probe", "calibrate the ultrasound probe from B-scans of crossed wires"),
+    Verb("measure-lag", "measure by how much the scanner's images lag behind the tracked poses"),
     Verb("surface", "reconstruct the surface from a capture, rendered or real"),
+    Verb("freehand", "put tracked B-scans into a volume, for 3D Slicer too"),
     Verb("evaluate", "compare a surface with a rendered capture's ground truth"),
     Verb("accuracy", "measure errors of the twin's rig and compare with the paper's figures"),
 )

@@ -18,6 +18,8 @@ EXTRAS = ("twin", "train", "dev")
 MODULES = {  # where a package isn't imported by the name that it is installed by
     "hydra-core": "hydra",
     "opencv-contrib-python-headless": "cv2",
+    "pynrrd": "nrrd",
+    "simpleitk": "SimpleITK",
     "pytest-xdist": "xdist",
     "pyyaml": "yaml",
 }

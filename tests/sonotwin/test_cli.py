@@ -10,7 +10,7 @@ import pytest
 from recon.errors import InputError
 from sonotwin import cli
 
-VERBS = sorted(path.stem for path in Path(cli.__file__).with_name("verbs").glob("[a-z]*.py"))
+VERBS = sorted(path.stem.replace("_", "-") for path in Path(cli.__file__).with_name("verbs").glob("[a-z]*.py"))
 
 
 def complaint(capsys, *arguments: str) -> str:

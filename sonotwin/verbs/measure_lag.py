@@ -1,0 +1,121 @@
+"""Measure by how much the scanner's images lag behind the poses of the tracker.
+
+Reads the sweep part of a capture folder: the probe moved up and down over a flat bottom in water, by 10 mm or more, three times
+or more, at an uneven pace. Writes into the folder `out`: lag.json, with lag_s for the other commands; depths.csv, the bottom's
+depth in each B-scan; and metrics.json. Results that are there already are replaced. Takes seconds.
+
+    sonotwin measure-lag capture=outputs/bottom/capture out=outputs/lag
+    sonotwin freehand capture=outputs/sweep/capture lag_s=0.0503 out=outputs/volume
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from rich.console import Console
+
+from recon import atomic, lag, metrics, sweep_capture, sweep_tables
+from recon.errors import InputError
+from recon.lag import Lag
+from recon.metrics import Metrics
+from recon.rig import Finite
+from recon.sweep_capture import SweepCapture
+
+LAG = "lag.json"  # by which the folder of a lag is known
+DEPTHS = "depths.csv"
+HEADER = ("frame", "time_ns", "depth_px", "residual_px", "used")
+
+Array = NDArray[np.float64]
+
+
+class Config(BaseModel):
+    """Fields of `conf/measure-lag.yaml`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    capture: Path
+    out: Path
+    search_s: tuple[Finite, Finite] = lag.SEARCH_S
+    top_px: Annotated[int, Field(ge=0)] = 40
+
+    @field_validator("search_s")
+    @classmethod
+    def _in_order(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not 0 < value[1] - value[0] <= 1e3:
+            raise ValueError(
+                f"expected two lags, the less one first and at most 1000 s apart, found {value[0]:g} and {value[1]:g}"
+            )
+        return value
+
+
+def run(config: Config) -> None:
+    """Find the bottom in all B-scans, compare its depth with the probe's height, and write.
+
+    Raises
+    ------
+    InputError
+        If the capture is incomplete or damaged, the motion doesn't tell the lag, or `out` can't be written to.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    atomic.check_folder(config.out, LAG, inputs=[config.capture])
+    sweep = sweep_capture.read_sweep(config.capture)
+    start = perf_counter()
+    with console.status("looking for the bottom"):
+        depths = np.array([lag.bottom_depth(image, config.top_px) for image in sweep.images()])
+    seconds = perf_counter() - start
+    found_in = f"bottom in {np.isfinite(depths).sum()} of {len(depths)} B-scans"
+    console.print(f"find        {found_in}, {len(sweep.track.times)} poses, {seconds:.0f} s", markup=False)
+    try:
+        found = lag.estimate(sweep.times, depths, sweep.track, config.search_s)
+    except InputError as error:
+        raise InputError(f"{sweep.name}: {error}") from None
+    figures = measure(depths, found) | {"seconds_find": round(seconds, 3)}
+    for line in describe(figures):
+        console.print(line, markup=False)
+    written = write(config.out, sweep, depths, found, figures)
+    console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
+
+
+def measure(depths: Array, found: Lag) -> Metrics:
+    """Figures of a lag, each named with its unit."""
+    return {
+        "frames": len(depths),
+        "frames_with_bottom": int(np.isfinite(depths).sum()),
+        "frames_used": int(found.used.sum()),
+        "lag_ms": 1e3 * found.seconds,
+        "lag_sigma_ms": 1e3 * found.sigma_s,
+        "lag_low_ms": 1e3 * found.interval_s[0],
+        "lag_high_ms": 1e3 * found.interval_s[1],
+        "jitter_ms": 1e3 * found.jitter_s,
+        "depth_sigma_px": found.depth_sigma,
+    }
+
+
+def describe(figures: Metrics) -> Iterator[str]:
+    """Lines that say the lag with its interval, and what scatters."""
+    interval = f"{figures['lag_low_ms']:.1f} to {figures['lag_high_ms']:.1f} ms"
+    yield f"lag         {figures['lag_ms']:.1f} ms, {interval} ({100 * lag.COVERAGE:.0f} %), the images after the poses"
+    scatter = f"{figures['depth_sigma_px']:.2f} px of depth, {figures['jitter_ms']:.1f} ms of the time stamps"
+    yield f"scatter     {scatter} (1 sigma); {figures['frames_used']} B-scans used"
+
+
+def write(out: Path, sweep: SweepCapture, depths: Array, found: Lag, figures: Metrics) -> list[str]:
+    """Write all files, whole or not at all; returns their names."""
+    content = {"lag_s": found.seconds, "sigma_s": found.sigma_s, "interval_s": list(found.interval_s), "coverage": lag.COVERAGE}
+    with atomic.new_folder(out, LAG) as folder:
+        (folder / LAG).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        sweep_tables.write_rows(folder / DEPTHS, HEADER, rows(sweep, depths, found))
+        metrics.write(folder / metrics.FILE, figures)
+    return [LAG, DEPTHS, metrics.FILE]
+
+
+def rows(sweep: SweepCapture, depths: Array, found: Lag) -> Iterator[Sequence[object]]:
+    """What was found in each B-scan, in the order of HEADER; empty where there is nothing."""
+    for frame, time, depth, residual, used in zip(sweep.frames, sweep.times, depths, found.residuals, found.used, strict=True):
+        shown = ["" if np.isnan(value) else f"{value:.3f}" for value in (depth, residual)]
+        yield frame, time, *shown, int(used)

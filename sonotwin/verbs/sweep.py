@@ -1,0 +1,91 @@
+"""Render a freehand ultrasound sweep of a scene, as scanner and tracking cameras would have recorded it, with its ground truth.
+
+Reads the rig, the scene, the transducer and the probe's path from conf/. Writes OUT/capture/, which calibrate-probe, measure-lag
+and freehand read like any hardware's: B-scans and tracked poses by their own clocks, and the probe's calibration, except with
+path=wire, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times, and labels of what
+each pixel shows. Takes about
+a quarter of a second a B-scan on two cores, half a minute for the default stroke, and ten seconds more when it first compiles.
+
+    sonotwin sweep out=outputs/sweep
+    sonotwin sweep scene=tank ultrasound=water path=bob out=outputs/bottom
+    sonotwin sweep scene=crosswire ultrasound=water path=wire out=outputs/wires
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from rich.console import Console
+from rich.progress import Progress
+
+from recon.rig import Rig
+from scenes.catalogue import build_scene
+from twin.ultrasound import session
+from twin.ultrasound.probe_path import WirePath
+from twin.ultrasound.scan import Scan
+from twin.ultrasound.solids import Body, body
+from twin.ultrasound.sweep import Clocks, Plan, PoseNoise, scans
+from twin.ultrasound.transducer import Transducer
+
+
+class Config(BaseModel):
+    """Fields of `conf/sweep.yaml`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rig: Rig
+    scene: dict
+    ultrasound: Transducer
+    path: session.AnyPath
+    out: Path
+    clocks: Clocks = Clocks()
+    pose_noise: PoseNoise = PoseNoise()
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _one_scanner(self) -> "Config":
+        for name in ("image_size", "scale_mm_per_px"):
+            design, found = getattr(self.rig.probe, name), getattr(self.ultrasound, name)
+            if design != found:
+                raise ValueError(f"ultrasound.{name}: expected rig.probe's {list(design)}, found {list(found)}")
+        return self
+
+
+def run(config: Config) -> None:
+    """Render, and say what was written.
+
+    Raises
+    ------
+    InputError
+        If the scene has no acoustics or not what the path is about, or `out` can't be written to.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    session.check_places(config.out)
+    with console.status("setting up the scene"):
+        scene = build_scene(config.scene)
+        scanned = body(scene)
+        planned = session.plan_sweep(
+            config.path, config.rig, scanned, config.ultrasound, config.clocks, config.pose_noise, config.seed
+        )
+    count = len(planned.times)
+    console.print(f"path        {config.path.kind}, {count} B-scans, {len(planned.track.times)} poses")
+    probe = None if isinstance(config.path, WirePath) else session.calibration_of(config.rig)
+    settings = config.model_dump(mode="json", exclude={"out"})
+    start = perf_counter()
+    taken = shown(scanned, config, planned, console)
+    session.write_session(config.out, scene, scanned, config.ultrasound, planned, taken, probe, settings)
+    seconds = perf_counter() - start
+    width, height = config.ultrasound.image_size
+    console.print(f"render      {count} B-scans, {width}x{height}, {seconds:.1f} s")
+    console.print(f"wrote       {config.out}/{{capture,truth}}", markup=False)
+
+
+def shown(scanned: Body, config: Config, planned: Plan, console: Console) -> Iterator[Scan]:
+    """Take the images one by one, and show how far it is."""
+    scan_seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        taken = scans(scanned, config.ultrasound, planned, scan_seed)
+        yield from progress.track(taken, total=len(planned.times), description="rendering B-scans")

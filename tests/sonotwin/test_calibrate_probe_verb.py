@@ -1,0 +1,164 @@
+"""`sonotwin calibrate-probe`, from B-scans of crossed wires to files."""
+
+import contextlib
+import csv
+import io
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon import probe_calibration, probe_files, repeatability, rigid, sweep_tables, water
+from sonotwin.cli import main
+from tests.recon import bscans, probe_motions, sweep_sets
+
+LAG_S = 0.03
+FILES = ["US_params.npz", "frames.csv", "metrics.json", "probe.yaml"]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory, rig) -> Path:
+    return sweep_sets.wires(tmp_path_factory.mktemp("wires") / "capture", rig, np.random.default_rng(0), LAG_S)
+
+
+def calibrate(*fields: str) -> list[str]:
+    """Lines that were said."""
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert main(["calibrate-probe", *fields]) == 0
+    return said.getvalue().splitlines()
+
+
+@pytest.fixture(scope="module")
+def calibrated(capture) -> tuple[Path, list[str]]:
+    """The folder of a calibration as measured, and what was said."""
+    out = capture.parent / "probe"
+    return out, calibrate(f"capture={capture}", f"out={out}", f"lag_s={LAG_S}")
+
+
+def test_b_scans_become_a_calibration(calibrated, rig):
+    """The place of every corner is as sure as is said: within 4 sigma, of some 0.1 mm."""
+    out, lines = calibrated
+    assert sorted(path.name for path in out.iterdir()) == FILES
+    found, true = probe_files.read(out / "probe.yaml"), sweep_sets.probe_in_water(rig)
+    pixels = repeatability.five_points(bscans.SIZE)
+    sigma = np.sqrt(np.trace(probe_calibration.point_covariance(found, pixels), axis1=1, axis2=2))
+    away = np.linalg.norm(found.to_target(pixels) - true.to_target(pixels), axis=1)
+    assert (away < 4 * sigma).all() and sigma.max() < 0.2
+    figures = json.loads((out / "metrics.json").read_text())
+    assert (figures["frames"], figures["frames_rejected"]) == (30, 2)
+    assert figures["frames_used"] + figures["frames_outliers"] == 28
+    assert figures["sigma_bottom_right_mm"] == pytest.approx(sigma[4])
+    assert [line.split()[0] for line in lines] == [
+        *("find", "rejected", "rejected", "calibrate", "probe", "uncertain", "sound", "depth", "wrote")
+    ]
+    assert re.fullmatch(r"find +30 frames, 321x408: crossing in 28, 2 rejected, \d+ s", lines[0])
+    assert "1 no echo stands out: frame 4" in lines[1] and "1 the target was not tracked: frame 12" in lines[2]
+
+
+def test_the_authors_program_reads_it(calibrated):
+    """Equation 1 with the names of the authors' file puts a pixel where the calibration does."""
+    out, _ = calibrated
+    with np.load(out / "US_params.npz") as file:
+        point = file["T_I_T"] @ [file["sx"] * 100, file["sy"] * 200, 0, 1]
+    assert point[:3] == pytest.approx(probe_files.read(out / "probe.yaml").to_target([100, 200]), abs=1e-9)
+
+
+def test_every_frame_is_accounted_for(calibrated):
+    out, _ = calibrated
+    with (out / "frames.csv").open(newline="") as stream:
+        table = list(csv.DictReader(stream))
+    assert [int(row["frame"]) for row in table] == list(range(30))
+    assert table[sweep_sets.BLANK]["status"] == table[sweep_sets.UNTRACKED]["status"] == "rejected"
+    assert table[sweep_sets.BLANK]["reason"] == "no echo stands out"
+    used = [float(row["residual_mm"]) for row in table if row["status"] == "used"]
+    figures = json.loads((out / "metrics.json").read_text())
+    assert np.sqrt(np.mean(np.square(used))) == pytest.approx(figures["rms_mm"], abs=1e-3)
+
+
+def test_the_scale_tells_the_speed_of_sound_in_the_water(calibrated):
+    """1488 m/s at 22 degrees, though nobody has told the temperature."""
+    figures = json.loads((calibrated[0] / "metrics.json").read_text())
+    expected = float(water.speed_of_sound(sweep_sets.WATER_C))
+    assert abs(figures["implied_speed_m_per_s"] - expected) < 4 * figures["implied_speed_sigma_m_per_s"] < 10
+    assert figures["water_speed_m_per_s"] is None
+
+
+def test_the_temperature_makes_it_fit_tissue(capture, calibrated, rig, tmp_path):
+    """In water the scanner shows depths 3.4 % too deep; converted, its own scale comes back, which is right for tissue."""
+    lines = calibrate(f"capture={capture}", f"out={tmp_path / 'out'}", f"lag_s={LAG_S}", f"temperature_c={sweep_sets.WATER_C}")
+    found, measured = (probe_files.read(folder / "probe.yaml") for folder in (tmp_path / "out", calibrated[0]))
+    ratio = water.SCANNER_SPEED / float(water.speed_of_sound(sweep_sets.WATER_C))
+    assert found.scale[1] / measured.scale[1] == pytest.approx(ratio, rel=1e-9)
+    assert abs(found.scale[1] - rig.probe.scale_mm_per_px[1]) < 4 * found.uncertainty.sigma("sy")
+    assert found.uncertainty.sigma("sy") > ratio * measured.uncertainty.sigma("sy"), "the thermometer's share"
+    (said,) = (line for line in lines if line.startswith("water "))
+    assert "1488.4 m/s" in said and "1.68 mm too deep at 50 mm" in said
+    (said,) = (line for line in lines if line.startswith("depth "))
+    assert "converted from this water to 1540 m/s" in said
+
+
+def test_pairs_found_elsewhere_give_the_same_kind_of_result(rig, rng, tmp_path):
+    probe = probe_motions.true_probe(rig)
+    seen = probe_motions.observe(probe, *probe_motions.motion(rig), rng)
+    table = np.column_stack([seen.poses[:, :3].reshape(-1, 12), seen.pixels])
+    sweep_tables.write_rows(tmp_path / "pairs.csv", sweep_tables.PAIRS, table.tolist())
+    lines = calibrate(f"pairs={tmp_path / 'pairs.csv'}", f"out={tmp_path / 'out'}")
+    found = probe_files.read(tmp_path / "out" / "probe.yaml")
+    assert np.linalg.norm(found.to_target([160, 204]) - probe.to_target([160, 204])) < 0.3
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
+    assert "crossing in 30, 0 rejected" in lines[0]
+
+
+def complaint(capsys, *fields: str) -> str:
+    assert main(["calibrate-probe", *fields]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line.removeprefix("sonotwin: ")
+
+
+def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, rig, rng, tmp_path, capsys):
+    out = tmp_path / "out"
+    fields = [f"capture={capture}", f"out={out}"]
+    assert complaint(capsys, f"out={out}") == "calibrate-probe: expected capture or pairs, found neither"
+    assert complaint(capsys, *fields, "pairs=a.csv") == "calibrate-probe: expected capture or pairs, found both"
+    assert complaint(capsys, *fields, "noise.angle_deg=-1").startswith("calibrate-probe: noise.angle_deg: expected finite")
+    assert complaint(capsys, *fields, "temperature_c=120").startswith("temperature_c: expected 0 to 95 degrees Celsius")
+    assert "are the clocks others?" in complaint(capsys, *fields, "lag_s=100")
+    assert complaint(capsys, f"pairs={tmp_path / 'a.csv'}", f"out={out}").endswith("a.csv: expected a file, found none")
+    darker = "appearance.min_contrast_db=55"
+    found = complaint(capsys, *fields, f"lag_s={LAG_S}", darker)
+    assert found == ("wires: expected 6 frames or more with a pose and the crossing, found 0 (most often: no echo stands out)")
+    turned = ["rig.probe.target_from_image.rotation_deg=[0,0,0]", f"lag_s={LAG_S}"]
+    assert complaint(capsys, *fields, *turned).startswith("wires: calibration: expected target_from_image near its design")
+    copied = shutil.copytree(capture, tmp_path / "capture")
+    image = copied / "sweep" / "us" / "0007.png"
+    image.write_bytes(image.read_bytes()[:-30])
+    assert complaint(capsys, f"capture={copied}", f"out={out}").startswith(f"{image}: expected a whole PNG image")
+    assert not out.exists()
+
+
+def test_a_motion_without_turns_is_named(rig, tmp_path, capsys):
+    """A probe that is only moved about tells nothing of where its image is."""
+    probe = probe_motions.true_probe(rig)
+    pixels = probe_motions.motion(rig)[1]
+    table = []
+    for pixel in pixels:
+        pose = rigid.transform(probe_motions.LOOKING_AWAY @ probe.target_from_image[:3, :3].T, np.zeros(3))
+        pose[:3, 3] = probe_motions.WIRE - rigid.apply(pose, probe.to_target(pixel))
+        table.append([*pose[:3].ravel(), *pixel])
+    sweep_tables.write_rows(tmp_path / "pairs.csv", sweep_tables.PAIRS, table)
+    found = complaint(capsys, f"pairs={tmp_path / 'pairs.csv'}", f"out={tmp_path / 'out'}")
+    assert "pairs.csv: motion: expected turns of the probe about two axes" in found
+
+
+def test_other_folders_are_not_replaced(capture, tmp_path, capsys):
+    """Not even a capture's calibration folder, where a probe.yaml may lie beside the cameras' file."""
+    out = tmp_path / "calibration"
+    out.mkdir()
+    for name in ("probe.yaml", "optics.yaml"):
+        (out / name).write_text("mine")
+    assert "expected a new or empty folder or one with frames.csv" in complaint(capsys, f"capture={capture}", f"out={out}")
+    assert "apart from what is read" in complaint(capsys, f"capture={capture}", f"out={capture.parent}")
+    assert len(list(out.iterdir())) == 2

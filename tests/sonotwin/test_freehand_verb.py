@@ -1,0 +1,136 @@
+"""`sonotwin freehand`, from a sweep or a sequence of the PLUS toolkit to a volume."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon import probe_files, sequences, sweep_capture, volumes
+from sonotwin.cli import main
+from tests.recon import sweep_sets
+
+LAG_S = 0.2
+PLUS = """<PlusConfiguration version="2.1">
+  <VolumeReconstruction OutputSpacing="0.8 0.8 0.8" Interpolation="NEAREST_NEIGHBOR" CompoundingMode="MAXIMUM" FillHoles="OFF"/>
+</PlusConfiguration>
+"""
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory, rig) -> Path:
+    return sweep_sets.ball(tmp_path_factory.mktemp("ball") / "capture", rig, LAG_S)
+
+
+@pytest.fixture(scope="module")
+def reconstructed(capture) -> Path:
+    out = capture.parent / "volume"
+    assert main(["freehand", f"capture={capture}", f"lag_s={LAG_S}", f"out={out}"]) == 0
+    return out
+
+
+def ball_of(path: Path) -> tuple[np.ndarray, float]:
+    """Centre and volume (mm, mm^3) of what is bright."""
+    volume = volumes.read_volume(path)
+    k, j, i = np.nonzero(volume.voxels > 110)
+    corners = np.column_stack([i, j, k, np.ones(len(i))]) @ volume.world_from_voxel.T
+    return corners[:, :3].mean(axis=0), len(i) * float(np.prod(volume.spacing))
+
+
+BALL_MM3 = 4 / 3 * np.pi * sweep_sets.BALL_MM**3
+
+
+def test_the_ball_is_where_it_is_and_as_large(reconstructed):
+    """Within a half voxel; 905 mm^3 within 5 %, its surface being 452 mm^2 and half-filled voxels counting either way."""
+    centre, content = ball_of(reconstructed / "volume.nrrd")
+    assert np.linalg.norm(centre - sweep_sets.BALL) < 0.25
+    assert content == pytest.approx(BALL_MM3, rel=0.05)
+    figures = json.loads((reconstructed / "metrics.json").read_text())
+    assert (figures["frames"], figures["frames_placed"]) == (41, 41)
+    assert 0 < figures["pasted_fraction"] <= figures["filled_fraction"] <= 1
+
+
+def test_a_lag_that_is_not_told_moves_the_ball(capture, reconstructed, tmp_path):
+    """The probe moves at 10 mm/s, so that 0.2 s are 2 mm along the sweep."""
+    assert main(["freehand", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 0
+    away = ball_of(tmp_path / "out" / "volume.nrrd")[0] - ball_of(reconstructed / "volume.nrrd")[0]
+    assert np.linalg.norm(away) == pytest.approx(10 * LAG_S, abs=0.3)
+
+
+def test_the_sequence_is_the_sweep_for_slicer(capture, reconstructed, rig):
+    """Images, poses and times, by which PLUS would put the B-scans where they are put here."""
+    frames = sequences.read_sequence(reconstructed / "sequence.igs.mha")
+    sweep = sweep_capture.read_sweep(capture)
+    np.testing.assert_array_equal(frames.images, np.stack(list(sweep.images())))
+    ours = sweep.poses(LAG_S) @ sequences.target_from_pixel(sweep.probe)
+    np.testing.assert_allclose(sequences.poses(frames, "Reference", "Image"), ours, atol=1e-9)
+    np.testing.assert_allclose(np.diff(frames.times_s), 0.05, atol=1e-6)
+    assert sorted(path.name for path in reconstructed.iterdir()) == ["metrics.json", "sequence.igs.mha", "volume.nrrd"]
+
+
+def test_a_sequence_gives_the_same_volume(reconstructed, tmp_path):
+    assert main(["freehand", f"sequence={reconstructed / 'sequence.igs.mha'}", f"out={tmp_path / 'out'}"]) == 0
+    ours, theirs = (volumes.read_volume(folder / "volume.nrrd") for folder in (reconstructed, tmp_path / "out"))
+    np.testing.assert_array_equal(ours.voxels, theirs.voxels)
+    np.testing.assert_allclose(ours.origin, theirs.origin, atol=1e-9)
+    assert not (tmp_path / "out" / "sequence.igs.mha").exists()
+
+
+def test_a_sequence_by_the_configuration_of_plus(reconstructed, tmp_path, capsys):
+    (tmp_path / "plus.xml").write_text(PLUS)
+    fields = [f"sequence={reconstructed / 'sequence.igs.mha'}", f"config={tmp_path / 'plus.xml'}", f"out={tmp_path / 'out'}"]
+    assert main(["freehand", *fields]) == 0
+    volume = volumes.read_volume(tmp_path / "out" / "volume.nrrd")
+    np.testing.assert_allclose(volume.spacing, 0.8)
+    np.testing.assert_allclose(volume.directions, np.eye(3), atol=1e-12)
+    assert np.linalg.norm(ball_of(tmp_path / "out" / "volume.nrrd")[0] - sweep_sets.BALL) < 0.4
+    assert "voxels of 0.8 mm, by " in capsys.readouterr().out
+
+
+def test_fields_of_the_volume(capture, tmp_path, capsys):
+    """Along the world's axes, coarser, of a part of each image around the ball, with holes left open."""
+    fields = ["extent=aligned", "spacing_mm=1", "clip=[20,20,40,60]", "hole_voxels=0", "compounding=maximum"]
+    assert main(["freehand", f"capture={capture}", f"lag_s={LAG_S}", f"out={tmp_path / 'out'}", *fields]) == 0
+    volume = volumes.read_volume(tmp_path / "out" / "volume.nrrd")
+    np.testing.assert_allclose(volume.spacing, 1.0)
+    figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert figures["pasted_fraction"] == figures["filled_fraction"]
+    # 39 px by 59 px of 0.49 mm, tilted by 20 degrees: 27.9 and 33.8 mm along x and z; 20 mm of sweep along y
+    assert volume.voxels.shape[::-1] == (29, 21, 35) and set(np.unique(volume.voxels)) == {0, 20, 200}
+    assert "aligned, maximum, nearest" in capsys.readouterr().out
+
+
+def test_another_calibration_takes_the_place_of_the_captures(capture, reconstructed, rig, tmp_path):
+    """Moved by 3 mm along the depth, it moves the ball as far."""
+    probe = sweep_capture.read_sweep(capture).probe
+    moved = probe.target_from_image.copy()
+    moved[:3, 3] += 3 * moved[:3, 1]
+    probe_files.write(tmp_path / "probe.yaml", type(probe)(moved, probe.scale))
+    fields = [f"capture={capture}", f"lag_s={LAG_S}", f"probe={tmp_path / 'probe.yaml'}", f"out={tmp_path / 'out'}"]
+    assert main(["freehand", *fields]) == 0
+    away = ball_of(tmp_path / "out" / "volume.nrrd")[0] - ball_of(reconstructed / "volume.nrrd")[0]
+    assert np.linalg.norm(away) == pytest.approx(3, abs=0.1)
+
+
+def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, reconstructed, rig, tmp_path, capsys):
+    out = tmp_path / "out"
+
+    def complaint(*fields: str) -> str:
+        assert main(["freehand", f"out={out}", *fields]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("sonotwin: ")
+
+    bare, sequence = sweep_sets.ball(tmp_path / "bare", rig, with_probe=False), reconstructed / "sequence.igs.mha"
+    assert complaint() == "freehand: expected capture or sequence, found neither"
+    assert complaint(f"capture={bare}") == f"{bare}: expected the probe's calibration, found none; give probe=..."
+    assert complaint(f"capture={capture}", "config=a.xml").startswith("freehand: config: expected a configuration with a seq")
+    assert complaint(f"sequence={sequence}", "lag_s=0.1").startswith("freehand: lag_s: expected none with a sequence")
+    assert complaint(f"sequence={sequence}", "probe=a", "config=b").startswith("freehand: probe: expected none with a config")
+    both = ["compounding=integer_mean", "interpolation=linear"]
+    assert complaint(f"capture={capture}", *both).startswith("freehand: interpolation: expected nearest with integer_mean")
+    assert complaint(f"capture={capture}", "spacing_mm=0.01").startswith("volume: expected at most 4.0 GiB, found ")
+    assert complaint(f"capture={capture}", "clip=[90,0,10,10]").startswith("clip: expected a part of an image of 80x100")
+    assert complaint(f"capture={capture}", "clip=[0,0,0,10]").startswith("freehand: clip.2: expected ")
+    assert complaint(f"capture={capture}", f"probe={tmp_path}").startswith(f"{tmp_path}: expected a probe's calibration")
+    assert complaint(f"sequence={tmp_path / 'a.igs.mha'}").startswith(f"{tmp_path / 'a.igs.mha'}: expected ")
+    assert not out.exists()

@@ -1,0 +1,48 @@
+"""`sonotwin measure-lag`, from B-scans of a tank's bottom to the lag."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonotwin.cli import main
+from tests.recon import sweep_sets
+
+LAG_S = 0.0473
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return sweep_sets.bottom(tmp_path_factory.mktemp("bottom") / "capture", np.random.default_rng(0), LAG_S)
+
+
+def test_the_lag_is_found_and_said(capture, tmp_path, capsys):
+    out = tmp_path / "lag"
+    assert main(["measure-lag", f"capture={capture}", f"out={out}"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["find", "lag", "scatter", "wrote"]
+    assert lines[0].startswith("find        bottom in 86 of 86 B-scans, 252 poses") and "lag         47.3 ms, 47." in lines[1]
+    found, figures = json.loads((out / "lag.json").read_text()), json.loads((out / "metrics.json").read_text())
+    assert found["lag_s"] == pytest.approx(LAG_S, abs=0.001)
+    assert found["interval_s"][0] <= found["lag_s"] <= found["interval_s"][1] and found["sigma_s"] > 0
+    assert figures["lag_ms"] == pytest.approx(1e3 * found["lag_s"])
+    with (out / "depths.csv").open(newline="") as stream:
+        depths = [float(row["depth_px"]) for row in csv.DictReader(stream)]
+    assert len(depths) == 86 and 150 < np.ptp(depths) < 200, "18 to 24 mm of 0.1225 mm/px"
+
+
+def test_what_is_wrong_is_said_in_one_line(capture, tmp_path, capsys):
+    def complaint(*fields: str) -> str:
+        assert main(["measure-lag", f"capture={capture}", f"out={tmp_path / 'out'}", *fields]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("sonotwin: ")
+
+    assert complaint("search_s=[0.5,-0.5]").startswith("measure-lag: search_s: expected two lags, the less one first")
+    assert complaint("search_s=[-0.5,0.03]").startswith("bottom: search_s: expected the lag within -0.5 to 0.03 s")
+    assert complaint("search_s=[50,51]").startswith("bottom: times: expected poses at 60 % of the images or more")
+    assert complaint("top_px=407") == "bottom: depths: expected at least 20 images that show the bottom, found 0"
+    assert complaint("top_px=-1").startswith("measure-lag: top_px: expected ")
+    assert "expected a folder apart from what is read" in complaint(f"out={capture}")
+    assert not (tmp_path / "out").exists()

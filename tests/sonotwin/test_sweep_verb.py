@@ -1,0 +1,131 @@
+"""`sonotwin sweep`: what it writes, what the pipeline makes of it, and what it refuses before it renders."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon import rigid, volumes
+from recon.sweep_capture import read_sweep
+from sonotwin.cli import main
+
+
+def small(width: int, height: int) -> list[str]:
+    """A narrow, shallow image of the same scanner."""
+    return [f"{part}.image_size=[{width},{height}]" for part in ("rig.probe", "ultrasound")]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def stroke(tmp_path_factory) -> Path:
+    """Nine B-scans along a cyst of the test object, 12 mm deep."""
+    out = tmp_path_factory.mktemp("stroke") / "out"
+    fields = ["scene=test_object", "path.start_mm=[5,-6]", "path.end_mm=[5,-2]", "clocks.scanner_jitter_s=0", *small(48, 128)]
+    assert main(["sweep", f"out={out}", *fields]) == 0
+    return out
+
+
+def test_the_capture_is_one_of_a_calibrated_rig(stroke, rig):
+    """Tracked poses, taken through the probe's calibration, are the true ones to within the tracker's noise."""
+    sweep = read_sweep(stroke / "capture")
+    truth = np.load(stroke / "truth" / "sweep" / "sweep.npz")
+    assert (sweep.size, len(sweep.paths)) == ((48, 128), 9)
+    assert sweep.times - truth["times_ns"] == pytest.approx(np.full(9, 50_000_000))
+    assert sweep.probe is not None and sweep.probe.scale.tolist() == list(rig.probe.scale_mm_per_px)
+    found = sweep.poses(lag_s=0.05) @ sweep.probe.target_from_image
+    apart = np.linalg.norm(found[:, :3, 3] - truth["world_from_image"][:, :3, 3], axis=1)
+    assert 0.005 < np.nanmax(apart) < 1.0, "0.05 deg over 140 mm are 0.12 mm an axis; five times that, and the shift"
+
+
+def test_labels_say_what_the_pixels_show(stroke):
+    """Pixels labelled cyst are dark, those labelled block are bright."""
+    names = json.loads((stroke / "truth" / "scene.json").read_text())["labels"]
+    cysts = [number for number, name in enumerate(names) if name.startswith("cyst")]
+    images = np.stack(list(read_sweep(stroke / "capture").images()))
+    files = sorted((stroke / "truth" / "sweep" / "labels").iterdir())
+    labels = np.stack([cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in files])
+    deep = np.arange(128)[:, None] > 40  # clear of the face's ringing
+    block, cyst = images[(labels == names.index("block")) & deep], images[np.isin(labels, cysts) & deep]
+    assert cyst.size > 1000 and np.median(block) > np.median(cyst) + 40
+
+
+def test_freehand_makes_a_volume_of_it(stroke, tmp_path):
+    assert main(["freehand", f"capture={stroke / 'capture'}", "lag_s=0.05", f"out={tmp_path / 'volume'}"]) == 0
+    voxels = volumes.read_volume(tmp_path / "volume" / "volume.nrrd").voxels
+    assert (voxels > 0).mean() > 0.3 and 4 / 0.5 <= min(voxels.shape) <= 12, "a stroke of 4 mm, and what the hand adds"
+
+
+def test_measure_lag_finds_the_lag(tmp_path):
+    """A steady hand over a tank's bottom: the lag that the clocks have lies in the interval that is said."""
+    fields = ["scene=tank", "ultrasound=water", "path=bob", "path.height_mm=6", "path.middle_mm=[4,-2,676]", "path.seconds=4.5"]
+    fields += ["path.hand.turn_deg=0", "clocks.scanner_hz=8", "clocks.lag_s=0.083", *small(32, 280)]
+    assert main(["sweep", f"out={tmp_path / 'out'}", *fields]) == 0
+    assert main(["measure-lag", f"capture={tmp_path / 'out' / 'capture'}", f"out={tmp_path / 'lag'}"]) == 0
+    found = json.loads((tmp_path / "lag" / "lag.json").read_text())
+    low, high = found["interval_s"]
+    assert low <= 0.083 <= high and high - low < 0.03
+
+
+def test_wires_cross_where_the_protocol_has_them(tmp_path):
+    """In the image plane near its corners, with the target at rest and no calibration given; same seed, same bytes."""
+    fields = ["scene=crosswire", "ultrasound=water", "path=wire", "path.count=3", "path.rest_s=0.2", *small(48, 128)]
+    for name, seed in (("one", 3), ("two", 3), ("other", 4)):
+        assert main(["sweep", f"out={tmp_path / name}", f"seed={seed}", *fields]) == 0
+    one, two, other = (contents(tmp_path / name) for name in ("one", "two", "other"))
+    assert one == two and one.keys() == other.keys()
+    assert one["capture/sweep/us/0000.png"] != other["capture/sweep/us/0000.png"]
+    sweep = read_sweep(tmp_path / "one" / "capture")
+    assert sweep.probe is None and np.isfinite(sweep.poses()).all(), "a lag of 50 ms within a rest of 200"
+    poses = np.load(tmp_path / "one" / "truth" / "sweep" / "sweep.npz")["world_from_image"]
+    places = np.stack([rigid.apply(rigid.invert(pose), [4.0, -2.0, 660.0]) for pose in poses])
+    assert np.abs(places[:, 2]).max() < 1e-6
+    shown = places[:, :2] / [0.1229, 0.1225 * 1488.3 / 1540]
+    assert np.abs(shown / [47, 127] - 0.5) == pytest.approx(np.tile([0.44, 0.40], (3, 1)), abs=0.01)
+    for image, (u, v) in zip(sweep.images(), shown, strict=True):
+        u, v = round(u), round(v)
+        assert image[max(v - 3, 0) : v + 4, max(u - 3, 0) : u + 4].max() > np.median(image) + 60, "an echo of the wires"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["scene=plane"], "scene: plane: expected one with acoustics (breast,"),
+        (["scene=tank", "path.surface=breast"], "path.surface: expected one of tank, found breast"),
+        (["scene=tank"], "path.surface: expected a scene with a solid to stroke over, found none"),
+        (["scene=tank", "path.surface=tank", "path.start_mm=[4,90]"], "path: expected the probe over tank, found it beside at"),
+        (["scene=tank", "path.surface=tank", "path.end_mm=[4,-35]"], "end_mm: expected a stroke of some length, found 0 mm"),
+        (["scene=tank", "path=wire"], "path: expected a scene of two crossed wires, such as scene=crosswire, found no wires"),
+        (["scene=tank", "path=bob", "path.height_mm=40"], "path: expected the probe in front of all things, found it in tank"),
+        (["scene=tank", "path=bob", "path.seconds=0.04"], "path: expected one that lasts two images, found 0.040 s"),
+        (
+            ["scene=cylinders", "path.surface=inner", "path.start_mm=[0,-2]", "path.end_mm=[2,-2]"],
+            "path: expected the probe in front of all things, found it in outer after 0.00 s",
+        ),
+        (["path=wires"], "path: expected one of bob, stroke, wire, found wires; did you mean wire?"),
+        (["path.kind=fly"], "path.kind: expected one of 'stroke', 'bob', 'wire', found 'fly'"),
+        (["path.speed_mm_s=0"], "speed_mm_s: expected greater than 0, found 0"),
+        (["ultrasound.image_size=[96,96]"], "ultrasound.image_size: expected rig.probe's [321, 408], found [96, 96]"),
+        (["clocks.scanner_hz=0"], "clocks.scanner_hz: expected greater than 0, found 0"),
+        (["pose_noise.turn_deg=-1"], "pose_noise.turn_deg: expected greater than or equal to 0, found -1"),
+        (["seed=-1"], "seed: expected greater than or equal to 0, found -1"),
+    ],
+)
+def test_nonsense_is_refused_by_name(arguments, complaint, tmp_path, capsys):
+    """One line, exit status 2, nothing written."""
+    assert main(["sweep", f"out={tmp_path / 'out'}", *arguments]) == 2
+    message = capsys.readouterr().err
+    assert complaint in message and message.count("\n") == 1 and message.startswith("sonotwin: ")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_place_that_is_taken_is_refused(tmp_path, capsys):
+    (tmp_path / "out" / "capture").mkdir(parents=True)
+    (tmp_path / "out" / "capture" / "thesis.tex").write_text("years of work")
+    assert main(["sweep", f"out={tmp_path / 'out'}"]) == 2
+    assert "expected a new or empty folder" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["capture"]
