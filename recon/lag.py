@@ -1,9 +1,11 @@
 """Time calibration: by how much the scanner's images lag behind the poses, from an up-and-down motion over a flat bottom.
 
-The bottom's depth in the image follows the probe's height: `depth(t) = a + b height(t - lag)`. Both streams have time stamps of
-their own, so neither jitter nor dropped frames matter beyond the errors that they are: the height is interpolated at the moment
-that each image was taken. Wanted is an offset of the clocks and delays together; where the clocks drift against each other by
-50 ppm it changes by 3 ms a minute, so calibrate anew for long sessions.
+The bottom's depth in the image follows the probe: `depth(t) = a + b . x(t - lag)` with six coordinates x of its pose. Above all
+it follows the height; but the target stands off from the array, so that a hand that tilts by half a degree moves the one by a
+millimetre and not the other. For tilts of some degrees depth is linear in the coordinates, and needs no calibrated probe. Both
+streams have time stamps of their own, so neither jitter nor dropped frames matter beyond the errors that they are: the pose is
+interpolated at the moment that each image was taken. Wanted is an offset of the clocks and delays together; where the clocks
+drift against each other by 50 ppm it changes by 3 ms a minute, so calibrate anew for long sessions.
 
 Move the probe by 10 mm or more, three times or more, at an uneven pace: a motion that repeats itself fits at more than one lag.
 """
@@ -14,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import BSpline, make_lsq_spline
+from scipy.spatial.transform import Rotation
 
 from recon import tracks
 from recon.errors import InputError
@@ -26,6 +29,8 @@ SEARCH_S = (-0.5, 0.5)
 STEP_S = 0.01  # of the search
 MIN_FRAMES = 20
 MIN_RANGE_MM = 4.0  # of the motion, between its 5th and 95th percentile
+KNOT_S = 0.1  # of the spline through the motion: hands move below 3 Hz
+STILL = 1e-9  # mm or rad: a coordinate that changes by less tells nothing
 MIN_OVERLAP = 0.6  # of the images with a pose
 MIN_CORRELATION = 0.6  # of depth and height, by ranks, outliers among them
 MIN_AGREEMENT = 0.95  # their correlation without outliers
@@ -79,12 +84,12 @@ def estimate(times: NDArray[np.int64], depths: Array, track: Track, search_s: tu
         raise InputError(f"depths: expected at least {MIN_FRAMES} images that show the bottom, found {seen.sum()}")
     if track.found.sum() < MIN_FRAMES:
         raise InputError(f"track: expected at least {MIN_FRAMES} poses, found {track.found.sum()}")
-    heights = _heights(track)
+    coordinates = _coordinates(track)
     origin = int(track.times[0])
     seconds = (times - origin) * 1e-9
     moments = (track.times[track.found] - origin) * 1e-9
-    start = _search(seconds[seen], depths[seen], moments, heights, search_s)
-    return _refined(seconds, depths, moments, CubicSpline(moments, heights), start)
+    start = _search(seconds[seen], depths[seen], moments, coordinates[:, 0], search_s)
+    return _refined(seconds, depths, moments, _smooth(moments, coordinates), start)
 
 
 def poses_at(track: Track, times: NDArray[np.int64], lag: Lag | float) -> Array:
@@ -130,15 +135,31 @@ def _line_at_zero(u: Array, v: Array, blocks: int) -> float:
     return float(np.polynomial.polynomial.polyfit(u[agreed], v[agreed], 1)[0])
 
 
-def _heights(track: Track) -> Array:
-    """Where the probe stands along the main direction of its motion : (n,) mm, of the poses that were found."""
-    places = track.poses[track.found, :3, 3]
-    direction = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)[2][0]
-    heights = (places - places.mean(axis=0)) @ direction
-    extent = np.subtract(*np.percentile(heights, [95, 5]))
+def _coordinates(track: Track) -> Array:
+    """Of the poses that were found, about their mean : (n, 3 to 6).
+
+    The height along the main direction of the motion, mm; the place across it; the turn, rad. What doesn't change is left out.
+    """
+    poses = track.poses[track.found]
+    places = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
+    places = places @ np.linalg.svd(places, full_matrices=False)[2].T
+    extent = np.subtract(*np.percentile(places[:, 0], [95, 5]))
     if extent < MIN_RANGE_MM:
         raise InputError(f"track: expected an up-and-down motion of at least {MIN_RANGE_MM:g} mm, found {extent:.1f} mm")
-    return heights
+    rotations = Rotation.from_matrix(poses[:, :3, :3])
+    coordinates = np.column_stack([places, (rotations * rotations.mean().inv()).as_rotvec()])
+    return coordinates[:, np.ptp(coordinates, axis=0) > STILL]
+
+
+def _smooth(moments: Array, coordinates: Array) -> BSpline:
+    """Motion by a cubic spline with a knot every KNOT_S, or at every other pose where there are fewer; least squares.
+
+    Through the poses themselves it would carry their noise, and less of it between poses than at them: lags at which images fall
+    between poses would seem to fit better.
+    """
+    step = max(2, round(KNOT_S / float(np.median(np.diff(moments)))))
+    knots = moments[step:-step:step]
+    return make_lsq_spline(moments, coordinates, np.r_[[moments[0]] * 4, knots, [moments[-1]] * 4], k=3)
 
 
 def _within(moments: Array, wanted: Array) -> NDArray[np.bool_]:
@@ -177,28 +198,25 @@ def _search(seconds: Array, depths: Array, moments: Array, heights: Array, searc
     return float(lags[best])
 
 
-def _refined(seconds: Array, depths: Array, moments: Array, spline: CubicSpline, start: float) -> Lag:
+def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, start: float) -> Lag:
     """Weighted least squares over a, b and the lag, with variances of depth and of time that the residuals tell."""
     lag, speed = start, spline.derivative()
-    used = np.isfinite(depths) & _within(moments, seconds - lag)
+    seen = np.isfinite(depths)
+    used = seen & _within(moments, seconds - lag)
+    line = np.zeros(1 + spline(start).size)  # a, b
+    line[1::-1] = stats.theilslopes(depths[used], spline(seconds[used] - lag)[:, 0])[:2]
     variance = np.ones(len(depths))
-    constant = slope = 0.0
-    jitter = depth_variance = 0.0
-    design, residuals = np.zeros((len(depths), 3)), np.full(len(depths), np.nan)
     for round_ in range(15):
-        inside = np.isfinite(depths) & _within(moments, seconds - lag)
-        heights = spline(seconds - lag)
+        inside = seen & _within(moments, seconds - lag)
         weights = np.where(used & inside, 1 / variance, 0)
+        design = np.column_stack([np.ones_like(seconds), spline(seconds - lag), -speed(seconds - lag) @ line[1:]])
+        missing = np.where(seen, depths, 0) - design[:, :-1] @ line
         root = np.sqrt(weights)
-        line = np.column_stack([np.ones_like(heights), heights])
-        filled = np.where(np.isfinite(depths), depths, 0)
-        if round_ == 0:
-            constant, slope = stats.theilslopes(depths[used], heights[used])[1::-1]
-        design = np.column_stack([line, -slope * speed(seconds - lag)])
-        step = np.linalg.lstsq(design * root[:, None], (filled - constant - slope * heights) * root, rcond=None)[0]
-        constant, slope, lag = constant + step[0], slope + step[1], lag + float(np.clip(step[2], -0.05, 0.05))
-        residuals = np.where(inside, depths - constant - slope * spline(seconds - lag), np.nan)
-        rates = (slope * speed(seconds - lag)) ** 2
+        step = np.linalg.lstsq(design * root[:, None], missing * root, rcond=None)[0]
+        line, lag = line + step[:-1], lag + float(np.clip(step[-1], -0.05, 0.05))
+        predicted = line[0] + spline(seconds - lag) @ line[1:]
+        residuals = np.where(inside, depths - predicted, np.nan)
+        rates = (speed(seconds - lag) @ line[1:]) ** 2
         spread = 1.4826 * np.nanmedian(np.abs(residuals))
         near = inside & (np.abs(residuals) < (8 * spread if round_ < 3 else GATE * np.sqrt(variance)))
         depth_variance, jitter = _two_variances(residuals[near], rates[near], spread)
@@ -206,18 +224,18 @@ def _refined(seconds: Array, depths: Array, moments: Array, spline: CubicSpline,
         used = inside & (np.abs(residuals) < GATE * np.sqrt(variance))
         if used.sum() < MIN_FRAMES:
             raise InputError(f"depths: expected at least {MIN_FRAMES} images that agree on a lag, found {used.sum()}")
-        if round_ > 4 and abs(step[2]) < 1e-7:
+        if round_ > 4 and abs(step[-1]) < 1e-7:
             break
-    _agree(heights, depths, inside, used)
+    _agree(predicted, depths, inside, used)
     sigma = _sigma(design[used], residuals[used], 1 / variance[used])
-    reach = float(stats.t.ppf((1 + COVERAGE) / 2, used.sum() - 3)) * sigma
+    reach = float(stats.t.ppf((1 + COVERAGE) / 2, used.sum() - design.shape[1])) * sigma
     return Lag(lag, sigma, (lag - reach, lag + reach), jitter, float(np.sqrt(depth_variance)), used, residuals)
 
 
-def _agree(heights: Array, depths: Array, inside: NDArray[np.bool_], used: NDArray[np.bool_]) -> None:
+def _agree(predicted: Array, depths: Array, inside: NDArray[np.bool_], used: NDArray[np.bool_]) -> None:
     """Refuse depths that don't follow the height, or of which too many don't."""
     outliers = 1 - used.sum() / inside.sum()
-    agreement = abs(np.corrcoef(heights[used], depths[used])[0, 1])
+    agreement = abs(np.corrcoef(predicted[used], depths[used])[0, 1])
     if agreement < MIN_AGREEMENT or outliers > MAX_OUTLIERS:
         found = f"a correlation of {agreement:.2f} with {100 * outliers:.0f} % outliers left out"
         raise InputError(f"depths: expected them to follow the probe's height, found {found}")
@@ -237,7 +255,7 @@ def _two_variances(residuals: Array, rates: Array, spread: float) -> tuple[float
 
 def _sigma(design: Array, residuals: Array, weights: Array) -> float:
     """Of the lag, from the residuals as they are (a sandwich, each enlarged by its leverage), whatever the variances are."""
-    inverse = np.linalg.inv(design.T @ (design * weights[:, None]))
+    inverse = np.linalg.pinv(design.T @ (design * weights[:, None]))
     leverage = np.einsum("ni,ij,nj->n", design, inverse, design) * weights
     pulls = design * (weights * residuals / (1 - np.minimum(leverage, 0.9)))[:, None]
-    return float(np.sqrt((inverse @ (pulls.T @ pulls) @ inverse)[2, 2]))
+    return float(np.sqrt((inverse @ (pulls.T @ pulls) @ inverse)[-1, -1]))

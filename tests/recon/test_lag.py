@@ -82,6 +82,29 @@ def test_images_are_put_where_the_probe_was(rng):
     assert np.sqrt(np.nanmean(uncorrected**2)) > 2.0
 
 
+def test_a_hand_that_tilts_moves_the_target_and_not_the_lag(rng):
+    """The target stands 120 mm off the array; tilts of 1 deg in step with the motion alone would shift the lag by 20 ms."""
+    t = np.arange(0.013, 20, 0.025)
+
+    def pose(t):
+        turn = np.deg2rad(np.column_stack([np.sin(0.9 * t), 1.0 * np.cos(2.5 * t + 1.5 * np.sin(0.5 * t)), np.sin(0.7 * t)]))
+        made = np.array([rigid.from_rotation_vector(each, [0, 0, 0]) for each in turn])
+        made[:, :3, 3] = (
+            np.column_stack([0 * t, 0 * t, 700 + height(t)]) + made[:, :3, 0] * 120
+        )  # the array's middle moves up and down
+        return made
+
+    noisy = pose(t)
+    noisy[:, :3, 3] += POSE_NOISE_MM * rng.standard_normal((len(t), 3))
+    shown = np.arange(0, 20, FRAME_S)
+    depths = (60 - height(shown)) / bscans.MM_PER_PX + DEPTH_NOISE_PX * rng.standard_normal(len(shown))
+    stamps = shown + 0.1 + 0.005 * rng.standard_normal(len(shown))
+    found = lag.estimate(nanoseconds(stamps), depths, Track(nanoseconds(t), noisy))
+    assert abs(found.seconds - 0.1) < 0.003
+    assert found.interval_s[0] <= 0.1 <= found.interval_s[1]
+    assert found.depth_sigma < 1.5
+
+
 def refused(named, heights, depths, search_s=lag.SEARCH_S):
     t = np.arange(0, 20, FRAME_S)
     with pytest.raises(InputError, match=named) as raised:
