@@ -22,6 +22,7 @@ MODULES = {  # where a package isn't imported by the name that it is installed b
     "simpleitk": "SimpleITK",
     "pytest-xdist": "xdist",
     "pyyaml": "yaml",
+    "scikit-image": "skimage",
 }
 BROUGHT_BY = {"drjit": "mitsuba", "omegaconf": "hydra"}  # imported by us, required by what we require
 

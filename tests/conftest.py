@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from recon.rig import Rig
+from twin.ultrasound.transducer import Transducer
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -25,6 +26,13 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
 def rig() -> Rig:
     """The rig of Meza et al. 2021."""
     return Rig.model_validate(yaml.safe_load((ROOT / "conf/rig/meza2021.yaml").read_text(encoding="utf-8")))
+
+
+@pytest.fixture(scope="session")
+def scanners() -> dict[str, Transducer]:
+    """The arrays and scanners of `conf/ultrasound`, by name."""
+    files = (ROOT / "conf/ultrasound").glob("*.yaml")
+    return {file.stem: Transducer.model_validate(yaml.safe_load(file.read_text(encoding="utf-8"))) for file in files}
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 
@@ -11,6 +11,7 @@ from recon import atomic
 from recon.errors import InputError
 from recon.patterns import Patterns
 from recon.rig import Rig
+from twin.ultrasound.transducer import Transducer
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class Setup:
     rig: Rig
     sequences: Mapping[str, Patterns]  # by their names in conf/patterns
     real: Path | None = None  # folder of real recordings
+    scanners: Mapping[str, Transducer] = field(default_factory=dict)  # by their names in conf/ultrasound
 
 
 def measure(measurements: Sequence[Measurement]) -> Iterator[Row]:
