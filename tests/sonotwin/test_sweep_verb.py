@@ -73,7 +73,15 @@ def test_measure_lag_finds_the_lag(tmp_path):
 
 def test_wires_cross_where_the_protocol_has_them(tmp_path):
     """In the image plane near its corners, with the target at rest and no calibration given; same seed, same bytes."""
-    fields = ["scene=crosswire", "ultrasound=water", "path=wire", "path.count=3", "path.rest_s=0.2", *small(48, 128)]
+    fields = [
+        "scene=crosswire",
+        "ultrasound=water",
+        "path=wire",
+        "path.count=3",
+        "path.rest_s=0.2",
+        "path.miss_mm=0",
+        *small(48, 128),
+    ]
     for name, seed in (("one", 3), ("two", 3), ("other", 4)):
         assert main(["sweep", f"out={tmp_path / name}", f"seed={seed}", *fields]) == 0
     one, two, other = (contents(tmp_path / name) for name in ("one", "two", "other"))
@@ -106,7 +114,7 @@ def test_wires_cross_where_the_protocol_has_them(tmp_path):
             ["scene=cylinders", "path.surface=inner", "path.start_mm=[0,-2]", "path.end_mm=[2,-2]"],
             "path: expected the probe in front of all things, found it in outer after 0.00 s",
         ),
-        (["path=wires"], "path: expected one of bob, stroke, wire, found wires; did you mean wire?"),
+        (["path=wires"], "path: expected one of bob, none, raster, stroke, wire, found wires; did you mean wire?"),
         (["path.kind=fly"], "path.kind: expected one of 'stroke', 'bob', 'wire', found 'fly'"),
         (["path.speed_mm_s=0"], "speed_mm_s: expected greater than 0, found 0"),
         (["ultrasound.image_size=[96,96]"], "ultrasound.image_size: expected rig.probe's [321, 408], found [96, 96]"),

@@ -6,6 +6,9 @@ Fresnel diffraction of the aperture, separable in the two directions. With `|H| 
 
 the echo of a scatterer of scattering length f, received as the mean over an aperture of D mm, is `f lambda H_t H_r / D` in each
 direction, relative to that of a perfect mirror. A surface element dA of a mirror is a scatterer of length `R dA / lambda`.
+
+Along the array, Hann windows leave little to interfere, and the centre frequency stands for the echo's band. Across, the edges of
+the element send waves of their own; near the face their ripples differ from frequency to frequency, and the band averages them.
 Source: Goodman, Introduction to Fourier Optics, chapter 4; reciprocity for the receiver.
 """
 
@@ -14,6 +17,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fresnel
 
 from twin.ultrasound.transducer import Transducer
 
@@ -27,6 +31,7 @@ FAINT = 2e-3  # of the peak: the point spread ends there (-54 dB)
 EDGES = (0.03, 0.06)  # of the peak across the plane, two-way: the slice's end for surfaces and wires, and for scatterers
 REACH_MM = 4.0  # of the point spread along the array, at most
 STEP_MM = 0.025  # of the elevational table
+BAND = np.linspace(-1.1, 1.1, 23)  # frequencies of an echo, in its full widths at half amplitude beside the centre
 DEEPER = 1.2  # true depth that the tables reach, over the shown one
 
 
@@ -100,13 +105,31 @@ def _lateral(transducer: Transducer, rows: Array) -> tuple[NDArray[np.complex128
     return table, reach
 
 
+def through_lens(offsets: Array, depth: float, height: float, focus: float, wavelengths: Array) -> NDArray[np.complex128]:
+    """Field H : (m, n) of an even aperture behind a lens, at offsets : (n,) mm, for m wavelengths; Fresnel's integrals."""
+    bend = 1 / depth - 1 / focus
+    bend = bend if abs(bend) > 1e-4 else 1e-4  # in focus: 0.01 rad at the edge
+    k = 2 * np.pi / wavelengths[:, None]
+    centre, scale = offsets / (bend * depth), np.sqrt(k * abs(bend) / np.pi)
+    parts = [np.array(fresnel(scale * (edge - centre))) for edge in (height / 2, -height / 2)]
+    sine, cosine = parts[0] - parts[1]
+    integral = (cosine + 1j * np.sign(bend) * sine) / scale
+    phase = k / 2 * (offsets**2 / depth - bend * centre**2)
+    return integral * np.exp(1j * phase) / np.sqrt(1j * wavelengths[:, None] * depth)
+
+
 def _elevation(transducer: Transducer, depths: Array) -> tuple[NDArray[np.complex128], Array, Array]:
+    """Two-way amplitude, and where the slice ends: each place's echo, projected on the pulse that the image is made with."""
     offsets = np.arange(0, transducer.elevation_mm * 0.5 + 2.0, STEP_MM)
-    height = transducer.elevation_mm
+    height, focus = transducer.elevation_mm, transducer.elevation_focus_mm
+    near, far = transducer.bandwidth
+    weight = np.exp(-8 * np.log(2) * BAND**2)  # the echo's spectrum, squared
+    weight /= weight.sum()
     table = np.empty((len(depths), len(offsets)), complex)
     for k, depth in enumerate(np.maximum(depths, NEAREST_MM)):
-        one_way = diffracted(offsets, depth, height, transducer.elevation_focus_mm, transducer.wavelength_mm, apodised=False)
-        table[k] = one_way**2 / height
+        share = BAND * (near + (far - near) * min(depth / transducer.depth_mm, 1.0))
+        wavelengths = transducer.wavelength_mm / np.maximum(1 + share, 0.2)
+        table[k] = weight @ through_lens(offsets, depth, height, focus, wavelengths) ** 2 / height
     level = np.abs(table) / np.abs(table).max(axis=1, keepdims=True)
     half, core = (np.where(level >= least, offsets, 0).max(axis=1) + STEP_MM for least in EDGES)
     return table, half, core

@@ -29,8 +29,9 @@ def noise(transducer: Transducer, beam: Beam, rng: np.random.Generator) -> Field
     height, width = transducer.image_size[::-1]
     focus = np.interp(transducer.transmit_focus_mm, transducer.rows_mm, reference_power(transducer, beam))
     sigma = np.sqrt(focus / 2) * 10 ** (transducer.noise_db / 20)
-    parts = rng.standard_normal((2, height, width), dtype=np.float32)
-    return np.float32(sigma) * (parts[0] + 1j * parts[1])
+    parts = rng.standard_normal((height, width, 2), dtype=np.float32)
+    parts *= np.float32(sigma)
+    return parts.view(np.complex64)[..., 0]
 
 
 def gain_over_depth(transducer: Transducer, beam: Beam) -> Array:

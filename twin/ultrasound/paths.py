@@ -18,6 +18,7 @@ from twin.ultrasound.transducer import Transducer
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
+LEAP_MM = 2.5  # at most, without a look at the tissue; less than the margin of the solids' grids
 GRADIENT_MM = 0.3  # over which a surface's normal is taken
 
 
@@ -84,11 +85,17 @@ def _follow(flat, where, frame, pose, lines, depths, sx, step, impedance, speed,
         x0, y0, z0 = pose[0, 0] * sx * line + pose[0, 3], pose[1, 0] * sx * line + pose[1, 3], pose[2, 0] * sx * line + pose[2, 3]
         here = label_at(flat, where, frame, x0, y0, z0)
         labels[line, 0] = here
-        delay, left, slope, aside = 0.0, 1.0, 0.0, 0.0
+        delay, left, slope, aside, clear = 0.0, 1.0, 0.0, 0.0, 0.0
         for k in range(1, depths):
             t = step * k
             x, y, z = x0 + dx * t, y0 + dy * t, z0 + dz * t
-            there = label_at(flat, where, frame, x, y, z)
+            there = here
+            if t >= clear:  # a border may lie as near
+                there = label_at(flat, where, frame, x, y, z)
+                near = LEAP_MM
+                for s in range(len(where)):
+                    near = min(near, abs(distance_at(flat, where[s], frame[s], x, y, z)))
+                clear = t + 0.9 * near
             part = 1.0  # of the step in the tissue that it started in
             if there != here:
                 s = max(here, there) - 1

@@ -36,12 +36,15 @@ class Hand(Part):
 
 
 class SurfacePath(Part):
-    """A straight stroke over a surface that faces the cameras, seen along the world's z."""
+    """Straight strokes over a surface that faces the cameras, seen along the world's z, there and back, side by side."""
 
     kind: Literal["stroke"] = "stroke"
     surface: str = ""  # name of the solid, where a scene has several
     start_mm: tuple[Finite, Finite] = (4.0, -35.0)  # x, y in the world of the array's middle
-    end_mm: tuple[Finite, Finite] = (4.0, 30.0)
+    end_mm: tuple[Finite, Finite] = (4.0, 30.0)  # of the first stroke
+    strokes: Annotated[int, Field(ge=1, le=100)] = 1
+    stroke_step_mm: Finite = 30.0  # from one to the next, along the array
+    step_seconds: Annotated[float, Field(ge=0.05, le=60)] = 0.3  # in which the probe slides over to the next
     speed_mm_s: Positive = 10.0
     turn_deg: Finite = 0.0  # of the array about the line of sight, from the world's x
     tilt_deg: tuple[Finite, Finite] = (0.0, 0.0)  # off the surface's normal: in the image plane, and of the plane
@@ -67,11 +70,12 @@ class WirePath(Part):
     count: Annotated[int, Field(ge=1, le=1000)] = 30  # poses, one image each
     tilt_deg: Annotated[float, Field(ge=0, le=80)] = 35.0  # to all sides
     roll_deg: Annotated[float, Field(ge=0, le=180)] = 180.0  # about the depth axis, both ways
+    miss_mm: NotNegative = 0.2  # standard deviation of the crossing across the image plane: a hand holds it where it shines most
     rest_s: Annotated[float, Field(ge=0.1, le=60)] = 0.5  # in each pose; the image is taken in the middle
 
 
 def along_surface(path: SurfacePath, solid: Solid, transducer: Transducer, seed: int) -> Track:
-    """Poses `world_from_image` over time, from 0 ns, of a stroke over a solid.
+    """Poses `world_from_image` over time, from 0 ns, of one or more strokes over a solid.
 
     The face touches the surface where it first meets it, square to the plane fitted to the surface under the foot.
 
@@ -84,11 +88,21 @@ def along_surface(path: SurfacePath, solid: Solid, transducer: Transducer, seed:
     duration = float(np.linalg.norm(end - start)) / path.speed_mm_s
     if duration < 2 / RATE_HZ:
         raise InputError(f"path.end_mm: expected a stroke of some length, found {np.linalg.norm(end - start):g} mm")
-    count = int(duration * RATE_HZ) + 1
-    share = np.linspace(0, 1, count)
-    share = share * share * (3 - 2 * share)  # sets off and stops gently
-    faces = np.stack([_placed(path, start + s * (end - start), solid, transducer) for s in share])
+    aside = path.stroke_step_mm * _upright(path.turn_deg)[:2, 0]
+    places = []
+    for stroke in range(path.strokes):
+        one, other = (start, end) if stroke % 2 == 0 else (end, start)
+        if stroke:
+            places.append(_eased(one + (stroke - 1) * aside, one + stroke * aside, path.step_seconds)[1:-1])
+        places.append(_eased(one + stroke * aside, other + stroke * aside, duration))
+    faces = np.stack([_placed(path, place, solid, transducer) for place in np.concatenate(places)])
     return _led(faces, path.hand, transducer, seed)
+
+
+def _eased(start: Array, end: Array, seconds: float) -> Array:
+    """Places : (n, 2) from start to end, that set off and stop gently."""
+    share = np.linspace(0, 1, int(seconds * RATE_HZ) + 1)
+    return start + (share * share * (3 - 2 * share))[:, None] * (end - start)
 
 
 def bobbing(bob: Bob, transducer: Transducer, seed: int) -> Track:
@@ -123,7 +137,7 @@ def crossing(body: Body) -> Array:
     return nearest.mean(axis=0)
 
 
-def about_crossing(path: WirePath, body: Body, transducer: Transducer) -> tuple[Track, NDArray[np.int64]]:
+def about_crossing(path: WirePath, body: Body, transducer: Transducer, seed: int = 0) -> tuple[Track, NDArray[np.int64]]:
     """Poses `world_from_image` over time, from 0 ns, at rest only; and the middles of the rests : (count,) ns.
 
     The crossing appears at the pixels of the protocol, the delays of the medium's sound included.
@@ -133,16 +147,25 @@ def about_crossing(path: WirePath, body: Body, transducer: Transducer) -> tuple[
     InputError
         If the scene has no crossing.
     """
-    wire = crossing(body)
     turns, pixels = probe_calibration.motion(transducer.image_size, path.count, path.tilt_deg, path.roll_deg)
-    rotations = _upright(0.0) @ Rotation.from_euler("YXZ", turns[:, [1, 0, 2]], degrees=True).as_matrix()
-    true_scale = np.array(transducer.scale_mm_per_px) * [1.0, body.medium.speed / transducer.assumed_speed]
-    places = np.column_stack([pixels * true_scale, np.zeros(len(pixels))])
-    poses = [rigid.transform(turn, wire - turn @ place) for turn, place in zip(rotations, places, strict=True)]
+    beside = path.miss_mm * np.random.default_rng(seed).standard_normal(path.count)
+    poses = held(body, transducer, turns, pixels, beside)
     steps = np.rint(np.linspace(0, path.rest_s, int(path.rest_s * RATE_HZ) + 1) * 1e9).astype(np.int64)
     starts = np.rint(np.arange(path.count) * (path.rest_s + MOVE_S) * 1e9).astype(np.int64)
     rests = Track((starts[:, None] + steps).ravel(), np.repeat(poses, len(steps), axis=0))
     return rests, starts + steps[-1] // 2
+
+
+def held(body: Body, transducer: Transducer, turns: Array, pixels: Array, beside: Array) -> Array:
+    """Poses `world_from_image` : (n, 4, 4) of a probe turned by (n, 3) deg as in `recon.probe_calibration.motion`.
+
+    The crossing appears at the pixels : (n, 2), delays included, and lies (n,) mm beside the image plane.
+    """
+    wire = crossing(body)
+    rotations = _upright(0.0) @ Rotation.from_euler("YXZ", turns[:, [1, 0, 2]], degrees=True).as_matrix()
+    true_scale = np.array(transducer.scale_mm_per_px) * [1.0, body.medium.speed / transducer.assumed_speed]
+    places = np.column_stack([pixels * true_scale, beside])
+    return np.stack([rigid.transform(turn, wire - turn @ place) for turn, place in zip(rotations, places, strict=True)])
 
 
 def _upright(turn_deg: float) -> Array:

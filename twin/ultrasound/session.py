@@ -57,7 +57,7 @@ def plan_sweep(
             taken = moments(course, clocks.scanner_hz)
             refuse_inside(course, body, transducer)
         case WirePath():
-            course, taken = about_crossing(path, body, transducer)
+            course, taken = about_crossing(path, body, transducer, path_seed)
             refuse_inside(course, body, transducer)
     return plan(rig.probe, course, taken, clocks, noise, clock_seed)
 

@@ -6,6 +6,7 @@ smaller come later. A plane's distance is linear, and so exact on a grid of two 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import trimesh
@@ -63,6 +64,10 @@ class Body:
 
     def packed(self) -> tuple[NDArray[np.float32], NDArray[np.int64], Array]:
         """Distances : (m,) in a row, per solid start and size : (n, 4), and origin and 1/spacing : (n, 6)."""
+        return self._packed
+
+    @cached_property
+    def _packed(self) -> tuple[NDArray[np.float32], NDArray[np.int64], Array]:
         sizes = [solid.distance.size for solid in self.solids]
         starts = np.concatenate([[0], np.cumsum(sizes)])[:-1] if sizes else []
         where = [(int(start), *solid.distance.shape) for start, solid in zip(starts, self.solids, strict=True)]

@@ -1,5 +1,7 @@
 """Bodies, poses and measures that tests of the B-mode model share."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from recon import rigid
@@ -11,7 +13,7 @@ from twin.ultrasound.transducer import Transducer
 def filament(depth: float, beside: float = 0.0, length: float = 40.0, middle: float = 0.0) -> Body:
     """A smooth wire along y at z = depth, in a medium of 1540 m/s without loss or echoes."""
     ends = np.array([[beside, middle - length / 2, depth], [beside, middle + length / 2, depth]])
-    return Body(Tissue(1.5, 1540.0, 0.0, None), (), (Wire("wire", TISSUES["steel"], ends, 0.01),))
+    return Body(Tissue(1.5, 1540.0, 0.0, None), (), (Wire("wire", replace(TISSUES["steel"], roughness=0.0), ends, 0.01),))
 
 
 def down(transducer: Transducer, face: tuple[float, float, float], tilt_deg: float = 0.0) -> np.ndarray:

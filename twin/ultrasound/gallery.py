@@ -1,0 +1,70 @@
+"""One picture of what the twin shows of each kind of thing, to be compared with published B-scans.
+
+python -m twin.ultrasound.gallery docs/images/bscans.png
+"""
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon import rigid
+from scenes.catalogue import build_scene
+from twin.ultrasound.probe_path import Hand, SurfacePath, along_surface
+from twin.ultrasound.scan import scan
+from twin.ultrasound.session import surface_of
+from twin.ultrasound.solids import body
+from twin.ultrasound.transducer import Transducer
+
+TISSUE = Transducer()
+WATER = Transducer(tgc_db_per_cm_mhz=0.0165, gain_db=-40.0)  # conf/ultrasound/water.yaml
+MASSES = {"27 mm": (-10.0, -8.0), "14 mm": (28.0, -24.0), "12 mm": (26.0, 26.0)}  # x, y of the breast's tumours
+STATIONS = (  # title, scene, array, face in the world, direction of the array
+    ("crossed wires, water", "crosswire", WATER, (4.0, -2.0, 635.0), (1, 0, 0)),
+    ("rod of 15.82 mm, water", "inner_cylinder", WATER, (4.0, -2.0, 645.0), (0, 1, 0)),
+    ("plate of 10 mm, water", "tank", WATER, (4.0, -2.0, 680.0), (1, 0, 0)),
+    ("rod in gelatin", "cylinders", TISSUE, (4.0, -2.0, 640.0), (0, 1, 0)),
+    ("test object", "test_object", TISSUE, (4.0, -2.0, 650.0), (1, 0, 0)),
+)
+COLUMNS = 4
+GAP_PX, TITLE_PX = 6, 22
+
+
+def bscans() -> dict[str, NDArray[np.uint8]]:
+    """B-scans by title: the breast over its three tumours, wires, rods, a plate, the test object."""
+    breast = body(build_scene({"kind": "breast"}))
+    images = {}
+    for size, (x, y) in MASSES.items():
+        still = SurfacePath(start_mm=(x, y), end_mm=(x + 0.5, y), hand=Hand(shift_mm=0, turn_deg=0))
+        pose = along_surface(still, surface_of("breast", breast), TISSUE, 1).poses[0]
+        images[f"breast, tumour of {size}"] = scan(breast, TISSUE, pose, 1).image
+    for title, kind, array, face, along in STATIONS:
+        axes = np.column_stack([along, [0, 0, 1], np.cross(along, [0, 0, 1])])
+        pose = rigid.transform(axes, face) @ rigid.transform(np.eye(3), (-array.width_mm / 2, 0, 0))
+        images[title] = scan(body(build_scene({"kind": kind})), array, pose, 1).image
+    return images
+
+
+def sheet(images: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Images of one size, each under its title, in rows of `COLUMNS`."""
+    tiles = []
+    for title, image in images.items():
+        tile = cv2.copyMakeBorder(image, TITLE_PX, GAP_PX, GAP_PX, GAP_PX, cv2.BORDER_CONSTANT, value=255)
+        tiles.append(cv2.putText(tile, title, (GAP_PX, TITLE_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 0, 1, cv2.LINE_AA))
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
+    return np.vstack([np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)])
+
+
+def main() -> None:
+    """Write the sheet, at half its size."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("picture", type=Path)
+    picture = sheet(bscans())
+    small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(parser.parse_args().picture), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+if __name__ == "__main__":
+    main()
