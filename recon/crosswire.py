@@ -8,6 +8,8 @@ the crossing isn't in the image plane (a second spot, or a spot too wide).
 The slice is thick, so an oblique wire is drawn out into a line: its parts beside the image plane lie at other depths. The
 crossing is then an X, and its brightest point means nothing, for the wires' echoes interfere. But the lines still meet where
 the crossing is, seen along the image's normal, however their brightness goes; so two lines are fitted to the bright pixels.
+Of all pairs of lines the one is taken that leaves fewest pixels unexplained, where a pixel on both lines counts once: else two
+lines along one wire would be the likeliest pair.
 """
 
 from dataclasses import dataclass
@@ -31,17 +33,18 @@ MIN_CORE = 12  # pixels, twice the unknowns
 FLOOR_PX = 0.1  # no sighting counts as more exact than this
 MAX_RIPPLE_DB = 1.0  # rms, of a spot about its paraboloid
 MAX_OBLIQUE = 0.3  # correlation of a spot's width and height; what lies aslant is a wire drawn out
+FACE_PERCENT = 10  # of a row: its level there is the face's, even if a wire covers most of the row
 ARMS_DB = 22.0  # below the brightest, which lines are fitted to
 ARMS_PX = (70, 45)  # from the brightest, along the array and in depth
 POINT_PX = np.array([2.6, 1.1])  # 1 sigma of a line's width along the array and in depth
 DIRECTIONS = 12  # of the first look
 STARTS = 6
 STRAY = np.exp(-4.5)  # likelihood of a pixel on neither line, as at 3 sigma
-MAX_SMOOTH = 0.62  # share of an echo's relief that a paraboloid explains: a bar or a blob has no arms
+MAX_SMOOTH = 0.45  # share of an echo's relief that a paraboloid explains: a bar or a blob has no arms
 BORDER_PX = 4  # of the image, where lines may not meet
 MIN_SINE = 0.15  # of the angle between the lines, in units of POINT_PX
-SHARED_PX = 24.0  # pixels with one independent error: beads of interference, measured on simulated wires
-MAX_ERROR_PX = (8.0, 4.0)  # 1 sigma of where lines meet
+SHARED_PX = 3.0  # pixels with one independent error of their place across the line, measured on simulated wires
+MAX_ERROR_PX = (1.6, 1.2)  # 1 sigma of where lines meet; what is worse adds little to poses, and is often a wrong line
 DECIBEL = 20 / np.log(10)  # dB a neper of amplitude
 
 
@@ -65,6 +68,7 @@ class Crossing:
     covariance: Array  # (2, 2) px^2
     contrast_db: float  # of the strongest echo above the background; NaN if nothing stands out
     reason: str | None = None  # of the rejection
+    directions: Array | None = None  # (2, 2) px, along the two lines; None of a spot
 
     @property
     def found(self) -> bool:
@@ -197,20 +201,28 @@ def _lines(level: NDArray[np.float32], look: Appearance, contrast: float) -> Cro
     sigma = np.sqrt(np.diag(covariance))
     if (sigma > MAX_ERROR_PX).any():
         return _none(f"lines too alike: they meet within {sigma[0]:.1f}x{sigma[1]:.1f} px (1 sigma)", contrast)
-    return Crossing(pixel, covariance, contrast)
+    along = np.stack([np.cos(angles[best]), np.sin(angles[best])], axis=-1) * POINT_PX
+    return Crossing(pixel, covariance, contrast, directions=along / np.linalg.norm(along, axis=1, keepdims=True))
 
 
 def _arms(level: NDArray[np.float32], look: Appearance) -> tuple[Array, Array, Array]:
     """Pixels : (n, 2) of the brightest echo, from its brightest in units of POINT_PX; dB above its edge; the brightest in px."""
-    smooth = cv2.GaussianBlur(level, (0, 0), sigmaX=MATCHED_PX[0], sigmaY=MATCHED_PX[1]) / (255 / look.dynamic_range_db)
+    face = np.percentile(level, FACE_PERCENT, axis=1, keepdims=True)
+    relief = (level - face) / (255 / look.dynamic_range_db)
+    smooth = cv2.GaussianBlur(relief, (0, 0), sigmaX=MATCHED_PX[0], sigmaY=MATCHED_PX[1])
     smooth[: look.top_px] = 0
     v, u = np.unravel_index(smooth.argmax(), smooth.shape)
-    rows, columns = _outline(smooth, np.array([u, v]), ARMS_DB)
+    background = np.median(smooth)
+    noise = 1.4826 * np.median(np.abs(smooth - background))
+    drop = min(ARMS_DB, smooth[v, u] - background - NOISE * noise)
+    if drop <= 0:
+        return np.zeros((0, 2)), np.zeros(0), np.zeros(2)
+    rows, columns = _outline(smooth, np.array([u, v]), drop)
     elsewhere = smooth.copy()
     elsewhere[rows, columns] = 0
     if elsewhere.max() > smooth[v, u] - look.rival_db:
         return np.zeros((0, 2)), np.zeros(0), np.zeros(2)  # another echo as bright
-    above = level[rows, columns] / (255 / look.dynamic_range_db) - smooth[v, u] + ARMS_DB
+    above = relief[rows, columns] - smooth[v, u] + drop
     near = (np.abs(columns - u) < ARMS_PX[0]) & (np.abs(rows - v) < ARMS_PX[1]) & (above > 0) & (rows >= look.top_px)
     brightest = np.array([u, v], float)
     return (np.column_stack([columns, rows])[near] - brightest) / POINT_PX, above[near].astype(float), brightest
@@ -233,7 +245,9 @@ def _start(points: Array, weights: Array) -> tuple[Array, Array]:
     near = np.exp(-(np.einsum("pnj,aj->pan", points[few] - places[:, None], normals) ** 2) / 2)
     first, second = np.triu_indices(DIRECTIONS, 1)
     pairs = zip(first, second, strict=True)
-    likelihood = np.stack([np.log(near[:, a] + near[:, b] + STRAY) @ weights[few] for a, b in pairs], axis=1)
+    likelihood = np.stack(
+        [np.log(near[:, a] + near[:, b] - near[:, a] * near[:, b] + STRAY) @ weights[few] for a, b in pairs], axis=1
+    )
     best = np.argsort(-likelihood.max(axis=0))[:STARTS]
     middles = np.repeat(places[likelihood[:, best].argmax(axis=0)][:, None], 2, axis=1)
     return middles, np.column_stack([angles[first[best]], angles[second[best]]])
@@ -245,14 +259,13 @@ def _refined(points: Array, weights: Array, middles: Array, angles: Array) -> tu
         normals = np.stack([-np.sin(angles), np.cos(angles)], axis=-1)
         distances = np.einsum("skj,nj->skn", normals, points) - (normals * middles).sum(axis=-1)[..., None]
         near = np.exp(-np.minimum(distances**2, 60) / 2)
-        total = near.sum(axis=1) + STRAY
-        shares = near / total[:, None] * weights
+        shares = near / (near.sum(axis=1) + STRAY)[:, None] * weights
         mass = shares.sum(axis=-1) + 1e-9
         middles = np.einsum("skn,nj->skj", shares, points) / mass[..., None]
         spread = np.einsum("skn,ni,nj->skij", shares, points, points) / mass[..., None, None]
         spread -= middles[..., :, None] * middles[..., None, :]
         angles = np.arctan2(2 * spread[..., 0, 1], spread[..., 0, 0] - spread[..., 1, 1]) / 2
-    return middles, angles, shares, np.log(total) @ weights
+    return middles, angles, shares, np.log(near.sum(axis=1) - near.prod(axis=1) + STRAY) @ weights
 
 
 def _meeting_covariance(offsets: Array, shares: Array, angles: Array) -> Array:

@@ -8,25 +8,26 @@ which gives a start in closed form; Levenberg and Marquardt do the rest.
 **Which motion is best.** An error of the tracked angle moves the wire by the lever, here 140 mm, so 0.08 degrees are 0.2 mm: far
 more than the errors of position or pixel. Frames are therefore weighted by their covariance, which has this lever in it. Turns
 decide how well the image's place is told from the wire's: roll the probe about its depth axis as far as the tracking allows, tilt
-it 35 degrees to all sides, and bring the crossing near all corners of the image in turn. `motion` lists such frames. Predicted
-errors (1 sigma, of the place in space) of 30 frames with 0.08 degrees and 0.05 mm of noise per axis, for the rig of the paper:
+it 35 degrees to all sides, mostly forward and backward, and bring the crossing near all corners of the image in turn. `motion`
+lists such frames. Predicted errors (1 sigma, of the place in space) of 30 frames with 0.08 degrees and 0.05 mm of noise per axis,
+for the rig of the paper:
 
     roll both ways     centre     corners
     180 degrees        0.07       0.11 to 0.12 mm
     90 degrees         0.08       0.11 to 0.13 mm
-    35 degrees         0.09       0.12 to 0.13 mm
+    35 degrees         0.09       0.12 to 0.14 mm
 
-With the crossing spread evenly over the image the corners are some 10 % worse; with 0.3 mm of slice thickness all are 40 % worse.
+With the crossing spread evenly over the image the corners are some 10 % worse; with 0.3 mm of slice thickness all are 50 % worse.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from recon import crosswire, probe_checks, rigid
+from recon import crosswire, probe_checks, probe_equations, rigid, wires
 from recon.calibration import Uncertainty
 from recon.crosswire import Appearance, Crossing
 from recon.errors import InputError
@@ -46,7 +47,9 @@ MAX_FACTOR = 8.0  # measured over assumed noise beyond which frames don't show o
 MAX_RMS_MM = 3.0  # of residuals beyond which they don't either, however long the lever; Meza et al. 2021 have 0.423
 MIN_INLIERS = 0.5  # of the frames
 REACH = (0.43, 0.40)  # of the crossing from the middle, of the image's width and height: spots stay whole and clear of the face
+ROCK = 0.6  # most of a tilt that is about the image's normal, where wires are seen edge-on
 FLOOR_MM = 1e-6  # no sighting counts as more exact than this
+APART_MM = 1.0  # 1 sigma of the distance of wires that cross, before it is measured
 MAX_STEPS = 50
 CONVERGED = 1e-10  # relative decrease of the cost
 
@@ -70,11 +73,13 @@ class Sightings:
     pose_covariance: Array | None = None  # (n, 6, 6) as in recon.tracks: a turn (rad) after the pose's own, a shift (mm)
     pixel_covariance: Array | None = None  # (n, 2, 2) px^2
     slice_mm: Array | None = None  # (n,) standard deviation across the image plane
+    directions: Array | None = None  # (n, 2, 2) px, along the wires' lines; NaN where they were seen as a spot
+    beside: Array | None = None  # (n, 2) px a mm: where lines meet, by the distance of the wires; `calibrate` finds it
 
     def of(self, chosen: ArrayLike) -> "Sightings":
         """Those of some frames, by number or mask."""
-        arrays = (self.poses, self.pixels, self.pose_covariance, self.pixel_covariance, self.slice_mm)
-        return Sightings(*(None if array is None else array[chosen] for array in arrays))
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Sightings(**{name: None if value is None else value[chosen] for name, value in values.items()})
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,7 @@ class Adjustment:
     normalised: Array  # (n,) length of the residual over its standard deviation; sqrt(3) for a typical frame
     outliers: Mask  # (n,)
     noise_factor: float  # measured noise over the assumed; the covariance is scaled by its square
+    apart_mm: float = 0.0  # between the wires' axes, where they were seen as lines
 
     @property
     def rms_mm(self) -> float:
@@ -99,19 +105,32 @@ class _Estimate:
     target_from_image: Array  # (4, 4)
     scale: Array  # (2,)
     wire: Array  # (3,)
+    apart: float = 0.0  # mm, of the wires
 
     def moved(self, step: Array) -> "_Estimate":
-        """After a step : (11,) of sx, sy, the turn, the shift and the wire."""
+        """After a step : (12,) of sx, sy, the turn, the shift, the wire and the wires' distance."""
         turn = Rotation.from_rotvec(step[2:5]).as_matrix()
         shifted = self.target_from_image[:3, 3] + step[5:8]
         turned = rigid.transform(turn @ self.target_from_image[:3, :3], shifted)
-        return _Estimate(turned, self.scale + step[:2], self.wire + step[8:])
+        return _Estimate(turned, self.scale + step[:2], self.wire + step[8:11], self.apart + step[11])
+
+    def pixels(self, sightings: Sightings) -> Array:
+        """Where the midpoint between the wires is : (n, 2) px."""
+        return sightings.pixels if sightings.beside is None else sightings.pixels - self.apart * sightings.beside
 
 
 def calibrate(
-    sightings: Sightings, size: Size, noise: Noise | None = None, expected: Array | None = None, seed: int = 0
+    sightings: Sightings,
+    size: Size,
+    noise: Noise | None = None,
+    expected: Array | None = None,
+    seed: int = 0,
+    ahead_mm: float = 0.0,
 ) -> Adjustment:
-    """Calibrate a probe from poses and pixels of one point at rest.
+    """Calibrate a probe from poses and pixels of one point at rest: of two wires, the midpoint between their axes.
+
+    Seen as two lines, the wires meet beside that point, one being above the other. Where six frames or more show lines, it is
+    found which is whose, and the distance of the axes is adjusted with the rest.
 
     Parameters
     ----------
@@ -124,6 +143,8 @@ def calibrate(
         image or target, fit the equations as well as the truth does; they are known by this alone.
     seed : int
         Of the random draws of frames for the robust start.
+    ahead_mm : float
+        By how much the echo lies before the wires' axes: see `recon.wires.echo_ahead`.
 
     Raises
     ------
@@ -136,6 +157,9 @@ def calibrate(
     probe_checks.motion(sightings.poses, sightings.pixels, size)
     start = _robust_start(sightings, noise, np.random.default_rng(seed))
     estimate, inliers, factor = _without_outliers(start, sightings, noise)
+    sightings = _with_wires(estimate, sightings, inliers)
+    if sightings.beside is not None:
+        estimate, inliers, factor = _without_outliers(estimate, sightings, noise)
     rms = float(np.sqrt((_residuals(estimate, sightings.of(inliers)) ** 2).sum(axis=1).mean()))
     if factor > MAX_FACTOR or rms > MAX_RMS_MM or inliers.mean() < MIN_INLIERS:
         _say_why(sightings, noise, rms, factor, inliers)
@@ -144,10 +168,11 @@ def calibrate(
     probe_checks.information(estimate.target_from_image, estimate.scale, information, sightings.of(inliers), size)
     covariance = np.linalg.inv(information)[: len(NAMES), : len(NAMES)]
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
-    calibration = ProbeCalibration(estimate.target_from_image, estimate.scale, uncertainty)
+    ahead = rigid.transform(np.eye(3), [0, -ahead_mm, 0])
+    calibration = ProbeCalibration(estimate.target_from_image @ ahead, estimate.scale, uncertainty)
     probe_checks.outcome(calibration, size, expected)
     chi = np.sqrt(_squared(estimate, sightings, noise)) / factor
-    return Adjustment(calibration, estimate.wire, _residuals(estimate, sightings), chi, ~inliers, factor)
+    return Adjustment(calibration, estimate.wire, _residuals(estimate, sightings), chi, ~inliers, factor, abs(estimate.apart))
 
 
 def from_images(
@@ -168,38 +193,9 @@ def from_images(
     good = [k for k, each in enumerate(found) if each.found]
     pixels = np.array([found[k].pixel for k in good]).reshape(-1, 2)
     covariance = np.array([found[k].covariance for k in good]).reshape(-1, 2, 2)
-    return Sightings(poses[good], pixels, pixel_covariance=covariance), found
-
-
-def closed_form(poses: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    """Least squares without iteration, all frames alike, for any number of sets of frames at once.
-
-    `R_i (u_i a + v_i b + t) + t_i = wire` is linear in a = sx x, b = sy y, t and the wire. The lengths of a and b are the scales;
-    the rotation is the one nearest to their directions.
-
-    Parameters
-    ----------
-    poses, pixels : (..., n, 4, 4) and (..., n, 2)
-        n >= 4.
-
-    Returns
-    -------
-    target_from_image, scale, wire : (..., 4, 4), (..., 2), (..., 3)
-    """
-    turns, shifts = poses[..., :3, :3], poses[..., :3, 3]
-    u, v = pixels[..., 0, None, None], pixels[..., 1, None, None]
-    fixed = np.broadcast_to(-np.eye(3), turns.shape)
-    design = np.concatenate([u / 100 * turns, v / 100 * turns, turns / 100, fixed / 100], axis=-1)  # columns of like length
-    rows = (*pixels.shape[:-2], -1)
-    solution = -(np.linalg.pinv(design.reshape(*rows, 12)) @ shifts.reshape(*rows, 1))[..., 0] / 100
-    columns = np.stack([solution[..., :3], solution[..., 3:6]], axis=-1)
-    scale = np.linalg.norm(columns, axis=-2)
-    left, _, right = np.linalg.svd(columns / np.maximum(scale, 1e-12)[..., None, :], full_matrices=False)
-    axes = left @ right
-    result = np.zeros((*pixels.shape[:-2], 4, 4))
-    result[..., :3, :2], result[..., :3, 2] = axes, np.cross(axes[..., 0], axes[..., 1])
-    result[..., :3, 3], result[..., 3, 3] = solution[..., 6:9], 1
-    return result, scale, solution[..., 9:]
+    unseen = np.full((2, 2), np.nan)
+    lines = np.array([unseen if found[k].directions is None else found[k].directions for k in good]).reshape(-1, 2, 2)
+    return Sightings(poses[good], pixels, pixel_covariance=covariance, directions=lines), found
 
 
 def point_covariance(calibration: ProbeCalibration, pixels: ArrayLike) -> Array:
@@ -208,7 +204,7 @@ def point_covariance(calibration: ProbeCalibration, pixels: ArrayLike) -> Array:
     if calibration.uncertainty is None:
         return np.zeros((len(pixels), 3, 3))
     order = [NAMES.index(name) for name in calibration.uncertainty.names]
-    jacobian = _point_jacobian(calibration.target_from_image, calibration.scale, pixels)[..., order]
+    jacobian = probe_equations.point_jacobian(calibration.target_from_image, calibration.scale, pixels)[..., order]
     return jacobian @ calibration.uncertainty.covariance @ np.swapaxes(jacobian, -1, -2)
 
 
@@ -219,14 +215,16 @@ def motion(size: Size, count: int = 30, tilt_deg: float = 35.0, roll_deg: float 
     -------
     turns : (count, 3) deg
         Tilt about the array's axis x, roll about the depth axis y and tilt about the normal z, done in the order y, x, z in
-        axes that go with the image. Tilts are `tilt_deg` to all sides, rolls up to `roll_deg` both ways.
+        axes that go with the image. Tilts are `tilt_deg` to all sides, but mostly forward and backward: rocked in its own plane
+        only, the probe sees both wires on one line. Rolls are up to `roll_deg` both ways.
     pixels : (count, 2) px
         Near the four corners, each round in another order: they tell the scales and the image's attitude best.
     """
     steps = np.arange(count)
     phase = 2 * np.pi * np.sqrt(2) * steps  # irrational, as the roll's: no two frames are alike, and no two angles go together
     roll = roll_deg * (2 * ((steps * (np.sqrt(5) - 1) / 2) % 1) - 1)
-    turns = np.column_stack([tilt_deg * np.cos(phase), roll, tilt_deg * np.sin(phase)])
+    rock = ROCK * np.sin(phase)
+    turns = np.column_stack([tilt_deg * np.sign(np.cos(phase)) * np.sqrt(1 - rock**2), roll, tilt_deg * rock])
     corners = np.array([[-1, -1], [1, 1], [1, -1], [-1, 1]])
     return turns, (np.array(size) - 1) / 2 + np.array(size) * REACH * corners[(steps + steps // 4) % 4]
 
@@ -240,11 +238,23 @@ def _checked(sightings: Sightings, size: Size) -> Sightings:
         raise InputError(f"sightings: expected at least {MIN_FRAMES} frames with a pose and a crossing, found {len(poses)}")
     probe_checks.poses(poses)
     probe_checks.pixels(pixels, size)
-    return Sightings(poses, pixels, sightings.pose_covariance, sightings.pixel_covariance, sightings.slice_mm)
+    return replace(sightings, poses=poses, pixels=pixels, beside=None)
+
+
+def _with_wires(estimate: _Estimate, sightings: Sightings, inliers: Mask) -> Sightings:
+    """With the places where lines meet by the wires' distance, if both wires can be told."""
+    if sightings.directions is None:
+        return sightings
+    lines = np.isfinite(sightings.directions).all(axis=(1, 2))
+    turns, chosen = sightings.poses[:, :3, :3] @ estimate.target_from_image[:3, :3], lines & inliers
+    found = wires.directions_of(wires.planes(turns[chosen], estimate.scale, sightings.directions[chosen]))
+    if found is None:
+        return sightings
+    return replace(sightings, beside=np.where(lines[:, None], wires.beside(turns, estimate.scale, found), 0))
 
 
 def _residuals(estimate: _Estimate, sightings: Sightings) -> Array:
-    points = ProbeCalibration(estimate.target_from_image, estimate.scale).to_target(sightings.pixels)
+    points = ProbeCalibration(estimate.target_from_image, estimate.scale).to_target(estimate.pixels(sightings))
     return np.einsum("nij,nj->ni", sightings.poses[:, :3, :3], points) + sightings.poses[:, :3, 3] - estimate.wire
 
 
@@ -252,11 +262,13 @@ def _covariances(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Arr
     """Of the residuals : (n, 3, 3) mm^2: the pose's, with its lever, and in the image's axes the crossing's."""
     n = len(sightings.pixels)
     turns = sightings.poses[:, :3, :3]
-    points = ProbeCalibration(estimate.target_from_image, estimate.scale).to_target(sightings.pixels)
+    points = ProbeCalibration(estimate.target_from_image, estimate.scale).to_target(estimate.pixels(sightings))
     pose = sightings.pose_covariance
     if pose is None:
         pose = np.diag([np.radians(noise.angle_deg) ** 2] * 3 + [noise.position_mm**2] * 3)
-    lever = np.concatenate([-_cross(np.einsum("nij,nj->ni", turns, points)), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=-1)
+    lever = np.concatenate(
+        [-probe_equations.cross(np.einsum("nij,nj->ni", turns, points)), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=-1
+    )
     local = np.broadcast_to(FLOOR_MM**2 * np.eye(3), (n, 3, 3)).copy()
     pixel = np.eye(2) * noise.pixel_px**2 if sightings.pixel_covariance is None else sightings.pixel_covariance
     local[:, :2, :2] += pixel * np.outer(estimate.scale, estimate.scale)
@@ -273,22 +285,20 @@ def _squared(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
     )
 
 
-def _point_jacobian(target_from_image: Array, scale: Array, pixels: Array) -> Array:
-    """Of points in the target's frame, by NAMES : (n, 3, 8)."""
-    x, y = target_from_image[:3, 0], target_from_image[:3, 1]
-    arms = pixels[:, :1] * scale[0] * x + pixels[:, 1:] * scale[1] * y
-    unit = np.broadcast_to(np.eye(3), (len(pixels), 3, 3))
-    return np.concatenate([(pixels[:, :1] * x)[..., None], (pixels[:, 1:] * y)[..., None], -_cross(arms), unit], axis=-1)
-
-
 def _normal_equations(estimate: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> tuple[Array, Array, float]:
-    """Matrix (11, 11), right-hand side (11,) and cost, with the covariances as they are at the estimate."""
-    jacobian = sightings.poses[:, :3, :3] @ _point_jacobian(estimate.target_from_image, estimate.scale, sightings.pixels)
-    jacobian = np.concatenate([jacobian, np.broadcast_to(-np.eye(3), (len(jacobian), 3, 3))], axis=-1)
+    """Matrix (12, 12), right-hand side (12,) and cost, with the covariances as they are at the estimate."""
+    turns, n = sightings.poses[:, :3, :3], len(sightings.pixels)
+    jacobian = turns @ probe_equations.point_jacobian(estimate.target_from_image, estimate.scale, estimate.pixels(sightings))
+    beside = np.zeros((n, 2)) if sightings.beside is None else sightings.beside
+    apart = -np.einsum("nij,jk,nk->ni", turns, estimate.target_from_image[:3, :2] * estimate.scale, beside)
+    jacobian = np.concatenate([jacobian, np.broadcast_to(-np.eye(3), (n, 3, 3)), apart[..., None]], axis=-1)
     residuals = _residuals(estimate, sightings)
     whiten = np.linalg.inv(np.linalg.cholesky(_covariances(estimate, sightings, noise))) * np.sqrt(weights)[:, None, None]
-    white, left = (whiten @ jacobian).reshape(-1, 11), (whiten @ residuals[..., None]).ravel()
-    return white.T @ white, -white.T @ left, float(left @ left)
+    white, left = (whiten @ jacobian).reshape(-1, 12), (whiten @ residuals[..., None]).ravel()
+    matrix, rhs, cost = white.T @ white, -white.T @ left, float(left @ left)
+    matrix[11, 11] += 1 / APART_MM**2
+    rhs[11] -= estimate.apart / APART_MM**2
+    return matrix, rhs, cost + (estimate.apart / APART_MM) ** 2
 
 
 def _levenberg_marquardt(start: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> _Estimate:
@@ -315,8 +325,11 @@ def _robust_start(sightings: Sightings, noise: Noise, rng: np.random.Generator) 
     """Least median of squares over closed forms: of all frames, and of random sixes. The best few are refined first."""
     n = len(sightings.pixels)
     draws = np.argsort(rng.random((DRAWS, n)), axis=1)[:, :MIN_FRAMES]
-    starts = [_Estimate(*closed_form(sightings.poses, sightings.pixels))]
-    starts += [_Estimate(*each) for each in zip(*closed_form(sightings.poses[draws], sightings.pixels[draws]), strict=True)]
+    starts = [_Estimate(*probe_equations.closed_form(sightings.poses, sightings.pixels))]
+    starts += [
+        _Estimate(*each)
+        for each in zip(*probe_equations.closed_form(sightings.poses[draws], sightings.pixels[draws]), strict=True)
+    ]
     medians = np.array([np.median((_residuals(start, sightings) ** 2).sum(axis=1)) for start in starts])
     best = [_refined_on_half(starts[k], sightings, noise) for k in np.argsort(medians)[:5]]
     return min(best, key=lambda estimate: np.median(_squared(estimate, sightings, noise)))
@@ -350,7 +363,7 @@ def _without_outliers(start: _Estimate, sightings: Sightings, noise: Noise) -> t
             break
         inliers = inside
         estimate = _levenberg_marquardt(estimate, sightings.of(inliers), noise, np.ones(inliers.sum()))
-        freedom = 3 * inliers.sum() - 11
+        freedom = 3 * inliers.sum() - 11 - (sightings.beside is not None)
         factor = np.sqrt(max(_squared(estimate, sightings.of(inliers), noise).sum() / freedom, 1e-12))
     return estimate, inliers, float(factor)
 
@@ -369,11 +382,3 @@ def _say_why(sightings: Sightings, noise: Noise, rms: float, factor: float, inli
     few = f"only {inliers.sum()} of {len(inliers)} that agree"
     found = few if inliers.mean() < MIN_INLIERS else f"residuals of {rms:.1f} mm (rms), {factor:.1f} times the assumed noise"
     raise InputError(f"sightings: expected frames of one point at rest, found {found}")
-
-
-def _cross(vectors: Array) -> Array:
-    """Matrices : (n, 3, 3) of the cross product with vectors : (n, 3) from the left."""
-    result = np.zeros((*vectors.shape, 3))
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    result[..., 0, 1], result[..., 0, 2], result[..., 1, 2] = -z, y, -x
-    return result - np.swapaxes(result, -1, -2)

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, field_validator, model_validator
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from recon import atomic, metrics, probe_calibration, probe_files, repeatability, sweep_capture, sweep_tables, water
+from recon import atomic, metrics, probe_calibration, probe_files, repeatability, sweep_capture, sweep_tables, water, wires
 from recon.capture import Size
 from recon.crosswire import Appearance, Crossing
 from recon.errors import InputError
@@ -38,6 +38,7 @@ from recon.sweep_capture import SweepCapture
 PROBE = "probe.yaml"
 FRAMES = "frames.csv"  # by which the folder of a probe's calibration is known
 HEADER = ("frame", "status", "u", "v", "contrast_db", "residual_mm", "normalised", "reason")
+ORDINARY_C = 22.0  # of water, where no temperature is given
 SHOWN_DEPTH_MM = 50.0  # at which a wrong speed of sound is shown
 
 
@@ -55,6 +56,8 @@ class Config(BaseModel):
     temperature_sigma_c: NotNegative = 0.5
     assumed_speed: Positive = water.SCANNER_SPEED
     medium_speed: Positive | None = None
+    wire_radius_mm: NotNegative = 0.1
+    wire_speed: Positive = 2600.0
     appearance: Appearance = Appearance()
     noise: Noise = Noise()
     seed: int = 0
@@ -114,7 +117,9 @@ def run(config: Config) -> None:
     start = perf_counter()
     expected = config.rig.probe.target_from_image.matrix()
     try:
-        found = probe_calibration.calibrate(seen.sightings, seen.size, config.noise, expected, config.seed)
+        found = probe_calibration.calibrate(
+            seen.sightings, seen.size, config.noise, expected, config.seed, ahead_mm=echo_ahead(config)
+        )
     except InputError as error:
         raise InputError(f"{seen.name}: {error}") from None
     seconds["seconds_calibrate"] = round(perf_counter() - start, 3)
@@ -190,6 +195,12 @@ def refuse_few(seen: Seen) -> None:
         raise InputError(f"{seen.name}: expected {expected}, found {len(seen.usable)} (most often: {reason})")
 
 
+def echo_ahead(config: Config) -> float:
+    """By how much the wires' echo lies before their axes, mm."""
+    temperature = ORDINARY_C if config.temperature_c is None else config.temperature_c
+    return wires.echo_ahead(config.wire_radius_mm, config.wire_speed, float(water.speed_of_sound(temperature)))
+
+
 def in_tissue(calibration: ProbeCalibration, config: Config) -> ProbeCalibration:
     """The calibration for the medium that will be scanned, where the water's temperature is known; else as it is."""
     if config.temperature_c is None:
@@ -219,6 +230,8 @@ def measure(seen: Seen, found: Adjustment, calibration: ProbeCalibration, config
         "frames_used": int((~found.outliers).sum()),
         "rms_mm": found.rms_mm,
         "noise_factor": found.noise_factor,
+        "wires_apart_mm": found.apart_mm,
+        "echo_ahead_mm": echo_ahead(config),
         "sx_mm_per_px": float(calibration.scale[0]),
         "sy_mm_per_px": float(calibration.scale[1]),
         "sx_sigma_mm_per_px": known.sigma("sx"),
@@ -239,6 +252,9 @@ def describe(seen: Seen, found: Adjustment, figures: Metrics, config: Config) ->
     left_out = f", {len(frames)} outlier{'s' if len(frames) > 1 else ''} left out ({_listed(frames)})" if frames else ""
     rms, factor = figures["rms_mm"], figures["noise_factor"]
     yield f"calibrate   {figures['frames_used']} frames{left_out}; RMS {rms:.3f} mm, noise {factor:.2f} times the assumed"
+    if found.apart_mm:
+        ahead = f"their echo taken {figures['echo_ahead_mm']:.2f} mm before their axes"
+        yield f"wires       seen as lines, the axes {found.apart_mm:.2f} mm apart; {ahead}"
     scales = ", ".join(
         f"{name} {figures[f'{name}_mm_per_px']:.5f} ± {figures[f'{name}_sigma_mm_per_px']:.5f}" for name in ("sx", "sy")
     )

@@ -27,8 +27,10 @@ def test_the_covariance_covers_the_error(rng):
     for _ in range(30):
         place = rng.uniform([60, 60], [260, 350])
         found = crosswire.find(bscans.image(bscans.spot(place, -26, tail_db=-60), rng, floor_db=-46))
+        if not found.found:  # too rough a top
+            continue
         z.append((found.pixel - place) @ np.linalg.solve(found.covariance, found.pixel - place))
-    assert 0.3 < np.mean(z) / 2 < 2.0
+    assert len(z) > 20 and 0.3 < np.mean(z) / 2 < 2.0
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.1, -0.4])
@@ -90,6 +92,25 @@ def test_oblique_wires_cross_where_their_lines_meet(rng, first, second):
         error = found.pixel - place
         assert (np.abs(error) < [2, 1]).all()
         assert error @ np.linalg.solve(found.covariance, error) < 13.8  # chi-square with 2, 1 of 1000
+
+
+def test_a_line_that_runs_into_the_face_doesnt_cross_it(rng):
+    """The face's ring is as bright along its whole row: no second line, however near the crossing is."""
+    place = np.array([150.3, 40.7])
+    amplitude = arm(place, 0.5, 24, 0) + 1j * arm(place, -0.4, 10, 0) + bscans.face(2)
+    found = crosswire.find(bscans.image(amplitude, rng))
+    assert found.found, found.reason
+    assert (np.abs(found.pixel - place) < [2, 1]).all()
+
+
+def test_the_wires_directions_are_those_of_the_lines(rng):
+    found = crosswire.find(bscans.image(arm(PLACE, 0.5, 18, 9) + 1j * arm(PLACE, -0.4, 14, -6), rng))
+    slopes = np.sort(found.directions[:, 1] / found.directions[:, 0])
+    assert slopes == pytest.approx([-0.4, 0.5], abs=0.05)
+
+
+def test_a_spot_has_no_directions(rng):
+    assert crosswire.find(bscans.image(bscans.spot(PLACE), rng)).directions is None
 
 
 def test_one_oblique_wire_is_no_crossing(rng):

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from recon import probe_calibration, repeatability, rigid, water
+from recon import probe_calibration, probe_equations, repeatability, rigid, water
 from recon.errors import InputError
 from recon.probe import ProbeCalibration
 from recon.probe_calibration import Noise, Sightings, calibrate
@@ -51,7 +51,7 @@ def test_without_noise_the_calibration_is_the_truth(probe, frames):
 
 def test_the_closed_form_is_exact_for_four_frames(probe, frames):
     poses = poses_of(probe, *frames)[:4]
-    pose, scale, _ = probe_calibration.closed_form(poses, frames[1][:4])
+    pose, scale, _ = probe_equations.closed_form(poses, frames[1][:4])
     assert errors(ProbeCalibration(pose, scale), probe).max() < 1e-5
 
 
