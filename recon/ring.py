@@ -3,7 +3,10 @@
 What is seen is the front half of the wall: it is bright where it is square to the beam, weaker towards the sides, and nothing
 behind it is where it seems, for sound has another speed inside. A wall's echo has its middle on the wall, since pulse and beam
 are symmetric; so the edge is the middle of the echo across the wall, between two equal levels, which stands clipped pixels.
-Only the bend of the wall moves it: of a circle of radius R blurred by sigma along the wall, the ridge lies at `R - sigma²/(2 R)`.
+Two things move it. The bend of the wall: of a circle of radius R blurred by sigma along the wall, the ridge lies at
+`R - sigma²/(2 R)`. And its fading towards the sides: the beam is wider than the pulse is deep, so a bright crest smears beyond
+the wall beside it. A wall whose power grows as `exp(g s)` along its tangent t, blurred by a Gaussian of covariance S, has its
+ridge `-g t.S n` off along its normal n.
 """
 
 from collections.abc import Sequence
@@ -33,6 +36,7 @@ WINDOW_SPREADS = 3.0  # times the spread along the array
 SAMPLE_MM = 0.02
 EDGE_DB = 10.0  # below the echo's top, where its two edges are taken
 OUTLIER = 3.5  # standard deviations from the smooth outline
+FADING_DEG = 6.0  # sigma of the window in which the brightness' slope along the wall is taken
 LEAST_EDGES = 40
 FLOOR_MM = 0.01  # no edge counts as more exact than this
 SEED = 0  # of the trials: the same image gives the same ring
@@ -210,9 +214,12 @@ def _measured(level: NDArray[np.float32], scale: Array, circle: Array, look: App
     kept = np.abs(radius - outline) < OUTLIER * scatter * extent + FLOOR_MM
     if kept.sum() < LEAST_EDGES:
         return _none(f"too few edges: {kept.sum()} of {len(kept)} on a smooth outline")
+    nepers = np.log(10) / 10 * profiles[good][kept].max(axis=1) / grey  # of power
     angle, rays, radius = angle[kept], rays[kept], radius[kept]
-    along_wall = (look.spread_mm[0] * np.cos(angle)) ** 2 + (look.spread_mm[1] * np.sin(angle)) ** 2  # variance
-    radius = radius + along_wall / (2 * radius)
+    wide, deep = np.square(look.spread_mm)  # variances
+    bend = (wide * np.cos(angle) ** 2 + deep * np.sin(angle) ** 2) / (2 * radius)
+    fading = _slopes(angle, nepers) / radius * (wide - deep) * np.sin(angle) * np.cos(angle)
+    radius = radius + bend + fading
     sigma = np.hypot(scatter * extent[kept], FLOOR_MM)
     across = rays / scale  # px for 1 mm
     covariance = sigma[:, None, None] ** 2 * across[:, :, None] * across[:, None, :]
@@ -235,6 +242,14 @@ def _echo_middles(profiles: Array, drop: float, contrast: float) -> tuple[Array,
             right = j - (edge - profile[j]) / (profile[j - 1] - profile[j])
             middle[k], extent[k] = (left + right) / 2, right - left
     return middle, extent
+
+
+def _slopes(angle: Array, value: Array) -> Array:
+    """Slopes : (n,) of a value over the angle, of lines fitted in a Gaussian window around each."""
+    weight = np.exp(-0.5 * ((angle[:, None] - angle) / np.deg2rad(FADING_DEG)) ** 2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    away = angle - (weight @ angle)[:, None]
+    return (weight * away) @ value / (weight * away**2).sum(axis=1)
 
 
 def _smooth_outline(angle: Array, radius: Array, extent: Array) -> tuple[Array, float]:

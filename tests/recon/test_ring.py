@@ -80,6 +80,24 @@ def test_the_bend_of_a_thin_tube_is_allowed_for():
     assert np.linalg.norm(offset[front], axis=1).mean() == pytest.approx(3.0, abs=0.012)
 
 
+def test_a_crest_that_outshines_the_sides_does_not_draw_them_out():
+    """Power that falls by 1 neper a mm from the crest, blurred by 0.4 and 0.1 mm: at 45 degrees 0.5 (0.4² - 0.1²) = 0.075 mm."""
+    pose = rigid.transform([[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0, -SCALE[0] * 160, -14])
+    radius, spread = 8.0, (0.4, 0.1)
+    points = wall(pose, radius, 89.0)
+    angle = np.arctan2(points[:, 0] - SCALE[0] * 160, 14.0 - points[:, 1])
+    power = np.zeros((FINE * SIZE[1], FINE * SIZE[0]))
+    i = np.rint(FINE * (points / SCALE + 0.5) - 0.5).astype(int)
+    np.add.at(power, (i[:, 1], i[:, 0]), np.exp(-radius * np.abs(angle)))
+    power = gaussian_filter(power, np.array(spread)[::-1] / SCALE[::-1] * FINE)[FINE // 2 :: FINE, FINE // 2 :: FINE]
+    image = np.clip(255 * (1 + 10 * np.log10(power / power.max() + 1e-9) / 60), 0, 255)
+    one = ring.find(image, SCALE, ring.Appearance(spread_mm=spread))
+    offset = one.pixels * SCALE - [SCALE[0] * 160, 14.0]
+    side = np.abs(np.abs(np.arctan2(offset[:, 0], -offset[:, 1])) - np.deg2rad(40)) < np.deg2rad(15)
+    assert side.sum() > 40
+    assert np.linalg.norm(offset[side], axis=1).mean() == pytest.approx(radius, abs=0.02)
+
+
 def test_a_wide_beam_is_stood(rng):
     sweep = poses(12, rng, tilt_deg=1.0)
     look = ring.Appearance(spread_mm=(0.4, 0.1))

@@ -1,0 +1,83 @@
+"""How true the diameter of a cylinder is that ultrasound measures in water: slices of a freehand sweep, a tube through them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon import ring, tracks, water
+from recon.probe import ProbeCalibration
+from recon.rig import Probe
+from recon.ring import Ring, Tube
+from scenes import inner_cylinder
+from twin.accuracy.rows import Row, Setup
+from twin.ultrasound.probe_path import SurfacePath, along_surface
+from twin.ultrasound.session import surface_of
+from twin.ultrasound.solids import body
+from twin.ultrasound.sweep import Clocks, Plan, PoseNoise, moments, plan, scans
+from twin.ultrasound.transducer import Transducer
+
+Array = NDArray[np.float64]
+
+WATER = Transducer(tgc_db_per_cm_mhz=0.0165, gain_db=-40.0)  # conf/ultrasound/water.yaml
+TEMPERATURE_C = 22.0
+SLICES = 94  # of the paper
+PACE_MM_S = 10.0
+LENGTH_MM = 46.5  # of the stroke: half a millimetre from slice to slice
+STANDOFF_MM = 17.0  # of the face from the wall
+PAPER_MM = 0.72  # error of its diameter
+SEEDS = (1, 2)  # of path, noise and clocks
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A sweep along the cylinder, as recorded."""
+
+    scene: inner_cylinder.Config
+    planned: Plan
+    images: list[NDArray[np.uint8]]
+
+
+def rows(setup: Setup) -> list[Row]:
+    """Rows h: the diameter against the true one, beside the standard deviation that the fit predicts."""
+    return [row for seed in SEEDS for row in judged(stroke(setup.rig.probe, SLICES, seed), setup.rig.probe, f"sweep {seed}")]
+
+
+def stroke(probe: Probe, slices: int, seed: int) -> Stroke:
+    """Lead the probe by hand along the middle of the cylinder, its array across, and take images at the scanner's rate."""
+    config, clocks = inner_cylinder.Config(), Clocks(scanner_hz=(slices - 1) * PACE_MM_S / LENGTH_MM)
+    made = body(inner_cylinder.build(config))
+    x, y, _ = config.centre_mm
+    half = LENGTH_MM / 2 + 0.1  # for the last image, too
+    path = SurfacePath(start_mm=(x - half, y), end_mm=(x + half, y), speed_mm_s=PACE_MM_S, turn_deg=90.0, standoff_mm=STANDOFF_MM)
+    course = along_surface(path, surface_of("inner", made), WATER, seed)
+    planned = plan(probe, course, moments(course, clocks.scanner_hz), clocks, PoseNoise(), seed)
+    return Stroke(config, planned, [one.image for one in scans(made, WATER, planned, seed)])
+
+
+def measured(recorded: Stroke, probe: Probe, speed: float) -> tuple[list[Ring], Tube]:
+    """Rings and tube as the pipeline finds them: the lag is known, and so is the speed of sound, m/s."""
+    scanner = ProbeCalibration(probe.target_from_image.matrix(), np.array(probe.scale_mm_per_px))
+    calibration = water.in_medium(scanner, WATER.assumed_speed, speed)
+    lag_ns = round(1e9 * Clocks().lag_s)
+    world_from_target = tracks.at(recorded.planned.track, recorded.planned.times - lag_ns)
+    world_from_pixel = world_from_target @ calibration.target_from_image @ np.diag([*calibration.scale, 1.0, 1.0])
+    rings = [ring.find(image, calibration.scale) for image in recorded.images]
+    return rings, ring.fit_tube(rings, world_from_pixel)
+
+
+def judged(recorded: Stroke, probe: Probe, what: str) -> list[Row]:
+    """Rows of one sweep."""
+    rings, tube = measured(recorded, probe, float(water.speed_of_sound(TEMPERATURE_C)))
+    name = f"inner cylinder, {len(rings)} slices, {what}"
+    error = abs(2 * tube.shape.radius - recorded.scene.diameter_mm)
+    turn = float(np.rad2deg(np.arccos(min(abs(tube.shape.axis[0]), 1.0))))
+    aside = float(np.linalg.norm((tube.shape.point - recorded.scene.centre_mm)[1:]))
+    found = float(np.mean([one.found for one in rings]))
+    return [
+        Row("h", f"{name}: error of the diameter (paper: {PAPER_MM})", error, 0.15, 2 * tube.sigma_mm, "mm"),
+        Row("h", f"{name}: share with a ring", found, 0.95, None, "", at_least=True),
+        Row("h", f"{name}: error of the axis' direction", turn, 0.1, None, "deg"),
+        Row("h", f"{name}: distance of the axis, in the middle", aside, 0.1, None, "mm"),
+        Row("h", f"{name}: RMS of the points about the tube", tube.rms, 0.1, None, "mm"),
+    ]
