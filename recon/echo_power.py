@@ -4,10 +4,11 @@ Speckle's power averages to the tissue's backscatter, its grey levels don't: the
 smaller than it is by what pulse and beam spill into it. So grey levels are turned back into power before they are averaged.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from recon import freehand
@@ -16,8 +17,9 @@ from recon.freehand import Clip, Grid
 from recon.volumes import Volume
 
 Array = NDArray[np.float64]
+Map = NDArray[np.float32]
 
-TISSUE_LEVEL = 40  # of 255 that tissue has on average: what is brighter than 8 dB above it counts as 8 dB
+BRIGHTEST = 10**0.8  # times tissue: what is brighter counts as 8 dB above it, such as walls square to the beam
 MEDIAN_OF_MEAN = np.log(2)  # of the power of speckle, which is exponentially distributed
 
 
@@ -26,7 +28,12 @@ class EchoPower:
     """Mean power, relative to the tissue's typical one, and where a pixel fell."""
 
     volume: Volume  # voxels (nz, ny, nx) float32; x along the array, y into the depth, z across the images
-    seen: NDArray[np.bool_]  # (nz, ny, nx)
+    weight: Map  # (nz, ny, nx) pixels that a voxel is the mean of
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Voxels that a pixel fell into : (nz, ny, nx)."""
+        return self.weight > 0
 
 
 def typical_grey(images: NDArray, rows: slice) -> float:
@@ -59,15 +66,78 @@ def averaged(
     dynamic_range_db: float = 60.0,
     clip: Clip | None = None,
 ) -> EchoPower:
-    """Average the power of B-scans : n times (h, w) uint8, log-compressed, on a grid; see `recon.freehand.reconstruct`.
+    """Average the power of B-scans : n times (h, w) uint8, log-compressed, on a grid.
 
     `tissue_grey` is the median level of tissue, which gets a mean power of 1. A `clip` should leave out the ringing at the face.
     """
+    table = powers(tissue_grey, dynamic_range_db)
+
+    def parts() -> Iterator[tuple[Map, Map, Map]]:
+        for image in images:
+            left, right, top, bottom = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
+            v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
+            yield table[image[top : bottom + 1, left : right + 1]], u, v
+
+    return accumulated(parts(), world_from_pixel, grid)
+
+
+def powers(tissue_grey: float, dynamic_range_db: float = 60.0) -> Map:
+    """Power of each grey level : (256,), relative to the mean of tissue whose median level is given."""
     decibels = (np.arange(256) - tissue_grey) * dynamic_range_db / 255
-    power = TISSUE_LEVEL * MEDIAN_OF_MEAN * 10 ** (decibels / 10)
-    table = np.rint(np.clip(power, 0, 255)).astype(np.uint8)
+    table = np.minimum(MEDIAN_OF_MEAN * 10 ** (decibels / 10), BRIGHTEST)
     table[0] = 0
-    result = freehand.reconstruct((table[image] for image in images), world_from_pixel, grid, "mean", "linear", clip)
-    volume = result.volume
-    relative = volume.voxels.astype(np.float32) / TISSUE_LEVEL
-    return EchoPower(Volume(relative, volume.origin, volume.spacing, volume.directions), result.filled)
+    return table.astype(np.float32)
+
+
+def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, grid: Grid) -> EchoPower:
+    """Average powers on a grid, each counting for the eight voxels around it by its distance.
+
+    Parameters
+    ----------
+    parts : n times (power, u, v), of one shape
+        Power, NaN where it isn't to count, and the places in the image.
+    world_from_pixel : (n, 4, 4)
+        Images with a NaN are left out.
+
+    Raises
+    ------
+    InputError
+        If the grid needs too much memory, or there are more or fewer images than poses.
+    """
+    shape = grid.size[::-1]
+    if np.prod(grid.size, dtype=float) * 8 > freehand.MOST_BYTES:
+        raise InputError(
+            f"power: expected at most {freehand.MOST_BYTES / 2**30:.0f} GiB, found {' x '.join(map(str, shape))} voxels"
+        )
+    value, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    voxel_from_world = np.linalg.inv(Volume(value, grid.origin, grid.spacing, grid.directions).world_from_voxel)
+    count = 0
+    for power, u, v in parts:
+        if count == len(world_from_pixel):
+            raise InputError(f"images: expected as many as poses, {count}, found more")
+        matrix = voxel_from_world @ world_from_pixel[count]
+        count += 1
+        if np.isfinite(matrix).all():
+            _add(power.ravel(), u.ravel(), v.ravel(), matrix, value, weight)
+    if count < len(world_from_pixel):
+        raise InputError(f"images: expected as many as poses, {len(world_from_pixel)}, found {count}")
+    value /= np.maximum(weight, 1e-6)
+    return EchoPower(Volume(value, grid.origin, grid.spacing, grid.directions), weight)
+
+
+@njit(cache=True)
+def _add(power, u, v, m, value, weight):
+    nz, ny, nx = value.shape
+    for n in range(power.size):
+        if not np.isfinite(power[n]):
+            continue
+        x = m[0, 0] * u[n] + m[0, 1] * v[n] + m[0, 3]
+        y = m[1, 0] * u[n] + m[1, 1] * v[n] + m[1, 3]
+        z = m[2, 0] * u[n] + m[2, 1] * v[n] + m[2, 3]
+        i0, j0, k0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+        for k in range(max(k0, 0), min(k0 + 2, nz)):
+            for j in range(max(j0, 0), min(j0 + 2, ny)):
+                for i in range(max(i0, 0), min(i0 + 2, nx)):
+                    share = np.float32((1 - abs(x - i)) * (1 - abs(y - j)) * (1 - abs(z - k)))
+                    value[k, j, i] += share * power[n]
+                    weight[k, j, i] += share

@@ -41,6 +41,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("measure-lag", "measure by how much the scanner's images lag behind the tracked poses"),
     Verb("surface", "reconstruct the surface from a capture, rendered or real"),
     Verb("freehand", "put tracked B-scans into a volume, for 3D Slicer too"),
+    Verb("segment", "find masses or a tube in tracked B-scans, as closed surfaces in the world"),
     Verb("evaluate", "compare a surface with a rendered capture's ground truth"),
     Verb("accuracy", "measure errors of the twin's rig and compare with the paper's figures"),
 )

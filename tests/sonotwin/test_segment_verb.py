@@ -1,0 +1,98 @@
+"""`sonotwin segment`, from a sweep to closed surfaces in the world."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.ndimage import gaussian_filter
+
+from recon import rigid, sweep_capture
+from recon.probe import ProbeCalibration
+from recon.tracks import Track
+from sonotwin.cli import main
+from tests.recon import probe_motions, sweep_sets
+
+LAG_S = 0.1
+SIZE, SCALE = (90, 100), np.array([0.35, 0.35])  # px, mm/px: 31.5 x 35 mm
+CENTRE, RADIUS = np.array([12.0, -8.0, 700.0]), 5.0
+DARK = 0.04  # of tissue's power
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory, rig) -> Path:
+    """A sweep at 10 mm/s, along y, across a dark ball in speckle, 16 mm deep."""
+    folder = tmp_path_factory.mktemp("mass") / "capture"
+    rng = np.random.default_rng(3)
+    probe = ProbeCalibration(rig.probe.target_from_image.matrix(), SCALE)
+    turn = probe_motions.LOOKING_AWAY
+    place = turn[:, 0] * SCALE[0] * SIZE[0] / 2 + turn[:, 1] * 16.0
+
+    def world_from_image(t: float) -> np.ndarray:
+        return rigid.transform(turn, CENTRE - place + turn[:, 2] * 10 * t)
+
+    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    plane = np.stack([u * SCALE[0], v * SCALE[1], 0 * u], axis=-1)
+
+    def image(t: float) -> np.ndarray:
+        distance = np.linalg.norm(rigid.apply(world_from_image(t), plane) - CENTRE, axis=-1)
+        field = rng.normal(size=(2, *distance.shape)) * np.where(distance < RADIUS, np.sqrt(DARK), 1.0)
+        power = (gaussian_filter(field, (0, 0.5, 0.7)) ** 2).sum(axis=0) * 4 * np.pi * 0.35
+        return np.rint(np.clip(255 * (1 + (10 * np.log10(power + 1e-9) - 28) / 60), 0, 255)).astype(np.uint8)
+
+    moments, tracked = np.arange(-1.2, 1.2, 0.05), np.arange(-1.3, 1.3, 0.025)
+    poses = np.array([world_from_image(t) @ rigid.invert(probe.target_from_image) for t in tracked])
+    times, track = sweep_sets.nanoseconds(moments + LAG_S), Track(sweep_sets.nanoseconds(tracked), poses)
+    sweep_capture.write_sweep(folder, (image(t) for t in moments), times, track, SIZE, probe, "mass")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def segmented(capture) -> Path:
+    out = capture.parent / "masses"
+    plane = trimesh.creation.box((80, 80, 1)).apply_translation([12, -8, 685.5])
+    front = plane.submesh([np.flatnonzero(plane.face_normals[:, 2] < -0.9)], append=True)
+    front = front.subdivide().subdivide().subdivide().subdivide()
+    front.export(capture.parent / "skin.ply")
+    assert main(["segment", f"capture={capture}", f"lag_s={LAG_S}", f"surface={capture.parent / 'skin.ply'}", f"out={out}"]) == 0
+    return out
+
+
+def test_the_mass_is_where_it_is_and_as_large(segmented):
+    """Speckle of 1100 mm2 of border views leaves some per cent; the skin is a plane 15 mm before its middle."""
+    figures = json.loads((segmented / "metrics.json").read_text())
+    assert figures["masses"] == 1
+    assert figures["mass0_volume_mm3"] == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.08)
+    centre = [figures[f"mass0_centre_{axis}_mm"] for axis in "xyz"]
+    assert np.linalg.norm(centre - CENTRE) < 0.25
+    assert figures["mass0_inside"] == 1 and figures["mass0_depth_mm"] == pytest.approx(15 - RADIUS, abs=0.6)
+
+
+def test_files(segmented):
+    names = {path.name for path in segmented.iterdir()}
+    assert {"mass0.ply", "mass0.glb", "metrics.json", "overlay0.png"} <= names
+    mesh = trimesh.load_mesh(segmented / "mass0.ply")
+    figures = json.loads((segmented / "metrics.json").read_text())
+    assert mesh.is_watertight and mesh.volume == pytest.approx(figures["mass0_volume_mm3"], rel=1e-3)
+
+
+def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, tmp_path, capsys):
+    out = tmp_path / "out"
+
+    def complaint(*fields: str) -> str:
+        assert main(["segment", f"out={out}", *fields]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("sonotwin: ")
+
+    assert complaint() == "segment: expected capture or sequence, found neither"
+    assert complaint(f"capture={capture}", f"surface={tmp_path / 'a.ply'}").endswith(
+        "a.ply: expected a surface as PLY, found none"
+    )
+    (tmp_path / "b.ply").write_bytes(b"ply\nformat")
+    assert f"{tmp_path / 'b.ply'}: expected a surface" in complaint(f"capture={capture}", f"surface={tmp_path / 'b.ply'}")
+    assert complaint(f"capture={capture}", "tissue_m_s=1").startswith("segment: tissue_m_s: expected ")
+    assert complaint(f"capture={capture}", "kind=tube", "surface=a.ply").startswith("segment: surface: expected none with kind=")
+    assert complaint(f"capture={capture}", "diameter_mm=[9,5]").startswith("segment: diameter_mm: expected the least before")
+    assert complaint(f"capture={capture}", "kind=tube").startswith(f"{capture}: rings: expected at least three images")
+    assert not out.exists()

@@ -1,0 +1,18 @@
+"""The rows of the tumours, at full size."""
+
+from pathlib import Path
+
+import pytest
+
+from recon.capture import read_patterns
+from twin.accuracy import masses
+from twin.accuracy.rows import Setup
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.mark.slow
+def test_tumours_are_found_as_large_as_they_are(rig):
+    """All three, no others, within 0.5 mm and 8 %, under the skin that the cameras measured."""
+    setup = Setup(rig, {path.stem: read_patterns(path) for path in (ROOT / "conf" / "patterns").glob("*.yaml")})
+    assert not [row for row in masses.rows(setup) if not row.ok]
