@@ -5,7 +5,7 @@ A page is an opening and a list of sections; a section is a heading and blocks o
 
 import html
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from string import Template
@@ -80,9 +80,20 @@ def drawing(svg: str, caption: str, detail: str = "") -> str:
 
 
 def view(name: str, plotly_json: str, caption: str) -> str:
-    """A 3-D view to be turned, with a switch for its colours."""
+    """A 3-D view to be turned."""
     figure = plotly_json.replace("</", "<\\/")
     return _template("view.html").substitute(name=name, figure=figure, caption=_text(caption))
+
+
+def switch(name: str) -> str:
+    """Buttons for the colour of a `figures.surface_view` that stands on the page under this name: error, depth or plain."""
+    return _template("switch.html").substitute(name=name)
+
+
+def key(colours: Mapping[str, str]) -> str:
+    """What the colours of lines in pictures mean."""
+    entries = "".join(f'<span><i style="background:{colour}"></i>{_text(name)}</span>' for name, colour in colours.items())
+    return f'<p class="key">{entries}</p>'
 
 
 def grid(blocks: Iterable[str], arrangement: str = "") -> str:

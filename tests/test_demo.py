@@ -3,14 +3,16 @@
 import html
 import json
 import re
+import shlex
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from recon.errors import InputError
 from sonotwin.cli import main
-from sonotwin.config import compose
-from sonotwin.verbs.demo import Config, commands
+from sonotwin.config import compose, load
+from sonotwin.verbs.demo import Config, commands, looked_inside
 from twin import demo
 from twin.demo import Step
 
@@ -23,6 +25,12 @@ SMALL = (  # camera 1 at half its size: fringes of ten pixels a period
     "scene.edge_mm=1.5",
     "poses.count=4",
 )
+COARSE = [  # B-scans of half the lines and two thirds of the rows
+    f"{part}.{field}"
+    for part in ("rig.probe", "ultrasound")
+    for field in ("image_size=[161,272]", "scale_mm_per_px=[0.2458,0.18375]")
+]
+SWEPT = (*COARSE, "path.strokes=1", "wires=30", "bottom_s=3")  # over the largest tumour alone
 MADE = ("report.html", "surface.ply", "surface.glb", "metrics.json", "calibration/calibration.html", "truth/scene.json")
 
 
@@ -32,7 +40,7 @@ def figures(folder):
 
 def test_a_small_demonstration_runs_through(tmp_path, capsys):
     out = tmp_path / "demo"
-    assert main(["demo", *SMALL, f"out={out}", f"board={tmp_path / 'board'}"]) == 0
+    assert main(["demo", *SMALL, "path=none", f"out={out}", f"board={tmp_path / 'board'}"]) == 0
     assert not [name for name in MADE if not (out / name).is_file()]
     metrics = figures(out)
     # With four samples a pixel rendering noise adds to the sensor's; at this size edges are a larger part of the image.
@@ -54,6 +62,33 @@ def test_a_small_demonstration_runs_through(tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_a_small_demonstration_looks_inside(tmp_path, capsys):
+    """The tumour that is swept over is found where it is; the two others are told to be missing."""
+    out = tmp_path / "demo"
+    assert main(["demo", *SMALL[:-1], *SWEPT, "poses=none", f"out={out}"]) == 0
+    made = (
+        "report.html",
+        "probe/probe.yaml",
+        "lag/lag.json",
+        "volume/volume.nrrd",
+        "tumours/mass0.ply",
+        "sweep/truth/scene.json",
+    )
+    assert not [name for name in made if not (out / name).is_file()]
+    metrics = figures(out)
+    assert (metrics["tumours_true"], metrics["tumours_found"], metrics["tumours_false"]) == (3, 1, 0)
+    assert metrics["tumour0_centre_error_mm"] < 1 and metrics["tumour0_dice"] > 0.85 and metrics["tumour0_inside"] == 1
+    assert metrics["lag_low_ms"] - 2 < 50 < metrics["lag_high_ms"] + 2
+    assert metrics["sweep_placement_rms_mm"] < 1
+    steps = ("wires", "probe", "bottom", "lag", "sweep", "volume", "tumours", "compare")
+    assert all(f"seconds_{name}" in metrics for name in steps)
+    last = capsys.readouterr().out.splitlines()[-7:]
+    assert [line.split()[0] for line in last] == ["measured", "accuracy", "probe", "lag", "tumours", "coverage", "look"]
+    report = html.unescape((out / "report.html").read_text(encoding="utf-8"))
+    assert "sonotwin segment" in report and "tumours, found" in report and "not found" in report
+
+
+@pytest.mark.slow
 def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path):
     out = tmp_path / "demo"
     assert main(["demo", f"out={out}", f"board={tmp_path / 'board'}"]) == 0
@@ -63,6 +98,9 @@ def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path):
     assert metrics["coverage"] > 0.98 and metrics["gross_error_fraction"] < 1e-4
     assert metrics["z_std"] == pytest.approx(1, abs=0.1)
     assert metrics["seconds_demo"] < 300
+    assert metrics["tumours_found"] == 3 and metrics["tumours_false"] == 0
+    for k in range(3):
+        assert metrics[f"tumour{k}_centre_error_mm"] < 1 and metrics[f"tumour{k}_inside"] == 1
     assert (out / "report.html").stat().st_size < 12e6
 
 
@@ -137,7 +175,7 @@ def test_other_peoples_files_are_left_alone(tmp_path):
 def test_the_report_repeats_the_settings_that_were_given(tmp_path):
     overrides = ["scene=sphere", "out=elsewhere", "poses=paper"]
     config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
-    lines = commands(tmp_path / "a b", config, overrides)
+    lines = commands(tmp_path / "a b", config, overrides, 0.0)
     verbs = ["demo", "render", "calibrate-optics", "render", "surface", "evaluate"]
     assert [re.split(r"\s", line)[1] for line in lines] == verbs
     assert "scene=sphere" in lines[0] and "scene=sphere" in lines[3] and "elsewhere" not in "".join(lines)
@@ -146,7 +184,44 @@ def test_the_report_repeats_the_settings_that_were_given(tmp_path):
 
 
 def test_without_poses_nothing_is_calibrated(tmp_path):
-    config = Config.model_validate(compose("demo", ["poses=none"]), context={"overrides": []})
+    config = Config.model_validate(compose("demo", ["poses=none", "path=none"]), context={"overrides": []})
     assert config.poses is None
-    lines = commands(tmp_path, config, [])
+    lines = commands(tmp_path, config, [], 0.0)
     assert [re.split(r"\s", line)[1] for line in lines] == ["demo", "render", "surface", "evaluate"]
+
+
+def test_the_commands_of_the_sweep_are_those_of_the_verbs(tmp_path):
+    """Each has the settings that its verb knows, and passes its verb's own checks."""
+    overrides = ["poses=none", "clocks.lag_s=0.08", "scene.edge_mm=1.5", "engine.samples=4", f"board={tmp_path}", *COARSE]
+    config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
+    lines = [shlex.split(line)[1:] for line in commands(tmp_path, config, overrides, 0.0503)]
+    verbs = [line[0] for line in lines]
+    inside = ["sweep", "calibrate-probe", "sweep", "measure-lag", "sweep", "freehand", "segment"]
+    assert verbs == ["demo", "render", "surface", "evaluate", *inside]
+    for verb, *fields in lines:
+        module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
+        assert load(verb, fields, module.Config), verb
+    assert "lag_s=0.0503" in lines[-1] and "path=raster" in lines[8] and "clocks.lag_s=0.08" in lines[8]
+
+
+@pytest.mark.parametrize(("overrides", "inside"), [([], True), (["path=none"], False), (["scene=sphere"], False)])
+def test_only_what_has_tumours_is_looked_into(overrides, inside):
+    config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
+    assert config.looks_inside is inside
+
+
+def test_what_is_left_out_is_said():
+    """A sphere hides nothing, and a person might wonder; who asks for no path knows."""
+    sphere, none = (
+        Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
+        for overrides in (["scene=sphere"], ["path=none"])
+    )
+    (line,) = looked_inside(sphere, {})
+    assert line.startswith("left out") and "sphere" in line
+    assert looked_inside(none, {}) == []
+
+
+def test_two_scanners_are_refused_before_any_work(tmp_path, capsys):
+    assert main(["demo", "ultrasound.image_size=[161,272]", f"out={tmp_path / 'demo'}"]) != 0
+    assert "ultrasound.image_size: expected rig.probe's [321, 408]" in capsys.readouterr().err
+    assert not (tmp_path / "demo").exists()

@@ -16,8 +16,10 @@ from recon.figures import CYCLIC, DIVERGING, SEQUENTIAL, Scale
 from recon.metrics import Metrics, shown
 from recon.page import Opening, Section
 from recon.patterns import CentreLine, Fringes, GrayCode, Uniform
-from twin import evaluate
+from twin import evaluate, sweep_report
 from twin.evaluate import GROSS_MM, Comparison, Truth
+from twin.sweep_report import Inside
+from twin.ultrasound.session import SUPPORTS
 
 ERROR_MM = 0.1  # colours of errors span plus and minus this
 SYSTEMATIC_MM = 0.02  # colours of averaged errors span plus and minus this
@@ -63,7 +65,12 @@ def read(captured: Path, truth: Path, points: Path, camera: str = "cam1") -> Mea
 
 
 def write(
-    path: Path, measurement: Measurement, metrics: Metrics, outputs: Sequence[tuple[str, str]], commands: Sequence[str]
+    path: Path,
+    measurement: Measurement,
+    metrics: Metrics,
+    outputs: Sequence[tuple[str, str]],
+    commands: Sequence[str],
+    inside: Inside | None = None,
 ) -> None:
     """Write the report, one HTML file of about 8 MB that needs no other.
 
@@ -75,12 +82,20 @@ def write(
         For the list at the end.
     commands : sequence of str
         That make the same again.
+    inside : Inside, optional
+        What ultrasound adds.
     """
+    scanned, probe = [], []
+    if inside is not None:
+        scanned = [sweep_report.inside(inside, measurement.points, without_supports(measurement), metrics)]
+        probe = [sweep_report.probe_and_clock(inside, metrics)]
     sections = [
         surface(measurement),
+        *scanned,
         errors(measurement, metrics),
         images(measurement),
         decoding(measurement),
+        *probe,
         beside_the_paper(metrics),
         settings(measurement, metrics),
         Section("Files, and how to make them again", [page.table(("file", "what is in it"), outputs), page.commands(commands)]),
@@ -104,11 +119,12 @@ def opening(measurement: Measurement, metrics: Metrics) -> Opening:
     things = ", ".join(f"{name} {shown(value, '.3f')}" for name, value in evaluate.things(metrics).items())
     result = (
         f"From {measurement.shots.patterns.count} images, {page.count(metrics['points'])} points of the surface were measured to "
-        f"{here:.3f} mm RMS of the true one ({things}){factor}."
+        f"{here:.3f} mm RMS of the true one ({things}){factor}.{sweep_report.result(metrics)}"
     )
+    both = "tumours_true" in metrics
     return Opening(
-        "fringe projection, digital twin",
-        f"The {scene}, measured by fringe projection",
+        f"fringe projection{' and freehand ultrasound' if both else ''}, digital twin",
+        f"The {scene}, {'outside and inside' if both else 'measured by fringe projection'}",
         result,
         (
             ("error, RMS", f"{here:.3f}", "mm"),
@@ -122,9 +138,15 @@ def opening(measurement: Measurement, metrics: Metrics) -> Opening:
 
 def surface(measurement: Measurement) -> Section:
     """The surface in 3-D."""
-    view = figures.surface_view(measurement.points, measurement.comparison.error, ERROR_MM)
+    drawn = figures.surface_view(measurement.points, measurement.comparison.error, ERROR_MM)
     caption = "Drag to turn, scroll to come nearer. Red lies outside the true surface, blue inside; equal scales on all axes."
-    return Section("The surface", [page.view("surface", view, caption)])
+    return Section("The surface", [page.switch("surface"), page.view("surface", drawn, caption)])
+
+
+def without_supports(measurement: Measurement) -> NDArray[np.bool_]:
+    """Pixels : (h, w) that see something besides what things lie on."""
+    supports = [number for number, name in enumerate(measurement.truth.things) if name in SUPPORTS]
+    return ~np.isin(measurement.truth.objects, supports)
 
 
 def errors(measurement: Measurement, metrics: Metrics) -> Section:
@@ -253,7 +275,8 @@ def beside_the_paper(metrics: Metrics) -> Section:
     caption = (
         "Paper: J. Meza et al., Three-dimensional multimodal medical imaging system based on free-hand ultrasound and structured "
         "light, Optical Engineering 60(5) 054106, 2021. Limit: the noise of photons, sensor and digits alone, through the rig’s "
-        "true geometry. The paper’s rig was calibrated with its own images; here the capture came with the true calibration."
+        "true geometry. The paper’s rig was calibrated with its own images; here "
+        + ("so was the rig, with a rendered board." if "poses" in metrics else "the capture came with the true calibration.")
     )
     return Section("Paper, limit, here", [page.table(("", "paper", "limit", "here"), rows, caption)])
 

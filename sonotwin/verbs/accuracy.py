@@ -11,6 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Literal, get_args
 
+import yaml
 from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
@@ -19,8 +20,9 @@ from recon.errors import InputError
 from recon.rig import Rig
 from sonotwin.config import folder
 from twin.accuracy import rows
+from twin.ultrasound.transducer import Transducer
 
-Group = Literal["optics", "surface", "calibration"]
+Group = Literal["optics", "surface", "calibration", "ultrasound"]
 
 
 class Config(BaseModel):
@@ -50,9 +52,7 @@ def run(config: Config) -> int:
     if config.real and not config.real.is_dir():
         raise InputError(f"accuracy: real: expected a folder of recordings, found none at {config.real}")
     config.out.mkdir(parents=True, exist_ok=True)
-    setup = rows.Setup(
-        config.rig, {path.stem: read_patterns(path) for path in (folder() / "patterns").glob("*.yaml")}, config.real
-    )
+    setup = setup_of(config.rig, config.real)
     console = Console(soft_wrap=True, highlight=False)
     met = True
     for group in groups:
@@ -67,3 +67,13 @@ def run(config: Config) -> int:
         console.print(f"wrote {config.out / f'{group}.json'}", markup=False)
         met &= all(row.ok for row in measured)
     return 0 if met else 1
+
+
+def setup_of(rig: Rig, real: Path | None = None) -> rows.Setup:
+    """What measurements are made with: a rig, all sequences and scanners of conf/, and real recordings if they are at hand."""
+    sequences = {path.stem: read_patterns(path) for path in (folder() / "patterns").glob("*.yaml")}
+    scanners = {
+        path.stem: Transducer(**yaml.safe_load(path.read_text(encoding="utf-8")))
+        for path in (folder() / "ultrasound").glob("*.yaml")
+    }
+    return rows.Setup(rig, sequences, real, scanners)

@@ -1,79 +1,64 @@
-"""Calibrate the rendered rig, measure a phantom's surface with it, compare with the truth, and report the whole story.
+"""Calibrate the rendered rig, measure a phantom outside and inside with it, compare with the truth, and report the whole story.
 
-Reads the same choices from conf/ as `sonotwin render`. Writes into the folder `out`: report.html and calibration/calibration.html
-(open them in a browser; they need no network), surface.ply (mm), surface.glb (metres, y up), metrics.json, the captures and
-their truth, and the folders of the steps between. Takes under two minutes on two cores; the first run ever also compiles, for
-about a minute. The board's images are kept and used
-again by all demonstrations of the same rig. A run that was interrupted is simply started again.
+Reads the same choices from conf/ as `sonotwin render` and `sonotwin sweep`. Writes into the folder `out`: report.html and
+calibration/calibration.html (open them in a browser; they need no network), surface.ply (mm), surface.glb (metres, y up),
+metrics.json; of scenes with tumours volume/volume.nrrd and tumours/; the captures and their truth, and the folders of the steps
+between. Takes about three minutes on two cores, half of that without ultrasound (path=none); the first run ever also compiles,
+for about a minute. The board's images are kept and used again by all demonstrations of the same rig. A run that was interrupted
+is simply started again.
 
     sonotwin demo
-    sonotwin demo poses=paper
+    sonotwin demo poses=paper path=none
     sonotwin demo scene=sphere patterns=gray_surface out=outputs/sphere
 """
 
+import json
 import os
-import shlex
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import Field, PrivateAttr, model_validator
+import numpy as np
+import trimesh
 from rich.console import Console
 
-from recon import atomic, metrics
+from recon import atomic, metrics, probe_files, sequences, sweep_capture
 from recon.capture import read_patterns
 from recon.metrics import Metrics, shown
 from sonotwin.config import folder as conf
-from sonotwin.verbs import calibrate_optics, evaluate, render, surface
-from twin import demo, report, session
+from sonotwin.demo_commands import commands
+from sonotwin.demo_config import BOARD, BOARD_PATTERNS, CALIBRATION, WATER_C, Config
+from sonotwin.verbs import calibrate_optics, calibrate_probe, evaluate, freehand, measure_lag, render, segment, surface, sweep
+from twin import demo, evaluate_sweep, report, sweep_report
 from twin.demo import Step
 from twin.evaluate import things
+from twin.ultrasound.probe_path import Bob, WirePath
 
 Figures = Mapping[str, float | int]
 
 MESHES = ("surface.ply", "surface.glb")
-CALIBRATION = "calibration"  # folder
-BOARD_PATTERNS = "paper_calibration"
-BOARD = {"scene": {"kind": "board"}, "cameras": ["cam1", "cam2"]}  # the board as conf/scene/board.yaml has it
 OUTPUTS = (
     ("report.html", "this page"),
     ("surface.ply", "the surface: triangles, normals and predicted sigma of each vertex, in mm"),
     ("surface.glb", "the same for viewers and for the web, in metres"),
     ("metrics.json", "all figures on this page and some more"),
     ("calibration/calibration.html", "the calibration that the surface was measured with, and how far it can be trusted"),
+    ("volume/volume.nrrd", "the B-scans of the sweep as a volume in the frame of the surface, in mm"),
+    ("tumours/", "what was found inside: a closed surface each, in mm"),
+    ("probe/probe.yaml", "the calibration of the probe, with its covariance"),
+    ("lag/lag.json", "by how much the scanner lags behind the cameras"),
     ("capture/", "the images, their manifest and the calibration, as a camera would have left them"),
     ("truth/", "what the images were rendered from: points, normals, projector coordinates, true calibration"),
+    ("sweep/, wires/, bottom/", "the B-scans and poses of the sweep, of crossed wires and of a flat bottom, and their truth"),
     ("surface/points.npz", "the point of every pixel and its predicted sigma"),
     ("evaluation/error_map.png", "map of the errors"),
     ("demo.json", "every setting"),
 )
 
 
-class Config(render.Config):
-    """Fields of `conf/demo.yaml`: those of `conf/render.yaml`, for one camera; but the poses are of another scene, the board."""
-
-    cameras: Annotated[list[session.CameraName], Field(min_length=1, max_length=1)]
-    board: Path
-    _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
-
-    @model_validator(mode="after")
-    def _fits_poses(self) -> "Config":
-        return self
-
-    def rendering(self, changes: Mapping[str, object]) -> render.Config:
-        """What `sonotwin render` is to do, with some fields changed."""
-        fields = {name: getattr(self, name) for name in render.Config.model_fields}
-        return render.Config.model_validate(fields | dict(changes))
-
-    def model_post_init(self, context: Any) -> None:
-        """Keep the overrides, for the commands that the report shows."""
-        if context:
-            self._overrides = context["overrides"]
-
-
 def run(config: Config) -> None:
-    """Play the steps, then say in four lines what came out.
+    """Play the steps, then say in some lines what came out.
 
     Raises
     ------
@@ -82,6 +67,7 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     steps = (calibration_steps(config) if config.poses else []) + surface_steps(config)
+    steps += (sweep_steps(config) if config.looks_inside else []) + [telling_step(config)]
     found = demo.play(
         steps, config.out, config.model_dump(mode="json"), lambda text: console.print(text, style="bold cyan", markup=False)
     )
@@ -131,48 +117,93 @@ def surface_steps(config: Config) -> list[Step]:
         evaluate.run(evaluate.Config(**places, camera=camera))
         return metrics.read(folder / "evaluation" / metrics.FILE)
 
-    def telling(folder: Path, figures: Figures) -> Figures:
-        story = report.read(folder / "capture", folder / "truth", folder / "surface" / surface.POINTS, camera)
-        outputs = [(name, text) for name, text in OUTPUTS if (folder / name).exists() or name == "report.html"]
-        report.write(folder / "report.html", story, dict(figures), outputs, commands(folder, config, config._overrides))
-        return {}
-
     return [
         Step("render", f"render {config.patterns.count} images of the scene and its truth", rendering, ("capture", "truth")),
         Step("surface", "reconstruct the surface from the images", reconstruction, ("surface", *MESHES)),
         # its prediction is of the points that have a truth, by the true normals
         Step("evaluate", "compare it with the truth", comparison, ("evaluation",), refines=("predicted_rms_mm",)),
-        Step("report", "write the report", telling, ("report.html",)),
     ]
 
 
-def commands(folder: Path, config: Config, overrides: Sequence[str]) -> list[str]:
-    """The command lines that do the same at once and step by step, with the settings that `sonotwin demo` was given."""
-    camera = config.cameras[0]
-    given = [override for override in overrides if not override.startswith("out=")]
-    of_scene = [override for override in given if not override.startswith("poses")]
-    of_board = [override for override in given if override.startswith(("rig", "engine", "seed", "poses"))]
-    board, optics = config.board, folder / CALIBRATION / calibrate_optics.OPTICS
-    choices = ["scene=board", "poses=demo", f"patterns={BOARD_PATTERNS}", "cameras=[cam1,cam2]"]
-    calibrating = [
-        ["render", *choices, *of_board, f"out={board}"],
-        ["calibrate-optics", f"capture={board / 'capture'}", f"truth={board / 'truth'}", f"out={folder / CALIBRATION}"],
+def sweep_steps(config: Config) -> list[Step]:
+    """From the probe's calibration to the tumours under the surface, and how far they are from the truth."""
+
+    def wires(folder: Path, _: Figures) -> Figures:
+        path = WirePath(count=config.wires)
+        sweep.run(config.sweeping(folder / "wires", scene={"kind": "crosswire"}, path=path, ultrasound=config.in_water()))
+        return {}
+
+    def probe(folder: Path, _: Figures) -> Figures:
+        places = {"capture": folder / "wires" / "capture", "out": folder / "probe"}
+        calibrate_probe.run(calibrate_probe.Config(rig=config.rig, temperature_c=WATER_C, **places))
+        return _named("probe", metrics.read(folder / "probe" / metrics.FILE))
+
+    def bottom(folder: Path, _: Figures) -> Figures:
+        path = Bob(seconds=config.bottom_s)
+        sweep.run(config.sweeping(folder / "bottom", scene={"kind": "tank"}, path=path, ultrasound=config.in_water()))
+        return {}
+
+    def lag(folder: Path, _: Figures) -> Figures:
+        measure_lag.run(measure_lag.Config(capture=folder / "bottom" / "capture", out=folder / "lag"))
+        return _named("lag", metrics.read(folder / "lag" / metrics.FILE))
+
+    def sweeping(folder: Path, _: Figures) -> Figures:
+        sweep.run(config.sweeping(folder / "sweep"))
+        return {}
+
+    def volume(folder: Path, _: Figures) -> Figures:
+        freehand.run(freehand.Config(out=folder / "volume", **_placed(folder)))
+        return _named("volume", metrics.read(folder / "volume" / metrics.FILE))
+
+    def tumours(folder: Path, _: Figures) -> Figures:
+        places = {"surface": folder / "surface" / "surface.ply", "out": folder / "tumours"}
+        segment.run(segment.Config(kind="masses", tissue_m_s=config.tissue_m_s, **places, **_placed(folder)))
+        return {}
+
+    def comparison(folder: Path, _: Figures) -> Figures:
+        findings, truth = compared(folder)
+        captured, placed = sweep_capture.read_sweep(folder / "sweep" / "capture"), _placed(folder)
+        calibration = probe_files.read(placed["probe"])
+        apart = evaluate_sweep.placement(captured.poses(placed["lag_s"]) @ sequences.target_from_pixel(calibration), truth)
+        figures = evaluate_sweep.measure(findings, truth, metrics.read(folder / "tumours" / metrics.FILE))
+        return figures | {"sweep_placement_rms_mm": float(np.sqrt(np.nanmean(apart**2)))}
+
+    return [
+        Step("wires", f"render {config.wires} B-scans of crossed wires", wires, ("wires",)),
+        Step("probe", "calibrate the ultrasound probe", probe, ("probe",)),
+        Step("bottom", "render B-scans of a flat bottom, up and down", bottom, ("bottom",)),
+        Step("lag", "measure by how much the scanner lags behind the cameras", lag, ("lag",)),
+        Step("sweep", "render a sweep over the scene and its truth", sweeping, ("sweep",)),
+        Step("volume", "put its B-scans into a volume", volume, ("volume",)),
+        Step("tumours", "find tumours in its B-scans", tumours, ("tumours",)),
+        Step("compare", "compare them with the truth", comparison),
     ]
-    calibrated = [f"calibration={optics}"] if config.poses else []
-    lines = (
-        ["demo", *given, f"out={folder}"],
-        *(calibrating if config.poses else []),
-        ["render", *of_scene, f"out={folder}"],
-        ["surface", f"capture={folder / 'capture'}", *calibrated, f"camera={camera}", f"out={folder / 'surface'}"],
-        [
-            "evaluate",
-            f"surface={folder / 'surface'}",
-            f"truth={folder / 'truth'}",
-            f"camera={camera}",
-            f"out={folder / 'evaluation'}",
-        ],
-    )
-    return [shlex.join(["sonotwin", *line]) for line in lines]
+
+
+def telling_step(config: Config) -> Step:
+    """The report of all steps before it."""
+
+    def telling(folder: Path, figures: Figures) -> Figures:
+        story = report.read(folder / "capture", folder / "truth", folder / "surface" / surface.POINTS, config.cameras[0])
+        inside = None
+        if config.looks_inside:
+            findings, truth = compared(folder)
+            places = {name: folder / name for name in ("sweep", "bottom", "probe", "lag", "volume")}
+            inside = sweep_report.read(places, findings, truth)
+        outputs = [(name, text) for name, text in OUTPUTS if (folder / name.partition(",")[0]).exists() or name == "report.html"]
+        lines = commands(folder, config, config._overrides, inside.lag_s if inside else 0.0)
+        report.write(folder / "report.html", story, dict(figures), outputs, lines, inside)
+        return {}
+
+    return Step("report", "write the report", telling, ("report.html",))
+
+
+def compared(folder: Path) -> tuple[list[evaluate_sweep.Finding], evaluate_sweep.SweepTruth]:
+    """The true tumours with what was found of each, and the truth."""
+    truth = evaluate_sweep.read_truth(folder / "sweep" / "truth")
+    count = int(metrics.read(folder / "tumours" / metrics.FILE)["masses"])
+    found = [trimesh.load_mesh(folder / "tumours" / f"mass{number}.ply", process=False) for number in range(count)]
+    return evaluate_sweep.compare(found, truth), truth
 
 
 def summary(config: Config, found: Metrics) -> list[str]:
@@ -185,6 +216,7 @@ def summary(config: Config, found: Metrics) -> list[str]:
         f"accuracy    {shown(found['surface_rms_mm'], '.3f', ' mm')} RMS ({parts}); "
         f"the camera's noise alone would leave {shown(found['limit_rms_mm'], '.3f', ' mm')}",
         *calibrated(found),
+        *looked_inside(config, found),
         f"coverage    {100 * found['coverage']:.1f} % of what camera and projector both see; "
         f"{100 * found['gross_error_fraction']:.3f} % of the points are off by more than 1 mm",
         f"look at     {out / 'report.html'}; the surface is in {out / 'surface.ply'} and {out / 'surface.glb'}",
@@ -200,6 +232,39 @@ def calibrated(found: Metrics) -> list[str]:
         f"calibrated  from {found['poses']:.0f} poses: reprojection {remaining} px RMS; "
         f"points off by {found['point_error_rms_mm']:.3f} mm RMS for it, {found['point_sigma_mm']:.3f} mm predicted"
     ]
+
+
+def looked_inside(config: Config, found: Metrics) -> list[str]:
+    """What ultrasound found, and how well it knows where it looks; or why it wasn't asked."""
+    if not config.looks_inside:
+        return (
+            []
+            if config.path is None
+            else [f"left out    ultrasound: nothing is to be found inside the scene ({config.scene['kind']})"]
+        )
+    errors = evaluate_sweep.of_each(found, "centre_error_mm")
+    off = f", centres off by {', '.join(f'{error:.2f}' for error in errors)} mm" if errors else ""
+    count = sum(value == 1 for value in evaluate_sweep.of_each(found, "inside"))
+    false = f"; {found['tumours_false']} more are none" if found["tumours_false"] else ""
+    return [
+        f"probe       from {found['probe_frames_used']} B-scans of crossed wires: {found['probe_rms_mm']:.3f} mm RMS; image "
+        f"centre known to {found['probe_sigma_centre_mm']:.3f} mm, by its own prediction",
+        f"lag         {found['lag_ms']:.1f} ms, {found['lag_low_ms']:.1f} to {found['lag_high_ms']:.1f} ms (95 %), true "
+        f"{1e3 * config.clocks.lag_s:.1f}; pixels of the sweep off by {found['sweep_placement_rms_mm']:.3f} mm RMS",
+        f"tumours     {found['tumours_found']} of {found['tumours_true']} found, {count} inside the surface{off}{false}",
+    ]
+
+
+def _placed(folder: Path) -> dict[str, Any]:
+    """What places a sweep's B-scans in the world: fields of `freehand` and `segment`."""
+    lag_s = json.loads((folder / "lag" / measure_lag.LAG).read_text(encoding="utf-8"))["lag_s"]
+    return {"capture": folder / "sweep" / "capture", "probe": folder / "probe" / calibrate_probe.PROBE, "lag_s": lag_s}
+
+
+def _named(step: str, figures: Metrics) -> Metrics:
+    """Figures of a step by names that no other has, less its seconds: `frames` of the probe is `probe_frames`."""
+    kept = {name.removeprefix(f"{step}_"): value for name, value in figures.items() if not name.startswith("seconds_")}
+    return {f"{step}_{name}": value for name, value in kept.items()}
 
 
 def _offer(source: Path, path: Path) -> None:

@@ -47,11 +47,16 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _one_scanner(self) -> "Config":
-        for name in ("image_size", "scale_mm_per_px"):
-            design, found = getattr(self.rig.probe, name), getattr(self.ultrasound, name)
-            if design != found:
-                raise ValueError(f"ultrasound.{name}: expected rig.probe's {list(design)}, found {list(found)}")
+        check_scanner(self.rig, self.ultrasound)
         return self
+
+
+def check_scanner(rig: Rig, transducer: Transducer) -> None:
+    """Check that `rig.probe` and the transducer describe one scanner; ValueError if they don't."""
+    for name in ("image_size", "scale_mm_per_px"):
+        design, found = getattr(rig.probe, name), getattr(transducer, name)
+        if design != found:
+            raise ValueError(f"ultrasound.{name}: expected rig.probe's {list(design)}, found {list(found)}")
 
 
 def run(config: Config) -> None:

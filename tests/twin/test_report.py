@@ -14,6 +14,7 @@ import pytest
 
 from recon import decode, figures, triangulate
 from recon.capture import read_surface
+from tests.twin import drawn_sweep
 from twin import evaluate, report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -34,6 +35,9 @@ TELL = """<script>
     await wait();
     pictures[button.dataset.colour] = await Plotly.toImage(view, { format: "png", width: 480, height: 360 });
   }
+  const inside = document.getElementById("inside");
+  while (!inside.dataset.drawn && !complaints.length) await wait();
+  pictures.inside = await Plotly.toImage(inside, { format: "png", width: 480, height: 360 });
   const fetched = performance.getEntriesByType("resource").map(entry => entry.name).filter(name => !name.startsWith("data:"));
   const broken = [...document.images].filter(image => image.src && !image.naturalWidth).length;
   const answer = document.createElement("pre");
@@ -55,11 +59,18 @@ def story(session, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def written(story, tmp_path_factory):
+def inside(rig, tmp_path_factory):
+    """What ultrasound adds to it."""
+    return drawn_sweep.inside(tmp_path_factory.mktemp("inside"), rig, np.random.default_rng(7))
+
+
+@pytest.fixture(scope="module")
+def written(story, inside, tmp_path_factory):
     """A report of the drawn session: its text."""
     folder = tmp_path_factory.mktemp("report")
-    metrics = evaluate.measure(story.points, story.comparison, story.truth)
-    report.write(folder / "report.html", story, metrics, [("surface.ply", "the <mesh>")], ["sonotwin demo 'out=a b'"])
+    metrics = evaluate.measure(story.points, story.comparison, story.truth) | drawn_sweep.figures(inside)
+    outputs, commands = [("surface.ply", "the <mesh>")], ["sonotwin demo 'out=a b'"]
+    report.write(folder / "report.html", story, metrics, outputs, commands, inside)
     return (folder / "report.html").read_text(encoding="utf-8")
 
 
@@ -78,6 +89,19 @@ def test_the_report_says_what_was_measured(written):
     assert "sonotwin demo 'out=a b'" in shown
     assert re.search(r"Sphere, error of the radius\s+0.045 mm\s+0.\d{4} mm", shown)
     assert re.search(r"Cylinder, error of the radius\s+0.10 mm\s+not in this scene", shown)
+
+
+def test_the_report_says_what_ultrasound_found(written):
+    """One tumour of two, off by 0.5 mm; the other in no more figures than are known of it."""
+    shown = html.unescape(re.sub("<[^>]*>", " ", re.sub("<(script|style|svg).*?</\\1>", "", written, flags=re.DOTALL)))
+    assert "Ultrasound found 1 of 2 tumours inside it, its centre off by 0.50 mm." in shown
+    assert re.search(r"Tumour 1\s+12\.0 / 12\.0\s+0\.90 / 0\.90\s+0\.50\s+0\.29\s+0\.9\d+\s+.* yes", shown)
+    assert re.search(r"Tumour 2\s+unknown / 8\.0\s+unknown / 0\.27\s+unknown .* not found", shown)
+    assert "1450 m/s in this tissue" in shown and "shown 20 mm deep lies 1.2 mm less deep" in shown
+    assert re.search(r"Image centre, off by\s+0\.274 mm\s+0\.\d{3} mm\s+0\.200 mm", shown)
+    assert re.search(
+        r"Lag of the scanner’s images\s+not measured\s+4\d\.\d to 5\d\.\d ms \(95 %\)\s+\d\d\.\d ms; true 50\.0", shown
+    )
 
 
 def test_a_report_of_next_to_nothing_is_written(story, tmp_path):
@@ -127,7 +151,7 @@ def test_the_report_opens_in_a_browser(written, tmp_path):
     assert (answer["complaints"], answer["fetched"], answer["broken"]) == ([], [], 0)
     assert answer["wide"] <= 1280
     pictures = {name: decoded(url) for name, url in answer["pictures"].items()}
-    assert set(pictures) == {"error", "depth", "plain"}
+    assert set(pictures) == {"error", "depth", "plain", "inside"}
     for picture in pictures.values():
         middle = picture[90:270, 120:360]
         assert (middle[..., 3] > 0).mean() > 0.3, "no surface in the middle of the view"

@@ -36,4 +36,3 @@ def test_a_changed_pose_is_not_the_same(monkeypatch):
 def test_the_real_sweep(real, rig):
     check(recordings.real_sweep(Setup(rig, {}, real)))
     check(recordings.real_file(Setup(rig, {}, real)))
-

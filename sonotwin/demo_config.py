@@ -1,0 +1,77 @@
+"""What a demonstration is made from: its fields, and what it takes as given."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import Field, PrivateAttr, model_validator
+
+from recon.rig import Positive
+from scenes.acoustics import MADE_OF
+from sonotwin.config import folder as conf
+from sonotwin.verbs import render, segment, sweep
+from twin import session
+from twin.ultrasound.session import AnyPath
+from twin.ultrasound.sweep import Clocks, PoseNoise
+from twin.ultrasound.transducer import Transducer
+
+CALIBRATION = "calibration"  # folder
+BOARD_PATTERNS = "paper_calibration"
+WATER = "water"  # setting of the scanner in a tank
+WATER_C = 22.0  # of the tank, as `scenes.acoustics` has it
+ONE_SCANNER = ("ultrasound.image_size", "ultrasound.scale_mm_per_px")  # the same in all its settings
+TUMOURS = "tumour"  # what the things are called that ultrasound looks for
+BOARD = {"scene": {"kind": "board"}, "cameras": ["cam1", "cam2"]}  # the board as conf/scene/board.yaml has it
+
+
+class Config(render.Config):
+    """Fields of `conf/demo.yaml`: those of `conf/render.yaml`, for one camera, but the poses are of another scene, the board;
+    and those of `conf/sweep.yaml`.
+    """
+
+    cameras: Annotated[list[session.CameraName], Field(min_length=1, max_length=1)]
+    board: Path
+    ultrasound: Transducer
+    path: AnyPath | None
+    clocks: Clocks = Clocks()
+    pose_noise: PoseNoise = PoseNoise()
+    wires: Annotated[int, Field(ge=1, le=1000)] = 40
+    bottom_s: Positive = 6.0
+    tissue_m_s: segment.Speed = 1450.0
+    _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
+
+    @model_validator(mode="after")
+    def _fits_poses(self) -> "Config":
+        return self
+
+    @model_validator(mode="after")
+    def _one_scanner(self) -> "Config":
+        sweep.check_scanner(self.rig, self.ultrasound)
+        return self
+
+    @property
+    def looks_inside(self) -> bool:
+        """Whether there is a sweep: a path was given, and there is something to find."""
+        return self.path is not None and TUMOURS in MADE_OF.get(str(self.scene["kind"]), {})
+
+    def rendering(self, changes: Mapping[str, object]) -> render.Config:
+        """What `sonotwin render` is to do, with some fields changed."""
+        fields = {name: getattr(self, name) for name in render.Config.model_fields}
+        return render.Config.model_validate(fields | dict(changes))
+
+    def sweeping(self, out: Path, **changes: object) -> sweep.Config:
+        """What `sonotwin sweep` is to do, with some fields changed."""
+        fields = {name: getattr(self, name) for name in sweep.Config.model_fields}
+        return sweep.Config.model_validate(fields | changes | {"out": out})
+
+    def in_water(self) -> Transducer:
+        """The same scanner, set for a tank."""
+        settings = yaml.safe_load((conf() / "ultrasound" / f"{WATER}.yaml").read_text(encoding="utf-8"))
+        one = {name: getattr(self.ultrasound, name) for name in (field.partition(".")[2] for field in ONE_SCANNER)}
+        return Transducer.model_validate(settings | one)
+
+    def model_post_init(self, context: Any) -> None:
+        """Keep the overrides, for the commands that the report shows."""
+        if context:
+            self._overrides = context["overrides"]
