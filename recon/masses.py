@@ -36,6 +36,7 @@ REFINEMENTS = 3  # of the surface in each
 SAMPLED = 40  # images that tissue's level is taken from
 CORE = 0.6  # of a mass's extent: where it is darkest
 LEAST_SEEN = 0.3  # of the core, by sound that came through other masses
+LEVELLINGS = 4  # Newton's steps to the level that holds the volume
 NEAR_MM = 1.5  # of a vertex, within which distances come from the surface itself
 NEIGHBOURS = 6  # vertices that the distance to a surface is taken from
 FAR_MM = 5.0  # to which distances are known around a mass
@@ -137,14 +138,22 @@ def evened(mass: Mass, lattice: Volume) -> Mass:
 
     Moved vertices can cross each other; the smoothed distance to them has a clean surface, taken where it holds the same volume.
     """
-    around = Grid(lattice.voxels.shape[::-1], lattice.origin, lattice.spacing, lattice.directions)
-    distance = ndimage.gaussian_filter(distances([mass], around).voxels, EVEN_MM / lattice.spacing[::-1])
-    part = tuple(slice(max(0, a.min() - 4), a.max() + 5) for a in np.nonzero(distance < 0))
+    low, high = _around(mass, lattice)
+    origin = rigid.apply(lattice.world_from_voxel, low)
+    around = distances([mass], Grid(tuple(high - low), origin, lattice.spacing, lattice.directions))
+    field, whole = ndimage.gaussian_filter(around.voxels, EVEN_MM / lattice.spacing[::-1]), 3 * (slice(0, None),)
     level = 0.0
-    for _ in range(2):
-        mesh = _meshed(distance[part], level, part, lattice, outside=FAR_MM)
+    for _ in range(LEVELLINGS):
+        mesh = _meshed(field, level, whole, around, outside=FAR_MM)
         level += (mass.volume - mesh.volume) / mesh.area
-    return Mass(_meshed(distance[part], level, part, lattice, outside=FAR_MM))
+    return Mass(_meshed(field, level, whole, around, outside=FAR_MM))
+
+
+def _around(mass: Mass, lattice: Volume) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First voxel and the one after the last : (3,) x, y, z, of the box to `FAR_MM` around a mass, maybe beyond the lattice."""
+    voxel = rigid.apply(np.linalg.inv(lattice.world_from_voxel), mass.mesh.vertices)
+    margin = FAR_MM / lattice.spacing
+    return np.floor(voxel.min(axis=0) - margin).astype(int), np.ceil(voxel.max(axis=0) + margin).astype(int) + 1
 
 
 def rough(power: EchoPower) -> list[Mass]:
@@ -196,12 +205,9 @@ def distances(masses: Sequence[Mass], grid: Grid) -> Volume:
     """Signed distance to the masses : mm, negative inside, on a grid; `FAR_MM` at most, and exact near them only."""
     field = np.full(grid.size[::-1], FAR_MM, np.float32)
     volume = Volume(field, grid.origin, grid.spacing, grid.directions)
-    margin = FAR_MM / grid.spacing
     for mass in masses:
-        voxel = rigid.apply(np.linalg.inv(volume.world_from_voxel), mass.mesh.vertices)
-        low = np.maximum(np.floor(voxel.min(axis=0) - margin), 0).astype(int)
-        high = np.minimum(np.ceil(voxel.max(axis=0) + margin).astype(int) + 1, grid.size)
-        part = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
+        low, high = _around(mass, volume)
+        part = tuple(slice(max(a, 0), min(b, n)) for a, b, n in zip(low[::-1], high[::-1], field.shape, strict=True))
         near = _near_distance(mass.mesh, volume, part)
         apart, _ = ndimage.label(np.isnan(near))
         bodies, count = ndimage.label((apart != apart[0, 0, 0]) & ~(near >= 0))
@@ -215,14 +221,17 @@ def distances(masses: Sequence[Mass], grid: Grid) -> Volume:
 
 def _near_distance(mesh: trimesh.Trimesh, volume: Volume, part: tuple[slice, ...]) -> NDArray:
     """Signed distance of a part's voxels to a mesh, by the tangent planes of its nearest vertices; NaN beyond `NEAR_MM`."""
-    k, j, i = np.mgrid[part]
-    places = rigid.apply(volume.world_from_voxel, np.stack([i, j, k], axis=-1).reshape(-1, 3))
-    away, nearest = KDTree(mesh.vertices).query(places, k=NEIGHBOURS, distance_upper_bound=NEAR_MM)
-    known = np.isfinite(away)
-    nearest = np.where(known, nearest, 0)
+    shape, low = tuple(s.stop - s.start for s in part), [s.start for s in part[::-1]]
+    voxel = np.rint(rigid.apply(np.linalg.inv(volume.world_from_voxel), mesh.vertices)).astype(int) - low
+    apart = np.ones(shape, bool)
+    apart[tuple(np.clip(voxel, 0, np.array(shape[::-1]) - 1).T[::-1])] = False
+    k, j, i = np.nonzero(np.asarray(ndimage.distance_transform_edt(apart, volume.spacing[::-1])) < NEAR_MM)
+    places = rigid.apply(volume.world_from_voxel, np.column_stack([i, j, k]) + low)
+    _, nearest = KDTree(mesh.vertices).query(places, k=NEIGHBOURS)
     across = ((places[:, None] - mesh.vertices[nearest]) * mesh.vertex_normals[nearest]).sum(axis=2)
-    total, count = (across * known).sum(axis=1), known.sum(axis=1)
-    return np.divide(total, count, out=np.full(len(places), np.nan), where=count > 0).reshape(i.shape)
+    result = np.full(shape, np.nan)
+    result[k, j, i] = across.mean(axis=1)
+    return result
 
 
 def cleared(
