@@ -1,4 +1,4 @@
-"""Make the README's picture from what `make demo` left in outputs/demo: `.venv/bin/python docs/picture.py`."""
+"""Make the README's pictures from what `make demo` left in outputs/demo: `.venv/bin/python docs/picture.py`."""
 
 from pathlib import Path
 
@@ -7,13 +7,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LightSource
 
-from twin import evaluate
+from sonotwin.verbs.demo import compared
+from twin import evaluate, sweep_pictures, sweep_report
+from twin.evaluate_sweep import nearest_frame
 
 DEMO = Path("outputs/demo")
+INCH_PX = 80
+TABLE_MM = 697.0  # beyond which the table lies
 SMOOTHED_PX = 2.0  # for the shading alone: bare noise of 0.02 mm would show
 
 
-def main() -> None:
+def outside() -> None:
     """Four panels: the scene, its fringes, the reconstructed surface, its errors."""
     images = [cv2.imread(str(DEMO / "capture/surface/cam1" / f"{k:04d}.png"), cv2.IMREAD_GRAYSCALE) for k in range(9)]
     points, sigma = evaluate.read_points(DEMO / "surface/points.npz")
@@ -37,8 +41,42 @@ def main() -> None:
     ):
         panel.set_title(title)
         panel.set_axis_off()
-    figure.savefig("docs/images/demo.png", dpi=80)
+    figure.savefig("docs/images/demo.png", dpi=INCH_PX)
+
+
+def inside() -> None:
+    """The measured skin with the tumours found under it, and a B-scan through each beside what it should show."""
+    findings, truth = compared(DEMO)
+    story = sweep_report.read({name: DEMO / name for name in ("sweep", "bottom", "probe", "lag", "volume")}, findings, truth)
+    figure = plt.figure(figsize=(16, 3.4), layout="constrained")
+    axes = figure.add_subplot(1, 4, 1, projection="3d", computed_zorder=False)
+    skin = evaluate.read_points(DEMO / "surface/points.npz")[0][::8, ::8]
+    breast = np.where((skin[..., 2] < TABLE_MM)[..., None], skin, np.nan)
+    axes.plot_wireframe(*shown(breast), rcount=60, ccount=60, color="0.6", linewidth=0.3)
+    for finding in findings:
+        if finding.found is not None:
+            corners = np.stack(shown(finding.found.vertices), axis=-1)
+            axes.plot_trisurf(*corners.T, triangles=finding.found.faces, color=sweep_pictures.FOUND, linewidth=0)
+    axes.set_box_aspect([np.ptp(axis[np.isfinite(axis)]) for axis in shown(breast)], zoom=1.5)
+    axes.view_init(elev=18, azim=-60)
+    axes.set_axis_off()
+    axes.set_title("tumours found under the measured skin")
+    for panel, finding in enumerate(findings, 2):
+        number = nearest_frame(finding.true.center_mass, story.world_from_pixel, story.sweep.size)
+        axes = figure.add_subplot(1, 4, panel)
+        if number is not None:
+            image = story.sweep.image(number)
+            axes.imshow(sweep_pictures.beside_truth(image, number, story.world_from_pixel[number], findings, truth))
+        axes.set_title("a B-scan and what it should show")
+        axes.set_axis_off()
+    figure.savefig("docs/images/inside.png", dpi=INCH_PX)
+
+
+def shown(points: np.ndarray) -> list[np.ndarray]:
+    """Coordinates x, y, z of points : (..., 3) with the camera's view from above: z up."""
+    return [points[..., 0], -points[..., 1], -points[..., 2]]
 
 
 if __name__ == "__main__":
-    main()
+    outside()
+    inside()

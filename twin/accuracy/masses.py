@@ -25,23 +25,29 @@ from twin.ultrasound.transducer import Transducer
 # as of conf/path/raster.yaml
 PATH = SurfacePath(start_mm=(-18.0, -36.0), end_mm=(-18.0, 37.0), strokes=2, stroke_step_mm=46.0, speed_mm_s=21.0)
 SOUND = Sound(tissue=TISSUES["silicone"].speed)  # a phantom's is known; that of masses isn't
+SEEDS = (11, 12)  # of the sweeps
 CENTRE_MM, VOLUME_PERCENT = 0.5, 8.0  # what is asked
 
 
-def rows(setup: Setup) -> list[Row]:
-    """The tumours of 27, 14 and 12 mm: centre and volume, whether all are found and no others, and lie under the skin."""
-    found, skin = list(segmented(setup)), measured_skin(setup)
+def rows(setup: Setup, seeds: Sequence[int] = SEEDS) -> list[Row]:
+    """The tumours of 27, 14 and 12 mm in some sweeps: whether all are found and no others, centre, volume, and under the skin."""
+    sweeps, skin = [segmented(setup, seed) for seed in seeds], measured_skin(setup)
     result = []
     for size, (name, truth) in zip((27, 14, 12), tumours().items(), strict=True):
-        mass = min(found, key=lambda one, truth=truth: np.linalg.norm(one.centre - truth.center_mass), default=None)
-        centre, volume = errors(mass, truth)
-        what = f"{name} of {size} mm"
-        result.append(Row("i", f"{what}: centre", centre, CENTRE_MM, None, "mm"))
-        result.append(Row("i", f"{what}: volume", volume, VOLUME_PERCENT, None, "%"))
-    inside = sum(contain(mass.mesh, skin).inside for mass in found)
-    result.append(Row("i", "masses found that are no tumours, or tumours not found", abs(len(found) - 3), 0, 0, "masses"))
+        centre, volume = np.max([errors(nearest(found, truth), truth) for found in sweeps], axis=0)
+        what = f"{name} of {size} mm, worse of {len(sweeps)} sweeps"
+        result.append(Row("i", f"{what}: centre", float(centre), CENTRE_MM, None, "mm"))
+        result.append(Row("i", f"{what}: volume", float(volume), VOLUME_PERCENT, None, "%"))
+    inside = min(sum(contain(mass.mesh, skin).inside for mass in found) for found in sweeps)
+    wrong = max(abs(len(found) - 3) for found in sweeps)
+    result.append(Row("i", "masses found that are no tumours, or tumours not found", wrong, 0, 0, "masses"))
     result.append(Row("i", "masses found inside the measured skin", inside, 3, 3, "masses", at_least=True))
     return result
+
+
+def nearest(found: Sequence[Mass], truth: trimesh.Trimesh) -> Mass | None:
+    """The mass whose centre is nearest to the true one's."""
+    return min(found, key=lambda one: np.linalg.norm(one.centre - truth.center_mass), default=None)
 
 
 def errors(mass: Mass | None, truth: trimesh.Trimesh) -> tuple[float, float]:
@@ -58,7 +64,7 @@ def tumours() -> dict[str, trimesh.Trimesh]:
     return {thing.name: thing.mesh for thing in things if thing.name.startswith("tumour")}
 
 
-def segmented(setup: Setup, seed: int = 1) -> Sequence[Mass]:
+def segmented(setup: Setup, seed: int) -> Sequence[Mass]:
     """Sweep over the breast in the twin, as `sonotwin sweep path=raster` does, and segment; poses noisy, the lag known."""
     scene, transducer, clocks = body(build_scene({"kind": "breast"})), Transducer(), Clocks()
     planned = session.plan_sweep(PATH, setup.rig, scene, transducer, clocks, PoseNoise(), seed)
