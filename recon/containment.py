@@ -9,6 +9,8 @@ from scipy.spatial import KDTree
 
 Array = NDArray[np.float64]
 
+LEAST_COVERED = 0.5  # of a mesh's vertices, to call it inside
+
 
 @dataclass(frozen=True)
 class Containment:
@@ -27,9 +29,11 @@ class Containment:
         return float(np.nanmin(self.depths)) if self.covered > 0 else float("nan")
 
     @property
-    def inside(self) -> bool:
-        """Whether every vertex that is covered lies inside, and most are covered."""
-        return self.covered > 0.5 and self.least_mm > 0
+    def inside(self) -> bool | None:
+        """Whether every vertex lies inside: False if a covered one doesn't, None (unknown) if not more than half are covered."""
+        if self.least_mm <= 0:
+            return False
+        return True if self.covered > LEAST_COVERED else None
 
 
 def contain(mesh: trimesh.Trimesh, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)) -> Containment:

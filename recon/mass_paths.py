@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from recon.probe import SCANNER_SPEED
 from recon.volumes import Volume
-from recon.water import SCANNER_SPEED
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -27,7 +27,6 @@ class Sound:
 
     tissue: float = SCANNER_SPEED
     mass: float = SCANNER_SPEED  # the mean of soft tissues; masses of the breast have 1510 to 1570
-    assumed: float = SCANNER_SPEED  # by the scanner
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Masses darker than the tissue around them, in tracked B-scans: each a closed surface in the world."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,7 @@ ROUNDS = 2  # of clearing
 EVEN_MM = 0.5  # standard deviation; a voxel
 REFINEMENTS = 3  # of the surface in each
 SAMPLED = 40  # images that tissue's level is taken from
+LEAST_GREY = 5.0  # of 255, that tissue has
 CORE = 0.6  # of a mass's extent: where it is darkest
 LEAST_SEEN = 0.3  # of the core, by sound that came through other masses
 LEVELLINGS = 4  # Newton's steps to the level that holds the volume
@@ -68,6 +69,7 @@ def from_scans(
     world_from_pixel: Array,
     sound: Sound | None = None,
     dynamic_range_db: float = 60.0,
+    grey: float | None = None,
 ) -> list[Mass]:
     """Find masses in B-scans, largest first.
 
@@ -76,28 +78,55 @@ def from_scans(
     images : gives the n B-scans (h, w) uint8, one by one, from the first at each call
     shape : (h, w)
     world_from_pixel : (n, 4, 4)
-        Right where sound travels as the scanner assumes; images with a NaN are left out.
+        With depths as of the tissue's speed of sound, see `recon.water.in_tissue`; images with a NaN are left out.
+    grey : float
+        Of tissue, as of `tissue_grey`, which is asked if it isn't given.
+
+    Raises
+    ------
+    InputError
+        If no image has a pose, or they show no tissue.
     """
     sound = sound or Sound()
-    matrices = in_tissue(world_from_pixel, sound)
-    clip = Clip(0, int(np.ceil(TOP_MM / pixel_mm(matrices)[1])), shape[1], shape[0])
-    grid = echo_power.beam_grid(matrices, shape, SPACING_MM, clip)
-    every = max(1, len(matrices) // SAMPLED)
-    sample = np.stack([image[clip.v : shape[0] // 2] for k, image in enumerate(images()) if k % every == 0])
-    grey = echo_power.typical_grey(sample, slice(None))
+    clip = below_face(shape, world_from_pixel)
+    grey = tissue_grey(images(), shape, world_from_pixel) if grey is None else grey
+    grid = echo_power.beam_grid(world_from_pixel, shape, SPACING_MM, clip)
     table = echo_power.powers(grey, dynamic_range_db)
-    power = echo_power.averaged(images(), matrices, grid, grey, dynamic_range_db, clip)
+    power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
     masses = find(power)
     for _ in range(ROUNDS):
         if masses:
-            power = cleared(images, matrices, grid, table, clip, masses, sound)
+            power = cleared(images, world_from_pixel, grid, table, clip, masses, sound)
             masses = refined([mass for mass in masses if is_dark(mass, power)], power)
     return sorted(masses, key=lambda mass: -mass.volume)
 
 
-def in_tissue(world_from_pixel: Array, sound: Sound) -> Array:
-    """Matrices : (n, 4, 4) with depths as of the tissue's speed of sound; the delay is zero at row 0."""
-    return world_from_pixel @ np.diag([1, sound.tissue / sound.assumed, 1, 1])
+def below_face(shape: tuple[int, int], world_from_pixel: Array) -> Clip:
+    """The part of images (h, w) below the ringing at the face; InputError if nothing is."""
+    top = int(np.ceil(TOP_MM / pixel_mm(world_from_pixel)[1]))
+    if top >= shape[0] // 2:
+        raise InputError(
+            f"images: expected more than {2 * TOP_MM:g} mm of depth, found {shape[0]} rows, of which {top} are ringing"
+        )
+    return Clip(0, top, shape[1], shape[0])
+
+
+def tissue_grey(images: Iterable[NDArray], shape: tuple[int, int], world_from_pixel: Array) -> float:
+    """Typical grey level of tissue in n B-scans (h, w) uint8: the median of the upper halves of some of those that have a pose.
+
+    Raises
+    ------
+    InputError
+        If it is black there: gel, a standoff, or water.
+    """
+    top, placed = below_face(shape, world_from_pixel).v, np.flatnonzero(np.isfinite(world_from_pixel).all(axis=(1, 2)))
+    chosen = set(placed[:: max(1, len(placed) // SAMPLED)].tolist())
+    sample = np.stack([image[top : shape[0] // 2] for k, image in enumerate(images) if k in chosen])
+    grey = echo_power.typical_grey(sample, slice(None))
+    if grey < LEAST_GREY:
+        expected = f"tissue in the upper half of the B-scans, of a grey level of {LEAST_GREY:g} or more"
+        raise InputError(f"images: expected {expected}, found {grey:.0f} (median): gel, a standoff, or water?")
+    return grey
 
 
 def is_dark(mass: Mass, power: EchoPower) -> bool:
@@ -111,11 +140,10 @@ def is_dark(mass: Mass, power: EchoPower) -> bool:
 
 def shown(masses: Sequence[Mass], world_from_pixel: Array, shape: tuple[int, int], sound: Sound) -> Iterator[Mask]:
     """Which pixels of each B-scan show a mass : n times (h, w), delays and bent lines included; none where there's no pose."""
-    matrices = in_tissue(world_from_pixel, sound)
-    inside = distances(masses, echo_power.beam_grid(matrices, shape, SPACING_MM))
-    for matrix in matrices:
+    inside, scale = distances(masses, echo_power.beam_grid(world_from_pixel, shape, SPACING_MM)), pixel_mm(world_from_pixel)
+    for matrix in world_from_pixel:
         if np.isfinite(matrix).all():
-            lines = follow(inside, pixel_mm(matrices), matrix, shape, sound)
+            lines = follow(inside, scale, matrix, shape, sound)
             yield _sampled(inside, matrix, lines.u, lines.v) < 0
         else:
             yield np.zeros(shape, bool)

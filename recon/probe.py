@@ -10,6 +10,8 @@ from recon.calibration import Uncertainty
 
 Array = NDArray[np.float64]
 
+SCANNER_SPEED = 1540.0  # m/s, a mean of soft tissues, which scanners assume
+
 
 @dataclass(frozen=True)
 class ProbeCalibration:
@@ -22,6 +24,7 @@ class ProbeCalibration:
     target_from_image: Array  # (4, 4), mm
     scale: Array  # (2,) sx, sy, mm/px
     uncertainty: Uncertainty | None = None
+    speed_m_s: float = SCANNER_SPEED  # m/s, of the sound for which sy holds
 
     def to_target(self, pixels: ArrayLike) -> Array:
         """Pixels : (..., 2) of a B-scan, to points : (..., 3) mm in the target's frame."""

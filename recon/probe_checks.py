@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from recon import rigid
 from recon.errors import InputError
 from recon.probe import ProbeCalibration
+from recon.water import SPEEDS
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width, height, px
@@ -88,8 +89,8 @@ def information(target_from_image: Array, scale: Array, matrix: Array, frames: _
 
     Parameters
     ----------
-    matrix : (11, 11)
-        Normal equations by sx, sy, turn, shift and wire, with the measured noise.
+    matrix : (12, 12)
+        Normal equations by sx, sy, turn, shift, wire and the wires' distance, with the measured noise.
     """
     unit = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
     values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
@@ -131,13 +132,23 @@ def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -
         raise InputError(f"calibration: expected the target above the probe's face, found {found}")
 
 
+def speed(implied: float) -> None:
+    """Refuse a calibration whose sy, beside the scanner's, tells a speed of sound (m/s) that nothing has."""
+    if not SPEEDS[0] <= implied <= SPEEDS[1]:
+        expected = f"calibration: sy: expected to tell a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s"
+        raise InputError(f"{expected}, found {implied:.0f}: are the poses in mm, and rig.probe.scale_mm_per_px the scanner's?")
+
+
 def _as_designed(calibration: ProbeCalibration, size: Size, expected: Array) -> None:
     found = calibration.target_from_image[:3, :3]
-    if _angle(expected[:3, :3].T @ found) < FAR_DEG:
-        return
+    near = _angle(expected[:3, :3].T @ found) < FAR_DEG
     centre = (np.array(size) - 1) / 2
     away = np.linalg.norm(calibration.to_target(centre) - ProbeCalibration(expected, calibration.scale).to_target(centre))
-    if away < FAR_MM:  # the image lies where it should, so its own axes differ
+    if near and away < FAR_MM:
+        return
+    if near:
+        name = "are the poses in mm, and is rig.probe this bracket's?"
+    elif away < FAR_MM:  # the image lies where it should, so its own axes differ
         name = min(IMAGE_AXES, key=lambda key: _angle(IMAGE_AXES[key].T @ expected[:3, :3].T @ found))
     else:
         turn = min(_SIGNED, key=lambda signed: _angle(signed.T @ found @ expected[:3, :3].T))

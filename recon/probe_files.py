@@ -1,8 +1,9 @@
 """Files of the probe's calibration: sonotwin's own `probe.yaml`, and the rig authors' `US_params.npz`.
 
-- own: OpenCV FileStorage YAML with `schema`, `target_from_image` (4x4, mm), `scale` (sx, sy in mm/px) and, if known,
-  `parameters`, their names as in `recon.probe`, and `covariance`.
-- the authors': npz with sx, sy and T_I_T, which is `target_from_image`.
+- own: OpenCV FileStorage YAML with `schema`, `target_from_image` (4x4, mm), `scale` (sx, sy in mm/px), `speed_m_s`, the speed of
+  sound for which sy holds (1540 if it is missing), and, if known, `parameters`, their names as in `recon.probe`, and
+  `covariance`.
+- the authors': npz with sx, sy and T_I_T, which is `target_from_image`; no speed, so that 1540 m/s is taken.
 """
 
 from pathlib import Path
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 from recon import arrays, atomic
 from recon.calibration import Uncertainty
 from recon.errors import InputError
-from recon.probe import ProbeCalibration
+from recon.probe import SCANNER_SPEED, ProbeCalibration
+from recon.water import SPEEDS
 
 Array = NDArray[np.float64]
 
@@ -31,7 +33,7 @@ def read(path: Path) -> ProbeCalibration:
     Raises
     ------
     InputError
-        If the file is missing, damaged, of another kind, or a value is missing, not finite, no rotation or no scale.
+        If the file is missing, damaged, of another kind, or a value is missing, not finite, no rotation, scale or speed of sound.
     """
     path = Path(path)
     try:
@@ -56,6 +58,7 @@ def write(path: Path, calibration: ProbeCalibration) -> None:
     storage.write("schema", SCHEMA)
     storage.write("target_from_image", calibration.target_from_image)
     storage.write("scale", np.asarray(calibration.scale, float).reshape(1, 2))
+    storage.write("speed_m_s", float(calibration.speed_m_s))
     if calibration.uncertainty is not None:
         storage.startWriteStruct("parameters", cv2.FileNode_SEQ)
         for name in calibration.uncertainty.names:
@@ -68,7 +71,7 @@ def write(path: Path, calibration: ProbeCalibration) -> None:
 
 
 def write_authors(path: Path, calibration: ProbeCalibration) -> None:
-    """Write the rig authors' `US_params.npz`, whole or not at all; it has no room for the uncertainty."""
+    """Write the rig authors' `US_params.npz`, whole or not at all; it has no room for uncertainty and speed."""
     sx, sy = calibration.scale
     with atomic.new_file(path) as temporary, temporary.open("wb") as file:
         np.savez(file, sx=sx, sy=sy, T_I_T=calibration.target_from_image)
@@ -81,7 +84,7 @@ def _authors(path: Path) -> ProbeCalibration:
         if values[name].size != 1:
             raise InputError(f"{path}: {name}: expected one number, found {values[name].size}")
     scale = np.array([values["sx"].item(), values["sy"].item()], float)
-    return _checked(path, "T_I_T", values["T_I_T"].astype(float), scale, None)
+    return _checked(path, "T_I_T", values["T_I_T"].astype(float), scale, None, SCANNER_SPEED)
 
 
 def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
@@ -90,10 +93,12 @@ def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
     if found != SCHEMA:
         raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
     pose, scale = _matrix(path, storage, "target_from_image"), _matrix(path, storage, "scale").ravel()
-    return _checked(path, "target_from_image", pose, scale, _uncertainty(path, storage))
+    return _checked(path, "target_from_image", pose, scale, _uncertainty(path, storage), _speed(path, storage))
 
 
-def _checked(path: Path, name: str, pose: Array, scale: Array, uncertainty: Uncertainty | None) -> ProbeCalibration:
+def _checked(
+    path: Path, name: str, pose: Array, scale: Array, uncertainty: Uncertainty | None, speed_m_s: float
+) -> ProbeCalibration:
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise InputError(f"{path}: {name}: expected a 4x4 rigid transform in mm, found shape {pose.shape} or values not finite")
     turn = pose[:3, :3]
@@ -102,7 +107,18 @@ def _checked(path: Path, name: str, pose: Array, scale: Array, uncertainty: Unce
         raise InputError(f"{path}: {name}: expected a 4x4 rigid transform, found a matrix with no right-handed rotation in it")
     if scale.shape != (2,) or not np.isfinite(scale).all() or scale.min() <= 0:
         raise InputError(f"{path}: scale: expected sx and sy above zero in mm/px, found {scale.tolist()}")
-    return ProbeCalibration(pose, scale, uncertainty)
+    return ProbeCalibration(pose, scale, uncertainty, speed_m_s)
+
+
+def _speed(path: Path, storage: cv2.FileStorage) -> float:
+    node = storage.getNode("speed_m_s")
+    if node.empty():
+        return SCANNER_SPEED
+    value = node.real() if node.isReal() or node.isInt() else None
+    if value is None or not SPEEDS[0] <= value <= SPEEDS[1]:
+        found = "something else" if value is None else f"{value:g}"
+        raise InputError(f"{path}: speed_m_s: expected a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s, found {found}")
+    return float(value)
 
 
 def _uncertainty(path: Path, storage: cv2.FileStorage) -> Uncertainty | None:

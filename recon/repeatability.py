@@ -37,7 +37,10 @@ def cr2(calibrations: Sequence[ProbeCalibration], pixels: ArrayLike) -> Array:
 
 
 def average(calibrations: Sequence[ProbeCalibration]) -> ProbeCalibration:
-    """The mean of independent calibrations: rotations as rotations (least sum of squared chords), the rest as vectors."""
+    """The mean of independent calibrations: rotations as rotations (least sum of squared chords), the rest as vectors.
+
+    All have to hold for about the same speed of sound, as those of one tank do; so has the mean.
+    """
     turns = Rotation.from_matrix(np.stack([calibration.target_from_image[:3, :3] for calibration in calibrations]))
     origin = np.mean([calibration.target_from_image[:3, 3] for calibration in calibrations], axis=0)
     scale = np.mean([calibration.scale for calibration in calibrations], axis=0)
@@ -45,4 +48,9 @@ def average(calibrations: Sequence[ProbeCalibration]) -> ProbeCalibration:
     alike = len(known) == len(calibrations) and all(each.names == known[0].names for each in known)
     covariance = np.sum([each.covariance for each in known], axis=0) / len(known) ** 2 if alike else None
     uncertainty = None if covariance is None else Uncertainty(known[0].names, covariance)
-    return ProbeCalibration(rigid.transform(turns.mean().as_matrix(), origin), scale, uncertainty)
+    return ProbeCalibration(
+        rigid.transform(turns.mean().as_matrix(), origin),
+        scale,
+        uncertainty,
+        float(np.mean([each.speed_m_s for each in calibrations])),
+    )

@@ -39,6 +39,7 @@ OUTLIER = 3.5  # standard deviations from the smooth outline
 FADING_DEG = 6.0  # sigma of the window in which the brightness' slope along the wall is taken
 LEAST_EDGES = 40
 FLOOR_MM = 0.01  # no edge counts as more exact than this
+ROBUST = 3.0  # standard deviations, from which a point counts less in the cylinder's fit
 SEED = 0  # of the trials: the same image gives the same ring
 
 
@@ -283,13 +284,23 @@ def _weighted(points: Array, covariance: Array, frames: NDArray[np.int64]) -> Tu
     begin = np.array([0, 0, 0, 0, start.radius])
     normal = away(begin)[1]
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", normal, covariance, normal) + FLOOR_MM**2)
-    result = least_squares(lambda p: away(p)[0] / sigma, begin, x_scale="jac", loss="soft_l1", f_scale=3.0)
+    result = least_squares(lambda p: away(p)[0] / sigma, begin, x_scale="jac", loss="soft_l1", f_scale=ROBUST)
     bread = np.linalg.inv(result.jac.T @ result.jac)
-    scores = np.stack([(result.jac[frames == k] * result.fun[frames == k, None]).sum(axis=0) for k in np.unique(frames)])
+    gradients = _gradients(result.jac, result.fun, ROBUST)
+    scores = np.stack([gradients[frames == k].sum(axis=0) for k in np.unique(frames)])
     variance = bread @ (scores.T @ scores) @ bread * len(scores) / max(len(scores) - 1, 1)
     axis = start.axis + result.x[2:4] @ across
     shape = Cylinder(start.point + result.x[:2] @ across, axis / np.linalg.norm(axis), float(result.x[4]))
     return Tube(shape, float(np.sqrt(variance[4, 4])), away(result.x)[0], frames)
+
+
+def _gradients(jac: Array, misfit: Array, scale: float) -> Array:
+    """Gradient : (n, p) of each point's soft_l1 loss `scale² (sqrt(1 + z) - 1)`, z the misfit over the scale, squared.
+
+    It is the plain Jacobian times `misfit / sqrt(1 + z)`; SciPy's `least_squares` returns misfits as they are, but the Jacobian
+    times the root of the loss' second derivative, `(1 + z)^(-3/4)`, so that jac^T jac is the Hessian.
+    """
+    return jac * (misfit * (1 + (misfit / scale) ** 2) ** 0.25)[:, None]
 
 
 def _none(reason: str) -> Ring:

@@ -6,21 +6,25 @@ changes: the lines of a linear array stand where its elements do.
 
 A calibration in water finds mm of water a pixel, with no need of the temperature: `sy = sy_scanner c_water / c0`. It is right for
 sweeps through the same water. For tissue, or water of another temperature, it is converted by the ratio of the speeds; depths
-scale about the probe's face, where the delay is zero.
+scale about the probe's face, where the delay is zero. Which speed a calibration holds for is kept in it.
 """
+
+from typing import Annotated
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from recon import rigid
 from recon.calibration import Uncertainty
 from recon.errors import InputError
-from recon.probe import ProbeCalibration
+from recon.probe import SCANNER_SPEED, ProbeCalibration
 
 Array = NDArray[np.float64]
 
-SCANNER_SPEED = 1540.0  # m/s, a mean of soft tissues, which scanners assume
+SPEEDS = (300.0, 5000.0)  # m/s, of anything that is scanned
+Speed = Annotated[float, Field(ge=SPEEDS[0], le=SPEEDS[1], allow_inf_nan=False)]  # m/s; of a setting
 VALID_C = (0.0, 95.0)  # degrees Celsius
 MARCZAK = (1402.385, 5.038813, -5.799136e-2, 3.287156e-4, -1.398845e-6, 2.787860e-9)  # m/s, by powers of degrees Celsius
 
@@ -67,6 +71,12 @@ def implied_speed(calibration: ProbeCalibration, scanner_sy: float, assumed: flo
     return float(assumed * calibration.scale[1] / scanner_sy), float(assumed * sigma / scanner_sy)
 
 
+def in_tissue(world_from_pixel: Array, calibrated: float, speed: float) -> Array:
+    """Matrices : (..., 4, 4) px to mm, whose depths hold for a calibrated speed, for a medium of another; row 0 is the face."""
+    _check(calibrated=calibrated, speed=speed)
+    return world_from_pixel @ np.diag([1, speed / calibrated, 1, 1])
+
+
 def in_medium(
     calibration: ProbeCalibration, calibrated: float, speed: float, face_row: float = 0.0, ratio_sigma: float = 0.0
 ) -> ProbeCalibration:
@@ -81,9 +91,7 @@ def in_medium(
     ratio_sigma : float
         Standard deviation of `speed / calibrated`, say from that of the temperature.
     """
-    for name, value in (("calibrated", calibrated), ("speed", speed)):
-        if not 300 <= value <= 5000:
-            raise InputError(f"{name}: expected a speed of sound of 300 to 5000 m/s, found {value:g}")
+    _check(calibrated=calibrated, speed=speed)
     ratio = speed / calibrated
     sx, sy = calibration.scale
     depth = calibration.target_from_image[:3, 1]
@@ -93,9 +101,19 @@ def in_medium(
         jacobian, by_ratio = _jacobian(uncertainty.names, depth, sy, ratio, face_row)
         covariance = jacobian @ uncertainty.covariance @ jacobian.T + ratio_sigma**2 * np.outer(by_ratio, by_ratio)
         uncertainty = Uncertainty(uncertainty.names, covariance)
-    return ProbeCalibration(
-        rigid.transform(calibration.target_from_image[:3, :3], origin), np.array([sx, sy * ratio]), uncertainty
-    )
+    turn = calibration.target_from_image[:3, :3]
+    return ProbeCalibration(rigid.transform(turn, origin), np.array([sx, sy * ratio]), uncertainty, speed)
+
+
+def for_tissue(calibration: ProbeCalibration, speed: float | None) -> ProbeCalibration:
+    """A calibration converted from the speed that it holds for to that of the images' medium; as it is if that isn't known."""
+    return calibration if speed is None else in_medium(calibration, calibration.speed_m_s, speed)
+
+
+def _check(**speeds: float) -> None:
+    for name, value in speeds.items():
+        if not SPEEDS[0] <= value <= SPEEDS[1]:
+            raise InputError(f"{name}: expected a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s, found {value:g}")
 
 
 def _jacobian(names: tuple[str, ...], depth: Array, sy: float, ratio: float, face_row: float) -> tuple[Array, Array]:

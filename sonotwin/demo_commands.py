@@ -49,6 +49,7 @@ def sweep_commands(folder: Path, config: Config, given: Sequence[str], lag_s: fl
         f"capture={folder / 'sweep' / 'capture'}",
         f"probe={folder / 'probe' / calibrate_probe.PROBE}",
         f"lag_s={lag_s:.4f}",
+        f"tissue_m_s={config.tissue_m_s:g}",
     ]
     return [
         ["sweep", "scene=crosswire", "path=wire", f"path.count={config.wires}", *of_tank, f"out={folder / 'wires'}"],
@@ -66,7 +67,6 @@ def sweep_commands(folder: Path, config: Config, given: Sequence[str], lag_s: fl
         [
             "segment",
             *placed,
-            f"tissue_m_s={config.tissue_m_s:g}",
             f"surface={folder / 'surface' / 'surface.ply'}",
             f"out={folder / 'tumours'}",
         ],

@@ -8,9 +8,10 @@ import yaml
 from pydantic import Field, PrivateAttr, model_validator
 
 from recon.rig import Positive
+from recon.water import Speed
 from scenes.acoustics import MADE_OF
 from sonotwin.config import folder as conf
-from sonotwin.verbs import render, segment, sweep
+from sonotwin.verbs import render, sweep
 from twin import session
 from twin.ultrasound.session import AnyPath
 from twin.ultrasound.sweep import Clocks, PoseNoise
@@ -38,11 +39,12 @@ class Config(render.Config):
     pose_noise: PoseNoise = PoseNoise()
     wires: Annotated[int, Field(ge=1, le=1000)] = 40
     bottom_s: Positive = 6.0
-    tissue_m_s: segment.Speed = 1450.0
+    tissue_m_s: Speed = 1450.0
     _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
 
     @model_validator(mode="after")
     def _fits_poses(self) -> "Config":
+        # in place of render's check of that name: here poses are of the board, rendered by itself, and the scene is another
         return self
 
     @model_validator(mode="after")

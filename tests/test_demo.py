@@ -201,6 +201,7 @@ def test_the_commands_of_the_sweep_are_those_of_the_verbs(tmp_path):
     for verb, *fields in lines:
         module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
         assert load(verb, fields, module.Config), verb
+    assert all("tissue_m_s=1450" in line for line in lines[-2:]), "volume and masses at one speed"
     assert "lag_s=0.0503" in lines[-1] and "path=raster" in lines[8] and "clocks.lag_s=0.08" in lines[8]
 
 

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from recon import containment, probe_calibration, rigid
+from recon import arrays, containment, probe_calibration, rigid, sweep_capture
 from recon.errors import InputError, one_line
 from recon.metrics import Metrics
 from recon.probe import ProbeCalibration
@@ -91,22 +91,21 @@ def read_truth(folder: Path) -> SweepTruth:
         raise InputError(f"{path}: {one_line(error)}") from None
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: expected the settings of a rendered sweep, found them damaged at {error}") from None
-    try:
-        poses = np.load(folder / session.POSES)["world_from_image"]
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"{folder / session.POSES}: expected the true poses, found {error}") from None
+    poses = arrays.read(folder / session.POSES, {"world_from_image": arrays.Form("f", (None, 4, 4))})["world_from_image"]
+    labels = tuple(folder / session.LABELS / sweep_capture.image_name(number) for number in range(len(poses)))
+    if missing := [path for path in labels if not path.is_file()]:
+        raise InputError(f"{missing[0]}: expected an image of labels, found none")
     scene = build_scene(wanted)
     hidden = tuple(thing for thing in scene.things if thing.inside)
     if not hidden:
         raise InputError(f"{path}: expected a scene with something inside, found {scene.name}")
     scanned = body(scene)
-    labels = tuple(sorted((folder / session.LABELS).iterdir()))
     return SweepTruth(
         scanned,
         hidden,
         facing(session.surface_of("", scanned).mesh),
         transducer,
-        session.calibration_of(rig),
+        session.calibration_of(rig, transducer),
         clocks.lag_s,
         poses,
         labels,
@@ -138,7 +137,8 @@ def placement(world_from_pixel: Array, truth: SweepTruth) -> Array:
     Parameters
     ----------
     world_from_pixel : (n, 4, 4)
-        From px to mm, by the tracked poses, the lag and the calibration together.
+        From px to mm, by the tracked poses, the lag and the calibration together, for the speed of sound that the scanner
+        assumes: what the medium's own does to depths is no error of theirs.
     """
     pixels = five_points(truth.transducer.image_size)
     flat = np.column_stack([pixels, np.zeros(len(pixels))])
@@ -173,7 +173,8 @@ def measure(findings: Sequence[Finding], truth: SweepTruth, segmented: Metrics) 
 
     The outline's error is of the found surface's vertices to the true one, positive outside; `bias` its mean. Dice is twice the
     shared volume over the sum of both. `under_skin` is the least tissue between a thing and the skin over it, and `inside` is 1
-    where the found thing lies under the measured surface. `tumours_false` is what was found where nothing is.
+    where the found thing lies under the measured surface, NaN where that isn't known. `tumours_false` is what was found where
+    nothing is.
 
     Parameters
     ----------

@@ -8,11 +8,11 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes, map_coordinates
 
-from recon import figures, rigid
+from recon import figures, rigid, water
 from recon.figures import Colours
 from recon.volumes import Volume
 from twin.evaluate_sweep import Finding, SweepTruth
-from twin.ultrasound import truth
+from twin.ultrasound import session, truth
 
 Array = NDArray[np.float64]
 
@@ -26,13 +26,24 @@ LEVEL_STEP_MM = 0.2  # px of a section through the volume
 def beside_truth(
     scan: NDArray[np.uint8], number: int, world_from_pixel: Array, findings: Sequence[Finding], expected: SweepTruth
 ) -> Colours:
-    """B-scan (h, w) of a number and its echo-free image, both with outlines; world_from_pixel : (4, 4) as measured."""
+    """B-scan (h, w) of a number and its echo-free image, both with outlines; world_from_pixel : (4, 4) measured, in tissue."""
     ideal = truth.echo_free(expected.shown(number), expected.body, expected.transducer)
-    true_from_pixel = expected.world_from_image[number] @ np.diag([*expected.transducer.scale_mm_per_px, 1.0, 1.0])
-    outlines = cuts(findings, world_from_pixel, true_from_pixel)
-    tick = TICK_MM / expected.transducer.scale_mm_per_px[1]
+    outlines = cuts(findings, world_from_pixel, true_from_pixel(number, expected))
+    tick = TICK_MM / float(np.linalg.norm(world_from_pixel[:3, 1]))
     panels = [outlined(ticked(enlarged(figures.grey(image, 255)), tick), outlines) for image in (scan, ideal)]
     return np.hstack([panels[0], np.zeros((len(panels[0]), GAP_PX, 4), np.uint8), panels[1]])
+
+
+def true_from_pixel(number: int, expected: SweepTruth) -> Array:
+    """Where pixels of a B-scan of a number truly lie in the tissue : (4, 4), to mm in the world."""
+    transducer = expected.transducer
+    shown = expected.world_from_image[number] @ np.diag([*transducer.scale_mm_per_px, 1.0, 1.0])
+    return water.in_tissue(shown, transducer.assumed_speed, tissue_speed(expected))
+
+
+def tissue_speed(expected: SweepTruth) -> float:
+    """Of sound in what was swept over, m/s."""
+    return session.surface_of("", expected.body).tissue.speed
 
 
 def level_section(volume: Volume, z: float, findings: Sequence[Finding]) -> Colours:

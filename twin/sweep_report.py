@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon import figures, lag, page, probe_files, rigid, sequences, sweep_capture, volumes, water
+from recon import figures, lag, masses, page, probe_files, rigid, sequences, sweep_capture, volumes, water
 from recon.figures import SEQUENTIAL, Colours, Lines, Scale, Shape, Sheet
-from recon.metrics import Metrics, shown
+from recon.metrics import FILE, Metrics, shown
+from recon.metrics import read as read_figures
 from recon.page import Section
 from recon.probe import ProbeCalibration
 from recon.repeatability import five_points
@@ -21,7 +22,6 @@ from recon.volumes import Volume
 from twin import evaluate_sweep, sweep_pictures
 from twin.evaluate_sweep import Finding, SweepTruth
 from twin.sweep_pictures import FOUND, TICK_MM, TRUE
-from twin.ultrasound import session
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,7 @@ SKIN = "#d9b8a4"
 FRAMES = "#8f969c"
 PATH = "#7d8b6a"
 DEEP_MM = 20.0  # at which a speed of sound other than assumed is told
+MASS_MM = 10.0  # of a tumour, of which it is told too
 CELLS = (17, 21)  # of the maps over a B-scan, across and down
 PLANES_SHOWN = 12  # B-scans whose outlines are drawn in space
 PAPER = {  # Meza et al. 2021, Optical Engineering 60(5) 054106: CR2, and the RMS of the equations
@@ -44,7 +45,7 @@ class Inside:
     """A sweep, what was made of it, and its truth."""
 
     sweep: SweepCapture
-    world_from_pixel: Array  # (n, 4, 4), as measured
+    world_from_pixel: Array  # (n, 4, 4), as measured, with depths as of speed_m_s
     volume: Volume
     findings: Sequence[Finding]
     truth: SweepTruth
@@ -52,6 +53,7 @@ class Inside:
     bob: SweepCapture  # over a flat bottom
     depth_residuals: Array  # (k, 2) for each of its B-scans: depth in px and residual in px; NaN where none
     lag_s: float
+    speed_m_s: float  # of sound in the tissue, as was told
 
 
 def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: SweepTruth) -> Inside:
@@ -70,9 +72,10 @@ def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: Swe
     probe = probe_files.read(folders["probe"] / "probe.yaml")
     lag_s = float(json.loads((folders["lag"] / "lag.json").read_text(encoding="utf-8"))["lag_s"])
     rows = _rows(folders["lag"] / "depths.csv")
+    told = float(read_figures(folders["volume"] / FILE)["speed_m_per_s"])
     return Inside(
         sweep,
-        sweep.poses(lag_s) @ sequences.target_from_pixel(probe),
+        sweep.poses(lag_s) @ sequences.target_from_pixel(water.for_tissue(probe, told)),
         volumes.read_volume(folders["volume"] / "volume.nrrd"),
         findings,
         expected,
@@ -80,6 +83,7 @@ def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: Swe
         sweep_capture.read_sweep(folders["bottom"] / "capture"),
         np.array([[float(row[name] or "nan") for name in ("depth_px", "residual_px")] for row in rows]),
         lag_s,
+        told,
     )
 
 
@@ -114,12 +118,12 @@ def inside(story: Inside, points: NDArray[np.float32], skin: NDArray[np.bool_], 
         "the centre of the largest tumour that was scanned; equal scales on all axes."
     )
     pairs = [page.picture(*picture) for picture in pictures(story)]
-    width, height = np.array(story.truth.transducer.image_size) * story.truth.transducer.scale_mm_per_px
+    width, height = np.array(story.sweep.size) * masses.pixel_mm(story.world_from_pixel)
     beside = (
         f"Each B-scan ({width:.0f} mm wide, {height:.0f} mm deep, ticks every {TICK_MM:.0f} mm) beside what it should show: "
         "each tissue’s mean grey, without speckle, surfaces, loss, blur or noise. True outlines are cut from the rendered thing "
         "at the true pose, found ones from the found thing at the tracked pose, so their distance holds every error there is. "
-        f"{too_deep(story.truth)}"
+        f"{too_deep(story.truth, story.speed_m_s)}"
     )
     return Section(
         "Inside",
@@ -134,14 +138,22 @@ def inside(story: Inside, points: NDArray[np.float32], skin: NDArray[np.bool_], 
     )
 
 
-def too_deep(expected: SweepTruth) -> str:
-    """What the speed of sound in the thing that was scanned does to depths, in one sentence."""
-    tissue, assumed = session.surface_of("", expected.body).tissue, expected.transducer.assumed_speed
-    off = float(water.shown_too_deep(DEEP_MM, tissue.speed, assumed))
+def too_deep(expected: SweepTruth, told: float) -> str:
+    """What the speed of sound in the thing that was scanned does to depths, and what was done about it."""
+    speed, assumed = sweep_pictures.tissue_speed(expected), expected.transducer.assumed_speed
+    off = float(water.shown_too_deep(DEEP_MM, speed, assumed))
+    lies = f"lies {abs(off):.1f} mm {'less' if off > 0 else 'more'} deep" if off else "lies there"
+    names = {thing.name for thing in expected.hidden}
+    of_mass = float(np.mean([solid.tissue.speed for solid in expected.body.solids if solid.name in names]))
+    shorter = MASS_MM * (1 - speed / of_mass)
+    far = (
+        f" Of sound in a tumour ({of_mass:.0f} m/s) nothing is told: {MASS_MM:.0f} mm of it look {abs(shorter):.1f} mm "
+        f"{'shorter' if shorter > 0 else 'longer'}, so its far side is shown {'above' if shorter > 0 else 'below'} its outline."
+    )
     return (
-        f"Sound makes {tissue.speed:.0f} m/s in this tissue, and the scanner assumes {assumed:.0f}: an echo shown {DEEP_MM:.0f} "
-        f"mm deep lies {abs(off):.1f} mm {'less' if off > 0 else 'more'} deep, and dark "
-        f"regions reach {'below' if off > 0 else 'above'} their true outlines."
+        f"Sound makes {speed:.0f} m/s in this tissue, and the scanner assumes {assumed:.0f}: an echo shown {DEEP_MM:.0f} mm "
+        f"deep {lies}. Found outlines, ticks and volume are for {told:.0f} m/s, as was told, true outlines for {speed:.0f}."
+        f"{far if round(abs(shorter), 1) else ''}"
     )
 
 
@@ -312,7 +324,7 @@ def probe_table(metrics: Metrics, story: Inside) -> str:
         "Paper: Meza et al. 2021; its CR2, the mean distance of five calibrations from their mean, stands beside the error "
         "against the truth here, which holds what calibrations have in common too. Predicted: one standard deviation of the "
         "place in space. The last row has all errors: of the tracked poses, the lag and the calibration, over centre and corners "
-        "of all B-scans."
+        "of all B-scans, at the speed of sound that the scanner assumes."
     )
     return page.table(("", "paper", "predicted", "here"), rows, caption)
 

@@ -18,22 +18,36 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from recon import atomic, metrics, probe_calibration, probe_files, repeatability, sweep_capture, sweep_tables, water, wires
+from recon import (
+    atomic,
+    metrics,
+    probe_calibration,
+    probe_checks,
+    probe_files,
+    repeatability,
+    sweep_capture,
+    sweep_tables,
+    water,
+    wires,
+)
 from recon.capture import Size
 from recon.crosswire import Appearance, Crossing
 from recon.errors import InputError
 from recon.metrics import Metrics
 from recon.probe import ProbeCalibration
 from recon.probe_calibration import MIN_FRAMES, Adjustment, Noise, Sightings
-from recon.rig import Finite, NotNegative, Positive, Probe, Rig
+from recon.rig import Finite, NotNegative, Probe, Rig
 from recon.sweep_capture import SweepCapture
+from recon.water import Speed
+from sonotwin.verbs.measure_lag import LagSeconds
 
 PROBE = "probe.yaml"
 FRAMES = "frames.csv"  # by which the folder of a probe's calibration is known
@@ -51,16 +65,16 @@ class Config(BaseModel):
     out: Path
     capture: Path | None = None
     pairs: Path | None = None
-    lag_s: Finite = 0.0
+    lag_s: LagSeconds = 0.0
     temperature_c: Finite | None = None
     temperature_sigma_c: NotNegative = 0.5
-    assumed_speed: Positive = water.SCANNER_SPEED
-    medium_speed: Positive | None = None
+    assumed_speed: Speed = water.SCANNER_SPEED
+    medium_speed: Speed | None = None
     wire_radius_mm: NotNegative = 0.1
-    wire_speed: Positive = 2600.0
+    wire_speed: Annotated[float, Field(ge=300, le=10000)] = 2600.0
     appearance: Appearance = Appearance()
     noise: Noise = Noise()
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0)] = 0
 
     @field_validator("appearance", "noise")
     @classmethod
@@ -70,10 +84,26 @@ class Config(BaseModel):
                 raise ValueError(f"{name}: expected finite numbers from 0 on, found {numbers}")
         return value
 
+    @field_validator("appearance")
+    @classmethod
+    def _of_a_scanner(cls, value: Appearance) -> Appearance:
+        if not 20 <= value.dynamic_range_db <= 120:
+            raise ValueError(f"dynamic_range_db: expected 20 to 120 dB, found {value.dynamic_range_db:g}")
+        return value
+
+    @field_validator("noise")
+    @classmethod
+    def _some(cls, value: Noise) -> Noise:
+        if not any(dataclasses.astuple(value)):
+            raise ValueError("expected one standard deviation above zero at least, found none: their proportions count")
+        return value
+
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
         if (self.capture is None) == (self.pairs is None):
             raise ValueError(f"expected capture or pairs, found {'neither' if self.capture is None else 'both'}")
+        if self.medium_speed is not None and self.temperature_c is None:
+            raise ValueError("medium_speed: expected temperature_c with it, found none")
         return self
 
 
@@ -120,10 +150,11 @@ def run(config: Config) -> None:
         found = probe_calibration.calibrate(
             seen.sightings, seen.size, config.noise, expected, config.seed, ahead_mm=echo_ahead(config)
         )
+        probe_checks.speed(implied_speed(found.calibration, config)[0])
     except InputError as error:
         raise InputError(f"{seen.name}: {error}") from None
     seconds["seconds_calibrate"] = round(perf_counter() - start, 3)
-    calibration = in_tissue(found.calibration, config)
+    calibration = with_speed(found.calibration, config)
     figures = measure(seen, found, calibration, config)
     for line in describe(seen, found, figures, config):
         console.print(line, markup=False)
@@ -201,10 +232,15 @@ def echo_ahead(config: Config) -> float:
     return wires.echo_ahead(config.wire_radius_mm, config.wire_speed, float(water.speed_of_sound(temperature)))
 
 
-def in_tissue(calibration: ProbeCalibration, config: Config) -> ProbeCalibration:
-    """The calibration for the medium that will be scanned, where the water's temperature is known; else as it is."""
+def implied_speed(calibration: ProbeCalibration, config: Config) -> tuple[float, float]:
+    """Speed of sound and its standard deviation, m/s, that sy tells beside the design's."""
+    return water.implied_speed(calibration, config.rig.probe.scale_mm_per_px[1], config.assumed_speed)
+
+
+def with_speed(calibration: ProbeCalibration, config: Config) -> ProbeCalibration:
+    """For the medium that will be scanned, where the water's temperature is known; else as it is, for the speed that sy tells."""
     if config.temperature_c is None:
-        return calibration
+        return replace(calibration, speed_m_s=implied_speed(calibration, config)[0])
     in_water = float(water.speed_of_sound(config.temperature_c))
     wanted = config.medium_speed or config.assumed_speed
     sigma = wanted / in_water**2 * float(water.speed_sigma(config.temperature_c, config.temperature_sigma_c))
@@ -217,7 +253,7 @@ def measure(seen: Seen, found: Adjustment, calibration: ProbeCalibration, config
     expected = design.target_from_image.matrix()
     pixels = repeatability.five_points(seen.size)
     sigma = np.sqrt(np.trace(probe_calibration.point_covariance(calibration, pixels), axis1=1, axis2=2))
-    speed, speed_sigma = water.implied_speed(found.calibration, design.scale_mm_per_px[1], config.assumed_speed)
+    speed, speed_sigma = implied_speed(found.calibration, config)
     turn = Rotation.from_matrix(expected[:3, :3].T @ calibration.target_from_image[:3, :3]).magnitude()
     away = calibration.to_target(pixels[0]) - ProbeCalibration(expected, np.array(design.scale_mm_per_px)).to_target(pixels[0])
     known = calibration.uncertainty
@@ -241,6 +277,7 @@ def measure(seen: Seen, found: Adjustment, calibration: ProbeCalibration, config
         "implied_speed_m_per_s": speed,
         "implied_speed_sigma_m_per_s": speed_sigma,
         "water_speed_m_per_s": np.nan if config.temperature_c is None else float(water.speed_of_sound(config.temperature_c)),
+        "speed_m_per_s": calibration.speed_m_s,
         "design_turn_deg": float(np.degrees(turn)),
         "design_centre_mm": float(np.linalg.norm(away)),
     }
@@ -267,7 +304,8 @@ def describe(seen: Seen, found: Adjustment, figures: Metrics, config: Config) ->
     implied = f"{speed:.0f} ± {sigma:.0f} m/s by sy, if the scanner's is {config.rig.probe.scale_mm_per_px[1]:g} mm/px"
     yield f"sound       {implied} for {config.assumed_speed:g} m/s"
     if config.temperature_c is None:
-        yield "depth       as in the medium of the calibration, right for sweeps through the same; temperature_c=... converts it"
+        same = f"as in the medium of the calibration, {figures['speed_m_per_s']:.0f} m/s, right for sweeps through the same"
+        yield f"depth       {same}; temperature_c=... converts it"
         return
     in_water, assumed = figures["water_speed_m_per_s"], config.assumed_speed
     deep = float(water.shown_too_deep(SHOWN_DEPTH_MM, in_water, assumed))

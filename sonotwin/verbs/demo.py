@@ -23,7 +23,7 @@ import numpy as np
 import trimesh
 from rich.console import Console
 
-from recon import atomic, metrics, probe_files, sequences, sweep_capture
+from recon import atomic, metrics, probe_files, sequences, sweep_capture, water
 from recon.capture import read_patterns
 from recon.metrics import Metrics, shown
 from sonotwin.config import folder as conf
@@ -152,7 +152,7 @@ def sweep_steps(config: Config) -> list[Step]:
         return {}
 
     def volume(folder: Path, _: Figures) -> Figures:
-        freehand.run(freehand.Config(out=folder / "volume", **_placed(folder)))
+        freehand.run(freehand.Config(out=folder / "volume", tissue_m_s=config.tissue_m_s, **_placed(folder)))
         return _named("volume", metrics.read(folder / "volume" / metrics.FILE))
 
     def tumours(folder: Path, _: Figures) -> Figures:
@@ -164,7 +164,8 @@ def sweep_steps(config: Config) -> list[Step]:
         findings, truth = compared(folder)
         captured, placed = sweep_capture.read_sweep(folder / "sweep" / "capture"), _placed(folder)
         calibration = probe_files.read(placed["probe"])
-        apart = evaluate_sweep.placement(captured.poses(placed["lag_s"]) @ sequences.target_from_pixel(calibration), truth)
+        shown = sequences.target_from_pixel(water.for_tissue(calibration, truth.transducer.assumed_speed))
+        apart = evaluate_sweep.placement(captured.poses(placed["lag_s"]) @ shown, truth)
         figures = evaluate_sweep.measure(findings, truth, metrics.read(folder / "tumours" / metrics.FILE))
         return figures | {"sweep_placement_rms_mm": float(np.sqrt(np.nanmean(apart**2)))}
 

@@ -3,11 +3,11 @@
 Reads the sweep part of a capture folder, with the probe's calibration and the lag between scanner and tracker; or a tracked
 sequence of the PLUS toolkit, reconstructed by the fields below or by its own configuration. Writes into the folder `out`:
 volume.nrrd (in the world's frame, mm); of a capture also sequence.igs.mha, the B-scans with their poses for PLUS and 3D Slicer;
-and metrics.json. Results that are there already are replaced. Takes a second for a hundred B-scans, and some seconds more when it
-first compiles.
+and metrics.json. Depths are as of the speed of sound that the probe's calibration holds for, unless tissue_m_s is given. Results
+that are there already are replaced. Takes a second for a hundred B-scans, and some seconds more when it first compiles.
 
     sonotwin freehand capture=outputs/sweep/capture probe=outputs/probe/probe.yaml lag_s=0.0503 out=outputs/volume
-    sonotwin freehand capture=outputs/sweep/capture spacing_mm=0.3 compounding=maximum out=outputs/volume
+    sonotwin freehand capture=outputs/sweep/capture tissue_m_s=1450 spacing_mm=0.3 compounding=maximum out=outputs/volume
     sonotwin freehand sequence=sweep.igs.mha config=config.xml out=outputs/volume
 """
 
@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 
-from recon import atomic, freehand, holes, metrics, plus_config, probe_files, sequences, sweep_capture, volumes
+from recon import atomic, freehand, holes, metrics, plus_config, probe_files, sequences, sweep_capture, volumes, water
 from recon.errors import InputError
 from recon.freehand import Clip, Compounding, Interpolation, Reconstruction
 from recon.metrics import Metrics
 from recon.probe import ProbeCalibration
-from recon.rig import Finite, Positive
 from recon.sweep_capture import SweepCapture
+from recon.water import SCANNER_SPEED, Speed
+from sonotwin.verbs.measure_lag import LagSeconds
 
 VOLUME = "volume.nrrd"  # by which the folder of a volume is known
 SEQUENCE = "sequence.igs.mha"
@@ -44,17 +45,18 @@ class Config(BaseModel):
     out: Path
     capture: Path | None = None
     probe: Path | None = None
-    lag_s: Finite = 0.0
+    lag_s: LagSeconds = 0.0
+    tissue_m_s: Speed | None = None
     sequence: Path | None = None
     config: Path | None = None
-    spacing_mm: Positive = 0.5
+    spacing_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.5
     extent: Literal["aligned", "principal"] = "principal"
     compounding: Compounding = "mean"
     interpolation: Interpolation = "nearest"
     clip: tuple[int, int, Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] | None = None
     hole_voxels: Annotated[int, Field(ge=0, le=1000)] = holes.MOST_VOXELS
     hole_sticks: Annotated[int, Field(ge=1, le=len(holes.STICKS))] = 1
-    most_gib: Positive = freehand.MOST_BYTES / 2**30
+    most_gib: Annotated[float, Field(gt=0, le=1024)] = freehand.MOST_BYTES / 2**30
 
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
@@ -66,6 +68,8 @@ class Config(BaseModel):
             raise ValueError(f"lag_s: expected none with a sequence, whose poses are those of its images, found {self.lag_s:g}")
         if self.config is not None and self.probe is not None:
             raise ValueError("probe: expected none with a config, which has the calibration, found one")
+        if self.config is not None and self.tissue_m_s is not None:
+            raise ValueError(f"tissue_m_s: expected none with a config, which has the depths, found {self.tissue_m_s:g}")
         if self.compounding == "integer_mean" and self.interpolation == "linear":
             raise ValueError("interpolation: expected nearest with integer_mean, which counts whole pixels, found linear")
         return self
@@ -78,6 +82,9 @@ class Scans:
     shape: tuple[int, int]  # height, width
     world_from_pixel: Array  # (n, 4, 4); NaN where there is no pose
     stream: Callable[[], Iterator[NDArray[np.uint8]]]  # the images (h, w), one by one, from the first at each call
+    speed_m_s: float  # of the sound for which the depths are
+    calibrated_m_s: float  # of that for which the calibration is
+    probe: ProbeCalibration | None = None  # converted likewise; None where the sequence has its own
 
     @property
     def placed(self) -> int:
@@ -98,14 +105,16 @@ def run(config: Config) -> None:
     atomic.check_folder(config.out, VOLUME, inputs=inputs)
     if config.capture is not None:
         sweep = sweep_capture.read_sweep(config.capture)
-        probe = probe_of(sweep, config)
-        scans, transcript = scans_of_sweep(sweep, probe, config.lag_s), (sweep, probe)
+        probe = probe_of(sweep, config.capture, config.probe)
+        scans = scans_of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
     else:
         assert config.sequence is not None
-        scans, transcript = scans_of_sequence(config.sequence, config.probe, config.config), None
+        sweep, scans = None, scans_of_sequence(config.sequence, config.probe, config.config, config.tissue_m_s)
     height, width = scans.shape
     count = len(scans.world_from_pixel)
     console.print(f"read        {count} B-scans, {width}x{height}, {scans.placed} with a pose", markup=False)
+    if config.config is None:
+        console.print(depths(scans), markup=False)
 
     start = perf_counter()
     with console.status("putting B-scans into the volume"):
@@ -117,40 +126,42 @@ def run(config: Config) -> None:
 
     with console.status("writing"), atomic.new_folder(config.out, VOLUME) as folder:
         volumes.write_volume(folder / VOLUME, filled.volume)
-        if transcript is not None:
-            write_sequence(folder / SEQUENCE, *transcript, config.lag_s)
+        if sweep is not None and scans.probe is not None:
+            write_sequence(folder / SEQUENCE, sweep, scans.probe, config.lag_s)
         metrics.write(folder / metrics.FILE, figures | seconds)
         written = [name for name in (VOLUME, SEQUENCE, metrics.FILE) if (folder / name).exists()]
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
 
 
-def probe_of(sweep: SweepCapture, config: Config) -> ProbeCalibration:
-    """The probe's calibration: that given, else that of the capture.
+def probe_of(sweep: SweepCapture, capture: Path, given: Path | None) -> ProbeCalibration:
+    """The probe's calibration: that in the file that is given, else that of the capture.
 
     Raises
     ------
     InputError
         If there is neither.
     """
-    if config.probe is not None:
-        return probe_files.read(config.probe)
+    if given is not None:
+        return probe_files.read(given)
     if sweep.probe is None:
-        raise InputError(f"{config.capture}: expected the probe's calibration, found none; give probe=...")
+        raise InputError(f"{capture}: expected the probe's calibration, found none; give probe=...")
     return sweep.probe
 
 
-def scans_of_sweep(sweep: SweepCapture, probe: ProbeCalibration, lag_s: float) -> Scans:
-    """The B-scans of a capture, in the world."""
-    world_from_pixel = sweep.poses(lag_s) @ sequences.target_from_pixel(probe)
-    return Scans(sweep.size[::-1], world_from_pixel, sweep.images)
+def scans_of_sweep(sweep: SweepCapture, probe: ProbeCalibration, lag_s: float, tissue_m_s: float | None) -> Scans:
+    """The B-scans of a capture, in the world; of tissue with a speed of sound other than the calibration's, if it is known."""
+    converted = water.for_tissue(probe, tissue_m_s)
+    world_from_pixel = sweep.poses(lag_s) @ sequences.target_from_pixel(converted)
+    return Scans(sweep.size[::-1], world_from_pixel, sweep.images, converted.speed_m_s, probe.speed_m_s, converted)
 
 
-def scans_of_sequence(path: Path, probe: Path | None, config: Path | None) -> Scans:
-    """The B-scans of a PLUS sequence, in the frame of its reference."""
+def scans_of_sequence(path: Path, probe: Path | None, config: Path | None, tissue_m_s: float | None) -> Scans:
+    """The B-scans of a PLUS sequence, in the frame of its reference; its own calibration is taken to hold for 1540 m/s."""
     frames, shape = sequences.read_tracking(path), sequences.image_shape(path)
     fixed, to, of = {}, "Reference", "Image"
-    if probe is not None:
-        fixed = {"ImageToProbe": sequences.target_from_pixel(probe_files.read(probe))}
+    given = None if probe is None else probe_files.read(probe)
+    if given is not None:
+        fixed = {"ImageToProbe": sequences.target_from_pixel(given)}
     elif config is not None:
         wanted = plus_config.read_config(config)
         fixed, to, of = wanted.transforms, wanted.reference, wanted.image
@@ -159,7 +170,18 @@ def scans_of_sequence(path: Path, probe: Path | None, config: Path | None) -> Sc
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     valid = frames.valid["Image"][:, None, None]
-    return Scans(shape, np.where(valid, world_from_pixel, np.nan), lambda: sequences.stream_images(path))
+    calibrated = SCANNER_SPEED if given is None else given.speed_m_s
+    speed = tissue_m_s or calibrated
+    matrices = water.in_tissue(np.where(valid, world_from_pixel, np.nan), calibrated, speed)
+    converted = None if given is None else water.for_tissue(given, tissue_m_s)
+    return Scans(shape, matrices, lambda: sequences.stream_images(path), speed, calibrated, converted)
+
+
+def depths(scans: Scans) -> str:
+    """A line that says which speed of sound the depths are for."""
+    calibrated, speed = scans.calibrated_m_s, scans.speed_m_s
+    how = "as calibrated" if speed == calibrated else f"converted from {calibrated:.0f} m/s, for which the probe is calibrated"
+    return f"depth       right where sound makes {speed:.0f} m/s, {how}"
 
 
 def reconstruct(scans: Scans, config: Config) -> tuple[Reconstruction, Reconstruction]:
@@ -186,6 +208,7 @@ def measure(scans: Scans, pasted: Reconstruction, filled: Reconstruction) -> Met
     return {
         "frames": len(scans.world_from_pixel),
         "frames_placed": scans.placed,
+        "speed_m_per_s": scans.speed_m_s,
         **dict(zip(("voxels_x", "voxels_y", "voxels_z"), (nx, ny, nz), strict=True)),
         **{f"spacing_{axis}_mm": float(step) for axis, step in zip("xyz", volume.spacing, strict=True)},
         "pasted_fraction": float(pasted.filled.mean()),

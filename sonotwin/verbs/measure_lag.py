@@ -31,6 +31,7 @@ DEPTHS = "depths.csv"
 HEADER = ("frame", "time_ns", "depth_px", "residual_px", "used")
 
 Array = NDArray[np.float64]
+LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s; of the settings lag_s of other commands
 
 
 class Config(BaseModel):

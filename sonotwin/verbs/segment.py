@@ -1,9 +1,9 @@
 """Find masses, or a tube, in the B-scans of a freehand sweep, as closed surfaces in the world.
 
 Reads the sweep part of a capture folder, with the probe's calibration and the lag between scanner and tracker, or a tracked
-sequence of the PLUS toolkit; and, to tell whether masses lie inside, the skin as of `sonotwin surface`. Writes into the folder
-`out`: mass0.ply, mass1.ply ... from the largest on, or tube.ply, in the world's frame, mm; the same as .glb; some B-scans with
-the outline, overlay0.png ...; and metrics.json. Results that are there already are replaced. Takes about a minute for 150
+sequence of the PLUS toolkit; and, to tell whether masses lie inside, the skin as of `sonotwin surface`, a PLY. Writes into the
+folder `out`: mass0.ply, mass1.ply ... from the largest on, or tube.ply, in the world's frame, mm; the same as .glb; some B-scans
+with the outline, overlay0.png ...; and metrics.json. Results that are there already are replaced. Takes about a minute for 150
 B-scans, a tube some seconds.
 
     sonotwin segment capture=outputs/sweep/capture lag_s=0.05 tissue_m_s=1450 out=outputs/masses
@@ -30,13 +30,16 @@ from recon.errors import InputError
 from recon.mass_paths import Sound
 from recon.masses import Mass
 from recon.metrics import Metrics
-from recon.rig import Finite, Positive
+from recon.probe import SCANNER_SPEED, ProbeCalibration
+from recon.rig import Positive
 from recon.ring import Appearance, Ring, Tube
+from recon.water import Speed
 from sonotwin.verbs import freehand
 from sonotwin.verbs.freehand import Scans
+from sonotwin.verbs.measure_lag import LagSeconds
 
 Array = NDArray[np.float64]
-Speed = Annotated[float, Field(ge=300, le=5000)]
+Spread = Annotated[float, Field(ge=0, le=5)]
 
 LEAST_PX = 30  # of a mass in a B-scan that is drawn
 COLOUR = (60, 220, 255)  # of outlines, blue, green, red
@@ -51,14 +54,16 @@ class Config(BaseModel):
     kind: Literal["masses", "tube"] = "masses"
     capture: Path | None = None
     probe: Path | None = None
-    lag_s: Finite = 0.0
+    lag_s: LagSeconds = 0.0
     sequence: Path | None = None
     surface: Path | None = None
-    assumed_m_s: Speed = 1540.0
-    tissue_m_s: Speed = 1540.0
-    mass_m_s: Speed = 1540.0
+    tissue_m_s: Speed | None = None
+    mass_m_s: Speed = SCANNER_SPEED
     dynamic_range_db: Annotated[float, Field(ge=20, le=120)] = 60.0
     diameter_mm: tuple[Positive, Positive] = (5.0, 36.0)
+    spread_mm: tuple[Spread, Spread] = (0.25, 0.08)
+    min_contrast_db: Annotated[float, Field(ge=0, le=120)] = 15.0
+    top_mm: Annotated[float, Field(ge=0, le=100)] = 2.5
     overlays: Annotated[int, Field(ge=0, le=100)] = 4
 
     @model_validator(mode="after")
@@ -74,9 +79,9 @@ class Config(BaseModel):
         return self
 
     @property
-    def sound(self) -> Sound:
-        """The speeds."""
-        return Sound(self.tissue_m_s, self.mass_m_s, self.assumed_m_s)
+    def tube(self) -> Appearance:
+        """What a tube looks like."""
+        return Appearance(self.diameter_mm, self.spread_mm, self.dynamic_range_db, self.min_contrast_db, self.top_mm)
 
 
 @dataclass(frozen=True)
@@ -105,12 +110,13 @@ def run(config: Config) -> None:
     height, width = scans.shape
     count = len(scans.world_from_pixel)
     console.print(f"read        {count} B-scans, {width}x{height}, {scans.placed} with a pose", markup=False)
+    console.print(freehand.depths(scans), markup=False)
     start = perf_counter()
     with console.status(f"looking for {'a tube' if config.kind == 'tube' else 'masses'}"):
         found = find_tube(scans, config) if config.kind == "tube" else find_masses(scans, config, skin)
     for line in found.lines:
         console.print(line, markup=False)
-    figures = {"frames": count, "frames_placed": scans.placed} | found.figures
+    figures = {"frames": count, "frames_placed": scans.placed, "speed_m_per_s": scans.speed_m_s} | found.figures
     with console.status("writing"), atomic.new_folder(config.out, metrics.FILE) as folder:
         for name, mesh in found.meshes.items():
             meshes.write_ply(folder / f"{name}.ply", mesh)
@@ -126,10 +132,10 @@ def read(config: Config) -> Scans:
     """The B-scans in the world."""
     if config.capture is None:
         assert config.sequence is not None
-        return freehand.scans_of_sequence(config.sequence, config.probe, None)
+        return freehand.scans_of_sequence(config.sequence, config.probe, None, config.tissue_m_s)
     sweep = sweep_capture.read_sweep(config.capture)
-    source = freehand.Config(out=config.out, capture=config.capture, probe=config.probe)
-    return freehand.scans_of_sweep(sweep, freehand.probe_of(sweep, source), config.lag_s)
+    probe = freehand.probe_of(sweep, config.capture, config.probe)
+    return freehand.scans_of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
 
 
 def read_skin(path: Path) -> trimesh.Trimesh:
@@ -140,10 +146,12 @@ def read_skin(path: Path) -> trimesh.Trimesh:
     InputError
         If the file is none.
     """
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path}: expected a surface as PLY, found {path.suffix or 'no suffix'}")
     if not path.is_file():
         raise InputError(f"{path}: expected a surface as PLY, found none")
     try:
-        mesh = trimesh.load(path, process=False)
+        mesh = trimesh.load(path, file_type="ply", process=False)
     except (ValueError, IndexError, KeyError, TypeError) as error:
         raise InputError(f"{path}: expected a surface as PLY, found a damaged one: {error}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
@@ -153,14 +161,20 @@ def read_skin(path: Path) -> trimesh.Trimesh:
 
 def find_masses(scans: Scans, config: Config, skin: trimesh.Trimesh | None) -> Found:
     """Masses, with the outlines that the B-scans show of them."""
-    found = masses.from_scans(scans.stream, scans.shape, scans.world_from_pixel, config.sound, config.dynamic_range_db)
-    figures: Metrics = {"masses": len(found)}
-    lines = [] if found else ["masses      none that is darker than the tissue around it"]
+    sound, placed = Sound(scans.speed_m_s, config.mass_m_s), scans.world_from_pixel
+    try:
+        grey = masses.tissue_grey(scans.stream(), scans.shape, placed)
+    except InputError as error:
+        raise InputError(f"{config.capture or config.sequence}: {error}") from None
+    found = masses.from_scans(scans.stream, scans.shape, placed, sound, config.dynamic_range_db, grey)
+    figures: Metrics = {"tissue_grey": grey, "masses": len(found)}
+    lines = [f"tissue      grey {grey:.0f} of 255"]
+    lines += [] if found else ["masses      none that is darker than the tissue around it"]
     for number, mass in enumerate(found):
         under = None if skin is None else contain(mass.mesh, skin)
         figures |= measure(f"mass{number}", mass, under)
         lines.append(f"mass{number}       {describe(mass, under)}")
-    shown = masses.shown(found, scans.world_from_pixel, scans.shape, config.sound)
+    shown = masses.shown(found, placed, scans.shape, sound)
     outlines = {k: mask for k, mask in enumerate(shown) if mask.sum() >= LEAST_PX}
     chosen = spread({k: int(mask.sum()) for k, mask in outlines.items()}, config.overlays)
     drawn = [(k, drawn_over(image, list(_contours(outlines[k])))) for k, image in enumerate(scans.stream()) if k in chosen]
@@ -173,7 +187,8 @@ def measure(name: str, mass: Mass, under: Containment | None) -> Metrics:
     figures |= {f"{name}_centre_{axis}_mm": float(value) for axis, value in zip("xyz", mass.centre, strict=True)}
     figures |= {f"{name}_extent_{axis}_mm": float(value) for axis, value in zip("xyz", mass.mesh.extents, strict=True)}
     if under is not None:
-        figures |= {f"{name}_inside": int(under.inside), f"{name}_depth_mm": under.least_mm}
+        inside = np.nan if under.inside is None else int(under.inside)
+        figures |= {f"{name}_inside": inside, f"{name}_covered": under.covered, f"{name}_depth_mm": under.least_mm}
     return figures
 
 
@@ -183,17 +198,16 @@ def describe(mass: Mass, under: Containment | None) -> str:
     text = f"{mass.volume:.0f} mm3, centre {centre} mm, {' x '.join(f'{value:.1f}' for value in mass.mesh.extents)} mm"
     if under is None:
         return text
-    if np.isnan(under.least_mm):
-        return f"{text}, not under the surface"
+    if under.inside is None:
+        return f"{text}, inside unknown: only {100 * under.covered:.0f} % lies under the surface"
     return f"{text}, {'inside' if under.inside else 'not inside'}, {metrics.shown(under.least_mm, '.1f')} mm below the skin"
 
 
 def find_tube(scans: Scans, config: Config) -> Found:
     """A tube, with its wall in the B-scans."""
-    look = Appearance(diameter_mm=config.diameter_mm, dynamic_range_db=config.dynamic_range_db)
-    matrices = masses.in_tissue(scans.world_from_pixel, config.sound)
-    scale = masses.pixel_mm(matrices)
-    rings = [ring.find(image, np.array(scale), look) for image in scans.stream()]
+    matrices = scans.world_from_pixel
+    scale = np.array(masses.pixel_mm(matrices))
+    rings = [ring.find(image, scale, config.tube) for image in scans.stream()]
     try:
         tube = ring.fit_tube(rings, matrices)
     except InputError as error:
@@ -201,7 +215,8 @@ def find_tube(scans: Scans, config: Config) -> Found:
         found = f"; most others: {max(set(reasons), key=reasons.count)}" if reasons else ""
         raise InputError(f"{config.capture or config.sequence}: {error}{found}") from None
     used = len(np.unique(tube.frames))
-    diameter, sigma = 2 * tube.shape.radius, 2 * tube.sigma_mm
+    of_scale = 0.0 if scans.probe is None else scale_sigma(rings, matrices, tube, scans.probe)
+    diameter, sigma = 2 * tube.shape.radius, 2 * float(np.hypot(tube.sigma_mm, of_scale))
     figures: Metrics = {
         "tube_diameter_mm": diameter,
         "tube_diameter_sigma_mm": sigma,
@@ -214,6 +229,22 @@ def find_tube(scans: Scans, config: Config) -> Found:
     chosen = spread({int(k): len(rings[k].pixels) for k in np.unique(tube.frames)}, config.overlays)
     drawn = [(k, drawn_over(image, [rings[k].pixels], closed=False)) for k, image in enumerate(scans.stream()) if k in chosen]
     return Found({"tube": tube_mesh(tube, rings, matrices)}, figures, [line], drawn)
+
+
+def scale_sigma(rings: Sequence[Ring], matrices: Array, tube: Tube, probe: ProbeCalibration) -> float:
+    """Standard deviation of a tube's radius, mm, by that of sx and sy, which all images have in common; 0 if none is known."""
+    known = probe.uncertainty
+    if known is None:
+        return 0.0
+    names = [name for name in ("sx", "sy") if known.sigma(name) > 0]
+    steps = []
+    for name in names:
+        k = ("sx", "sy").index(name)
+        changed = np.ones(4)
+        changed[k] += known.sigma(name) / probe.scale[k]
+        steps.append((ring.fit_tube(rings, matrices * changed).shape.radius - tube.shape.radius) / known.sigma(name))
+    order = [known.names.index(name) for name in names]
+    return float(np.sqrt(np.array(steps) @ known.covariance[np.ix_(order, order)] @ np.array(steps))) if names else 0.0
 
 
 def tube_mesh(tube: Tube, rings: Sequence[Ring], matrices: Array) -> trimesh.Trimesh:

@@ -3,8 +3,8 @@
 Reads the rig, the scene, the transducer and the probe's path from conf/. Writes OUT/capture/, which calibrate-probe, measure-lag
 and freehand read like any hardware's: B-scans and tracked poses by their own clocks, and the probe's calibration, except with
 path=wire, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times, and labels of what
-each pixel shows. Takes about
-a quarter of a second a B-scan on two cores, half a minute for the default stroke, and ten seconds more when it first compiles.
+each pixel shows. Takes about a quarter of a second a B-scan on two cores, half a minute for the default stroke, and ten seconds
+more when it first compiles.
 
     sonotwin sweep out=outputs/sweep
     sonotwin sweep scene=tank ultrasound=water path=bob out=outputs/bottom
@@ -77,7 +77,7 @@ def run(config: Config) -> None:
         )
     count = len(planned.times)
     console.print(f"path        {config.path.kind}, {count} B-scans, {len(planned.track.times)} poses")
-    probe = None if isinstance(config.path, WirePath) else session.calibration_of(config.rig)
+    probe = None if isinstance(config.path, WirePath) else session.calibration_of(config.rig, config.ultrasound)
     settings = config.model_dump(mode="json", exclude={"out"})
     start = perf_counter()
     taken = shown(scanned, config, planned, console)

@@ -7,6 +7,7 @@ from scipy.special import ndtr
 
 from recon import echo_power, masses, rigid
 from recon.echo_power import EchoPower
+from recon.errors import InputError
 from recon.mass_paths import Sound, follow
 from recon.masses import find
 from recon.volumes import Volume
@@ -130,3 +131,15 @@ def test_distances_are_known_deep_inside_and_far_away():
     assert np.abs(found.voxels - np.clip(true, -masses.FAR_MM, masses.FAR_MM)).max() < 0.6  # a voxel's diagonal
     near = np.abs(true) < 0.5
     assert np.abs(found.voxels - true)[near].max() < 0.05
+
+
+def test_the_level_of_tissue_is_that_of_images_with_a_pose():
+    """Three of five images are of air, before the target was seen; and gel all over is no tissue."""
+    images, matrices = np.zeros((5, 200, 40), np.uint8), np.tile(np.diag([0.2, 0.2, 0.2, 1.0]), (5, 1, 1))
+    images[3:] = 136
+    matrices[:3] = np.nan
+    assert masses.tissue_grey(iter(images), (200, 40), matrices) == 136
+    with pytest.raises(InputError, match=r"images: expected tissue in the upper half .* found 4 \(median\): gel"):
+        masses.tissue_grey(iter(np.full((5, 200, 40), 4, np.uint8)), (200, 40), matrices)
+    with pytest.raises(InputError, match="images: expected more than 6 mm of depth, found 20 rows, of which 15 are ringing"):
+        masses.tissue_grey(iter(images[:, :20]), (20, 40), matrices)

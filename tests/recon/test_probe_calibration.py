@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from recon import probe_calibration, probe_equations, repeatability, rigid, water
+from recon import probe_calibration, probe_checks, probe_equations, repeatability, rigid, water
 from recon.errors import InputError
 from recon.probe import ProbeCalibration
 from recon.probe_calibration import Noise, Sightings, calibrate
@@ -285,3 +285,25 @@ def test_a_calibration_in_water_shows_its_speed_of_sound_and_is_corrected_for_it
     uncorrected = errors(made, probe).max()
     assert uncorrected == pytest.approx(water.shown_too_deep(50.0, speed), abs=0.3)
     assert errors(water.in_medium(made, float(speed), water.SCANNER_SPEED), probe).max() < 0.31
+
+
+def test_poses_in_cm_are_told_by_the_brackets_length(probe, frames, rng):
+    """They fit as well, with all lengths a tenth: only the design tells."""
+    sightings = observe(probe, *frames, rng)
+    in_cm = Sightings(shifts(sightings.poses, np.eye(4) / 10), sightings.pixels)
+    small = Noise(ANGLE_DEG, POSITION_MM / 10, PIXEL_PX, SLICE_MM / 10)
+    with pytest.raises(InputError, match=r"found it \d deg and 1\d\d mm off: are the poses in mm, and is rig.probe") as raised:
+        calibrate(in_cm, SIZE, small, probe.target_from_image)
+    assert "\n" not in str(raised.value)
+
+
+def test_exact_poses_need_no_noise(probe, frames):
+    """Nothing is inverted that is singular: a floor of a micrometre stands for none."""
+    result = calibrate(Sightings(poses_of(probe, *frames), frames[1]), SIZE, Noise(0, 0, 0, 0))
+    assert errors(result.calibration, probe).max() < 1e-6
+
+
+@pytest.mark.parametrize("implied", [154.0, 15400.0])
+def test_a_scale_that_tells_no_speed_of_sound_is_refused(implied):
+    with pytest.raises(InputError, match=f"300 to 5000 m/s, found {implied:.0f}: are the poses in mm"):
+        probe_checks.speed(implied)

@@ -14,7 +14,7 @@ from recon.probe import ProbeCalibration
 def probe(rig, rng):
     root = rng.standard_normal((8, 8)) * 1e-3
     uncertainty = Uncertainty(probe_files.PARAMETERS, root @ root.T)
-    return ProbeCalibration(rig.probe.target_from_image.matrix(), np.array(rig.probe.scale_mm_per_px), uncertainty)
+    return ProbeCalibration(rig.probe.target_from_image.matrix(), np.array(rig.probe.scale_mm_per_px), uncertainty, 1488.3)
 
 
 def test_what_is_written_is_read(probe, tmp_path):
@@ -22,7 +22,7 @@ def test_what_is_written_is_read(probe, tmp_path):
     probe_files.write(path, probe)
     back = probe_files.read(path)
     assert np.array_equal(back.target_from_image, probe.target_from_image)
-    assert np.array_equal(back.scale, probe.scale)
+    assert np.array_equal(back.scale, probe.scale) and back.speed_m_s == 1488.3
     assert back.uncertainty.names == probe.uncertainty.names
     assert back.uncertainty.covariance == pytest.approx(probe.uncertainty.covariance)
 
@@ -50,6 +50,9 @@ def test_the_authors_file(probe, tmp_path):
         ("sonotwin-probe/1", "sonotwin-probe/9", "schema: expected sonotwin-probe/1, found sonotwin-probe/9"),
         ("target_from_image:", "image:", "target_from_image: expected a matrix, found none"),
         ("scale:", "size:", "scale: expected a matrix, found none"),
+        ("speed_m_s: 1488.3", "speed_m_s: 1.4883", "speed_m_s: expected a speed of sound of 300 to 5000 m/s, found 1.4883"),
+        ("speed_m_s: 1488.3", "speed_m_s: .Nan", "speed_m_s: expected a speed of sound of 300 to 5000 m/s, found nan"),
+        ("speed_m_s: 1488.3", "speed_m_s: fast", "speed_m_s: expected a speed of sound of 300 to 5000 m/s, found something"),
         ("   - sx\n", "   - sz\n", "parameters: expected some of"),
         ("   - sx\n", "   - sy\n", "parameters: expected some of"),
         ("   - sx\n", "", "covariance: expected 7x7"),
@@ -90,3 +93,12 @@ def test_no_file_and_no_matrix_are_refused(tmp_path):
     (tmp_path / "list.yaml").write_text("%YAML:1.0\n---\n- 1\n")
     with pytest.raises(InputError, match=r"list\.yaml"):
         probe_files.read(tmp_path / "list.yaml")
+
+
+def test_a_file_without_a_speed_is_for_the_scanners(probe, tmp_path):
+    """Files of before, and the authors', which has no room for it."""
+    path = tmp_path / "probe.yaml"
+    probe_files.write(path, probe)
+    path.write_text("".join(line for line in path.read_text().splitlines(True) if "speed_m_s" not in line))
+    probe_files.write_authors(tmp_path / probe_files.AUTHORS, probe)
+    assert probe_files.read(path).speed_m_s == probe_files.read(tmp_path / probe_files.AUTHORS).speed_m_s == 1540.0

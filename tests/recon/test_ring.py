@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from recon import rigid, ring
@@ -118,6 +119,22 @@ def test_edges_scatter_as_much_as_they_say(rng):
         normalised.append((radial - 7.91) / np.sqrt(np.einsum("ni,nij,nj->n", normal, across, normal)))
     spread = np.concatenate(normalised).std()
     assert 1 / 1.5 < spread < 1.5
+
+
+def test_the_scores_are_gradients_of_the_robust_loss(rng):
+    """A line with some points far off: numerical gradients of `scale² (sqrt(1 + z) - 1)`; in sum they vanish at the optimum."""
+    x, scale, step = np.linspace(-1, 1, 40), 3.0, 1e-5
+    y = 2 * x + 1 + rng.normal(size=40) + 12 * (rng.random(40) < 0.2)
+    result = least_squares(lambda p: p[0] + p[1] * x - y, [0.0, 0.0], loss="soft_l1", f_scale=scale, gtol=1e-12, xtol=1e-12)
+
+    def losses(p):
+        return scale**2 * (np.sqrt(1 + ((p[0] + p[1] * x - y) / scale) ** 2) - 1)
+
+    numerical = np.column_stack([(losses(result.x + d) - losses(result.x - d)) / (2 * step) for d in step * np.eye(2)])
+    gradients = ring._gradients(result.jac, result.fun, scale)
+    assert np.abs(result.fun).max() > 2 * scale
+    np.testing.assert_allclose(gradients, numerical, atol=1e-5)
+    np.testing.assert_allclose(gradients.sum(axis=0), 0, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recon import rigid, water
+from recon import rigid, sequences, water
 from recon.calibration import Uncertainty
 from recon.errors import InputError
 from recon.probe import ProbeCalibration
@@ -53,7 +53,7 @@ def test_the_face_keeps_its_place_and_depths_scale_about_it(probe):
 
 def test_there_and_back_is_where_it_was(probe):
     back = water.in_medium(water.in_medium(probe, 1488.0, 1540.0, 12.0), 1540.0, 1488.0, 12.0)
-    assert back.scale == pytest.approx(probe.scale)
+    assert back.scale == pytest.approx(probe.scale) and back.speed_m_s == 1488.0
     assert back.target_from_image == pytest.approx(probe.target_from_image)
     assert back.uncertainty.covariance == pytest.approx(probe.uncertainty.covariance)
 
@@ -78,3 +78,17 @@ def test_the_covariance_goes_along(probe, rng):
 def test_a_speed_of_no_medium_is_refused(probe):
     with pytest.raises(InputError, match="calibrated"):
         water.in_medium(probe, 1.488, 1540.0)
+
+
+def test_matrices_and_calibrations_are_converted_alike(probe, rng):
+    """From whatever speed a calibration holds for; and not at all where the tissue's isn't known."""
+    in_water = water.in_medium(probe, 1540.0, 1488.0)
+    made = water.for_tissue(in_water, 1450.0)
+    assert made.scale[1] == pytest.approx(probe.scale[1] * 1450 / 1540) and made.speed_m_s == 1450.0
+    assert water.for_tissue(in_water, None) is in_water
+    pixels = rng.uniform(0, 300, (20, 2))
+    flat = np.column_stack([pixels, np.zeros(20)])
+    matrix = water.in_tissue(sequences.target_from_pixel(in_water), in_water.speed_m_s, 1450.0)
+    np.testing.assert_allclose(rigid.apply(matrix, flat), made.to_target(pixels), atol=1e-9)
+    with pytest.raises(InputError, match="speed: expected a speed of sound of 300 to 5000 m/s, found nan"):
+        water.in_tissue(matrix, 1540.0, np.nan)

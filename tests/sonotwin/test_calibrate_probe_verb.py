@@ -84,12 +84,14 @@ def test_the_scale_tells_the_speed_of_sound_in_the_water(calibrated):
     expected = float(water.speed_of_sound(sweep_sets.WATER_C))
     assert abs(figures["implied_speed_m_per_s"] - expected) < 4 * figures["implied_speed_sigma_m_per_s"] < 10
     assert figures["water_speed_m_per_s"] is None
+    assert probe_files.read(calibrated[0] / "probe.yaml").speed_m_s == pytest.approx(figures["implied_speed_m_per_s"])
 
 
 def test_the_temperature_makes_it_fit_tissue(capture, calibrated, rig, tmp_path):
     """In water the scanner shows depths 3.4 % too deep; converted, its own scale comes back, which is right for tissue."""
     lines = calibrate(f"capture={capture}", f"out={tmp_path / 'out'}", f"lag_s={LAG_S}", f"temperature_c={sweep_sets.WATER_C}")
     found, measured = (probe_files.read(folder / "probe.yaml") for folder in (tmp_path / "out", calibrated[0]))
+    assert found.speed_m_s == water.SCANNER_SPEED
     ratio = water.SCANNER_SPEED / float(water.speed_of_sound(sweep_sets.WATER_C))
     assert found.scale[1] / measured.scale[1] == pytest.approx(ratio, rel=1e-9)
     assert abs(found.scale[1] - rig.probe.scale_mm_per_px[1]) < 4 * found.uncertainty.sigma("sy")
@@ -125,6 +127,18 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, rig, 
     assert complaint(capsys, *fields, "pairs=a.csv") == "calibrate-probe: expected capture or pairs, found both"
     assert complaint(capsys, *fields, "noise.angle_deg=-1").startswith("calibrate-probe: noise.angle_deg: expected finite")
     assert complaint(capsys, *fields, "temperature_c=120").startswith("temperature_c: expected 0 to 95 degrees Celsius")
+    assert complaint(capsys, *fields, "medium_speed=1450") == (
+        "calibrate-probe: medium_speed: expected temperature_c with it, found none"
+    )
+    assert complaint(capsys, *fields, "wire_speed=20000").startswith("calibrate-probe: wire_speed: expected ")
+    assert complaint(capsys, *fields, "assumed_speed=1.54").startswith("calibrate-probe: assumed_speed: expected ")
+    assert complaint(capsys, *fields, "seed=-1").startswith("calibrate-probe: seed: expected ")
+    assert complaint(capsys, *fields, "lag_s=1e7").startswith("calibrate-probe: lag_s: expected ")
+    assert "dynamic_range_db: expected 20 to 120 dB, found 0" in complaint(capsys, *fields, "appearance.dynamic_range_db=0")
+    silent = [f"noise.{name}=0" for name in ("angle_deg", "position_mm", "pixel_px", "slice_mm")]
+    assert complaint(capsys, *fields, *silent).startswith("calibrate-probe: noise: expected one standard deviation above zero")
+    scanner = [f"lag_s={LAG_S}", "rig.probe.scale_mm_per_px=[0.1229,0.0122]"]
+    assert "calibration: sy: expected to tell a speed of sound" in complaint(capsys, *fields, *scanner)
     assert "are the clocks others?" in complaint(capsys, *fields, "lag_s=100")
     assert complaint(capsys, f"pairs={tmp_path / 'a.csv'}", f"out={out}").endswith("a.csv: expected a file, found none")
     darker = "appearance.min_contrast_db=55"

@@ -1,6 +1,7 @@
 """`sonotwin freehand`, from a sweep or a sequence of the PLUS toolkit to a volume."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +113,29 @@ def test_another_calibration_takes_the_place_of_the_captures(capture, reconstruc
     assert np.linalg.norm(away) == pytest.approx(3, abs=0.1)
 
 
+def test_the_tissues_speed_of_sound_scales_depths_alike_in_volume_and_sequence(capture, reconstructed, rig, tmp_path):
+    """A calibration for 1488 m/s and tissue of 1450: 2.6 % less deep. A sequence's own calibration counts as one for 1540."""
+    probe = sweep_capture.read_sweep(capture).probe
+    probe_files.write(tmp_path / "probe.yaml", replace(probe, speed_m_s=1488.0))
+    fields = [f"capture={capture}", f"lag_s={LAG_S}", f"probe={tmp_path / 'probe.yaml'}", "tissue_m_s=1450"]
+    assert main(["freehand", *fields, f"out={tmp_path / 'out'}"]) == 0
+    figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert figures["speed_m_per_s"] == 1450
+    frames = sequences.read_tracking(tmp_path / "out" / "sequence.igs.mha")
+    ours = sequences.poses(frames, "Reference", "Image")
+    shown = sequences.poses(sequences.read_tracking(reconstructed / "sequence.igs.mha"), "Reference", "Image")
+    np.testing.assert_allclose(ours[:, :3, 1], shown[:, :3, 1] * 1450 / 1488, atol=1e-9)
+    np.testing.assert_allclose(ours[:, :3, 3], shown[:, :3, 3], atol=1e-9)
+    depth = np.linalg.inv(shown[20]) @ [*sweep_sets.BALL, 1]  # px, of the ball in the middle of the sweep
+    expected = (ours[20] @ [depth[0], depth[1], 0, 1])[:3] - (shown[20] @ [depth[0], depth[1], 0, 1])[:3]
+    moved = ball_of(tmp_path / "out" / "volume.nrrd")[0] - ball_of(reconstructed / "volume.nrrd")[0]
+    assert np.linalg.norm(moved - expected) < 0.2 and np.linalg.norm(expected) > 0.5
+    again = [f"sequence={reconstructed / 'sequence.igs.mha'}", f"tissue_m_s={1540 * 1450 / 1488}"]
+    assert main(["freehand", *again, f"out={tmp_path / 'again'}"]) == 0
+    moved = ball_of(tmp_path / "again" / "volume.nrrd")[0] - ball_of(reconstructed / "volume.nrrd")[0]
+    assert np.linalg.norm(moved - expected) < 0.2
+
+
 def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, reconstructed, rig, tmp_path, capsys):
     out = tmp_path / "out"
 
@@ -128,6 +152,10 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, recon
     assert complaint(f"sequence={sequence}", "probe=a", "config=b").startswith("freehand: probe: expected none with a config")
     both = ["compounding=integer_mean", "interpolation=linear"]
     assert complaint(f"capture={capture}", *both).startswith("freehand: interpolation: expected nearest with integer_mean")
+    both = [f"sequence={sequence}", "config=a.xml", "tissue_m_s=1450"]
+    assert complaint(*both).startswith("freehand: tissue_m_s: expected none with a config")
+    for field in ("spacing_mm=0.001", "most_gib=2000", "lag_s=-1e7", "tissue_m_s=10"):
+        assert complaint(f"capture={capture}", field).startswith(f"freehand: {field.partition('=')[0]}: expected ")
     assert complaint(f"capture={capture}", "spacing_mm=0.01").startswith("volume: expected at most 4.0 GiB, found ")
     assert complaint(f"capture={capture}", "clip=[90,0,10,10]").startswith("clip: expected a part of an image of 80x100")
     assert complaint(f"capture={capture}", "clip=[0,0,0,10]").startswith("freehand: clip.2: expected ")

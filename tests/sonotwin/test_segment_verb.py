@@ -8,10 +8,15 @@ import pytest
 import trimesh
 from scipy.ndimage import gaussian_filter
 
-from recon import rigid, sweep_capture
+from recon import rigid, ring, sweep_capture
+from recon.calibration import Uncertainty
+from recon.containment import Containment
+from recon.masses import Mass
 from recon.probe import ProbeCalibration
+from recon.ring import Ring
 from recon.tracks import Track
 from sonotwin.cli import main
+from sonotwin.verbs import segment
 from tests.recon import probe_motions, sweep_sets
 
 LAG_S = 0.1
@@ -66,7 +71,9 @@ def test_the_mass_is_where_it_is_and_as_large(segmented):
     assert figures["mass0_volume_mm3"] == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.08)
     centre = [figures[f"mass0_centre_{axis}_mm"] for axis in "xyz"]
     assert np.linalg.norm(centre - CENTRE) < 0.25
-    assert figures["mass0_inside"] == 1 and figures["mass0_depth_mm"] == pytest.approx(15 - RADIUS, abs=0.6)
+    assert 80 < figures["tissue_grey"] < 180 and figures["speed_m_per_s"] == 1540
+    assert figures["mass0_inside"] == 1 and figures["mass0_covered"] == 1
+    assert figures["mass0_depth_mm"] == pytest.approx(15 - RADIUS, abs=0.6)
 
 
 def test_files(segmented):
@@ -91,8 +98,40 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, tmp_p
     )
     (tmp_path / "b.ply").write_bytes(b"ply\nformat")
     assert f"{tmp_path / 'b.ply'}: expected a surface" in complaint(f"capture={capture}", f"surface={tmp_path / 'b.ply'}")
+    (tmp_path / "c.stl").write_bytes(b"solid")
+    assert complaint(f"capture={capture}", f"surface={tmp_path / 'c.stl'}").endswith("expected a surface as PLY, found .stl")
+    assert complaint(f"capture={capture}", "lag_s=1e9").startswith("segment: lag_s: expected ")
     assert complaint(f"capture={capture}", "tissue_m_s=1").startswith("segment: tissue_m_s: expected ")
     assert complaint(f"capture={capture}", "kind=tube", "surface=a.ply").startswith("segment: surface: expected none with kind=")
     assert complaint(f"capture={capture}", "diameter_mm=[9,5]").startswith("segment: diameter_mm: expected the least before")
     assert complaint(f"capture={capture}", "kind=tube").startswith(f"{capture}: rings: expected at least three images")
     assert not out.exists()
+
+
+def test_whether_a_mass_is_inside_may_be_unknown():
+    """Covered by less than half, with nothing above the surface."""
+    mass = Mass(trimesh.creation.icosphere(radius=3))
+    depths = np.full(len(mass.mesh.vertices), np.nan)
+    depths[: round(0.48 * len(depths))] = 2.0
+    under = Containment(depths)
+    assert segment.describe(mass, under).endswith("unknown: only 48 % lies under the surface")
+    figures = segment.measure("mass0", mass, under)
+    assert np.isnan(figures["mass0_inside"]) and figures["mass0_covered"] == pytest.approx(0.48, abs=0.01)
+
+
+def test_an_uncertain_scale_is_an_uncertain_diameter(rig):
+    """Circles in the image: 1 % of sx and sy together are 1 % of the radius; of sx alone, near half of it."""
+    scale, turned = np.array([0.2, 0.1]), np.radians(np.arange(0, 360, 2.0))
+    pixels = (np.array([16.0, 15.0]) + 6.0 * np.column_stack([np.cos(turned), np.sin(turned)])) / scale
+    one = Ring(pixels, np.tile(0.01 * np.eye(2), (len(pixels), 1, 1)))
+    matrices = np.stack([rigid.transform(np.eye(3), [0, 0, k]) @ np.diag([*scale, 1, 1]) for k in range(8)])
+    tube = ring.fit_tube([one] * 8, matrices)
+
+    def sigma(covariance: np.ndarray) -> float:
+        known = Uncertainty(("sx", "sy"), covariance)
+        return segment.scale_sigma([one] * 8, matrices, tube, ProbeCalibration(np.eye(4), scale, known))
+
+    together = np.outer(0.01 * scale, 0.01 * scale)
+    assert sigma(together) == pytest.approx(0.06, rel=0.02)
+    assert sigma(np.diag(np.diag(together))) == pytest.approx(0.06 / np.sqrt(2), rel=0.1)
+    assert segment.scale_sigma([one] * 8, matrices, tube, ProbeCalibration(np.eye(4), scale)) == 0

@@ -28,6 +28,8 @@ SHIFT = np.array([0.3, 0.0, 0.4])  # mm, by which the found one is off
 LAG_S = 0.05
 COUNT = 13  # B-scans, 1 mm apart
 SIZE, SCALE = (80, 110), (0.49, 0.4)  # of a B-scan: px, mm/px
+TISSUE_M_S = 1450.0  # of silicone
+IN_TISSUE = (SCALE[0], SCALE[1] * TISSUE_M_S / 1540.0)  # mm/px
 PROBE_MM = 0.2  # error of the probe's calibration, along the array
 
 
@@ -54,7 +56,7 @@ def true_sweep(folder: Path, rig: Rig) -> SweepTruth:
     folder.mkdir(parents=True)
     paths = []
     for number, pose in enumerate(poses()):
-        places = rigid.apply(pose, np.stack([u * SCALE[0], v * SCALE[1], 0 * u], axis=-1))
+        places = rigid.apply(pose, np.stack([u * IN_TISSUE[0], v * IN_TISSUE[1], 0 * u], axis=-1))
         labels = np.zeros(u.shape, np.uint8)
         for label, (middle, radius) in enumerate(((CENTRE, RADIUS), *TUMOURS), 1):
             labels[np.linalg.norm(places - middle, axis=-1) < radius] = label
@@ -99,7 +101,7 @@ def inside(folder: Path, rig: Rig, rng: np.random.Generator) -> Inside:
     volume = Volume(rng.integers(1, 200, (40, 40, 40)).astype(np.uint8), low, np.ones(3))
     return Inside(
         sweep_capture.read_sweep(folder / "sweep"),
-        poses() @ np.diag([*truth.probe.scale, 1, 1]),
+        poses() @ np.diag([*IN_TISSUE, 1, 1]),
         volume,
         evaluate_sweep.compare([ball(TUMOURS[0][0] + SHIFT, TUMOURS[0][1])], truth),
         truth,
@@ -107,6 +109,7 @@ def inside(folder: Path, rig: Rig, rng: np.random.Generator) -> Inside:
         bob,
         np.column_stack([depths, found_lag.residuals]),
         found_lag.seconds,
+        TISSUE_M_S,
     )
 
 
@@ -114,7 +117,8 @@ def segmented(found: list[trimesh.Trimesh], truth: SweepTruth) -> dict[str, floa
     """What segmentation says of masses under a skin that was measured without errors."""
     lie = [containment.contain(mesh, truth.skin) for mesh in found]
     depths = {f"mass{k}_depth_mm": one.least_mm for k, one in enumerate(lie)}
-    return {"masses": len(found), **depths, **{f"mass{k}_inside": int(one.inside) for k, one in enumerate(lie)}}
+    inside = {f"mass{k}_inside": np.nan if one.inside is None else int(one.inside) for k, one in enumerate(lie)}
+    return {"masses": len(found), **depths, **inside}
 
 
 def figures(story: Inside) -> dict[str, float | int]:

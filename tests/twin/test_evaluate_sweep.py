@@ -1,6 +1,7 @@
 """Are the errors of a sweep what they are known to be?"""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import trimesh
 
 from recon import rigid
 from recon.errors import InputError
+from sonotwin.config import compose
 from tests.twin import drawn_sweep
 from tests.twin.drawn_sweep import PROBE_MM, SHIFT, SIZE, TUMOURS, ball
 from twin import evaluate_sweep
@@ -102,6 +104,40 @@ def inside_out(mesh):
 def test_a_closed_mesh_is_opened_to_the_cameras():
     box = trimesh.creation.box([10, 10, 10])
     assert evaluate_sweep.facing(box).triangles_center[:, 2] == pytest.approx([-5, -5])
+
+
+def settings() -> str:
+    parts = {"scene": {"kind": "breast"}, "clocks": {}}
+    composed = compose("sweep", ["out=none"])
+    return json.dumps({name: composed[name] for name in ("rig", "ultrasound")} | parts)
+
+
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        (lambda folder: (folder / "sweep/sweep.npz").unlink(), "sweep.npz: expected a file, found none"),
+        (lambda folder: (folder / "sweep/sweep.npz").write_bytes(b"PK\x03\x04half"), "sweep.npz: expected an npz file"),
+        (lambda folder: shutil.rmtree(folder / "sweep/labels"), "0000.png: expected an image of labels, found none"),
+        (lambda folder: (folder / "sweep/labels/0001.png").unlink(), "0001.png: expected an image of labels, found none"),
+    ],
+)
+def test_a_damaged_truth_is_refused_in_one_line(damage, complaint, tmp_path):
+    (tmp_path / "sweep" / "labels").mkdir(parents=True)
+    (tmp_path / "settings.json").write_text(settings(), encoding="utf-8")
+    np.savez(tmp_path / "sweep/sweep.npz", world_from_image=np.tile(np.eye(4), (2, 1, 1)))
+    for number in range(2):
+        (tmp_path / f"sweep/labels/{number:04d}.png").write_bytes(b"")
+    damage(tmp_path)
+    with pytest.raises(InputError, match=complaint) as raised:
+        evaluate_sweep.read_truth(tmp_path)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_tumour_that_the_surface_hardly_covers_is_neither_inside_nor_outside(truth):
+    found = [ball(TUMOURS[0][0], TUMOURS[0][1])]
+    segmented = drawn_sweep.segmented(found, truth) | {"mass0_inside": np.nan}
+    figures = evaluate_sweep.measure(evaluate_sweep.compare(found, truth), truth, segmented)
+    assert np.isnan(figures["tumour0_inside"]) and evaluate_sweep.of_each(figures, "inside") == []
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 from recon import rigid
 from tests.twin import drawn_sweep
-from tests.twin.drawn_sweep import CENTRE, LAG_S, SCALE, SHIFT, TUMOURS, ball
+from tests.twin.drawn_sweep import CENTRE, IN_TISSUE, LAG_S, SCALE, SHIFT, TUMOURS, ball
 from twin import sweep_pictures, sweep_report
 from twin.sweep_pictures import FOUND, TRUE, ZOOM
 
@@ -24,7 +24,7 @@ def test_a_ball_is_cut_in_a_circle(story):
     pixels = sweep_pictures.cut(ball(middle, radius), story.world_from_pixel[8]).reshape(-1, 2)
     at = rigid.apply(np.linalg.inv(story.world_from_pixel[8]), middle)
     assert at[2] == pytest.approx(-2) or at[2] == pytest.approx(2)
-    distance = np.linalg.norm((pixels - at[:2]) * SCALE, axis=1)
+    distance = np.linalg.norm((pixels - at[:2]) * IN_TISSUE, axis=1)
     assert distance == pytest.approx(np.full(len(pixels), np.sqrt(radius**2 - 4)), abs=0.02)
     assert len(sweep_pictures.cut(ball(middle, 1.0), story.world_from_pixel[8])) == 0
 
@@ -32,14 +32,14 @@ def test_a_ball_is_cut_in_a_circle(story):
 def test_outlines_lie_on_the_edges_of_what_the_image_shows(story):
     """The true one on the edge of the labels, the found one beside it by its shift."""
     number = drawn_sweep.COUNT // 2
-    true = np.diag([*SCALE, 1.0, 1.0])
-    outlines = sweep_pictures.cuts(story.findings, story.world_from_pixel[number], story.truth.world_from_image[number] @ true)
+    true = sweep_pictures.true_from_pixel(number, story.truth)
+    outlines = sweep_pictures.cuts(story.findings, story.world_from_pixel[number], true)
     edge = cv2.distanceTransform(np.uint8(story.truth.shown(number) < 2), cv2.DIST_L2, 5)
     edge += cv2.distanceTransform(np.uint8(story.truth.shown(number) >= 2), cv2.DIST_L2, 5) - 1
     u, v = np.rint(outlines[TRUE].reshape(-1, 2)).astype(int).T
     assert edge[v, u].max() < 1.5
     found, first = outlines[FOUND].reshape(-1, 2), sweep_pictures.cut(story.findings[0].true, story.world_from_pixel[number])
-    apart = (found.mean(axis=0) - first.reshape(-1, 2).mean(axis=0)) * SCALE
+    apart = (found.mean(axis=0) - first.reshape(-1, 2).mean(axis=0)) * IN_TISSUE
     assert apart == pytest.approx(SHIFT[[0, 2]], abs=0.02), "along the array is x, into the depth z"
 
 
@@ -81,6 +81,13 @@ def test_the_bottom_is_late_by_lag_times_speed(story):
     slope = (speed @ late) / (speed @ speed)
     assert abs(slope) == pytest.approx(LAG_S, abs=0.003)
     assert np.abs(speed).max() > 30 and np.corrcoef(speed, late)[0, 1] > 0.9
+
+
+def test_what_the_speed_of_sound_does_is_said(story):
+    """Silicone's 1450 m/s make 20 mm on the screen 18.8; 10 mm of a tumour, 1530 m/s, are shown as 9.5 of silicone."""
+    text = sweep_report.too_deep(story.truth, 1460.0)
+    assert "1450 m/s in this tissue" in text and "lies 1.2 mm less deep" in text and "volume are for 1460 m/s" in text
+    assert "10 mm of it look 0.5 mm shorter, so its far side is shown above its outline" in text
 
 
 def test_the_result_tells_of_false_findings(story):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import trimesh
 
-from recon import masses, sequences
+from recon import masses, sequences, water
 from recon.containment import contain
 from recon.lag import poses_at
 from recon.mass_paths import Sound
@@ -38,7 +38,7 @@ def rows(setup: Setup, seeds: Sequence[int] = SEEDS) -> list[Row]:
         what = f"{name} of {size} mm, worse of {len(sweeps)} sweeps"
         result.append(Row("i", f"{what}: centre", float(centre), CENTRE_MM, None, "mm"))
         result.append(Row("i", f"{what}: volume", float(volume), VOLUME_PERCENT, None, "%"))
-    inside = min(sum(contain(mass.mesh, skin).inside for mass in found) for found in sweeps)
+    inside = min(sum(contain(mass.mesh, skin).inside is True for mass in found) for found in sweeps)
     wrong = max(abs(len(found) - 3) for found in sweeps)
     result.append(Row("i", "masses found that are no tumours, or tumours not found", wrong, 0, 0, "masses"))
     result.append(Row("i", "masses found inside the measured skin", inside, 3, 3, "masses", at_least=True))
@@ -70,7 +70,8 @@ def segmented(setup: Setup, seed: int) -> Sequence[Mass]:
     planned = session.plan_sweep(PATH, setup.rig, scene, transducer, clocks, PoseNoise(), seed)
     images = np.stack([one.image for one in scans(scene, transducer, planned, seed)])
     poses = poses_at(planned.track, planned.times, clocks.lag_s)
-    world_from_pixel = poses @ sequences.target_from_pixel(session.calibration_of(setup.rig))
+    calibration = water.for_tissue(session.calibration_of(setup.rig, transducer), SOUND.tissue)
+    world_from_pixel = poses @ sequences.target_from_pixel(calibration)
     return masses.from_scans(lambda: iter(images), images.shape[1:], world_from_pixel, SOUND)
 
 

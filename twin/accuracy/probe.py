@@ -116,10 +116,10 @@ def calibrated_exactly(rig: Rig, frames: Frames, block: NDArray[np.int64], rng: 
     return probe_calibration.calibrate(seen, rig.probe.image_size, noise).calibration
 
 
-def in_water(rig: Rig) -> ProbeCalibration:
+def in_water(setup: Setup) -> ProbeCalibration:
     """The true calibration for images of the scene's water."""
-    truth = calibration_of(rig)
-    return replace(truth, scale=truth.scale * [1, float(water.speed_of_sound(TEMPERATURE_C)) / water.SCANNER_SPEED])
+    truth = calibration_of(setup.rig, setup.scanners["water"])
+    return water.in_medium(truth, truth.speed_m_s, float(water.speed_of_sound(TEMPERATURE_C)))
 
 
 def errors(found: Sequence[ProbeCalibration], truth: ProbeCalibration, rig: Rig) -> Array:
@@ -158,7 +158,7 @@ def sets(rig: Rig, frames: Frames) -> tuple[list[list[Adjustment]], list[list[Pr
 
 def repeats(setup: Setup, frames: Frames) -> list[Row]:
     """Row d: five calibrations agree, and are right; the limit is that of the poses' errors alone."""
-    rig, truth = setup.rig, in_water(setup.rig)
+    rig, truth = setup.rig, in_water(setup)
     by_images, exact = sets(rig, frames)
     found = [[each.calibration for each in one] for one in by_images]
     figures = np.mean([repeatabilities(one, rig) for one in found], axis=0)
@@ -175,10 +175,11 @@ def repeats(setup: Setup, frames: Frames) -> list[Row]:
     many = f"{len(flat)} calibrations, worst of five points: true error"
     rows.append(Row("d", f"{many}, median", float(np.median(error.max(1))), TRUE_MM, float(np.median(limit.max(1))), "mm"))
     rows.append(Row("d", f"{many}, worst", float(error.max()), TRUE_MM, float(limit.max()), "mm"))
-    freedom = 8 * len(flat)
-    ratio = sum(squared_length(each, truth) for each in flat) / freedom
+    ratio = sum(squared_length(each, truth) for each in flat) / (8 * len(flat))
+    freedom = 8 * len(found[0])  # repeats share their images, so only sets of these count as independent
     low, high = chi2.ppf([(1 - REGION) / 2, (1 + REGION) / 2], freedom) / freedom
-    honest = f"{len(flat)} calibrations: squared error of the parameters over its expectation"
+    shared = f"{len(flat)} calibrations of {len(found[0])} sets of images, {100 * REGION:.0f} % interval of {len(found[0])}"
+    honest = f"{shared}: squared error of the parameters over its expectation"
     rows.append(Row("d", f"{honest}, at least", ratio, low, 1.0, "", at_least=True))
     rows.append(Row("d", f"{honest}, at most", ratio, high, 1.0, ""))
     return rows
@@ -194,7 +195,7 @@ def with_outliers(sightings: Sightings, size: tuple[int, int], rng: np.random.Ge
 
 def outliers(setup: Setup, frames: Frames) -> list[Row]:
     """Row e: the same with 30 % of the crossings anywhere, over row d; the limit is that of so many fewer frames."""
-    rig, truth = setup.rig, in_water(setup.rig)
+    rig, truth = setup.rig, in_water(setup)
     clean = [[each.calibration for each in one] for one in sets(rig, frames)[0]]
     spoilt = []
     for repeat in range(REPEATS):
@@ -265,7 +266,7 @@ def refused(make: Callable[[], object], named: str) -> float:
 
 def sound(setup: Setup, frames: Frames) -> list[Row]:
     """Row f: what water of 22 degrees does to depths is found as predicted, and is undone by the temperature."""
-    rig, truth = setup.rig, calibration_of(setup.rig)
+    rig, truth = setup.rig, calibration_of(setup.rig, setup.scanners["water"])
     speed = float(water.speed_of_sound(TEMPERATURE_C))
     found = [each.calibration for each in sets(rig, frames)[0][0]]
     mean = repeatability.average(found)

@@ -97,9 +97,10 @@ def refuse_inside(course: Track, body: Body, transducer: Transducer, allowed_mm:
             raise InputError(f"path: expected the probe in front of all things, found it in {name} after {time * 1e-9:.2f} s")
 
 
-def calibration_of(rig: Rig) -> ProbeCalibration:
+def calibration_of(rig: Rig, transducer: Transducer) -> ProbeCalibration:
     """The rig's true probe calibration, right where sound travels as the scanner assumes."""
-    return ProbeCalibration(rig.probe.target_from_image.matrix(), np.array(rig.probe.scale_mm_per_px))
+    scale = np.array(rig.probe.scale_mm_per_px)
+    return ProbeCalibration(rig.probe.target_from_image.matrix(), scale, speed_m_s=transducer.assumed_speed)
 
 
 def check_places(out: Path) -> None:

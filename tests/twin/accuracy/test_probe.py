@@ -60,6 +60,18 @@ def test_a_common_error_of_crossings_is_seen_in_the_truth_only(setup):
     assert {"true error, median", "true error, worst"} <= {what.split(": ")[-1].split("points: ")[-1] for what in missed(rows)}
 
 
+def test_repeats_do_not_narrow_the_interval_of_the_squared_error(setup, monkeypatch):
+    """They share their images: two sets, 16 degrees of freedom, however often the poses' errors are drawn."""
+    frames, low_high = exact_frames(60), []
+    for repeats in (1, 3):
+        monkeypatch.setattr(probe, "REPEATS", repeats)
+        probe.sets.cache_clear()
+        rows = probe.repeats(setup, frames)[-2:]
+        assert all(f"{2 * repeats} calibrations of 2 sets" in row.what for row in rows)
+        low_high.append([row.bar for row in rows])
+    assert low_high[0] == low_high[1] == pytest.approx([6.908 / 16, 28.845 / 16], abs=1e-3)  # of tables of chi-square
+
+
 def test_faults_are_refused_by_name(setup, monkeypatch):
     """A planar motion is of rendered wires at full size; here of exact crossings."""
     turns = np.outer(np.linspace(-35, 35, 20), [1.0, 0, 0])

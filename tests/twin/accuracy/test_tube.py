@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -37,3 +38,19 @@ def test_depths_at_the_speed_that_the_scanner_assumes_are_wrong(rig, recorded):
 def test_the_array_is_that_of_the_configuration():
     path = Path(__file__).parents[3] / "conf" / "ultrasound" / "water.yaml"
     assert Transducer(**yaml.safe_load(path.read_text(encoding="utf-8"))) == tube.WATER
+
+
+def test_the_spread_of_a_wires_echo_grows_with_the_f_numbers():
+    """Apertures of two thirds: 1.5 times as wide; the pulse, of (4 ln 2 / pi) / (B f0) at half amplitude, stays."""
+    (across, deep), (wider, same) = tube.spread(tube.WATER), tube.spread(tube.WIDER)
+    assert wider / across == pytest.approx(1.5, rel=0.05)
+    assert same == pytest.approx(deep, rel=0.02)
+    near, far = tube.WATER.bandwidth
+    share = tube.WIRE_DEPTH_MM / tube.WATER.depth_mm
+    expected = tube.WATER.wavelength_mm / 2 * 4 * np.log(2) / np.pi / (near + (far - near) * share) / (2.355 * np.sqrt(2))
+    assert deep == pytest.approx(expected, rel=0.1)
+
+
+def test_a_wider_beam_is_stood_with_its_spread(rig):
+    row = tube.wider(tube.stroke(rig.probe, SLICES, 1, tube.WIDER), rig.probe)
+    assert row.ok and "0.29 and 0.06 mm" in row.what

@@ -32,3 +32,10 @@ def width_at_half(profile: np.ndarray, step: float) -> float:
     start = left + (half - profile[left]) / (profile[left + 1] - profile[left])
     end = right - (half - profile[right]) / (profile[right - 1] - profile[right])
     return step * (end - start)
+
+
+def peak(profile: np.ndarray) -> float:
+    """Place of the highest sample, by a parabola through it and its neighbours."""
+    top = int(profile.argmax())
+    before, here, after = (float(value) for value in profile[top - 1 : top + 2])
+    return top + (before - after) / (2 * (before - 2 * here + after))
