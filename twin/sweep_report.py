@@ -110,8 +110,9 @@ def inside(story: Inside, points: NDArray[np.float32], skin: NDArray[np.bool_], 
         Which of them to show.
     """
     text = (
-        "The B-scans lie in the frame of the cameras, because the cameras track the probe: nothing is registered. Tumours are "
-        "found in them without any knowledge of the truth, and meet the measured surface in one coordinate system."
+        "The B-scans lie in the frame of the cameras, because the cameras track the probe: nothing is registered. Here the poses "
+        "are the true ones with a tracker's errors. Tumours are found without any knowledge of the truth, and meet the measured "
+        "surface in one coordinate system."
     )
     caption = (
         "Drag to turn, scroll to come nearer, click in the legend to show or hide. The B-scan is the one that passes nearest to "
