@@ -5,8 +5,8 @@ of a pose and the crossing's pixel, found elsewhere. Writes into the folder `out
 the rig authors' layout, US_params.npz; frames.csv, what became of each frame; and metrics.json. A calibration that is there
 already is replaced. Takes a second for thirty B-scans.
 
-Let the probe rest at each frame, or give the lag. Tilt it by 35 degrees to all sides, roll it as far as the target is seen, and
-bring the crossing near all corners of the image in turn.
+Let the probe rest at each frame, or give the lag. Tilt it by 35 degrees, mostly forward and backward, roll it as far as the
+target is seen, and bring the crossing near all corners of the image in turn.
 
     sonotwin calibrate-probe capture=outputs/wires/capture out=outputs/probe
     sonotwin calibrate-probe capture=outputs/wires/capture temperature_c=22.4 out=outputs/probe

@@ -169,7 +169,11 @@ def find_masses(scans: Scans, config: Config, skin: trimesh.Trimesh | None) -> F
     found = masses.from_scans(scans.stream, scans.shape, placed, sound, config.dynamic_range_db, grey)
     figures: Metrics = {"tissue_grey": grey, "masses": len(found)}
     lines = [f"tissue      grey {grey:.0f} of 255"]
-    lines += [] if found else ["masses      none that is darker than the tissue around it"]
+    lines += (
+        []
+        if found
+        else ["masses      none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"]
+    )
     for number, mass in enumerate(found):
         under = None if skin is None else contain(mass.mesh, skin)
         figures |= measure(f"mass{number}", mass, under)

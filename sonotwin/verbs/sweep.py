@@ -3,8 +3,8 @@
 Reads the rig, the scene, the transducer and the probe's path from conf/. Writes OUT/capture/, which calibrate-probe, measure-lag
 and freehand read like any hardware's: B-scans and tracked poses by their own clocks, and the probe's calibration, except with
 path=wire, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times, and labels of what
-each pixel shows. Takes about a quarter of a second a B-scan on two cores, half a minute for the default stroke, and ten seconds
-more when it first compiles.
+each pixel shows. Takes about a tenth of a second a B-scan on two cores, a quarter of a minute for the default stroke, and a
+minute more when it first compiles.
 
     sonotwin sweep out=outputs/sweep
     sonotwin sweep scene=tank ultrasound=water path=bob out=outputs/bottom
@@ -17,7 +17,7 @@ from time import perf_counter
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
@@ -44,6 +44,13 @@ class Config(BaseModel):
     clocks: Clocks = Clocks()
     pose_noise: PoseNoise = PoseNoise()
     seed: Annotated[int, Field(ge=0)] = 0
+
+    @field_validator("path", mode="before")
+    @classmethod
+    def _leads_somewhere(cls, value: object) -> object:
+        if value is None:
+            raise ValueError("expected one that leads the probe, found none, which is for demonstrations without a sweep")
+        return value
 
     @model_validator(mode="after")
     def _one_scanner(self) -> "Config":
