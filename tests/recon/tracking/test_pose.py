@@ -14,6 +14,7 @@ from recon.tracking.pose import Sighting
 from twin.session import calibration_of
 
 SIGMA_PX = 0.03
+POSES = 60
 
 
 @pytest.fixture(scope="module")
@@ -55,17 +56,17 @@ def test_exact_where_there_is_no_noise(cameras, rig, rng):
 
 
 def test_the_covariance_is_that_of_the_errors(cameras, rig, rng):
-    """Squared normalised errors of 200 poses and misfits follow chi-square: means within 4 standard errors."""
+    """Squared normalised errors of 60 poses and misfits follow chi-square: means within 4 standard errors."""
     squared, misfits = [], []
-    for _ in range(200):
+    for _ in range(POSES):
         true = random_pose(rng)
         found = pose.estimate(*seen(cameras, rig.target, true, rng), rig.target)
         off = error(found.world_from_target, true)
         squared.append(off @ np.linalg.solve(found.covariance, off))
         misfits.append(found.misfit)
     for values in (squared, misfits):
-        assert abs(np.mean(values) - 6) < 4 * np.sqrt(12 / 200)
-    assert np.mean(np.array(squared) < chi2.ppf(0.95, 6)) > 0.9
+        assert abs(np.mean(values) - 6) < 4 * np.sqrt(12 / POSES)
+    assert np.mean(np.array(squared) < chi2.ppf(0.95, 6)) > 0.85
 
 
 def test_other_names_are_not_the_target(cameras, rig, rng):

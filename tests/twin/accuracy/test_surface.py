@@ -24,7 +24,7 @@ def check(rows) -> None:
     assert not [row for row in rows if not row.ok]
 
 
-@pytest.mark.parametrize("pose", [0, 4])
+@pytest.mark.parametrize("pose", [0, pytest.param(4, marks=pytest.mark.slow)])
 def test_planes_of_the_paper(setup, pose):
     """Nearest and farthest plane: RMS within 1.25 of what noise allows, errors as large as predicted."""
     check(surface.planes(setup, pose))
@@ -40,6 +40,7 @@ def test_breast(setup):
     check(surface.breast(setup))
 
 
+@pytest.mark.slow
 def test_no_wrong_order_survives(setup):
     """Deep steps and shadows: no point on a wrong order, and what the centre line doesn't reach is said to be so."""
     check(surface.orders_under_stress(setup))
