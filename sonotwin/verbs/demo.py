@@ -3,8 +3,8 @@
 Reads the same choices from conf/ as `sonotwin render` and `sonotwin sweep`. Writes into the folder `out`: report.html and
 calibration/calibration.html (open them in a browser; they need no network), surface.ply (mm), surface.glb (metres, y up),
 metrics.json; of scenes with tumours volume/volume.nrrd and tumours/; the captures and their truth, and the folders of the steps
-between. Takes about three minutes on two cores, half of that without ultrasound (path=none); the first run ever also compiles,
-for about a minute. The board's images are kept and used again by all demonstrations of the same rig. A run that was interrupted
+between. Takes four to six minutes on two cores, half of that without ultrasound (path=none); the first run ever also compiles,
+for some minutes. The board's images are kept and used again by all demonstrations of the same rig. A run that was interrupted
 is simply started again.
 
     sonotwin demo
