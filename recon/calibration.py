@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from recon import arrays, atomic, rigid
+from recon import arrays, atomic, filestorage, rigid
 from recon.camera import Array, Camera
 from recon.errors import InputError
 from recon.projection import DISTORTION, MATRIX, MOTION
@@ -25,7 +25,6 @@ STEREO_KEYS = ("K1", "dist1", "K2", "dist2", "R", "t")
 OWN_KEYS = ("schema", "parameters", "covariance")  # any other is a device
 
 WORLD = "cam1"  # the device whose frame the world is: it has no pose
-SYMMETRIC = 1e-9  # of a covariance, relative to the standard deviations: it comes from a text file
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
     if data.startswith(b"PK"):
         matrices = arrays.read(path, dict.fromkeys(STEREO_KEYS, arrays.Form("fiu")))
         return _stereo_pair(path, {key: value.astype(float) for key, value in matrices.items()}, sizes or {})
-    storage = _open(path, data)
+    storage = filestorage.opened(path, data)
     try:
         keys = storage.root().keys() if storage.root().isMap() else []
         if "schema" in keys:
@@ -127,7 +126,10 @@ def _own(path: Path, storage: cv2.FileStorage) -> Calibration:
         node = storage.getNode(name)
         if not node.isMap():
             raise InputError(f"{path}: {name}: expected size, matrix, distortion and camera_from_world, found something else")
-        values = {key: _matrix(path, f"{name}.{key}", node.getNode(key)) for key in ("matrix", "distortion", "camera_from_world")}
+        values = {
+            key: filestorage.matrix(path, f"{name}.{key}", node.getNode(key))
+            for key in ("matrix", "distortion", "camera_from_world")
+        }
         size = node.getNode("size")
         lengths = [size.at(i) for i in range(size.size())] if size.isSeq() else []
         if len(lengths) != 2 or not all(length.isInt() and length.real() > 0 for length in lengths):
@@ -151,19 +153,7 @@ def _uncertainty(path: Path, storage: cv2.FileStorage, cameras: Mapping[str, Cam
     wrong = next((name for k, name in enumerate(names) if name not in known or name in names[:k]), None)
     if wrong is not None:
         raise InputError(f"{path}: parameters: expected a device's parameter like projector.fx, each once, found {wrong}")
-    covariance = _matrix(path, "covariance", storage.getNode("covariance"))
-    expected = f"{path}: covariance: expected {len(names)}x{len(names)} variances and covariances of the parameters, found"
-    if covariance.shape != (len(names), len(names)):
-        raise InputError(f"{expected} shape {covariance.shape}")
-    if not np.isfinite(covariance).all():
-        raise InputError(f"{expected} values that are not finite")
-    sigma = np.sqrt(np.abs(np.diag(covariance)))
-    scale = np.outer(sigma, sigma) + np.finfo(float).tiny
-    if (np.abs(covariance - covariance.T) > SYMMETRIC * scale).any():
-        raise InputError(f"{expected} a matrix that is not symmetric")
-    if np.diag(covariance).min() < 0 or (np.abs(covariance) > (1 + SYMMETRIC) * scale).any():
-        raise InputError(f"{expected} a variance below zero or a correlation beyond one")
-    return Uncertainty(names, (covariance + covariance.T) / 2)
+    return Uncertainty(names, filestorage.covariance(path, storage, len(names)))
 
 
 def _slmaster(path: Path, values: Mapping[str, Array], sizes: Mapping[str, tuple[int, int]]) -> Calibration:
@@ -204,24 +194,5 @@ def _size(path: Path, name: str, sizes: Mapping[str, tuple[int, int]]) -> tuple[
     return sizes[name]
 
 
-def _open(path: Path, data: bytes) -> cv2.FileStorage:
-    try:
-        return cv2.FileStorage(data.decode("utf-8"), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-    except (cv2.error, SystemError, UnicodeDecodeError):
-        raise InputError(f"{path}: expected an npz file or OpenCV's YAML, XML or JSON, found other or damaged data") from None
-
-
 def _matrices(path: Path, storage: cv2.FileStorage, keys: tuple[str, ...]) -> dict[str, Array]:
-    return {key: _matrix(path, key, storage.getNode(key)) for key in keys}
-
-
-def _matrix(path: Path, name: str, node: cv2.FileNode) -> Array:
-    if node.empty():
-        raise InputError(f"{path}: {name}: expected a matrix, found none")
-    try:
-        value = node.mat()
-    except (cv2.error, SystemError):
-        value = None
-    if value is None:
-        raise InputError(f"{path}: {name}: expected a matrix, found something else")
-    return np.asarray(value, float)
+    return {key: filestorage.matrix(path, key, storage.getNode(key)) for key in keys}

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon import arrays, atomic
+from recon import arrays, atomic, filestorage
 from recon.calibration import Uncertainty
 from recon.errors import InputError
 from recon.probe import SCANNER_SPEED, ProbeCalibration
@@ -24,7 +24,6 @@ SCHEMA = "sonotwin-probe/1"
 PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
 AUTHORS = "US_params.npz"
 ORTHOGONAL = 1e-3  # of a rotation; files of few digits pass
-SYMMETRIC = 1e-9  # of a covariance, relative to the standard deviations: it comes from a text file
 
 
 def read(path: Path) -> ProbeCalibration:
@@ -42,10 +41,7 @@ def read(path: Path) -> ProbeCalibration:
         raise InputError(f"{path}: expected a probe's calibration, found {(error.strerror or 'none').lower()}") from None
     if data.startswith(b"PK"):
         return _authors(path)
-    try:
-        storage = cv2.FileStorage(data.decode("utf-8"), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-    except (cv2.error, SystemError, UnicodeDecodeError):
-        raise InputError(f"{path}: expected an npz file or OpenCV's YAML, XML or JSON, found other or damaged data") from None
+    storage = filestorage.opened(path, data)
     try:
         return _own(path, storage)
     finally:
@@ -92,7 +88,10 @@ def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
     found = node.string() if node is not None and node.isString() else "none"
     if found != SCHEMA:
         raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
-    pose, scale = _matrix(path, storage, "target_from_image"), _matrix(path, storage, "scale").ravel()
+    pose, scale = (
+        filestorage.matrix(path, "target_from_image", storage.getNode("target_from_image")),
+        filestorage.matrix(path, "scale", storage.getNode("scale")).ravel(),
+    )
     return _checked(path, "target_from_image", pose, scale, _uncertainty(path, storage), _speed(path, storage))
 
 
@@ -129,29 +128,4 @@ def _uncertainty(path: Path, storage: cv2.FileStorage) -> Uncertainty | None:
     names = tuple(entry.string() for entry in entries if entry.isString())
     if not names or len(names) < len(entries) or len(set(names)) < len(names) or not set(names) <= set(PARAMETERS):
         raise InputError(f"{path}: parameters: expected some of {' '.join(PARAMETERS)}, each once, found something else")
-    covariance = _matrix(path, storage, "covariance")
-    expected = f"{path}: covariance: expected {len(names)}x{len(names)} variances and covariances of the parameters, found"
-    if covariance.shape != (len(names), len(names)):
-        raise InputError(f"{expected} shape {covariance.shape}")
-    if not np.isfinite(covariance).all():
-        raise InputError(f"{expected} values that are not finite")
-    sigma = np.sqrt(np.abs(np.diag(covariance)))
-    limit = np.outer(sigma, sigma) + np.finfo(float).tiny
-    if (np.abs(covariance - covariance.T) > SYMMETRIC * limit).any():
-        raise InputError(f"{expected} a matrix that is not symmetric")
-    if np.diag(covariance).min() < 0 or (np.abs(covariance) > (1 + SYMMETRIC) * limit).any():
-        raise InputError(f"{expected} a variance below zero or a correlation beyond one")
-    return Uncertainty(names, (covariance + covariance.T) / 2)
-
-
-def _matrix(path: Path, storage: cv2.FileStorage, name: str) -> Array:
-    node = storage.getNode(name)
-    if node.empty():
-        raise InputError(f"{path}: {name}: expected a matrix, found none")
-    try:
-        value = node.mat()
-    except (cv2.error, SystemError):
-        value = None
-    if value is None:
-        raise InputError(f"{path}: {name}: expected a matrix, found something else")
-    return np.asarray(value, float)
+    return Uncertainty(names, filestorage.covariance(path, storage, len(names)))

@@ -1,0 +1,69 @@
+"""OpenCV FileStorage as calibrations are kept in it: opened, and its matrices read, or refused in one line."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+
+Array = NDArray[np.float64]
+
+SYMMETRIC = 1e-9  # of a covariance, relative to the standard deviations: it comes from a text file
+
+
+def opened(path: Path, data: bytes) -> cv2.FileStorage:
+    """The storage in a file's bytes; the path is for the message.
+
+    Raises
+    ------
+    InputError
+        If the bytes are none.
+    """
+    try:
+        return cv2.FileStorage(data.decode("utf-8"), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+    except (cv2.error, SystemError, UnicodeDecodeError):
+        raise InputError(f"{path}: expected an npz file or OpenCV's YAML, XML or JSON, found other or damaged data") from None
+
+
+def matrix(path: Path, name: str, node: cv2.FileNode) -> Array:
+    """A node's matrix.
+
+    Raises
+    ------
+    InputError
+        If there is none, or something else.
+    """
+    if node.empty():
+        raise InputError(f"{path}: {name}: expected a matrix, found none")
+    try:
+        value = node.mat()
+    except (cv2.error, SystemError):
+        value = None
+    if value is None:
+        raise InputError(f"{path}: {name}: expected a matrix, found something else")
+    return np.asarray(value, float)
+
+
+def covariance(path: Path, storage: cv2.FileStorage, count: int) -> Array:
+    """The matrix `covariance` of a number of parameters, made exactly symmetric.
+
+    Raises
+    ------
+    InputError
+        If it is missing, of another shape, not finite, not symmetric, or no covariance.
+    """
+    values = matrix(path, "covariance", storage.getNode("covariance"))
+    expected = f"{path}: covariance: expected {count}x{count} variances and covariances of the parameters, found"
+    if values.shape != (count, count):
+        raise InputError(f"{expected} shape {values.shape}")
+    if not np.isfinite(values).all():
+        raise InputError(f"{expected} values that are not finite")
+    sigma = np.sqrt(np.abs(np.diag(values)))
+    scale = np.outer(sigma, sigma) + np.finfo(float).tiny
+    if (np.abs(values - values.T) > SYMMETRIC * scale).any():
+        raise InputError(f"{expected} a matrix that is not symmetric")
+    if np.diag(values).min() < 0 or (np.abs(values) > (1 + SYMMETRIC) * scale).any():
+        raise InputError(f"{expected} a variance below zero or a correlation beyond one")
+    return (values + values.T) / 2
