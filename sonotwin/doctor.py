@@ -17,6 +17,7 @@ OLDEST_PYTHON = (3, 11)
 EXTRAS = ("twin", "train", "dev")
 MODULES = {  # where a package isn't imported by the name that it is installed by
     "hydra-core": "hydra",
+    "lightning-fabric": "lightning_fabric",
     "opencv-contrib-python-headless": "cv2",
     "pynrrd": "nrrd",
     "simpleitk": "SimpleITK",
