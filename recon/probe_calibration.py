@@ -266,9 +266,7 @@ def _covariances(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Arr
     pose = sightings.pose_covariance
     if pose is None:
         pose = np.diag([np.radians(noise.angle_deg) ** 2] * 3 + [noise.position_mm**2] * 3)
-    lever = np.concatenate(
-        [-probe_equations.cross(np.einsum("nij,nj->ni", turns, points)), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=-1
-    )
+    lever = np.concatenate([-rigid.cross(np.einsum("nij,nj->ni", turns, points)), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=-1)
     local = np.broadcast_to(FLOOR_MM**2 * np.eye(3), (n, 3, 3)).copy()
     pixel = np.eye(2) * noise.pixel_px**2 if sightings.pixel_covariance is None else sightings.pixel_covariance
     local[:, :2, :2] += pixel * np.outer(estimate.scale, estimate.scale)

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import rigid
+
 Array = NDArray[np.float64]
 
 
@@ -42,12 +44,4 @@ def point_jacobian(target_from_image: Array, scale: Array, pixels: Array) -> Arr
     x, y = target_from_image[:3, 0], target_from_image[:3, 1]
     arms = pixels[:, :1] * scale[0] * x + pixels[:, 1:] * scale[1] * y
     unit = np.broadcast_to(np.eye(3), (len(pixels), 3, 3))
-    return np.concatenate([(pixels[:, :1] * x)[..., None], (pixels[:, 1:] * y)[..., None], -cross(arms), unit], axis=-1)
-
-
-def cross(vectors: Array) -> Array:
-    """Matrices : (n, 3, 3) of the cross product with vectors : (n, 3) from the left."""
-    result = np.zeros((*vectors.shape, 3))
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    result[..., 0, 1], result[..., 0, 2], result[..., 1, 2] = -z, y, -x
-    return result - np.swapaxes(result, -1, -2)
+    return np.concatenate([(pixels[:, :1] * x)[..., None], (pixels[:, 1:] * y)[..., None], -rigid.cross(arms), unit], axis=-1)

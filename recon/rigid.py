@@ -34,3 +34,12 @@ def invert(to_from: Array) -> Array:
     """Return `from_to`, the inverse of a rigid transform."""
     rotation = to_from[:3, :3].T
     return transform(rotation, -rotation @ to_from[:3, 3])
+
+
+def cross(vectors: ArrayLike) -> Array:
+    """Matrices : (..., 3, 3) of the cross product with vectors : (..., 3) from the left."""
+    vectors = np.asarray(vectors, float)
+    result = np.zeros((*vectors.shape, 3))
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    result[..., 0, 1], result[..., 0, 2], result[..., 1, 2] = -z, y, -x
+    return result - np.swapaxes(result, -1, -2)

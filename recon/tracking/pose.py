@@ -15,9 +15,8 @@ from scipy.stats import chi2
 
 from recon import rigid
 from recon.camera import Camera
-from recon.circles import centre_offsets
-from recon.projection import linearise
 from recon.rig import Target
+from recon.tracking.outline_model import ellipses_of, rays_through, slopes_at
 
 Array = NDArray[np.float64]
 
@@ -27,6 +26,7 @@ APART_MM = 4.0  # by which two views' rays of one centre may miss each other
 STEPS = 3  # of the fit: the start is a few hundredths of a mm off
 IMPLAUSIBLE = 1e-9  # chance of a misfit so large, below which it isn't the target
 FREEDOM = 6
+MOST = float(chi2.isf(IMPLAUSIBLE, FREEDOM))
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def meet(first: Sighting, second: Sighting) -> tuple[Array, Array]:
     NaN where rays are parallel or meet behind a camera.
     """
     origins = [view.camera.centre for view in (first, second)]
-    rays = [view.camera.rays(view.centres) for view in (first, second)]
+    rays = [rays_through(view.camera, view.centres) for view in (first, second)]
     base = origins[1] - origins[0]
     cosine = np.einsum("ni,ni->n", *rays)
     along = [ray @ base for ray in rays]
@@ -125,10 +125,10 @@ def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Arr
     for _ in range(STEPS):
         rows, left = [], []
         for view, white in zip(views, whiten, strict=True):
-            shown = linearise(view.camera, rigid.apply(pose, model), ())
-            predicted = shown.pixels + centre_offsets(view.camera, pose, model, radius)
-            jacobian = np.concatenate([-_cross(rigid.rotate(pose, model)), np.tile(np.eye(3), (3, 1, 1))], axis=-1)
-            rows.append((white @ shown.by_point @ jacobian).reshape(-1, 6))
+            predicted = ellipses_of(view.camera, pose, model, radius)[0]
+            by_point = slopes_at(view.camera, rigid.apply(pose, model))
+            jacobian = np.concatenate([-rigid.cross(rigid.rotate(pose, model)), np.tile(np.eye(3), (3, 1, 1))], axis=-1)
+            rows.append((white @ by_point @ jacobian).reshape(-1, 6))
             left.append((white @ (view.centres - predicted)[..., None]).ravel())
         design, residual = np.concatenate(rows), np.concatenate(left)
         step, _, rank, _ = np.linalg.lstsq(design, residual)
@@ -136,13 +136,7 @@ def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Arr
             return lost("views that do not determine the pose")
         misfit = float(np.sum((residual - design @ step) ** 2))
         pose = rigid.transform(Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[3:])
-    if chi2.sf(misfit, FREEDOM) < IMPLAUSIBLE:
-        return lost(f"a misfit of {np.sqrt(misfit / FREEDOM):.0f} times the centres' uncertainty")
+    if not misfit < MOST:
+        times = np.sqrt(misfit / FREEDOM)
+        return lost(f"a misfit of {times:.0f} times the centres' uncertainty: other circles, or cameras swapped or moved")
     return TargetPose(pose, np.linalg.inv(design.T @ design), misfit)
-
-
-def _cross(vectors: Array) -> Array:
-    """Matrices : (n, 3, 3) of the cross product with vectors : (n, 3) from the left."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)

@@ -1,0 +1,271 @@
+"""Films: what two cameras saw of a moving target, read as a stream; and the poses that were found in them, written.
+
+A film is the sweep part of a capture with images of both cameras, `sweep/cam1` and `sweep/cam2`, each with its `timestamps.csv`.
+The cameras share a clock. Frames belong together by their time stamps, whatever their numbers. Two pairs are in memory at a time.
+"""
+
+import os
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon import atomic, calibration, manifest, sweep_tables
+from recon.calibration import Calibration
+from recon.camera import Camera
+from recon.capture import Images, read_image, write_images
+from recon.errors import InputError
+from recon.manifest import MANIFEST, SCHEMA, Device, Manifest, SweepPart
+from recon.sweep_capture import FOLDER, SCANNER, STAMPS, image_name
+from recon.tracking import overlays
+from recon.tracking.following import Followed
+from recon.tracking.tracker import Tracking
+
+CAMERAS = ("cam1", "cam2")
+OPTICS = "calibration/optics.yaml"
+AHEAD = 2  # pairs that are read while one is worked on
+ALONE_NS = 33_000_000  # taken for the period where a single frame tells none
+POSES, FRAMES, OVERLAYS = "poses.csv", "frames.csv", "overlays"
+COLUMNS = (
+    "time_ns", "frame_cam1", "frame_cam2", "found", "how", "sigma_mm", "sigma_deg", "blur_px_cam1", "blur_px_cam2", "reason",
+)  # fmt: skip
+OVERLAY_WIDTH = 640  # px, of each view
+QUALITY = 88  # of JPEG
+
+Pair = tuple[Images, Images]
+
+
+@dataclass(frozen=True)
+class Film:
+    """n pairs of frames; tables and calibration are checked and every image is there, but none is read yet."""
+
+    name: str
+    cameras: tuple[Camera, Camera]
+    depths: tuple[int, int]  # bits of each camera
+    paths: tuple[tuple[Path, Path], ...]  # n
+    frames: NDArray[np.int64]  # (n, 2) their numbers
+    times: NDArray[np.int64]  # (n,) ns, of camera 1's frames
+
+    @property
+    def bits(self) -> int | None:
+        """Of whole numbers beyond 8 bits; None if there are none."""
+        return max(self.depths) if max(self.depths) > 8 else None
+
+    @property
+    def rate_hz(self) -> float:
+        """Pairs a second; NaN of a single one."""
+        return 1e9 / float(np.median(np.diff(self.times))) if len(self.times) > 1 else np.nan
+
+    def pairs(self) -> Iterator[Pair]:
+        """Read the frames, camera 1's and camera 2's : (h, w), pair by pair; InputError at one that is damaged."""
+        waiting: deque[tuple[Future[Images], ...]] = deque()
+        with ThreadPoolExecutor(len(CAMERAS)) as pool:
+            for both in self.paths:
+                cameras = zip(both, self.cameras, self.depths, strict=True)
+                waiting.append(tuple(pool.submit(read_image, path, camera.size, bits) for path, camera, bits in cameras))
+                if len(waiting) > AHEAD:
+                    yield _taken(waiting)
+            while waiting:
+                yield _taken(waiting)
+
+
+def read_film(folder: Path, calibration_file: Path | None = None) -> Film:
+    """Open the film of a capture folder, with a calibration from elsewhere if one is given.
+
+    Raises
+    ------
+    InputError
+        If the manifest, the calibration or a table is wrong, a camera or a frame is missing, or frames have no partner.
+    """
+    folder = Path(folder)
+    read = manifest.read_manifest(folder)
+    told, root = folder / MANIFEST, folder / read.root
+    if read.sweep is None:
+        raise InputError(f"{told}: expected sweep, with frames of {' and '.join(CAMERAS)}, found none")
+    for name in CAMERAS:
+        if name not in read.sweep.images:
+            raise InputError(f"{told}: sweep.images.{name}: expected a path, found none")
+    if calibration_file is None and read.calibration is None:
+        raise InputError(f"{told}: expected calibration, the path of a calibration file, found none")
+    devices = [read.devices[name] for name in CAMERAS]
+    depths = devices[0].bits, devices[1].bits
+    if min(depths) > 8 and depths[0] != depths[1]:
+        raise InputError(f"{told}: devices.cam2.bits: expected {depths[0]}, as of cam1, found {depths[1]}")
+    source = Path(calibration_file or folder / str(read.calibration))
+    cameras = _cameras(source, devices)
+    places = [root / read.sweep.images[name] for name in CAMERAS]
+    tables = [sweep_tables.read_stamps(place / STAMPS) for place in places]
+    first, second = _partners(places, tables)
+    frames = np.column_stack([tables[0][0][first], tables[1][0][second]])
+    paths = tuple((places[0] / image_name(a), places[1] / image_name(b)) for a, b in frames.tolist())
+    for path in (path for both in paths for path in both):
+        if not path.is_file():
+            raise InputError(f"{path}: expected a file, found {'something else' if path.exists() else 'none'}")
+    return Film(read.name or folder.resolve().name, cameras, depths, paths, frames, tables[0][1][first])
+
+
+def write_film(
+    folder: Path,
+    pairs: Iterable[Pair],
+    times: NDArray[np.int64],
+    optics: Calibration,
+    devices: Mapping[str, Device],
+    name: str = "",
+) -> None:
+    """Write a capture folder with a film alone, whole or not at all.
+
+    Parameters
+    ----------
+    pairs : n of two (h, w) uint8 or uint16
+        Frames of camera 1 and camera 2, taken one by one; uint16 where the device has more than 8 bits.
+    times : (n,) ns
+        Of both, strictly increasing.
+
+    Raises
+    ------
+    InputError
+        If the place is taken by something that is not a capture, or can't be written to.
+    ValueError
+        If frames, times and devices don't fit together.
+    """
+    times = np.asarray(times, np.int64)
+    if (np.diff(times) <= 0).any():
+        raise ValueError("times: expected them strictly increasing")
+    part = SweepPart(images={camera: f"{FOLDER}/{camera}" for camera in CAMERAS})
+    content = Manifest(schema=SCHEMA, name=name, devices=dict(devices), calibration=OPTICS, sweep=part)
+    with atomic.new_folder(folder, MANIFEST) as temporary:
+        count = 0
+        for pair in pairs:
+            for camera, image in zip(CAMERAS, pair, strict=True):
+                kind = np.uint8 if devices[camera].bits == 8 else np.uint16
+                if image.shape != devices[camera].size[::-1] or image.dtype != kind:
+                    size = "x".join(map(str, devices[camera].size))
+                    raise ValueError(f"{camera}: expected {size} {kind.__name__}, found {image.shape} {image.dtype}")
+                write_images([temporary / part.images[camera] / image_name(count)], image[None])
+            count += 1
+        if count != len(times):
+            raise ValueError(f"pairs: expected {len(times)}, one a time, found {count}")
+        for camera in CAMERAS:
+            sweep_tables.write_stamps(temporary / part.images[camera] / STAMPS, times)
+        (temporary / OPTICS).parent.mkdir()
+        calibration.write(temporary / OPTICS, optics)
+        manifest.write_manifest(temporary, content)
+
+
+def write_poses(folder: Path, film: Film, followed: Followed) -> None:
+    """Write `poses.csv`, the table that other verbs read, and `frames.csv`: how each pose was found, or why not."""
+    sweep_tables.write_track(folder / POSES, followed.track)
+    rows = (
+        [int(time), *numbers, int(each.found), each.how or "", *_figures(each), each.pose.reason or ""]
+        for time, numbers, each in zip(film.times, film.frames.tolist(), followed.trackings, strict=True)
+    )
+    sweep_tables.write_rows(folder / FRAMES, COLUMNS, rows)
+
+
+def overlay(pair: Pair, found: Tracking, cameras: Sequence[Camera]) -> NDArray[np.uint8]:
+    """Both views side by side : (h, w, 3) BGR, scaled down, with what was seen in them."""
+    shown = []
+    for image, view, camera in zip(pair, found.views, cameras, strict=True):
+        height = round(image.shape[0] * OVERLAY_WIDTH / image.shape[1])
+        size = (OVERLAY_WIDTH, height)
+        shown.append(cv2.resize(overlays.drawn(image, view, found.pose, camera), size, interpolation=cv2.INTER_AREA))
+    tallest = max(len(each) for each in shown)
+    return np.hstack([np.pad(each, ((0, tallest - len(each)), (0, 0), (0, 0))) for each in shown])
+
+
+def write_overlay(folder: Path, number: int, picture: NDArray[np.uint8]) -> None:
+    """Write an overlay as `overlays/0007.jpg`, making the folder."""
+    (folder / OVERLAYS).mkdir(exist_ok=True)
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    (folder / OVERLAYS / overlay_name(number)).write_bytes(data.tobytes())
+
+
+def overlay_name(number: int) -> str:
+    """File name of the overlay of camera 1's frame of a number."""
+    return image_name(number).replace(".png", ".jpg")
+
+
+def hand_on(folder: Path, source: Path, out: Path) -> bool:
+    """Make a folder of poses a capture: the one that they were found in, with them as its track. Only if it has B-scans.
+
+    Parameters
+    ----------
+    folder : where to write.
+    source : the capture.
+    out : where the folder is going to be.
+    """
+    read = manifest.read_manifest(source)
+    if read.sweep is None or SCANNER not in read.sweep.images:
+        return False
+    source, out = source.resolve(), out.resolve()
+    root = source / read.root
+    files = {name: os.path.relpath(source / path, out) for name in ("calibration", "probe") if (path := getattr(read, name))}
+    sweep = read.sweep.model_copy(update={"track": os.path.relpath(out / POSES, root)})
+    change = {"root": os.path.relpath(root, out), "sweep": sweep, **files}
+    manifest.write_manifest(folder, read.model_copy(update=change))
+    return True
+
+
+def _taken(waiting: deque[tuple[Future[Images], ...]]) -> Pair:
+    first, second = waiting.popleft()
+    return first.result(), second.result()
+
+
+def _cameras(path: Path, devices: Sequence[Device]) -> tuple[Camera, Camera]:
+    """Both cameras of a calibration, whose images are of the devices' sizes."""
+    sizes = {name: device.size for name, device in zip(CAMERAS, devices, strict=True)}
+    known = calibration.read(path, sizes=sizes).cameras
+    for name, wanted in sizes.items():
+        if name not in known:
+            raise InputError(f"{path}: expected {name}, found {', '.join(known)}")
+        if known[name].size != wanted:
+            found = "x".join(map(str, known[name].size))
+            raise InputError(f"{path}: {name}: expected {wanted[0]}x{wanted[1]} px, as its frames, found {found}")
+    return known[CAMERAS[0]], known[CAMERAS[1]]
+
+
+def _partners(
+    places: Sequence[Path], tables: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows : (n,), (n,) of both tables that belong together: each the other's nearest in time, within half a period."""
+    times = [table[1] for table in tables]
+    periods = [float(np.median(np.diff(each))) for each in times if len(each) > 1]
+    allowed = (min(periods) if periods else ALONE_NS) / 2
+    nearest = [_nearest(times[0], times[1]), _nearest(times[1], times[0])]
+    for one, other in ((0, 1), (1, 0)):
+        own = np.arange(len(times[one]))
+        alone = (nearest[other][nearest[one]] != own) | (np.abs(times[other][nearest[one]] - times[one]) > allowed)
+        if alone.any():
+            k = int(np.flatnonzero(alone)[0])
+            away = abs(int(times[other][nearest[one][k]]) - int(times[one][k])) * 1e-6
+            wanted = f"a frame of its own within {allowed * 1e-6:.1f} ms of {CAMERAS[one]}'s frame {tables[one][0][k]}"
+            counts = " and ".join(f"{len(each)} frames of {name}" for each, name in zip(times, CAMERAS, strict=True))
+            raise InputError(
+                f"{places[other] / STAMPS}: expected {wanted}, found the nearest {away:.1f} ms away ({alone.sum()} such, "
+                f"in {counts}); leave frames without a partner out of both tables"
+            )
+    return np.arange(len(times[0])), nearest[0]
+
+
+def _nearest(wanted: NDArray[np.int64], times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Row of the time nearest to each of those wanted."""
+    after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1)) % len(times)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(times[before] - wanted) <= np.abs(times[after] - wanted), before, after)
+
+
+def _figures(found: Tracking) -> list[float | str]:
+    blurs = [float(view.blur_px.max()) for view in found.views]
+    told = [*sigmas(found), *blurs]
+    return [round(value, 5) if np.isfinite(value) else "" for value in told]
+
+
+def sigmas(found: Tracking) -> tuple[float, float]:
+    """Predicted standard deviations of a pose, over all directions: mm and deg; NaN if there is none."""
+    turn, shift = (float(np.sqrt(np.trace(found.pose.covariance[part, part]))) for part in (slice(0, 3), slice(3, 6)))
+    return shift, float(np.rad2deg(turn))

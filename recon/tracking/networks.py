@@ -1,0 +1,104 @@
+"""The tracker's two networks, run by ONNX Runtime."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+from onnxruntime.capi import onnxruntime_pybind11_state as runtime  # pyrefly: ignore[missing-module-attribute]
+
+from recon.errors import InputError
+
+Floats = NDArray[np.float32]
+
+WEIGHTS = Path(__file__).parent / "weights"
+DETECTOR_SIZE = (320, 240)  # width, height, px
+CELL = 8  # px, of the detector's output
+PATCH = 120  # px
+Interface = tuple[dict[str, tuple[int | None, ...]], dict[str, tuple[int | None, ...]]]
+
+DETECTOR: Interface = ({"image": (None, 1, 240, 320)}, {"detection": (None, 65, 30, 40), "identity": (None, 4, 30, 40)})
+SEGMENTER: Interface = ({"patch": (None, 1, PATCH, PATCH)}, {"mask": (None, 1, PATCH, PATCH)})
+FAULTS = (runtime.InvalidProtobuf, runtime.InvalidGraph, runtime.InvalidArgument, runtime.Fail, runtime.NotImplemented,
+          runtime.NoModel, runtime.NoSuchFile, runtime.RuntimeException)  # fmt: skip
+
+
+class Networks(Protocol):
+    """Whatever detects circles in a frame and segments them in patches."""
+
+    def detect(self, images: Floats) -> tuple[Floats, Floats]:
+        """Images : (n, 240, 320) of 0 to 1, to logits of places : (n, 65, 30, 40) and of identities : (n, 4, 30, 40)."""
+        ...
+
+    def segment(self, patches: Floats) -> Floats:
+        """Patches : (n, 120, 120) of 0 to 1, to logits : (n, 120, 120) of the disc nearest to each one's middle."""
+        ...
+
+
+@dataclass(frozen=True)
+class OnnxNetworks:
+    """Both networks, loaded."""
+
+    detector: onnxruntime.InferenceSession
+    segmenter: onnxruntime.InferenceSession
+
+    def detect(self, images: Floats) -> tuple[Floats, Floats]:
+        """See `Networks`."""
+        detection, identity = self.detector.run(list(DETECTOR[1]), {"image": np.ascontiguousarray(images[:, None], np.float32)})
+        return np.asarray(detection), np.asarray(identity)
+
+    def segment(self, patches: Floats) -> Floats:
+        """See `Networks`."""
+        return np.asarray(self.segmenter.run(["mask"], {"patch": np.ascontiguousarray(patches[:, None], np.float32)})[0])[:, 0]
+
+
+def load(folder: Path = WEIGHTS, threads: int = 0) -> OnnxNetworks:
+    """Load `detector.onnx` and `segmenter.onnx`, to run on `threads` cores, 0 for all.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, isn't a network, or is another one.
+    """
+    folder = Path(folder)
+    return OnnxNetworks(
+        session(folder / "detector.onnx", DETECTOR, threads), session(folder / "segmenter.onnx", SEGMENTER, threads)
+    )
+
+
+def session(path: Path, interface: Interface, threads: int = 0) -> onnxruntime.InferenceSession:
+    """Open a network, and check that it takes and gives what is expected."""
+    if not path.is_file():
+        raise InputError(f"{path}: expected a network, found no file")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = threads, 4
+    try:
+        opened = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except FAULTS as error:
+        raise InputError(f"{path}: expected an ONNX network, found {_brief(str(error))}") from None
+    for what, expected, found in (("inputs", interface[0], opened.get_inputs()), ("outputs", interface[1], opened.get_outputs())):
+        shapes = {node.name: tuple(node.shape) for node in found}
+        if not all(name in shapes and _fits(shapes[name], shape) for name, shape in expected.items()) or (
+            what == "inputs" and len(shapes) != len(expected)
+        ):
+            raise InputError(f"{path}: {what}: expected {_listed(expected)}, found {_listed(shapes)}")
+    return opened
+
+
+def _fits(found: tuple[object, ...], expected: tuple[int | None, ...]) -> bool:
+    """Whether all sizes that the file fixes are as expected; names stand for any."""
+    return len(found) == len(expected) and all(
+        not isinstance(a, int) or b is None or a == b for a, b in zip(found, expected, strict=True)
+    )
+
+
+def _listed(shapes: dict) -> str:
+    sizes = {name: "x".join("n" if size is None else str(size) for size in shape) for name, shape in shapes.items()}
+    return ", ".join(f"{name} ({size})" for name, size in sizes.items())
+
+
+def _brief(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= 80 else line[:77] + "..."

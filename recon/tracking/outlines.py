@@ -1,0 +1,120 @@
+"""Outer rims of the target's rings in a frame, to a hundredth of a pixel, from rough ellipses.
+
+The limit is what noise leaves of an edge, `(n/C) sqrt(2 sqrt(pi) s / (pi R))` px along each axis for noise n, contrast C, blur s
+and radius R: 0.003 px for a ring of 45 px lit to 100 of 255. `recon.tracking.rims` has the model that is fitted.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.ellipses import Ellipses
+from recon.rig import Target
+from recon.tracking import rims
+
+Array = NDArray[np.float64]
+
+FLOOR_PX = 0.002  # what lens model, print and pixel grid leave however little noise there is
+LEAST_SEEN = 0.4  # of the rim: with less an ellipse is a guess
+LEAST_CONTRAST = 4.0  # times the noise of a pixel
+LEAST_DN = 1.5
+LARGEST_SIGMA = 0.6  # px: worse, and the ellipse tells no circle
+LARGEST_BLUR = 0.35  # of the ring's width; beyond that its dark ring is gone
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """n rims, as fitted; NaN where there is none."""
+
+    ellipses: Ellipses  # of n
+    covariance: Array  # (n, 2, 2) px^2, of the centres
+    inside: Array  # (n,) DN, of the dark ring
+    outside: Array  # (n,) DN, of the white around it
+    middle: Array  # (n,) DN, of the white within it
+    noise: Array  # (n,) DN, a pixel's, the larger of both sides
+    motion: Array  # (n, 2) px, path over the exposure, up to its sign
+    seen: Array  # (n,) share of the rim that looks like one
+    reasons: tuple[str | None, ...]  # why it is no ring
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """Whether each is a ring : (n,)."""
+        return np.array([reason is None for reason in self.reasons], bool)
+
+    @property
+    def contrast(self) -> Array:
+        """Of white and black : (n,) DN."""
+        return self.outside - self.inside
+
+    def __getitem__(self, chosen) -> "Outlines":
+        return Outlines(
+            self.ellipses[chosen],
+            self.covariance[chosen],
+            self.inside[chosen],
+            self.outside[chosen],
+            self.middle[chosen],
+            self.noise[chosen],
+            self.motion[chosen],
+            self.seen[chosen],
+            tuple(np.array(self.reasons, object)[chosen]),
+        )
+
+
+def measure(image: NDArray, rough: Ellipses, reach: float | Array, target: Target) -> Outlines:
+    """Fit the outer rims of rings.
+
+    Parameters
+    ----------
+    image : (h, w) DN
+        uint8 or float32, 255 is full.
+    rough : Ellipses
+        n rough ellipses.
+    reach : float or (n,) px
+        By how much their rims may be off; up to a third of the smaller semi-axis.
+    """
+    return measure_both(image, image, rough, np.zeros(len(rough.centre), bool), reach, target)
+
+
+def measure_both(
+    first: NDArray, second: NDArray, rough: Ellipses, of_second: NDArray[np.bool_], reach: float | Array, target: Target
+) -> Outlines:
+    """The same for rings in two frames at once; `of_second` : (n,) says in which each is."""
+    reach = np.broadcast_to(np.asarray(reach, float), len(rough.centre)).copy()
+    hole = target.inner_diameter_mm / target.outer_diameter_mm
+    kind = np.uint8 if first.dtype == second.dtype == np.uint8 else np.float32
+    first, second = np.ascontiguousarray(first, kind), np.ascontiguousarray(second, kind)
+    centres, shapes = np.ascontiguousarray(rough.centre, float), np.ascontiguousarray(rough.shape, float)
+    return _judged(rims.fit_rims(first, second, np.asarray(of_second, bool), centres, shapes, reach, hole), hole)
+
+
+def _judged(rows: Array, hole: float) -> Outlines:
+    shape = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+    inside, outside, middle = rows[:, rims.LEVELS], rows[:, rims.LEVELS + 3], rows[:, rims.MIDDLE]
+    noise, seen = rows[:, rims.NOISE : rims.NOISE + 2].max(axis=1, initial=0), rows[:, rims.SEEN]
+    chance = 1 + 3 * np.sqrt(2 / (rims.SECTORS * np.maximum(seen, 0.1)))
+    excess = np.maximum(rows[:, rims.EXCESS] / chance, 1)
+    covariance = rows[:, rims.COVARIANCE : rims.COVARIANCE + 25].reshape(-1, 5, 5)[:, :2, :2] * excess[:, None, None]
+    covariance = covariance + FLOOR_PX**2 * np.eye(2)
+    v0, v1, v2 = rows[:, rims.VARIANCE : rims.VARIANCE + 3].T
+    path, direction = np.sqrt(24 * np.hypot(v1, v2)), np.arctan2(v2, v1) / 2
+    motion = path[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
+    reasons: list[str | None] = []
+    for i in range(len(rows)):
+        contrast = outside[i] - inside[i]
+        semi = (shape[i, 0, 0] + shape[i, 1, 1]) / 2
+        if rows[i, rims.FAILED]:
+            reasons.append("no rim")
+        elif contrast < max(LEAST_DN, LEAST_CONTRAST * noise[i] / np.sqrt(semi)):
+            reasons.append(f"a contrast of {contrast:.1f} DN in noise of {noise[i]:.1f}")
+        elif seen[i] < LEAST_SEEN:
+            reasons.append(f"{100 * seen[i]:.0f} % of its rim seen")
+        elif not middle[i] - inside[i] > 0.5 * contrast * (1 - np.sqrt(v0[i]) / (hole * semi)):
+            reasons.append("no white middle")
+        elif np.sqrt(v0[i]) > LARGEST_BLUR * (1 - hole) * semi:
+            reasons.append(f"blurred by {np.sqrt(12 * v0[i]):.0f} px")
+        elif np.sqrt(np.trace(covariance[i])) > LARGEST_SIGMA:
+            reasons.append(f"an uncertainty of {np.sqrt(np.trace(covariance[i])):.1f} px")
+        else:
+            reasons.append(None)
+    return Outlines(Ellipses(rows[:, :2], shape), covariance, inside, outside, middle, noise, motion, seen, tuple(reasons))

@@ -1,0 +1,73 @@
+"""Pictures of what the tracker saw: ellipses, names, the target's axes, or the reason why there is none."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon import rigid
+from recon.camera import Camera
+from recon.tracking.frames import grey
+from recon.tracking.pose import NAMES, TargetPose
+from recon.tracking.views import View
+
+FRACTION = 4  # bits of sub-pixels that cv2 draws with
+COLOURS = ((80, 80, 255), (80, 220, 80), (255, 140, 60))  # BGR; of c0, c1, c2 and of x, y, z
+BAD = (0, 160, 255)
+AXIS_MM = 20.0
+FULL = 220.0  # of 255, to which a dark image is brightened
+
+
+def drawn(image: NDArray, view: View, pose: TargetPose | None = None, camera: Camera | None = None) -> NDArray[np.uint8]:
+    """A picture : (h, w, 3) BGR of a frame, brightened, with what was seen in it; axes need the pose and the camera.
+
+    Raises
+    ------
+    InputError
+        If it isn't an image.
+    """
+    picture = _picture(image)
+    for k in range(len(NAMES)):
+        _ring(picture, view, k)
+    if pose is not None and camera is not None and pose.found:
+        _axes(picture, pose, camera)
+    reason = pose.reason if pose is not None else view.reason
+    if reason is not None:
+        _text(picture, f"not found: {reason}", (10, picture.shape[0] - 12), BAD)
+    return picture
+
+
+def _picture(image: NDArray) -> NDArray[np.uint8]:
+    values = grey(image).astype(np.float32)
+    bright = max(float(np.percentile(values[::4, ::4], 99.5)), 1.0)
+    shown = np.clip(values * max(FULL / bright, 1.0) if bright < FULL else values, 0, 255).astype(np.uint8)
+    return cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR)
+
+
+def _ring(picture: NDArray[np.uint8], view: View, k: int) -> None:
+    centre, shape = view.outlines.ellipses.centre[k], view.outlines.ellipses.shape[k]
+    if not (np.isfinite(centre).all() and np.isfinite(shape).all()):
+        return
+    colour = COLOURS[k] if view.outlines.found[k] else BAD
+    angles = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+    points = centre + np.column_stack([np.cos(angles), np.sin(angles)]) @ shape
+    cv2.polylines(picture, [_fixed(points)], True, colour, 1, cv2.LINE_AA, FRACTION)
+    cv2.circle(picture, tuple(int(x) for x in _fixed(centre)), 2 << FRACTION, colour, -1, cv2.LINE_AA, FRACTION)
+    _text(picture, NAMES[k], tuple(int(x) for x in centre + np.array([6, -6])), colour)
+
+
+def _axes(picture: NDArray[np.uint8], pose: TargetPose, camera: Camera) -> None:
+    ends = camera.project(rigid.apply(pose.world_from_target, np.vstack([np.zeros(3), AXIS_MM * np.eye(3)])))
+    for k, end in enumerate(ends[1:]):
+        if np.isfinite([*ends[0], *end]).all():
+            start, stop = (tuple(int(x) for x in _fixed(point)) for point in (ends[0], end))
+            cv2.line(picture, start, stop, COLOURS[k], 2, cv2.LINE_AA, FRACTION)
+
+
+def _text(picture: NDArray[np.uint8], text: str, place: tuple[int, ...], colour: tuple[int, int, int]) -> None:
+    scale = max(picture.shape[1] / 1800, 0.35)
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), 3, cv2.LINE_AA)
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+
+
+def _fixed(points: NDArray) -> NDArray[np.int32]:
+    return np.rint(np.asarray(points) * (1 << FRACTION)).astype(np.int32)

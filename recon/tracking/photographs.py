@@ -1,0 +1,52 @@
+"""The target in a single image of any size: its circles, without a pose."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.ellipses import Ellipses
+from recon.errors import InputError
+from recon.rig import Target
+from recon.tracking import detection, identity, segmentation, views
+from recon.tracking.frames import grey
+from recon.tracking.networks import Networks
+from recon.tracking.outlines import measure
+from recon.tracking.views import View
+
+FRAME = (1280, 1024)  # width, height, px, of the cameras that the networks know
+ROUGH_PX = 5.0  # of such a frame
+LEAST_REACH_PX = 2.0
+
+
+def find(image: NDArray, networks: Networks, target: Target, bits: int | None = None) -> View:
+    """Find the target's circles in an image of any size, colour and depth. Never raises on what it shows.
+
+    The networks see it at the size of a camera's frame, its border going on where the aspect differs; the target should take
+    as much of it as in a camera's. Rims are fitted in the image itself.
+    """
+    try:
+        image = grey(image, bits)
+    except InputError as error:
+        return views.nothing(str(error))
+    frame, scale = _framed(image)
+    candidates = detection.detect([frame], networks)[0]
+    choices = identity.triples(candidates, target, FRAME[0])
+    result = views.nothing(f"{len(candidates.points)} places like circles, no three that lie like the target's")
+    for triple in choices:
+        rough = segmentation.rough_ellipses(frame, triple.points, networks)
+        back = Ellipses((rough.centre + 0.5) / scale - 0.5, rough.shape / scale)
+        outlines = measure(image, back, max(ROUGH_PX / scale, LEAST_REACH_PX), target)
+        view = views.judged(views.renamed(outlines, target), target)
+        if view.found:
+            return view
+        result = view if triple is choices[0] else result
+    return result
+
+
+def _framed(image: NDArray) -> tuple[NDArray, float]:
+    """The image at a camera's size, and how many of its pixels one of the image's makes."""
+    height, width = image.shape
+    scale = min(FRAME[0] / width, FRAME[1] / height)
+    size = (max(round(width * scale), 1), max(round(height * scale), 1))
+    scaled = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    return np.ascontiguousarray(np.pad(scaled, ((0, FRAME[1] - size[1]), (0, FRAME[0] - size[0])), mode="edge")), scale

@@ -1,0 +1,400 @@
+"""The fit of a ring's outer rim to the pixels beside it, compiled.
+
+The band of pixels about the rim is modelled as the image of an elliptical edge: dark inside, bright outside, each side a plane,
+blurred by the lens (Gaussian) and by motion (a box along one direction), which together are three numbers, the variance of the
+profile across the edge as it turns with the normal: `V = v0 + v1 cos 2phi + v2 sin 2phi`. Motion by b px along psi makes the
+profile a box of width `b |cos(phi - psi)|`; along the edge it pulls the rim inwards by `curvature (b sin(phi - psi))^2 / 24`. The
+white middle is part of the model as far as it blurs into the band.
+
+Fourteen parameters, Gauss-Newton. The pixels of a sector share their derivatives but for four (where the edge lies, both levels,
+the variance), so sums of four unknowns a sector are all that the loop over pixels makes. Sectors that look otherwise (a finger,
+a cable, the image's border) lose their weight. The noise is told from the residuals, apart for the dark and the bright side.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from recon.tracking.cholesky import solve_and_invert
+
+SECTORS = 48
+STARTS = (0, 5, 8, 11, 14)  # of the parameters of offset, inside, outside, variance
+GLOBAL = 14  # centre (2), shape (3), planes inside (3) and outside (3), variance (3)
+CAPTURE_STEPS = 8  # on every second pixel of every second row, from a rough ellipse
+STEPS = 8  # on all pixels
+CAPTURED = 0.1  # px
+SETTLED = 4e-3  # px; the step after that is a tenth of it
+LEAST_VARIANCE = 0.06  # px^2: a pixel's own extent is 1/12
+NARROW = 1.2  # standard deviations of the lens's blur: a box below that is as good as Gaussian
+SCATTER = 10.0  # standard deviations beyond which a pixel counts less
+KEPT = (1 - 6 / SCATTER**2) / (1 - 2 / SCATTER**2)  # of normal noise's variance, seen with pixels counting by their residuals
+STRANGE = 6.0  # times the usual mean square at which a sector has lost three quarters of its weight
+ROUNDING = 1 / 12  # DN^2
+FAST = {"reassoc", "contract", "arcp", "nsz"}  # all but what is not finite
+OUTERMOST = 0.37  # radii beyond the rim: half way to the neighbour
+FEWEST = 4  # pixels of a sector that count
+LEAST_SECTORS = 16
+
+# what a fit returns, by column
+CENTRE, SHAPE, COVARIANCE, LEVELS, NOISE, VARIANCE, SEEN, EXCESS, MIDDLE, FAILED = 0, 2, 5, 30, 36, 38, 41, 42, 43, 44
+COLUMNS = 45
+# of a sector, by column
+UX, UY, NX, NY, WIDE, BOX, BLUR, PULL, INNER, OUTER, COS, SIN, X, Y = range(14)
+# sums of a sector: the upper triangle of 4x4 and the right side, squares, count, and five for the noise
+SQUARES, COUNT, LOCAL = 14, 15, 21
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def fit_rims(first, second, of_second, centres, shapes, reach, hole):
+    """Fit n rims : (n, COLUMNS), each in one of two images of one type, from rough ellipses that may be off by reach : (n,) px.
+
+    `hole` is the inner over the outer diameter.
+    """
+    result = np.full((len(centres), COLUMNS), np.nan)
+    for i in prange(len(centres)):
+        _fit(second if of_second[i] else first, centres[i], shapes[i], reach[i], hole, result[i])
+    return result
+
+
+@njit(cache=True, error_model="numpy")
+def _fit(image, centre, shape, reach, hole, result):
+    ellipse = np.array([centre[0], centre[1], shape[0, 0], shape[0, 1], shape[1, 1]])
+    result[FAILED] = 1
+    if not _sound(ellipse, image.shape):
+        return
+    variance = np.array([(reach / 2.5) ** 2 + 0.25, 0.0, 0.0])
+    planes, noise, weights = np.zeros(6), np.ones(2), np.ones(SECTORS)
+    if not _first_levels(image, ellipse, variance, reach, hole, planes, noise):
+        return
+    sums, inverse = np.zeros((SECTORS, LOCAL)), np.zeros((GLOBAL, GLOBAL))
+    for capture in (True, False):
+        stride = 2 if capture and ellipse[2] + ellipse[4] > 40 else 1
+        for _ in range(CAPTURE_STEPS if capture else STEPS):
+            sectors = _geometry(ellipse, variance, reach if capture else 0.0, hole)
+            _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums)
+            if not _judge(sums, weights, noise, capture, FEWEST if stride == 1 else 1):
+                return
+            step = np.zeros(GLOBAL)
+            if not _solve(sums, weights, sectors, planes, step, inverse):
+                return
+            _move(ellipse, planes, variance, step, reach)
+            if not _sound(ellipse, image.shape):
+                return
+            if np.abs(step[:5]).max() < (CAPTURED if capture else SETTLED):
+                break
+    freedom = max(weights.sum() - 6, 1.0)
+    scores = 0.0
+    for j in range(SECTORS):
+        if sums[j, 0] > 0:
+            scores += weights[j] * sums[j, 10] ** 2 / sums[j, 0]
+    result[CENTRE : CENTRE + 5] = ellipse
+    result[COVARIANCE : COVARIANCE + 25] = inverse[:5, :5].copy().ravel()
+    result[LEVELS : LEVELS + 6] = planes
+    result[NOISE : NOISE + 2] = np.sqrt(noise)
+    result[VARIANCE : VARIANCE + 3] = variance
+    result[SEEN] = weights.sum() / SECTORS
+    result[EXCESS] = scores / freedom
+    result[MIDDLE] = _middle(image, ellipse, hole)
+    result[FAILED] = 0
+
+
+@njit(cache=True, error_model="numpy")
+def _sound(ellipse, size):
+    """Whether the numbers are those of an ellipse that is at least half in the image."""
+    if not np.isfinite(ellipse).all():
+        return False
+    half, gap = (ellipse[2] + ellipse[4]) / 2, math.hypot((ellipse[2] - ellipse[4]) / 2, ellipse[3])
+    if half - gap < 3 or half - gap < 0.2 * (half + gap) or half + gap > max(size):
+        return False
+    return -1 < ellipse[0] < size[1] and -1 < ellipse[1] < size[0]
+
+
+@njit(cache=True, error_model="numpy")
+def _geometry(ellipse, variance, reach, hole):
+    """Of each sector's middle : (SECTORS, 14): its place, the normal, the profile there, and how far to look."""
+    sectors = np.empty((SECTORS, 14))
+    a, b, c = ellipse[2], ellipse[3], ellipse[4]
+    determinant = a * c - b * b
+    radius = (a + c) / 2
+    strength = math.hypot(variance[1], variance[2])
+    blur = math.sqrt(max(variance[0] - strength, LEAST_VARIANCE))
+    path = math.sqrt(24 * strength)
+    psi = 0.5 * math.atan2(variance[2], variance[1])
+    for j in range(SECTORS):
+        at = (j + 0.5) * 4 / SECTORS
+        quadrant = int(at)
+        y = at - quadrant
+        x = 1 - y
+        length = math.hypot(x, y)
+        x, y = x / length, y / length
+        for _ in range(quadrant):
+            x, y = -y, x
+        nx, ny = (c * x - b * y) / determinant, (a * y - b * x) / determinant
+        slope = math.hypot(nx, ny)
+        nx, ny = nx / slope, ny / slope
+        across = path * abs(nx * math.cos(psi) + ny * math.sin(psi))
+        along = path * (ny * math.cos(psi) - nx * math.sin(psi))
+        curvature = determinant / math.hypot(b * x - a * y, c * x - b * y) ** 3
+        far = max(across / 2 + 3 * blur + 1.5, 1.3 * reach + 1)
+        sectors[j, UX], sectors[j, UY], sectors[j, NX], sectors[j, NY] = x, y, nx, ny
+        sectors[j, BOX], sectors[j, BLUR] = across, blur
+        sectors[j, WIDE] = blur * blur + across * across / 12
+        sectors[j, PULL] = curvature * along * along / 24
+        sectors[j, INNER] = min(far, 0.75 * (1 - hole) / slope)
+        sectors[j, OUTER] = min(far, OUTERMOST / slope)
+        sectors[j, COS], sectors[j, SIN] = nx * nx - ny * ny, 2 * nx * ny
+        sectors[j, X], sectors[j, Y] = (a * x + b * y) / radius, (b * x + c * y) / radius
+    return sectors
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _primitive(z):
+    """Integral of the normal distribution function up to z."""
+    return z * 0.5 * math.erfc(-z * 0.7071067811865476) + math.exp(-0.5 * z * z) * 0.3989422804014327
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _profile(distance, box, blur, wide):
+    """The blurred step and its derivative by the distance, 1/px."""
+    if abs(distance) > box / 2 + 4.5 * blur:
+        return (1.0 if distance > 0 else 0.0), 0.0
+    if box < NARROW * blur:
+        scale = math.sqrt(wide)
+        z = distance / scale
+        return 0.5 * math.erfc(-z * 0.7071067811865476), math.exp(-0.5 * z * z) * 0.3989422804014327 / scale
+    high, low = (distance + box / 2) / blur, (distance - box / 2) / blur
+    share = (_primitive(high) - _primitive(low)) * blur / box
+    return share, 0.5 * (math.erfc(-high * 0.7071067811865476) - math.erfc(-low * 0.7071067811865476)) / box
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _sector(x, y):
+    """Number of the sector of a direction."""
+    total = abs(x) + abs(y)
+    if x >= 0:
+        at = y / total if y >= 0 else 3 + x / total
+    else:
+        at = 1 - x / total if y >= 0 else 2 - y / total
+    return min(int(at * (SECTORS / 4)), SECTORS - 1)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _window(ellipse, beyond, size):
+    """Rows and columns that hold the ellipse and what is around it by a share of its size."""
+    half_x, half_y = beyond * math.hypot(ellipse[2], ellipse[3]), beyond * math.hypot(ellipse[3], ellipse[4])
+    left, right = max(int(ellipse[0] - half_x), 0), min(int(ellipse[0] + half_x) + 2, size[1])
+    return left, right, max(int(ellipse[1] - half_y), 0), min(int(ellipse[1] + half_y) + 2, size[0])
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums):
+    """Fill the sums of all sectors: measured less modelled, and the model's slopes."""
+    sums[:] = 0
+    a, b, c = ellipse[2], ellipse[3], ellipse[4]
+    determinant = a * c - b * b
+    ia, ib, ic = c / determinant, -b / determinant, a / determinant
+    radius = (a + c) / 2
+    shortest = radius - math.hypot((a - c) / 2, b)
+    lowest = max(1 - sectors[:, INNER].max() * 1.2 / shortest, 1 - 0.85 * (1 - hole)) ** 2
+    highest = min(1 + sectors[:, OUTER].max() * 1.2 / shortest, 1 + OUTERMOST)
+    left, right, top, bottom = _window(ellipse, highest, image.shape)
+    highest = highest * highest
+    flat, lean, rest = ia * ia + ib * ib, ib * (ia + ic), ib * ib + ic * ic
+    for v in range(top, bottom, stride):
+        y = v - ellipse[1]
+        middle = ellipse[0] - lean * y / flat
+        beyond = (rest - lean * lean / flat) * y * y
+        if beyond >= highest:
+            continue
+        half = math.sqrt((highest - beyond) / flat)
+        empty = math.sqrt((lowest - beyond) / flat) if beyond < lowest else 0.0
+        u = max(left, int(middle - half) + 1) - stride
+        last = min(right - 1, int(middle + half))
+        while u + stride <= last:
+            u += stride
+            if abs(u - middle) < empty - 1:
+                u += int((middle + empty - 1 - u) / stride) * stride
+            x = u - ellipse[0]
+            p, q = ia * x + ib * y, ib * x + ic * y
+            square = p * p + q * q
+            if square < lowest or square > highest:
+                continue
+            away = math.sqrt(square)
+            p, q = p / away, q / away
+            j = _sector(p, q)
+            sx, sy = ia * p + ib * q, ib * p + ic * q
+            slope2 = sx * sx + sy * sy
+            slope = math.sqrt(slope2)
+            distance = (away - 1) / slope
+            turn = p * (ib * sx + ic * sy) - q * (ia * sx + ib * sy)
+            distance += turn * turn * distance * distance / (away * slope2 * 2 * slope)
+            if distance < -sectors[j, INNER] or distance > sectors[j, OUTER]:
+                continue
+            distance += sectors[j, PULL]
+            wide = sectors[j, WIDE]
+            share, peak = _profile(distance, sectors[j, BOX], sectors[j, BLUR], wide)
+            bright = share
+            within = (away - hole) / slope
+            if hole > 0 and within * within < 16 * wide + sectors[j, BOX] ** 2 / 4:
+                bright += 1 - _profile(within, sectors[j, BOX], sectors[j, BLUR], wide)[0]
+            xr, yr = x / radius, y / radius
+            inside, outside = planes[0] + planes[1] * xr + planes[2] * yr, planes[3] + planes[4] * xr + planes[5] * yr
+            step = outside - inside
+            bent = wide * peak * ((planes[4] - planes[1]) * sectors[j, NX] + (planes[5] - planes[2]) * sectors[j, NY]) / radius
+            residual = image[v, u] - inside - step * bright - bent
+            expected = noise[0] + (noise[1] - noise[0]) * min(bright, 1.0)
+            squared = residual * residual
+            robust = 1 / (1 + squared / (SCATTER * SCATTER * expected)) ** 2
+            w = robust / expected
+            c0, c1, c2 = -step * peak, 1 - bright, bright
+            c3 = c0 * distance / (2 * wide)
+            row = sums[j]
+            row[0] += w * c0 * c0
+            row[1] += w * c0 * c1
+            row[2] += w * c0 * c2
+            row[3] += w * c0 * c3
+            row[4] += w * c1 * c1
+            row[5] += w * c1 * c2
+            row[6] += w * c1 * c3
+            row[7] += w * c2 * c2
+            row[8] += w * c2 * c3
+            row[9] += w * c3 * c3
+            row[10] += w * c0 * residual
+            row[11] += w * c1 * residual
+            row[12] += w * c2 * residual
+            row[13] += w * c3 * residual
+            row[SQUARES] += w * squared
+            row[COUNT] += robust
+            row[16] += robust * c1 * c1
+            row[17] += robust * c1 * c2
+            row[18] += robust * c2 * c2
+            row[19] += robust * c1 * squared
+            row[20] += robust * c2 * squared
+
+
+@njit(cache=True, error_model="numpy")
+def _judge(sums, weights, noise, capture, fewest):
+    """Weigh the sectors by how well they fit and follow the noise; False if too little of the rim is in the image."""
+    seen = sums[:, COUNT] >= fewest
+    if seen.sum() < LEAST_SECTORS:
+        return False
+    mean = sums[:, SQUARES] / np.maximum(sums[:, COUNT], 1e-9)
+    usual = np.median(mean[seen])
+    if not usual > 0:
+        usual = 1.0
+    for j in range(SECTORS):
+        weights[j] = 1 / (1 + (mean[j] / (STRANGE * usual)) ** 2) ** 2 if seen[j] else 0.0
+    if capture:
+        noise[:] = np.maximum(noise.mean() * usual, ROUNDING)
+        return True
+    a, b, c = (weights * sums[:, 16]).sum(), (weights * sums[:, 17]).sum(), (weights * sums[:, 18]).sum()
+    p, q = (weights * sums[:, 19]).sum() / KEPT, (weights * sums[:, 20]).sum() / KEPT
+    determinant = a * c - b * b
+    if determinant > 1e-6 * a * c:
+        noise[0], noise[1] = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+    if noise[0] < ROUNDING:
+        noise[0], noise[1] = ROUNDING, (q - b * ROUNDING) / c
+    if noise[1] < ROUNDING:
+        noise[1], noise[0] = ROUNDING, max((p - b * ROUNDING) / a, ROUNDING)
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(sums, weights, sectors, planes, step, inverse):
+    """The step : (14,) and the inverse of the normal matrix : (14, 14); False if they are undetermined."""
+    normal, right = np.zeros((GLOBAL, GLOBAL)), np.zeros(GLOBAL)
+    slopes = np.ones(GLOBAL)
+    for j in range(SECTORS):
+        if weights[j] < 1e-6:
+            continue
+        ux, uy, nx, ny = sectors[j, UX], sectors[j, UY], sectors[j, NX], sectors[j, NY]
+        slopes[0], slopes[1], slopes[2], slopes[3], slopes[4] = nx, ny, nx * ux, nx * uy + ny * ux, ny * uy
+        slopes[6], slopes[7] = sectors[j, X], sectors[j, Y]
+        slopes[9], slopes[10] = sectors[j, X], sectors[j, Y]
+        slopes[12], slopes[13] = sectors[j, COS], sectors[j, SIN]
+        k = 0
+        for m in range(4):
+            for n in range(m, 4):
+                known = weights[j] * sums[j, k]
+                k += 1
+                for p in range(STARTS[m], STARTS[m + 1]):
+                    for q in range(max(STARTS[n], p), STARTS[n + 1]):
+                        normal[p, q] += known * slopes[p] * slopes[q]
+            for p in range(STARTS[m], STARTS[m + 1]):
+                right[p] += weights[j] * sums[j, 10 + m] * slopes[p]
+    for p in range(GLOBAL):
+        for q in range(p):
+            normal[p, q] = normal[q, p]
+    level = (planes[3] - planes[0]) ** 2 + 1
+    for k in (6, 7, 9, 10):  # light hardly doubles from one side of a ring to the other
+        normal[k, k] += 4 / level
+        right[k] -= 4 / level * planes[k - 5]
+    for k in range(GLOBAL):
+        normal[k, k] += 1e-10 * normal[k, k] + 1e-12
+    return solve_and_invert(normal, right, step, inverse)
+
+
+@njit(cache=True, error_model="numpy")
+def _move(ellipse, planes, variance, step, reach):
+    shortest = (ellipse[2] + ellipse[4]) / 2 - math.hypot((ellipse[2] - ellipse[4]) / 2, ellipse[3])
+    limit = min(max(reach, 1.0), 0.3 * shortest)
+    scale = min(1.0, limit / max(np.abs(step[:5]).max(), 1e-12))
+    ellipse += scale * step[:5]
+    planes += step[5:11]
+    limit = 0.85 * variance[0] if step[11] < 0 else 2 * variance[0]
+    variance += min(1.0, limit / max(np.abs(step[11:]).max(), 1e-12)) * step[11:]
+    variance[0] = max(variance[0], LEAST_VARIANCE)
+    strength = math.hypot(variance[1], variance[2])
+    if strength > variance[0] - LEAST_VARIANCE:
+        variance[1:] *= (variance[0] - LEAST_VARIANCE) / strength
+
+
+@njit(cache=True, error_model="numpy")
+def _first_levels(image, ellipse, variance, reach, hole, planes, noise):
+    """Medians over the sectors of the means inside and outside; False if there is no dark ring on bright ground."""
+    sectors = _geometry(ellipse, variance, reach, hole)
+    totals = np.zeros((SECTORS, 4))
+    determinant = ellipse[2] * ellipse[4] - ellipse[3] ** 2
+    ia, ib, ic = ellipse[4] / determinant, -ellipse[3] / determinant, ellipse[2] / determinant
+    left, right, top, bottom = _window(ellipse, 1 + OUTERMOST, image.shape)
+    for v in range(top, bottom):
+        y = v - ellipse[1]
+        for u in range(left, right):
+            x = u - ellipse[0]
+            p, q = ia * x + ib * y, ib * x + ic * y
+            away = math.sqrt(p * p + q * q)
+            if away < hole or away > 1 + OUTERMOST:
+                continue
+            j = _sector(p, q)
+            distance = (away - 1) * away / math.hypot(ia * p + ib * q, ib * p + ic * q)
+            if -sectors[j, INNER] < distance < -0.35 * sectors[j, INNER]:
+                totals[j, 0] += 1
+                totals[j, 1] += image[v, u]
+            elif 0.35 * sectors[j, OUTER] < distance < sectors[j, OUTER]:
+                totals[j, 2] += 1
+                totals[j, 3] += image[v, u]
+    seen = np.minimum(totals[:, 0], totals[:, 2]) > 0
+    if seen.sum() < LEAST_SECTORS:
+        return False
+    planes[0] = np.median(totals[seen, 1] / totals[seen, 0])
+    planes[3] = np.median(totals[seen, 3] / totals[seen, 2])
+    noise[:] = max((0.1 * (planes[3] - planes[0])) ** 2, ROUNDING)
+    return planes[3] > planes[0]
+
+
+@njit(cache=True, error_model="numpy")
+def _middle(image, ellipse, hole):
+    """Mean of the white middle, of its inner half."""
+    determinant = ellipse[2] * ellipse[4] - ellipse[3] ** 2
+    ia, ib, ic = ellipse[4] / determinant, -ellipse[3] / determinant, ellipse[2] / determinant
+    size = 0.5 * hole
+    left, right, top, bottom = _window(ellipse, size, image.shape)
+    count, total = 0, 0.0
+    for v in range(top, bottom):
+        for u in range(left, right):
+            x, y = u - ellipse[0], v - ellipse[1]
+            if (ia * x + ib * y) ** 2 + (ib * x + ic * y) ** 2 <= size * size:
+                count += 1
+                total += image[v, u]
+    return total / count if count else np.nan

@@ -1,0 +1,65 @@
+"""What one camera shows of the target: its three rims, or why they aren't there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.camera import Camera
+from recon.ellipses import Ellipses
+from recon.rig import Target
+from recon.tracking import identity
+from recon.tracking.outlines import Outlines
+from recon.tracking.pose import NAMES, Sighting
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class View:
+    """The three circles of one view, in the order of NAMES."""
+
+    outlines: Outlines  # of 3
+    reason: str | None = None  # why this isn't the target
+
+    @property
+    def found(self) -> bool:
+        """Whether all three circles are there."""
+        return self.reason is None
+
+    @property
+    def blur_px(self) -> Array:
+        """Lengths : (3,) of the circles' paths over the exposure."""
+        return np.linalg.norm(self.outlines.motion, axis=1)
+
+    def sighting(self, camera: Camera) -> Sighting:
+        """For the pose."""
+        return Sighting(camera, self.outlines.ellipses.centre, self.outlines.covariance)
+
+
+def nothing(reason: str) -> View:
+    """No circles, for a reason."""
+    numbers = np.full(3, np.nan)
+    ellipses = Ellipses(np.full((3, 2), np.nan), np.full((3, 2, 2), np.nan))
+    outlines = Outlines(
+        ellipses, np.full((3, 2, 2), np.nan), numbers, numbers, numbers, numbers, np.full((3, 2), np.nan), numbers, (reason,) * 3
+    )
+    return View(outlines, reason)
+
+
+def judged(outlines: Outlines, target: Target) -> View:
+    """A view of three rims: it is the target if all are rings, of the sizes that their distances ask for."""
+    bad = [f"{name}: {reason}" for name, reason in zip(NAMES, outlines.reasons, strict=True) if reason is not None]
+    if bad:
+        return View(outlines, "; ".join(bad))
+    off = identity.disagreement(outlines.ellipses, target)
+    if not np.isfinite(off):
+        return View(outlines, "circles of which the names are mirrored")
+    if off > identity.ALIKE:
+        return View(outlines, f"circles whose sizes are {100 * off:.0f} % from what their distances ask for")
+    return View(outlines)
+
+
+def renamed(outlines: Outlines, target: Target) -> Outlines:
+    """The same rims in the order that their geometry asks for, if all are rings."""
+    return outlines[identity.named(outlines.ellipses, target)[0]] if outlines.found.all() else outlines

@@ -1,0 +1,118 @@
+"""Rims are found to the physical limit, with honest covariance, and what hides or spoils them is noticed."""
+
+import numpy as np
+import pytest
+
+from recon import rigid
+from recon.circles import centre_offsets
+from recon.ellipses import Ellipses
+from recon.tracking import pose
+from recon.tracking.outline_model import ellipses_of, rays_through
+from recon.tracking.outlines import measure
+from tests.recon.tracking import drawings
+
+FRAMES = 6  # of three rings
+
+
+@pytest.fixture(scope="module")
+def camera(rig):
+    return rig.cam1.optics.camera()
+
+
+def shown(camera, place, target):
+    return Ellipses(*ellipses_of(camera, place, pose.circle_centres(target), target.outer_diameter_mm / 2))
+
+
+def found_and_true(camera, target, rng, white, blur_px=0.0):
+    """One frame: the rims from ellipses up to 3 px off, and the truth."""
+    place = drawings.facing(rng)
+    angle = rng.uniform(0, 2 * np.pi)
+    path = blur_px * place[2, 3] / camera.matrix[0, 0] * np.array([np.cos(angle), np.sin(angle), 0])
+    poses = [place] if blur_px == 0 else drawings.exposure(place, path)
+    image = drawings.frame(camera, poses, target, white, rng)
+    true = shown(camera, place, target)
+    rough = Ellipses(true.centre + rng.uniform(-2, 2, (3, 2)), true.shape * 1.02)
+    return measure(image, rough, 6.0, target), true
+
+
+@pytest.mark.parametrize(("white", "blur", "typical"), [(100, 0, 0.012), (20, 0, 0.02), (8, 0, 0.05), (65, 12, 0.03)])
+def test_centres_and_their_covariance(camera, rig, rng, white, blur, typical):
+    """The median error stays below twice what was measured, and squared normalised errors follow chi-square of 2: 18 rings give a
+    mean within 4 standard errors of 2 / sqrt(18)."""
+    errors, squared = [], []
+    for _ in range(FRAMES):
+        found, true = found_and_true(camera, rig.target, rng, white, blur)
+        assert found.found.all(), found.reasons
+        off = found.ellipses.centre - true.centre
+        errors += list(np.hypot(*off.T))
+        squared += [e @ np.linalg.solve(c, e) for e, c in zip(off, found.covariance, strict=True)]
+        if blur:
+            assert np.abs(np.linalg.norm(found.motion, axis=1) - blur).max() < 0.1 * blur
+    assert np.median(errors) < typical
+    assert 0.5 < np.mean(squared) < 2 + 4 * 2 / np.sqrt(3 * FRAMES)
+
+
+def test_light_that_falls_off_does_not_move_the_centre(camera, rig, rng):
+    """Twice as bright at one side of a ring as at the other."""
+    place = drawings.facing(rng, 5.0)
+    true = shown(camera, place, rig.target)
+    light = np.exp(np.log(2) * (np.arange(1280) - true.centre[0, 0]) / 90)[None].clip(0.2, 3)
+    image = drawings.frame(camera, [place], rig.target, 40.0, rng, light=light)
+    found = measure(image, true, 3.0, rig.target)
+    assert np.hypot(*(found.ellipses.centre[0] - true.centre[0])) < 0.04
+
+
+def test_a_finger_over_a_quarter_of_the_rim_costs_little(camera, rig, rng):
+    place = drawings.facing(rng)
+    true = shown(camera, place, rig.target)
+    image = drawings.frame(camera, [place], rig.target, 80.0, rng)
+    centre, radius = true.centre[1], true.semi_axes[1].mean()
+    v, u = np.mgrid[:1024, :1280]
+    finger = (
+        (u - centre[0] > 0.1 * radius) & (v - centre[1] > 0.1 * radius) & (np.hypot(u - centre[0], v - centre[1]) < 2 * radius)
+    )
+    image[finger] = np.clip(45 + 2 * rng.standard_normal(finger.sum()), 0, 255).astype(np.uint8)
+    found = measure(image, true, 3.0, rig.target)
+    assert found.found[1]
+    assert found.seen[1] < 0.85
+    off = found.ellipses.centre[1] - true.centre[1]
+    assert np.hypot(*off) < 0.06
+    assert np.trace(found.covariance[1]) > np.trace(found.covariance[0])
+
+
+def test_clipped_white_keeps_the_centre(camera, rig, rng):
+    """The edge moves outwards, all around alike."""
+    place = drawings.facing(rng)
+    true = shown(camera, place, rig.target)
+    found = measure(drawings.frame(camera, [place], rig.target, 500.0, rng), true, 4.0, rig.target)
+    assert found.found.all()
+    assert np.hypot(*(found.ellipses.centre - true.centre).T).max() < 0.05
+
+
+def test_what_is_no_ring_is_not_found(camera, rig, rng):
+    true = shown(camera, drawings.facing(rng), rig.target)
+    noise = rng.integers(0, 256, (1024, 1280)).astype(np.uint8)
+    v, u = np.mgrid[:1024, :1280]
+    disc = np.where(np.hypot(u - true.centre[0, 0], v - true.centre[0, 1]) < true.semi_axes[0].mean(), 5, 90).astype(np.uint8)
+    for image in (np.zeros((1024, 1280), np.uint8), np.full((1024, 1280), 255, np.uint8), noise, disc):
+        assert not measure(image, true, 6.0, rig.target).found.any()
+    nowhere = Ellipses(np.full((3, 2), np.nan), np.full((3, 2, 2), np.nan))
+    assert measure(noise, nowhere, 6.0, rig.target).reasons == ("no rim",) * 3
+    outside = Ellipses(true.centre + 5000, true.shape)
+    assert not measure(noise, outside, 6.0, rig.target).found.any()
+
+
+def test_fitted_ellipses_are_those_of_the_plain_fit(camera, rig, rng):
+    """Against the projected centres with the offsets that calibration takes."""
+    model, radius = pose.circle_centres(rig.target), rig.target.outer_diameter_mm / 2
+    for _ in range(5):
+        place = drawings.facing(rng)
+        expected = camera.project(rigid.apply(place, model)) + centre_offsets(camera, place, model, radius)
+        assert np.abs(shown(camera, place, rig.target).centre - expected).max() < 1e-5
+
+
+def test_rays_are_the_cameras(rig, rng):
+    camera = rig.cam2.optics.camera()
+    pixels = rng.uniform(0, 1000, (20, 2))
+    assert np.abs(rays_through(camera, pixels) - camera.rays(pixels)).max() < 1e-12
+    assert np.isnan(rays_through(camera, np.full((1, 2), np.nan))).all()

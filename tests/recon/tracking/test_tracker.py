@@ -1,0 +1,181 @@
+"""The tracker finds, follows and loses a drawn target, and says why where it isn't found."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recon import rigid
+from recon.tracking import following, overlays, photographs, pose
+from recon.tracking.tracker import Tracker
+from tests.recon.tracking import drawings
+from tests.recon.tracking.stand_ins import Told
+
+FACING = rigid.transform(
+    np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("xyz", [8, -12, 30], degrees=True).as_matrix(), [0, 20, 660]
+)
+
+
+@pytest.fixture(scope="module")
+def cameras(rig):
+    return rig.cam1.optics.camera(), rig.cam2.optics.camera()
+
+
+def centres(camera, place, target):
+    return camera.project(rigid.apply(place, pose.circle_centres(target)))
+
+
+@pytest.fixture(scope="module")
+def pair(cameras, rig):
+    rng = np.random.default_rng(7)
+    return [drawings.frame(camera, [FACING], rig.target, 65.0, rng) for camera in cameras]
+
+
+@pytest.fixture
+def told(cameras, rig):
+    return Told([centres(camera, FACING, rig.target) for camera in cameras])
+
+
+@pytest.fixture
+def tracker(cameras, rig, told):
+    return Tracker(cameras, rig.target, told)
+
+
+def off_mm(found, place=FACING):
+    return np.linalg.norm(found.pose.world_from_target[:3, 3] - place[:3, 3])
+
+
+def test_it_detects_then_follows_without_a_network(tracker, pair, told):
+    first = tracker.step(*pair)
+    assert first.found, first.pose.reason
+    assert first.how == "detected"
+    second = tracker.step(*pair)
+    assert second.how == "predicted" and (told.detections, told.segmentations) == (1, 1)
+    for found in (first, second):
+        assert off_mm(found) < 0.05
+        assert all(view.found and 0 <= view.blur_px.max() < 1.5 for view in found.views)
+
+
+def test_it_follows_a_moving_target_as_a_track(tracker, cameras, rig, rng, told):
+    """400 mm/s and a turn of 200 deg/s, at 60 frames/s."""
+    places = []
+    for k in range(4):
+        turn = Rotation.from_rotvec([0, 0, np.radians(200) * k / 60]).as_matrix()
+        places.append(rigid.transform(turn @ FACING[:3, :3], FACING[:3, 3] + np.array([300.0, 200, 150]) * k / 60))
+    frames = [
+        (k * 16_666_667, *(drawings.frame(camera, [place], rig.target, 65.0, rng) for camera in cameras))
+        for k, place in enumerate(places)
+    ]
+    followed = following.follow(tracker, frames)
+    assert followed.reasons == (None,) * 4
+    assert [each.how for each in followed.trackings][2:] == ["predicted"] * 2
+    assert followed.track.found.all() and followed.track.covariance is not None
+    assert max(off_mm(each, place) for each, place in zip(followed.trackings, places, strict=True)) < 0.1
+
+
+def test_wrong_names_are_put_right_by_geometry(cameras, rig, pair):
+    """A network that turns all names round, the same in both views or not."""
+    for names in ((1, 2, 0), (2, 0, 1), (0, 2, 1), (3, 3, 3)):
+        found = Tracker(cameras, rig.target, Told([centres(camera, FACING, rig.target) for camera in cameras], names=names)).step(
+            *pair
+        )
+        assert not found.found or off_mm(found) < 0.05
+        assert found.found or names == (0, 2, 1), found.pose.reason
+
+
+def test_false_candidates_do_not_distract(cameras, rig, pair, rng):
+    places = [np.vstack([centres(camera, FACING, rig.target), rng.uniform(50, 950, (6, 2))]) for camera in cameras]
+    found = Tracker(cameras, rig.target, Told(places, names=(0, 1, 2, 0, 1, 2, 3, 3, 3))).step(*pair)
+    assert found.found and off_mm(found) < 0.05
+
+
+def test_one_camera_alone_is_said_so(tracker, pair):
+    blank = np.full_like(pair[0], 20)
+    seen = tracker.step(pair[0], blank)
+    assert not seen.found and seen.pose.reason.startswith("only camera 1 sees the target")
+    assert seen.views[0].found and not seen.views[1].found
+    other = tracker.step(blank, pair[1])
+    assert other.pose.reason.startswith("only camera 2 sees the target")
+
+
+def test_swapped_cameras_are_not_found(cameras, rig, pair):
+    places = [centres(camera, FACING, rig.target) for camera in cameras]
+    found = Tracker(cameras, rig.target, Told(places[::-1])).step(pair[1], pair[0])
+    assert not found.found and "cameras swapped" in str(found.pose.reason)
+
+
+def test_a_mirrored_target_is_not_found(cameras, rig, pair):
+    """As a camera that flips its images would show it."""
+    flipped = [np.ascontiguousarray(image[:, ::-1]) for image in pair]
+    places = [centres(camera, FACING, rig.target) for camera in cameras]
+    found = Tracker(cameras, rig.target, Told([np.column_stack([1279 - p[:, 0], p[:, 1]]) for p in places])).step(*flipped)
+    assert not found.found
+
+
+@pytest.mark.parametrize("kind", ["blank", "black", "saturated", "noise", "nan", "half"])
+def test_images_without_a_target_are_not_found(tracker, pair, rng, kind):
+    images = {
+        "blank": np.full((1024, 1280), 40, np.uint8),
+        "black": np.zeros((1024, 1280), np.uint8),
+        "saturated": np.full((1024, 1280), 255, np.uint8),
+        "noise": rng.integers(0, 255, (1024, 1280)).astype(np.uint8),
+        "nan": np.full((1024, 1280), np.nan, np.float32),
+        "half": np.where(np.arange(1280) < 620, pair[0], 30).astype(np.uint8),
+    }
+    seen = tracker.step(images[kind], images[kind])
+    assert not seen.found and seen.pose.reason
+    tracker.remember(FACING, tracker._clock)
+    seen = tracker.step(images[kind], images[kind])
+    assert not seen.found and np.isnan(seen.pose.world_from_target).all()
+
+
+def test_a_wrong_size_is_refused_by_name(tracker, pair):
+    seen = tracker.step(pair[0], pair[1][:512, :640])
+    assert seen.pose.reason == "camera 2: expected an image of 1280x1024, found 640x512"
+    for nonsense in (np.array(None), np.zeros((1024, 1280, 7), np.uint8), np.zeros(0), np.array("text")):
+        assert "expected an image" in str(tracker.step(pair[0], nonsense).pose.reason)
+
+
+def test_colour_and_depth_make_no_difference(cameras, rig, pair, told):
+    deep = [(image.astype(np.uint16) * 16).clip(0, 4095) for image in pair]
+    for images in ([np.repeat(i[..., None], 3, axis=2) for i in pair], deep, [i.astype(np.float32) / 255 for i in pair]):
+        found = Tracker(cameras, rig.target, told, bits=12 if images is deep else None).step(*images)
+        assert found.found and off_mm(found) < 0.05, found.pose.reason
+
+
+def test_without_networks_it_says_so(cameras, rig, pair):
+    lonely = Tracker(cameras, rig.target)
+    assert "no networks" in str(lonely.step(*pair).pose.reason)
+    lonely.remember(FACING, lonely._clock)
+    assert lonely.step(*pair).how == "predicted"
+
+
+def test_a_lost_target_is_detected_again(tracker, pair, cameras, rig, rng, told):
+    assert tracker.step(*pair).found
+    moved = FACING.copy()
+    moved[:3, 3] += [25, -10, 15]
+    told.places = [centres(camera, moved, rig.target) for camera in cameras]
+    seen = tracker.step(*(drawings.frame(camera, [moved], rig.target, 65.0, rng) for camera in cameras))
+    assert seen.how == "detected" and off_mm(seen, moved) < 0.05
+
+
+def test_photographs_of_any_size(cameras, rig, pair):
+    """Down to thumbnails: the same circles, in the image's own pixels."""
+    import cv2
+
+    true = centres(cameras[0], FACING, rig.target)
+    for width, height, limit in ((1280, 1024, 0.4), (320, 256, 0.4), (2560, 2048, 1.0)):
+        image = cv2.resize(pair[0], (width, height), interpolation=cv2.INTER_AREA)
+        view = photographs.find(image, Told([true]), rig.target)
+        assert view.found, view.reason
+        expected = (true + 0.5) * width / 1280 - 0.5
+        assert np.hypot(*(view.outlines.ellipses.centre - expected).T).max() < limit
+    assert not photographs.find(np.zeros((50, 70), np.uint8), Told([[]]), rig.target).found
+    assert "expected an image" in str(photographs.find(np.zeros(3), Told([[]]), rig.target).reason)
+
+
+def test_pictures_show_what_was_seen(tracker, pair, cameras):
+    found = tracker.step(*pair)
+    picture = overlays.drawn(pair[0], found.views[0], found.pose, cameras[0])
+    assert picture.shape == (1024, 1280, 3) and (picture.max(axis=2) != picture.min(axis=2)).sum() > 500
+    missed = tracker.step(np.zeros_like(pair[0]), np.zeros_like(pair[0]))
+    assert overlays.drawn(np.zeros_like(pair[0]), missed.views[0], missed.pose).any()
