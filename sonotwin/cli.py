@@ -36,14 +36,18 @@ VERBS = (  # in the order in which a person meets them
     Verb("demo", "render a phantom, reconstruct its surface, compare with the truth"),
     Verb("render", "render a capture of a scene with its ground truth"),
     Verb("sweep", "render a freehand ultrasound sweep of a scene with its ground truth"),
+    Verb("dataset", "render tracking frames with ground truth, as training data"),
+    Verb("film", "render a film of the moving target with its ground truth"),
     Verb("calibrate-optics", "calibrate cameras and projector from images of a board, rendered or real"),
     Verb("calibrate-probe", "calibrate the ultrasound probe from B-scans of crossed wires"),
     Verb("measure-lag", "measure by how much the scanner's images lag behind the tracked poses"),
     Verb("surface", "reconstruct the surface from a capture, rendered or real"),
+    Verb("track", "track the probe's target through the frames of two cameras"),
     Verb("freehand", "put tracked B-scans into a volume, for 3D Slicer too"),
     Verb("segment", "find masses or a tube in tracked B-scans, as closed surfaces in the world"),
     Verb("evaluate", "compare a surface with a rendered capture's ground truth"),
     Verb("accuracy", "measure errors of the twin's rig and compare with the paper's figures"),
+    Verb("train", "train a network of the tracker with a data set"),
 )
 
 USAGE = """\

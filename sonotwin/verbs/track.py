@@ -1,0 +1,141 @@
+"""Track the probe's target through the frames of two cameras.
+
+Reads a capture folder with frames of both cameras (sweep/cam1, sweep/cam2) and their calibration; frames are paired by their time
+stamps. Writes into the folder `out`: poses.csv, poses with their covariance in the layout that all verbs read; frames.csv, how
+each pose was found or why not; overlays/, both views side by side with what was seen in them; and metrics.json. Frames are read
+one after the other, so a film may be of any length. Results that are there already are replaced. Takes some seconds, and 20 to
+60 frames a second from then on.
+
+If the capture has B-scans too (sweep/us), `out` becomes a capture itself, those images with these poses, and the verbs that need
+poses are given it instead:
+
+    sonotwin film out=outputs/film
+    sonotwin track capture=outputs/film/capture out=outputs/track
+    sonotwin track capture=recorded calibration=calibration/optics.yaml out=tracked
+    sonotwin freehand capture=tracked probe=probe.yaml lag_s=0.05 out=volume
+"""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from rich.console import Console
+from rich.progress import Progress
+
+from recon import atomic, metrics
+from recon.metrics import Metrics, shown
+from recon.rig import Rig
+from recon.tracking import capture, following, networks
+from recon.tracking.capture import Film
+from recon.tracking.following import Followed
+from recon.tracking.tracker import Tracker, Tracking
+
+WAYS = ("predicted", "segmented", "detected")
+KINDS = 4  # of reasons that are told apart
+
+
+class Config(BaseModel):
+    """Fields of `conf/track.yaml`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rig: Rig
+    capture: Path
+    out: Path
+    calibration: Path | None = None
+    networks: Path | None = None
+    threads: Annotated[int, Field(ge=0, le=1024)] = 0
+    overlays: bool = True
+
+
+def run(config: Config) -> None:
+    """Read, track and write.
+
+    Raises
+    ------
+    InputError
+        If the capture is incomplete or damaged, a network is missing, or `out` can't be written to.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    inputs = [path for path in (config.capture, config.calibration, config.networks) if path is not None]
+    atomic.check_folder(config.out, capture.POSES, inputs=inputs)
+    film = capture.read_film(config.capture, config.calibration)
+    loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
+    tracker = Tracker(film.cameras, config.rig.target, loaded, film.bits)
+    rate = f", {film.rate_hz:.4g} a second" if np.isfinite(film.rate_hz) else ""
+    sizes = " and ".join(dict.fromkeys("x".join(map(str, camera.size)) for camera in film.cameras))
+    console.print(f"read        {len(film.times)} pairs of frames, {sizes}{rate}", markup=False)
+
+    with atomic.new_folder(config.out, capture.POSES) as folder:
+        start = perf_counter()
+        followed = follow(film, tracker, folder if config.overlays else None, console)
+        figures = measure(followed)
+        for line in describe(followed, figures):
+            console.print(line, markup=False)
+        capture.write_poses(folder, film, followed)
+        metrics.write(folder / metrics.FILE, figures | {"seconds_track": round(perf_counter() - start, 3)})
+        capture.hand_on(folder, config.capture, config.out)
+        written = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
+    console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
+
+
+def follow(film: Film, tracker: Tracker, pictures: Path | None, console: Console) -> Followed:
+    """Track a film from its first pair to its last, writing overlays into a folder if one is given."""
+    trackings: list[Tracking] = []
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        pairs = progress.track(film.pairs(), total=len(film.times), description="tracking")
+        for time, (number, _), pair in zip(film.times.tolist(), film.frames.tolist(), pairs, strict=True):
+            found = tracker.step(*pair, time * 1e-9)
+            trackings.append(found)
+            if pictures is not None:
+                capture.write_overlay(pictures, number, capture.overlay(pair, found, film.cameras))
+    return following.gathered(film.times, trackings)
+
+
+def measure(followed: Followed) -> Metrics:
+    """Figures of what was tracked; frames a second are of the tracker alone, in its median frame."""
+    found = [each for each in followed.trackings if each.found]
+    sigma = np.array([capture.sigmas(each) for each in found]).reshape(-1, 2)
+    typical = np.median(sigma, axis=0) if found else np.full(2, np.nan)
+    seconds = float(np.median([sum(each.seconds.values()) for each in followed.trackings]))
+    return {
+        "frames": len(followed.trackings),
+        "frames_found": len(found),
+        **{f"frames_{way}": sum(each.how == way for each in found) for way in WAYS},
+        "sigma_median_mm": float(typical[0]),
+        "sigma_median_deg": float(typical[1]),
+        "frames_per_s": 1 / max(seconds, 1e-9),
+    }
+
+
+def describe(followed: Followed, figures: Metrics) -> list[str]:
+    """How many were found and why not the others, how, how fast and how well."""
+    found, count = figures["frames_found"], figures["frames"]
+    missed = ", ".join(f"{kind} ({number})" for kind, number in kinds(followed.reasons))
+    left = f", {count - found} not: {missed}" if found < count else ""
+    ways = ", ".join(f"{figures[f'frames_{way}']} {way}" for way in WAYS if figures[f"frames_{way}"])
+    return [
+        f"found       {found} of {count} frames{left}",
+        f"speed       {figures['frames_per_s']:.1f} frames a second, in the median{f'; {ways}' if ways else ''}",
+        f"sigma       {shown(figures['sigma_median_mm'], '.3f', ' mm')}, {shown(figures['sigma_median_deg'], '.3f', ' deg')}, "
+        "predicted, median",
+    ]
+
+
+def kinds(reasons: Sequence[str | None]) -> list[tuple[str, int]]:
+    """Reasons without their details, the commonest first, each with how often; the rarest are put together."""
+    counted = Counter(kind(reason) for reason in reasons if reason is not None).most_common()
+    rest = sum(number for _, number in counted[KINDS:])
+    return counted[:KINDS] + ([("others", rest)] if rest else [])
+
+
+def kind(reason: str) -> str:
+    """A reason without its details."""
+    if reason.startswith("camera 1:"):
+        return "no camera sees the target"
+    return re.sub(r"(?<!\w)(?<!camera )\d[\d.]*", "…", re.split(r"[;:]", reason)[0])

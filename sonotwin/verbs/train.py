@@ -1,0 +1,227 @@
+"""Train a network of the tracker: the detector, which finds circles in a view, or the segmenter, which outlines one in a patch.
+
+Reads a data set as of `sonotwin dataset` into memory, 150 kB a sample for a detector and 170 kB for a segmenter. Writes into the
+folder `out`: the network as ONNX for the tracker, its weights as .safetensors and .pt with the published names, metrics.json of
+the validation samples, the curves as log.jsonl and curves.png, and checkpoint.pt, from which the same command goes on if it was
+interrupted. Needs the extra `train`. On one core the networks of ours see some 40 crops or 100 patches a second, and half an hour
+to an hour is enough; the published ones take 10 times as long.
+
+    sonotwin train network=detector data=outputs/dataset out=outputs/detector max_minutes=60
+    sonotwin train network=published_segmenter data=outputs/dataset out=outputs/segmenter steps=20000 threads=1
+    sonotwin train network=detector data=outputs/more init=outputs/detector/detector.safetensors out=outputs/detector2 steps=5000
+"""
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from matplotlib.figure import Figure
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from rich.console import Console
+from rich.progress import Progress
+
+from recon import atomic, metrics
+from recon.errors import InputError
+from recon.metrics import Metrics, shown
+from trainers import export, fit, shards
+from trainers.fit import Fitted, Plan, Precision
+from trainers.networks import Name, is_detector, network
+from trainers.shards import Data
+
+MARKER = "training.json"  # what a run was asked for
+MAY_CHANGE = {"out", "resume", "steps", "max_minutes", "threads", "checkpoint_minutes"}  # when a run goes on
+
+
+class Config(BaseModel):
+    """Fields of `conf/train.yaml`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    network: Name
+    data: Path
+    out: Path
+    steps: Annotated[int, Field(ge=1)] | None = None
+    max_minutes: Annotated[float, Field(gt=0, le=100_000)] | None = None
+    init: Path | None = None
+    resume: bool = True
+    partial: bool = False
+    validation_data: Path | None = None
+    validation: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    batch: Annotated[int, Field(ge=2, le=4096)] | None = None
+    crop_px: Annotated[int, Field(ge=64, le=240, multiple_of=8)] = 160
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = 0.002
+    weight_decay: Annotated[float, Field(ge=0, le=1)] = 0.01
+    precision: Precision = "auto"
+    threads: Annotated[int, Field(ge=1, le=1024)] | None = None
+    checkpoint_minutes: Annotated[float, Field(gt=0)] = 5.0
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _ends(self) -> "Config":
+        if self.steps is None and self.max_minutes is None:
+            raise ValueError("expected steps or max_minutes, found neither")
+        return self
+
+    @property
+    def plan(self) -> Plan:
+        """What the training needs to know."""
+        batch = self.batch or (8 if self.network.startswith("published") else 16)
+        return Plan(
+            self.network,
+            batch,
+            self.crop_px,
+            self.learning_rate,
+            self.weight_decay,
+            self.seed,
+            self.steps,
+            self.max_minutes,
+            self.checkpoint_minutes,
+            precision=self.precision,
+        )
+
+
+def run(config: Config) -> None:
+    """Train, measure and write.
+
+    Raises
+    ------
+    InputError
+        If the data set or the weights to start from are missing, damaged or others, or `out` can't be written to.
+    KeyboardInterrupt
+        If it was stopped; a checkpoint is there then.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    inputs = [path for path in (config.data, config.validation_data, config.init) if path is not None]
+    atomic.check_folder(config.out, MARKER, inputs=inputs)
+    goes_on = check_resumed(config)
+    torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
+    torch.manual_seed(config.seed)
+    module = network(config.network)
+    if config.init is not None:
+        export.load(config.init, module)
+    train, validation = read(config, console)
+    what = "views" if is_detector(config.network) else "patches"
+    console.print(f"read        {len(train)} {what} to train with, {len(validation)} to validate with", markup=False)
+    prepare(config, goes_on)
+    fitted = fitted_with_progress(config, module, train, validation, console)
+    since = f", from step {fitted.resumed_at} on" if fitted.resumed_at else ""
+    weights = sum(value.numel() for value in module.parameters())
+    console.print(
+        f"train       {weights} weights, {fitted.steps} steps of {config.plan.batch}, {fitted.seconds / 60:.1f} min{since}"
+    )
+    with console.status("measuring"):
+        figures = fit.measure(fitted.network, validation)
+    console.print(f"validate    {describe(figures)}", markup=False)
+    with console.status("writing"):
+        names = write(config, fitted, figures)
+    console.print(f"wrote       {config.out}/{{{','.join(names)}}}", markup=False)
+
+
+def check_resumed(config: Config) -> bool:
+    """Whether a run goes on from a checkpoint in `out`; InputError if that one was asked for something else."""
+    marker, checkpoint = config.out / MARKER, config.out / fit.CHECKPOINT
+    if not config.resume or not checkpoint.is_file():
+        return False
+    try:
+        before = json.loads(marker.read_text(encoding="utf-8"))
+        differing = [name for name, value in settings(config).items() if name not in MAY_CHANGE and before[name] != value]
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
+        raise InputError(
+            f"{marker}: expected a training's settings, found other or damaged data; resume=false starts anew"
+        ) from None
+    if differing:
+        name = differing[0]
+        raise InputError(f"{config.out}: expected {name}={before[name]} as its checkpoint has, or resume=false to start anew")
+    return True
+
+
+def settings(config: Config) -> dict:
+    """What was asked for, as JSON has it; folders by their whole paths."""
+    paths = {name: str(path.resolve()) for name in ("data", "out", "init", "validation_data") if (path := getattr(config, name))}
+    return config.model_dump(mode="json") | paths
+
+
+def prepare(config: Config, goes_on: bool) -> None:
+    """Make the folder, without what an earlier run left if this one starts anew."""
+    config.out.mkdir(parents=True, exist_ok=True)
+    atomic.remove_leftovers(config.out / fit.CHECKPOINT)
+    if not goes_on:
+        for name in (fit.CHECKPOINT, fit.LOG, metrics.FILE, "curves.png"):
+            (config.out / name).unlink(missing_ok=True)
+    with atomic.new_file(config.out / MARKER) as temporary:
+        temporary.write_text(json.dumps(settings(config), indent=2) + "\n", encoding="utf-8")
+
+
+def read(config: Config, console: Console) -> tuple[Data, Data]:
+    """What to train and to validate with."""
+    reader = shards.read_views if is_detector(config.network) else shards.read_patches
+    with console.status("reading") as status:
+        data = reader(
+            config.data, lambda count: status.update(f"reading, {count} samples") if count % 100 == 0 else None, config.partial
+        )
+        if config.validation_data is not None:
+            return data, reader(config.validation_data)
+    return shards.split(data, config.validation)
+
+
+def fitted_with_progress(config: Config, module: torch.nn.Module, train: Data, validation: Data, console: Console) -> Fitted:
+    """Train, and show how far it is."""
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as display:
+        task = display.add_task("training", total=1.0)
+
+        def tell(step: int, done: float, loss: float) -> None:
+            display.update(task, completed=done, description=f"training, step {step}, loss {loss:.3f}")
+
+        return fit.fit(module, train, validation, config.plan, config.out, tell)
+
+
+def describe(figures: Metrics) -> str:
+    """One line about what the network is worth."""
+    if "recall" in figures:
+        return (
+            f"{shown(100 * figures['recall'], '.1f', ' %')} of circles found with their identity, "
+            f"{shown(100 * figures['all_three'], '.1f', ' %')} of views with all three, "
+            f"median {shown(figures['place_median_full_px'], '.2f', ' px')} off in full resolution, "
+            f"{shown(figures['false_per_empty_view'], '.2f')} false circles an empty view"
+        )
+    return (
+        f"IoU {shown(figures['iou'], '.3f')}, centres {shown(figures['centre_median_px'], '.2f', ' px')} off, "
+        f"{shown(100 * figures['missed'], '.1f', ' %')} missed, "
+        f"{shown(100 * figures['empty_right'], '.1f', ' %')} of empty ones right"
+    )
+
+
+def write(config: Config, fitted: Fitted, figures: Metrics) -> list[str]:
+    """Write the network, its figures and curves; gives the files' names."""
+    stem = config.network.removeprefix("published_")
+    export.save_onnx(config.out / f"{stem}.onnx", fitted.network, config.network)
+    for suffix in (".safetensors", ".pt"):
+        export.save((config.out / stem).with_suffix(suffix), fitted.network)
+    metrics.write(config.out / metrics.FILE, figures | {"steps": fitted.steps, "seconds_train": round(fitted.seconds, 1)})
+    with atomic.new_file(config.out / "curves.png") as temporary:
+        curves(fit.read_log(config.out)).savefig(temporary, dpi=120)
+    return [f"{stem}{suffix}" for suffix in (".onnx", ".safetensors", ".pt")] + [
+        metrics.FILE,
+        "curves.png",
+        fit.LOG,
+        fit.CHECKPOINT,
+    ]
+
+
+def curves(rows: list[fit.Row]) -> Figure:
+    """Loss, and what validation said on the way, over the steps."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for axes, names in ((left, ("loss",)), (right, ("recall", "all_three", "iou", "empty_right"))):
+        for name in names:
+            points = [(row["step"], row[name]) for row in rows if row.get(name) is not None]
+            if points:
+                axes.plot(*zip(*points, strict=True), label=name, marker="." if axes is right else None)
+        axes.set_xlabel("step")
+        axes.grid(alpha=0.3)
+        if axes.lines:
+            axes.legend()
+    left.set_yscale("log")
+    return figure

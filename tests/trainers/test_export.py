@@ -1,0 +1,74 @@
+"""What is written is the network: other software gets the same answers from the files."""
+# ruff: noqa: E402 - torch is asked for before what needs it
+
+import pytest
+
+torch = pytest.importorskip("torch")
+import onnx
+import onnxruntime
+
+from recon.errors import InputError
+from trainers.export import load, save, save_onnx
+from trainers.networks import network
+
+
+def trained(name, seed=0):
+    """A network whose norms have statistics, as after some steps."""
+    torch.manual_seed(seed)
+    module = network(name).train()
+    with torch.no_grad():
+        for _ in range(3):
+            module(torch.rand(2, 1, 64, 64))
+    return module.eval()
+
+
+@pytest.mark.parametrize("name", ["detector", "segmenter", "published_segmenter"])
+def test_onnx_runtime_agrees_at_any_size(name, tmp_path):
+    module = trained(name)
+    save_onnx(tmp_path / "network.onnx", module, name)
+    session = onnxruntime.InferenceSession(str(tmp_path / "network.onnx"), providers=["CPUExecutionProvider"])
+    assert onnx.load(tmp_path / "network.onnx").opset_import[0].version >= 17
+    outputs = [value.name for value in session.get_outputs()]
+    assert outputs == (["detection", "identity"] if name == "detector" else ["mask"])
+    for n, height, width in ((1, 240, 320), (3, 96, 64)):
+        picture = torch.rand(n, 1, height, width)
+        with torch.no_grad():
+            wanted = module(picture)
+        found = session.run(outputs, {"image" if name == "detector" else "patch": picture.numpy()})
+        for one, other in zip(found, wanted if isinstance(wanted, tuple) else (wanted,), strict=True):
+            assert abs(one - other.numpy()).max() < 1e-4
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+def test_weights_come_back_to_the_bit(suffix, tmp_path):
+    module, other = trained("published_segmenter"), trained("published_segmenter", 1)
+    save(tmp_path / f"weights{suffix}", module)
+    load(tmp_path / f"weights{suffix}", other)
+    assert all(torch.equal(one, two) for one, two in zip(module.state_dict().values(), other.state_dict().values(), strict=True))
+
+
+def test_published_files_of_older_torch_are_read(tmp_path):
+    """Their state dictionaries may lack the norms' counters and have the prefix of a parallel module."""
+    module = trained("published_segmenter")
+    old = {f"module.{name}": value for name, value in module.state_dict().items() if "num_batches" not in name}
+    torch.save(old, tmp_path / "old.pt")
+    other = network("published_segmenter")
+    load(tmp_path / "old.pt", other)
+    assert torch.equal(other.up1.double_conv[0].weight, module.up1.double_conv[0].weight)
+
+
+def test_other_files_are_refused_in_one_line(tmp_path):
+    save(tmp_path / "segmenter.safetensors", trained("segmenter"))
+    (tmp_path / "damaged.pt").write_bytes(b"nothing")
+    (tmp_path / "damaged.safetensors").write_bytes(b"nothing")
+    torch.save([1, 2], tmp_path / "list.pt")
+    for name, message in (
+        ("segmenter.safetensors", "expected weights inc.double_conv.0.weight of shape .16, 1, 3, 3., found none"),
+        ("damaged.pt", "expected a"),
+        ("damaged.safetensors", "expected weights as safetensors, found a damaged file"),
+        ("list.pt", "expected a state dictionary"),
+        ("none.pt", "expected weights, .safetensors or .pt, found none"),
+    ):
+        with pytest.raises(InputError, match=message) as caught:
+            load(tmp_path / name, network("published_segmenter"))
+        assert str(caught.value).startswith(str(tmp_path / name)) and "\n" not in str(caught.value)

@@ -1,0 +1,104 @@
+"""Training goes on where it was, to the bit, and learns."""
+# ruff: noqa: E402 - torch is asked for before what needs it
+
+import os
+import signal
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from trainers import fit
+from trainers.fit import Plan, progress, rate, read_log
+from trainers.networks import Detector, Segmenter
+from trainers.shards import read_patches, read_views, split
+
+
+def plan(name, steps, **changes):
+    return Plan(
+        **{"name": name, "batch": 4, "crop_px": 64, "learning_rate": 2e-3, "weight_decay": 0.01, "seed": 3} | changes,
+        steps=steps,
+        max_minutes=None,
+    )
+
+
+def small(name):
+    torch.manual_seed(0)
+    return Detector(8) if name == "detector" else Segmenter((4, 4, 4))
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+class Interrupted(Exception):
+    """As if the machine had been switched off."""
+
+
+@pytest.mark.parametrize("name", ["detector", "segmenter"])
+def test_an_interrupted_training_ends_with_the_same_weights(name, data_set, tmp_path):
+    """Switched off at step 7, after the checkpoint of step 5; log rows of steps that come again are there once."""
+    data = split((read_views if name == "detector" else read_patches)(data_set), 0.1)
+    paths = [tmp_path / "whole", tmp_path / "parts"]
+    for path in paths:
+        path.mkdir()
+    asked = plan(name, 10, log_steps=2)
+    whole = fit.fit(small(name), *data, asked, paths[0], lambda step, done, loss: None)
+
+    def stop(step, done, loss):
+        if step == 5:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(KeyboardInterrupt):
+        fit.fit(small(name), *data, asked, paths[1], stop)
+
+    def fail(step, done, loss):
+        if step == 7:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        fit.fit(small(name), *data, asked, paths[1], fail)
+    parts = fit.fit(small(name), *data, asked, paths[1], lambda step, done, loss: None)
+    assert (whole.resumed_at, parts.resumed_at, parts.steps) == (0, 5, 10)
+    for one, other in zip(whole.network.state_dict().values(), parts.network.state_dict().values(), strict=True):
+        assert torch.equal(one, other)
+    assert [row["step"] for row in read_log(paths[1])] == [2, 4, 6, 8, 10]
+
+
+def test_the_learning_rate_rises_falls_and_ends(data_set):
+    rates = [rate(k / 1000) for k in range(1001)]
+    assert max(rates) == pytest.approx(1) and rates.index(max(rates)) == 50
+    assert 0 < rates[0] < 0.05 and rates[-1] == pytest.approx(0.01)
+
+
+def test_the_end_comes_with_steps_or_minutes():
+    both = Plan("detector", 4, 64, 1e-3, 0, 0, 100, 2.0)
+    assert progress(both, 50, 0) == 0.5 and progress(both, 50, 90) == 0.75 and progress(both, 0, 500) == 1
+
+
+def test_a_tiny_segmenter_learns_the_drawn_discs(data_set, tmp_path):
+    """In 50 steps from nothing to an outline that is right for most of a disc, and to none where there is none."""
+    train, held = split(read_patches(data_set), 0.2)
+    torch.manual_seed(0)
+    fitted = fit.fit(
+        Segmenter((4, 8, 16)), train, held, plan("segmenter", 50, batch=8, learning_rate=1e-2), tmp_path, lambda *_: None
+    )
+    figures = fit.measure(fitted.network, held)
+    assert figures["iou"] > 0.8
+    assert figures["centre_median_px"] < 4
+
+
+@pytest.mark.slow
+def test_a_small_detector_learns_the_drawn_targets(write, tmp_path):
+    """Some minutes of training find most circles by their names: identity follows from the target's shape alone."""
+    train, held = split(read_views(write(tmp_path / "set", 120)), 0.1)
+    torch.manual_seed(0)
+    asked = plan("detector", 700, batch=16, crop_px=160, learning_rate=4e-3)
+    fitted = fit.fit(Detector(32), train, held, asked, tmp_path, lambda *_: None)
+    figures = fit.measure(fitted.network, held)
+    assert figures["recall"] > 0.6
+    assert figures["identity_accuracy"] > 0.7

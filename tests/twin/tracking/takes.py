@@ -1,0 +1,53 @@
+"""Takes for the tests: a plain, clean target over empty surroundings, in even light."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from recon import rigid
+from recon.rig import Rig
+from twin.tracking.draw import LAMPS, Lighting, Motion, Print, Take, draw
+from twin.tracking.ranges import DataRanges
+
+CONF = Path(__file__).parents[3] / "conf"
+
+
+def rig() -> Rig:
+    return Rig(**yaml.safe_load((CONF / "rig/meza2021.yaml").read_text()))
+
+
+def ranges(**changes) -> DataRanges:
+    settings = yaml.safe_load((CONF / "dataset.yaml").read_text())["ranges"]
+    return DataRanges(**{**settings, "variants": 2, **changes})
+
+
+def facing(tilt_deg: float = 20.0, place=(30.0, -20.0, 650.0), turn_deg: float = 30.0) -> np.ndarray:
+    """`world_from_target` of a target that faces camera 1 but for a tilt about the image's vertical."""
+    towards = rigid.from_rotation_vector([np.pi, 0, 0], place)
+    return (
+        towards
+        @ rigid.from_rotation_vector([0, 0, np.deg2rad(turn_deg)], [0] * 3)
+        @ rigid.from_rotation_vector([0, np.deg2rad(tilt_deg), 0], [0] * 3)
+    )
+
+
+def plain_take(pose: np.ndarray, *, shift_mm=(0, 0, 0), turn_rad=(0, 0, 0), k: int = 0, white_dn: float = 100.0) -> Take:
+    """The rig's own cameras, light from all around alone, a perfect print, and the surroundings far below."""
+    described = rig()
+    drawn = draw(ranges(), described, 0, k)
+    lamps = np.zeros((LAMPS, 5))
+    lamps[:, 3] = 1
+    far = rigid.invert(rigid.from_rotation_vector([np.pi, 0, 0], [0, 0, 3000]))
+    return replace(
+        drawn,
+        cameras=(described.cam1, described.cam2),
+        present=True,
+        motion=Motion(pose, np.array(shift_mm, float), np.array(turn_rad, float)),
+        lighting=Lighting(lamps, 1 / np.pi, np.zeros(3), np.array([0, 1, 0, 12, 0.0])),
+        scene_from_world=far,
+        face=Print(0.03, 0.8, 0.0, 0.0, np.zeros((3, 6)), np.zeros((4, 4))),
+        white_dn=white_dn,
+        gain=1.0,
+    )

@@ -1,0 +1,152 @@
+"""Rays, motion and light against closed forms and independent code."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon import rigid
+from recon.discs import measure
+from recon.ellipses import Ellipses
+from recon.tracking.pose import circle_centres
+from tests.twin.tracking.takes import facing, plain_take, rig
+from twin.tracking.bank import build_bank
+from twin.tracking.frames import white_radiance
+from twin.tracking.transport import NO_CIRCLE, Lanes, render
+from twin.tracking.truth import view_truth
+
+RIG = rig()
+MOST = 64  # sample points in a set; another number would be compiled anew
+
+
+@pytest.fixture(scope="module")
+def bank():
+    return build_bank(RIG.target, 2, 3)
+
+
+def window(truth, circle: int, margin: int = 14) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels about a circle : u, v of a square, and its first pixel."""
+    half = int(np.ceil(truth.ellipses[circle, 2] + truth.blur_px[circle])) + margin
+    first = np.rint(truth.centres[circle]).astype(int) - half
+    v, u = np.mgrid[: 2 * half + 1, : 2 * half + 1]
+    return u + first[0], v + first[1], first
+
+
+def light_of(bank, take, camera: int, u, v, samples: int = 64, circle: int = NO_CIRCLE):
+    n = u.size
+    one = np.ones(n, np.uint32)
+    lanes = Lanes(0 * one, camera * one, np.float32(u.ravel()), np.float32(v.ravel()), samples * one,
+                  np.arange(n, dtype=np.uint32), 0 * one, circle * one)  # fmt: skip
+    return render(bank, RIG, [take], lanes, MOST, seed=1)
+
+
+def unhidden(bank, camera: int = 0, **motion):
+    """A take with a body whose discs nothing covers in a view."""
+    for body in (0, 1):
+        take = replace(plain_take(facing(), **motion), body=body)
+        truth = view_truth(take, take.cameras[camera], RIG.target)
+        shown = []
+        for circle in range(3):
+            u, v, _ = window(truth, circle)
+            light = light_of(bank, take, camera, u, v, 4, circle)
+            shown.append(light.seen.sum() / light.disc.sum())
+        if min(shown) > 0.999:
+            return take, truth
+    pytest.skip("both bodies cover a disc")
+
+
+@pytest.mark.parametrize("camera", [0, 1])
+@pytest.mark.parametrize("path_px", [0.0, 12.0])
+def test_discs_lie_where_they_are_projected(bank, camera, path_px):
+    """The rim, found in the light itself, is the true ellipse to 0.01 px: rays, distortion, motion and print agree with recon."""
+    shift = np.array([0.8, 0.6, 0]) * path_px * 650 / 3320
+    take, truth = unhidden(bank, camera, shift_mm=shift)
+    for circle in (1, 2):
+        u, v, first = window(truth, circle)
+        light = light_of(bank, take, camera, u, v)
+        image = light.radiance.reshape(u.shape) / light.radiance.max() * 200
+        row = truth.ellipses[circle]
+        turn = np.array([[np.cos(row[4]), -np.sin(row[4])], [np.sin(row[4]), np.cos(row[4])]])
+        rough = Ellipses((row[:2] - first)[None], (turn @ np.diag(row[2:4]) @ turn.T)[None])
+        found = measure(image, rough, np.array([10.0])).fit.ellipses
+        assert np.abs(found.centre[0] + first - row[:2]).max() < (0.01 if path_px == 0 else 0.05)
+        assert found.semi_axes[0] == pytest.approx(row[2:4], abs=0.05 if path_px == 0 else 1.5)
+
+
+def test_rays_undo_the_lens_as_recon_does(bank):
+    """A grid of targets' centres seen through strong distortion: the light's middle stays where `Camera.project` puts it."""
+    take = plain_take(facing(0, (60, 45, 600)))
+    strong = take.cameras[0].optics.model_copy(update={"distortion": (-0.3, 0.2, 0.001, -0.002, 0.1)})
+    take = replace(take, cameras=(take.cameras[0].model_copy(update={"optics": strong}), take.cameras[1]))
+    truth = view_truth(take, take.cameras[0], RIG.target)
+    for circle in range(3):
+        u, v, _ = window(truth, circle, 4)
+        aimed = light_of(bank, take, 0, u, v, 16, circle).disc
+        middle = np.array([(aimed * u.ravel()).sum(), (aimed * v.ravel()).sum()]) / aimed.sum()
+        assert np.abs(middle - truth.ellipses[circle, :2]).max() < 0.02
+
+
+def test_a_moved_target_is_the_mean_of_still_ones(bank):
+    """Blur is what a camera adds up: the moving frame equals the mean of still frames along the way."""
+    shift, turn = np.array([3.0, 1.0, 2.0]), np.array([0.02, -0.01, 0.05])
+    moving = replace(plain_take(facing(), shift_mm=shift, turn_rad=turn), body=0)
+    truth = view_truth(moving, moving.cameras[0], RIG.target)
+    u, v, _ = window(truth, 1)
+    blurred = light_of(bank, moving, 0, u, v, 64).radiance
+    times = (np.arange(10) + 0.5) / 10 - 0.5
+    still = np.mean([
+        light_of(bank, replace(plain_take(moving.motion.at(time)), body=0), 0, u, v, 16).radiance for time in times
+    ], axis=0)  # fmt: skip
+    contrast = still.max() - still.min()
+    assert np.sqrt(np.mean((blurred - still) ** 2)) < 0.03 * contrast
+    sharp = light_of(bank, replace(plain_take(facing()), body=0), 0, u, v, 16).radiance
+    assert np.sqrt(np.mean((sharp - still) ** 2)) > 0.1 * contrast  # the test can tell
+
+
+def test_white_shines_as_the_closed_form_says(bank):
+    """One lamp, no light from around: paper * I cos / (pi d^2)."""
+    take = plain_take(facing(10))
+    pose = take.motion.world_from_target
+    lamps = np.zeros((4, 5))
+    lamps[:, 3] = 0.01
+    lamps[0, :3] = pose[:3, 3] + pose[:3, :3] @ [200, 300, 900]
+    lamps[0, 4] = 900.0**2
+    take = replace(take, lighting=replace(take.lighting, lamps=lamps, ambient=0.0))
+    truth = view_truth(take, take.cameras[0], RIG.target)
+    u, v, _ = window(truth, 0, 10)
+    light = light_of(bank, take, 0, u, v, 16)
+    shadowless = light.white_radiance[light.white > 0] / light.white[light.white > 0]
+    shadowless = shadowless[shadowless > 0]
+    assert np.median(shadowless) == pytest.approx(
+        white_radiance(take, RIG.cam1, RIG), rel=0.06
+    )  # 13 mm off the middle; vignetting
+
+
+def test_projected_fringes_stand_where_the_projector_puts_them(bank):
+    """Along the target's face the light follows the projector's columns."""
+    take = plain_take(facing(5))
+    fringes = np.array([650.0**2 * 5, 0.5, 0.5, 40.0, 0.0])
+    take = replace(take, lighting=replace(take.lighting, ambient=1e-9, projector=fringes))
+    truth = view_truth(take, take.cameras[0], RIG.target)
+    line = truth.centres[0] + np.linspace(-60, 60, 200)[:, None] * [0.7, 0.7]
+    u, v = np.rint(line).T
+    light = light_of(bank, take, 0, u, v, 64)
+    pose, camera = take.motion.world_from_target, RIG.cam1.optics.camera()
+    rays = camera.rays(np.column_stack([u, v]))
+    distance = ((pose[:3, 3] - camera.centre) @ pose[:3, 2]) / (rays @ pose[:3, 2])
+    columns = RIG.projector.optics.camera().project(camera.centre + rays * distance[:, None])[:, 0]
+    distortion_px = 3.0  # the data sets' projector is a pinhole
+    expected = 0.5 + 0.5 * np.cos(2 * np.pi * columns / 40)
+    lit = light.white > 32
+    assert lit.sum() > 30
+    assert np.corrcoef(light.radiance[lit], expected[lit])[0, 1] > np.cos(2 * np.pi * distortion_px / 40) - 0.05
+
+
+def test_a_face_turned_away_shows_no_circle(bank):
+    away = facing() @ rigid.from_rotation_vector([np.pi, 0, 0], [0, 0, 0])
+    take = plain_take(away)
+    camera = take.cameras[0].optics.camera()
+    middle = camera.project(rigid.apply(away, circle_centres(RIG.target)))[0]
+    v, u = np.mgrid[-30:30, -30:30] + np.rint(middle[::-1]).astype(int)[:, None, None]
+    light = light_of(bank, take, 0, u, v, 4, 0)
+    assert light.disc.sum() == light.seen.sum() == light.white.sum() == 0

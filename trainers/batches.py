@@ -1,0 +1,99 @@
+"""Batches to train with: views or patches changed at random, and what networks should answer. Batch k is that of (seed, k)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Generator, Tensor
+
+from trainers.augment import WHITE, moved, occlude, photograph, turns, uniform, warp
+from trainers.labels import HIDDEN, SEEN, Labels, label_offset, labels, seen_in_view
+from trainers.shards import PATCH, Patches, Views
+
+TARGET_IN_CROP = 0.85  # of crops from views with a target are about it; the others are of anywhere
+COVERED = (HIDDEN + SEEN) / 2  # visible fraction of a circle whose centre something was put before: neither answer is wrong
+SCALES, DISC_SCALES = (0.5, 1.6), (0.6, 1.5)  # least and most, of views and of patches
+COARSEST, COARSEST_DISC = 0.45, 0.22  # a picture 300 px wide may have been made larger, to full resolution
+SHIFT = 12.0  # px, most, of a disc from the middle of its patch: the detector's error, and the rounding
+
+
+@dataclass(frozen=True)
+class Crops:
+    """A batch for a detector."""
+
+    images: Tensor  # (n, 1, h, w) grey/255
+    labels: Labels
+    places: Tensor  # (n, 3, 2) coarse places of the circles, px, not rounded; NaN without a target
+
+
+@dataclass(frozen=True)
+class Discs:
+    """A batch for a segmenter."""
+
+    images: Tensor  # (n, 1, 120, 120) grey/255
+    masks: Tensor  # (n, 1, 120, 120) from 0 to 1
+    weights: Tensor  # (n, 1, 120, 120) 0 where the patch shows nothing
+
+
+def generator_of(seed: int, step: int) -> Generator:
+    """The random numbers of one step."""
+    state = np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0]
+    return Generator().manual_seed(int(state >> np.uint64(1)))
+
+
+def crops(views: Views, size: int, edge: int, generator: Generator) -> Crops:
+    """Crops of `edge` px of `size` random views, turned, scaled and photographed anew."""
+    which = torch.randint(len(views), (size,), generator=generator).numpy()
+    images = views.images[which]
+    scale = torch.from_numpy(views.scale[which]).float()
+    centres = seen_in_view(torch.from_numpy(views.centres[which]).float(), scale)
+    visible, white = torch.from_numpy(views.visible[which]).float(), torch.from_numpy(views.white[which]).float()
+    height, width = images.shape[1:]
+    linear = turns(size, SCALES, generator)
+    anywhere = torch.rand(size, 2, generator=generator) * torch.tensor([width - 1.0, height - 1.0])
+    about = (torch.rand(size, generator=generator) < TARGET_IN_CROP) & (visible >= SEEN).any(1)
+    source = torch.where(about[:, None], torch.nan_to_num(centres.mean(1)), anywhere)
+    goal = edge * uniform(0.15, 0.85, (size, 2), generator)
+    images = warp(images, linear, source, goal, (edge, edge), _fill(images, generator))
+    places = moved(centres, linear, source, goal)
+    images, covered = occlude(images, 2, generator)
+    visible = torch.where(_at(covered, places), visible.clamp(max=COVERED), visible)
+    places = places + label_offset(scale)[:, None]
+    images = photograph(images, white, COARSEST, generator) / WHITE
+    return Crops(images, labels(places, visible, (edge, edge)), places)
+
+
+def discs(patches: Patches, size: int, generator: Generator) -> Discs:
+    """`size` random patches with their masks, shifted, turned, scaled and photographed anew."""
+    which = torch.randint(len(patches), (size,), generator=generator).numpy()
+    linear = turns(size, DISC_SCALES, generator)
+    drawn = torch.from_numpy(patches.ellipses[which][:, :2]).float()
+    middle = torch.full((size, 2), (PATCH - 1) / 2)
+    near = ((drawn - middle).abs() < 2 * SHIFT).all(1)  # false without a disc
+    source = torch.where(near[:, None], drawn, middle)
+    goal = middle + SHIFT * uniform(-1.0, 1.0, (size, 2), generator)
+    change = (linear, source, goal, (PATCH, PATCH))
+    images = warp(patches.images[which], *change, _fill(patches.images[which], generator))
+    masks = warp(patches.masks[which], *change, torch.zeros(size)) / 255
+    known = (warp(np.full((size, PATCH, PATCH), 255, np.uint8), *change, torch.zeros(size)) > 254).float()
+    images, _ = occlude(images, 1, generator)
+    white = torch.from_numpy(patches.white[which]).float()
+    guessed = torch.isfinite(drawn[:, 0]) & (torch.from_numpy(patches.visible[which]) < SEEN)  # no detector leads there
+    known = known * ~guessed[:, None, None, None]
+    return Discs(photograph(images, white, COARSEST_DISC, generator) / WHITE, masks, known)
+
+
+def _fill(images: NDArray[np.uint8], generator: Generator) -> Tensor:
+    """A grey (n,) for what lies beyond images (n, h, w), mostly a dark one."""
+    return torch.from_numpy(images.max((1, 2))) * torch.rand(len(images), generator=generator) ** 2
+
+
+def _at(masks: Tensor, places: Tensor) -> Tensor:
+    """What masks (n, 1, h, w) say at places (n, k, 2), px; no outside."""
+    height, width = masks.shape[-2:]
+    nearest = torch.nan_to_num(places, nan=-1.0).round().long()
+    u, v = nearest[..., 0], nearest[..., 1]
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    rows = torch.arange(len(masks))[:, None]
+    return masks[rows, 0, v.clamp(0, height - 1), u.clamp(0, width - 1)] & inside

@@ -1,0 +1,240 @@
+"""The loop that trains a network: resumable at any step, since what a step sees depends on the seed and its number alone."""
+
+import json
+import math
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor, nn
+
+from recon import atomic
+from recon.errors import InputError
+from trainers.batches import crops, discs, generator_of
+from trainers.export import read_state
+from trainers.labels import Labels, detector_loss, segmenter_loss
+from trainers.metrics import measure_detector, measure_segmenter
+from trainers.networks import Name
+from trainers.shards import Data, Patches, Views, chosen
+
+CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
+WARM_UP = 0.05  # of the training, over which the learning rate rises
+LAST_RATE = 0.01  # of the highest learning rate, at the end
+CLIP = 5.0  # most of the gradient's norm
+AVERAGE = 0.998  # of the averaged weights that stays in a step, once there were enough steps
+
+Precision = Literal["auto", "32-true", "bf16-mixed"]
+Row = dict[str, float | int]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to train. The end comes with `steps` or `max_minutes`, whichever is first."""
+
+    name: Name
+    batch: int
+    crop_px: int  # of a detector's crops
+    learning_rate: float  # the highest
+    weight_decay: float
+    seed: int
+    steps: int | None
+    max_minutes: float | None
+    checkpoint_minutes: float = 5.0
+    log_steps: int = 50
+    validate_at_most: int = 200  # views or patches at each checkpoint; at the end it is all
+    precision: Precision = "auto"
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A trained network: its averaged weights, which are better than the last ones."""
+
+    network: nn.Module
+    steps: int
+    seconds: float
+    resumed_at: int
+
+
+Tell = Callable[[int, float, float], None]  # step, share of the training that is done, loss
+
+
+def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Path, tell: Tell) -> Fitted:
+    """Train, or go on where `folder` has a checkpoint.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        On SIGTERM or Ctrl+C, once the checkpoint is written.
+    """
+    fabric = Fabric(accelerator="auto", devices=1, precision=precision_of(plan.precision))
+    plain = start.to(memory_format=torch.channels_last)  # pyrefly: ignore[no-matching-overload]
+    optimizer = torch.optim.AdamW(_groups(plain, plan.weight_decay), lr=plan.learning_rate)
+    average = deepcopy(plain).requires_grad_(False)
+    step, before = _resume(folder / CHECKPOINT, plain, average, optimizer)
+    resumed_at = step
+    _forget_later(folder / LOG, step)
+    module, optimizer = fabric.setup(plain, optimizer)
+    average = average.to(fabric.device)
+    began = written = perf_counter()
+    losses: list[float] = []
+    shown = chosen(validation, np.unique(np.linspace(0, len(validation) - 1, plan.validate_at_most).round().astype(int)))
+
+    def save() -> None:
+        state = {"network": plain.state_dict(), "average": average.state_dict(), "optimizer": optimizer.state_dict()}
+        _write(folder / CHECKPOINT, state | {"step": step, "seconds": seconds})
+
+    with _stops() as stopped:
+        seconds = before
+        while (done := progress(plan, step, seconds)) < 1:
+            for group in optimizer.param_groups:
+                group["lr"] = plan.learning_rate * rate(done)
+            module.train()
+            loss = _loss(module, fabric, train, plan, step)
+            optimizer.zero_grad(set_to_none=True)
+            fabric.backward(loss)
+            fabric.clip_gradients(module, optimizer, max_norm=CLIP, error_if_nonfinite=False)
+            optimizer.step()
+            _blend(average, plain, min(AVERAGE, (1 + step) / (10 + step)))
+            step += 1
+            seconds = before + perf_counter() - began
+            losses.append(float(loss.detach()))
+            if not math.isfinite(losses[-1]):
+                raise InputError(f"learning_rate: expected one that training survives, found {plan.learning_rate:g}: step {step}")
+            tell(step, progress(plan, step, seconds), losses[-1])
+            if step % plan.log_steps == 0:
+                row = {"step": step, "seconds": round(seconds, 2), "loss": float(np.mean(losses)), "rate": rate(done)}
+                _append(folder / LOG, row)
+                losses.clear()
+            if stopped.is_set():
+                save()
+                raise KeyboardInterrupt
+            if perf_counter() - written > 60 * plan.checkpoint_minutes:
+                save()
+                looked = perf_counter()
+                _append(folder / LOG, {"step": step, "seconds": round(seconds, 2)} | measure(average, shown))
+                written = perf_counter()
+                began += written - looked  # looking is no training
+    save()
+    return Fitted(average.cpu(), step, seconds, resumed_at)
+
+
+def measure(module: nn.Module, data: Data) -> dict[str, float | int]:
+    """Figures of a network, as of `trainers.metrics`, in 32 bits."""
+    looked_at = deepcopy(module).cpu().float()
+    return measure_detector(looked_at, data) if isinstance(data, Views) else measure_segmenter(looked_at, data)
+
+
+def progress(plan: Plan, step: int, seconds: float) -> float:
+    """Share of the training that is done, 0 to 1."""
+    by_steps = step / plan.steps if plan.steps else 0.0
+    return min(max(by_steps, seconds / (60 * plan.max_minutes) if plan.max_minutes else 0.0), 1.0)
+
+
+def rate(done: float) -> float:
+    """Learning rate relative to the highest: up evenly, then down along a cosine."""
+    if done < WARM_UP:
+        return (done + 0.02 * WARM_UP) / (1.02 * WARM_UP)
+    return LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * (done - WARM_UP) / (1 - WARM_UP)))
+
+
+def precision_of(wanted: Precision) -> Literal["32-true", "bf16-mixed"]:
+    """16 bits where the machine reckons with them, else 32: without the instructions they are slower."""
+    if wanted != "auto":
+        return wanted
+    if torch.cuda.is_available():
+        return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
+    path = Path("/proc/cpuinfo")
+    flags = path.read_text(encoding="utf-8") if path.is_file() else ""
+    return "bf16-mixed" if "avx512_bf16" in flags or "amx_bf16" in flags else "32-true"
+
+
+def read_log(folder: Path) -> list[Row]:
+    """Rows of the log so far."""
+    path = folder / LOG
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.is_file() else []
+
+
+def _loss(module: nn.Module, fabric: Fabric, train: Data, plan: Plan, step: int) -> Tensor:
+    generator = generator_of(plan.seed, step)
+    if isinstance(train, Patches):
+        some = discs(train, plan.batch, generator)
+        images, masks, weights = fabric.to_device((some.images, some.masks, some.weights))
+        return segmenter_loss(module(images.contiguous(memory_format=torch.channels_last)).float(), masks, weights)
+    batch = crops(train, plan.batch, plan.crop_px, generator)
+    images, pixel, kind = fabric.to_device((batch.images, batch.labels.pixel, batch.labels.identity))
+    detection, identity = module(images.contiguous(memory_format=torch.channels_last))
+    return detector_loss(detection.float(), identity.float(), Labels(pixel, kind))
+
+
+def _groups(module: nn.Module, decay: float) -> list[dict]:
+    """Parameters with and without decay: biases and norms have none."""
+    matrices = [value for value in module.parameters() if value.ndim > 1]
+    others = [value for value in module.parameters() if value.ndim <= 1]
+    return [{"params": matrices, "weight_decay": decay}, {"params": others, "weight_decay": 0.0}]
+
+
+@torch.no_grad()
+def _blend(average: nn.Module, module: nn.Module, stays: float) -> None:
+    for old, new in zip(average.state_dict().values(), module.state_dict().values(), strict=True):
+        if old.is_floating_point():
+            old.lerp_(new, 1 - stays)
+        else:
+            old.copy_(new)
+
+
+def _resume(path: Path, module: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer) -> tuple[int, float]:
+    """Step and seconds of the checkpoint, whose state is put in place; 0 without one."""
+    if not path.is_file():
+        return 0, 0.0
+    state = read_state(path)
+    try:
+        module.load_state_dict(state["network"])
+        average.load_state_dict(state["average"])
+        optimizer.load_state_dict(state["optimizer"])
+        return int(state["step"]), float(state["seconds"])
+    except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected a checkpoint of this network, found another: {str(error).splitlines()[0]}") from None
+
+
+def _write(path: Path, state: Mapping) -> None:
+    with atomic.new_file(path) as temporary:
+        torch.save(dict(state), temporary)
+
+
+def _append(path: Path, row: Mapping[str, float | int]) -> None:
+    finite = {name: value if math.isfinite(value) else None for name, value in row.items()}
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(finite) + "\n")
+
+
+def _forget_later(path: Path, step: int) -> None:
+    """Drop rows of steps after the checkpoint: they come again."""
+    if path.is_file():
+        kept = [line for line in path.read_text(encoding="utf-8").splitlines() if json.loads(line)["step"] <= step]
+        with atomic.new_file(path) as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
+
+@contextmanager
+def _stops() -> Iterator[threading.Event]:
+    """An event that SIGTERM and Ctrl+C set, so that a step and the checkpoint after it come to their end."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
+        yield event
+        return
+    kinds = (signal.SIGTERM, signal.SIGINT)
+    before = {kind: signal.signal(kind, lambda number, frame: event.set()) for kind in kinds}
+    try:
+        yield event
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
