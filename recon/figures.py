@@ -191,6 +191,19 @@ def slope(x: NDArray, y: NDArray, steepness: float, labels: tuple[str, str], nam
     return _inline_svg(figure)
 
 
+def course(values: NDArray, bounds: NDArray, labels: tuple[str, str], names: tuple[str, str]) -> str:
+    """Values : (n,) in their order and the bounds : (n,) they are held against; shaded where NaN. Labels and names as `slope`."""
+    figure, axes = _drawing(5.2, 3.1)
+    axes.plot(bounds, color=LINE, linewidth=1.3, drawstyle="steps-mid", label=names[1])
+    axes.plot(values, "o", color=BARS, markersize=3.6, label=names[0])
+    for k in np.flatnonzero(np.isnan(values)):
+        axes.axvspan(k - 0.5, k + 0.5, color=BARS, alpha=0.18, linewidth=0)
+    axes.set(xlabel=labels[0], ylabel=labels[1], xlim=(-0.5, len(values) - 0.5), ylim=(0, 1.2 * axes.get_ylim()[1]))
+    axes.legend(frameon=False, labelcolor=TEXT, fontsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+    return _inline_svg(figure)
+
+
 def outlines(shapes: NDArray, marks: Mapping[str, NDArray], labels: tuple[str, str]) -> str:
     """Outlines : (p, c, 2) mm and named marks : (2,) mm in one plane with equal scales, y down, as an SVG drawing."""
     everything = np.concatenate([np.reshape(shapes, (-1, 2)), *(np.reshape(mark, (1, 2)) for mark in marks.values())])

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from sonotwin.demo_config import BOARD_PATTERNS, CALIBRATION, ONE_SCANNER, WATER_C, Config
-from sonotwin.verbs import calibrate_optics, calibrate_probe, render, sweep
+from sonotwin.verbs import calibrate_optics, calibrate_probe, film, render, sweep, track
 
 
 def commands(folder: Path, config: Config, overrides: Sequence[str], lag_s: float) -> list[str]:
@@ -36,6 +36,7 @@ def commands(folder: Path, config: Config, overrides: Sequence[str], lag_s: floa
             f"out={folder / 'evaluation'}",
         ],
         *(sweep_commands(folder, config, given, lag_s) if config.looks_inside else []),
+        *(film_commands(folder, config, given) if config.film_frames else []),
     )
     return [shlex.join(["sonotwin", *line]) for line in lines]
 
@@ -70,6 +71,16 @@ def sweep_commands(folder: Path, config: Config, given: Sequence[str], lag_s: fl
             f"surface={folder / 'surface' / 'surface.ply'}",
             f"out={folder / 'tumours'}",
         ],
+    ]
+
+
+def film_commands(folder: Path, config: Config, given: Sequence[str]) -> list[list[str]]:
+    """The same for the steps of the tracker, as words."""
+    filmed = _of(given, film.Config, without=("path", "quality"))
+    of_rig = [override for override in _of(given, track.Config) if override.startswith("rig")]
+    return [
+        ["film", *filmed, f"frames={config.film_frames}", f"out={folder / 'film'}"],
+        ["track", *of_rig, f"capture={folder / 'film' / 'capture'}", f"out={folder / 'track'}"],
     ]
 
 

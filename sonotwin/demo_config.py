@@ -11,7 +11,7 @@ from recon.rig import Positive
 from recon.water import Speed
 from scenes.acoustics import MADE_OF
 from sonotwin.config import folder as conf
-from sonotwin.verbs import render, sweep
+from sonotwin.verbs import film, render, sweep
 from twin import session
 from twin.ultrasound.session import AnyPath
 from twin.ultrasound.sweep import Clocks, PoseNoise
@@ -40,6 +40,7 @@ class Config(render.Config):
     wires: Annotated[int, Field(ge=1, le=1000)] = 40
     bottom_s: Positive = 6.0
     tissue_m_s: Speed = 1450.0
+    film_frames: Annotated[int, Field(ge=0, le=10_000)] = 24
     _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
 
     @model_validator(mode="after")
@@ -66,6 +67,13 @@ class Config(render.Config):
         """What `sonotwin sweep` is to do, with some fields changed."""
         fields = {name: getattr(self, name) for name in sweep.Config.model_fields}
         return sweep.Config.model_validate(fields | changes | {"out": out})
+
+    def filming(self, out: Path) -> film.Config:
+        """What `sonotwin film` is to do."""
+        settings = yaml.safe_load((conf() / "film.yaml").read_text(encoding="utf-8"))
+        del settings["defaults"]
+        given = {"rig": self.rig, "seed": self.seed, "frames": self.film_frames, "out": out}
+        return film.Config.model_validate(settings | given)
 
     def in_water(self) -> Transducer:
         """The same scanner, set for a tank."""

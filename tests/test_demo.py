@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from recon.errors import InputError
+from recon.tracking import networks
 from sonotwin.cli import main
 from sonotwin.config import compose, load
-from sonotwin.verbs.demo import Config, commands, looked_inside
+from sonotwin.verbs.demo import Config, commands, followed, looked_inside
 from twin import demo
 from twin.demo import Step
 
@@ -24,6 +25,7 @@ SMALL = (  # camera 1 at half its size: fringes of ten pixels a period
     "engine.samples=4",
     "scene.edge_mm=1.5",
     "poses.count=4",
+    "film_frames=0",  # a camera of half the size shows the tracker half a target
 )
 COARSE = [  # B-scans of half the lines and two thirds of the rows
     f"{part}.{field}"
@@ -65,7 +67,7 @@ def test_a_small_demonstration_runs_through(tmp_path, capsys):
 def test_a_small_demonstration_looks_inside(tmp_path, capsys):
     """The tumour that is swept over is found where it is; the two others are told to be missing."""
     out = tmp_path / "demo"
-    assert main(["demo", *SMALL[:-1], *SWEPT, "poses=none", f"out={out}"]) == 0
+    assert main(["demo", *SMALL[:-2], *SMALL[-1:], *SWEPT, "poses=none", f"out={out}"]) == 0
     made = (
         "report.html",
         "probe/probe.yaml",
@@ -99,6 +101,8 @@ def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path):
     assert metrics["z_std"] == pytest.approx(1, abs=0.1)
     assert metrics["seconds_demo"] < 300
     assert metrics["tumours_found"] == 3 and metrics["tumours_false"] == 0
+    assert metrics["track_visible_found"] == metrics["track_visible"] > 12 and metrics["track_false"] == 0
+    assert metrics["track_shift_median_mm"] < 0.1 and metrics["track_within_bound"] > 0.8
     for k in range(3):
         assert metrics[f"tumour{k}_centre_error_mm"] < 1 and metrics[f"tumour{k}_inside"] == 1
     assert (out / "report.html").stat().st_size < 12e6
@@ -176,7 +180,7 @@ def test_the_report_repeats_the_settings_that_were_given(tmp_path):
     overrides = ["scene=sphere", "out=elsewhere", "poses=paper"]
     config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
     lines = commands(tmp_path / "a b", config, overrides, 0.0)
-    verbs = ["demo", "render", "calibrate-optics", "render", "surface", "evaluate"]
+    verbs = ["demo", "render", "calibrate-optics", "render", "surface", "evaluate", "film", "track"]
     assert [re.split(r"\s", line)[1] for line in lines] == verbs
     assert "scene=sphere" in lines[0] and "scene=sphere" in lines[3] and "elsewhere" not in "".join(lines)
     assert "scene=board" in lines[1] and "poses=paper" in lines[1] and "poses=paper" not in lines[3]
@@ -184,7 +188,8 @@ def test_the_report_repeats_the_settings_that_were_given(tmp_path):
 
 
 def test_without_poses_nothing_is_calibrated(tmp_path):
-    config = Config.model_validate(compose("demo", ["poses=none", "path=none"]), context={"overrides": []})
+    fields = ["poses=none", "path=none", "film_frames=0"]
+    config = Config.model_validate(compose("demo", fields), context={"overrides": []})
     assert config.poses is None
     lines = commands(tmp_path, config, [], 0.0)
     assert [re.split(r"\s", line)[1] for line in lines] == ["demo", "render", "surface", "evaluate"]
@@ -197,12 +202,13 @@ def test_the_commands_of_the_sweep_are_those_of_the_verbs(tmp_path):
     lines = [shlex.split(line)[1:] for line in commands(tmp_path, config, overrides, 0.0503)]
     verbs = [line[0] for line in lines]
     inside = ["sweep", "calibrate-probe", "sweep", "measure-lag", "sweep", "freehand", "segment"]
-    assert verbs == ["demo", "render", "surface", "evaluate", *inside]
+    assert verbs == ["demo", "render", "surface", "evaluate", *inside, "film", "track"]
     for verb, *fields in lines:
         module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
         assert load(verb, fields, module.Config), verb
-    assert all("tissue_m_s=1450" in line for line in lines[-2:]), "volume and masses at one speed"
-    assert "lag_s=0.0503" in lines[-1] and "path=raster" in lines[8] and "clocks.lag_s=0.08" in lines[8]
+    assert all("tissue_m_s=1450" in line for line in lines[-4:-2]), "volume and masses at one speed"
+    assert "frames=24" in lines[-2] and f"capture={tmp_path}/film/capture" in lines[-1]
+    assert "lag_s=0.0503" in lines[-3] and "path=raster" in lines[8] and "clocks.lag_s=0.08" in lines[8]
 
 
 @pytest.mark.parametrize(("overrides", "inside"), [([], True), (["path=none"], False), (["scene=sphere"], False)])
@@ -220,6 +226,21 @@ def test_what_is_left_out_is_said():
     (line,) = looked_inside(sphere, {})
     assert line.startswith("left out") and "sphere" in line
     assert looked_inside(none, {}) == []
+
+
+def test_missing_networks_are_told_before_any_work(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(networks.load, "__defaults__", (tmp_path, 0))
+    assert main(["demo", f"out={tmp_path / 'demo'}"]) == 2
+    assert "detector.onnx: expected a network, found no file" in capsys.readouterr().err
+    assert not (tmp_path / "demo").exists()
+
+
+def test_how_the_target_was_tracked_is_said():
+    found = {"found": 17, "frames": 24, "visible": 15, "visible_found": 14}
+    errors = {"shift_median_mm": 0.03, "shift_p95_mm": 0.08, "turn_median_deg": 0.15, "turn_p95_deg": 0.3}
+    (line,) = followed({f"track_{name}": value for name, value in (found | errors).items()})
+    assert line.startswith("tracked     the target in 17 of 24 frames, in 14 of 15 that show it whole; off by 0.030 mm and 0.150")
+    assert followed({}) == []
 
 
 def test_two_scanners_are_refused_before_any_work(tmp_path, capsys):

@@ -16,9 +16,10 @@ from recon.figures import CYCLIC, DIVERGING, SEQUENTIAL, Scale
 from recon.metrics import Metrics, shown
 from recon.page import Opening, Section
 from recon.patterns import CentreLine, Fringes, GrayCode, Uniform
-from twin import evaluate, sweep_report
+from twin import evaluate, sweep_report, track_report
 from twin.evaluate import GROSS_MM, Comparison, Truth
 from twin.sweep_report import Inside
+from twin.track_report import Tracked
 from twin.ultrasound.session import SUPPORTS
 
 ERROR_MM = 0.1  # colours of errors span plus and minus this
@@ -71,6 +72,7 @@ def write(
     outputs: Sequence[tuple[str, str]],
     commands: Sequence[str],
     inside: Inside | None = None,
+    tracked: Tracked | None = None,
 ) -> None:
     """Write the report, one HTML file of about 8 MB that needs no other.
 
@@ -84,6 +86,8 @@ def write(
         That make the same again.
     inside : Inside, optional
         What ultrasound adds.
+    tracked : Tracked, optional
+        What tracking adds.
     """
     scanned, probe = [], []
     if inside is not None:
@@ -96,6 +100,7 @@ def write(
         images(measurement),
         decoding(measurement),
         *probe,
+        *([track_report.section(tracked, metrics)] if tracked is not None else []),
         beside_the_paper(metrics),
         settings(measurement, metrics),
         Section("Files, and how to make them again", [page.table(("file", "what is in it"), outputs), page.commands(commands)]),
@@ -120,6 +125,7 @@ def opening(measurement: Measurement, metrics: Metrics) -> Opening:
     result = (
         f"From {measurement.shots.patterns.count} images, {page.count(metrics['points'])} points of the surface were measured to "
         f"{here:.3f} mm RMS of the true one ({things}){factor}.{sweep_report.result(metrics)}"
+        f"{track_report.result(metrics)}"
     )
     both = "tumours_true" in metrics
     return Opening(

@@ -20,9 +20,10 @@ from recon.errors import InputError
 from recon.rig import Rig
 from sonotwin.config import folder
 from twin.accuracy import rows
+from twin.tracking.ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
-Group = Literal["optics", "surface", "calibration", "ultrasound"]
+Group = Literal["optics", "surface", "calibration", "ultrasound", "tracking"]
 
 
 class Config(BaseModel):
@@ -76,4 +77,5 @@ def setup_of(rig: Rig, real: Path | None = None) -> rows.Setup:
         path.stem: Transducer(**yaml.safe_load(path.read_text(encoding="utf-8")))
         for path in (folder() / "ultrasound").glob("*.yaml")
     }
-    return rows.Setup(rig, sequences, real, scanners)
+    frames = DataRanges(**yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"])
+    return rows.Setup(rig, sequences, real, scanners, frames)

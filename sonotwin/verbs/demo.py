@@ -1,11 +1,12 @@
 """Calibrate the rendered rig, measure a phantom outside and inside with it, compare with the truth, and report the whole story.
 
-Reads the same choices from conf/ as `sonotwin render` and `sonotwin sweep`. Writes into the folder `out`: report.html and
-calibration/calibration.html (open them in a browser; they need no network), surface.ply (mm), surface.glb (metres, y up),
-metrics.json; of scenes with tumours volume/volume.nrrd and tumours/; the captures and their truth, and the folders of the steps
-between. Takes four to six minutes on two cores, half of that without ultrasound (path=none); the first run ever also compiles,
-for some minutes. The board's images are kept and used again by all demonstrations of the same rig. A run that was interrupted
-is simply started again.
+Reads the same choices from conf/ as `sonotwin render`, `sonotwin sweep` and `sonotwin film`. Writes into the folder `out`:
+report.html and calibration/calibration.html (open them in a browser; they need no network), surface.ply (mm), surface.glb
+(metres, y up), metrics.json; of scenes with tumours volume/volume.nrrd and tumours/; track/, the tracker's poses in a film; the
+captures and their truth, and the folders of the steps between. Takes five to seven minutes on two cores, half of that without
+ultrasound (path=none), and less than a minute less without the film (film_frames=0); the first run ever also compiles, for some
+minutes. The board's images are kept and used again by all demonstrations of the same rig. A run that was interrupted is simply
+started again.
 
     sonotwin demo
     sonotwin demo poses=paper path=none
@@ -26,11 +27,24 @@ from rich.console import Console
 from recon import atomic, metrics, probe_files, sequences, sweep_capture, water
 from recon.capture import read_patterns
 from recon.metrics import Metrics, shown
+from recon.tracking import networks
 from sonotwin.config import folder as conf
 from sonotwin.demo_commands import commands
 from sonotwin.demo_config import BOARD, BOARD_PATTERNS, CALIBRATION, WATER_C, Config
-from sonotwin.verbs import calibrate_optics, calibrate_probe, evaluate, freehand, measure_lag, render, segment, surface, sweep
-from twin import demo, evaluate_sweep, report, sweep_report
+from sonotwin.verbs import (
+    calibrate_optics,
+    calibrate_probe,
+    evaluate,
+    film,
+    freehand,
+    measure_lag,
+    render,
+    segment,
+    surface,
+    sweep,
+    track,
+)
+from twin import demo, evaluate_sweep, evaluate_track, report, sweep_report, track_report
 from twin.demo import Step
 from twin.evaluate import things
 from twin.ultrasound.probe_path import Bob, WirePath
@@ -48,9 +62,11 @@ OUTPUTS = (
     ("tumours/", "what was found inside: a closed surface each, in mm"),
     ("probe/probe.yaml", "the calibration of the probe, with its covariance"),
     ("lag/lag.json", "by how much the scanner lags behind the cameras"),
+    ("track/", "the target's poses in the film with their covariance, why some weren't found, and pictures of all frames"),
     ("capture/", "the images, their manifest and the calibration, as a camera would have left them"),
     ("truth/", "what the images were rendered from: points, normals, projector coordinates, true calibration"),
     ("sweep/, wires/, bottom/", "the B-scans and poses of the sweep, of crossed wires and of a flat bottom, and their truth"),
+    ("film/", "frames of the moving target by both cameras, and their truth"),
     ("surface/points.npz", "the point of every pixel and its predicted sigma"),
     ("evaluation/error_map.png", "map of the errors"),
     ("demo.json", "every setting"),
@@ -63,11 +79,14 @@ def run(config: Config) -> None:
     Raises
     ------
     InputError
-        If a setting is wrong or `out` holds something else.
+        If a setting is wrong, the tracker's networks are missing, or `out` holds something else.
     """
     console = Console(soft_wrap=True, highlight=False)
+    if config.film_frames:
+        networks.load()  # before minutes of work
     steps = (calibration_steps(config) if config.poses else []) + surface_steps(config)
-    steps += (sweep_steps(config) if config.looks_inside else []) + [telling_step(config)]
+    steps += sweep_steps(config) if config.looks_inside else []
+    steps += [*(film_steps(config) if config.film_frames else []), telling_step(config)]
     found = demo.play(
         steps, config.out, config.model_dump(mode="json"), lambda text: console.print(text, style="bold cyan", markup=False)
     )
@@ -181,6 +200,25 @@ def sweep_steps(config: Config) -> list[Step]:
     ]
 
 
+def film_steps(config: Config) -> list[Step]:
+    """From a film of the moving target to its poses, and how far they are from the truth."""
+
+    def filming(folder: Path, _: Figures) -> Figures:
+        film.run(config.filming(folder / "film"))
+        return {}
+
+    def tracking(folder: Path, _: Figures) -> Figures:
+        track.run(track.Config(rig=config.rig, capture=folder / "film" / "capture", out=folder / "track"))
+        tracked = track_report.read(folder / "film", folder / "track")
+        own = _named("track", metrics.read(folder / "track" / metrics.FILE))
+        return own | evaluate_track.measure(tracked.errors, tracked.truth)
+
+    return [
+        Step("film", f"render {config.film_frames} pairs of frames of the moving target", filming, ("film",)),
+        Step("track", "track the target through them, and compare with the truth", tracking, ("track",)),
+    ]
+
+
 def telling_step(config: Config) -> Step:
     """The report of all steps before it."""
 
@@ -191,9 +229,10 @@ def telling_step(config: Config) -> Step:
             findings, truth = compared(folder)
             places = {name: folder / name for name in ("sweep", "bottom", "probe", "lag", "volume")}
             inside = sweep_report.read(places, findings, truth)
+        tracked = track_report.read(folder / "film", folder / "track") if config.film_frames else None
         outputs = [(name, text) for name, text in OUTPUTS if (folder / name.partition(",")[0]).exists() or name == "report.html"]
         lines = commands(folder, config, config._overrides, inside.lag_s if inside else 0.0)
-        report.write(folder / "report.html", story, dict(figures), outputs, lines, inside)
+        report.write(folder / "report.html", story, dict(figures), outputs, lines, inside, tracked)
         return {}
 
     return Step("report", "write the report", telling, ("report.html",))
@@ -218,6 +257,7 @@ def summary(config: Config, found: Metrics) -> list[str]:
         f"the camera's noise alone would leave {shown(found['limit_rms_mm'], '.3f', ' mm')}",
         *calibrated(found),
         *looked_inside(config, found),
+        *followed(found),
         f"coverage    {100 * found['coverage']:.1f} % of what camera and projector both see; "
         f"{100 * found['gross_error_fraction']:.3f} % of the points are off by more than 1 mm",
         f"look at     {out / 'report.html'}; the surface is in {out / 'surface.ply'} and {out / 'surface.glb'}",
@@ -253,6 +293,18 @@ def looked_inside(config: Config, found: Metrics) -> list[str]:
         f"lag         {found['lag_ms']:.1f} ms, {found['lag_low_ms']:.1f} to {found['lag_high_ms']:.1f} ms (95 %), true "
         f"{1e3 * config.clocks.lag_s:.1f}; pixels of the sweep off by {found['sweep_placement_rms_mm']:.3f} mm RMS",
         f"tumours     {found['tumours_found']} of {found['tumours_true']} found, {count} inside the surface{off}{false}",
+    ]
+
+
+def followed(found: Metrics) -> list[str]:
+    """How well the target was tracked, if there was a film."""
+    if "track_found" not in found:
+        return []
+    medians = f"{shown(found['track_shift_median_mm'], '.3f', ' mm')} and {shown(found['track_turn_median_deg'], '.3f', ' deg')}"
+    most = f"{shown(found['track_shift_p95_mm'], '.3f', ' mm')} and {shown(found['track_turn_p95_deg'], '.3f', ' deg')}"
+    return [
+        f"tracked     the target in {found['track_found']} of {found['track_frames']} frames, in {found['track_visible_found']} "
+        f"of {found['track_visible']} that show it whole; off by {medians} in the median, 95 % by less than {most}"
     ]
 
 

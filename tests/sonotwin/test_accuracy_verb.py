@@ -37,7 +37,10 @@ def test_rows_are_written_and_missed_bars_told(quick, value, status, tmp_path, c
     [
         ("document=none.md", "none.md: expected a Markdown file, found none"),
         ("real=nowhere", "accuracy: real: expected a folder of recordings, found none at nowhere"),
-        ("only=acoustics", "accuracy: only: expected 'optics', 'surface', 'calibration' or 'ultrasound', found 'acoustics'"),
+        (
+            "only=acoustics",
+            "accuracy: only: expected 'optics', 'surface', 'calibration', 'ultrasound' or 'tracking', found 'acoustics'",
+        ),
     ],
 )
 def test_mistakes_are_said_first(quick, field, complaint, tmp_path, monkeypatch, capsys):

@@ -11,6 +11,7 @@ from recon import atomic
 from recon.errors import InputError
 from recon.patterns import Patterns
 from recon.rig import Rig
+from twin.tracking.ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
 
@@ -44,6 +45,7 @@ class Setup:
     sequences: Mapping[str, Patterns]  # by their names in conf/patterns
     real: Path | None = None  # folder of real recordings
     scanners: Mapping[str, Transducer] = field(default_factory=dict)  # by their names in conf/ultrasound
+    frames: DataRanges | None = None  # of tracking frames, as in conf/dataset.yaml
 
 
 def measure(measurements: Sequence[Measurement]) -> Iterator[Row]:

@@ -1,0 +1,54 @@
+"""Frames that tracking is measured on, rendered when asked for: unseen ones like training data, and studies."""
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+from recon.rig import Target
+from twin.accuracy.rows import Setup
+from twin.tracking.bank import Bank, build_bank
+from twin.tracking.draw import Take, draw
+from twin.tracking.frames import Frames, Quality, render_sketches
+from twin.tracking.prints import BitGrid
+from twin.tracking.ranges import DataRanges
+from twin.tracking.study import study_take
+
+BATCH = 4  # takes in one launch
+STUDY_VARIANTS = 12  # of bodies and surroundings
+WHOLLY = 0.999  # of each disc: what a study asks to be seen of them
+
+
+def ranges_of(setup: Setup) -> DataRanges:
+    """Ranges of frames; ValueError if the setup has none."""
+    if setup.frames is None:
+        raise ValueError("setup.frames: expected the ranges of conf/dataset.yaml, found none")
+    return setup.frames
+
+
+def unseen(setup: Setup, seed: int, samples: int) -> Iterator[tuple[Take, Frames]]:
+    """Samples as of a data set of another seed, so with other bodies and surroundings too."""
+    ranges = ranges_of(setup)
+    bank = _bank(setup.rig.target, ranges.variants, seed)
+    for first in range(0, samples, BATCH):
+        takes = [draw(ranges, setup.rig, seed, k) for k in range(first, min(first + BATCH, samples))]
+        yield from zip(takes, render_sketches(bank, setup.rig, takes, Quality(), seed), strict=True)
+
+
+def study(
+    setup: Setup, seed: int, count: int, white_dn: float, blur_px: float, rays: int = 32, grid: BitGrid | None = None
+) -> Iterator[tuple[Take, Frames]]:
+    """Samples of set light and blur, over the whole working volume, in which nothing covers the target."""
+    ranges = ranges_of(setup).model_copy(update={"variants": STUDY_VARIANTS})
+    bank = _bank(setup.rig.target, STUDY_VARIANTS, seed)
+    given, k = 0, 0
+    while given < count:
+        takes = [study_take(setup.rig, ranges, seed, number, white_dn, blur_px) for number in range(k, k + BATCH)]
+        k += BATCH
+        for take, frames in zip(takes, render_sketches(bank, setup.rig, takes, Quality(window=rays), seed, grid), strict=True):
+            if given < count and min(view.visible.min() for view in frames.truth) > WHOLLY:
+                given += 1
+                yield take, frames
+
+
+@lru_cache(maxsize=4)
+def _bank(target: Target, variants: int, seed: int) -> Bank:
+    return build_bank(target, variants, seed)
