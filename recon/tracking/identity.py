@@ -18,7 +18,7 @@ from recon.tracking.detection import Candidates
 
 Array = NDArray[np.float64]
 
-TILTED = 0.45  # least ratio of scales across and along the tilt: 63 degrees
+TILTED = 0.36  # least ratio of scales across and along the tilt: 69 degrees
 DISC = (0.03, 0.19)  # diameter of a disc, of the image's width
 UNNAMED = 1e-3  # no identity is less likely than that: a network may be wrong
 ALIKE = 0.15  # of a disc's size, by which an ellipse may differ from what the distances ask for

@@ -19,7 +19,7 @@ FLOOR_PX = 0.002  # what lens model, print and pixel grid leave however little n
 LEAST_SEEN = 0.4  # of the rim: with less an ellipse is a guess
 LEAST_CONTRAST = 4.0  # times the noise of a pixel
 LEAST_DN = 1.5
-LARGEST_SIGMA = 0.6  # px: worse, and the ellipse tells no circle
+LARGEST_SIGMA = 1.5  # px: worse, and the ellipse tells no circle
 LARGEST_BLUR = 0.35  # of the ring's width; beyond that its dark ring is gone
 
 

@@ -10,12 +10,13 @@ from recon.rig import Target
 from recon.tracking import detection, identity, segmentation, views
 from recon.tracking.frames import grey
 from recon.tracking.networks import Networks
-from recon.tracking.outlines import measure
+from recon.tracking.outlines import Outlines, measure
 from recon.tracking.views import View
 
 FRAME = (1280, 1024)  # width, height, px, of the cameras that the networks know
 ROUGH_PX = 5.0  # of such a frame
 LEAST_REACH_PX = 2.0
+PRINTED = 0.25  # by which discs may be larger or smaller than the target's
 
 
 def find(image: NDArray, networks: Networks, target: Target, bits: int | None = None) -> View:
@@ -33,14 +34,27 @@ def find(image: NDArray, networks: Networks, target: Target, bits: int | None = 
     choices = identity.triples(candidates, target, FRAME[0])
     result = views.nothing(f"{len(candidates.points)} places like circles, no three that lie like the target's")
     for triple in choices:
-        rough = segmentation.rough_ellipses(frame, triple.points, networks)
+        rough = segmentation.rough_ellipses(frame, triple.points, networks, target)
         back = Ellipses((rough.centre + 0.5) / scale - 0.5, rough.shape / scale)
         outlines = measure(image, back, max(ROUGH_PX / scale, LEAST_REACH_PX), target)
-        view = views.judged(views.renamed(outlines, target), target)
+        outlines = views.renamed(outlines, target)
+        view = views.judged(outlines, _as_printed(outlines, target))
         if view.found:
             return view
         result = view if triple is choices[0] else result
     return result
+
+
+def _as_printed(outlines: Outlines, target: Target) -> Target:
+    """The target with discs as large as they look beside their distances: how a photograph's was printed isn't known exactly."""
+    affine = identity.affinity(outlines.ellipses.centre, target)
+    with np.errstate(invalid="ignore"):
+        expected = np.sqrt(np.abs(np.linalg.det(affine))) * target.outer_diameter_mm / 2
+        ratio = np.median(np.sqrt(np.linalg.det(outlines.ellipses.shape))) / expected
+    if not abs(ratio - 1) < PRINTED:
+        return target
+    sizes = {name: getattr(target, name) * float(ratio) for name in ("outer_diameter_mm", "inner_diameter_mm")}
+    return target.model_copy(update=sizes)
 
 
 def _framed(image: NDArray) -> tuple[NDArray, float]:

@@ -1,42 +1,63 @@
 """Rough ellipses of discs from the segmenter's masks of patches."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.ellipses import Ellipses, root
+from recon.rig import Target
+from recon.tracking.identity import affinity
 from recon.tracking.networks import PATCH, Networks
 
 Array = NDArray[np.float64]
 
 OFFSET = 59  # px from a patch's corner to the point that it is about
+WIDEST = 105.0  # px of a disc's width that a patch holds
 SIZE = (14.0, 75.0)  # px, of the semi-axes
 FLATTEST = 0.35
 AREA = (0.8, 1.15)  # of a blob to that of its ellipse
 ASTRAY = 40.0  # px from the patch's middle
 
 
-def rough_ellipses(image: NDArray, points: Array, networks: Networks) -> Ellipses:
-    """Ellipses of the discs about points : (n, 2) px, to a pixel or two; NaN where there is none."""
-    cut, origins = patches(image, points)
-    return read(networks.segment(cut), origins)
+@dataclass(frozen=True)
+class Patches:
+    """What the segmenter looks at."""
+
+    images: NDArray[np.float32]  # (n, 120, 120) from 0 to 1
+    corners: NDArray[np.int64]  # (n, 2) px, the first pixel in the image
+    step: int = 1  # px of the image that make one of a patch
 
 
-def patches(image: NDArray, points: Array) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Patches : (n, 120, 120) of 0 to 1 about points : (n, 2) px, and their corners : (n, 2) px; the image's border goes on."""
+def rough_ellipses(image: NDArray, points: Array, networks: Networks, target: Target) -> Ellipses:
+    """Ellipses of the discs about points : (3, 2) px of c0, c1, c2, to a pixel or two; NaN where there is none."""
+    cut = patches(image, points, step_for(points, target))
+    return read(networks.segment(cut.images), cut)
+
+
+def step_for(points: Array, target: Target) -> int:
+    """How coarse patches must be to hold the discs, from the distances of the three circles : (3, 2) px."""
+    scales = np.linalg.svd(np.nan_to_num(affinity(points, target)), compute_uv=False)
+    return max(int(np.ceil(scales[0] * target.outer_diameter_mm / WIDEST)), 1)
+
+
+def patches(image: NDArray, points: Array, step: int = 1) -> Patches:
+    """Patches about points : (n, 2) px; beyond the image its border goes on."""
     height, width = image.shape
-    origins = np.rint(np.nan_to_num(points)).astype(np.int64) - OFFSET
-    along = np.arange(PATCH)
-    rows = np.clip(origins[:, 1, None] + along, 0, height - 1)
-    columns = np.clip(origins[:, 0, None] + along, 0, width - 1)
-    return image[rows[:, :, None], columns[:, None, :]].astype(np.float32) / np.float32(255), origins
+    corners = np.rint(np.nan_to_num(points)).astype(np.int64) - OFFSET * step
+    along = np.arange(PATCH * step)
+    rows = np.clip(corners[:, 1, None] + along, 0, height - 1)
+    columns = np.clip(corners[:, 0, None] + along, 0, width - 1)
+    cut = image[rows[:, :, None], columns[:, None, :]].astype(np.float32) / np.float32(255)
+    return Patches(cut.reshape(-1, PATCH, step, PATCH, step).mean(axis=(2, 4)), corners, step)
 
 
-def read(masks: NDArray, origins: NDArray[np.int64]) -> Ellipses:
-    """Ellipses, in px of the image, of masks : (n, 120, 120), logits."""
+def read(masks: NDArray, cut: Patches) -> Ellipses:
+    """Ellipses, in px of the image, of the patches' masks : (n, 120, 120), logits."""
     found = [_ellipse(np.asarray(mask) > 0) for mask in masks]
-    centre = np.array([item[0] for item in found]).reshape(-1, 2) + origins
-    return Ellipses(centre, np.array([item[1] for item in found]).reshape(-1, 2, 2))
+    centre = np.array([item[0] for item in found]).reshape(-1, 2) * cut.step + (cut.step - 1) / 2 + cut.corners
+    return Ellipses(centre, np.array([item[1] for item in found]).reshape(-1, 2, 2) * cut.step)
 
 
 NOTHING = (np.full(2, np.nan), np.full((2, 2), np.nan))

@@ -157,8 +157,13 @@ class Tracker:
         self, frames: Frames, networks: Networks, places: tuple[Array, Array], how: str, before: Tracking | None = None
     ) -> Tracking:
         """From six places, three a frame : (3, 2) px, to the pose, by the segmenter."""
-        cut, origins = zip(*(segmentation.patches(frame, at) for frame, at in zip(frames, places, strict=True)), strict=True)
-        rough = segmentation.read(networks.segment(np.concatenate(cut)), np.concatenate(origins))
+        cuts = [
+            segmentation.patches(frame, at, segmentation.step_for(at, self.target))
+            for frame, at in zip(frames, places, strict=True)
+        ]
+        masks = networks.segment(np.concatenate([cut.images for cut in cuts]))
+        halves = [segmentation.read(half, cut) for half, cut in zip((masks[:3], masks[3:]), cuts, strict=True)]
+        rough = Ellipses(*(np.concatenate([getattr(half, name) for half in halves]) for name in ("centre", "shape")))
         if before is not None and not np.isfinite(rough.centre).all():
             return before
         return self._fitted(frames, rough, ROUGH_PX, how, rename=how == "detected")
@@ -183,7 +188,7 @@ class Tracker:
     def _one_sided(self, frames: Frames, networks: Networks, choices: list[list[Triple]], reasons: list[str]) -> Tracking:
         """The circles of the one view that has any."""
         k = 0 if choices[0] else 1
-        rough = segmentation.rough_ellipses(frames[k], choices[k][0].points, networks)
+        rough = segmentation.rough_ellipses(frames[k], choices[k][0].points, networks, self.target)
         outlines = measure_both(*frames, rough, np.full(3, k == 1), ROUGH_PX, self.target)
         view, other = views.judged(views.renamed(outlines, self.target), self.target), views.nothing(reasons[1 - k])
         seen = (view, other) if k == 0 else (other, view)

@@ -191,9 +191,9 @@ def published_recipe(networks: Networks) -> Locate:
             if found is None:
                 return None
             full = (image.shape[1], image.shape[0])
-            patches, _ = segmentation.patches(image, found * (np.array(full) / DETECTOR_SIZE))
+            cut = segmentation.patches(image, found * (np.array(full) / DETECTOR_SIZE))
             origins = published.patch_origins(found, DETECTOR_SIZE, full)
-            centres.append(published.centres_from_logits(networks.segment(patches), origins))
+            centres.append(published.centres_from_logits(networks.segment(cut.images), origins))
         return published.pose_from_centres(centres[0], centres[1], *cameras)
 
     return locate

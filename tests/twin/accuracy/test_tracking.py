@@ -37,7 +37,10 @@ def test_right_exchanged_and_other_circles_are_told_apart():
 
 
 def test_a_hidden_or_cut_target_is_not_asked_for():
-    assert not score(views.nothing(""), replace(TRUTH, visible=np.array([1, 0.4, 1])), True, False).shows_target
+    hidden = score(views.nothing(""), replace(TRUTH, visible=np.array([1, 0.4, 1])), True, False)
+    assert not hidden.shows_target and not hidden.covered
+    partly = score(views.nothing(""), replace(TRUTH, visible=np.array([1, 0.7, 1])), True, False)
+    assert partly.covered and not partly.shows_target
     assert not score(views.nothing(""), replace(TRUTH, inside=np.array([True, False, True])), True, False).shows_target
     empty = score(found(TRUTH.ellipses[:, :2]), TRUTH, False, False)
     assert empty.empty and empty.found and not empty.right and not empty.shows_target
