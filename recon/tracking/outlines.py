@@ -1,7 +1,7 @@
 """Outer rims of the target's rings in a frame, to a hundredth of a pixel, from rough ellipses.
 
 The limit is what noise leaves of an edge, `(n/C) sqrt(2 sqrt(pi) s / (pi R))` px along each axis for noise n, contrast C, blur s
-and radius R: 0.003 px for a ring of 45 px lit to 100 of 255. `recon.tracking.rims` has the model that is fitted.
+and radius R: 0.0012 px for n = 1, C = 100, s = 0.6, R = 45. `recon.tracking.rims` has the model that is fitted.
 """
 
 from dataclasses import dataclass

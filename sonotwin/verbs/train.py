@@ -4,7 +4,7 @@ Reads a data set as of `sonotwin dataset` into memory, 150 kB a sample for a det
 folder `out`: the network as ONNX for the tracker, its weights as .safetensors and .pt with the published names, metrics.json of
 the validation samples, the curves as log.jsonl and curves.png, and checkpoint.pt, from which the same command goes on if it was
 interrupted. Needs the extra `train`. On one core the networks of ours see some 40 crops or 100 patches a second, and half an hour
-to an hour is enough; the published ones take 10 times as long.
+to some hours are asked for; the published ones take 6 to 20 times as long.
 
     sonotwin train network=detector data=outputs/dataset out=outputs/detector max_minutes=60
     sonotwin train network=published_segmenter data=outputs/dataset out=outputs/segmenter steps=20000 threads=1
