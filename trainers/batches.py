@@ -50,6 +50,8 @@ def crops(views: Views, size: int, edge: int, generator: Generator) -> Crops:
     centres = seen_in_view(torch.from_numpy(views.centres[which]).float(), scale)
     visible, white = torch.from_numpy(views.visible[which]).float(), torch.from_numpy(views.white[which]).float()
     height, width = images.shape[1:]
+    shown = (centres >= -0.5).all(-1) & (centres < torch.tensor([width, height]) - 0.5).all(-1)
+    visible = torch.where(shown, visible, torch.zeros(()))  # beyond the view there is nothing to find
     linear = turns(size, SCALES, generator)
     anywhere = torch.rand(size, 2, generator=generator) * torch.tensor([width - 1.0, height - 1.0])
     about = (torch.rand(size, generator=generator) < TARGET_IN_CROP) & (visible >= SEEN).any(1)

@@ -79,18 +79,19 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
     plain = start.to(memory_format=torch.channels_last)  # pyrefly: ignore[no-matching-overload]
     optimizer = torch.optim.AdamW(_groups(plain, plan.weight_decay), lr=plan.learning_rate)
     average = deepcopy(plain).requires_grad_(False)
-    step, before = _resume(folder / CHECKPOINT, plain, average, optimizer)
-    resumed_at = step
-    _forget_later(folder / LOG, step)
     module, optimizer = fabric.setup(plain, optimizer)
     average = average.to(fabric.device)
+    step, before = _resume(folder / CHECKPOINT, plain, average, optimizer, (len(train), len(validation)))
+    resumed_at = step
+    _forget_later(folder / LOG, step)
     began = written = perf_counter()
     losses: list[float] = []
     shown = chosen(validation, np.unique(np.linspace(0, len(validation) - 1, plan.validate_at_most).round().astype(int)))
 
     def save() -> None:
         state = {"network": plain.state_dict(), "average": average.state_dict(), "optimizer": optimizer.state_dict()}
-        _write(folder / CHECKPOINT, state | {"step": step, "seconds": seconds})
+        counts = {"samples": (len(train), len(validation))}
+        _write(folder / CHECKPOINT, state | counts | {"step": step, "seconds": seconds})
 
     with _stops() as stopped:
         seconds = before
@@ -160,7 +161,8 @@ def precision_of(wanted: Precision) -> Literal["32-true", "bf16-mixed"]:
 def read_log(folder: Path) -> list[Row]:
     """Rows of the log so far."""
     path = folder / LOG
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.is_file() else []
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return [json.loads(line) for line in lines if line.endswith("}")]  # the last one may be cut short
 
 
 def _loss(module: nn.Module, fabric: Fabric, train: Data, plan: Plan, step: int) -> Tensor:
@@ -191,11 +193,21 @@ def _blend(average: nn.Module, module: nn.Module, stays: float) -> None:
             old.copy_(new)
 
 
-def _resume(path: Path, module: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer) -> tuple[int, float]:
-    """Step and seconds of the checkpoint, whose state is put in place; 0 without one."""
+def _resume(
+    path: Path, module: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer, samples: tuple[int, int]
+) -> tuple[int, float]:
+    """Step and seconds of the checkpoint, whose state is put in place; 0 without one.
+
+    InputError if it is of another network, or of another number of samples to train and to validate with: a data set that has
+    grown gives other batches, and validates with what was trained with.
+    """
     if not path.is_file():
         return 0, 0.0
     state = read_state(path)
+    if tuple(state.get("samples", samples)) != samples:
+        raise InputError(
+            f"{path}: expected a checkpoint of {samples[0]} samples, found one of {state['samples'][0]}; resume=false"
+        )
     try:
         module.load_state_dict(state["network"])
         average.load_state_dict(state["average"])
@@ -219,7 +231,10 @@ def _append(path: Path, row: Mapping[str, float | int]) -> None:
 def _forget_later(path: Path, step: int) -> None:
     """Drop rows of steps after the checkpoint: they come again."""
     if path.is_file():
-        kept = [line for line in path.read_text(encoding="utf-8").splitlines() if json.loads(line)["step"] <= step]
+        whole = [
+            line for line in path.read_text(encoding="utf-8").splitlines() if line.endswith("}")
+        ]  # the last may be cut short
+        kept = [line for line in whole if json.loads(line)["step"] <= step]
         with atomic.new_file(path) as temporary:
             temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
 

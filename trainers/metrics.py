@@ -75,7 +75,10 @@ def measure_detector(network: nn.Module, views: Views) -> Metrics:
         [_errors(found, centres / scale) for found, centres, scale in zip(peaks, views.centres, views.scale, strict=True)]
     )
     named, anyhow = errors[:, 0], errors[:, 1]  # (n, 3) px, to the circle found by that name, and by any
-    counts = views.visible >= SEEN
+    places = (views.centres + 0.5) / views.scale[:, None] - 0.5
+    with np.errstate(invalid="ignore"):
+        held = ((places >= -0.5) & (places < np.array(views.images.shape[:0:-1]) - 0.5)).all(-1)
+    counts = (views.visible >= SEEN) & held  # beyond the view there is nothing to find
     right, located = named <= FOUND, anyhow <= FOUND
     whole = counts.all(1) & views.inside.all(1)
     all_three = right.all(1)

@@ -105,15 +105,15 @@ def _judged(rows: Array, hole: float) -> Outlines:
         semi = (shape[i, 0, 0] + shape[i, 1, 1]) / 2
         if rows[i, rims.FAILED]:
             reasons.append("no rim")
-        elif contrast < max(LEAST_DN, LEAST_CONTRAST * noise[i] / np.sqrt(semi)):
+        elif not contrast >= max(LEAST_DN, LEAST_CONTRAST * noise[i] / np.sqrt(semi)):
             reasons.append(f"a contrast of {contrast:.1f} DN in noise of {noise[i]:.1f}")
-        elif seen[i] < LEAST_SEEN:
+        elif not seen[i] >= LEAST_SEEN:
             reasons.append(f"{100 * seen[i]:.0f} % of its rim seen")
         elif not middle[i] - inside[i] > 0.5 * contrast * (1 - np.sqrt(v0[i]) / (hole * semi)):
             reasons.append("no white middle")
-        elif np.sqrt(v0[i]) > LARGEST_BLUR * (1 - hole) * semi:
+        elif not np.sqrt(v0[i]) <= LARGEST_BLUR * (1 - hole) * semi:
             reasons.append(f"blurred by {np.sqrt(12 * v0[i]):.0f} px")
-        elif np.sqrt(np.trace(covariance[i])) > LARGEST_SIGMA:
+        elif not np.sqrt(np.trace(covariance[i])) <= LARGEST_SIGMA:
             reasons.append(f"an uncertainty of {np.sqrt(np.trace(covariance[i])):.1f} px")
         else:
             reasons.append(None)

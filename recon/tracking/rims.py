@@ -25,6 +25,7 @@ CAPTURE_STEPS = 8  # on every second pixel of every second row, from a rough ell
 STEPS = 8  # on all pixels
 CAPTURED = 0.1  # px
 SETTLED = 4e-3  # px; the step after that is a tenth of it
+RESTLESS = 0.2  # px of the last step: a fit that still moves so has found nothing
 LEAST_VARIANCE = 0.06  # px^2: a pixel's own extent is 1/12
 NARROW = 1.2  # standard deviations of the lens's blur: a box below that is as good as Gaussian
 SCATTER = 10.0  # standard deviations beyond which a pixel counts less
@@ -68,6 +69,7 @@ def _fit(image, centre, shape, reach, hole, result):
     if not _first_levels(image, ellipse, variance, reach, hole, planes, noise):
         return
     sums, inverse = np.zeros((SECTORS, LOCAL)), np.zeros((GLOBAL, GLOBAL))
+    moved = np.inf
     for capture in (True, False):
         stride = 2 if capture and ellipse[2] + ellipse[4] > 40 else 1
         for _ in range(CAPTURE_STEPS if capture else STEPS):
@@ -81,8 +83,11 @@ def _fit(image, centre, shape, reach, hole, result):
             _move(ellipse, planes, variance, step, reach)
             if not _sound(ellipse, image.shape):
                 return
-            if np.abs(step[:5]).max() < (CAPTURED if capture else SETTLED):
+            moved = np.abs(step[:5]).max()
+            if moved < (CAPTURED if capture else SETTLED):
                 break
+    if not moved < RESTLESS:
+        return
     freedom = max(weights.sum() - 6, 1.0)
     scores = 0.0
     for j in range(SECTORS):

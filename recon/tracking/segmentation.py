@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 
 OFFSET = 59  # px from a patch's corner to the point that it is about
 WIDEST = 105.0  # px of a disc's width that a patch holds
+COARSEST = 3  # px of the image that make one of a patch, most; no disc is wider, see identity.DISC
 SIZE = (14.0, 75.0)  # px, of the semi-axes
 FLATTEST = 0.35
 AREA = (0.8, 1.15)  # of a blob to that of its ellipse
@@ -39,7 +40,7 @@ def rough_ellipses(image: NDArray, points: Array, networks: Networks, target: Ta
 def step_for(points: Array, target: Target) -> int:
     """How coarse patches must be to hold the discs, from the distances of the three circles : (3, 2) px."""
     scales = np.linalg.svd(np.nan_to_num(affinity(points, target)), compute_uv=False)
-    return max(int(np.ceil(scales[0] * target.outer_diameter_mm / WIDEST)), 1)
+    return int(np.clip(np.ceil(scales[0] * target.outer_diameter_mm / WIDEST), 1, COARSEST))
 
 
 def patches(image: NDArray, points: Array, step: int = 1) -> Patches:

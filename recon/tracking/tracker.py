@@ -125,6 +125,8 @@ class Tracker:
             return pose
         before, earlier = self._past[-2]
         ahead = (now - last) / (last - before)
+        if ahead > FORGOTTEN_FRAMES:  # stamps that come in bursts tell no velocity
+            return pose
         turn = Rotation.from_matrix(pose[:3, :3] @ earlier[:3, :3].T).as_rotvec()
         moved = Rotation.from_rotvec(ahead * turn).as_matrix() @ pose[:3, :3]
         return rigid.transform(moved, pose[:3, 3] + ahead * (pose[:3, 3] - earlier[:3, 3]))

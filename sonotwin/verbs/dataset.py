@@ -31,7 +31,7 @@ class Config(BaseModel):
     rig: Rig
     out: Path
     samples: Annotated[int, Field(ge=1, le=10_000_000)]
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     workers: Annotated[int, Field(ge=1, le=256)] = 1
     frames: Literal["views", "sketches", "full"] = "views"
     shard: Annotated[int, Field(ge=1, le=10_000)] = 50

@@ -37,7 +37,7 @@ class Config(film.Filming):
     out: Path
     pixels: Literal["sketch", "full"] = "sketch"
     quality: Quality = Quality()
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
 
 def run(config: Config) -> None:

@@ -56,7 +56,7 @@ class Config(BaseModel):
     precision: Precision = "auto"
     threads: Annotated[int, Field(ge=1, le=1024)] | None = None
     checkpoint_minutes: Annotated[float, Field(gt=0)] = 5.0
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
     @model_validator(mode="after")
     def _ends(self) -> "Config":

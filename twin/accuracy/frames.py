@@ -7,7 +7,7 @@ from recon.rig import Target
 from twin.accuracy.rows import Setup
 from twin.tracking.bank import Bank, build_bank
 from twin.tracking.draw import Take, draw
-from twin.tracking.frames import Frames, Quality, render_sketches
+from twin.tracking.frames import Frames, Quality, render_full, render_sketches
 from twin.tracking.prints import BitGrid
 from twin.tracking.ranges import DataRanges
 from twin.tracking.study import study_take
@@ -30,7 +30,10 @@ def unseen(setup: Setup, seed: int, samples: int) -> Iterator[tuple[Take, Frames
     bank = _bank(setup.rig.target, ranges.variants, seed)
     for first in range(0, samples, BATCH):
         takes = [draw(ranges, setup.rig, seed, k) for k in range(first, min(first + BATCH, samples))]
-        yield from zip(takes, render_sketches(bank, setup.rig, takes, Quality(), seed), strict=True)
+        sketched = iter(render_sketches(bank, setup.rig, takes, Quality(), seed))
+        for take, frames in zip(takes, sketched, strict=True):
+            # false alarms are looked for in whole images: a sketch without target is coarse all over
+            yield take, frames if take.present else render_full(bank, setup.rig, [take], Quality(), seed)[0]
 
 
 def study(

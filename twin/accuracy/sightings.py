@@ -35,7 +35,6 @@ class Seen:
     found: bool
     right: bool
     exchanged: bool  # circles of the target, under wrong names
-    pose_found: bool
 
 
 def rows(setup: Setup, networks: Networks, samples: int = SAMPLES) -> list[Row]:
@@ -69,10 +68,10 @@ def scored(samples: Iterable[tuple[Take, Frames]], target: Target, networks: Net
         first, second = (device.optics.camera() for device in take.cameras)
         result = Tracker((first, second), target, networks).step(*given.views)
         for view, truth in zip(result.views, given.truth, strict=True):
-            yield score(view, truth, take.present, result.found)
+            yield score(view, truth, take.present)
 
 
-def score(view: View, truth: ViewTruth, present: bool, pose_found: bool) -> Seen:
+def score(view: View, truth: ViewTruth, present: bool) -> Seen:
     """Compare a view with its truth."""
     right = exchanged = False
     if view.found and present:
@@ -90,7 +89,6 @@ def score(view: View, truth: ViewTruth, present: bool, pose_found: bool) -> Seen
         found=view.found,
         right=right,
         exchanged=exchanged,
-        pose_found=pose_found,
     )
 
 

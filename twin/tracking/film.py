@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from recon import atomic, calibration, rigid
 from recon.calibration import Calibration
+from recon.errors import InputError
 from recon.manifest import MANIFEST, Device
 from recon.rig import Finite, NotNegative, Part, Positive, Rig, Target, Vector
 from recon.tracking import capture
@@ -38,6 +39,7 @@ SETTINGS = "settings.json"
 TRUTH = "sweep/film.npz"
 BODIES = 4  # of which the one is taken whose fingers and cable cover least of the circles
 LOOKS = 8  # frames in which that is looked at
+NEAREST_MM = 100.0  # of a circle before a camera, along its axis
 LIFT_MM = 0.2  # of the rays off the target's face
 BATCH = 3  # frames traced in one launch; doesn't change them
 
@@ -142,6 +144,10 @@ def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int)
     cameras = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
     way = lead(filming.path, rig.target, (cameras[0].centre + cameras[1].centre) / 2, seed)
     motions = [way.motion(time * 1e-9, filming.exposure_s) for time in filming.times.tolist()]
+    for motion in motions:
+        places = rigid.apply(motion.world_from_target, circle_centres(rig.target))
+        if min(rigid.apply(camera.camera_from_world, places)[:, 2].min() for camera in cameras) < NEAREST_MM:
+            raise InputError(f"path.places_mm: expected places at least {NEAREST_MM:g} mm before both cameras, found nearer ones")
     some = [motions[k].world_from_target for k in np.linspace(0, len(motions) - 1, min(LOOKS, len(motions))).astype(int)]
     eyes = np.array([rigid.apply(rigid.invert(pose), camera.centre) for pose in some for camera in cameras])
     moved = _farthest(filming.path) - drawn.motion.world_from_target[:3, 3]

@@ -17,7 +17,7 @@ from twin.tracking.draw import Take
 from twin.tracking.pictures import HALF, PATCH, VIEW, Picture, Sketch, View, Window, full_frame, joined
 from twin.tracking.prints import BitGrid
 from twin.tracking.transport import NO_CIRCLE, Lanes, Light, render
-from twin.tracking.truth import ViewTruth, view_truth
+from twin.tracking.truth import ViewTruth, inside_share, view_truth
 
 Grey = NDArray[np.uint8]
 
@@ -130,7 +130,7 @@ def _rendered(
             told.append(
                 replace(
                     truths[i][camera],
-                    visible=_visible(light, seen),
+                    visible=_visible(light, seen) * inside_share(truths[i][camera].ellipses, device.optics.size),
                     white_dn=_white(light, seen, take, device, rig),
                     patch_origins=origins[2 * i + camera],
                 )
@@ -198,7 +198,7 @@ def _unit_pattern(height: int, width: int, serial: int) -> tuple[NDArray[np.floa
 
 
 def _visible(light: Light, pieces) -> NDArray[np.float64]:
-    """Part of each disc that is seen : (3,)."""
+    """Part of what the image holds of each disc that nothing covers : (3,)."""
     return np.array([light.seen[piece].sum() / max(light.disc[piece].sum(), 1) for piece in pieces], float)
 
 

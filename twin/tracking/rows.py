@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon import rigid
+from recon.errors import InputError
 from recon.rig import CameraDevice, Rig
 from twin.tracking.draw import Take
 
@@ -115,8 +116,11 @@ def take_columns(takes: Sequence[Take], rig: Rig, body_at: Array, scene_at: Arra
 
 
 def camera_columns(devices: Sequence[CameraDevice]) -> dict[str, Array]:
-    """Columns of what belongs to a camera : (cameras, ...)."""
+    """Columns of what belongs to a camera : (cameras, ...); InputError for a lens with more than five coefficients."""
     cameras = [device.optics.camera() for device in devices]
+    for camera in cameras:
+        if np.any(camera.distortion[5:]):
+            raise InputError(f"rig: distortion: expected k1 k2 p1 p2 k3 at most, found {camera.distortion.size} coefficients")
     distortion = [np.pad(camera.distortion, (0, 5))[:5] for camera in cameras]
     middle = [(np.array(camera.size) - 1) / 2 for camera in cameras]
     return {

@@ -80,12 +80,18 @@ def prepare(place: Place, settings: Settings) -> list[int]:
             found = json.loads(told.read_text())
         except json.JSONDecodeError as error:
             raise InputError(f"{told}: expected JSON, found {error}") from None
+        if not isinstance(found, dict) or not isinstance(found.get("samples"), int):
+            raise InputError(f"{told}: expected a data set's settings, found something else")
+        if found["samples"] > settings.samples:
+            raise InputError(f"{told}: samples: expected at least the {found['samples']} there are, found {settings.samples}")
         differing = [key for key in written if key != "samples" and found.get(key) != written[key]]
         if differing:
             raise InputError(f"{told}: {differing[0]}: expected as in this run, found another data set; choose another out")
     elif place.folder.exists() and any(place.folder.iterdir()):
         raise InputError(f"{place.folder}: expected an empty folder or a data set, found other files")
     place.folder.mkdir(parents=True, exist_ok=True)
+    for number, _ in enumerate(settings.shards()):
+        atomic.remove_leftovers(place.shard(number))
     with atomic.new_file(told) as path:
         path.write_text(json.dumps(written, indent=1))
     return [number for number, _ in enumerate(settings.shards()) if not _complete(place, settings, number)]
@@ -111,8 +117,11 @@ def generate(place: Place, settings: Settings, missing: Sequence[int], workers: 
             yield write_shard(place, settings, bank, number)
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start, initargs=(settings, workers)) as pool:
-        for done in as_completed([pool.submit(_work, place, settings, number) for number in missing]):
-            yield done.result()
+        try:
+            for done in as_completed([pool.submit(_work, place, settings, number) for number in missing]):
+                yield done.result()
+        finally:
+            pool.shutdown(cancel_futures=True)  # stopped halfway, or one failed: the shards that wait are not begun
 
 
 _BANK: dict[str, Bank] = {}  # of a worker process: made once, used by each of its shards

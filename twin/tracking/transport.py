@@ -26,7 +26,7 @@ from twin.tracking.rows import Rows, Turn, camera_columns, take_columns
 
 Floats = NDArray[np.float32]
 
-UNDISTORTIONS = 8  # fixed-point steps; each takes a tenth off the error, which starts at a few px
+UNDISTORTIONS = 8  # fixed-point steps; each leaves a tenth of the error, which starts at a few px
 LIFT_MM = 0.05  # of a shadow ray's start off the surface, more than the coordinates' rounding
 ROOM_MM = 300.0  # things farther than this don't keep a point from the light that comes from all around
 FRESNEL = 0.04  # of a glossy coat at right angles
@@ -124,7 +124,7 @@ class _Path:
 
     def follow(self, u, v, circle, points: PairedPoints) -> tuple:
         """Radiance of one ray; whether it aims at the circle, reaches it, and ends on the target's paper."""
-        ray = self._ray(u, v, points)
+        ray, cosine = self._ray(u, v, points)
         when = points.mirrored_square()  # with the place in the pixel mirrored too, an edge's sampling errors cancel
         time = when.x
         turned = self._body_ray(ray, time)
@@ -135,13 +135,16 @@ class _Path:
         light = self._reflected(place, normal, -ray.d, reflectance, gloss, roughness, time, when.y + 0.5, points)
         radiance = dr.select(nothing, self._from_around(ray.d), light)
         away = ((u - self.mid_u) ** 2 + (v - self.mid_v) ** 2) * self.corner
-        radiance *= 1 - self.vignetting * away
+        radiance *= (1 - self.vignetting * away) * cosine**4
         paper = self.face.paint[1]
         on_paper = on_face & (reflectance > 0.8 * paper) & (reflectance < 1.25 * paper)
         return radiance, aims, aims & on_face, on_paper
 
-    def _ray(self, u, v, points: PairedPoints) -> mi.Ray3f:
-        """Through a point of the pixel, spread by the lens, and a point of the pupil; distortion undone by fixed-point steps."""
+    def _ray(self, u, v, points: PairedPoints) -> tuple[mi.Ray3f, mi.Float]:
+        """Through a point of the pixel, spread by the lens, and a point of the pupil; and its cosine with the optical axis.
+
+        The distortion is undone by fixed-point steps.
+        """
         offset = points.mirrored_square() + points.mirrored_normal() * self.blur
         xd, yd = (u + offset.x - self.cx) / self.fx, (v + offset.y - self.cy) / self.fy
         x, y = mi.Float(xd), mi.Float(yd)
@@ -155,7 +158,8 @@ class _Path:
         disc = points.mirrored_disc() * self.pupil
         start = mi.Vector3f(disc.x, disc.y, 0)
         direction = dr.normalize(mi.Vector3f(x, y, 1) * self.focus - start)
-        return mi.Ray3f(mi.Point3f(self.world_from_camera.apply(start)), self.world_from_camera.rotate(direction))
+        start, way = self.world_from_camera.apply(start), self.world_from_camera.rotate(direction)
+        return mi.Ray3f(mi.Point3f(start), way), dr.rsqrt(1 + x * x + y * y)
 
     def _untwisted(self, d: mi.Vector3f, time: mi.Float) -> mi.Vector3f:
         """A direction of the world, turned back by what the target has turned since the middle of the exposure [Rodrigues]."""

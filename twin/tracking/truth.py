@@ -25,7 +25,7 @@ class ViewTruth:
     ellipses: Array  # (3, 5) of the outer outlines: middle u, v, semi-axes a >= b px, angle rad of a from u towards v
     inside: NDArray[np.bool_]  # (3,) whether the whole disc lies in the image
     blur_px: Array  # (3,) length of a centre's path over the exposure
-    visible: Array = field(default_factory=lambda: np.zeros(3))  # part of each disc, 0 to 1
+    visible: Array = field(default_factory=lambda: np.zeros(3))  # part of each disc, 0 to 1: in the image, nothing before it
     white_dn: float = float("nan")  # brightness of the target's white, without noise
     patch_origins: NDArray[np.int64] = field(default_factory=lambda: np.zeros((3, 2), int))
 
@@ -51,6 +51,19 @@ def outline(centres: Array, radius: float) -> Array:
     angle = np.arange(RIM) * 2 * np.pi / RIM
     rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(RIM)]) * radius
     return centres[:, None] + rim
+
+
+def inside_share(ellipses: Array, size: tuple[int, int], rings: int = 24) -> Array:
+    """Part of each ellipse's area : (n,) that lies in an image of a size; ellipses : (n, 5) as of `ViewTruth`."""
+    radius = np.sqrt((np.arange(rings) + 0.5) / rings)
+    angle = (np.arange(4 * rings) + 0.5) * np.pi / (2 * rings)
+    x, y = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
+    shares = []
+    for u, v, a, b, turn in ellipses:
+        du, dv = a * x * np.cos(turn) - b * y * np.sin(turn), a * x * np.sin(turn) + b * y * np.cos(turn)
+        within = (np.abs(u + du + 0.5 - size[0] / 2) <= size[0] / 2) & (np.abs(v + dv + 0.5 - size[1] / 2) <= size[1] / 2)
+        shares.append(within.mean())
+    return np.array(shares)
 
 
 def ellipse_rows(rims: Array) -> Array:

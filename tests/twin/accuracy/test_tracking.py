@@ -26,23 +26,23 @@ def found(centres: np.ndarray) -> views.View:
 
 def test_right_exchanged_and_other_circles_are_told_apart():
     centres = TRUTH.ellipses[:, :2]
-    right = score(found(centres + 1.0), TRUTH, True, True)
+    right = score(found(centres + 1.0), TRUTH, True)
     assert right.shows_target and right.found and right.right and not right.exchanged
-    swapped = score(found(centres[[1, 0, 2]]), TRUTH, True, True)
+    swapped = score(found(centres[[1, 0, 2]]), TRUTH, True)
     assert swapped.exchanged and not swapped.right
-    elsewhere = score(found(centres + 200.0), TRUTH, True, True)
+    elsewhere = score(found(centres + 200.0), TRUTH, True)
     assert elsewhere.found and not elsewhere.right and not elsewhere.exchanged
-    missed = score(views.nothing("dark"), TRUTH, True, False)
+    missed = score(views.nothing("dark"), TRUTH, True)
     assert missed.shows_target and not missed.found and not missed.right
 
 
 def test_a_hidden_or_cut_target_is_not_asked_for():
-    hidden = score(views.nothing(""), replace(TRUTH, visible=np.array([1, 0.4, 1])), True, False)
+    hidden = score(views.nothing(""), replace(TRUTH, visible=np.array([1, 0.4, 1])), True)
     assert not hidden.shows_target and not hidden.covered
-    partly = score(views.nothing(""), replace(TRUTH, visible=np.array([1, 0.7, 1])), True, False)
+    partly = score(views.nothing(""), replace(TRUTH, visible=np.array([1, 0.7, 1])), True)
     assert partly.covered and not partly.shows_target
-    assert not score(views.nothing(""), replace(TRUTH, inside=np.array([True, False, True])), True, False).shows_target
-    empty = score(found(TRUTH.ellipses[:, :2]), TRUTH, False, False)
+    assert not score(views.nothing(""), replace(TRUTH, inside=np.array([True, False, True])), True).shows_target
+    empty = score(found(TRUTH.ellipses[:, :2]), TRUTH, False)
     assert empty.empty and empty.found and not empty.right and not empty.shows_target
 
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import tarfile
 
 import cv2
@@ -122,5 +123,8 @@ def test_a_folder_of_other_things_is_left_alone(tmp_path):
 
 
 def test_more_samples_may_be_asked_for_later(made, tmp_path):
-    assert prepare(made, settings(8)) == [2, 3]
-    assert prepare(made, settings(4)) == []
+    grown = Place(tmp_path / "set")
+    shutil.copytree(made.folder, grown.folder)
+    assert prepare(grown, settings(8)) == [2, 3]
+    with pytest.raises(InputError, match="samples: expected at least the 8"):
+        prepare(grown, settings(4))
