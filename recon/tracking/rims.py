@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit, prange
 
 from recon.tracking.cholesky import solve_and_invert
+from recon.tracking.edge_profile import blurred_step
 
 SECTORS = 48
 STARTS = (0, 5, 8, 11, 14)  # of the parameters of offset, inside, outside, variance
@@ -27,7 +28,6 @@ CAPTURED = 0.1  # px
 SETTLED = 4e-3  # px; the step after that is a tenth of it
 RESTLESS = 0.2  # px of the last step: a fit that still moves so has found nothing
 LEAST_VARIANCE = 0.06  # px^2: a pixel's own extent is 1/12
-NARROW = 1.2  # standard deviations of the lens's blur: a box below that is as good as Gaussian
 SCATTER = 10.0  # standard deviations beyond which a pixel counts less
 KEPT = (1 - 6 / SCATTER**2) / (1 - 2 / SCATTER**2)  # of normal noise's variance, seen with pixels counting by their residuals
 STRANGE = 6.0  # times the usual mean square at which a sector has lost three quarters of its weight
@@ -154,26 +154,6 @@ def _geometry(ellipse, variance, reach, hole):
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _primitive(z):
-    """Integral of the normal distribution function up to z."""
-    return z * 0.5 * math.erfc(-z * 0.7071067811865476) + math.exp(-0.5 * z * z) * 0.3989422804014327
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _profile(distance, box, blur, wide):
-    """The blurred step and its derivative by the distance, 1/px."""
-    if abs(distance) > box / 2 + 4.5 * blur:
-        return (1.0 if distance > 0 else 0.0), 0.0
-    if box < NARROW * blur:
-        scale = math.sqrt(wide)
-        z = distance / scale
-        return 0.5 * math.erfc(-z * 0.7071067811865476), math.exp(-0.5 * z * z) * 0.3989422804014327 / scale
-    high, low = (distance + box / 2) / blur, (distance - box / 2) / blur
-    share = (_primitive(high) - _primitive(low)) * blur / box
-    return share, 0.5 * (math.erfc(-high * 0.7071067811865476) - math.erfc(-low * 0.7071067811865476)) / box
-
-
-@njit(cache=True, inline="always", error_model="numpy")
 def _sector(x, y):
     """Number of the sector of a direction."""
     total = abs(x) + abs(y)
@@ -238,11 +218,11 @@ def _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums):
                 continue
             distance += sectors[j, PULL]
             wide = sectors[j, WIDE]
-            share, peak = _profile(distance, sectors[j, BOX], sectors[j, BLUR], wide)
+            share, peak = blurred_step(distance, sectors[j, BOX], sectors[j, BLUR], wide)
             bright = share
             within = (away - hole) / slope
             if hole > 0 and within * within < 16 * wide + sectors[j, BOX] ** 2 / 4:
-                bright += 1 - _profile(within, sectors[j, BOX], sectors[j, BLUR], wide)[0]
+                bright += 1 - blurred_step(within, sectors[j, BOX], sectors[j, BLUR], wide)[0]
             xr, yr = x / radius, y / radius
             inside, outside = planes[0] + planes[1] * xr + planes[2] * yr, planes[3] + planes[4] * xr + planes[5] * yr
             step = outside - inside

@@ -164,10 +164,10 @@ def _sensed(takes: Sequence[Take], rig: Rig, blocks: Sequence[Lanes], radiance: 
 
 def _electrons(take: Take, device: CameraDevice, rig: Rig) -> float:
     """Electrons for a radiance of 1, so that the target's white comes to the number that the exposure aims at."""
-    return take.white_dn / number_per_electron(device.sensor, Exposure(1.0, take.gain)) / white_radiance(take, device, rig)
+    return take.white_dn / number_per_electron(device.sensor, Exposure(1.0, take.gain)) / white_radiance(take, rig)
 
 
-def white_radiance(take: Take, device: CameraDevice, rig: Rig) -> float:
+def white_radiance(take: Take, rig: Rig) -> float:
     """Radiance of the target's white in the middle, nothing in the way."""
     pose, lighting = take.motion.world_from_target, take.lighting
     place = pose[:3, 3] + pose[:3, :3] @ [rig.target.c1_mm / 2, rig.target.c2_mm / 2, 0]

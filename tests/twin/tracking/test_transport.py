@@ -119,9 +119,7 @@ def test_white_shines_as_the_closed_form_says(bank):
     light = light_of(bank, take, 0, u, v, 16)
     shadowless = light.white_radiance[light.white > 0] / light.white[light.white > 0]
     shadowless = shadowless[shadowless > 0]
-    assert np.median(shadowless) == pytest.approx(
-        white_radiance(take, RIG.cam1, RIG), rel=0.06
-    )  # 13 mm off the middle; vignetting
+    assert np.median(shadowless) == pytest.approx(white_radiance(take, RIG), rel=0.06)  # 13 mm off the middle; vignetting
 
 
 def test_projected_fringes_stand_where_the_projector_puts_them(bank):
