@@ -22,9 +22,9 @@ from twin.optics.raster import Light
 from twin.optics.transport import Engine, Images, render
 from twin.optics.truth import SurfaceTruth, surface_truth
 from twin.optics.world import build_world, visible
+from twin.places import TRUTH_MARKER, check_places
 from twin.sensor import Exposure, Numbers, auto_exposure, electrons_per_radiance, expose, noise_dn, number_per_electron
 
-TRUTH_MARKER = "scene.json"
 CameraName = Literal["cam1", "cam2"]
 
 
@@ -142,8 +142,7 @@ def write_session(
     settings : what the session was rendered from; kept with the truth as `settings.json`.
     """
     optics = calibration_of(rig)
-    for folder, marker in ((out / "truth", TRUTH_MARKER), (out / "capture", capture.MANIFEST)):
-        atomic.check_folder(folder, marker)
+    check_places(out)
     shutil.rmtree(out / "capture", ignore_errors=True)
     with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
         (folder / "surface").mkdir()

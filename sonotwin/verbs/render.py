@@ -19,7 +19,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
-from recon import atomic, capture
 from recon.manifest import axes_without_fringes
 from recon.patterns import Patterns
 from recon.rig import Rig
@@ -27,6 +26,7 @@ from scenes.catalogue import build_scene, parse_scene
 from scenes.poses import Config as BoardPoses
 from twin import board_session, session
 from twin.optics.transport import Engine
+from twin.places import check_places
 
 
 class Config(BaseModel):
@@ -118,8 +118,7 @@ def render_board(config: Config, chosen: BoardPoses, console: Console) -> None:
 
 def render_surface(config: Config, console: Console) -> None:
     """What each camera sees of the scene under the patterns."""
-    for folder, marker in (("truth", session.TRUTH_MARKER), ("capture", capture.MANIFEST)):
-        atomic.check_folder(config.out / folder, marker)
+    check_places(config.out)
     scene = build_scene(config.scene)
     views = {}
     for camera in dict.fromkeys(config.cameras):

@@ -22,10 +22,11 @@ from scipy.spatial.transform import Rotation
 from recon import atomic, calibration, rigid
 from recon.calibration import Calibration
 from recon.errors import InputError
-from recon.manifest import MANIFEST, Device
+from recon.manifest import Device
 from recon.rig import Finite, NotNegative, Part, Positive, Rig, Target, Vector
 from recon.tracking import capture
 from recon.tracking.pose import circle_centres
+from twin.places import TRUTH_MARKER, check_places
 from twin.tracking.bank import Bank, build_bank
 from twin.tracking.draw import Motion, Take, draw
 from twin.tracking.frames import Frames, Quality, render_full, render_sketches, white_radiance
@@ -34,7 +35,6 @@ from twin.tracking.truth import outline
 
 Array = NDArray[np.float64]
 
-TRUTH_MARKER = "scene.json"  # as of the twin's other captures
 SETTINGS = "settings.json"
 TRUTH = "sweep/film.npz"
 BODIES = 4  # of which the one is taken whose fingers and cable cover least of the circles
@@ -164,7 +164,7 @@ def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int)
     )
     noise = np.random.default_rng([seed, 3]).integers(2**31, size=filming.frames).tolist()
     made = [replace(same, k=k, motion=motion, noise_seed=noise[k]) for k, motion in enumerate(motions)]
-    falls = np.array([white_radiance(take, rig.cam1, rig) for take in made])
+    falls = np.array([white_radiance(take, rig) for take in made])
     # one exposure: as bright on the whole as asked for, and in each frame as the light falls
     return [
         replace(take, white_dn=filming.white_dn * part) for take, part in zip(made, (falls / falls.mean()).tolist(), strict=True)
@@ -195,18 +195,6 @@ def shoot(
     render = render_sketches if pixels == "sketch" else render_full
     for first in range(0, len(made), BATCH):
         yield from render(bank, rig, made[first : first + BATCH], quality, seed)
-
-
-def check_places(out: Path) -> None:
-    """Check, before any long work, that capture and truth can be written.
-
-    Raises
-    ------
-    InputError
-        If something else is there.
-    """
-    for folder, marker in ((out / "truth", TRUTH_MARKER), (out / "capture", MANIFEST)):
-        atomic.check_folder(folder, marker)
 
 
 def write_session(

@@ -14,11 +14,11 @@ from pydantic import Field
 from recon import atomic, rigid, sweep_capture
 from recon.capture import write_images
 from recon.errors import InputError
-from recon.manifest import MANIFEST
 from recon.probe import ProbeCalibration
 from recon.rig import Rig
 from recon.tracks import Track
 from scenes.things import Scene
+from twin.places import TRUTH_MARKER, check_places
 from twin.ultrasound import truth
 from twin.ultrasound.probe_path import Bob, SurfacePath, WirePath, about_crossing, along_surface, bobbing
 from twin.ultrasound.scan import Scan
@@ -28,7 +28,6 @@ from twin.ultrasound.transducer import Transducer
 
 AnyPath = Annotated[SurfacePath | Bob | WirePath, Field(discriminator="kind")]
 
-TRUTH_MARKER = "scene.json"  # as of the twin's other captures
 SETTINGS = "settings.json"
 POSES = "sweep/sweep.npz"
 LABELS = "sweep/labels"
@@ -101,18 +100,6 @@ def calibration_of(rig: Rig, transducer: Transducer) -> ProbeCalibration:
     """The rig's true probe calibration, right where sound travels as the scanner assumes."""
     scale = np.array(rig.probe.scale_mm_per_px)
     return ProbeCalibration(rig.probe.target_from_image.matrix(), scale, speed_m_s=transducer.assumed_speed)
-
-
-def check_places(out: Path) -> None:
-    """Check, before any long work, that capture and truth can be written.
-
-    Raises
-    ------
-    InputError
-        If something else is there.
-    """
-    for folder, marker in ((out / "truth", TRUTH_MARKER), (out / "capture", MANIFEST)):
-        atomic.check_folder(folder, marker)
 
 
 def write_session(
