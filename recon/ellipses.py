@@ -5,6 +5,7 @@ semi-axes. Unlike axes and an angle, these five numbers stay smooth where the el
 many at once.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,11 @@ class Ellipses:
 
     def __getitem__(self, chosen) -> "Ellipses":
         return Ellipses(self.centre[chosen], self.shape[chosen])
+
+
+def joined(parts: Sequence[Ellipses]) -> Ellipses:
+    """Ellipses one after the other."""
+    return Ellipses(np.concatenate([part.centre for part in parts]), np.concatenate([part.shape for part in parts]))
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.ellipses import Ellipses
+from recon.ellipses import Ellipses, joined
 from recon.rig import Target
 from recon.tracking import rims
+from recon.tracking.sectors import SECTORS
 
 Array = NDArray[np.float64]
 
 FLOOR_PX = 0.002  # what lens model, print and pixel grid leave however little noise there is
+COVERED = 2  # power of the share that is seen, by which variances grow: what covers a rim bends it beside
 LEAST_SEEN = 0.4  # of the rim: with less an ellipse is a guess
 LEAST_CONTRAST = 4.0  # times the noise of a pixel
 LEAST_DN = 1.5
@@ -47,18 +49,19 @@ class Outlines:
         """Of white and black : (n,) DN."""
         return self.outside - self.inside
 
+    def replaced(self, which: int, other: "Outlines") -> "Outlines":
+        """The same with the one of `other` in a place."""
+        order = np.arange(len(self.reasons))
+        order[which] = len(order)
+        arrays = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in ARRAYS}
+        return Outlines(joined([self.ellipses, other.ellipses]), **arrays, reasons=self.reasons + other.reasons)[order]
+
     def __getitem__(self, chosen) -> "Outlines":
-        return Outlines(
-            self.ellipses[chosen],
-            self.covariance[chosen],
-            self.inside[chosen],
-            self.outside[chosen],
-            self.middle[chosen],
-            self.noise[chosen],
-            self.motion[chosen],
-            self.seen[chosen],
-            tuple(np.array(self.reasons, object)[chosen]),
-        )
+        arrays = {name: getattr(self, name)[chosen] for name in ARRAYS}
+        return Outlines(self.ellipses[chosen], **arrays, reasons=tuple(np.array(self.reasons, object)[chosen]))
+
+
+ARRAYS = ("covariance", "inside", "outside", "middle", "noise", "motion", "seen")
 
 
 def measure(image: NDArray, rough: Ellipses, reach: float | Array, target: Target) -> Outlines:
@@ -77,25 +80,34 @@ def measure(image: NDArray, rough: Ellipses, reach: float | Array, target: Targe
 
 
 def measure_both(
-    first: NDArray, second: NDArray, rough: Ellipses, of_second: NDArray[np.bool_], reach: float | Array, target: Target
+    first: NDArray,
+    second: NDArray,
+    rough: Ellipses,
+    of_second: NDArray[np.bool_],
+    reach: float | Array,
+    target: Target,
+    middles: bool = True,
 ) -> Outlines:
-    """The same for rings in two frames at once; `of_second` : (n,) says in which each is."""
+    """The same for rings in two frames at once.
+
+    `of_second` : (n,) says in which each is; without `middles` a ring may have no white middle that is seen.
+    """
     reach = np.broadcast_to(np.asarray(reach, float), len(rough.centre)).copy()
     hole = target.inner_diameter_mm / target.outer_diameter_mm
     kind = np.uint8 if first.dtype == second.dtype == np.uint8 else np.float32
     first, second = np.ascontiguousarray(first, kind), np.ascontiguousarray(second, kind)
     centres, shapes = np.ascontiguousarray(rough.centre, float), np.ascontiguousarray(rough.shape, float)
-    return _judged(rims.fit_rims(first, second, np.asarray(of_second, bool), centres, shapes, reach, hole), hole)
+    return _judged(rims.fit_rims(first, second, np.asarray(of_second, bool), centres, shapes, reach, hole), hole, middles)
 
 
-def _judged(rows: Array, hole: float) -> Outlines:
+def _judged(rows: Array, hole: float, middles: bool) -> Outlines:
     shape = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
     inside, outside, middle = rows[:, rims.LEVELS], rows[:, rims.LEVELS + 3], rows[:, rims.MIDDLE]
     noise, seen = rows[:, rims.NOISE : rims.NOISE + 2].max(axis=1, initial=0), rows[:, rims.SEEN]
-    chance = 1 + 3 * np.sqrt(2 / (rims.SECTORS * np.maximum(seen, 0.1)))
+    chance = 1 + 3 * np.sqrt(2 / (SECTORS * np.maximum(seen, 0.1)))
     excess = np.maximum(rows[:, rims.EXCESS] / chance, 1)
     covariance = rows[:, rims.COVARIANCE : rims.COVARIANCE + 25].reshape(-1, 5, 5)[:, :2, :2] * excess[:, None, None]
-    covariance = covariance + FLOOR_PX**2 * np.eye(2)
+    covariance = covariance / np.maximum(seen, 0.1)[:, None, None] ** COVERED + FLOOR_PX**2 * np.eye(2)
     v0, v1, v2 = rows[:, rims.VARIANCE : rims.VARIANCE + 3].T
     path, direction = np.sqrt(24 * np.hypot(v1, v2)), np.arctan2(v2, v1) / 2
     motion = path[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
@@ -109,7 +121,7 @@ def _judged(rows: Array, hole: float) -> Outlines:
             reasons.append(f"a contrast of {contrast:.1f} DN in noise of {noise[i]:.1f}")
         elif not seen[i] >= LEAST_SEEN:
             reasons.append(f"{100 * seen[i]:.0f} % of its rim seen")
-        elif not middle[i] - inside[i] > 0.5 * contrast * (1 - np.sqrt(v0[i]) / (hole * semi)):
+        elif middles and not middle[i] - inside[i] > 0.5 * contrast * (1 - np.sqrt(v0[i]) / (hole * semi)):
             reasons.append("no white middle")
         elif not np.sqrt(v0[i]) <= LARGEST_BLUR * (1 - hole) * semi:
             reasons.append(f"blurred by {np.sqrt(12 * v0[i]):.0f} px")

@@ -18,8 +18,36 @@ from numba import njit, prange
 
 from recon.tracking.cholesky import solve_and_invert
 from recon.tracking.edge_profile import blurred_step
+from recon.tracking.sectors import (
+    BLUR,
+    BOX,
+    COS,
+    COUNT,
+    INNER,
+    LEAST_SECTORS,
+    LEAST_VARIANCE,
+    LOCAL,
+    NX,
+    NY,
+    OUTER,
+    OUTERMOST,
+    PULL,
+    ROUNDING,
+    SCATTER,
+    SECTORS,
+    SIN,
+    SQUARES,
+    UX,
+    UY,
+    WIDE,
+    X,
+    Y,
+    geometry,
+    judge,
+    sector,
+    steep,
+)  # fmt: skip
 
-SECTORS = 48
 STARTS = (0, 5, 8, 11, 14)  # of the parameters of offset, inside, outside, variance
 GLOBAL = 14  # centre (2), shape (3), planes inside (3) and outside (3), variance (3)
 CAPTURE_STEPS = 8  # on every second pixel of every second row, from a rough ellipse
@@ -27,23 +55,12 @@ STEPS = 8  # on all pixels
 CAPTURED = 0.1  # px
 SETTLED = 4e-3  # px; the step after that is a tenth of it
 RESTLESS = 0.2  # px of the last step: a fit that still moves so has found nothing
-LEAST_VARIANCE = 0.06  # px^2: a pixel's own extent is 1/12
-SCATTER = 10.0  # standard deviations beyond which a pixel counts less
-KEPT = (1 - 6 / SCATTER**2) / (1 - 2 / SCATTER**2)  # of normal noise's variance, seen with pixels counting by their residuals
-STRANGE = 6.0  # times the usual mean square at which a sector has lost three quarters of its weight
-ROUNDING = 1 / 12  # DN^2
 FAST = {"reassoc", "contract", "arcp", "nsz"}  # all but what is not finite
-OUTERMOST = 0.37  # radii beyond the rim: half way to the neighbour
 FEWEST = 4  # pixels of a sector that count
-LEAST_SECTORS = 16
 
 # what a fit returns, by column
 CENTRE, SHAPE, COVARIANCE, LEVELS, NOISE, VARIANCE, SEEN, EXCESS, MIDDLE, FAILED = 0, 2, 5, 30, 36, 38, 41, 42, 43, 44
 COLUMNS = 45
-# of a sector, by column
-UX, UY, NX, NY, WIDE, BOX, BLUR, PULL, INNER, OUTER, COS, SIN, X, Y = range(14)
-# sums of a sector: the upper triangle of 4x4 and the right side, squares, count, and five for the noise
-SQUARES, COUNT, LOCAL = 14, 15, 21
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -73,9 +90,9 @@ def _fit(image, centre, shape, reach, hole, result):
     for capture in (True, False):
         stride = 2 if capture and ellipse[2] + ellipse[4] > 40 else 1
         for _ in range(CAPTURE_STEPS if capture else STEPS):
-            sectors = _geometry(ellipse, variance, reach if capture else 0.0, hole)
+            sectors = geometry(ellipse, variance, reach if capture else 0.0, hole)
             _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums)
-            if not _judge(sums, weights, noise, capture, FEWEST if stride == 1 else 1):
+            if not judge(sums, sectors, planes, weights, noise, capture, FEWEST if stride == 1 else 1):
                 return
             step = np.zeros(GLOBAL)
             if not _solve(sums, weights, sectors, planes, step, inverse):
@@ -98,7 +115,7 @@ def _fit(image, centre, shape, reach, hole, result):
     result[LEVELS : LEVELS + 6] = planes
     result[NOISE : NOISE + 2] = np.sqrt(noise)
     result[VARIANCE : VARIANCE + 3] = variance
-    result[SEEN] = weights.sum() / SECTORS
+    result[SEEN] = (weights > 0.5).sum() / SECTORS
     result[EXCESS] = scores / freedom
     result[MIDDLE] = _middle(image, ellipse, hole)
     result[FAILED] = 0
@@ -113,55 +130,6 @@ def _sound(ellipse, size):
     if half - gap < 3 or half - gap < 0.2 * (half + gap) or half + gap > max(size):
         return False
     return -1 < ellipse[0] < size[1] and -1 < ellipse[1] < size[0]
-
-
-@njit(cache=True, error_model="numpy")
-def _geometry(ellipse, variance, reach, hole):
-    """Of each sector's middle : (SECTORS, 14): its place, the normal, the profile there, and how far to look."""
-    sectors = np.empty((SECTORS, 14))
-    a, b, c = ellipse[2], ellipse[3], ellipse[4]
-    determinant = a * c - b * b
-    radius = (a + c) / 2
-    strength = math.hypot(variance[1], variance[2])
-    blur = math.sqrt(max(variance[0] - strength, LEAST_VARIANCE))
-    path = math.sqrt(24 * strength)
-    psi = 0.5 * math.atan2(variance[2], variance[1])
-    for j in range(SECTORS):
-        at = (j + 0.5) * 4 / SECTORS
-        quadrant = int(at)
-        y = at - quadrant
-        x = 1 - y
-        length = math.hypot(x, y)
-        x, y = x / length, y / length
-        for _ in range(quadrant):
-            x, y = -y, x
-        nx, ny = (c * x - b * y) / determinant, (a * y - b * x) / determinant
-        slope = math.hypot(nx, ny)
-        nx, ny = nx / slope, ny / slope
-        across = path * abs(nx * math.cos(psi) + ny * math.sin(psi))
-        along = path * (ny * math.cos(psi) - nx * math.sin(psi))
-        curvature = determinant / math.hypot(b * x - a * y, c * x - b * y) ** 3
-        far = max(across / 2 + 3 * blur + 1.5, 1.3 * reach + 1)
-        sectors[j, UX], sectors[j, UY], sectors[j, NX], sectors[j, NY] = x, y, nx, ny
-        sectors[j, BOX], sectors[j, BLUR] = across, blur
-        sectors[j, WIDE] = blur * blur + across * across / 12
-        sectors[j, PULL] = curvature * along * along / 24
-        sectors[j, INNER] = min(far, 0.75 * (1 - hole) / slope)
-        sectors[j, OUTER] = min(far, OUTERMOST / slope)
-        sectors[j, COS], sectors[j, SIN] = nx * nx - ny * ny, 2 * nx * ny
-        sectors[j, X], sectors[j, Y] = (a * x + b * y) / radius, (b * x + c * y) / radius
-    return sectors
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _sector(x, y):
-    """Number of the sector of a direction."""
-    total = abs(x) + abs(y)
-    if x >= 0:
-        at = y / total if y >= 0 else 3 + x / total
-    else:
-        at = 1 - x / total if y >= 0 else 2 - y / total
-    return min(int(at * (SECTORS / 4)), SECTORS - 1)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -207,7 +175,7 @@ def _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums):
                 continue
             away = math.sqrt(square)
             p, q = p / away, q / away
-            j = _sector(p, q)
+            j = sector(p, q)
             sx, sy = ia * p + ib * q, ib * p + ic * q
             slope2 = sx * sx + sy * sy
             slope = math.sqrt(slope2)
@@ -256,33 +224,6 @@ def _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums):
             row[18] += robust * c2 * c2
             row[19] += robust * c1 * squared
             row[20] += robust * c2 * squared
-
-
-@njit(cache=True, error_model="numpy")
-def _judge(sums, weights, noise, capture, fewest):
-    """Weigh the sectors by how well they fit and follow the noise; False if too little of the rim is in the image."""
-    seen = sums[:, COUNT] >= fewest
-    if seen.sum() < LEAST_SECTORS:
-        return False
-    mean = sums[:, SQUARES] / np.maximum(sums[:, COUNT], 1e-9)
-    usual = np.median(mean[seen])
-    if not usual > 0:
-        usual = 1.0
-    for j in range(SECTORS):
-        weights[j] = 1 / (1 + (mean[j] / (STRANGE * usual)) ** 2) ** 2 if seen[j] else 0.0
-    if capture:
-        noise[:] = np.maximum(noise.mean() * usual, ROUNDING)
-        return True
-    a, b, c = (weights * sums[:, 16]).sum(), (weights * sums[:, 17]).sum(), (weights * sums[:, 18]).sum()
-    p, q = (weights * sums[:, 19]).sum() / KEPT, (weights * sums[:, 20]).sum() / KEPT
-    determinant = a * c - b * b
-    if determinant > 1e-6 * a * c:
-        noise[0], noise[1] = (c * p - b * q) / determinant, (a * q - b * p) / determinant
-    if noise[0] < ROUNDING:
-        noise[0], noise[1] = ROUNDING, (q - b * ROUNDING) / c
-    if noise[1] < ROUNDING:
-        noise[1], noise[0] = ROUNDING, max((p - b * ROUNDING) / a, ROUNDING)
-    return True
 
 
 @njit(cache=True, error_model="numpy")
@@ -337,8 +278,8 @@ def _move(ellipse, planes, variance, step, reach):
 
 @njit(cache=True, error_model="numpy")
 def _first_levels(image, ellipse, variance, reach, hole, planes, noise):
-    """Medians over the sectors of the means inside and outside; False if there is no dark ring on bright ground."""
-    sectors = _geometry(ellipse, variance, reach, hole)
+    """Levels inside and outside, medians over the sectors like a rim; False if there is no dark ring on bright ground."""
+    sectors = geometry(ellipse, variance, reach, hole)
     totals = np.zeros((SECTORS, 4))
     determinant = ellipse[2] * ellipse[4] - ellipse[3] ** 2
     ia, ib, ic = ellipse[4] / determinant, -ellipse[3] / determinant, ellipse[2] / determinant
@@ -351,7 +292,7 @@ def _first_levels(image, ellipse, variance, reach, hole, planes, noise):
             away = math.sqrt(p * p + q * q)
             if away < hole or away > 1 + OUTERMOST:
                 continue
-            j = _sector(p, q)
+            j = sector(p, q)
             distance = (away - 1) * away / math.hypot(ia * p + ib * q, ib * p + ic * q)
             if -sectors[j, INNER] < distance < -0.35 * sectors[j, INNER]:
                 totals[j, 0] += 1
@@ -362,8 +303,9 @@ def _first_levels(image, ellipse, variance, reach, hole, planes, noise):
     seen = np.minimum(totals[:, 0], totals[:, 2]) > 0
     if seen.sum() < LEAST_SECTORS:
         return False
-    planes[0] = np.median(totals[seen, 1] / totals[seen, 0])
-    planes[3] = np.median(totals[seen, 3] / totals[seen, 2])
+    dark, bright = totals[:, 1] / np.maximum(totals[:, 0], 1), totals[:, 3] / np.maximum(totals[:, 2], 1)
+    like_rims = steep(dark, bright, seen)
+    planes[0], planes[3] = np.median(dark[like_rims]), np.median(bright[like_rims])
     noise[:] = max((0.1 * (planes[3] - planes[0])) ** 2, ROUNDING)
     return planes[3] > planes[0]
 

@@ -14,15 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from recon import rigid
 from recon.camera import Camera
-from recon.ellipses import Ellipses
+from recon.ellipses import Ellipses, joined
 from recon.errors import InputError
 from recon.rig import Target
-from recon.tracking import detection, identity, segmentation, views
+from recon.tracking import covered, detection, identity, segmentation, views
 from recon.tracking.frames import grey
 from recon.tracking.identity import Triple
 from recon.tracking.networks import Networks
 from recon.tracking.outline_model import ellipses_of
-from recon.tracking.outlines import measure_both
+from recon.tracking.outlines import Outlines, measure_both
 from recon.tracking.pose import GROSS_MM, Sighting, TargetPose, circle_centres, estimate, lost, meet
 from recon.tracking.views import View
 
@@ -140,7 +140,7 @@ class Tracker:
     def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str, rename: bool = False) -> Tracking:
         """From six rough ellipses to the pose."""
         outlines = measure_both(*frames, rough, np.arange(6) >= 3, reach, self.target)
-        halves = [outlines[:3], outlines[3:]]
+        halves = [self._completed(frames, half, k) for k, half in enumerate((outlines[:3], outlines[3:]))]
         if rename:
             halves = [views.renamed(half, self.target) for half in halves]
         seen = (views.judged(halves[0], self.target), views.judged(halves[1], self.target))
@@ -155,6 +155,15 @@ class Tracker:
                 found = lost(f"circles whose sizes are {100 * off:.0f} % from what their distance asks for")
         return Tracking(found, seen, how if found.found else None)
 
+    def _completed(self, frames: Frames, outlines: Outlines, view: int) -> Outlines:
+        """Three rims, of which one that something covers is looked for where the other two ask for it."""
+        which = covered.missing(outlines.found)
+        if which is None:
+            return outlines
+        rough = covered.third(outlines.ellipses, which, self.target)
+        again = measure_both(*frames, rough, np.array([view == 1]), covered.REACH_PX, self.target, middles=False)
+        return outlines.replaced(which, again) if again.found.all() else outlines
+
     def _segmented(
         self, frames: Frames, networks: Networks, places: tuple[Array, Array], how: str, before: Tracking | None = None
     ) -> Tracking:
@@ -165,7 +174,7 @@ class Tracker:
         ]
         masks = networks.segment(np.concatenate([cut.images for cut in cuts]))
         halves = [segmentation.read(half, cut) for half, cut in zip((masks[:3], masks[3:]), cuts, strict=True)]
-        rough = Ellipses(*(np.concatenate([getattr(half, name) for half in halves]) for name in ("centre", "shape")))
+        rough = joined(halves)
         if before is not None and not np.isfinite(rough.centre).all():
             return before
         return self._fitted(frames, rough, ROUGH_PX, how, rename=how == "detected")
@@ -191,7 +200,7 @@ class Tracker:
         """The circles of the one view that has any."""
         k = 0 if choices[0] else 1
         rough = segmentation.rough_ellipses(frames[k], choices[k][0].points, networks, self.target)
-        outlines = measure_both(*frames, rough, np.full(3, k == 1), ROUGH_PX, self.target)
+        outlines = self._completed(frames, measure_both(*frames, rough, np.full(3, k == 1), ROUGH_PX, self.target), k)
         view, other = views.judged(views.renamed(outlines, self.target), self.target), views.nothing(reasons[1 - k])
         seen = (view, other) if k == 0 else (other, view)
         return Tracking(lost(_unseen(seen)), seen)

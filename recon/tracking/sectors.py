@@ -1,0 +1,122 @@
+"""Sectors of a rim: where they lie, and which of them look like the rim of a ring, compiled."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+SECTORS = 48
+LEAST_SECTORS = 16
+OUTERMOST = 0.37  # radii beyond the rim: half way to the neighbour
+LEAST_VARIANCE = 0.06  # px^2: a pixel's own extent is 1/12
+SCATTER = 10.0  # standard deviations beyond which a pixel counts less
+KEPT = (1 - 6 / SCATTER**2) / (1 - 2 / SCATTER**2)  # of normal noise's variance, seen with pixels counting by their residuals
+STEEP = 0.6  # of the contrast (bright - dark) / (bright + dark) that a quarter of the sectors exceeds: with less it isn't a rim
+STRANGE = 4.0  # times the usual mean square at which a sector has lost three quarters of its weight
+ROUNDING = 1 / 12  # DN^2
+
+# of a sector, by column
+UX, UY, NX, NY, WIDE, BOX, BLUR, PULL, INNER, OUTER, COS, SIN, X, Y = range(14)
+# sums of a sector: the upper triangle of 4x4 and the right side, squares, count, and five for the noise
+SQUARES, COUNT, LOCAL = 14, 15, 21
+
+
+@njit(cache=True, error_model="numpy")
+def geometry(ellipse, variance, reach, hole):
+    """Of each sector's middle : (SECTORS, 14): its place, the normal, the profile there, and how far to look."""
+    sectors = np.empty((SECTORS, 14))
+    a, b, c = ellipse[2], ellipse[3], ellipse[4]
+    determinant = a * c - b * b
+    radius = (a + c) / 2
+    strength = math.hypot(variance[1], variance[2])
+    blur = math.sqrt(max(variance[0] - strength, LEAST_VARIANCE))
+    path = math.sqrt(24 * strength)
+    psi = 0.5 * math.atan2(variance[2], variance[1])
+    for j in range(SECTORS):
+        at = (j + 0.5) * 4 / SECTORS
+        quadrant = int(at)
+        y = at - quadrant
+        x = 1 - y
+        length = math.hypot(x, y)
+        x, y = x / length, y / length
+        for _ in range(quadrant):
+            x, y = -y, x
+        nx, ny = (c * x - b * y) / determinant, (a * y - b * x) / determinant
+        slope = math.hypot(nx, ny)
+        nx, ny = nx / slope, ny / slope
+        across = path * abs(nx * math.cos(psi) + ny * math.sin(psi))
+        along = path * (ny * math.cos(psi) - nx * math.sin(psi))
+        curvature = determinant / math.hypot(b * x - a * y, c * x - b * y) ** 3
+        far = max(across / 2 + 3 * blur + 1.5, 1.3 * reach + 1)
+        sectors[j, UX], sectors[j, UY], sectors[j, NX], sectors[j, NY] = x, y, nx, ny
+        sectors[j, BOX], sectors[j, BLUR] = across, blur
+        sectors[j, WIDE] = blur * blur + across * across / 12
+        sectors[j, PULL] = curvature * along * along / 24
+        sectors[j, INNER] = min(far, 0.75 * (1 - hole) / slope)
+        sectors[j, OUTER] = min(far, OUTERMOST / slope)
+        sectors[j, COS], sectors[j, SIN] = nx * nx - ny * ny, 2 * nx * ny
+        sectors[j, X], sectors[j, Y] = (a * x + b * y) / radius, (b * x + c * y) / radius
+    return sectors
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def sector(x, y):
+    """Number of the sector of a direction."""
+    total = abs(x) + abs(y)
+    if x >= 0:
+        at = y / total if y >= 0 else 3 + x / total
+    else:
+        at = 1 - x / total if y >= 0 else 2 - y / total
+    return min(int(at * (SECTORS / 4)), SECTORS - 1)
+
+
+@njit(cache=True, error_model="numpy")
+def steep(dark, bright, seen):
+    """Sectors : (SECTORS,) bool whose levels are ink's beside paper's, in whatever light: as deep as others."""
+    depth = (bright - dark) / np.maximum(np.abs(bright) + np.abs(dark), 1e-9)
+    return seen & (depth > STEEP * np.quantile(depth[seen], 0.75))
+
+
+@njit(cache=True, error_model="numpy")
+def _levels(sums, sectors, planes):
+    """What each sector's pixels alone say of the dark and the bright side : two of (SECTORS,) DN."""
+    dark = planes[0] + planes[1] * sectors[:, X] + planes[2] * sectors[:, Y]
+    bright = planes[3] + planes[4] * sectors[:, X] + planes[5] * sectors[:, Y]
+    for j in range(SECTORS):
+        a, b, c, p, q = sums[j, 4] * 1.001, sums[j, 5], sums[j, 7] * 1.001, sums[j, 11], sums[j, 12]
+        determinant = a * c - b * b
+        if determinant > 0:
+            dark[j] += (c * p - b * q) / determinant
+            bright[j] += (a * q - b * p) / determinant
+    return dark, bright
+
+
+@njit(cache=True, error_model="numpy")
+def judge(sums, sectors, planes, weights, noise, capture, fewest):
+    """Weigh the sectors by how well they fit and follow the noise; False if too little of the rim is in the image."""
+    seen = sums[:, COUNT] >= fewest
+    if seen.sum() < LEAST_SECTORS:
+        return False
+    mean = sums[:, SQUARES] / np.maximum(sums[:, COUNT], 1e-9)
+    dark, bright = _levels(sums, sectors, planes)
+    likely = steep(dark, bright, seen)
+    if likely.sum() < LEAST_SECTORS:
+        return False
+    usual = np.median(mean[likely])
+    if not usual > 0:
+        usual = 1.0
+    for j in range(SECTORS):
+        weights[j] = 1 / (1 + (mean[j] / (STRANGE * usual)) ** 2) ** 2 if likely[j] else 0.0
+    if capture:
+        noise[:] = np.maximum(noise.mean() * usual, ROUNDING)
+        return True
+    a, b, c = (weights * sums[:, 16]).sum(), (weights * sums[:, 17]).sum(), (weights * sums[:, 18]).sum()
+    p, q = (weights * sums[:, 19]).sum() / KEPT, (weights * sums[:, 20]).sum() / KEPT
+    determinant = a * c - b * b
+    if determinant > 1e-6 * a * c:
+        noise[0], noise[1] = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+    if noise[0] < ROUNDING:
+        noise[0], noise[1] = ROUNDING, (q - b * ROUNDING) / c
+    if noise[1] < ROUNDING:
+        noise[1], noise[0] = ROUNDING, max((p - b * ROUNDING) / a, ROUNDING)
+    return True
