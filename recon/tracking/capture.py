@@ -23,7 +23,7 @@ from recon.errors import InputError
 from recon.manifest import MANIFEST, SCHEMA, Device, Manifest, SweepPart
 from recon.sweep_capture import FOLDER, SCANNER, STAMPS, image_name
 from recon.tracking import overlays
-from recon.tracking.following import Followed
+from recon.tracking.following import Step, track_of
 from recon.tracking.tracker import Tracking
 
 CAMERAS = ("cam1", "cam2")
@@ -47,7 +47,7 @@ class Film:
     name: str
     cameras: tuple[Camera, Camera]
     depths: tuple[int, int]  # bits of each camera
-    paths: tuple[tuple[Path, Path], ...]  # n
+    folders: tuple[Path, Path]  # of each camera's frames
     frames: NDArray[np.int64]  # (n, 2) their numbers
     times: NDArray[np.int64]  # (n,) ns, of camera 1's frames
 
@@ -55,6 +55,11 @@ class Film:
     def bits(self) -> int | None:
         """Of whole numbers beyond 8 bits; None if there are none."""
         return max(self.depths) if max(self.depths) > 8 else None
+
+    def paths(self) -> Iterator[tuple[Path, Path]]:
+        """Of both frames, pair by pair."""
+        first, second = self.folders
+        return ((first / image_name(a), second / image_name(b)) for a, b in self.frames.tolist())
 
     @property
     def rate_hz(self) -> float:
@@ -65,7 +70,7 @@ class Film:
         """Read the frames, camera 1's and camera 2's : (h, w), pair by pair; InputError at one that is damaged."""
         waiting: deque[tuple[Future[Images], ...]] = deque()
         with ThreadPoolExecutor(len(CAMERAS)) as pool:
-            for both in self.paths:
+            for both in self.paths():
                 cameras = zip(both, self.cameras, self.depths, strict=True)
                 waiting.append(tuple(pool.submit(read_image, path, camera.size, bits) for path, camera, bits in cameras))
                 if len(waiting) > AHEAD:
@@ -102,11 +107,11 @@ def read_film(folder: Path, calibration_file: Path | None = None) -> Film:
     tables = [sweep_tables.read_stamps(place / STAMPS) for place in places]
     first, second = _partners(places, tables)
     frames = np.column_stack([tables[0][0][first], tables[1][0][second]])
-    paths = tuple((places[0] / image_name(a), places[1] / image_name(b)) for a, b in frames.tolist())
-    for path in (path for both in paths for path in both):
+    film = Film(read.name or folder.resolve().name, cameras, depths, (places[0], places[1]), frames, tables[0][1][first])
+    for path in (path for both in film.paths() for path in both):
         if not path.is_file():
             raise InputError(f"{path}: expected a file, found {'something else' if path.exists() else 'none'}")
-    return Film(read.name or folder.resolve().name, cameras, depths, paths, frames, tables[0][1][first])
+    return film
 
 
 def write_film(
@@ -157,12 +162,12 @@ def write_film(
         manifest.write_manifest(temporary, content)
 
 
-def write_poses(folder: Path, film: Film, followed: Followed) -> None:
+def write_poses(folder: Path, film: Film, steps: Sequence[Step]) -> None:
     """Write `poses.csv`, the table that other verbs read, and `frames.csv`: how each pose was found, or why not."""
-    sweep_tables.write_track(folder / POSES, followed.track)
+    sweep_tables.write_track(folder / POSES, track_of(steps))
     rows = (
-        [int(time), *numbers, int(each.found), each.how or "", *_figures(each), each.pose.reason or ""]
-        for time, numbers, each in zip(film.times, film.frames.tolist(), followed.trackings, strict=True)
+        [step.time_ns, *numbers, int(step.found), step.how or "", *_rounded([*step.sigmas, *step.blur_px]), step.reason or ""]
+        for numbers, step in zip(film.frames.tolist(), steps, strict=True)
     )
     sweep_tables.write_rows(folder / FRAMES, COLUMNS, rows)
 
@@ -190,7 +195,7 @@ def overlay_name(number: int) -> str:
     return image_name(number).replace(".png", ".jpg")
 
 
-def hand_on(folder: Path, source: Path, out: Path) -> bool:
+def hand_on(folder: Path, source: Path, out: Path, optics: Path | None = None) -> bool:
     """Make a folder of poses a capture: the one that they were found in, with them as its track. Only if it has B-scans.
 
     Parameters
@@ -198,6 +203,7 @@ def hand_on(folder: Path, source: Path, out: Path) -> bool:
     folder : where to write.
     source : the capture.
     out : where the folder is going to be.
+    optics : the calibration that they were found with, if it isn't the capture's own.
     """
     read = manifest.read_manifest(source)
     if read.sweep is None or SCANNER not in read.sweep.images:
@@ -205,6 +211,8 @@ def hand_on(folder: Path, source: Path, out: Path) -> bool:
     source, out = source.resolve(), out.resolve()
     root = source / read.root
     files = {name: os.path.relpath(source / path, out) for name in ("calibration", "probe") if (path := getattr(read, name))}
+    if optics is not None:
+        files["calibration"] = os.path.relpath(optics.resolve(), out)
     sweep = read.sweep.model_copy(update={"track": os.path.relpath(out / POSES, root)})
     change = {"root": os.path.relpath(root, out), "sweep": sweep, **files}
     manifest.write_manifest(folder, read.model_copy(update=change))
@@ -259,13 +267,5 @@ def _nearest(wanted: NDArray[np.int64], times: NDArray[np.int64]) -> NDArray[np.
     return np.where(np.abs(times[before] - wanted) <= np.abs(times[after] - wanted), before, after)
 
 
-def _figures(found: Tracking) -> list[float | str]:
-    blurs = [float(view.blur_px.max()) for view in found.views]
-    told = [*sigmas(found), *blurs]
-    return [round(value, 5) if np.isfinite(value) else "" for value in told]
-
-
-def sigmas(found: Tracking) -> tuple[float, float]:
-    """Predicted standard deviations of a pose, over all directions: mm and deg; NaN if there is none."""
-    turn, shift = (float(np.sqrt(np.trace(found.pose.covariance[part, part]))) for part in (slice(0, 3), slice(3, 6)))
-    return shift, float(np.rad2deg(turn))
+def _rounded(values: Sequence[float]) -> list[float | str]:
+    return [round(value, 5) if np.isfinite(value) else "" for value in values]

@@ -32,8 +32,8 @@ from recon.metrics import Metrics, shown
 from recon.rig import Rig
 from recon.tracking import capture, following, networks
 from recon.tracking.capture import Film
-from recon.tracking.following import Followed
-from recon.tracking.tracker import Tracker, Tracking
+from recon.tracking.following import Step
+from recon.tracking.tracker import Tracker
 
 WAYS = ("predicted", "segmented", "detected")
 KINDS = 4  # of reasons that are told apart
@@ -73,50 +73,49 @@ def run(config: Config) -> None:
 
     with atomic.new_folder(config.out, capture.POSES) as folder:
         start = perf_counter()
-        followed = follow(film, tracker, folder if config.overlays else None, console)
-        figures = measure(followed)
-        for line in describe(followed, figures):
+        steps = follow(film, tracker, folder if config.overlays else None, console)
+        figures = measure(steps)
+        for line in describe(steps, figures):
             console.print(line, markup=False)
-        capture.write_poses(folder, film, followed)
+        capture.write_poses(folder, film, steps)
         metrics.write(folder / metrics.FILE, figures | {"seconds_track": round(perf_counter() - start, 3)})
-        capture.hand_on(folder, config.capture, config.out)
+        capture.hand_on(folder, config.capture, config.out, config.calibration)
         written = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
 
 
-def follow(film: Film, tracker: Tracker, pictures: Path | None, console: Console) -> Followed:
+def follow(film: Film, tracker: Tracker, pictures: Path | None, console: Console) -> list[Step]:
     """Track a film from its first pair to its last, writing overlays into a folder if one is given."""
-    trackings: list[Tracking] = []
+    steps = []
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         pairs = progress.track(film.pairs(), total=len(film.times), description="tracking")
         for time, (number, _), pair in zip(film.times.tolist(), film.frames.tolist(), pairs, strict=True):
             found = tracker.step(*pair, time * 1e-9)
-            trackings.append(found)
+            steps.append(following.kept(found, time))
             if pictures is not None:
                 capture.write_overlay(pictures, number, capture.overlay(pair, found, film.cameras))
-    return following.gathered(film.times, trackings)
+    return steps
 
 
-def measure(followed: Followed) -> Metrics:
+def measure(steps: Sequence[Step]) -> Metrics:
     """Figures of what was tracked; frames a second are of the tracker alone, in its median frame."""
-    found = [each for each in followed.trackings if each.found]
-    sigma = np.array([capture.sigmas(each) for each in found]).reshape(-1, 2)
+    found = [step for step in steps if step.found]
+    sigma = np.array([step.sigmas for step in found]).reshape(-1, 2)
     typical = np.median(sigma, axis=0) if found else np.full(2, np.nan)
-    seconds = float(np.median([sum(each.seconds.values()) for each in followed.trackings]))
     return {
-        "frames": len(followed.trackings),
+        "frames": len(steps),
         "frames_found": len(found),
-        **{f"frames_{way}": sum(each.how == way for each in found) for way in WAYS},
+        **{f"frames_{way}": sum(step.how == way for step in found) for way in WAYS},
         "sigma_median_mm": float(typical[0]),
         "sigma_median_deg": float(typical[1]),
-        "frames_per_s": 1 / max(seconds, 1e-9),
+        "frames_per_s": 1 / max(float(np.median([step.seconds for step in steps])), 1e-9),
     }
 
 
-def describe(followed: Followed, figures: Metrics) -> list[str]:
+def describe(steps: Sequence[Step], figures: Metrics) -> list[str]:
     """How many were found and why not the others, how, how fast and how well."""
     found, count = figures["frames_found"], figures["frames"]
-    missed = ", ".join(f"{kind} ({number})" for kind, number in kinds(followed.reasons))
+    missed = ", ".join(f"{kind} ({number})" for kind, number in kinds([step.reason for step in steps]))
     left = f", {count - found} not: {missed}" if found < count else ""
     ways = ", ".join(f"{figures[f'frames_{way}']} {way}" for way in WAYS if figures[f"frames_{way}"])
     return [

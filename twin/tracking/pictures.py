@@ -54,7 +54,7 @@ class View:
         u, v = self.taps()
         taps = numbers.reshape(2, VIEW[1], 2, VIEW[0]).transpose(1, 0, 3, 2).reshape(2 * VIEW[1], 2 * VIEW[0])
         width, height = self.size
-        return taps[_nearest(v.T.ravel(), height)][:, _nearest(u.T.ravel(), width)]
+        return taps[np.ix_(_nearest(v.T.ravel(), height), _nearest(u.T.ravel(), width))]
 
     def taps(self) -> tuple[Whole, Whole]:
         """Camera pixels that make a view's: along u : (2, 320), and along v : (2, 240)."""

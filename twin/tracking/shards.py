@@ -5,11 +5,14 @@ goes on with the shards that are missing, and workers need no coordinator: the b
 """
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import wait
 from pathlib import Path
+from threading import Thread
 from typing import Literal
 
 import cv2
@@ -128,8 +131,17 @@ _BANK: dict[str, Bank] = {}  # of a worker process: made once, used by each of i
 
 
 def _start(settings: Settings, workers: int) -> None:
+    Thread(target=_end_with_parent, daemon=True).start()
     dr.set_thread_count(max(dr.thread_count() // workers, 1))
     _BANK["own"] = build_bank(settings.rig.target, settings.ranges.variants, settings.seed)
+
+
+def _end_with_parent() -> None:
+    """A worker whose parent was killed would render on until its shard is full."""
+    parent = parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
 
 
 def _work(place: Place, settings: Settings, number: int) -> int:

@@ -87,7 +87,7 @@ def ellipse_rows(rims: Array) -> Array:
 
 def path_length(motion: Motion, camera: Camera, model: Array, steps: int = 9) -> Array:
     """Length of the centres' paths over the exposure : (n,) px."""
-    places = np.array([camera.project(rigid.apply(motion.at(time), model)) for time in np.linspace(-0.5, 0.5, steps)])
+    places = camera.project(np.array([rigid.apply(motion.at(time), model) for time in np.linspace(-0.5, 0.5, steps)]))
     return np.linalg.norm(np.diff(places, axis=0), axis=-1).sum(axis=0)
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import calibration, sweep_capture, sweep_tables
+from recon import calibration, manifest, sweep_capture, sweep_tables
 from recon.errors import InputError
 from recon.tracking import capture, following
 from recon.tracking.tracker import Tracker
@@ -157,20 +157,20 @@ def followed(rig, tmp_path_factory):
     tracker = Tracker(film.cameras, rig.target, Told(films.centres(rig, films.places(1)[0])))
     pictures = folder / "out"
     pictures.mkdir()
-    trackings = []
+    steps = []
     for k, pair in enumerate(film.pairs()):
-        trackings.append(tracker.step(*pair, film.times[k] * 1e-9))
-        capture.write_overlay(pictures, k, capture.overlay(pair, trackings[-1], film.cameras))
-    told = following.gathered(film.times, trackings)
-    capture.write_poses(pictures, film, told)
-    return told, pictures
+        found = tracker.step(*pair, film.times[k] * 1e-9)
+        steps.append(following.kept(found, int(film.times[k])))
+        capture.write_overlay(pictures, k, capture.overlay(pair, found, film.cameras))
+    capture.write_poses(pictures, film, steps)
+    return steps, pictures
 
 
 def test_poses_are_those_of_the_target(followed):
-    told, folder = followed
+    steps, folder = followed
     track = sweep_tables.read_track(folder / capture.POSES)
     assert track.found.tolist() == [True, True, False]
-    assert np.array_equal(track.poses[:2], told.track.poses[:2]) and track.covariance is not None
+    assert np.array_equal(track.poses[:2], following.track_of(steps).poses[:2]) and track.covariance is not None
     apart = np.linalg.norm(track.poses[:2, :3, 3] - films.places(2)[:, :3, 3], axis=1)
     assert apart.max() < 0.05
     with (folder / capture.FRAMES).open(newline="") as stream:
@@ -198,6 +198,8 @@ def test_a_sweeps_poses_are_handed_on(rig, tmp_path, rng):
     after = sweep_capture.read_sweep(out)
     assert len(after.paths) == len(before.paths) and np.array_equal(after.image(3), before.image(3))
     assert np.array_equal(after.track.poses, before.track.poses, equal_nan=True)
+    capture.hand_on(out, source, out, tmp_path / "elsewhere" / "optics.yaml")
+    assert manifest.read_manifest(out).calibration == "../optics.yaml"
 
 
 def test_without_b_scans_nothing_is_handed_on(blank, tmp_path):

@@ -61,15 +61,15 @@ def test_it_follows_a_moving_target_as_a_track(tracker, cameras, rig, rng, told)
     for k in range(4):
         turn = Rotation.from_rotvec([0, 0, np.radians(200) * k / 60]).as_matrix()
         places.append(rigid.transform(turn @ FACING[:3, :3], FACING[:3, 3] + np.array([300.0, 200, 150]) * k / 60))
-    frames = [
-        (k * 16_666_667, *(drawings.frame(camera, [place], rig.target, 65.0, rng) for camera in cameras))
-        for k, place in enumerate(places)
-    ]
-    followed = following.follow(tracker, frames)
-    assert followed.reasons == (None,) * 4
-    assert [each.how for each in followed.trackings][2:] == ["predicted"] * 2
-    assert followed.track.found.all() and followed.track.covariance is not None
-    assert max(off_mm(each, place) for each, place in zip(followed.trackings, places, strict=True)) < 0.1
+    found = []
+    for k, place in enumerate(places):
+        frames = (drawings.frame(camera, [place], rig.target, 65.0, rng) for camera in cameras)
+        found.append(tracker.step(*frames, k / 60))
+    assert [each.pose.reason for each in found] == [None] * 4
+    assert [each.how for each in found][2:] == ["predicted"] * 2
+    track = following.track_of([following.kept(each, k * 16_666_667) for k, each in enumerate(found)])
+    assert track.found.all() and track.covariance is not None
+    assert max(off_mm(each, place) for each, place in zip(found, places, strict=True)) < 0.1
 
 
 def test_wrong_names_are_put_right_by_geometry(cameras, rig, pair):
