@@ -1,8 +1,8 @@
 """Measure the errors of the twin and of the pipeline, beside what is asked, what physics allows and what the paper reports.
 
 Reads the rig and the pattern sequences from conf/, and real recordings where `real` names their folder. Writes GROUP.json into
-the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}; and the tables of the Markdown page that
-`document` names. Takes some minutes a group. Exit status 1 if a bar is missed.
+the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}, and figures; and the tables of the Markdown page
+that `document` names. Takes some minutes a group. Exit status 1 if a bar is missed.
 
     sonotwin accuracy only=optics
 """
@@ -53,7 +53,7 @@ def run(config: Config) -> int:
     if config.real and not config.real.is_dir():
         raise InputError(f"accuracy: real: expected a folder of recordings, found none at {config.real}")
     config.out.mkdir(parents=True, exist_ok=True)
-    setup = setup_of(config.rig, config.real)
+    setup = setup_of(config.rig, config.real, config.out)
     console = Console(soft_wrap=True, highlight=False)
     met = True
     for group in groups:
@@ -70,7 +70,7 @@ def run(config: Config) -> int:
     return 0 if met else 1
 
 
-def setup_of(rig: Rig, real: Path | None = None) -> rows.Setup:
+def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> rows.Setup:
     """What measurements are made with: a rig, all sequences and scanners of conf/, and real recordings if they are at hand."""
     sequences = {path.stem: read_patterns(path) for path in (folder() / "patterns").glob("*.yaml")}
     scanners = {
@@ -78,4 +78,4 @@ def setup_of(rig: Rig, real: Path | None = None) -> rows.Setup:
         for path in (folder() / "ultrasound").glob("*.yaml")
     }
     frames = DataRanges(**yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"])
-    return rows.Setup(rig, sequences, real, scanners, frames)
+    return rows.Setup(rig, sequences, real, scanners, frames, out)

@@ -1,6 +1,6 @@
-"""Errors of circles' centres and of poses, over light and blur, beside the physical limit, the published recipe and rivals."""
+"""Errors of circles' centres and of poses, beside the physical limit and the published recipe."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,16 +10,14 @@ from scipy.stats import chi2
 
 from recon.camera import Camera
 from recon.rig import Target
-from recon.tracking import classical, detection, fiducials, published, segmentation
+from recon.tracking import detection, published, segmentation
 from recon.tracking.networks import DETECTOR_SIZE, Networks
-from recon.tracking.pose import Sighting, estimate
 from recon.tracking.tracker import Tracker
 from twin.accuracy import frames
 from twin.accuracy.rows import Row, Setup
 from twin.sensor import Exposure, noise_dn, number_per_electron
 from twin.tracking.draw import Take
 from twin.tracking.frames import Frames
-from twin.tracking.prints import BitGrid
 from twin.tracking.truth import ViewTruth
 
 Array = NDArray[np.float64]
@@ -28,10 +26,9 @@ Images = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 Locate = Callable[[Pair, Images], Array | None]  # from two frames to world_from_target : (4, 4) mm, or None
 
 SEED = 2002
-LIT_DN, COUNT, BLURRED = 120.0, 100, 40  # frames of the static study, and of each other blur
-FINE = 128  # rays a pixel, so that rendering's noise is small beside the sensor's where covariances are tested
-BLURS = (0.0, 4.0, 8.0, 12.0, 16.0)
-GRID_WHITE, GRID_BLUR, GRID_COUNT = (6.0, 12.0, 25.0, 60.0, 150.0), (0.0, 4.0, 8.0, 12.0, 20.0), 6
+LIT_DN, COUNT, BLURRED = 120.0, 60, 24  # frames of the static study, and of each other blur
+FINE = 64  # rays a pixel, so that rendering's noise is small beside the sensor's where covariances are tested
+BLURS = (4.0, 8.0, 12.0, 16.0)
 
 
 @dataclass(frozen=True)
@@ -46,24 +43,26 @@ class Located:
 
 
 def centre_rows(setup: Setup, networks: Networks) -> list[Row]:
-    """Median errors of centres, still and moving."""
+    """Median errors of centres in motion."""
     result = []
     for blur in BLURS:
-        count = COUNT if blur == 0 else BLURRED
-        errors = [
-            located(take, given, setup.rig.target, networks) for take, given in frames.study(setup, SEED, count, LIT_DN, blur)
-        ]
-        centres = np.concatenate([one.centre_px for one in errors])
-        limit = np.concatenate([one.limit_px for one in errors])
-        bar = {0.0: 0.02, 16.0: 0.25}.get(blur, 0.15)
-        share = 100 * np.isfinite(centres).mean()
-        what = f"centre error at {blur:g} px blur, white 120, median of {len(centres)} circles ({share:.0f} % found)"
-        result.append(Row("c", what, float(np.nanmedian(centres)), bar, float(np.median(limit)), "px"))
+        shown = frames.study(setup, SEED, BLURRED, LIT_DN, blur)
+        errors = [located(take, given, setup.rig.target, networks) for take, given in shown]
+        result.append(centre_row(blur, errors, 0.15 if blur <= 12 else 0.25))
     return result
 
 
+def centre_row(blur: float, errors: Sequence[Located], bar: float) -> Row:
+    """Median error of centres, beside what noise alone leaves."""
+    centres = np.concatenate([one.centre_px for one in errors])
+    limit = np.concatenate([one.limit_px for one in errors])
+    share = 100 * np.isfinite(centres).mean()
+    what = f"centre error at {blur:g} px blur, white 120, median of {len(centres)} circles ({share:.0f} % found)"
+    return Row("c", what, float(np.nanmedian(centres)), bar, float(np.median(limit)), "px")
+
+
 def pose_rows(setup: Setup, networks: Networks) -> list[Row]:
-    """Errors of poses, static and lit, over the working volume; whether the covariance holds; the published recipe's."""
+    """Errors of centres and poses, static and lit, over the working volume; whether covariances hold; the published recipe's."""
     sample = list(frames.study(setup, SEED, COUNT, LIT_DN, 0.0, FINE))
     target = setup.rig.target
     errors = [located(take, given, target, networks) for take, given in sample]
@@ -77,6 +76,7 @@ def pose_rows(setup: Setup, networks: Networks) -> list[Row]:
     of = f"static, lit, {len(sample)} poses"
     inside = 100 * np.mean(known < chi2.ppf(0.95, 6))
     return [
+        centre_row(0.0, errors, 0.02),
         Row("d", f"translation, {of}: median", float(np.nanmedian(shift)), 0.04, None, "mm"),
         Row("d", f"translation, {of}: 95th percentile", float(np.nanpercentile(shift, 95)), 0.10, None, "mm"),
         Row("d", f"rotation, {of}: median", float(np.nanmedian(turn)), 0.08, None, "deg"),
@@ -146,41 +146,6 @@ def centre_limit(take: Take, camera: int, truth: ViewTruth, target: Target) -> A
     return np.sqrt(2) * axis
 
 
-def ours(target: Target, networks: Networks) -> Locate:
-    """The tracker, knowing nothing before."""
-
-    def locate(cameras: Pair, images: Images) -> Array | None:
-        result = Tracker(cameras, target, networks).step(*images)
-        return result.pose.world_from_target if result.found else None
-
-    return locate
-
-
-def classic(target: Target) -> Locate:
-    """Threshold, contours, ellipses and geometry in each view, then our pose."""
-
-    def locate(cameras: Pair, images: Images) -> Array | None:
-        seen = [classical.find(image, target) for image in images]
-        if not all(view.found for view in seen):
-            return None
-        first, second = (Sighting(camera, view.centres, view.covariance) for camera, view in zip(cameras, seen, strict=True))
-        result = estimate(first, second, target)
-        return result.world_from_target if result.found else None
-
-    return locate
-
-
-def marked(board: fiducials.Board) -> Locate:
-    """A board of markers in the target's place."""
-
-    def locate(cameras: Pair, images: Images) -> Array | None:
-        first, second = (fiducials.sight(image, camera, board) for image, camera in zip(images, cameras, strict=True))
-        result = fiducials.estimate(first, second, board)
-        return result.world_from_target if result.found else None
-
-    return locate
-
-
 def published_recipe(networks: Networks) -> Locate:
     """Masks' contours, ellipses' centres as circles' centres, triangulation, axes from differences."""
 
@@ -199,47 +164,3 @@ def published_recipe(networks: Networks) -> Locate:
         return published.pose_from_centres(centres[0], centres[1], *cameras)
 
     return locate
-
-
-def grid_rows(setup: Setup, networks: Networks) -> list[Row]:
-    """What else one could pick, over light and blur: share of poses found and their median errors, in all cells of the grid."""
-    target = setup.rig.target
-    aruco, april = fiducials.aruco_board(target), fiducials.apriltag_board(target)
-    choices: Sequence[tuple[str, Locate, BitGrid | None]] = (
-        ("ours", ours(target, networks), None),
-        ("classical", classic(target), None),
-        ("ArUco board", marked(aruco), bits(aruco)),
-        ("AprilTag board", marked(april), bits(april)),
-    )
-    result = []
-    for white in GRID_WHITE:
-        for blur in GRID_BLUR:
-            cache: dict[int, list[tuple[Take, Frames]]] = {}
-            for name, locate, grid in choices:
-                key = 0 if grid is None else id(grid)
-                if key not in cache:
-                    cache[key] = list(frames.study(setup, SEED + 1, GRID_COUNT, white, blur, 8, grid))
-                errors = [pose_errors(take, locate(cameras_of(take), given.views)) for take, given in cache[key]]
-                result += cell_rows(name, white, blur, errors)
-    return result
-
-
-def cell_rows(name: str, white: float, blur: float, errors: Iterable[tuple[float, float] | None]) -> list[Row]:
-    """Rows of one choice in one cell of the grid; nothing is asked of them."""
-    errors = list(errors)
-    good = np.array([one for one in errors if one is not None and one[0] < 5]).reshape(-1, 2)
-    what = f"{name}, white {white:g}, blur {blur:g} px"
-    rate = Row("f", f"{what}: found", 100 * len(good) / len(errors), 0, None, "%", at_least=True)
-    if not len(good):
-        return [rate]
-    return [
-        rate,
-        Row("f", f"{what}: translation, median", float(np.median(good[:, 0])), np.inf, None, "mm"),
-        Row("f", f"{what}: rotation, median", float(np.median(good[:, 1])), np.inf, None, "deg"),
-    ]
-
-
-def bits(board: fiducials.Board) -> BitGrid:
-    """A marker board's face, for the twin to print."""
-    x, y = (float(value) for value in board.origin_mm)
-    return BitGrid(board.cells, (x, y), (board.cell_mm, board.cell_mm))

@@ -46,6 +46,7 @@ class Setup:
     real: Path | None = None  # folder of real recordings
     scanners: Mapping[str, Transducer] = field(default_factory=dict)  # by their names in conf/ultrasound
     frames: DataRanges | None = None  # of tracking frames, as in conf/dataset.yaml
+    out: Path | None = None  # folder for figures; without it none is drawn
 
 
 def measure(measurements: Sequence[Measurement]) -> Iterator[Row]:

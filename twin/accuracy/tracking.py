@@ -9,7 +9,7 @@ from recon.rig import Target
 from recon.tracking import networks as nets
 from recon.tracking import photographs
 from recon.tracking.networks import Networks
-from twin.accuracy import poses, sightings
+from twin.accuracy import poses, rivals, sightings
 from twin.accuracy.rows import Measurement, Row, Setup
 
 PHOTO = "tracking_photo/cam2.png"
@@ -25,7 +25,7 @@ def measurements(setup: Setup) -> list[Measurement]:
         lambda: sightings.rows(setup, networks),
         lambda: poses.centre_rows(setup, networks),
         lambda: poses.pose_rows(setup, networks),
-        lambda: poses.grid_rows(setup, networks),
+        lambda: rivals.rows(setup, networks),
         *([] if (real := setup.real) is None else [lambda: photograph_rows(real, setup.rig.target, networks)]),
     ]
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -9,7 +10,8 @@ from recon import rigid
 from recon.ellipses import Ellipses
 from recon.tracking import views
 from tests.twin.tracking.takes import facing, plain_take, rig
-from twin.accuracy.poses import cell_rows, centre_limit, pose_difference, pose_errors
+from twin.accuracy import rivals
+from twin.accuracy.poses import centre_limit, pose_difference, pose_errors
 from twin.accuracy.sightings import percent, score
 from twin.tracking.truth import view_truth
 
@@ -75,7 +77,15 @@ def test_the_limit_of_a_centre_is_what_least_squares_on_an_edge_leaves(rng):
     assert limit == pytest.approx(np.sqrt(2) * noise / np.sqrt(information), rel=0.03)
 
 
-def test_a_cell_without_findings_has_no_errors():
-    assert len(cell_rows("ours", 6, 0, [None, None])) == 1
-    rows = cell_rows("ours", 60, 0, [(0.1, 0.2), None, (0.3, 0.4), (80.0, 90.0)])
-    assert [row.measured for row in rows] == pytest.approx([50.0, 0.2, 0.3])
+def test_rivals_are_summed_up_over_the_grid_and_drawn(tmp_path):
+    """One that finds half of what isn't dark, twice as far off where it is blurred."""
+    shift = np.full((len(rivals.WHITES), len(rivals.BLURS), 4), np.nan)
+    shift[2:, :, :2] = 0.1
+    shift[2:, 3:] *= 2
+    tried = rivals.Tried("half", shift, 3 * shift)
+    rows = {row.what: row.measured for row in rivals.summary(tried)}
+    assert list(rows.values()) == pytest.approx([100 * 3 / 10, 0, 100 * 3 / 10, 0.1, 0.3])
+    nothing = rivals.Tried("nothing", np.full_like(shift, np.nan), np.full_like(shift, np.nan))
+    assert [row.measured for row in rivals.summary(nothing)] == [0, 0, 0]
+    rivals.draw([tried, nothing], tmp_path / "rivals.png")
+    assert cv2.imread(str(tmp_path / "rivals.png")).shape[1] > 600
