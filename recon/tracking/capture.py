@@ -1,7 +1,7 @@
 """Films: what two cameras saw of a moving target, read as a stream; and the poses that were found in them, written.
 
 A film is the sweep part of a capture with images of both cameras, `sweep/cam1` and `sweep/cam2`, each with its `timestamps.csv`.
-The cameras share a clock. Frames belong together by their time stamps, whatever their numbers. Two pairs are in memory at a time.
+The cameras share a clock. Frames belong together by their time stamps, whatever their numbers. Three pairs at most are in memory.
 """
 
 import os

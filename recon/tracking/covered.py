@@ -1,8 +1,8 @@
 """A circle that something covers, from the other two of its view.
 
 Two discs tell the view's affinity all but exactly: it takes a circle to their ellipses, which leaves a turn, and one centre to
-the other, which settles it. What that turn does to the distance between them tells whether they are the circles that they are
-taken for. The third place follows, as exactly as a view is affine: to 2 px in the median, 7 px at 95 %.
+the other, which settles it. Their distance must be that of the circles that they are taken for; which end is which it can't tell.
+The third place follows, as exactly as a view is affine: to 2 px in the median, 7 px at most for the rig.
 """
 
 import numpy as np
@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from recon.ellipses import Ellipses
 from recon.rig import Target
 from recon.tracking.identity import ALIKE
+from recon.tracking.outlines import Outlines
 
 Array = NDArray[np.float64]
 
-REACH_PX = 6.0  # by which the place may be off
+REACH_PX = 8.0  # by which the place may be off
+DEPTH = 0.6  # of the others' contrast of ink and paper, that a third one must have: a fingertip has less
+INK = 0.15  # of a ring's contrast: a middle that is no brighter is ink, and this a black disc
 
 
 def missing(found: NDArray[np.bool_]) -> int | None:
@@ -23,7 +26,7 @@ def missing(found: NDArray[np.bool_]) -> int | None:
 
 
 def third(ellipses: Ellipses, which: int, target: Target) -> Ellipses:
-    """The ellipse, one, of circle number `which`, from the other two of three; NaN if these can't be what they are taken for."""
+    """The ellipse, one, of circle number `which`, from the other two of three; NaN if their distance is another one."""
     places = np.array([[0.0, 0.0], [target.c1_mm, 0.0], [0.0, target.c2_mm]])
     a, b = (k for k in range(3) if k != which)
     shape = (ellipses.shape[a] + ellipses.shape[b]) / 2
@@ -38,3 +41,15 @@ def third(ellipses: Ellipses, which: int, target: Target) -> Ellipses:
     middle = (ellipses.centre[a] + ellipses.centre[b]) / 2
     centre = middle + affine @ (places[which] - (places[a] + places[b]) / 2)
     return Ellipses(centre[None], shape[None])
+
+
+def alike(again: Outlines, outlines: Outlines, which: int) -> bool:
+    """Whether a rim, one, is a ring as the other two of three are: of ink as dark, and with a middle that isn't ink.
+
+    A middle that something hides tells nothing else, and a fingertip beside the target, which is round too, must not pass.
+    """
+    if not again.found.all():
+        return False
+    others = np.delete(outlines.depth, which)
+    seen_through = again.middle[0] - again.inside[0] > INK * again.contrast[0]
+    return bool(again.depth[0] > DEPTH * others.min() and seen_through)

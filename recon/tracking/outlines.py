@@ -17,7 +17,7 @@ from recon.tracking.sectors import SECTORS
 Array = NDArray[np.float64]
 
 FLOOR_PX = 0.002  # what lens model, print and pixel grid leave however little noise there is
-COVERED = 2  # power of the share that is seen, by which variances grow: what covers a rim bends it beside
+COVERED = 2  # power of the share that is seen, by which variances are divided: what covers a rim bends it beside
 LEAST_SEEN = 0.4  # of the rim: with less an ellipse is a guess
 LEAST_CONTRAST = 4.0  # times the noise of a pixel
 LEAST_DN = 1.5
@@ -48,6 +48,11 @@ class Outlines:
     def contrast(self) -> Array:
         """Of white and black : (n,) DN."""
         return self.outside - self.inside
+
+    @property
+    def depth(self) -> Array:
+        """Contrast in whatever light, (white - black) / (white + black) : (n,)."""
+        return self.contrast / (self.outside + self.inside)
 
     def replaced(self, which: int, other: "Outlines") -> "Outlines":
         """The same with the one of `other` in a place."""

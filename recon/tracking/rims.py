@@ -123,7 +123,7 @@ def _fit(image, centre, shape, reach, hole, result):
 
 @njit(cache=True, error_model="numpy")
 def _sound(ellipse, size):
-    """Whether the numbers are those of an ellipse that is at least half in the image."""
+    """Whether the numbers are those of an ellipse whose middle is in the image."""
     if not np.isfinite(ellipse).all():
         return False
     half, gap = (ellipse[2] + ellipse[4]) / 2, math.hypot((ellipse[2] - ellipse[4]) / 2, ellipse[3])
@@ -305,6 +305,8 @@ def _first_levels(image, ellipse, variance, reach, hole, planes, noise):
         return False
     dark, bright = totals[:, 1] / np.maximum(totals[:, 0], 1), totals[:, 3] / np.maximum(totals[:, 2], 1)
     like_rims = steep(dark, bright, seen)
+    if like_rims.sum() < LEAST_SECTORS:
+        return False
     planes[0], planes[3] = np.median(dark[like_rims]), np.median(bright[like_rims])
     noise[:] = max((0.1 * (planes[3] - planes[0])) ** 2, ROUNDING)
     return planes[3] > planes[0]

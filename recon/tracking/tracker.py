@@ -162,7 +162,7 @@ class Tracker:
             return outlines
         rough = covered.third(outlines.ellipses, which, self.target)
         again = measure_both(*frames, rough, np.array([view == 1]), covered.REACH_PX, self.target, middles=False)
-        return outlines.replaced(which, again) if again.found.all() else outlines
+        return outlines.replaced(which, again) if covered.alike(again, outlines, which) else outlines
 
     def _segmented(
         self, frames: Frames, networks: Networks, places: tuple[Array, Array], how: str, before: Tracking | None = None
@@ -175,7 +175,7 @@ class Tracker:
         masks = networks.segment(np.concatenate([cut.images for cut in cuts]))
         halves = [segmentation.read(half, cut) for half, cut in zip((masks[:3], masks[3:]), cuts, strict=True)]
         rough = joined(halves)
-        if before is not None and not np.isfinite(rough.centre).all():
+        if before is not None and min(np.isfinite(half.centre[:, 0]).sum() for half in halves) < 2:
             return before
         return self._fitted(frames, rough, ROUGH_PX, how, rename=how == "detected")
 
@@ -183,7 +183,7 @@ class Tracker:
         """From nothing to the pose."""
         candidates = detection.detect(list(frames), networks)
         choices = [identity.triples(each, self.target, frame.shape[1]) for each, frame in zip(candidates, frames, strict=True)]
-        reasons = [_absent(each, choice) for each, choice in zip(candidates, choices, strict=True)]
+        reasons = [_absent(each) for each in candidates]
         if not choices[0] and not choices[1]:
             return _nowhere(*reasons)
         if not (choices[0] and choices[1]):
@@ -238,9 +238,7 @@ def _sides(points: Array) -> Array:
     return points[[1, 2, 2]] - points[[0, 0, 1]]
 
 
-def _absent(candidates: detection.Candidates, choices: list[Triple]) -> str:
-    if choices:
-        return "circles that fit no rim"
+def _absent(candidates: detection.Candidates) -> str:
     count = len(candidates.points)
     return f"{count} of 3 circles" if count < 3 else f"{count} places like circles, no three that lie like the target's"
 

@@ -19,16 +19,26 @@ def shown(camera, place, target):
     return Ellipses(*ellipses_of(camera, place, pose.circle_centres(target), target.outer_diameter_mm / 2))
 
 
-def hidden(image, ellipse, rng):
-    """With a finger of 45 DN over the right half of an ellipse, its white middle too."""
-    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
-    radius = np.sqrt(np.linalg.det(ellipse.shape[0]))
-    finger = (u > ellipse.centre[0, 0] - 0.1 * radius) & (
-        np.hypot(u - ellipse.centre[0, 0], v - ellipse.centre[0, 1]) < 1.8 * radius
-    )
+def painted(image, part, level, rng):
+    """With something of a brightness over a part : (h, w) bool."""
     image = image.copy()
-    image[finger] = np.clip(45 + 2 * rng.standard_normal(finger.sum()), 0, 255).astype(np.uint8)
+    image[part] = np.clip(level + 2 * rng.standard_normal(part.sum()), 0, 255).astype(np.uint8)
     return image
+
+
+def crossed(image, ellipse, rng):
+    """With a cable of 25 DN over an ellipse, which hides its white middle."""
+    u = np.arange(image.shape[1])[None]
+    v = np.arange(image.shape[0])[:, None]
+    radius = np.sqrt(np.linalg.det(ellipse.shape[0]))
+    cable = (np.abs(u - ellipse.centre[0, 0]) < 0.45 * radius) & (np.abs(v - ellipse.centre[0, 1]) < 1.8 * radius)
+    return painted(image, cable, 25, rng)
+
+
+def followed(cameras, target, place, frames):
+    tracker = Tracker(cameras, target)
+    tracker.remember(place, 0.0)
+    return tracker.step(*frames, time_s=0.02)
 
 
 @pytest.mark.parametrize("which", [0, 1, 2])
@@ -39,29 +49,42 @@ def test_the_third_place_follows_from_two_discs(cameras, rig, rng, which):
         true = shown(cameras[0], drawings.facing(rng), rig.target)
         told = covered.third(true, which, rig.target)
         away.append(np.linalg.norm(told.centre[0] - true.centre[which]))
-        assert np.abs(told.shape[0] - true.shape[which]).max() < 0.15 * np.trace(true.shape[which])
-    assert np.median(away) < 6 and max(away) < 20
+        assert np.abs(told.shape[0] - true.shape[which]).max() < 0.15 * np.trace(true.shape[which]) / 2
+    assert np.median(away) < 5 and max(away) < 10
 
 
-def test_two_discs_under_wrong_names_tell_no_third(cameras, rig, rng):
+def test_two_discs_as_far_apart_as_others_tell_no_third(cameras, rig, rng):
     """c0 and c2 are 40 mm apart, c0 and c1 25."""
     true = shown(cameras[0], drawings.facing(rng), rig.target)
-    exchanged = true[np.array([0, 2, 1])]
-    assert np.isnan(covered.third(exchanged, 1, rig.target).centre).all()
+    assert np.isnan(covered.third(true[np.array([0, 2, 1])], 1, rig.target).centre).all()
 
 
 @pytest.mark.parametrize("which", [0, 1, 2])
-def test_a_target_with_a_disc_half_covered_is_found_in_both_views(cameras, rig, rng, which):
+def test_a_target_with_a_middle_that_is_hidden_is_found(cameras, rig, rng, which, monkeypatch):
+    """In both views, by looking again; without that it isn't."""
     place = drawings.facing(rng, 25.0)
-    frames = [drawings.frame(camera, [place], rig.target, 80.0, rng) for camera in cameras]
-    frames = [
-        hidden(frame, shown(camera, place, rig.target)[[which]], rng) for frame, camera in zip(frames, cameras, strict=True)
-    ]
-    tracker = Tracker(cameras, rig.target)
-    tracker.remember(place, 0.0)
-    found = tracker.step(*frames, time_s=0.02)
+    clear = [drawings.frame(camera, [place], rig.target, 80.0, rng) for camera in cameras]
+    ellipses = [shown(camera, place, rig.target)[[which]] for camera in cameras]
+    frames = [crossed(frame, one, rng) for frame, one in zip(clear, ellipses, strict=True)]
+    found = followed(cameras, rig.target, place, frames)
     assert found.found, found.pose.reason
-    assert all(view.outlines.seen[which] < 0.7 for view in found.views)
-    assert np.linalg.norm((found.pose.world_from_target @ [10, 15, 0, 1] - place @ [10, 15, 0, 1])[:3]) < 0.15
+    assert all(0.4 < view.outlines.seen[which] < 0.8 for view in found.views)
     error = found.pose.world_from_target[:3, 3] - place[:3, 3]
-    assert error @ np.linalg.solve(found.pose.covariance[3:, 3:], error) < 40
+    assert np.linalg.norm(error) < 0.1
+    assert error @ np.linalg.solve(found.pose.covariance[3:, 3:], error) < 20
+    monkeypatch.setattr(covered, "missing", lambda found: None)
+    assert "no white middle" in followed(cameras, rig.target, place, frames).pose.reason
+
+
+@pytest.mark.parametrize("level", [15, 37])
+def test_a_fingertip_in_a_rings_place_is_not_taken_for_it(cameras, rig, rng, level):
+    """As large as a disc and where c2 should be, but skin isn't ink; one as dark as ink has no middle."""
+    place = drawings.facing(rng, 25.0)
+    frames = []
+    for camera in cameras:
+        one = shown(camera, place, rig.target)[[2]]
+        v, u = np.mgrid[:1024, :1280]
+        within = np.linalg.norm(np.linalg.solve(one.shape[0] * 1.03, np.stack([u, v]).reshape(2, -1) - one.centre.T), axis=0) < 1
+        frames.append(painted(drawings.frame(camera, [place], rig.target, 80.0, rng), within.reshape(u.shape), level, rng))
+    found = followed(cameras, rig.target, place, frames)
+    assert not any(view.found for view in found.views)
