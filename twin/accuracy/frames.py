@@ -39,17 +39,19 @@ def unseen(setup: Setup, seed: int, samples: int) -> Iterator[tuple[Take, Frames
 def study(
     setup: Setup, seed: int, count: int, white_dn: float, blur_px: float, rays: int = 32, grid: BitGrid | None = None
 ) -> Iterator[tuple[Take, Frames]]:
-    """Samples of set light and blur, over the whole working volume, in which nothing covers the target."""
+    """Samples of set light and blur, over the whole working volume; nothing covers the target, by a look at few rays."""
     ranges = ranges_of(setup).model_copy(update={"variants": STUDY_VARIANTS})
     bank = _bank(setup.rig.target, STUDY_VARIANTS, seed)
     given, k = 0, 0
     while given < count:
         takes = [study_take(setup.rig, ranges, seed, number, white_dn, blur_px) for number in range(k, k + BATCH)]
         k += BATCH
-        for take, frames in zip(takes, render_sketches(bank, setup.rig, takes, Quality(window=rays), seed, grid), strict=True):
-            if given < count and min(view.visible.min() for view in frames.truth) > WHOLLY:
-                given += 1
-                yield take, frames
+        looked = render_sketches(bank, setup.rig, takes, Quality(window=2), seed, grid)
+        clear = [take for take, one in zip(takes, looked, strict=True) if min(view.visible.min() for view in one.truth) > WHOLLY]
+        clear = clear[: count - given]
+        given += len(clear)
+        if clear:
+            yield from zip(clear, render_sketches(bank, setup.rig, clear, Quality(window=rays), seed, grid), strict=True)
 
 
 @lru_cache(maxsize=4)
