@@ -12,11 +12,12 @@ from recon.ellipses import Ellipses
 from recon.rig import Target
 from recon.tracking.identity import ALIKE
 from recon.tracking.outlines import Outlines
+from recon.tracking.pose import circle_centres
+from recon.tracking.sectors import STEEP
 
 Array = NDArray[np.float64]
 
 REACH_PX = 8.0  # by which the place may be off
-DEPTH = 0.6  # of the others' contrast of ink and paper, that a third one must have: a fingertip has less
 INK = 0.15  # of a ring's contrast: a middle that is no brighter is ink, and this a black disc
 
 
@@ -27,7 +28,7 @@ def missing(found: NDArray[np.bool_]) -> int | None:
 
 def third(ellipses: Ellipses, which: int, target: Target) -> Ellipses:
     """The ellipse, one, of circle number `which`, from the other two of three; NaN if their distance is another one."""
-    places = np.array([[0.0, 0.0], [target.c1_mm, 0.0], [0.0, target.c2_mm]])
+    places = circle_centres(target)[:, :2]
     a, b = (k for k in range(3) if k != which)
     shape = (ellipses.shape[a] + ellipses.shape[b]) / 2
     untilted = np.linalg.solve(shape * 2 / target.outer_diameter_mm, ellipses.centre[b] - ellipses.centre[a])
@@ -52,4 +53,4 @@ def alike(again: Outlines, outlines: Outlines, which: int) -> bool:
         return False
     others = np.delete(outlines.depth, which)
     seen_through = again.middle[0] - again.inside[0] > INK * again.contrast[0]
-    return bool(again.depth[0] > DEPTH * others.min() and seen_through)
+    return bool(again.depth[0] > STEEP * others.min() and seen_through)

@@ -26,7 +26,7 @@ Images = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 Locate = Callable[[Pair, Images], Array | None]  # from two frames to world_from_target : (4, 4) mm, or None
 
 SEED = 2002
-LIT_DN, COUNT, BLURRED = 120.0, 40, 24  # frames of the static study, and of each other blur
+LIT_DN, COUNT, BLURRED = 120.0, 40, 12  # frames of the static study, and of each other blur
 FINE = 64  # rays a pixel, so that rendering's noise is small beside the sensor's where covariances are tested
 BLURS = (4.0, 8.0, 12.0, 16.0)
 

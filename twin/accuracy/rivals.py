@@ -22,7 +22,7 @@ from twin.tracking.prints import BitGrid
 Array = NDArray[np.float64]
 
 SEED = 2003
-WHITES, BLURS, COUNT = (6.0, 12.0, 25.0, 60.0, 150.0), (0.0, 4.0, 8.0, 12.0, 20.0), 4  # DN, px, frames a cell
+WHITES, BLURS, COUNT = (6.0, 12.0, 25.0, 60.0, 150.0), (0.0, 4.0, 8.0, 12.0, 20.0), 2  # DN, px, frames a cell
 RAYS = 8  # a pixel
 ELSEWHERE_MM = 5.0  # an error beyond that is another thing than the target
 DARK_DN, BLURRED_PX, LIT_DN = 12.0, 12.0, 60.0
