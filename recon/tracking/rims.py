@@ -46,7 +46,7 @@ from recon.tracking.sectors import (
     judge,
     sector,
     steep,
-)  # fmt: skip
+)
 
 STARTS = (0, 5, 8, 11, 14)  # of the parameters of offset, inside, outside, variance
 GLOBAL = 14  # centre (2), shape (3), planes inside (3) and outside (3), variance (3)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from recon import atomic
+from recon.figures import SEQUENTIAL
 from recon.rig import Target
 from recon.tracking import classical, fiducials
 from recon.tracking.networks import Networks
@@ -53,7 +55,7 @@ class Tried:
 
 
 def choices(target: Target, networks: Networks) -> list[Choice]:
-    """Ours, and what a user could take instead."""
+    """Ours, and what a user could take instead; those that need the same face side by side."""
     aruco, april = fiducials.aruco_board(target), fiducials.apriltag_board(target)
     return [
         Choice("ours", ours(target, networks)),
@@ -65,9 +67,8 @@ def choices(target: Target, networks: Networks) -> list[Choice]:
 
 def rows(setup: Setup, networks: Networks) -> list[Row]:
     """Summaries of the grid, of which nothing is asked; a figure of all its cells in `setup.out`."""
-    every = choices(setup.rig.target, networks)
-    alike = [every[:2], every[2:3], every[3:]]  # by what they look at
-    tried = [one for some in alike for one in over_grid(setup, some)]
+    alike = groupby(choices(setup.rig.target, networks), key=lambda choice: id(choice.face))
+    tried = [one for _, some in alike for one in over_grid(setup, list(some))]
     if setup.out is not None:
         draw(tried, setup.out / FIGURE)
     return [row for one in tried for row in summary(one)]
@@ -99,14 +100,7 @@ def summary(tried: Tried) -> list[Row]:
     return [
         *(Row("f", f"{tried.name}: {what}", float(share.mean()), 0, None, "%", at_least=True) for what, share in shares.items()),
         *(
-            Row(
-                "f",
-                f"{tried.name}: {what} {where}",
-                float(np.nanmedian(values)),
-                np.inf,
-                None,
-                unit,
-            )
+            Row("f", f"{tried.name}: {what} {where}", float(np.nanmedian(values)), np.inf, None, unit)
             for what, unit, values in exact
             if np.isfinite(values).any()
         ),
@@ -117,7 +111,7 @@ def draw(tried: Sequence[Tried], path: Path) -> None:
     """Write a figure of all cells: shares found, and medians of the errors in mm within."""
     figure = Figure(figsize=(3.2 * len(tried), 3.4), layout="constrained")
     for one, axes in zip(tried, figure.subplots(1, len(tried), sharey=True), strict=True):
-        shown = axes.imshow(one.found, vmin=0, vmax=100, cmap="viridis", aspect="auto")
+        shown = axes.imshow(one.found, vmin=0, vmax=100, cmap=SEQUENTIAL, aspect="auto")
         for i, j in np.ndindex(one.found.shape):
             known = one.shift_mm[i, j][np.isfinite(one.shift_mm[i, j])]
             text = f"{np.median(known):.2g}" if len(known) else "-"

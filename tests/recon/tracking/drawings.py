@@ -6,7 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from recon import rigid
 from recon.camera import Camera
+from recon.ellipses import Ellipses
 from recon.tracking import pose
+from recon.tracking.outline_model import ellipses_of
 
 ELECTRONS = 7700 / 255  # a digital number
 DARK_E = 11.0
@@ -71,6 +73,11 @@ def read_out(mean, rng):
     electrons = np.maximum(mean * ELECTRONS * (1 + 0.008 * rng.standard_normal(mean.shape, np.float32)), 0)
     electrons = electrons + np.sqrt(electrons + DARK_E**2 + 8.0**2) * rng.standard_normal(mean.shape, np.float32)
     return np.clip(np.rint(electrons / ELECTRONS + BLACK_DN), 0, 255).astype(np.uint8)
+
+
+def shown(camera, place, target):
+    """The ellipses of the three outer rims."""
+    return Ellipses(*ellipses_of(camera, place, pose.circle_centres(target), target.outer_diameter_mm / 2))
 
 
 def facing(rng, tilt_deg=35.0):

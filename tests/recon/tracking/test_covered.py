@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from recon.ellipses import Ellipses
-from recon.tracking import covered, pose
-from recon.tracking.outline_model import ellipses_of
+from recon.tracking import covered
 from recon.tracking.tracker import Tracker
 from tests.recon.tracking import drawings
 
@@ -13,10 +11,6 @@ from tests.recon.tracking import drawings
 @pytest.fixture(scope="module")
 def cameras(rig):
     return rig.cam1.optics.camera(), rig.cam2.optics.camera()
-
-
-def shown(camera, place, target):
-    return Ellipses(*ellipses_of(camera, place, pose.circle_centres(target), target.outer_diameter_mm / 2))
 
 
 def painted(image, part, level, rng):
@@ -46,7 +40,7 @@ def test_the_third_place_follows_from_two_discs(cameras, rig, rng, which):
     """As far as a view is affine: perspective across the target is the rest."""
     away = []
     for _ in range(40):
-        true = shown(cameras[0], drawings.facing(rng), rig.target)
+        true = drawings.shown(cameras[0], drawings.facing(rng), rig.target)
         told = covered.third(true, which, rig.target)
         away.append(np.linalg.norm(told.centre[0] - true.centre[which]))
         assert np.abs(told.shape[0] - true.shape[which]).max() < 0.15 * np.trace(true.shape[which]) / 2
@@ -55,7 +49,7 @@ def test_the_third_place_follows_from_two_discs(cameras, rig, rng, which):
 
 def test_two_discs_as_far_apart_as_others_tell_no_third(cameras, rig, rng):
     """c0 and c2 are 40 mm apart, c0 and c1 25."""
-    true = shown(cameras[0], drawings.facing(rng), rig.target)
+    true = drawings.shown(cameras[0], drawings.facing(rng), rig.target)
     assert np.isnan(covered.third(true[np.array([0, 2, 1])], 1, rig.target).centre).all()
 
 
@@ -64,7 +58,7 @@ def test_a_target_with_a_middle_that_is_hidden_is_found(cameras, rig, rng, which
     """In both views, by looking again; without that it isn't."""
     place = drawings.facing(rng, 25.0)
     clear = [drawings.frame(camera, [place], rig.target, 80.0, rng) for camera in cameras]
-    ellipses = [shown(camera, place, rig.target)[[which]] for camera in cameras]
+    ellipses = [drawings.shown(camera, place, rig.target)[[which]] for camera in cameras]
     frames = [crossed(frame, one, rng) for frame, one in zip(clear, ellipses, strict=True)]
     found = followed(cameras, rig.target, place, frames)
     assert found.found, found.pose.reason
@@ -82,7 +76,7 @@ def test_a_fingertip_in_a_rings_place_is_not_taken_for_it(cameras, rig, rng, lev
     place = drawings.facing(rng, 25.0)
     frames = []
     for camera in cameras:
-        one = shown(camera, place, rig.target)[[2]]
+        one = drawings.shown(camera, place, rig.target)[[2]]
         v, u = np.mgrid[:1024, :1280]
         within = np.linalg.norm(np.linalg.solve(one.shape[0] * 1.03, np.stack([u, v]).reshape(2, -1) - one.centre.T), axis=0) < 1
         frames.append(painted(drawings.frame(camera, [place], rig.target, 80.0, rng), within.reshape(u.shape), level, rng))

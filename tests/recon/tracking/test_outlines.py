@@ -7,7 +7,7 @@ from recon import rigid
 from recon.circles import centre_offsets
 from recon.ellipses import Ellipses
 from recon.tracking import pose
-from recon.tracking.outline_model import ellipses_of, rays_through
+from recon.tracking.outline_model import rays_through
 from recon.tracking.outlines import measure
 from tests.recon.tracking import drawings
 
@@ -19,10 +19,6 @@ def camera(rig):
     return rig.cam1.optics.camera()
 
 
-def shown(camera, place, target):
-    return Ellipses(*ellipses_of(camera, place, pose.circle_centres(target), target.outer_diameter_mm / 2))
-
-
 def found_and_true(camera, target, rng, white, blur_px=0.0):
     """One frame: the rims from ellipses up to 3 px off, and the truth."""
     place = drawings.facing(rng)
@@ -30,7 +26,7 @@ def found_and_true(camera, target, rng, white, blur_px=0.0):
     path = blur_px * place[2, 3] / camera.matrix[0, 0] * np.array([np.cos(angle), np.sin(angle), 0])
     poses = [place] if blur_px == 0 else drawings.exposure(place, path)
     image = drawings.frame(camera, poses, target, white, rng)
-    true = shown(camera, place, target)
+    true = drawings.shown(camera, place, target)
     rough = Ellipses(true.centre + rng.uniform(-2, 2, (3, 2)), true.shape * 1.02)
     return measure(image, rough, 6.0, target), true
 
@@ -55,7 +51,7 @@ def test_centres_and_their_covariance(camera, rig, rng, white, blur, typical):
 def test_light_that_falls_off_does_not_move_the_centre(camera, rig, rng):
     """Twice as bright at one side of a ring as at the other."""
     place = drawings.facing(rng, 5.0)
-    true = shown(camera, place, rig.target)
+    true = drawings.shown(camera, place, rig.target)
     light = np.exp(np.log(2) * (np.arange(1280) - true.centre[0, 0]) / 90)[None].clip(0.2, 3)
     image = drawings.frame(camera, [place], rig.target, 40.0, rng, light=light)
     found = measure(image, true, 3.0, rig.target)
@@ -64,7 +60,7 @@ def test_light_that_falls_off_does_not_move_the_centre(camera, rig, rng):
 
 def test_a_finger_over_a_quarter_of_the_rim_costs_little(camera, rig, rng):
     place = drawings.facing(rng)
-    true = shown(camera, place, rig.target)
+    true = drawings.shown(camera, place, rig.target)
     image = drawings.frame(camera, [place], rig.target, 80.0, rng)
     centre, radius = true.centre[1], true.semi_axes[1].mean()
     v, u = np.mgrid[:1024, :1280]
@@ -83,14 +79,14 @@ def test_a_finger_over_a_quarter_of_the_rim_costs_little(camera, rig, rng):
 def test_clipped_white_keeps_the_centre(camera, rig, rng):
     """The edge moves outwards, all around alike."""
     place = drawings.facing(rng)
-    true = shown(camera, place, rig.target)
+    true = drawings.shown(camera, place, rig.target)
     found = measure(drawings.frame(camera, [place], rig.target, 500.0, rng), true, 4.0, rig.target)
     assert found.found.all()
     assert np.hypot(*(found.ellipses.centre - true.centre).T).max() < 0.05
 
 
 def test_what_is_no_ring_is_not_found(camera, rig, rng):
-    true = shown(camera, drawings.facing(rng), rig.target)
+    true = drawings.shown(camera, drawings.facing(rng), rig.target)
     noise = rng.integers(0, 256, (1024, 1280)).astype(np.uint8)
     v, u = np.mgrid[:1024, :1280]
     disc = np.where(np.hypot(u - true.centre[0, 0], v - true.centre[0, 1]) < true.semi_axes[0].mean(), 5, 90).astype(np.uint8)
@@ -108,7 +104,7 @@ def test_fitted_ellipses_are_those_of_the_plain_fit(camera, rig, rng):
     for _ in range(5):
         place = drawings.facing(rng)
         expected = camera.project(rigid.apply(place, model)) + centre_offsets(camera, place, model, radius)
-        assert np.abs(shown(camera, place, rig.target).centre - expected).max() < 1e-5
+        assert np.abs(drawings.shown(camera, place, rig.target).centre - expected).max() < 1e-5
 
 
 def test_rays_are_the_cameras(rig, rng):
