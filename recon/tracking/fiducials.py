@@ -17,7 +17,7 @@ from recon import rigid
 from recon.camera import Camera
 from recon.projection import linearise
 from recon.rig import Target
-from recon.tracking.pose import FREEDOM, TargetPose, lost
+from recon.tracking.pose import PARAMETERS, TargetPose, lost
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -104,8 +104,7 @@ def sight(image: Grey, camera: Camera, board: Board) -> Markers:
 def estimate(first: Markers, second: Markers, board: Board) -> TargetPose:
     """Estimate the pose by least squares over all corners that either camera sees; one marker in one view is enough.
 
-    The covariance takes its scale from the residuals. The misfit is their mean square (never less than one, in units of
-    CORNER_PX) times pose.FREEDOM: on the scale of three circles' misfit, though from many more numbers.
+    The covariance takes its scale from the residuals; the misfit, in units of CORNER_PX, is never below its degrees of freedom.
     """
     views = [(view.camera, _design(view, board), view.corners.reshape(-1, 2)) for view in (first, second) if len(view.ids)]
     if not views:
@@ -120,8 +119,9 @@ def estimate(first: Markers, second: Markers, board: Board) -> TargetPose:
         return lost(f"corners {rms:.1f} px from where the board has them")
     if any(not _faces(pose, camera) for camera, _, _ in views):
         return lost("markers seen from behind")
-    variance = max(float(residual @ residual) / (len(residual) - FREEDOM), CORNER_PX**2)
-    return TargetPose(pose, variance * np.linalg.inv(design.T @ design), FREEDOM * variance / CORNER_PX**2)
+    freedom = len(residual) - PARAMETERS
+    variance = max(float(residual @ residual) / freedom, CORNER_PX**2)
+    return TargetPose(pose, variance * np.linalg.inv(design.T @ design), freedom * variance / CORNER_PX**2, freedom=freedom)
 
 
 def _board(target: Target, dictionary: int, modules: int) -> Board:
@@ -232,7 +232,7 @@ def _refined(pose: Array, views: Sequence[View]) -> tuple[Array, Array, Array] |
         if not np.isfinite(design).all():
             return None
         step, _, rank, _ = np.linalg.lstsq(design / SCALE, left)
-        if rank < FREEDOM:
+        if rank < PARAMETERS:
             return None
         step = step / SCALE
         pose = rigid.transform(Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[3:])

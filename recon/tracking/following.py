@@ -39,7 +39,7 @@ class Step:
 def kept(found: Tracking, time_ns: int) -> Step:
     """What is kept of a pair."""
     pose, (first, second) = found.pose, found.views
-    blurs = float(first.blur_px.max()), float(second.blur_px.max())
+    blurs = float(np.fmax.reduce(first.blur_px)), float(np.fmax.reduce(second.blur_px))
     return Step(time_ns, pose.world_from_target, pose.covariance, found.how, pose.reason, blurs, sum(found.seconds.values()))
 
 

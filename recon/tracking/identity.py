@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from recon.ellipses import Ellipses, root
 from recon.rig import Target
-from recon.tracking.detection import Candidates
+from recon.tracking.detection import LEAST_SCORE, Candidates
+from recon.tracking.pose import circle_centres
 
 Array = NDArray[np.float64]
 
@@ -23,31 +24,56 @@ DISC = (0.03, 0.19)  # diameter of a disc, of the image's width
 UNNAMED = 1e-3  # no identity is less likely than that: a network may be wrong
 ALIKE = 0.15  # of a disc's size, by which an ellipse may differ from what the distances ask for
 KEPT = 6  # triples a view
+HALVES = 3  # with one unseen
 
 
 @dataclass(frozen=True)
 class Triple:
-    """Three candidates as c0, c1, c2."""
+    """Where c0, c1, c2 may be."""
 
-    chosen: NDArray[np.int64]  # (3,) numbers of the candidates
-    points: Array  # (3, 2) px
+    points: Array  # (3, 2) px; NaN of one that isn't among the candidates
     score: float  # logarithm of its probability, but for a constant
+
+    def within(self, other: "Triple") -> bool:
+        """Whether all its candidates are the other's, under whatever names."""
+        return {tuple(point) for point in self.points if np.isfinite(point).all()} <= {tuple(point) for point in other.points}
 
 
 def triples(candidates: Candidates, target: Target, width: int) -> list[Triple]:
-    """Triples that can be the target in an image of this width (px), the likeliest first."""
-    if len(candidates.points) < 3:
-        return []
-    order = _orders(len(candidates.points))
-    points = candidates.points[order]
+    """What can be the target in an image of this width (px), the likeliest first: three candidates, or two and one unseen."""
+    points = np.vstack([candidates.points.reshape(-1, 2), np.full(2, np.nan)])
+    scores = np.append(candidates.scores, LEAST_SCORE)
+    names = np.vstack([candidates.identity[:, :3], np.full(3, 1 / 4)])
+    order = _orders(len(points))
+    likely = np.log(np.maximum(names[order, [0, 1, 2]], UNNAMED)).sum(axis=1) + np.log(scores[order]).sum(axis=1)
+    whole = (order < len(points) - 1).all(axis=1)
+    possible = np.empty(len(order), bool)
+    possible[whole] = _possible(points[order[whole]], target, width)
+    possible[~whole] = _half_possible(points[order[~whole]], target, width)
+    ranked = np.argsort(-likely, kind="stable")
+    best = np.concatenate([ranked[(possible & whole)[ranked]][:KEPT], ranked[(possible & ~whole)[ranked]][:HALVES]])
+    return [Triple(points[order[k]], float(likely[k])) for k in sorted(best, key=lambda k: -likely[k])]
+
+
+def _possible(points: Array, target: Target, width: int) -> NDArray[np.bool_]:
+    """Whether three points : (n, 3, 2) px can be the circles, by the view's scale and tilt."""
     affine = affinity(points, target)
     scales = np.linalg.svd(affine, compute_uv=False)
     size = scales[:, 0] * target.outer_diameter_mm / width
-    possible = (np.linalg.det(affine) < 0) & (scales[:, 1] > TILTED * scales[:, 0]) & (size > DISC[0]) & (size < DISC[1])
-    likely = np.log(np.maximum(candidates.identity[order, [0, 1, 2]], UNNAMED)).sum(axis=1)
-    likely += np.log(candidates.scores[order]).sum(axis=1)
-    best = [k for k in np.argsort(-likely, kind="stable") if possible[k]][:KEPT]
-    return [Triple(order[k], points[k], float(likely[k])) for k in best]
+    return (np.linalg.det(affine) < 0) & (scales[:, 1] > TILTED * scales[:, 0]) & (size > DISC[0]) & (size < DISC[1])
+
+
+def _half_possible(points: Array, target: Target, width: int) -> NDArray[np.bool_]:
+    """The same of points of which one is NaN, by the distance of the other two."""
+    size = stretch(points, target) * target.outer_diameter_mm / width
+    return (size > TILTED * DISC[0]) & (size < DISC[1])
+
+
+def stretch(points: Array, target: Target) -> Array:
+    """The largest ratio, px/mm, of two circles' distances in the image and on the target, from views : (..., 3, 2) px."""
+    places = circle_centres(target)[:, :2]
+    seen, true = (np.linalg.norm(each[..., [1, 2, 2], :] - each[..., [0, 0, 1], :], axis=-1) for each in (points, places))
+    return np.fmax.reduce(seen / true, axis=-1)
 
 
 def affinity(points: Array, target: Target) -> Array:
@@ -75,4 +101,4 @@ def named(ellipses: Ellipses, target: Target) -> tuple[NDArray[np.int64], float]
 
 @cache
 def _orders(count: int) -> NDArray[np.int64]:
-    return np.array(list(permutations(range(count), 3)), np.int64)
+    return np.array(list(permutations(range(count), 3)), np.int64).reshape(-1, 3)

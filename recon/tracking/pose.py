@@ -1,8 +1,9 @@
 """The target's pose from its three circles in two views, with its covariance, or the reason why there is none.
 
 Six centres are twelve numbers for a pose of six: the other six tell whether it is the target that is seen, with the right names
-and through the right cameras. Circles, not points, are fitted: what a view should show is the centre of the projected outline,
-which is not the projected centre.
+and through the right cameras. One circle may be missing in one view: then four are left, and two poses may fit, of which the
+ellipses' shapes tell one. Circles, not points, are fitted: what a view should show is the centre of the projected outline, which
+is not the projected centre.
 """
 
 from collections.abc import Sequence
@@ -11,31 +12,47 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from recon import rigid
 from recon.camera import Camera
 from recon.rig import Target
+from recon.tracking import one_view
 from recon.tracking.outline_model import ellipses_of, rays_through, slopes_at
 
 Array = NDArray[np.float64]
 
 NAMES = ("c0", "c1", "c2")
+PAIRS = ("c0-c1", "c0-c2", "c1-c2")
 GROSS_MM = 4.0  # by which distances between centres may be off, before the fit: a sixth of the least
 APART_MM = 4.0  # by which two views' rays of one centre may miss each other
-STEPS = 3  # of the fit: the start is a few hundredths of a mm off
-IMPLAUSIBLE = 1e-9  # chance of a misfit so large, below which it isn't the target
-FREEDOM = 6
-MOST = float(chi2.isf(IMPLAUSIBLE, FREEDOM))
+STEPS = 20  # of the fit, most: two or three from where rays meet, more from three points seen nearly face on
+SETTLED = 1e-4  # squared standard deviations of the last step
+ROUNDING = 1e-6  # of squared residuals
+LEAST_DAMPING = 1e-4
+IMPLAUSIBLE = 1e-6  # chance of a misfit so large, by chi-square, below which it isn't the target
+PARAMETERS = 6
+MISFITTING = "views that no pose fits: other circles, or cameras swapped or moved"
+RANK = 1e-7  # least ratio of singular values
+SIZES = 0.12  # of a disc's size, by which shapes may differ from the pose's
+SHAPES = 0.005  # the same: what blur and gradients leave of a shape, one standard deviation
+TOLD = 16.0  # by how much another pose's misfit, with shapes, must be larger
+SAME = 16.0  # squared standard deviations within which two poses are one
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """The three circles in one view."""
+    """The circles in one view."""
 
     camera: Camera
-    centres: Array  # (3, 2) px, of the ellipses, in the order of NAMES
+    centres: Array  # (3, 2) px, of the ellipses, in the order of NAMES; NaN where one isn't seen
     covariance: Array  # (3, 2, 2) px^2
+    shapes: Array | None = None  # (3, 2, 2) px, of the ellipses, as ellipses.Ellipses has them; None if they aren't known
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which circles are seen : (3,)."""
+        return np.isfinite(self.centres).all(axis=1)
 
 
 @dataclass(frozen=True)
@@ -44,8 +61,9 @@ class TargetPose:
 
     world_from_target: Array  # (4, 4) mm; NaN if it isn't known
     covariance: Array  # (6, 6) of a turn (rad) after the pose's own, and a shift (mm) in the world; as in tracks.Track
-    misfit: float  # squared normalised residuals, chi-square with FREEDOM degrees; NaN if there was no fit
+    misfit: float  # squared normalised residuals, chi-square with `freedom` degrees; NaN if there was no fit
     reason: str | None = None
+    freedom: int = PARAMETERS  # numbers that were measured beyond the pose's own
 
     @property
     def found(self) -> bool:
@@ -59,31 +77,74 @@ def circle_centres(target: Target) -> Array:
 
 
 def estimate(first: Sighting, second: Sighting, target: Target) -> TargetPose:
-    """Estimate the pose from two views, by least squares over all six ellipses' centres.
+    """Estimate the pose from two views, by least squares over all ellipses' centres.
 
     Never raises on what the views show: what can't be the target is not found, with a reason.
     """
-    model = circle_centres(target)
+    model, views = circle_centres(target), (first, second)
+    both = first.seen & second.seen
+    if both.sum() < 2 or not (first.seen.all() or second.seen.all()):
+        return lost("fewer circles than a pose needs: three in one view, two in the other")
     points, apart = meet(first, second)
-    if not np.isfinite(points).all():
+    if not np.isfinite(points[both]).all():
         return lost("a centre whose rays do not meet in front of the cameras")
-    if apart.max() > APART_MM:
-        worst = int(apart.argmax())
+    if apart[both].max() > APART_MM:
+        worst = int(np.where(both, apart, 0).argmax())
         return lost(f"rays of {NAMES[worst]} miss each other by {apart[worst]:.1f} mm: other circles, or cameras swapped")
     expected, found = _distances(model), _distances(points)
-    if np.abs(found - expected).max() > GROSS_MM:
-        shown = ", ".join(f"{value:.1f}" for value in found)
-        return lost(f"centres {shown} mm apart (c0-c1, c0-c2, c1-c2), expected {', '.join(f'{value:.1f}' for value in expected)}")
-    start = aligned(model, points)
-    facing = start[:3, 2] @ (start[:3, 3] - first.camera.centre)
-    if facing * (start[:3, 2] @ (start[:3, 3] - second.camera.centre)) <= 0:
-        return lost("the target's plane lies between the cameras")
-    return _refined(start, (first, second), target, model)
+    if np.nanmax(np.abs(found - expected)) > GROSS_MM:
+        pairs = [k for k in range(3) if np.isfinite(found[k])]
+        shown = ", ".join(f"{PAIRS[k]} {found[k]:.1f} mm apart, expected {expected[k]:.1f}" for k in pairs)
+        return lost(f"centres {shown}")
+    starts = [aligned(model, points)] if both.all() else _starts(views, model)
+    if not starts:
+        return lost("no pose shows three circles so")
+    fits = [_refined(start, views, target, model) for start in starts]
+    found = [fit for fit in fits if fit.found]
+    return _chosen(found, views, target) if found else min(fits, key=lambda fit: np.nan_to_num(fit.misfit, nan=np.inf))
 
 
-def lost(reason: str) -> TargetPose:
+def _starts(views: Sequence[Sighting], model: Array) -> list[Array]:
+    """Poses that the view of all three circles allows."""
+    whole = next(view for view in views if view.seen.all())
+    return one_view.poses(whole.camera, whole.centres, model)
+
+
+def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Target) -> TargetPose:
+    """Of poses that fit the centres, the one that fits the shapes, too; none if it doesn't, or if another does as well."""
+    off = [_off_shapes(fit.world_from_target, views, target) for fit in fits]
+    total = [fit.misfit + float(sum((each**2).sum() for each in one)) / SHAPES**2 for fit, one in zip(fits, off, strict=True)]
+    best = int(np.argmin(total))
+    most = max((float(np.abs(each).max()) for each in off[best]), default=0.0)
+    if not most <= SIZES:
+        return lost(f"circles whose sizes are {100 * most:.0f} % from what their distance asks for")
+    rivals = [fit for fit, each in zip(fits, total, strict=True) if each < total[best] + TOLD]
+    if any(_apart(fits[best], rival) > SAME for rival in rivals):
+        return lost("two poses that the circles seen do not tell apart")
+    return fits[best]
+
+
+def _off_shapes(pose: Array, views: Sequence[Sighting], target: Target) -> list[Array]:
+    """By how much, as a share of their size, ellipses differ from a pose's : of each view whose shapes are known, (m, 3)."""
+    off = []
+    for view in views:
+        if view.shapes is not None:
+            told = ellipses_of(view.camera, pose, circle_centres(target)[view.seen], target.outer_diameter_mm / 2)[1]
+            size = np.trace(told, axis1=1, axis2=2) / 2
+            off.append((view.shapes[view.seen] - told)[:, [0, 0, 1], [0, 1, 1]] / size[:, None])
+    return off
+
+
+def _apart(first: TargetPose, second: TargetPose) -> float:
+    """Squared distance of two poses in standard deviations of the first."""
+    turn = Rotation.from_matrix(second.world_from_target[:3, :3] @ first.world_from_target[:3, :3].T).as_rotvec()
+    off = np.concatenate([turn, second.world_from_target[:3, 3] - first.world_from_target[:3, 3]])
+    return float(off @ np.linalg.solve(first.covariance, off))
+
+
+def lost(reason: str, misfit: float = np.nan) -> TargetPose:
     """No pose, for a reason."""
-    return TargetPose(np.full((4, 4), np.nan), np.full((6, 6), np.nan), np.nan, reason)
+    return TargetPose(np.full((4, 4), np.nan), np.full((6, 6), np.nan), misfit, reason)
 
 
 def meet(first: Sighting, second: Sighting) -> tuple[Array, Array]:
@@ -118,25 +179,53 @@ def _distances(points: Array) -> Array:
 
 
 def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Array) -> TargetPose:
-    """Gauss-Newton on the ellipses' centres; the offsets from the projected centres follow the pose."""
-    pose, radius = start, target.outer_diameter_mm / 2
-    whiten = [np.linalg.inv(np.linalg.cholesky(view.covariance)) for view in views]
-    design, misfit = np.zeros((12, 6)), np.nan
+    """Least squares on the ellipses' centres, by Gauss-Newton, damped where that leads uphill [Levenberg 1944]."""
+    whiten = [np.linalg.inv(np.linalg.cholesky(view.covariance[view.seen])) for view in views]
+    pose, best, damping = start, None, 0.0
+    trial = start
     for _ in range(STEPS):
-        rows, left = [], []
-        for view, white in zip(views, whiten, strict=True):
-            predicted = ellipses_of(view.camera, pose, model, radius)[0]
-            by_point = slopes_at(view.camera, rigid.apply(pose, model))
-            jacobian = np.concatenate([-rigid.cross(rigid.rotate(pose, model)), np.tile(np.eye(3), (3, 1, 1))], axis=-1)
-            rows.append((white @ by_point @ jacobian).reshape(-1, 6))
-            left.append((white @ (view.centres - predicted)[..., None]).ravel())
-        design, residual = np.concatenate(rows), np.concatenate(left)
-        step, _, rank, _ = np.linalg.lstsq(design, residual)
-        if rank < 6 or not np.isfinite(step).all():
+        design, residual = _linearised(trial, views, whiten, target, model)
+        if not (np.isfinite(design).all() and np.isfinite(residual).all()):
+            return lost(MISFITTING)
+        if best is None or residual @ residual < best[1] @ best[1] + ROUNDING:
+            pose, best, damping = trial, (design, residual), damping / 10
+        else:
+            damping = max(10 * damping, LEAST_DAMPING)
+        design, residual = best
+        held = np.diag(np.sqrt(damping) * np.linalg.norm(design, axis=0))
+        step, _, rank, _ = np.linalg.lstsq(np.vstack([design, held]), np.append(residual, np.zeros(PARAMETERS)), RANK)
+        if rank < PARAMETERS:
             return lost("views that do not determine the pose")
-        misfit = float(np.sum((residual - design @ step) ** 2))
-        pose = rigid.transform(Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[3:])
-    if not misfit < MOST:
-        times = np.sqrt(misfit / FREEDOM)
-        return lost(f"a misfit of {times:.0f} times the centres' uncertainty: other circles, or cameras swapped or moved")
-    return TargetPose(pose, np.linalg.inv(design.T @ design), misfit)
+        if np.sum((design @ step) ** 2) < SETTLED:
+            break
+        trial = _moved(pose, step)
+    else:
+        return lost(MISFITTING)
+    misfit, freedom = float(np.sum((residual - design @ step) ** 2)), len(design) - PARAMETERS
+    if not misfit < chdtri(freedom, IMPLAUSIBLE):
+        times = np.sqrt(misfit / freedom)
+        return lost(f"a misfit of {times:.0f} times the centres' uncertainty: other circles, or cameras swapped or moved", misfit)
+    pose = _moved(pose, step)
+    if not all(pose[:3, 2] @ (pose[:3, 3] - view.camera.centre) < 0 for view in views):
+        return lost("a target whose front does not face both cameras")
+    return TargetPose(pose, np.linalg.inv(design.T @ design), misfit, freedom=freedom)
+
+
+def _linearised(
+    pose: Array, views: Sequence[Sighting], whiten: Sequence[Array], target: Target, model: Array
+) -> tuple[Array, Array]:
+    """Slopes : (n, 6) and residuals : (n,) of the centres seen, in standard deviations; ellipses' offsets follow the pose."""
+    rows, left = [], []
+    for view, white in zip(views, whiten, strict=True):
+        circles = model[view.seen]
+        predicted = ellipses_of(view.camera, pose, circles, target.outer_diameter_mm / 2)[0]
+        by_point = slopes_at(view.camera, rigid.apply(pose, circles))
+        by_turn, by_shift = -rigid.cross(rigid.rotate(pose, circles)), np.tile(np.eye(3), (len(circles), 1, 1))
+        rows.append((white @ by_point @ np.concatenate([by_turn, by_shift], axis=-1)).reshape(-1, PARAMETERS))
+        left.append((white @ (view.centres[view.seen] - predicted)[..., None]).ravel())
+    return np.concatenate(rows), np.concatenate(left)
+
+
+def _moved(pose: Array, step: Array) -> Array:
+    """A pose after a turn (rad) in the world and a shift (mm)."""
+    return rigid.transform(Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[3:])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from recon.ellipses import Ellipses, root
 from recon.rig import Target
-from recon.tracking.identity import affinity
+from recon.tracking.identity import affinity, stretch
 from recon.tracking.networks import PATCH, Networks
 
 Array = NDArray[np.float64]
@@ -32,15 +32,18 @@ class Patches:
 
 
 def rough_ellipses(image: NDArray, points: Array, networks: Networks, target: Target) -> Ellipses:
-    """Ellipses of the discs about points : (3, 2) px of c0, c1, c2, to a pixel or two; NaN where there is none."""
+    """Ellipses of the discs about points : (3, 2) px of c0, c1, c2, to a pixel or two; NaN where there is none, or no point."""
     cut = patches(image, points, step_for(points, target))
-    return read(networks.segment(cut.images), cut)
+    found = read(networks.segment(cut.images), cut)
+    there = np.isfinite(points).all(axis=1)
+    return Ellipses(np.where(there[:, None], found.centre, np.nan), np.where(there[:, None, None], found.shape, np.nan))
 
 
 def step_for(points: Array, target: Target) -> int:
-    """How coarse patches must be to hold the discs, from the distances of the three circles : (3, 2) px."""
-    scales = np.linalg.svd(np.nan_to_num(affinity(points, target)), compute_uv=False)
-    return int(np.clip(np.ceil(scales[0] * target.outer_diameter_mm / WIDEST), 1, COARSEST))
+    """How coarse patches must be to hold the discs, from the distances of two or three circles : (3, 2) px."""
+    affine = affinity(points, target)
+    scale = np.linalg.svd(affine, compute_uv=False)[0] if np.isfinite(affine).all() else stretch(points, target)
+    return int(np.clip(np.ceil(scale * target.outer_diameter_mm / WIDEST), 1, COARSEST))
 
 
 def patches(image: NDArray, points: Array, step: int = 1) -> Patches:

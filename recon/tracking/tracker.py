@@ -17,13 +17,13 @@ from recon.camera import Camera
 from recon.ellipses import Ellipses, joined
 from recon.errors import InputError
 from recon.rig import Target
-from recon.tracking import covered, detection, identity, segmentation, views
+from recon.tracking import covered, detection, identity, one_view, segmentation, views
 from recon.tracking.frames import grey
 from recon.tracking.identity import Triple
 from recon.tracking.networks import Networks
 from recon.tracking.outline_model import ellipses_of
 from recon.tracking.outlines import Outlines, measure_both
-from recon.tracking.pose import GROSS_MM, Sighting, TargetPose, circle_centres, estimate, lost, meet
+from recon.tracking.pose import TargetPose, circle_centres, estimate, lost
 from recon.tracking.views import View
 
 Array = NDArray[np.float64]
@@ -34,9 +34,8 @@ BLIND_PX = 14.0  # and without
 ROUGH_PX = 5.0  # by which the segmenter's ellipses may be off
 FORGOTTEN_S = 0.25  # after which the target may be anywhere
 FORGOTTEN_FRAMES = 4.0  # the same without times
-COARSE_MM = 8.0  # by which the detector's places may be off, in distances and as rays that miss each other
-TRIALS = 3  # pairs of triples that the segmenter looks at
-SIZES = 0.12  # of a disc's size, by which rims may differ from the pose's
+ALONE = "no networks to find it by"
+TRIALS = 10  # triples that the segmenter looks at
 
 
 @dataclass(frozen=True)
@@ -85,13 +84,14 @@ class Tracker:
                 result = self._fitted(frames, rough, REACH_PX if len(self._past) > 1 else BLIND_PX, "predicted")
                 watch.stop("predict")
                 if not result.found and self.networks is not None:
-                    result = self._segmented(frames, self.networks, (rough.centre[:3], rough.centre[3:]), "segmented", result)
+                    result = self._segmented(frames, self.networks, rough, result)
                     watch.stop("segment")
         if (result is None or not result.found) and self.networks is not None:
             result = self._detected(frames, self.networks)
             watch.stop("detect")
         if result is None:
-            result = _nowhere("no networks to find it by", "no networks to find it by")
+            seen = (views.nothing(ALONE), views.nothing(ALONE))
+            result = Tracking(lost(_unseen(seen)), seen)
         if result.found:
             self.remember(result.pose.world_from_target, now)
         return replace(result, seconds=watch.seconds)
@@ -137,23 +137,22 @@ class Tracker:
         both = [ellipses_of(camera, world_from_target, centres, radius) for camera in self.cameras]
         return Ellipses(np.concatenate([each[0] for each in both]), np.concatenate([each[1] for each in both]))
 
-    def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str, rename: bool = False) -> Tracking:
+    def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str) -> Tracking:
         """From six rough ellipses to the pose."""
         outlines = measure_both(*frames, rough, np.arange(6) >= 3, reach, self.target)
         halves = [self._completed(frames, half, k) for k, half in enumerate((outlines[:3], outlines[3:]))]
-        if rename:
-            halves = [views.renamed(half, self.target) for half in halves]
         seen = (views.judged(halves[0], self.target), views.judged(halves[1], self.target))
-        if not (seen[0].found and seen[1].found):
+        return self._posed(seen, how)
+
+    def _posed(self, seen: tuple[View, View], how: str) -> Tracking:
+        """From two views to the pose."""
+        if not (all(view.useful for view in seen) and any(view.found for view in seen)):
             return Tracking(lost(_unseen(seen)), seen)
         found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target)
-        if found.found:
-            expected = self._rough(found.world_from_target).shape
-            shown = np.concatenate([view.outlines.ellipses.shape for view in seen])
-            off = np.abs(shown - expected).max() / (np.trace(expected, axis1=1, axis2=2).mean() / 2)
-            if off > SIZES:
-                found = lost(f"circles whose sizes are {100 * off:.0f} % from what their distance asks for")
-        return Tracking(found, seen, how if found.found else None)
+        if not found.found:
+            return Tracking(found, seen)
+        told = self._rough(found.world_from_target)
+        return Tracking(found, (views.completed(seen[0], told[:3]), views.completed(seen[1], told[3:])), how)
 
     def _completed(self, frames: Frames, outlines: Outlines, view: int) -> Outlines:
         """Three rims, of which one that something covers is looked for where the other two ask for it."""
@@ -164,62 +163,63 @@ class Tracker:
         again = measure_both(*frames, rough, np.array([view == 1]), covered.REACH_PX, self.target, middles=False)
         return outlines.replaced(which, again) if covered.alike(again, outlines, which) else outlines
 
-    def _segmented(
-        self, frames: Frames, networks: Networks, places: tuple[Array, Array], how: str, before: Tracking | None = None
-    ) -> Tracking:
-        """From six places, three a frame : (3, 2) px, to the pose, by the segmenter."""
+    def _segmented(self, frames: Frames, networks: Networks, rough: Ellipses, before: Tracking) -> Tracking:
+        """From six rough ellipses to the pose, by the segmenter."""
         cuts = [
             segmentation.patches(frame, at, segmentation.step_for(at, self.target))
-            for frame, at in zip(frames, places, strict=True)
+            for frame, at in zip(frames, (rough.centre[:3], rough.centre[3:]), strict=True)
         ]
         masks = networks.segment(np.concatenate([cut.images for cut in cuts]))
         halves = [segmentation.read(half, cut) for half, cut in zip((masks[:3], masks[3:]), cuts, strict=True)]
-        rough = joined(halves)
-        if before is not None and min(np.isfinite(half.centre[:, 0]).sum() for half in halves) < 2:
+        if min(np.isfinite(half.centre[:, 0]).sum() for half in halves) < 2:
             return before
-        return self._fitted(frames, rough, ROUGH_PX, how, rename=how == "detected")
+        return self._fitted(frames, joined(halves), ROUGH_PX, "segmented")
 
     def _detected(self, frames: Frames, networks: Networks) -> Tracking:
-        """From nothing to the pose."""
+        """From nothing to the pose: a view alone tells it but for a tilt, and the other view is asked for each of these."""
         candidates = detection.detect(list(frames), networks)
-        choices = [identity.triples(each, self.target, frame.shape[1]) for each, frame in zip(candidates, frames, strict=True)]
-        reasons = [_absent(each) for each in candidates]
-        if not choices[0] and not choices[1]:
-            return _nowhere(*reasons)
-        if not (choices[0] and choices[1]):
-            return self._one_sided(frames, networks, choices, reasons)
-        tried = []
-        for pair in self._pairs(choices[0], choices[1]):
-            result = self._segmented(frames, networks, (pair[0].points, pair[1].points), "detected")
-            if result.found:
-                return result
-            tried.append(result)
-        return tried[0]  # the likeliest one's reason
+        choices = [
+            (k, triple)
+            for k, frame in enumerate(frames)
+            for triple in identity.triples(candidates[k], self.target, frame.shape[1])
+        ]
+        likeliest: dict[int, View] = {}
+        refused: list[Tracking] = []
+        settled: list[tuple[int, Triple]] = []
+        for k, triple in sorted(choices, key=lambda choice: -choice[1].score)[:TRIALS]:
+            if any(k == camera and triple.within(other) for camera, other in settled):
+                continue
+            view = self._alone(frames, networks, k, triple)
+            if k not in likeliest or (view.found and not likeliest[k].found):
+                likeliest[k] = view
+            if view.found:
+                results = self._confirmed(frames, k, view)
+                if any(result.found for result in results):
+                    return max(results, key=lambda result: result.found * result.pose.freedom)  # a wrong tilt misses circles
+                refused += [result for result in results if all(each.useful for each in result.views)]
+                settled.append((k, triple))
+        first, second = (likeliest.get(k, views.nothing(_absent(each))) for k, each in enumerate(candidates))
+        return refused[0] if refused and not (first.found and second.found) else self._posed((first, second), "detected")
 
-    def _one_sided(self, frames: Frames, networks: Networks, choices: list[list[Triple]], reasons: list[str]) -> Tracking:
-        """The circles of the one view that has any."""
-        k = 0 if choices[0] else 1
-        rough = segmentation.rough_ellipses(frames[k], choices[k][0].points, networks, self.target)
-        outlines = self._completed(frames, measure_both(*frames, rough, np.full(3, k == 1), ROUGH_PX, self.target), k)
-        view, other = views.judged(views.renamed(outlines, self.target), self.target), views.nothing(reasons[1 - k])
-        seen = (view, other) if k == 0 else (other, view)
-        return Tracking(lost(_unseen(seen)), seen)
+    def _confirmed(self, frames: Frames, k: int, view: View) -> list[Tracking]:
+        """What the other camera shows where each pose that camera k's view allows asks for its circles."""
+        model, radius, other = circle_centres(self.target), self.target.outer_diameter_mm / 2, 1 - k
+        results = []
+        for pose in one_view.poses(self.cameras[k], view.outlines.ellipses.centre, model):
+            rough = Ellipses(*ellipses_of(self.cameras[other], pose, model, radius))
+            shown = self._view(frames, other, rough, REACH_PX)
+            second = views.judged(shown, self.target)
+            results.append(self._posed((view, second) if k == 0 else (second, view), "detected"))
+        return results
 
-    def _pairs(self, first: list[Triple], second: list[Triple]) -> list[tuple[Triple, Triple]]:
-        """Pairs of triples that may be one target, the likeliest first; if there are none, the likeliest in each view."""
-        expected = np.linalg.norm(_sides(circle_centres(self.target)), axis=1)
-        loose = np.tile(np.eye(2), (3, 1, 1))
-        ordered = sorted(((a, b) for a in first for b in second), key=lambda pair: -pair[0].score - pair[1].score)
-        good = []
-        for pair in ordered:
-            sightings = [Sighting(camera, each.points, loose) for camera, each in zip(self.cameras, pair, strict=True)]
-            points, apart = meet(*sightings)
-            distances = np.linalg.norm(_sides(points), axis=1)
-            if np.isfinite(points).all() and apart.max() < COARSE_MM and np.abs(distances - expected).max() < 2 * GROSS_MM:
-                good.append(pair)
-            if len(good) == TRIALS:
-                break
-        return good or ordered[:1]
+    def _alone(self, frames: Frames, networks: Networks, k: int, triple: Triple) -> View:
+        """What one view shows where its three circles may be."""
+        rough = segmentation.rough_ellipses(frames[k], triple.points, networks, self.target)
+        return views.judged(views.renamed(self._view(frames, k, rough, ROUGH_PX), self.target), self.target)
+
+    def _view(self, frames: Frames, k: int, rough: Ellipses, reach: float) -> Outlines:
+        """Camera k's rims, from three rough ellipses."""
+        return self._completed(frames, measure_both(*frames, rough, np.full(3, k == 1), reach, self.target), k)
 
 
 @dataclass
@@ -234,10 +234,6 @@ class _Watch:
         self.seconds[stage], self.since = now - self.since, now
 
 
-def _sides(points: Array) -> Array:
-    return points[[1, 2, 2]] - points[[0, 0, 1]]
-
-
 def _absent(candidates: detection.Candidates) -> str:
     count = len(candidates.points)
     return f"{count} of 3 circles" if count < 3 else f"{count} places like circles, no three that lie like the target's"
@@ -249,8 +245,3 @@ def _unseen(seen: tuple[View, View]) -> str:
         if seen[k].found:
             return f"only camera {k + 1} sees the target; camera {2 - k}: {seen[1 - k].reason}"
     return f"camera 1: {seen[0].reason}; camera 2: {seen[1].reason}"
-
-
-def _nowhere(first: str, second: str) -> Tracking:
-    seen = (views.nothing(first), views.nothing(second))
-    return Tracking(lost(_unseen(seen)), seen)

@@ -1,6 +1,6 @@
 """What one camera shows of the target: its three rims, or why they aren't there."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,24 +17,30 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class View:
-    """The three circles of one view, in the order of NAMES."""
+    """The three circles of one view, in the order of NAMES. In one of two views a circle may be told by the pose alone."""
 
     outlines: Outlines  # of 3
     reason: str | None = None  # why this isn't the target
 
     @property
     def found(self) -> bool:
-        """Whether all three circles are there."""
+        """Whether it is known where all three circles are."""
         return self.reason is None
 
     @property
+    def useful(self) -> bool:
+        """Whether it can go into a pose: two rings are not compared with each other, the pose does that."""
+        return self.found or self.outlines.found.sum() == 2
+
+    @property
     def blur_px(self) -> Array:
-        """Lengths : (3,) of the circles' paths over the exposure."""
-        return np.linalg.norm(self.outlines.motion, axis=1)
+        """Lengths : (3,) of the circles' paths over the exposure; NaN of one that isn't seen."""
+        return np.where(self.outlines.found, np.linalg.norm(self.outlines.motion, axis=1), np.nan)
 
     def sighting(self, camera: Camera) -> Sighting:
-        """For the pose."""
-        return Sighting(camera, self.outlines.ellipses.centre, self.outlines.covariance)
+        """For the pose: what is seen."""
+        centres = np.where(self.outlines.found[:, None], self.outlines.ellipses.centre, np.nan)
+        return Sighting(camera, centres, self.outlines.covariance, self.outlines.ellipses.shape)
 
 
 def nothing(reason: str) -> View:
@@ -58,6 +64,15 @@ def judged(outlines: Outlines, target: Target) -> View:
     if off > identity.ALIKE:
         return View(outlines, f"circles whose sizes are {100 * off:.0f} % from what their distances ask for")
     return View(outlines)
+
+
+def completed(view: View, told: Ellipses) -> View:
+    """The view of a known pose, which tells where the circle is that isn't seen; what was measured of it stays as it was."""
+    outlines = view.outlines
+    seen = outlines.found[:, None]
+    centre = np.where(seen, outlines.ellipses.centre, told.centre)
+    shape = np.where(seen[..., None], outlines.ellipses.shape, told.shape)
+    return View(replace(outlines, ellipses=Ellipses(centre, shape)))
 
 
 def renamed(outlines: Outlines, target: Target) -> Outlines:

@@ -99,11 +99,11 @@ def located(take: Take, given: Frames, target: Target, networks: Networks) -> Lo
     nothing = Located(np.full(6, np.nan), limit, np.nan, np.nan, np.nan)
     if not result.found:
         return nothing
-    centres = np.concatenate([view.outlines.ellipses.centre for view in result.views])
+    seen = [view.sighting(camera).centres for view, camera in zip(result.views, cameras, strict=True)]
     shift, turn = pose_errors(take, result.pose.world_from_target) or (np.nan, np.nan)
     error = pose_difference(take.motion.world_from_target, result.pose.world_from_target)
     misfit = float(error @ np.linalg.solve(result.pose.covariance, error))
-    return Located(np.linalg.norm(centres - truth, axis=1), limit, shift, turn, misfit)
+    return Located(np.linalg.norm(np.concatenate(seen) - truth, axis=1), limit, shift, turn, misfit)
 
 
 def cameras_of(take: Take) -> Pair:

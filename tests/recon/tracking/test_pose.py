@@ -11,6 +11,7 @@ from recon import rigid
 from recon.circles import centre_offsets
 from recon.tracking import pose
 from recon.tracking.pose import Sighting
+from tests.recon.tracking import drawings
 from twin.session import calibration_of
 
 SIGMA_PX = 0.03
@@ -23,12 +24,6 @@ def cameras(rig):
     return known["cam1"], known["cam2"]
 
 
-def random_pose(rng):
-    """Up to 35 degrees off facing the cameras, turned anyhow, over the working volume."""
-    turn = Rotation.from_euler("xyz", [*rng.uniform(-35, 35, 2), rng.uniform(-180, 180)], degrees=True).as_matrix()
-    return rigid.transform(turn, rng.uniform([-60, -60, 600], [60, 60, 710]))
-
-
 def seen(cameras, target, world_from_target, rng=None):
     """What both cameras show of the target: centres of ellipses, with noise if there is a generator."""
     model, radius = pose.circle_centres(target), target.outer_diameter_mm / 2
@@ -36,7 +31,8 @@ def seen(cameras, target, world_from_target, rng=None):
     for camera in cameras:
         centres = camera.project(rigid.apply(world_from_target, model)) + centre_offsets(camera, world_from_target, model, radius)
         noise = 0 if rng is None else SIGMA_PX * rng.standard_normal((3, 2))
-        views.append(Sighting(camera, centres + noise, np.tile(SIGMA_PX**2 * np.eye(2), (3, 1, 1))))
+        shapes = drawings.shown(camera, world_from_target, target).shape
+        views.append(Sighting(camera, centres + noise, np.tile(SIGMA_PX**2 * np.eye(2), (3, 1, 1)), shapes))
     return views
 
 
@@ -49,7 +45,7 @@ def error(found, true):
 def test_exact_where_there_is_no_noise(cameras, rig, rng):
     """Circles are followed to rounding, although their ellipses' centres are a quarter of a pixel off the projected ones."""
     for _ in range(10):
-        true = random_pose(rng)
+        true = drawings.facing(rng)
         found = pose.estimate(*seen(cameras, rig.target, true), rig.target)
         assert np.abs(error(found.world_from_target, true)).max() < 1e-6
         assert found.misfit < 1e-6
@@ -59,7 +55,7 @@ def test_the_covariance_is_that_of_the_errors(cameras, rig, rng):
     """Squared normalised errors of 60 poses and misfits follow chi-square: means within 4 standard errors."""
     squared, misfits = [], []
     for _ in range(POSES):
-        true = random_pose(rng)
+        true = drawings.facing(rng)
         found = pose.estimate(*seen(cameras, rig.target, true, rng), rig.target)
         off = error(found.world_from_target, true)
         squared.append(off @ np.linalg.solve(found.covariance, off))
@@ -69,30 +65,112 @@ def test_the_covariance_is_that_of_the_errors(cameras, rig, rng):
     assert np.mean(np.array(squared) < chi2.ppf(0.95, 6)) > 0.85
 
 
+@pytest.mark.parametrize("which", [0, 1, 2])
+@pytest.mark.parametrize("hidden", [0, 1])
+def test_a_circle_may_be_missing_in_one_view(cameras, rig, rng, which, hidden):
+    """Then the misfit has 4 degrees of freedom, and the covariance still is that of the errors."""
+    squared, misfits = [], []
+    for _ in range(POSES // 2):
+        true = drawings.facing(rng)
+        views = seen(cameras, rig.target, true, rng)
+        views[hidden].centres[which] = np.nan
+        found = pose.estimate(*views, rig.target)
+        off = error(found.world_from_target, true)
+        squared.append(off @ np.linalg.solve(found.covariance, off))
+        misfits.append(found.misfit)
+        assert found.freedom == 4
+    for values, freedom in ((squared, 6), (misfits, 4)):
+        assert abs(np.mean(values) - freedom) < 4 * np.sqrt(2 * freedom / (POSES // 2))
+
+
+def face_on(camera, rng, tilt_deg):
+    """A pose that a camera sees tilted by so much, to any side."""
+    place = drawings.facing(rng)
+    away = camera.centre - place[:3, 3]
+    facing = Rotation.align_vectors(away, [0, 0, 1])[0] * Rotation.from_euler("z", rng.uniform(-180, 180), degrees=True)
+    side = rng.uniform(0, 2 * np.pi)
+    lean = Rotation.from_rotvec(np.radians(tilt_deg) * np.array([np.cos(side), np.sin(side), 0]))
+    return rigid.transform((facing * lean).as_matrix(), place[:3, 3])
+
+
+@pytest.mark.parametrize(("tilt_deg", "least"), [(0.0, 0.5), (2.5, 0.85), (10.0, 0.95)])
+def test_two_tilts_are_told_apart_or_refused(cameras, rig, rng, tilt_deg, least):
+    """Where the whole view sees the target nearly face on, both tilts fit its centres; shapes are 0.1 px off."""
+    squared = []
+    for _ in range(POSES):
+        true = face_on(cameras[0], rng, tilt_deg)
+        views = seen(cameras, rig.target, true, rng)
+        views[1].centres[rng.integers(3)] = np.nan
+        for view in views:
+            noise = 0.1 * rng.standard_normal((3, 2, 2))
+            view.shapes[:] += (noise + np.swapaxes(noise, 1, 2)) / 2
+        found = pose.estimate(*views, rig.target)
+        assert found.found or "two poses" in found.reason or "no pose fits" in found.reason
+        if found.found:
+            off = error(found.world_from_target, true)
+            squared.append(off @ np.linalg.solve(found.covariance, off))
+    assert len(squared) >= least * POSES
+    assert np.mean(np.array(squared) < chi2.ppf(0.95, 6)) > 0.85 and max(squared) < 100
+
+
+def test_without_shapes_two_tilts_are_not_told_apart(cameras, rig, rng):
+    """Nothing but perspective would: some are refused, none is wrong."""
+    reasons = []
+    for _ in range(POSES):
+        true = drawings.facing(rng)
+        views = [replace(view, shapes=None) for view in seen(cameras, rig.target, true, rng)]
+        views[1].centres[2] = np.nan
+        found = pose.estimate(*views, rig.target)
+        reasons.append(found.reason)
+        assert not found.found or np.abs(error(found.world_from_target, true)).max() < 1.0
+    assert any("two poses" in str(reason) for reason in reasons)
+
+
+def test_sizes_that_no_distance_gives_are_not_the_target(cameras, rig, rng):
+    views = [replace(view, shapes=1.2 * view.shapes) for view in seen(cameras, rig.target, drawings.facing(rng), rng)]
+    assert "sizes are 20 %" in str(pose.estimate(*views, rig.target).reason)
+
+
+def test_the_back_of_a_target_is_not_found(cameras, rig, rng):
+    """As through glass: the same circles, seen from behind."""
+    flipped = drawings.facing(rng) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    assert "front" in str(pose.estimate(*seen(cameras, rig.target, flipped, rng), rig.target).reason)
+
+
+@pytest.mark.parametrize("missing", [[(0, 0), (1, 0)], [(0, 0), (1, 1)], [(0, 0), (0, 1)]])
+def test_with_fewer_circles_there_is_no_pose(cameras, rig, rng, missing):
+    """One hidden from both cameras, another from each, two from one: (camera, circle)."""
+    views = seen(cameras, rig.target, drawings.facing(rng), rng)
+    for camera, which in missing:
+        views[camera].centres[which] = np.nan
+    found = pose.estimate(*views, rig.target)
+    assert not found.found and "fewer circles" in found.reason
+
+
 def test_other_names_are_not_the_target(cameras, rig, rng):
     for order in ([1, 0, 2], [2, 1, 0], [0, 2, 1], [1, 2, 0], [2, 0, 1]):
-        views = [replace(view, centres=view.centres[order]) for view in seen(cameras, rig.target, random_pose(rng), rng)]
+        views = [replace(view, centres=view.centres[order]) for view in seen(cameras, rig.target, drawings.facing(rng), rng)]
         found = pose.estimate(*views, rig.target)
         assert not found.found and "mm apart" in found.reason and np.isnan(found.world_from_target).all()
 
 
 def test_names_that_differ_between_the_views_are_not_the_target(cameras, rig, rng):
     for order in ([1, 0, 2], [2, 1, 0], [0, 2, 1]):
-        first, second = seen(cameras, rig.target, random_pose(rng), rng)
+        first, second = seen(cameras, rig.target, drawings.facing(rng), rng)
         found = pose.estimate(first, replace(second, centres=second.centres[order]), rig.target)
         assert not found.found
 
 
 def test_swapped_cameras_are_noticed(cameras, rig, rng):
     for _ in range(10):
-        first, second = seen(cameras, rig.target, random_pose(rng), rng)
+        first, second = seen(cameras, rig.target, drawings.facing(rng), rng)
         swapped = (replace(first, centres=second.centres), replace(second, centres=first.centres))
         assert not pose.estimate(*swapped, rig.target).found
 
 
 def test_a_centre_that_is_off_is_noticed(cameras, rig, rng):
     """By half a pixel, 17 times what it is known to be."""
-    first, second = seen(cameras, rig.target, random_pose(rng), rng)
+    first, second = seen(cameras, rig.target, drawings.facing(rng), rng)
     first.centres[1] += [0.35, 0.35]
     found = pose.estimate(first, second, rig.target)
     assert not found.found and "misfit" in found.reason

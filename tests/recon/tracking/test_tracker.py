@@ -88,6 +88,60 @@ def test_false_candidates_do_not_distract(cameras, rig, pair, rng):
     assert found.found and off_mm(found) < 0.05
 
 
+@pytest.mark.parametrize("left_out", [0, 1, 2])
+def test_two_candidates_a_view_are_enough(cameras, rig, pair, left_out):
+    """The third is looked for where these two ask for it."""
+    names = [k for k in range(3) if k != left_out]
+    found = Tracker(cameras, rig.target, Told([centres(c, FACING, rig.target)[names] for c in cameras], names=names)).step(*pair)
+    assert found.found and off_mm(found) < 0.05, found.pose.reason
+
+
+def test_one_view_is_enough_to_detect_it(cameras, rig, pair):
+    """It tells where to look in the other."""
+    places = [centres(camera, FACING, rig.target) for camera in cameras]
+    for known in ([places[0], []], [[], places[1]]):
+        found = Tracker(cameras, rig.target, Told(known)).step(*pair)
+        assert found.found and off_mm(found) < 0.05, found.pose.reason
+
+
+def covered(image, place):
+    """With a hand over the whole of the circle at a place."""
+    v, u = np.mgrid[:1024, :1280]
+    return np.where(np.hypot(u - place[0], v - place[1]) < 62, np.uint8(30), image)
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_a_circle_that_one_camera_does_not_see_is_told_by_the_pose(cameras, rig, pair, which):
+    """Found from nothing, and followed; not if the other camera doesn't see it either."""
+    hidden = covered(pair[1], centres(cameras[1], FACING, rig.target)[which])
+    tracker = Tracker(cameras, rig.target, Told([centres(camera, FACING, rig.target) for camera in cameras]))
+    for how in ("detected", "predicted"):
+        found = tracker.step(pair[0], hidden)
+        assert found.found and found.how == how, found.pose.reason
+        assert off_mm(found) < 0.05 and found.pose.freedom == 4
+        view = found.views[1]
+        assert view.found and not view.outlines.found[which]
+        true = drawings.shown(cameras[1], FACING, rig.target)
+        assert np.abs(view.outlines.ellipses.centre - true.centre).max() < 0.3
+        assert np.isfinite(following.kept(found, 0).blur_px).all()
+    neither = tracker.step(covered(pair[0], centres(cameras[0], FACING, rig.target)[which]), hidden)
+    assert not neither.found and str(neither.pose.reason).count(f"c{which}: ") == 2, neither.pose.reason
+
+
+def test_a_camera_that_was_moved_is_told_from_one_that_sees_nothing(cameras, rig, pair):
+    """By 9 rows, within reach of the fit; the detector sees camera 1's view alone."""
+    moved = np.roll(pair[1], 9, axis=0)
+    found = Tracker(cameras, rig.target, Told([centres(cameras[0], FACING, rig.target), []])).step(pair[0], moved)
+    assert not found.found and "moved" in str(found.pose.reason)
+
+
+def test_circles_that_one_view_shows_are_looked_at_once(cameras, rig, pair):
+    """Whatever names they may have."""
+    told = Told([centres(cameras[0], FACING, rig.target), []], names=(3, 3, 3))
+    assert not Tracker(cameras, rig.target, told).step(pair[0], np.full_like(pair[0], 20)).found
+    assert told.segmentations == 1
+
+
 def test_one_camera_alone_is_said_so(tracker, pair):
     blank = np.full_like(pair[0], 20)
     seen = tracker.step(pair[0], blank)
