@@ -36,6 +36,7 @@ MISFITTING = "views that no pose fits: other circles, or cameras swapped or move
 RANK = 1e-7  # least ratio of singular values
 SIZES = 0.12  # of a disc's size, by which shapes may differ from the pose's
 SHAPES = 0.005  # the same: what blur and gradients leave of a shape, one standard deviation
+DOUBT = 3.0  # standard deviations that are added to what sizes may differ by
 TOLD = 16.0  # by how much another pose's misfit, with shapes, must be larger
 SAME = 16.0  # squared standard deviations within which two poses are one
 
@@ -112,27 +113,29 @@ def _starts(views: Sequence[Sighting], model: Array) -> list[Array]:
 
 def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Target) -> TargetPose:
     """Of poses that fit the centres, the one that fits the shapes, too; none if it doesn't, or if another does as well."""
-    off = [_off_shapes(fit.world_from_target, views, target) for fit in fits]
-    total = [fit.misfit + float(sum((each**2).sum() for each in one)) / SHAPES**2 for fit, one in zip(fits, off, strict=True)]
+    shapes = [_off_shapes(fit.world_from_target, views, target) for fit in fits]
+    total = [fit.misfit + float(np.sum((off / sigma) ** 2)) for fit, (off, sigma) in zip(fits, shapes, strict=True)]
     best = int(np.argmin(total))
-    most = max((float(np.abs(each).max()) for each in off[best]), default=0.0)
-    if not most <= SIZES:
-        return lost(f"circles whose sizes are {100 * most:.0f} % from what their distance asks for")
+    off, sigma = shapes[best]
+    if not (np.abs(off) <= SIZES + DOUBT * sigma).all():
+        return lost(f"circles whose sizes are {100 * np.abs(off).max():.0f} % from what their distance asks for")
     rivals = [fit for fit, each in zip(fits, total, strict=True) if each < total[best] + TOLD]
     if any(_apart(fits[best], rival) > SAME for rival in rivals):
         return lost("two poses that the circles seen do not tell apart")
     return fits[best]
 
 
-def _off_shapes(pose: Array, views: Sequence[Sighting], target: Target) -> list[Array]:
-    """By how much, as a share of their size, ellipses differ from a pose's : of each view whose shapes are known, (m, 3)."""
-    off = []
+def _off_shapes(pose: Array, views: Sequence[Sighting], target: Target) -> tuple[Array, Array]:
+    """By how much ellipses differ from a pose's : (m, 3), and what that is known to : (m, 1), as shares of their size."""
+    off, sigma = [np.zeros((0, 3))], [np.zeros((0, 1))]
     for view in views:
         if view.shapes is not None:
             told = ellipses_of(view.camera, pose, circle_centres(target)[view.seen], target.outer_diameter_mm / 2)[1]
-            size = np.trace(told, axis1=1, axis2=2) / 2
-            off.append((view.shapes[view.seen] - told)[:, [0, 0, 1], [0, 1, 1]] / size[:, None])
-    return off
+            size = np.trace(told, axis1=1, axis2=2)[:, None] / 2
+            off.append((view.shapes[view.seen] - told)[:, [0, 0, 1], [0, 1, 1]] / size)
+            rim = np.trace(view.covariance[view.seen], axis1=1, axis2=2)[:, None] / size**2  # a shape's is about its centre's
+            sigma.append(np.sqrt(SHAPES**2 + rim))
+    return np.concatenate(off), np.concatenate(sigma)
 
 
 def _apart(first: TargetPose, second: TargetPose) -> float:

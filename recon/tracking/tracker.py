@@ -150,7 +150,7 @@ class Tracker:
             return Tracking(lost(_unseen(seen)), seen)
         found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target)
         if not found.found:
-            return Tracking(found, seen)
+            return Tracking(found, views.doubted(seen, found.reason) if all(view.found for view in seen) else seen)
         told = self._rough(found.world_from_target)
         return Tracking(found, (views.completed(seen[0], told[:3]), views.completed(seen[1], told[3:])), how)
 
@@ -184,33 +184,29 @@ class Tracker:
             for triple in identity.triples(candidates[k], self.target, frame.shape[1])
         ]
         likeliest: dict[int, View] = {}
-        refused: list[Tracking] = []
-        settled: list[tuple[int, Triple]] = []
+        settled: dict[int, Triple] = {}
         for k, triple in sorted(choices, key=lambda choice: -choice[1].score)[:TRIALS]:
-            if any(k == camera and triple.within(other) for camera, other in settled):
+            if k in settled and triple.within(settled[k]):
                 continue
             view = self._alone(frames, networks, k, triple)
             if k not in likeliest or (view.found and not likeliest[k].found):
                 likeliest[k] = view
             if view.found:
-                results = self._confirmed(frames, k, view)
+                settled[k] = triple
+                others = self._told(frames, k, view)
+                results = [self._posed((view, other) if k == 0 else (other, view), "detected") for other in others]
                 if any(result.found for result in results):
                     return max(results, key=lambda result: result.found * result.pose.freedom)  # a wrong tilt misses circles
-                refused += [result for result in results if all(each.useful for each in result.views)]
-                settled.append((k, triple))
+                likeliest.update((1 - k, other) for other in others if other.found)
         first, second = (likeliest.get(k, views.nothing(_absent(each))) for k, each in enumerate(candidates))
-        return refused[0] if refused and not (first.found and second.found) else self._posed((first, second), "detected")
+        return self._posed((first, second), "detected")
 
-    def _confirmed(self, frames: Frames, k: int, view: View) -> list[Tracking]:
+    def _told(self, frames: Frames, k: int, view: View) -> list[View]:
         """What the other camera shows where each pose that camera k's view allows asks for its circles."""
         model, radius, other = circle_centres(self.target), self.target.outer_diameter_mm / 2, 1 - k
-        results = []
-        for pose in one_view.poses(self.cameras[k], view.outlines.ellipses.centre, model):
-            rough = Ellipses(*ellipses_of(self.cameras[other], pose, model, radius))
-            shown = self._view(frames, other, rough, REACH_PX)
-            second = views.judged(shown, self.target)
-            results.append(self._posed((view, second) if k == 0 else (second, view), "detected"))
-        return results
+        poses = one_view.poses(self.cameras[k], view.outlines.ellipses.centre, model)
+        asked = [Ellipses(*ellipses_of(self.cameras[other], pose, model, radius)) for pose in poses]
+        return [views.judged(self._view(frames, other, rough, REACH_PX), self.target) for rough in asked]
 
     def _alone(self, frames: Frames, networks: Networks, k: int, triple: Triple) -> View:
         """What one view shows where its three circles may be."""

@@ -75,6 +75,12 @@ def completed(view: View, told: Ellipses) -> View:
     return View(replace(outlines, ellipses=Ellipses(centre, shape)))
 
 
+def doubted(pair: tuple[View, View], reason: str | None) -> tuple[View, View]:
+    """Two views that contradict each other: which one is wrong isn't known, so neither is the target's."""
+    first, second = pair
+    return replace(first, reason=reason), replace(second, reason=reason)
+
+
 def renamed(outlines: Outlines, target: Target) -> Outlines:
     """The same rims in the order that their geometry asks for, if all are rings."""
     return outlines[identity.named(outlines.ellipses, target)[0]] if outlines.found.all() else outlines

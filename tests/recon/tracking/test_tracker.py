@@ -155,6 +155,7 @@ def test_swapped_cameras_are_not_found(cameras, rig, pair):
     places = [centres(camera, FACING, rig.target) for camera in cameras]
     found = Tracker(cameras, rig.target, Told(places[::-1])).step(pair[1], pair[0])
     assert not found.found and "cameras swapped" in str(found.pose.reason)
+    assert not any(view.found for view in found.views)
 
 
 def test_a_mirrored_target_is_not_found(cameras, rig, pair):
