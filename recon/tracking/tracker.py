@@ -150,7 +150,7 @@ class Tracker:
             return Tracking(lost(_unseen(seen)), seen)
         found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target)
         if not found.found:
-            return Tracking(found, views.doubted(seen, found.reason) if all(view.found for view in seen) else seen)
+            return Tracking(found, views.doubted(seen, found.reason))
         told = self._rough(found.world_from_target)
         return Tracking(found, (views.completed(seen[0], told[:3]), views.completed(seen[1], told[3:])), how)
 
