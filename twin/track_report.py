@@ -65,8 +65,8 @@ def section(story: Tracked, metrics: Metrics) -> Section:
     text = (
         "A hand leads the target past the cameras, in light as dark as the real rig’s: slowly, then so fast that rims are "
         f"blurred over {metrics['track_blur_most_px']:.0f} px, then partly out of one camera’s view. Networks find its circles; "
-        "from then on their rims are fitted where the last poses let expect them. What doesn’t look like the target in both "
-        "views is not found, rather than found wrongly."
+        "from then on their rims are fitted where the last poses let expect them. What the two views "
+        "together don’t show to be the target is not found, rather than found wrongly."
     )
     detail = "With the bound that the tracker’s own covariance sets; shaded: not found."
     drawings = [

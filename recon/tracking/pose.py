@@ -62,7 +62,7 @@ class TargetPose:
 
     world_from_target: Array  # (4, 4) mm; NaN if it isn't known
     covariance: Array  # (6, 6) of a turn (rad) after the pose's own, and a shift (mm) in the world; as in tracks.Track
-    misfit: float  # squared normalised residuals, chi-square with `freedom` degrees; NaN if there was no fit
+    misfit: float  # squared normalised residuals, chi-square with `freedom` degrees; NaN where it isn't told
     reason: str | None = None
     freedom: int = PARAMETERS  # numbers that were measured beyond the pose's own
 

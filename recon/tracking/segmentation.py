@@ -16,10 +16,10 @@ Array = NDArray[np.float64]
 OFFSET = 59  # px from a patch's corner to the point that it is about
 WIDEST = 105.0  # px of a disc's width that a patch holds
 COARSEST = 3  # px of the image that make one of a patch, most; no disc is wider, see identity.DISC
-SIZE = (14.0, 75.0)  # px, of the semi-axes
+SIZE = (14.0, 75.0)  # px of the patch, of the semi-axes
 FLATTEST = 0.35
 AREA = (0.8, 1.15)  # of a blob to that of its ellipse
-ASTRAY = 40.0  # px from the patch's middle
+ASTRAY = 40.0  # px of the patch, from the patch's middle
 
 
 @dataclass(frozen=True)

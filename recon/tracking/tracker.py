@@ -35,7 +35,7 @@ ROUGH_PX = 5.0  # by which the segmenter's ellipses may be off
 FORGOTTEN_S = 0.25  # after which the target may be anywhere
 FORGOTTEN_FRAMES = 4.0  # the same without times
 ALONE = "no networks to find it by"
-TRIALS = 10  # triples that the segmenter looks at
+TRIALS = 10  # triples of both views that are looked at
 
 
 @dataclass(frozen=True)

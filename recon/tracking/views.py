@@ -76,7 +76,7 @@ def completed(view: View, told: Ellipses) -> View:
 
 
 def doubted(pair: tuple[View, View], reason: str | None) -> tuple[View, View]:
-    """Two views that contradict each other: which one is wrong isn't known, so neither is the target's."""
+    """Two views that give no pose together: which one is wrong isn't known, so neither counts as the target's."""
     first, second = pair
     return replace(first, reason=reason), replace(second, reason=reason)
 

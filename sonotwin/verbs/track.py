@@ -136,5 +136,5 @@ def kinds(reasons: Sequence[str | None]) -> list[tuple[str, int]]:
 def kind(reason: str) -> str:
     """A reason without its details."""
     if reason.startswith("camera 1:"):
-        return "no camera sees the target"
+        return "no camera sees all three circles"
     return re.sub(r"(?<!\w)(?<!camera )\d[\d.]*", "…", re.split(r"[;:]", reason)[0])

@@ -83,7 +83,7 @@ def test_reasons_are_put_together():
     assert kinds(reasons)[0] == ("only camera 1 sees the target", 2)
     assert [kind(str(reason)) for reason in reasons[3:]] == [
         "a misfit of … times the centres' uncertainty",
-        "no camera sees the target",
+        "no camera sees all three circles",
         "rays of c1 miss each other by … mm",
     ]
     assert kinds([f"reason {letter}" for letter in "aabcdef"])[-1] == ("others", 2)
