@@ -26,10 +26,12 @@ def test_the_readme_runs(tmp_path, monkeypatch):
     shutil.copy("made/capture/calibration/optics.yaml", "optics.yaml")
     recipes = commands(ROOT / "README.md")
     assert len(recipes) >= 5
-    few = {
-        "demo": ["poses.count=3", "film_frames=0"],
+    few = {  # rays, poses and frames: as they stand the recipes take ten minutes
+        "demo": ["poses.count=3", "film_frames=0", "engine.samples=2"],
+        "render": ["engine.samples=2"],
+        "film": ["frames=6"],
         "sweep": ["path.speed_mm_s=80"],
-    }  # the board's ten poses take a minute and a half
+    }
     assert main(["demo", *few["demo"], "scene=sphere", "out=demo"]) == 0  # the board's images lie where a reader's would
     for recipe in recipes:
         assert main([*recipe, *few.get(recipe[0], [])]) == 0, recipe

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -55,14 +54,13 @@ def test_help_of_a_verb(verb, capsys):
     assert f"    sonotwin {verb}" in text
 
 
-def test_help_is_instant():
-    """Three tries, the best counts: a busy machine must not fail it. Measured 0.05 s; the limit is that of the eye."""
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "sonotwin", "--help"], capture_output=True, check=True)
-        times.append(time.perf_counter() - start)
-    assert min(times) < 0.3
+def test_help_waits_for_no_library():
+    """It is there at once, 0.05 s, because nothing heavy is imported for it."""
+    heavy = {"numpy", "scipy", "cv2", "numba", "hydra", "drjit", "mitsuba", "torch", "onnxruntime", "matplotlib", "trimesh"}
+    code = "import sys; from sonotwin.cli import main; main(['--help']); print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "usage: sonotwin" in done.stdout
+    assert not heavy & set(done.stderr.split())
 
 
 def test_version(capsys):
