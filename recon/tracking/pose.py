@@ -8,6 +8,7 @@ is not the projected centre.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,7 @@ class Sighting:
     covariance: Array  # (3, 2, 2) px^2
     shapes: Array | None = None  # (3, 2, 2) px, of the ellipses, as ellipses.Ellipses has them; None if they aren't known
 
-    @property
+    @cached_property
     def seen(self) -> NDArray[np.bool_]:
         """Which circles are seen : (3,)."""
         return np.isfinite(self.centres).all(axis=1)
@@ -119,7 +120,7 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
     off, sigma = shapes[best]
     if not (np.abs(off) <= SIZES + DOUBT * sigma).all():
         return lost(f"circles whose sizes are {100 * np.abs(off).max():.0f} % from what their distance asks for")
-    rivals = [fit for fit, each in zip(fits, total, strict=True) if each < total[best] + TOLD]
+    rivals = [fit for k, fit in enumerate(fits) if k != best and total[k] < total[best] + TOLD]
     if any(_apart(fits[best], rival) > SAME for rival in rivals):
         return lost("two poses that the circles seen do not tell apart")
     return fits[best]
@@ -195,8 +196,7 @@ def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Arr
         else:
             damping = max(10 * damping, LEAST_DAMPING)
         design, residual = best
-        held = np.diag(np.sqrt(damping) * np.linalg.norm(design, axis=0))
-        step, _, rank, _ = np.linalg.lstsq(np.vstack([design, held]), np.append(residual, np.zeros(PARAMETERS)), RANK)
+        step, _, rank, _ = np.linalg.lstsq(*(_damped(design, residual, damping) if damping > 0 else best), RANK)
         if rank < PARAMETERS:
             return lost("views that do not determine the pose")
         if np.sum((design @ step) ** 2) < SETTLED:
@@ -227,6 +227,12 @@ def _linearised(
         rows.append((white @ by_point @ np.concatenate([by_turn, by_shift], axis=-1)).reshape(-1, PARAMETERS))
         left.append((white @ (view.centres[view.seen] - predicted)[..., None]).ravel())
     return np.concatenate(rows), np.concatenate(left)
+
+
+def _damped(design: Array, residual: Array, damping: float) -> tuple[Array, Array]:
+    """Equations that keep the step short, added."""
+    held = np.diag(np.sqrt(damping) * np.linalg.norm(design, axis=0))
+    return np.vstack([design, held]), np.append(residual, np.zeros(PARAMETERS))
 
 
 def _moved(pose: Array, step: Array) -> Array:

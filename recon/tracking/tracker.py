@@ -151,8 +151,10 @@ class Tracker:
         found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target)
         if not found.found:
             return Tracking(found, views.doubted(seen, found.reason))
-        told = self._rough(found.world_from_target)
-        return Tracking(found, (views.completed(seen[0], told[:3]), views.completed(seen[1], told[3:])), how)
+        if not all(view.found for view in seen):
+            told = self._rough(found.world_from_target)
+            seen = views.completed(seen[0], told[:3]), views.completed(seen[1], told[3:])
+        return Tracking(found, seen, how)
 
     def _completed(self, frames: Frames, outlines: Outlines, view: int) -> Outlines:
         """Three rims, of which one that something covers is looked for where the other two ask for it."""
