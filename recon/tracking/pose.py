@@ -102,8 +102,8 @@ def estimate(first: Sighting, second: Sighting, target: Target) -> TargetPose:
     if not starts:
         return lost("no pose shows three circles so")
     fits = [_refined(start, views, target, model) for start in starts]
-    found = [fit for fit in fits if fit.found]
-    return _chosen(found, views, target) if found else min(fits, key=lambda fit: np.nan_to_num(fit.misfit, nan=np.inf))
+    good = [fit for fit in fits if fit.found]
+    return _chosen(good, views, target) if good else min(fits, key=lambda fit: np.nan_to_num(fit.misfit, nan=np.inf))
 
 
 def _starts(views: Sequence[Sighting], model: Array) -> list[Array]:
