@@ -11,13 +11,12 @@ from functools import cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from recon import rigid
 from recon.camera import Camera
 from recon.projection import linearise
 from recon.rig import Target
-from recon.tracking.pose import PARAMETERS, TargetPose, lost
+from recon.tracking.pose import PARAMETERS, TargetPose, lost, moved
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -235,7 +234,7 @@ def _refined(pose: Array, views: Sequence[View]) -> tuple[Array, Array, Array] |
         if rank < PARAMETERS:
             return None
         step = step / SCALE
-        pose = rigid.transform(Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[3:])
+        pose = moved(pose, step)
         if np.abs(step * SCALE).max() < CONVERGED_PX:
             break
     design, left = _linearised(pose, views)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from recon.ellipses import Ellipses, root
 from recon.rig import Target
 from recon.tracking.detection import LEAST_SCORE, Candidates
-from recon.tracking.pose import circle_centres
+from recon.tracking.pose import circle_centres, distances
 
 Array = NDArray[np.float64]
 
@@ -71,9 +71,7 @@ def _half_possible(points: Array, target: Target, width: int) -> NDArray[np.bool
 
 def stretch(points: Array, target: Target) -> Array:
     """The largest ratio, px/mm, of two circles' distances in the image and on the target, from views : (..., 3, 2) px."""
-    places = circle_centres(target)[:, :2]
-    seen, true = (np.linalg.norm(each[..., [1, 2, 2], :] - each[..., [0, 0, 1], :], axis=-1) for each in (points, places))
-    return np.fmax.reduce(seen / true, axis=-1)
+    return np.fmax.reduce(distances(points) / distances(circle_centres(target)), axis=-1)
 
 
 def affinity(points: Array, target: Target) -> Array:

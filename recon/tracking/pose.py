@@ -93,7 +93,7 @@ def estimate(first: Sighting, second: Sighting, target: Target) -> TargetPose:
     if apart[both].max() > APART_MM:
         worst = int(np.where(both, apart, 0).argmax())
         return lost(f"rays of {NAMES[worst]} miss each other by {apart[worst]:.1f} mm: other circles, or cameras swapped")
-    expected, found = _distances(model), _distances(points)
+    expected, found = distances(model), distances(points)
     if np.nanmax(np.abs(found - expected)) > GROSS_MM:
         pairs = [k for k in range(3) if np.isfinite(found[k])]
         shown = ", ".join(f"{PAIRS[k]} {found[k]:.1f} mm apart, expected {expected[k]:.1f}" for k in pairs)
@@ -141,8 +141,7 @@ def _off_shapes(pose: Array, views: Sequence[Sighting], target: Target) -> tuple
 
 def _apart(first: TargetPose, second: TargetPose) -> float:
     """Squared distance of two poses in standard deviations of the first."""
-    turn = Rotation.from_matrix(second.world_from_target[:3, :3] @ first.world_from_target[:3, :3].T).as_rotvec()
-    off = np.concatenate([turn, second.world_from_target[:3, 3] - first.world_from_target[:3, 3]])
+    off = difference(first.world_from_target, second.world_from_target)
     return float(off @ np.linalg.solve(first.covariance, off))
 
 
@@ -178,8 +177,20 @@ def aligned(model: Array, points: Array) -> Array:
     return rigid.transform(turn, centre - turn @ middle)
 
 
-def _distances(points: Array) -> Array:
-    return np.linalg.norm(points[[1, 2, 2]] - points[[0, 0, 1]], axis=1)
+def distances(points: Array) -> Array:
+    """Of the pairs PAIRS of three points : (..., 3, n), to (..., 3)."""
+    return np.linalg.norm(points[..., [1, 2, 2], :] - points[..., [0, 0, 1], :], axis=-1)
+
+
+def moved(pose: Array, step: Array) -> Array:
+    """A pose after a turn (rad) in the world and a shift (mm) : (6,)."""
+    return rigid.transform(Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[3:])
+
+
+def difference(first: Array, second: Array) -> Array:
+    """The turn (rad) and shift (mm) : (6,) from one pose to another: undoes `moved`."""
+    turn = Rotation.from_matrix(second[:3, :3] @ first[:3, :3].T).as_rotvec()
+    return np.concatenate([turn, second[:3, 3] - first[:3, 3]])
 
 
 def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Array) -> TargetPose:
@@ -201,14 +212,14 @@ def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Arr
             return lost("views that do not determine the pose")
         if np.sum((design @ step) ** 2) < SETTLED:
             break
-        trial = _moved(pose, step)
+        trial = moved(pose, step)
     else:
         return lost(MISFITTING)
     misfit, freedom = float(np.sum((residual - design @ step) ** 2)), len(design) - PARAMETERS
     if not misfit < chdtri(freedom, IMPLAUSIBLE):
         times = np.sqrt(misfit / freedom)
         return lost(f"a misfit of {times:.0f} times the centres' uncertainty: other circles, or cameras swapped or moved", misfit)
-    pose = _moved(pose, step)
+    pose = moved(pose, step)
     if not all(pose[:3, 2] @ (pose[:3, 3] - view.camera.centre) < 0 for view in views):
         return lost("a target whose front does not face both cameras")
     return TargetPose(pose, np.linalg.inv(design.T @ design), misfit, freedom=freedom)
@@ -233,8 +244,3 @@ def _damped(design: Array, residual: Array, damping: float) -> tuple[Array, Arra
     """Equations that keep the step short, added."""
     held = np.diag(np.sqrt(damping) * np.linalg.norm(design, axis=0))
     return np.vstack([design, held]), np.append(residual, np.zeros(PARAMETERS))
-
-
-def _moved(pose: Array, step: Array) -> Array:
-    """A pose after a turn (rad) in the world and a shift (mm)."""
-    return rigid.transform(Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[3:])

@@ -133,9 +133,12 @@ class Tracker:
 
     def _rough(self, world_from_target: Array) -> Ellipses:
         """Six ellipses, three a view, of a pose."""
-        centres, radius = circle_centres(self.target), self.target.outer_diameter_mm / 2
-        both = [ellipses_of(camera, world_from_target, centres, radius) for camera in self.cameras]
-        return Ellipses(np.concatenate([each[0] for each in both]), np.concatenate([each[1] for each in both]))
+        return joined([self._asked(k, world_from_target) for k in (0, 1)])
+
+    def _asked(self, k: int, world_from_target: Array) -> Ellipses:
+        """Three ellipses that camera k should show of a pose."""
+        radius = self.target.outer_diameter_mm / 2
+        return Ellipses(*ellipses_of(self.cameras[k], world_from_target, circle_centres(self.target), radius))
 
     def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str) -> Tracking:
         """From six rough ellipses to the pose."""
@@ -205,10 +208,9 @@ class Tracker:
 
     def _told(self, frames: Frames, k: int, view: View) -> list[View]:
         """What the other camera shows where each pose that camera k's view allows asks for its circles."""
-        model, radius, other = circle_centres(self.target), self.target.outer_diameter_mm / 2, 1 - k
-        poses = one_view.poses(self.cameras[k], view.outlines.ellipses.centre, model)
-        asked = [Ellipses(*ellipses_of(self.cameras[other], pose, model, radius)) for pose in poses]
-        return [views.judged(self._view(frames, other, rough, REACH_PX), self.target) for rough in asked]
+        poses = one_view.poses(self.cameras[k], view.outlines.ellipses.centre, circle_centres(self.target))
+        asked = [self._asked(1 - k, pose) for pose in poses]
+        return [views.judged(self._view(frames, 1 - k, rough, REACH_PX), self.target) for rough in asked]
 
     def _alone(self, frames: Frames, networks: Networks, k: int, triple: Triple) -> View:
         """What one view shows where its three circles may be."""

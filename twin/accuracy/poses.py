@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from recon.camera import Camera
 from recon.rig import Target
 from recon.tracking import detection, published, segmentation
 from recon.tracking.networks import DETECTOR_SIZE, Networks
+from recon.tracking.pose import difference
 from recon.tracking.tracker import Tracker
 from twin.accuracy import frames
 from twin.accuracy.rows import Row, Setup
@@ -101,7 +101,7 @@ def located(take: Take, given: Frames, target: Target, networks: Networks) -> Lo
         return nothing
     seen = [view.sighting(camera).centres for view, camera in zip(result.views, cameras, strict=True)]
     shift, turn = pose_errors(take, result.pose.world_from_target) or (np.nan, np.nan)
-    error = pose_difference(take.motion.world_from_target, result.pose.world_from_target)
+    error = difference(take.motion.world_from_target, result.pose.world_from_target)
     misfit = float(error @ np.linalg.solve(result.pose.covariance, error))
     return Located(np.linalg.norm(np.concatenate(seen) - truth, axis=1), limit, shift, turn, misfit)
 
@@ -112,12 +112,6 @@ def cameras_of(take: Take) -> Pair:
     return first, second
 
 
-def pose_difference(truth: Array, found: Array) -> Array:
-    """Turn (rad) in the world and shift (mm) from a true pose to a found one : (6,), as `TargetPose.covariance` has them."""
-    turn = Rotation.from_matrix(found[:3, :3] @ truth[:3, :3].T).as_rotvec()
-    return np.concatenate([turn, found[:3, 3] - truth[:3, 3]])
-
-
 def pose_errors(take: Take, found: Array | None) -> tuple[float, float] | None:
     """Errors of the origin, mm, and of the axes, deg: the nearest rotation where the found matrix isn't one."""
     if found is None or not np.isfinite(found).all():
@@ -125,7 +119,7 @@ def pose_errors(take: Take, found: Array | None) -> tuple[float, float] | None:
     left, _, right = np.linalg.svd(found[:3, :3])
     nearest = np.eye(4)
     nearest[:3, :3], nearest[:3, 3] = left @ right, found[:3, 3]
-    error = pose_difference(take.motion.world_from_target, nearest)
+    error = difference(take.motion.world_from_target, nearest)
     return float(np.linalg.norm(error[3:])), float(np.rad2deg(np.linalg.norm(error[:3])))
 
 

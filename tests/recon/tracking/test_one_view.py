@@ -5,7 +5,7 @@ import pytest
 
 from recon import rigid
 from recon.tracking import one_view, pose
-from recon.tracking.tracker import BLIND_PX
+from recon.tracking.tracker import REACH_PX
 from tests.recon.tracking import drawings
 
 COUNT = 60
@@ -39,7 +39,7 @@ def test_the_other_view_is_told_within_the_reach_of_a_fit(cameras, rig, rng):
         )
         found = one_view.poses(cameras[0], first + 0.1 * rng.standard_normal((3, 2)), model)
         away = [np.linalg.norm(cameras[1].project(rigid.apply(each, model)) - second, axis=1).max() for each in found]
-        assert min(away) < BLIND_PX / 2
+        assert min(away) < 7.0 < REACH_PX
 
 
 def test_nonsense_allows_none(cameras, rig):

@@ -9,9 +9,10 @@ import pytest
 from recon import rigid
 from recon.ellipses import Ellipses
 from recon.tracking import views
+from recon.tracking.pose import difference
 from tests.twin.tracking.takes import facing, plain_take, rig
 from twin.accuracy import rivals
-from twin.accuracy.poses import centre_limit, pose_difference, pose_errors
+from twin.accuracy.poses import centre_limit, pose_errors
 from twin.accuracy.sightings import percent, score
 from twin.tracking.truth import view_truth
 
@@ -58,7 +59,7 @@ def test_errors_of_a_pose_are_its_shift_and_turn():
     off = rigid.from_rotation_vector([0, 0.01, 0], [0, 0, 0]) @ pose
     off[:3, 3] = pose[:3, 3] + [0.03, 0.04, 0]
     assert pose_errors(TAKE, off) == pytest.approx((0.05, np.rad2deg(0.01)))
-    assert pose_difference(pose, off) == pytest.approx([0, 0.01, 0, 0.03, 0.04, 0], abs=1e-9)
+    assert difference(pose, off) == pytest.approx([0, 0.01, 0, 0.03, 0.04, 0], abs=1e-9)
     assert pose_errors(TAKE, None) is None
 
 
