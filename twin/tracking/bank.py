@@ -29,7 +29,7 @@ class Bank:
 
     bodies: mi.Scene
     scenes: mi.Scene
-    posters: mi.ShapePtr  # the shape of all sheets with prints; its texture coordinates are mm on the sheet
+    posters: mi.ShapePtr  # the shape of all sheets with prints, if any; its texture coordinates are mm on the sheet
     body_at: Array  # (n, 3) mm
     scene_at: Array
 
@@ -48,9 +48,11 @@ def build_bank(target: Target, variants: int, seed: int) -> Bank:
         for one, place in zip(around, scene_at, strict=True)
         for part, from_poster in zip([p for p in one.parts if p.slot == "poster"], one.posters, strict=True)
     ]
-    posters = _poster_mesh(sheets)
-    scenes = mi.load_dict({"type": "scene", "a": scene, "b": posters})
-    return Bank(mi.load_dict({"type": "scene", "a": body}), scenes, mi.ShapePtr(posters), body_at, scene_at)
+    posters = _poster_mesh(sheets) if sheets else None
+    scenes = mi.load_dict({"type": "scene", "a": scene} | ({"b": posters} if posters else {}))
+    # on a GPU one kernel can trace rays in two worlds only if one is loaded as the other's child: OptiX has one table of shaders
+    bodies = mi.load_dict({"type": "scene", "a": body, "parent_scene": scenes})
+    return Bank(bodies, scenes, mi.ShapePtr(posters), body_at, scene_at)
 
 
 def _places(count: int, pitch: float) -> Array:
