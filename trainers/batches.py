@@ -1,15 +1,17 @@
 """Batches to train with: views or patches changed at random, and what networks should answer. Batch k is that of (seed, k)."""
 
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
+from torch.utils.data import DataLoader, Dataset
 
 from trainers.augment import WHITE, moved, occlude, photograph, turns, uniform, warp
 from trainers.labels import HIDDEN, SEEN, Labels, label_offset, labels, seen_in_view
-from trainers.shards import PATCH, Patches, Views
+from trainers.shards import PATCH, Data, Patches, Views
 
 TARGET_IN_CROP = 0.85  # of crops from views with a target are about it; the others are of anywhere
 COVERED = (HIDDEN + SEEN) / 2  # visible fraction of a circle whose centre something was put before: neither answer is wrong
@@ -34,6 +36,28 @@ class Discs:
     images: Tensor  # (n, 1, 120, 120) grey/255
     masks: Tensor  # (n, 1, 120, 120) from 0 to 1
     weights: Tensor  # (n, 1, 120, 120) 0 where the patch shows nothing
+
+
+@dataclass(frozen=True)
+class Batches(Dataset[tuple[Tensor, Tensor, Tensor]]):
+    """Batches by the numbers of their steps: images, and what the losses of `trainers.labels` compare answers with."""
+
+    data: Data
+    size: int
+    crop_px: int  # of views
+    seed: int
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
+        generator = generator_of(self.seed, index)
+        if isinstance(self.data, Patches):
+            some = discs(self.data, self.size, generator)
+            return some.images, some.masks, some.weights
+        some = crops(self.data, self.size, self.crop_px, generator)
+        return some.images, some.labels.pixel, some.labels.identity
+
+    def since(self, step: int, loaders: int) -> DataLoader:
+        """Those of a step and all later ones, made ahead by so many processes; by 0, each when it is asked for."""
+        return DataLoader(self, batch_size=None, sampler=count(step), num_workers=loaders)
 
 
 def generator_of(seed: int, step: int) -> Generator:

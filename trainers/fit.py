@@ -19,12 +19,12 @@ from torch import Tensor, nn
 
 from recon import atomic
 from recon.errors import InputError
-from trainers.batches import crops, discs, generator_of
+from trainers.batches import Batches
 from trainers.export import read_state
 from trainers.labels import Labels, detector_loss, segmenter_loss
 from trainers.metrics import measure_detector, measure_segmenter
-from trainers.networks import Name
-from trainers.shards import Data, Patches, Views, chosen
+from trainers.networks import Name, is_detector
+from trainers.shards import Data, Views, chosen
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
 WARM_UP = 0.05  # of the training, over which the learning rate rises
@@ -52,6 +52,7 @@ class Plan:
     log_steps: int = 50
     validate_at_most: int = 200  # views or patches at each checkpoint; at the end it is all
     precision: Precision = "auto"
+    loaders: int = 0  # processes that make batches ahead
 
 
 @dataclass(frozen=True)
@@ -93,13 +94,14 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
         counts = {"samples": (len(train), len(validation))}
         _write(folder / CHECKPOINT, state | counts | {"step": step, "seconds": seconds})
 
+    batches = iter(Batches(train, plan.batch, plan.crop_px, plan.seed).since(step, plan.loaders))
     with _stops() as stopped:
         seconds = before
         while (done := progress(plan, step, seconds)) < 1:
             for group in optimizer.param_groups:
                 group["lr"] = plan.learning_rate * rate(done)
             module.train()
-            loss = _loss(module, fabric, train, plan, step)
+            loss = _loss(module, plan.name, fabric.to_device(next(batches)))
             optimizer.zero_grad(set_to_none=True)
             fabric.backward(loss)
             fabric.clip_gradients(module, optimizer, max_norm=CLIP, error_if_nonfinite=False)
@@ -165,16 +167,13 @@ def read_log(folder: Path) -> list[Row]:
     return [json.loads(line) for line in lines if line.endswith("}")]  # the last one may be cut short
 
 
-def _loss(module: nn.Module, fabric: Fabric, train: Data, plan: Plan, step: int) -> Tensor:
-    generator = generator_of(plan.seed, step)
-    if isinstance(train, Patches):
-        some = discs(train, plan.batch, generator)
-        images, masks, weights = fabric.to_device((some.images, some.masks, some.weights))
-        return segmenter_loss(module(images.contiguous(memory_format=torch.channels_last)).float(), masks, weights)
-    batch = crops(train, plan.batch, plan.crop_px, generator)
-    images, pixel, kind = fabric.to_device((batch.images, batch.labels.pixel, batch.labels.identity))
-    detection, identity = module(images.contiguous(memory_format=torch.channels_last))
-    return detector_loss(detection.float(), identity.float(), Labels(pixel, kind))
+def _loss(module: nn.Module, name: Name, batch: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    images, *wanted = batch
+    answer = module(images.contiguous(memory_format=torch.channels_last))
+    if is_detector(name):
+        detection, identity = answer
+        return detector_loss(detection.float(), identity.float(), Labels(*wanted))
+    return segmenter_loss(answer.float(), *wanted)
 
 
 def _groups(module: nn.Module, decay: float) -> list[dict]:

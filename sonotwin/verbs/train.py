@@ -31,7 +31,7 @@ from trainers.networks import Name, is_detector, network
 from trainers.shards import Data
 
 MARKER = "training.json"  # what a run was asked for
-MAY_CHANGE = {"out", "resume", "steps", "max_minutes", "threads", "checkpoint_minutes"}  # when a run goes on
+MAY_CHANGE = {"out", "resume", "steps", "max_minutes", "threads", "loaders", "checkpoint_minutes"}  # when a run goes on
 
 
 class Config(BaseModel):
@@ -55,6 +55,7 @@ class Config(BaseModel):
     weight_decay: Annotated[float, Field(ge=0, le=1)] = 0.01
     precision: Precision = "auto"
     threads: Annotated[int, Field(ge=1, le=1024)] | None = None
+    loaders: Annotated[int, Field(ge=0, le=1024)] = 0
     checkpoint_minutes: Annotated[float, Field(gt=0)] = 5.0
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
@@ -79,6 +80,7 @@ class Config(BaseModel):
             self.max_minutes,
             self.checkpoint_minutes,
             precision=self.precision,
+            loaders=self.loaders,
         )
 
 
