@@ -22,6 +22,10 @@ LEAST_SEEN = 0.4  # of the rim: with less an ellipse is a guess
 LEAST_CONTRAST = 4.0  # times the noise of a pixel over the root of the semi-axis
 LEAST_DN = 1.5
 LARGEST_SIGMA = 1.5  # px: worse, and the ellipse tells no circle
+FULL_DN = 255.0
+WHOLE = 0.85  # of the rim: what is seen less of may be something else's edge
+SMEARED = 0.4  # of the semi-axis: a longer path is not as even as the model has it
+EXCEEDED = 2.0  # by which variances grow where the path is longer, or white is clipped; so measured on rendered frames
 LARGEST_BLUR = 0.35  # of the ring's width; beyond that its dark ring is gone
 
 
@@ -37,6 +41,7 @@ class Outlines:
     noise: Array  # (n,) DN, a pixel's, the larger of both sides
     motion: Array  # (n, 2) px, path over the exposure, up to its sign
     seen: Array  # (n,) share of the rim that looks like one
+    doubtful: NDArray[np.bool_]  # (n,) covered in part, clipped or smeared: some are off by more than that
     reasons: tuple[str | None, ...]  # why it is no ring
 
     @property
@@ -66,7 +71,7 @@ class Outlines:
         return Outlines(self.ellipses[chosen], **arrays, reasons=tuple(np.array(self.reasons, object)[chosen]))
 
 
-ARRAYS = ("covariance", "inside", "outside", "middle", "noise", "motion", "seen")
+ARRAYS = ("covariance", "inside", "outside", "middle", "noise", "motion", "seen", "doubtful")
 
 
 def measure(image: NDArray, rough: Ellipses, reach: float | Array, target: Target) -> Outlines:
@@ -115,6 +120,8 @@ def _judged(rows: Array, hole: float, middles: bool) -> Outlines:
     covariance = covariance / np.maximum(seen, 0.1)[:, None, None] ** COVERED + FLOOR_PX**2 * np.eye(2)
     v0, v1, v2 = rows[:, rims.VARIANCE : rims.VARIANCE + 3].T
     path, direction = np.sqrt(24 * np.hypot(v1, v2)), np.arctan2(v2, v1) / 2
+    beyond = (outside + noise > FULL_DN) | (path > SMEARED * np.trace(shape, axis1=1, axis2=2) / 2)
+    covariance[beyond] *= EXCEEDED
     motion = path[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
     reasons: list[str | None] = []
     for i in range(len(rows)):
@@ -134,4 +141,7 @@ def _judged(rows: Array, hole: float, middles: bool) -> Outlines:
             reasons.append(f"an uncertainty of {np.sqrt(np.trace(covariance[i])):.1f} px")
         else:
             reasons.append(None)
-    return Outlines(Ellipses(rows[:, :2], shape), covariance, inside, outside, middle, noise, motion, seen, tuple(reasons))
+    doubtful = beyond | (seen < WHOLE)
+    return Outlines(
+        Ellipses(rows[:, :2], shape), covariance, inside, outside, middle, noise, motion, seen, doubtful, tuple(reasons)
+    )

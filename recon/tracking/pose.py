@@ -6,9 +6,9 @@ ellipses' shapes tell one. Circles, not points, are fitted: what a view should s
 is not the projected centre.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ SETTLED = 1e-4  # squared standard deviations of the last step
 ROUNDING = 1e-6  # of squared residuals
 LEAST_DAMPING = 1e-4
 IMPLAUSIBLE = 1e-6  # chance of a misfit so large, by chi-square, below which it isn't the target
+SUSPICIOUS = 1e-3  # chance of a misfit below which circles that are doubtful are left out, one by one
 PARAMETERS = 6
 MISFITTING = "views that no pose fits: other circles, or cameras swapped or moved"
 RANK = 1e-7  # least ratio of singular values
@@ -50,11 +51,16 @@ class Sighting:
     centres: Array  # (3, 2) px, of the ellipses, in the order of NAMES; NaN where one isn't seen
     covariance: Array  # (3, 2, 2) px^2
     shapes: Array | None = None  # (3, 2, 2) px, of the ellipses, as ellipses.Ellipses has them; None if they aren't known
+    doubtful: NDArray[np.bool_] = field(default_factory=partial(np.zeros, 3, bool))  # (3,) which may be off by more than that
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
         """Which circles are seen : (3,)."""
         return np.isfinite(self.centres).all(axis=1)
+
+    def without(self, which: int) -> "Sighting":
+        """The same with one circle not seen."""
+        return replace(self, centres=np.where(np.arange(len(NAMES))[:, None] == which, np.nan, self.centres))
 
 
 @dataclass(frozen=True)
@@ -66,6 +72,7 @@ class TargetPose:
     misfit: float  # squared normalised residuals, chi-square with `freedom` degrees; NaN where it isn't told
     reason: str | None = None
     freedom: int = PARAMETERS  # numbers that were measured beyond the pose's own
+    used: NDArray[np.bool_] = field(default_factory=partial(np.ones, (2, 3), bool))  # (2, 3) of each view's circles, fitted to
 
     @property
     def found(self) -> bool:
@@ -79,31 +86,45 @@ def circle_centres(target: Target) -> Array:
 
 
 def estimate(first: Sighting, second: Sighting, target: Target) -> TargetPose:
-    """Estimate the pose from two views, by least squares over all ellipses' centres.
+    """Estimate the pose from two views, by least squares over all ellipses' centres, or all but a doubtful one that misfits.
 
     Never raises on what the views show: what can't be the target is not found, with a reason.
     """
-    model, views = circle_centres(target), (first, second)
+    views = (first, second)
+    found = _chosen(_fits(views, target), views, target)
+    if np.isnan(found.misfit) or found.misfit < chdtri(found.freedom, SUSPICIOUS):
+        return found
+    fewer = [fit for each in _without_one(views) for fit in _fits(each, target) if fit.found]
+    again = _chosen(fewer, views, target) if fewer else found
+    return again if again.found else found
+
+
+def _without_one(views: tuple[Sighting, Sighting]) -> Iterator[tuple[Sighting, Sighting]]:
+    """The views without one of the circles that are doubtful."""
+    first, second = views
+    yield from ((first.without(k), second) for k in np.flatnonzero(first.doubtful & first.seen))
+    yield from ((first, second.without(k)) for k in np.flatnonzero(second.doubtful & second.seen))
+
+
+def _fits(views: tuple[Sighting, Sighting], target: Target) -> list[TargetPose]:
+    """A pose of each start, or the reason why there is none."""
+    model, (first, second) = circle_centres(target), views
     both = first.seen & second.seen
     if both.sum() < 2 or not (first.seen.all() or second.seen.all()):
-        return lost("fewer circles than a pose needs: three in one view, two in the other")
+        return [lost("fewer circles than a pose needs: three in one view, two in the other")]
     points, apart = meet(first, second)
     if not np.isfinite(points[both]).all():
-        return lost("a centre whose rays do not meet in front of the cameras")
+        return [lost("a centre whose rays do not meet in front of the cameras")]
     if apart[both].max() > APART_MM:
         worst = int(np.where(both, apart, 0).argmax())
-        return lost(f"rays of {NAMES[worst]} miss each other by {apart[worst]:.1f} mm: other circles, or cameras swapped")
+        return [lost(f"rays of {NAMES[worst]} miss each other by {apart[worst]:.1f} mm: other circles, or cameras swapped")]
     expected, found = distances(model), distances(points)
     if np.nanmax(np.abs(found - expected)) > GROSS_MM:
         pairs = [k for k in range(3) if np.isfinite(found[k])]
         shown = ", ".join(f"{PAIRS[k]} {found[k]:.1f} mm apart, expected {expected[k]:.1f}" for k in pairs)
-        return lost(f"centres {shown}")
+        return [lost(f"centres {shown}")]
     starts = [aligned(model, points)] if both.all() else _starts(views, model)
-    if not starts:
-        return lost("no pose shows three circles so")
-    fits = [_refined(start, views, target, model) for start in starts]
-    good = [fit for fit in fits if fit.found]
-    return _chosen(good, views, target) if good else min(fits, key=lambda fit: np.nan_to_num(fit.misfit, nan=np.inf))
+    return [_refined(start, views, target, model) for start in starts] or [lost("no pose shows three circles so")]
 
 
 def _starts(views: Sequence[Sighting], model: Array) -> list[Array]:
@@ -114,27 +135,30 @@ def _starts(views: Sequence[Sighting], model: Array) -> list[Array]:
 
 def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Target) -> TargetPose:
     """Of poses that fit the centres, the one that fits the shapes, too; none if it doesn't, or if another does as well."""
-    shapes = [_off_shapes(fit.world_from_target, views, target) for fit in fits]
-    total = [fit.misfit + float(np.sum((off / sigma) ** 2)) for fit, (off, sigma) in zip(fits, shapes, strict=True)]
+    good = [fit for fit in fits if fit.found]
+    if not good:
+        return min(fits, key=lambda fit: np.nan_to_num(fit.misfit, nan=np.inf))
+    shapes = [_off_shapes(fit, views, target) for fit in good]
+    total = [fit.misfit + float(np.sum((off / sigma) ** 2)) for fit, (off, sigma) in zip(good, shapes, strict=True)]
     best = int(np.argmin(total))
     off, sigma = shapes[best]
     if not (np.abs(off) <= SIZES + DOUBT * sigma).all():
         return lost(f"circles whose sizes are {100 * np.abs(off).max():.0f} % from what their distance asks for")
-    rivals = [fit for k, fit in enumerate(fits) if k != best and total[k] < total[best] + TOLD]
-    if any(_apart(fits[best], rival) > SAME for rival in rivals):
+    rivals = [fit for k, fit in enumerate(good) if k != best and total[k] < total[best] + TOLD]
+    if any(_apart(good[best], rival) > SAME for rival in rivals):
         return lost("two poses that the circles seen do not tell apart")
-    return fits[best]
+    return good[best]
 
 
-def _off_shapes(pose: Array, views: Sequence[Sighting], target: Target) -> tuple[Array, Array]:
+def _off_shapes(fit: TargetPose, views: Sequence[Sighting], target: Target) -> tuple[Array, Array]:
     """By how much ellipses differ from a pose's : (m, 3), and what that is known to : (m, 1), as shares of their size."""
     off, sigma = [np.zeros((0, 3))], [np.zeros((0, 1))]
-    for view in views:
+    for view, used in zip(views, fit.used, strict=True):
         if view.shapes is not None:
-            told = ellipses_of(view.camera, pose, circle_centres(target)[view.seen], target.outer_diameter_mm / 2)[1]
+            told = ellipses_of(view.camera, fit.world_from_target, circle_centres(target)[used], target.outer_diameter_mm / 2)[1]
             size = np.trace(told, axis1=1, axis2=2)[:, None] / 2
-            off.append((view.shapes[view.seen] - told)[:, [0, 0, 1], [0, 1, 1]] / size)
-            rim = np.trace(view.covariance[view.seen], axis1=1, axis2=2)[:, None] / size**2  # a shape's is about its centre's
+            off.append((view.shapes[used] - told)[:, [0, 0, 1], [0, 1, 1]] / size)
+            rim = np.trace(view.covariance[used], axis1=1, axis2=2)[:, None] / size**2  # a shape's is about its centre's
             sigma.append(np.sqrt(SHAPES**2 + rim))
     return np.concatenate(off), np.concatenate(sigma)
 
@@ -222,7 +246,8 @@ def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Arr
     pose = moved(pose, step)
     if not all(pose[:3, 2] @ (pose[:3, 3] - view.camera.centre) < 0 for view in views):
         return lost("a target whose front does not face both cameras")
-    return TargetPose(pose, np.linalg.inv(design.T @ design), misfit, freedom=freedom)
+    used = np.stack([view.seen for view in views])
+    return TargetPose(pose, np.linalg.inv(design.T @ design), misfit, freedom=freedom, used=used)
 
 
 def _linearised(

@@ -154,9 +154,9 @@ class Tracker:
         found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target)
         if not found.found:
             return Tracking(found, views.doubted(seen, found.reason))
-        if not all(view.found for view in seen):
+        if not found.used.all():
             told = self._rough(found.world_from_target)
-            seen = views.completed(seen[0], told[:3]), views.completed(seen[1], told[3:])
+            seen = views.completed(seen[0], told[:3], found.used[0]), views.completed(seen[1], told[3:], found.used[1])
         return Tracking(found, seen, how)
 
     def _completed(self, frames: Frames, outlines: Outlines, view: int) -> Outlines:

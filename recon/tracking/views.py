@@ -14,6 +14,8 @@ from recon.tracking.pose import NAMES, Sighting
 
 Array = NDArray[np.float64]
 
+ELSEWHERE = "not where the others ask for it"
+
 
 @dataclass(frozen=True)
 class View:
@@ -40,15 +42,15 @@ class View:
     def sighting(self, camera: Camera) -> Sighting:
         """For the pose: what is seen."""
         centres = np.where(self.outlines.found[:, None], self.outlines.ellipses.centre, np.nan)
-        return Sighting(camera, centres, self.outlines.covariance, self.outlines.ellipses.shape)
+        return Sighting(camera, centres, self.outlines.covariance, self.outlines.ellipses.shape, self.outlines.doubtful)
 
 
 def nothing(reason: str) -> View:
     """No circles, for a reason."""
-    numbers = np.full(3, np.nan)
-    ellipses = Ellipses(np.full((3, 2), np.nan), np.full((3, 2, 2), np.nan))
+    numbers, pairs, squares = (np.full((3, 2, 2)[: k + 1], np.nan) for k in range(3))
+    levels = (numbers,) * 4
     outlines = Outlines(
-        ellipses, np.full((3, 2, 2), np.nan), numbers, numbers, numbers, numbers, np.full((3, 2), np.nan), numbers, (reason,) * 3
+        Ellipses(pairs, squares), squares, *levels, motion=pairs, seen=numbers, doubtful=np.zeros(3, bool), reasons=(reason,) * 3
     )
     return View(outlines, reason)
 
@@ -66,13 +68,13 @@ def judged(outlines: Outlines, target: Target) -> View:
     return View(outlines)
 
 
-def completed(view: View, told: Ellipses) -> View:
-    """The view of a known pose, which tells where the circle is that isn't seen; what was measured of it stays as it was."""
+def completed(view: View, told: Ellipses, used: NDArray[np.bool_]) -> View:
+    """The view of a known pose, which tells where the circles are that it wasn't fitted to; what was measured stays as it was."""
     outlines = view.outlines
-    seen = outlines.found[:, None]
-    centre = np.where(seen, outlines.ellipses.centre, told.centre)
-    shape = np.where(seen[..., None], outlines.ellipses.shape, told.shape)
-    return View(replace(outlines, ellipses=Ellipses(centre, shape)))
+    centre = np.where(used[:, None], outlines.ellipses.centre, told.centre)
+    shape = np.where(used[:, None, None], outlines.ellipses.shape, told.shape)
+    reasons = tuple(None if u else reason or ELSEWHERE for u, reason in zip(used, outlines.reasons, strict=True))
+    return View(replace(outlines, ellipses=Ellipses(centre, shape), reasons=reasons))
 
 
 def doubted(pair: tuple[View, View], reason: str | None) -> tuple[View, View]:

@@ -176,6 +176,24 @@ def test_a_centre_that_is_off_is_noticed(cameras, rig, rng):
     assert not found.found and "misfit" in found.reason
 
 
+@pytest.mark.parametrize("hidden", [0, 1])
+def test_a_doubtful_centre_that_is_off_is_left_out(cameras, rig, rng, hidden):
+    """By 20 times what it is known to be, in a view of which any circle may be; the covariance is that of the other five."""
+    squared = []
+    for _ in range(POSES):
+        true, which = drawings.facing(rng), rng.integers(3)
+        views = seen(cameras, rig.target, true, rng)
+        angle = rng.uniform(0, 2 * np.pi)
+        views[hidden].centres[which] += 20 * SIGMA_PX * np.array([np.cos(angle), np.sin(angle)])
+        views[hidden] = replace(views[hidden], doubtful=np.ones(3, bool))
+        found = pose.estimate(*views, rig.target)
+        assert found.found and found.freedom == 4
+        assert np.argwhere(~found.used).tolist() == [[hidden, which]]
+        off = error(found.world_from_target, true)
+        squared.append(off @ np.linalg.solve(found.covariance, off))
+    assert abs(np.mean(squared) - 6) < 4 * np.sqrt(12 / POSES)
+
+
 def test_nonsense_is_not_found(cameras, rig):
     view = Sighting(cameras[0], np.full((3, 2), np.nan), np.tile(np.eye(2), (3, 1, 1)))
     assert not pose.estimate(view, replace(view, camera=cameras[1]), rig.target).found
