@@ -2,7 +2,8 @@
 
 Two discs tell the view's affinity all but exactly: it takes a circle to their ellipses, which leaves a turn, and one centre to
 the other, which settles it. Their distance must be that of the circles that they are taken for; which end is which it can't tell.
-The third place follows, as exactly as a view is affine: to 2 px in the median, 7 px at most for the rig.
+The third place follows, as exactly as a view is affine: to 2 px in the median, 7 px at most for the rig. So does the shape there,
+which a rim of which half is covered doesn't tell by itself.
 """
 
 import numpy as np
@@ -11,14 +12,26 @@ from numpy.typing import NDArray
 from recon.ellipses import Ellipses
 from recon.rig import Target
 from recon.tracking.identity import ALIKE
-from recon.tracking.outlines import Outlines
+from recon.tracking.outlines import Outlines, measure_covered
 from recon.tracking.pose import circle_centres
 from recon.tracking.sectors import STEEP
 
 Array = NDArray[np.float64]
 
 REACH_PX = 8.0  # by which the place may be off
+SHAPE = 0.035  # of a disc's size, by which its shape differs from the mean of the others, one standard deviation: perspective
 INK = 0.15  # of a ring's contrast: a middle that is no brighter is ink, and this a black disc
+
+
+def completed(image: NDArray, outlines: Outlines, target: Target) -> Outlines:
+    """Three rims of an image, of which one that isn't found is looked for again where the other two ask for it."""
+    which = missing(outlines.found)
+    if which is None:
+        return outlines
+    rough = third(outlines.ellipses, which, target)
+    known = SHAPE * np.trace(rough.shape, axis1=1, axis2=2) / 2
+    again = measure_covered(image, rough, REACH_PX, known, target)
+    return outlines.replaced(which, again) if alike(again, outlines, which) else outlines
 
 
 def missing(found: NDArray[np.bool_]) -> int | None:

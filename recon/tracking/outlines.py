@@ -96,21 +96,38 @@ def measure_both(
     of_second: NDArray[np.bool_],
     reach: float | Array,
     target: Target,
-    middles: bool = True,
 ) -> Outlines:
-    """The same for rings in two frames at once.
+    """The same for rings in two frames at once; `of_second` : (n,) says in which each is."""
+    return _judged(_rows(first, second, rough, of_second, reach, np.inf, target), target, middles=True)
 
-    `of_second` : (n,) says in which each is; without `middles` a ring may have no white middle that is seen.
-    """
-    reach = np.broadcast_to(np.asarray(reach, float), len(rough.centre)).copy()
-    hole = target.inner_diameter_mm / target.outer_diameter_mm
+
+def measure_covered(image: NDArray, rough: Ellipses, reach: float, known: Array, target: Target) -> Outlines:
+    """The same for rings that may have no white middle that is seen, with shapes known to so many px : (n,), one deviation."""
+    return _judged(_rows(image, image, rough, np.zeros(len(rough.centre), bool), reach, known, target), target, middles=False)
+
+
+def _rows(
+    first: NDArray,
+    second: NDArray,
+    rough: Ellipses,
+    of_second: NDArray[np.bool_],
+    reach: float | Array,
+    known: float | Array,
+    target: Target,
+) -> Array:
+    reach, known = (np.broadcast_to(np.asarray(each, float), len(rough.centre)).copy() for each in (reach, known))
     kind = np.uint8 if first.dtype == second.dtype == np.uint8 else np.float32
     first, second = np.ascontiguousarray(first, kind), np.ascontiguousarray(second, kind)
     centres, shapes = np.ascontiguousarray(rough.centre, float), np.ascontiguousarray(rough.shape, float)
-    return _judged(rims.fit_rims(first, second, np.asarray(of_second, bool), centres, shapes, reach, hole), hole, middles)
+    return rims.fit_rims(first, second, np.asarray(of_second, bool), centres, shapes, reach, known, _hole(target))
 
 
-def _judged(rows: Array, hole: float, middles: bool) -> Outlines:
+def _hole(target: Target) -> float:
+    return target.inner_diameter_mm / target.outer_diameter_mm
+
+
+def _judged(rows: Array, target: Target, middles: bool) -> Outlines:
+    hole = _hole(target)
     shape = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
     inside, outside, middle = rows[:, rims.LEVELS], rows[:, rims.LEVELS + 3], rows[:, rims.MIDDLE]
     noise, seen = rows[:, rims.NOISE : rims.NOISE + 2].max(axis=1, initial=0), rows[:, rims.SEEN]

@@ -64,20 +64,22 @@ COLUMNS = 45
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def fit_rims(first, second, of_second, centres, shapes, reach, hole):
+def fit_rims(first, second, of_second, centres, shapes, reach, known, hole):
     """Fit n rims : (n, COLUMNS), each in one of two images of one type, from rough ellipses that may be off by reach : (n,) px.
 
-    `hole` is the inner over the outer diameter.
+    `known` : (n,) px, the standard deviation that shapes are known with before; inf if they aren't. `hole` is the inner over the
+    outer diameter.
     """
     result = np.full((len(centres), COLUMNS), np.nan)
     for i in prange(len(centres)):
-        _fit(second if of_second[i] else first, centres[i], shapes[i], reach[i], hole, result[i])
+        _fit(second if of_second[i] else first, centres[i], shapes[i], reach[i], known[i], hole, result[i])
     return result
 
 
 @njit(cache=True, error_model="numpy")
-def _fit(image, centre, shape, reach, hole, result):
+def _fit(image, centre, shape, reach, known, hole, result):
     ellipse = np.array([centre[0], centre[1], shape[0, 0], shape[0, 1], shape[1, 1]])
+    before = ellipse.copy()
     result[FAILED] = 1
     if not _sound(ellipse, image.shape):
         return
@@ -95,7 +97,7 @@ def _fit(image, centre, shape, reach, hole, result):
             if not judge(sums, sectors, planes, weights, noise, capture, FEWEST if stride == 1 else 1):
                 return
             step = np.zeros(GLOBAL)
-            if not _solve(sums, weights, sectors, planes, step, inverse):
+            if not _solve(sums, weights, sectors, planes, before - ellipse, known, step, inverse):
                 return
             _move(ellipse, planes, variance, step, reach)
             if not _sound(ellipse, image.shape):
@@ -227,8 +229,11 @@ def _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums):
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(sums, weights, sectors, planes, step, inverse):
-    """The step : (14,) and the inverse of the normal matrix : (14, 14); False if they are undetermined."""
+def _solve(sums, weights, sectors, planes, back, sigma, step, inverse):
+    """The step : (14,) and the inverse of the normal matrix : (14, 14); False if they are undetermined.
+
+    `back` : (5,) px is the way to the ellipse as it was before, `sigma` the standard deviation that its shape is known with.
+    """
     normal, right = np.zeros((GLOBAL, GLOBAL)), np.zeros(GLOBAL)
     slopes = np.ones(GLOBAL)
     for j in range(SECTORS):
@@ -252,6 +257,9 @@ def _solve(sums, weights, sectors, planes, step, inverse):
     for p in range(GLOBAL):
         for q in range(p):
             normal[p, q] = normal[q, p]
+    for k in (2, 3, 4):
+        normal[k, k] += 1 / sigma**2
+        right[k] += back[k] / sigma**2
     level = (planes[3] - planes[0]) ** 2 + 1
     for k in (6, 7, 9, 10):  # light hardly doubles from one side of a ring to the other
         normal[k, k] += 4 / level

@@ -22,7 +22,7 @@ from recon.tracking.frames import grey
 from recon.tracking.identity import Triple
 from recon.tracking.networks import Networks
 from recon.tracking.outline_model import ellipses_of
-from recon.tracking.outlines import Outlines, measure_both
+from recon.tracking.outlines import Outlines, measure, measure_both
 from recon.tracking.pose import TargetPose, circle_centres, estimate, lost
 from recon.tracking.views import View
 
@@ -143,14 +143,15 @@ class Tracker:
     def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str) -> Tracking:
         """From six rough ellipses to the pose."""
         outlines = measure_both(*frames, rough, np.arange(6) >= 3, reach, self.target)
-        halves = [self._completed(frames, half, k) for k, half in enumerate((outlines[:3], outlines[3:]))]
+        halves = [covered.completed(*each, self.target) for each in zip(frames, (outlines[:3], outlines[3:]), strict=True)]
         seen = (views.judged(halves[0], self.target), views.judged(halves[1], self.target))
         return self._posed(seen, how)
 
     def _posed(self, seen: tuple[View, View], how: str) -> Tracking:
         """From two views to the pose."""
         if not (all(view.useful for view in seen) and any(view.found for view in seen)):
-            return Tracking(lost(_unseen(seen)), seen)
+            alone = views.unconfirmed(seen[0]), views.unconfirmed(seen[1])
+            return Tracking(lost(_unseen(alone)), alone)
         found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target)
         if not found.found:
             return Tracking(found, views.doubted(seen, found.reason))
@@ -158,15 +159,6 @@ class Tracker:
             told = self._rough(found.world_from_target)
             seen = views.completed(seen[0], told[:3], found.used[0]), views.completed(seen[1], told[3:], found.used[1])
         return Tracking(found, seen, how)
-
-    def _completed(self, frames: Frames, outlines: Outlines, view: int) -> Outlines:
-        """Three rims, of which one that something covers is looked for where the other two ask for it."""
-        which = covered.missing(outlines.found)
-        if which is None:
-            return outlines
-        rough = covered.third(outlines.ellipses, which, self.target)
-        again = measure_both(*frames, rough, np.array([view == 1]), covered.REACH_PX, self.target, middles=False)
-        return outlines.replaced(which, again) if covered.alike(again, outlines, which) else outlines
 
     def _segmented(self, frames: Frames, networks: Networks, rough: Ellipses, before: Tracking) -> Tracking:
         """From six rough ellipses to the pose, by the segmenter."""
@@ -219,7 +211,7 @@ class Tracker:
 
     def _view(self, frames: Frames, k: int, rough: Ellipses, reach: float) -> Outlines:
         """Camera k's rims, from three rough ellipses."""
-        return self._completed(frames, measure_both(*frames, rough, np.full(3, k == 1), reach, self.target), k)
+        return covered.completed(frames[k], measure(frames[k], rough, reach, self.target), self.target)
 
 
 @dataclass

@@ -14,6 +14,7 @@ from recon.tracking.pose import NAMES, Sighting
 
 Array = NDArray[np.float64]
 
+ALONE = 0.6  # of each rim, to be seen by one camera only
 ELSEWHERE = "not where the others ask for it"
 
 
@@ -66,6 +67,16 @@ def judged(outlines: Outlines, target: Target) -> View:
     if off > identity.ALIKE:
         return View(outlines, f"circles whose sizes are {100 * off:.0f} % from what their distances ask for")
     return View(outlines)
+
+
+def unconfirmed(view: View) -> View:
+    """A view that the other one has nothing to say of: a rim of which little is seen may be something else's edge."""
+    part = [
+        f"{name}: {100 * seen:.0f} % of its rim seen, by one camera only"
+        for name, seen in zip(NAMES, view.outlines.seen, strict=True)
+        if seen < ALONE
+    ]
+    return replace(view, reason="; ".join(part)) if view.found and part else view
 
 
 def completed(view: View, told: Ellipses, used: NDArray[np.bool_]) -> View:
