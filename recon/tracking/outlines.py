@@ -21,6 +21,7 @@ COVERED = 2  # power of the share that is seen, by which variances are divided: 
 LEAST_SEEN = 0.4  # of the rim: with less an ellipse is a guess
 LEAST_CONTRAST = 4.0  # times the noise of a pixel over the root of the semi-axis
 LEAST_DN = 1.5
+MIDDLE = 0.3  # of the contrast, by which the middle is brighter than the ring at least: light may fall on it less than around
 LARGEST_SIGMA = 1.5  # px: worse, and the ellipse tells no circle
 FULL_DN = 255.0
 WHOLE = 0.85  # of the rim: what is seen less of may be something else's edge
@@ -150,7 +151,7 @@ def _judged(rows: Array, target: Target, middles: bool) -> Outlines:
             reasons.append(f"a contrast of {contrast:.1f} DN in noise of {noise[i]:.1f}")
         elif not seen[i] >= LEAST_SEEN:
             reasons.append(f"{100 * seen[i]:.0f} % of its rim seen")
-        elif middles and not middle[i] - inside[i] > 0.5 * contrast * (1 - np.sqrt(v0[i]) / (hole * semi)):
+        elif middles and not middle[i] - inside[i] > MIDDLE * contrast * (1 - np.sqrt(v0[i]) / (hole * semi)):
             reasons.append("no white middle")
         elif not np.sqrt(v0[i]) <= LARGEST_BLUR * (1 - hole) * semi:
             reasons.append(f"blurred by {np.sqrt(12 * v0[i]):.0f} px")

@@ -6,7 +6,7 @@ ellipses' shapes tell one. Circles, not points, are fitted: what a view should s
 is not the projected centre.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -37,6 +37,7 @@ PARAMETERS = 6
 MISFITTING = "views that no pose fits: other circles, or cameras swapped or moved"
 RANK = 1e-7  # least ratio of singular values
 SIZES = 0.12  # of a disc's size, by which shapes may differ from the pose's
+SIZES_ALONE = 0.05  # the same of one view by itself
 SHAPES = 0.005  # the same: what blur and gradients leave of a shape, one standard deviation
 DOUBT = 3.0  # standard deviations that are added to what sizes may differ by
 TOLD = 16.0  # by how much another pose's misfit, with shapes, must be larger
@@ -127,6 +128,12 @@ def _fits(views: tuple[Sighting, Sighting], target: Target) -> list[TargetPose]:
     return [_refined(start, views, target, model) for start in starts] or [lost("no pose shows three circles so")]
 
 
+def allowed(sighting: Sighting, target: Target) -> bool:
+    """Whether some pose gives three circles of one view the centres and the shapes that they have."""
+    poses = _starts([sighting], circle_centres(target))
+    return any(_like(*_off_shapes(pose, [sighting], [sighting.seen], target), SIZES_ALONE) for pose in poses)
+
+
 def _starts(views: Sequence[Sighting], model: Array) -> list[Array]:
     """Poses that the view of all three circles allows."""
     whole = next(view for view in views if view.seen.all())
@@ -138,11 +145,11 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
     good = [fit for fit in fits if fit.found]
     if not good:
         return min(fits, key=lambda fit: np.nan_to_num(fit.misfit, nan=np.inf))
-    shapes = [_off_shapes(fit, views, target) for fit in good]
+    shapes = [_off_shapes(fit.world_from_target, views, fit.used, target) for fit in good]
     total = [fit.misfit + float(np.sum((off / sigma) ** 2)) for fit, (off, sigma) in zip(good, shapes, strict=True)]
     best = int(np.argmin(total))
     off, sigma = shapes[best]
-    if not (np.abs(off) <= SIZES + DOUBT * sigma).all():
+    if not _like(off, sigma, SIZES):
         return lost(f"circles whose sizes are {100 * np.abs(off).max():.0f} % from what their distance asks for")
     rivals = [fit for k, fit in enumerate(good) if k != best and total[k] < total[best] + TOLD]
     if any(_apart(good[best], rival) > SAME for rival in rivals):
@@ -150,15 +157,20 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
     return good[best]
 
 
-def _off_shapes(fit: TargetPose, views: Sequence[Sighting], target: Target) -> tuple[Array, Array]:
+def _like(off: Array, sigma: Array, least: float) -> bool:
+    """Whether shapes are a pose's, but for a share that is allowed at least."""
+    return bool((np.abs(off) <= least + DOUBT * sigma).all())
+
+
+def _off_shapes(pose: Array, views: Sequence[Sighting], used: Iterable[NDArray[np.bool_]], target: Target) -> tuple[Array, Array]:
     """By how much ellipses differ from a pose's : (m, 3), and what that is known to : (m, 1), as shares of their size."""
     off, sigma = [np.zeros((0, 3))], [np.zeros((0, 1))]
-    for view, used in zip(views, fit.used, strict=True):
+    for view, circles in zip(views, used, strict=True):
         if view.shapes is not None:
-            told = ellipses_of(view.camera, fit.world_from_target, circle_centres(target)[used], target.outer_diameter_mm / 2)[1]
+            told = ellipses_of(view.camera, pose, circle_centres(target)[circles], target.outer_diameter_mm / 2)[1]
             size = np.trace(told, axis1=1, axis2=2)[:, None] / 2
-            off.append((view.shapes[used] - told)[:, [0, 0, 1], [0, 1, 1]] / size)
-            rim = np.trace(view.covariance[used], axis1=1, axis2=2)[:, None] / size**2  # a shape's is about its centre's
+            off.append((view.shapes[circles] - told)[:, [0, 0, 1], [0, 1, 1]] / size)
+            rim = np.trace(view.covariance[circles], axis1=1, axis2=2)[:, None] / size**2  # a shape's is about its centre's
             sigma.append(np.sqrt(SHAPES**2 + rim))
     return np.concatenate(off), np.concatenate(sigma)
 
@@ -240,7 +252,7 @@ def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Arr
     else:
         return lost(MISFITTING)
     misfit, freedom = float(np.sum((residual - design @ step) ** 2)), len(design) - PARAMETERS
-    if not misfit < chdtri(freedom, IMPLAUSIBLE):
+    if not misfit < chdtri(freedom, IMPLAUSIBLE if freedom == PARAMETERS else SUSPICIOUS):
         times = np.sqrt(misfit / freedom)
         return lost(f"a misfit of {times:.0f} times the centres' uncertainty: other circles, or cameras swapped or moved", misfit)
     pose = moved(pose, step)

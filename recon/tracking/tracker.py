@@ -150,15 +150,19 @@ class Tracker:
     def _posed(self, seen: tuple[View, View], how: str) -> Tracking:
         """From two views to the pose."""
         if not (all(view.useful for view in seen) and any(view.found for view in seen)):
-            alone = views.unconfirmed(seen[0]), views.unconfirmed(seen[1])
-            return Tracking(lost(_unseen(alone)), alone)
+            apart = self._apart(seen)
+            return Tracking(lost(_unseen(apart)), apart)
         found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target)
         if not found.found:
-            return Tracking(found, views.doubted(seen, found.reason))
+            return Tracking(found, views.doubted(seen, found.reason) if all(view.found for view in seen) else self._apart(seen))
         if not found.used.all():
             told = self._rough(found.world_from_target)
             seen = views.completed(seen[0], told[:3], found.used[0]), views.completed(seen[1], told[3:], found.used[1])
         return Tracking(found, seen, how)
+
+    def _apart(self, seen: tuple[View, View]) -> tuple[View, View]:
+        """Two views that don't confirm each other."""
+        return views.alone(seen[0], self.cameras[0], self.target), views.alone(seen[1], self.cameras[1], self.target)
 
     def _segmented(self, frames: Frames, networks: Networks, rough: Ellipses, before: Tracking) -> Tracking:
         """From six rough ellipses to the pose, by the segmenter."""

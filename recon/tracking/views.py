@@ -10,7 +10,7 @@ from recon.ellipses import Ellipses
 from recon.rig import Target
 from recon.tracking import identity
 from recon.tracking.outlines import Outlines
-from recon.tracking.pose import NAMES, Sighting
+from recon.tracking.pose import NAMES, Sighting, allowed
 
 Array = NDArray[np.float64]
 
@@ -69,14 +69,18 @@ def judged(outlines: Outlines, target: Target) -> View:
     return View(outlines)
 
 
-def unconfirmed(view: View) -> View:
-    """A view that the other one has nothing to say of: a rim of which little is seen may be something else's edge."""
-    part = [
-        f"{name}: {100 * seen:.0f} % of its rim seen, by one camera only"
+def alone(view: View, camera: Camera, target: Target) -> View:
+    """A view that the other one doesn't confirm: shapes must be those of a pose, and no rim may be another thing's edge."""
+    if not view.found:
+        return view
+    if not allowed(view.sighting(camera), target):
+        return replace(view, reason="circles of shapes that no pose gives them")
+    little = [
+        f"{name}: {100 * seen:.0f} % of its rim seen"
         for name, seen in zip(NAMES, view.outlines.seen, strict=True)
         if seen < ALONE
     ]
-    return replace(view, reason="; ".join(part)) if view.found and part else view
+    return replace(view, reason="; ".join(little) + ", by one camera only") if little else view
 
 
 def completed(view: View, told: Ellipses, used: NDArray[np.bool_]) -> View:

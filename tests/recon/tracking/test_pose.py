@@ -131,6 +131,16 @@ def test_sizes_that_no_distance_gives_are_not_the_target(cameras, rig, rng):
     assert "sizes are 20 %" in str(pose.estimate(*views, rig.target).reason)
 
 
+def test_one_view_alone_must_have_shapes_of_a_pose(cameras, rig, rng):
+    """Any three centres are those of some pose, but it tells the shapes too: three rings of a sheet aren't the target."""
+    for _ in range(10):
+        view, _ = seen(cameras, rig.target, drawings.facing(rng), rng)
+        assert pose.allowed(view, rig.target)
+        side = 0.15 * (view.centres[1] - view.centres[0])
+        assert not pose.allowed(replace(view, centres=view.centres + [[0, 0], side, [0, 0]]), rig.target)
+        assert not pose.allowed(replace(view, shapes=1.1 * view.shapes), rig.target)
+
+
 def test_the_back_of_a_target_is_not_found(cameras, rig, rng):
     """As through glass: the same circles, seen from behind."""
     flipped = drawings.facing(rng) @ np.diag([1.0, -1.0, -1.0, 1.0])
