@@ -137,7 +137,7 @@ def test_one_view_alone_must_have_shapes_of_a_pose(cameras, rig, rng):
         view, _ = seen(cameras, rig.target, drawings.facing(rng), rng)
         assert pose.allowed(view, rig.target)
         side = 0.15 * (view.centres[1] - view.centres[0])
-        assert not pose.allowed(replace(view, centres=view.centres + [[0, 0], side, [0, 0]]), rig.target)
+        assert not pose.allowed(replace(view, centres=view.centres + np.array([[0, 0], side, [0, 0]])), rig.target)
         assert not pose.allowed(replace(view, shapes=1.1 * view.shapes), rig.target)
 
 
