@@ -1,5 +1,6 @@
 """Batches to train with: views or patches changed at random, and what networks should answer. Batch k is that of (seed, k)."""
 
+import os
 from dataclasses import dataclass
 from itertools import count
 
@@ -57,7 +58,12 @@ class Batches(Dataset[tuple[Tensor, Tensor, Tensor]]):
 
     def since(self, step: int, loaders: int) -> DataLoader:
         """Those of a step and all later ones, made ahead by so many processes; by 0, each when it is asked for."""
-        return DataLoader(self, batch_size=None, sampler=count(step), num_workers=loaders)
+        return DataLoader(self, batch_size=None, sampler=count(step), num_workers=loaders, worker_init_fn=_apart)
+
+
+def _apart(_: int) -> None:
+    """Signals to stop are for the process that trains; those that make its batches end with it."""
+    os.setpgrp()
 
 
 def generator_of(seed: int, step: int) -> Generator:

@@ -95,16 +95,18 @@ def estimate(first: Sighting, second: Sighting, target: Target) -> TargetPose:
     found = _chosen(_fits(views, target), views, target)
     if np.isnan(found.misfit) or found.misfit < chdtri(found.freedom, SUSPICIOUS):
         return found
-    fewer = [fit for each in _without_one(views) for fit in _fits(each, target) if fit.found]
+    fewer = [fit for each in _without_one(views) for fit in _fits(each, target)]
     again = _chosen(fewer, views, target) if fewer else found
-    return again if again.found else found
+    doubtful = np.stack([view.doubtful for view in views])
+    return again if again.found and (doubtful & ~again.used).any() else found
 
 
 def _without_one(views: tuple[Sighting, Sighting]) -> Iterator[tuple[Sighting, Sighting]]:
-    """The views without one of the circles that are doubtful."""
+    """The views without a circle that is doubtful in either, in the one and in the other: which is wrong must be told."""
     first, second = views
-    yield from ((first.without(k), second) for k in np.flatnonzero(first.doubtful & first.seen))
-    yield from ((first, second.without(k)) for k in np.flatnonzero(second.doubtful & second.seen))
+    for k in np.flatnonzero((first.doubtful | second.doubtful) & first.seen & second.seen):
+        yield first.without(k), second
+        yield first, second.without(k)
 
 
 def _fits(views: tuple[Sighting, Sighting], target: Target) -> list[TargetPose]:
