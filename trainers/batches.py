@@ -1,6 +1,7 @@
 """Batches to train with: views or patches changed at random, and what networks should answer. Batch k is that of (seed, k)."""
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
 
@@ -56,9 +57,9 @@ class Batches(Dataset[tuple[Tensor, Tensor, Tensor]]):
         some = crops(self.data, self.size, self.crop_px, generator)
         return some.images, some.labels.pixel, some.labels.identity
 
-    def since(self, step: int, loaders: int) -> DataLoader:
+    def since(self, step: int, loaders: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Those of a step and all later ones, made ahead by so many processes; by 0, each when it is asked for."""
-        return DataLoader(self, batch_size=None, sampler=count(step), num_workers=loaders, worker_init_fn=_apart)
+        return iter(DataLoader(self, batch_size=None, sampler=count(step), num_workers=loaders, worker_init_fn=_apart))
 
 
 def _apart(_: int) -> None:

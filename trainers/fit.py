@@ -94,7 +94,7 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
         counts = {"samples": (len(train), len(validation))}
         _write(folder / CHECKPOINT, state | counts | {"step": step, "seconds": seconds})
 
-    batches = iter(Batches(train, plan.batch, plan.crop_px, plan.seed).since(step, plan.loaders))
+    batches = Batches(train, plan.batch, plan.crop_px, plan.seed).since(step, plan.loaders)
     with _stops() as stopped:
         seconds = before
         while (done := progress(plan, step, seconds)) < 1:

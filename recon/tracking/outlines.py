@@ -21,9 +21,9 @@ COVERED = 2  # power of the share that is seen, by which variances are divided: 
 LEAST_SEEN = 0.4  # of the rim: with less an ellipse is a guess
 LEAST_CONTRAST = 4.0  # times the noise of a pixel over the root of the semi-axis
 LEAST_DN = 1.5
-MIDDLE = 0.3  # of the contrast, by which the middle is brighter than the ring at least: light may fall on it less than around
+BRIGHT = 0.3  # of the contrast, by which the middle is brighter than the ring at least: light may fall on it less than around
 LARGEST_SIGMA = 1.5  # px: worse, and the ellipse tells no circle
-FULL_DN = 255.0
+FULL_DN = 255.0  # the end of the scale, see `frames.grey`
 WHOLE = 0.85  # of the rim: what is seen less of may be something else's edge
 SMEARED = 0.4  # of the semi-axis: a longer path is not as even as the model has it
 EXCEEDED = 2.0  # by which variances grow where the path is longer, or white is clipped; so measured on rendered frames
@@ -42,7 +42,7 @@ class Outlines:
     noise: Array  # (n,) DN, a pixel's, the larger of both sides
     motion: Array  # (n, 2) px, path over the exposure, up to its sign
     seen: Array  # (n,) share of the rim that looks like one
-    doubtful: NDArray[np.bool_]  # (n,) covered in part, clipped or smeared: some are off by more than that
+    doubtful: NDArray[np.bool_]  # (n,) covered in part, clipped or smeared: may be off by more than covariances say
     reasons: tuple[str | None, ...]  # why it is no ring
 
     @property
@@ -138,22 +138,22 @@ def _judged(rows: Array, target: Target, middles: bool) -> Outlines:
     covariance = covariance / np.maximum(seen, 0.1)[:, None, None] ** COVERED + FLOOR_PX**2 * np.eye(2)
     v0, v1, v2 = rows[:, rims.VARIANCE : rims.VARIANCE + 3].T
     path, direction = np.sqrt(24 * np.hypot(v1, v2)), np.arctan2(v2, v1) / 2
-    beyond = (outside + noise > FULL_DN) | (path > SMEARED * np.trace(shape, axis1=1, axis2=2) / 2)
+    semi = np.trace(shape, axis1=1, axis2=2) / 2
+    beyond = (outside + noise > FULL_DN) | (path > SMEARED * semi)
     covariance[beyond] *= EXCEEDED
     motion = path[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
     reasons: list[str | None] = []
     for i in range(len(rows)):
         contrast = outside[i] - inside[i]
-        semi = (shape[i, 0, 0] + shape[i, 1, 1]) / 2
         if rows[i, rims.FAILED]:
             reasons.append("no rim")
-        elif not contrast >= max(LEAST_DN, LEAST_CONTRAST * noise[i] / np.sqrt(semi)):
+        elif not contrast >= max(LEAST_DN, LEAST_CONTRAST * noise[i] / np.sqrt(semi[i])):
             reasons.append(f"a contrast of {contrast:.1f} DN in noise of {noise[i]:.1f}")
         elif not seen[i] >= LEAST_SEEN:
             reasons.append(f"{100 * seen[i]:.0f} % of its rim seen")
-        elif middles and not middle[i] - inside[i] > MIDDLE * contrast * (1 - np.sqrt(v0[i]) / (hole * semi)):
+        elif middles and not middle[i] - inside[i] > BRIGHT * contrast * (1 - np.sqrt(v0[i]) / (hole * semi[i])):
             reasons.append("no white middle")
-        elif not np.sqrt(v0[i]) <= LARGEST_BLUR * (1 - hole) * semi:
+        elif not np.sqrt(v0[i]) <= LARGEST_BLUR * (1 - hole) * semi[i]:
             reasons.append(f"blurred by {np.sqrt(12 * v0[i]):.0f} px")
         elif not np.sqrt(np.trace(covariance[i])) <= LARGEST_SIGMA:
             reasons.append(f"an uncertainty of {np.sqrt(np.trace(covariance[i])):.1f} px")

@@ -48,10 +48,18 @@ class View:
 
 def nothing(reason: str) -> View:
     """No circles, for a reason."""
-    numbers, pairs, squares = (np.full((3, 2, 2)[: k + 1], np.nan) for k in range(3))
-    levels = (numbers,) * 4
+    numbers, pairs, squares = np.full(3, np.nan), np.full((3, 2), np.nan), np.full((3, 2, 2), np.nan)
     outlines = Outlines(
-        Ellipses(pairs, squares), squares, *levels, motion=pairs, seen=numbers, doubtful=np.zeros(3, bool), reasons=(reason,) * 3
+        Ellipses(pairs, squares),
+        covariance=squares,
+        inside=numbers,
+        outside=numbers,
+        middle=numbers,
+        noise=numbers,
+        motion=pairs,
+        seen=numbers,
+        doubtful=np.zeros(3, bool),
+        reasons=(reason,) * 3,
     )
     return View(outlines, reason)
 

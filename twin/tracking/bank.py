@@ -49,7 +49,7 @@ def build_bank(target: Target, variants: int, seed: int) -> Bank:
         for part, from_poster in zip([p for p in one.parts if p.slot == "poster"], one.posters, strict=True)
     ]
     posters = _poster_mesh(sheets) if sheets else None
-    scenes = mi.load_dict({"type": "scene", "a": scene} | ({"b": posters} if posters else {}))
+    scenes = mi.load_dict({"type": "scene", "a": scene} | ({} if posters is None else {"b": posters}))
     # on a GPU one kernel can trace rays in two worlds only if one is loaded as the other's child: OptiX has one table of shaders
     bodies = mi.load_dict({"type": "scene", "a": body, "parent_scene": scenes})
     return Bank(bodies, scenes, mi.ShapePtr(posters), body_at, scene_at)
