@@ -101,7 +101,7 @@ def test_a_small_detector_learns_the_drawn_targets(write, tmp_path):
     """Some minutes of training find most circles by their names: identity follows from the target's shape alone."""
     train, held = split(read_views(write(tmp_path / "set", 120)), 0.1)
     torch.manual_seed(0)
-    asked = plan("detector", 2400, batch=16, crop_px=160, learning_rate=4e-3)
+    asked = plan("detector", 1400, batch=16, crop_px=160, learning_rate=4e-3)
     fitted = fit.fit(Detector(32), train, held, asked, tmp_path, lambda *_: None)
     figures = fit.measure(fitted.network, held)
     assert figures["recall"] > 0.6
