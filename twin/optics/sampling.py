@@ -5,6 +5,8 @@ of the phase. Points come in pairs mirrored about the centre, which makes the me
 Owen-scrambled Sobol' points (Burley 2020, hash-based Owen scrambling), a different scramble in each pixel and dimension.
 """
 
+from collections.abc import Iterator
+
 import drjit as dr
 import mitsuba as mi
 
@@ -56,6 +58,11 @@ class PairedPoints:
         self._index = index
         self._bits = samples.bit_length() - 1
         self._dimension = 0
+
+    def split(self, count: int) -> Iterator["PairedPoints"]:
+        """As many points, a power of two, of a set that is larger by as much; independent of this one's."""
+        for k in range(count):
+            yield PairedPoints(self._key, self._index * count + k, count << self._bits, mi.UInt32(0))
 
     def _next_seed(self) -> mi.UInt32:
         self._dimension += 1

@@ -30,7 +30,7 @@ class Quality(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    view: int = Field(default=2, ge=1, le=256)  # of each of the four camera pixels that make a view's pixel
+    view: int = Field(default=1, ge=1, le=256)  # of each of the four camera pixels that make a view's pixel
     patch: int = Field(default=4, ge=2, le=1024)
     window: int = Field(default=4, ge=2, le=1024)  # of full frames, and of what a sketch shows in full
 

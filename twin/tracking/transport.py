@@ -4,12 +4,15 @@ Body and scene are two worlds of the ray tracer. Each ray has its own time withi
 at that time and into the scene's, meets both, and the nearer is what it sees; its shadow is tested in both. So the blur of motion
 is exact, no world is ever rebuilt, and frames of different poses are traced in one launch.
 
-Of all that lights a point, one source is followed by a shadow ray, chosen in proportion to what each would give without
-shadows; the sum over all is then carried by that one. Where nothing is in shadow this has no noise at all.
+What all sources would give a point without shadows is summed up; a few shadow rays, each towards a source chosen in proportion
+to what it would give, say how much of the sum arrives. Where nothing is in shadow this has no noise at all.
+
+A ray costs little beside what it takes to fetch a take's parameters, so each thread follows several pixels of one camera.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +29,8 @@ from twin.tracking.rows import Rows, Turn, camera_columns, take_columns
 
 Floats = NDArray[np.float32]
 
+PIXELS = 8  # that a thread follows
+SHADOWS = 2  # shadow rays a ray, a power of two
 UNDISTORTIONS = 8  # fixed-point steps; each leaves a tenth of the error, which starts at a few px
 LIFT_MM = 0.05  # of a shadow ray's start off the surface, more than the coordinates' rounding
 ROOM_MM = 300.0  # things farther than this don't keep a point from the light that comes from all around
@@ -71,35 +76,59 @@ def render(
     grid : BitGrid or None
         What the target's face shows instead of the circles.
     """
-    take = mi.UInt32(lanes.take)
-    camera = take * 2 + mi.UInt32(lanes.camera)
+    first, step, end = _shares(lanes)
+    take, camera = dr.gather(mi.UInt32, mi.UInt32(lanes.take), first), dr.gather(mi.UInt32, mi.UInt32(lanes.camera), first)
     rows = Rows.of(take_columns(takes, rig, bank.body_at, bank.scene_at), take)
-    cameras = Rows.of(camera_columns([device for one in takes for device in one.cameras]), camera)
+    cameras = Rows.of(camera_columns([device for one in takes for device in one.cameras]), take * 2 + camera)
     path = _Path(bank, rig.target, rows, cameras, grid)
-    u, v = mi.Float(lanes.u), mi.Float(lanes.v)
-    count, circle = mi.UInt32(lanes.samples), mi.UInt32(lanes.circle)
-    key = mi.UInt32(np.uint32([one.k for one in takes])[lanes.take]) * 4 + mi.UInt32(lanes.camera)
-    sets, last = mi.UInt32(lanes.set), mi.UInt32(lanes.first) + count
+    key = dr.gather(mi.UInt32, mi.UInt32([one.k for one in takes]), take) * 4 + camera
     seeds = mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed), 4)[0]
-    zero = dr.zeros(mi.Float, len(lanes.u))
+    u, v, sets, circles = mi.Float(lanes.u), mi.Float(lanes.v), mi.UInt32(lanes.set), mi.UInt32(lanes.circle)
+    firsts, counts = mi.UInt32(lanes.first), mi.UInt32(lanes.samples)
+    results = [dr.zeros(mi.Float, len(lanes.u)) for _ in range(5)]
+    dr.eval(*results)
 
-    def body(index, radiance, disc, seen, white, white_radiance):
-        points = PairedPoints(sets, index, most_samples, seeds)
-        got = path.follow(u, v, circle, points)
-        return (
-            index + 1,
-            radiance + got[0],
-            disc + dr.select(got[1], 1.0, 0.0),
-            seen + dr.select(got[2], 1.0, 0.0),
-            white + dr.select(got[3], 1.0, 0.0),
-            white_radiance + dr.select(got[3], got[0], 0.0),
-        )
+    def body(pixel, k, *sums):
+        """Ray k of a pixel; after the last one its sums are stored, and the next pixel's begin."""
 
-    state = (mi.UInt32(lanes.first), zero, mi.Float(zero), mi.Float(zero), mi.Float(zero), mi.Float(zero))
-    _, *sums = dr.while_loop(state, lambda index, *_: index < last, body, label="rays")
-    dr.eval(*sums)
-    radiance, disc, seen, white, white_radiance = (np.array(total) for total in sums)
+        def its(column):
+            return dr.gather(type(column), column, pixel)
+
+        points = PairedPoints(its(sets), its(firsts) + k, most_samples, seeds)
+        radiance, *found = path.follow(its(u), its(v), its(circles), points)
+        values = radiance, *(dr.select(one, 1.0, 0.0) for one in found), dr.select(found[-1], radiance, 0.0)
+        sums = [total + value for total, value in zip(sums, values, strict=True)]
+        done = k + 1 == its(counts)
+        for result, total in zip(results, sums, strict=True):
+            dr.scatter(result, total, pixel, done)
+        return dr.select(done, pixel + step, pixel), dr.select(done, 0, k + 1), *(dr.select(done, 0, total) for total in sums)
+
+    state = (mi.UInt32(first), mi.UInt32(0), *(mi.Float(0) for _ in results))
+    dr.while_loop(state, lambda pixel, *_: pixel < end, body, label="rays")
+    radiance, disc, seen, white, white_radiance = (np.array(result) for result in results)
     return Light(radiance / lanes.samples, disc, seen, white, white_radiance)
+
+
+def _shares(lanes: Lanes) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+    """Which pixels each thread of the launch follows one after the other: the first, the step to the next, and the end.
+
+    A thread keeps to one camera of one take, whose parameters it fetches once; neighbours have neighbouring pixels at a time.
+    """
+    starts = np.flatnonzero(np.diff(lanes.take * 2 + lanes.camera, prepend=np.uint32(2**32 - 1)))
+    ends = np.append(starts[1:], len(lanes.u))
+    steps = -(-(ends - starts) // PIXELS)
+    first = np.concatenate([start + np.arange(step) for start, step in zip(starts, steps, strict=True)])
+    table = mi.UInt32(np.uint32(np.concatenate([first, np.repeat(steps, steps), np.repeat(ends, steps)])))
+    thread = dr.arange(mi.UInt32, len(first))
+    # fetched by number: what is read in order is compiled anew for each alignment in memory, which NumPy leaves to chance
+    return tuple(dr.gather(mi.UInt32, table, thread + k * len(first)) for k in range(3))
+
+
+class _Source(NamedTuple):
+    """A lamp or the projector as a place sees it."""
+
+    value: mi.Float  # radiance towards the viewer by it, without shadows
+    way: mi.Vector3f  # to a point of it
 
 
 class _Path:
@@ -131,13 +160,12 @@ class _Path:
         x, y, faces = self._on_face(turned)
         aims = faces & self._within_circle(x, y, circle)
         place, normal, surface, on_face, nothing = self._nearest(ray, turned, time, x, y)
-        reflectance, gloss, roughness = surface
-        light = self._reflected(place, normal, -ray.d, reflectance, gloss, roughness, time, when.y + 0.5, points)
-        radiance = dr.select(nothing, self._from_around(ray.d), light)
+        light = self._reflected(place, normal, -ray.d, surface, time, points)
+        radiance = dr.select(nothing, self.ambient * self._share_from(ray.d), light)
         away = ((u - self.mid_u) ** 2 + (v - self.mid_v) ** 2) * self.corner
         radiance *= (1 - self.vignetting * away) * cosine**4
         paper = self.face.paint[1]
-        on_paper = on_face & (reflectance > 0.8 * paper) & (reflectance < 1.25 * paper)
+        on_paper = on_face & (surface[0] > 0.8 * paper) & (surface[0] < 1.25 * paper)
         return radiance, aims, aims & on_face, on_paper
 
     def _ray(self, u, v, points: PairedPoints) -> tuple[mi.Ray3f, mi.Float]:
@@ -197,6 +225,7 @@ class _Path:
         in_body, in_scene = self._banked(turned), self._scene_ray(ray)
         flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
         body = self.bank.bodies.ray_intersect(in_body, flags, True, self.present)
+        in_scene.maxt = mi.Float(body.t)  # infinite where the body is missed
         scene = self.bank.scenes.ray_intersect(in_scene, flags, True, mi.Bool(True))
         held = body.is_valid() & (body.t < scene.t)
         nothing = ~body.is_valid() & ~scene.is_valid()
@@ -224,42 +253,49 @@ class _Path:
             return grid_cover(self.grid, x, y)
         return ring_cover(self.target, x, y, self.face.paint[3])
 
-    def _from_around(self, direction: mi.Vector3f) -> mi.Float:
-        return self.ambient * (1 + dr.dot(self.gradient, direction))
+    def _share_from(self, direction: mi.Vector3f) -> mi.Float:
+        """Light that comes from a direction, over the mean of all."""
+        return 1 + dr.dot(self.gradient, direction)
 
-    def _reflected(self, place, normal, view, reflectance, gloss, roughness, time, chance, points: PairedPoints) -> mi.Float:
-        """Radiance towards the viewer: all sources unshadowed, times whether the one followed is seen."""
-        pick, total, where = mi.Float(chance), mi.Float(0), points.square()
-        direction, reach = mi.Vector3f(0, 0, 1), mi.Float(0)
+    def _reflected(self, place, normal, view, surface, time, points: PairedPoints) -> mi.Float:
+        """Radiance towards the viewer: what all sources give unshadowed, times the part of the shadow rays that get through."""
+        around, sources = self._sources(place, normal, view, surface, points)
+        total, through = around + sum(source.value for source in sources), mi.Float(0)
+        for light in points.split(SHADOWS):
+            way, weight = self._towards_one(around, sources, light.square().x * total, normal, light.square())
+            blocked = self._blocked(place + normal * LIFT_MM, way, time, total > 0)
+            through += dr.select(blocked, 0, weight)
+        return total * through / SHADOWS
 
-        def offer(value, way, length):
-            nonlocal total, direction, reach, pick
-            total += value
-            take = pick * total < value
-            pick = dr.select(
-                take, pick * total / dr.maximum(value, 1e-20), (pick * total - value) / dr.maximum(total - value, 1e-20)
-            )
-            direction, reach = dr.select(take, way, direction), dr.select(take, length, reach)
-
-        around = mi.Frame3f(mi.Normal3f(normal)).to_world(mi.warp.square_to_cosine_hemisphere(where))
-        offer(reflectance * self._from_around(around), mi.Vector3f(around), mi.Float(ROOM_MM))
-        ball = mi.warp.square_to_uniform_sphere(where)
+    def _sources(self, place, normal, view, surface, points: PairedPoints) -> tuple[mi.Float, list["_Source"]]:
+        """What comes by the light from around, and by each lamp and the projector, without shadows."""
+        around = surface[0] * self.ambient * self._share_from(2 / 3 * normal)  # mean of all directions by their cosines
+        ball = mi.Vector3f(mi.warp.square_to_uniform_sphere(points.square()))
+        sources = []
         for k in range(LAMPS):
             px, py, pz, radius, intensity = self.lamps[5 * k : 5 * k + 5]
-            way = mi.Vector3f(px, py, pz) + mi.Vector3f(ball) * radius - place
-            offer(*self._lit(way, intensity, normal, view, reflectance, gloss, roughness))
+            way = mi.Vector3f(px, py, pz) + ball * radius - place
+            sources.append(_Source(self._lit(way, intensity, normal, view, *surface), way))
         way = self._projector_way(place)
-        offer(*self._lit(way, self._projected(place), normal, view, reflectance, gloss, roughness))
-        blocked = self._blocked(place + normal * LIFT_MM, direction, reach, time, total > 0)
-        return dr.select(blocked, 0, total)
+        sources.append(_Source(self._lit(way, self._projected(place), normal, view, *surface), way))
+        return around, sources
 
-    def _lit(self, way, intensity, normal, view, reflectance, gloss, roughness) -> tuple:
-        """Radiance by a source of an intensity, at the end of a way; with the way's direction and length."""
-        distance = dr.norm(way)
-        direction = way / distance
+    def _towards_one(self, around, sources: Sequence["_Source"], pick, normal, where) -> tuple[mi.Vector3f, mi.Float]:
+        """The way to the source in whose share `pick` falls, or in some direction; and the light from there over its mean."""
+        any_way = mi.Vector3f(mi.Frame3f(mi.Normal3f(normal)).to_world(mi.warp.square_to_cosine_hemisphere(where)))
+        way, weight = any_way * ROOM_MM, self._share_from(any_way) / self._share_from(2 / 3 * normal)
+        for source in sources:
+            chosen = (pick >= around) & (source.value > 0)
+            way, weight = dr.select(chosen, source.way, way), dr.select(chosen, 1, weight)
+            around = around + source.value
+        return way, weight
+
+    def _lit(self, way, intensity, normal, view, reflectance, gloss, roughness) -> mi.Float:
+        """Radiance by a source of an intensity, at the end of a way."""
+        direction = dr.normalize(way)
         cosine = dr.maximum(dr.dot(normal, direction), 0)
         irradiance = intensity * cosine / dr.squared_norm(way)
-        return irradiance * self._brdf(normal, view, direction, cosine, reflectance, gloss, roughness), direction, distance
+        return irradiance * self._brdf(normal, view, direction, cosine, reflectance, gloss, roughness)
 
     @staticmethod
     def _brdf(normal, view, direction, cosine, reflectance, gloss, roughness) -> mi.Float:
@@ -283,9 +319,10 @@ class _Path:
         value = mean + modulation * dr.cos(2 * dr.pi * dr.select(along_rows > 0, v, u) / period)
         return dr.select(within, intensity * value, 0)
 
-    def _blocked(self, place, direction, reach, time, active) -> mi.Bool:
+    def _blocked(self, place, way, time, active) -> mi.Bool:
         """Whether anything stands in a shadow ray's way."""
-        ray = mi.Ray3f(mi.Point3f(place), direction)
+        reach = dr.norm(way)
+        ray = mi.Ray3f(mi.Point3f(place), way / reach)
         in_body, in_scene = self._banked(self._body_ray(ray, time)), self._scene_ray(ray)
         in_body.maxt, in_scene.maxt = mi.Float(reach), mi.Float(reach)
         by_scene = self.bank.scenes.ray_test(in_scene, active)

@@ -61,6 +61,17 @@ def test_dimensions_are_independent():
     assert abs(np.corrcoef(x, y)[0, 1]) < 5 / np.sqrt(x.size)
 
 
+def test_split_points_are_one_larger_set():
+    """Two points for each of 8 fill the 16 strata of a larger set, those of each point in different halves, unlike its own."""
+    halves = [all_samples(lambda points, k=k: list(points.split(2))[k].square(), 8) for k in range(2)]
+    both = np.stack(halves, axis=2)  # (PIXELS, 8, 2, axis)
+    strata = np.sort(np.floor(both[..., 0].reshape(PIXELS, 16) * 16).astype(int), axis=1)
+    assert (strata == np.arange(16)).all()
+    assert (np.floor(2 * both[:, :, 0, 0]) != np.floor(2 * both[:, :, 1, 0])).all()
+    own = all_samples(PairedPoints.square, 8)
+    assert abs(np.corrcoef(own[..., 0].ravel(), both[:, :, 0, 0].ravel())[0, 1]) < 5 / np.sqrt(8 * PIXELS)
+
+
 def test_seed_decides():
     """The same seed gives the same points, another seed others."""
     first, again, other = (all_samples(PairedPoints.square, 8, seed) for seed in (1, 1, 2))

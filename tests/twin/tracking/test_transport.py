@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -9,10 +11,12 @@ from recon import rigid
 from recon.discs import measure
 from recon.ellipses import Ellipses
 from recon.tracking.pose import circle_centres
-from tests.twin.tracking.takes import facing, plain_take, rig
+from tests.twin.tracking.takes import facing, plain_take, ranges, rig
+from twin.optics.sampling import sobol_pair
 from twin.tracking.bank import build_bank
+from twin.tracking.draw import draw
 from twin.tracking.frames import white_radiance
-from twin.tracking.transport import NO_CIRCLE, Lanes, render
+from twin.tracking.transport import NO_CIRCLE, Lanes, _Path, render
 from twin.tracking.truth import view_truth
 
 RIG = rig()
@@ -32,12 +36,12 @@ def window(truth, circle: int, margin: int = 14) -> tuple[np.ndarray, np.ndarray
     return u + first[0], v + first[1], first
 
 
-def light_of(bank, take, camera: int, u, v, samples: int = 64, circle: int = NO_CIRCLE):
+def light_of(bank, take, camera: int, u, v, samples: int = 64, circle: int = NO_CIRCLE, seed: int = 1):
     n = u.size
     one = np.ones(n, np.uint32)
     lanes = Lanes(0 * one, camera * one, np.float32(u.ravel()), np.float32(v.ravel()), samples * one,
                   np.arange(n, dtype=np.uint32), 0 * one, circle * one)  # fmt: skip
-    return render(bank, RIG, [take], lanes, MOST, seed=1)
+    return render(bank, RIG, [take], lanes, MOST, seed)
 
 
 def unhidden(bank, camera: int = 0, **motion):
@@ -120,6 +124,44 @@ def test_white_shines_as_the_closed_form_says(bank):
     shadowless = light.white_radiance[light.white > 0] / light.white[light.white > 0]
     shadowless = shadowless[shadowless > 0]
     assert np.median(shadowless) == pytest.approx(white_radiance(take, RIG), rel=0.06)  # 13 mm off the middle; vignetting
+
+
+def lit_by(take, *names: str):
+    """The take with these of its sources: a lamp as large as a window, the uneven light from around, the projector."""
+    lamps = np.zeros((4, 5))
+    lamps[:, 3] = 1
+    lamps[0] = [250, -150, 0, 120, 650.0**2 * ("lamp" in names)]
+    projector = np.array([650.0**2 * 0.5 * ("projector" in names), 0.5, 0.4, 40.0, 0.0])
+    gradient = np.array([0.5, -0.5, 0.5])
+    lighting = replace(take.lighting, lamps=lamps, projector=projector, ambient=0.4 * ("around" in names), gradient=gradient)
+    return replace(take, lighting=lighting)
+
+
+def test_light_of_several_sources_adds_up_in_their_shadows(bank):
+    """Superposition: which source a shadow ray is sent to changes the noise alone."""
+    take = draw(ranges(), RIG, 0, 1)
+    v, u = np.mgrid[4:1024:10, 4:1280:10]
+    names = "lamp", "around", "projector"
+    tiles = np.ravel_multi_index(np.indices(u.shape) // 6, np.array(u.shape) // 6 + 1).ravel()
+    whole, *parts = (
+        np.array([np.bincount(tiles, light_of(bank, lit_by(take, *sources), 0, u, v, seed=k).radiance) for k in range(4)])
+        for sources in (names, *((name,) for name in names))
+    )
+    missing = whole.mean(axis=0) - sum(part.mean(axis=0) for part in parts)
+    variance = sum(one.var(axis=0, ddof=1) for one in (whole, *parts)) / 4
+    assert abs(missing.sum() / np.sqrt(variance.sum())) < 4
+    z = missing / np.sqrt(variance)
+    assert 0.7 < np.sqrt(np.mean(np.clip(z, -5, 5) ** 2)) < 1.3
+
+
+def test_uneven_light_comes_from_where_it_is():
+    """Of light 1 + g x over a place that faces z, 1/2 + 2 g / (3 pi) comes from x > 0: directions are drawn by their cosines."""
+    g, count = 0.6, 1 << 16
+    path = _Path.__new__(_Path)
+    path.gradient = mi.Vector3f(g, 0, 0)
+    where = sobol_pair(dr.arange(mi.UInt32, count), 16, mi.UInt32(1))
+    way, light = path._towards_one(mi.Float(1), [], mi.Float(0), mi.Vector3f(0, 0, 1), where)
+    assert dr.mean(dr.select(way.x > 0, light, 0))[0] == pytest.approx(0.5 + 2 * g / (3 * np.pi), abs=1e-3)
 
 
 def test_projected_fringes_stand_where_the_projector_puts_them(bank):
