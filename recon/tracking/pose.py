@@ -39,7 +39,7 @@ RANK = 1e-7  # least ratio of singular values
 SIZES = 0.12  # of a disc's size, by which shapes may differ from the pose's
 SIZES_ALONE = 0.05  # the same of one view by itself: three rings of a sheet were 14 % off, targets 0.5 % in the median
 SHAPES = 0.005  # the same: what blur and gradients leave of a shape, one standard deviation
-DOUBT = 3.0  # standard deviations that are added to what sizes may differ by
+SIGMAS = 3.0  # standard deviations that are added to what sizes may differ by
 TOLD = 16.0  # by how much another pose's misfit, with shapes, must be larger
 SAME = 16.0  # squared standard deviations within which two poses are one
 
@@ -89,7 +89,8 @@ def circle_centres(target: Target) -> Array:
 def estimate(first: Sighting, second: Sighting, target: Target) -> TargetPose:
     """Estimate the pose from two views, by least squares over all ellipses' centres, or all but a doubtful one that misfits.
 
-    Never raises on what the views show: what can't be the target is not found, with a reason.
+    Doubtful circles are right but inexact: one whose rays don't even meet, or that lies millimetres from where the others ask for
+    it, is another thing. Never raises on what the views show: what can't be the target is not found, with a reason.
     """
     views = (first, second)
     found = _chosen(_fits(views, target), views, target)
@@ -154,14 +155,14 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
     if not _like(off, sigma, SIZES):
         return lost(f"circles whose sizes are {100 * np.abs(off).max():.0f} % from what their distance asks for")
     rivals = [fit for k, fit in enumerate(good) if k != best and total[k] < total[best] + TOLD]
-    if any(_apart(good[best], rival) > SAME for rival in rivals):
+    if any(_distance2(good[best], rival) > SAME for rival in rivals):
         return lost("two poses that the circles seen do not tell apart")
     return good[best]
 
 
-def _like(off: Array, sigma: Array, least: float) -> bool:
-    """Whether shapes are a pose's, but for a share that is allowed at least."""
-    return bool((np.abs(off) <= least + DOUBT * sigma).all())
+def _like(off: Array, sigma: Array, share: float) -> bool:
+    """Whether shapes are a pose's but for a share, and for what they are known to."""
+    return bool((np.abs(off) <= share + SIGMAS * sigma).all())
 
 
 def _off_shapes(pose: Array, views: Sequence[Sighting], used: Iterable[NDArray[np.bool_]], target: Target) -> tuple[Array, Array]:
@@ -177,7 +178,7 @@ def _off_shapes(pose: Array, views: Sequence[Sighting], used: Iterable[NDArray[n
     return np.concatenate(off), np.concatenate(sigma)
 
 
-def _apart(first: TargetPose, second: TargetPose) -> float:
+def _distance2(first: TargetPose, second: TargetPose) -> float:
     """Squared distance of two poses in standard deviations of the first."""
     off = difference(first.world_from_target, second.world_from_target)
     return float(off @ np.linalg.solve(first.covariance, off))

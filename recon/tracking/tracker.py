@@ -34,7 +34,7 @@ BLIND_PX = 14.0  # and without
 ROUGH_PX = 5.0  # by which the segmenter's ellipses may be off
 FORGOTTEN_S = 0.25  # after which the target may be anywhere
 FORGOTTEN_FRAMES = 4.0  # the same without times
-ALONE = "no networks to find it by"
+NO_NETWORKS = "no networks to find it by"
 TRIALS = 10  # triples of both views that are looked at
 
 
@@ -90,7 +90,7 @@ class Tracker:
             result = self._detected(frames, self.networks)
             watch.stop("detect")
         if result is None:
-            seen = (views.nothing(ALONE), views.nothing(ALONE))
+            seen = (views.nothing(NO_NETWORKS), views.nothing(NO_NETWORKS))
             result = Tracking(lost(_unseen(seen)), seen)
         if result.found:
             self.remember(result.pose.world_from_target, now)
@@ -150,19 +150,20 @@ class Tracker:
     def _posed(self, seen: tuple[View, View], how: str) -> Tracking:
         """From two views to the pose."""
         if not (all(view.useful for view in seen) and any(view.found for view in seen)):
-            apart = self._apart(seen)
-            return Tracking(lost(_unseen(apart)), apart)
+            each = self._unconfirmed(seen)
+            return Tracking(lost(_unseen(each)), each)
         found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target)
         if not found.found:
-            return Tracking(found, views.doubted(seen, found.reason) if all(view.found for view in seen) else self._apart(seen))
+            both = all(view.found for view in seen)
+            return Tracking(found, views.doubted(seen, found.reason) if both else self._unconfirmed(seen))
         if not found.used.all():
             told = self._rough(found.world_from_target)
-            seen = views.completed(seen[0], told[:3], found.used[0]), views.completed(seen[1], told[3:], found.used[1])
+            seen = views.with_told(seen[0], told[:3], found.used[0]), views.with_told(seen[1], told[3:], found.used[1])
         return Tracking(found, seen, how)
 
-    def _apart(self, seen: tuple[View, View]) -> tuple[View, View]:
+    def _unconfirmed(self, seen: tuple[View, View]) -> tuple[View, View]:
         """Two views that don't confirm each other."""
-        return views.alone(seen[0], self.cameras[0], self.target), views.alone(seen[1], self.cameras[1], self.target)
+        return views.unconfirmed(seen[0], self.cameras[0], self.target), views.unconfirmed(seen[1], self.cameras[1], self.target)
 
     def _segmented(self, frames: Frames, networks: Networks, rough: Ellipses, before: Tracking) -> Tracking:
         """From six rough ellipses to the pose, by the segmenter."""
@@ -189,7 +190,7 @@ class Tracker:
         for k, triple in sorted(choices, key=lambda choice: -choice[1].score)[:TRIALS]:
             if k in settled and triple.within(settled[k]):
                 continue
-            view = self._alone(frames, networks, k, triple)
+            view = self._seen_at(frames, networks, k, triple)
             if k not in likeliest or (view.found and not likeliest[k].found):
                 likeliest[k] = view
             if view.found:
@@ -197,7 +198,7 @@ class Tracker:
                 others = self._told(frames, k, view)
                 results = [self._posed((view, other) if k == 0 else (other, view), "detected") for other in others]
                 if any(result.found for result in results):
-                    return max(results, key=lambda result: result.found * result.pose.freedom)  # a wrong tilt misses circles
+                    return min((one for one in results if one.found), key=_unlikely)
                 likeliest.update((1 - k, other) for other in others if other.found)
         first, second = (likeliest.get(k, views.nothing(_absent(each))) for k, each in enumerate(candidates))
         return self._posed((first, second), "detected")
@@ -208,7 +209,7 @@ class Tracker:
         asked = [self._asked(1 - k, pose) for pose in poses]
         return [views.judged(self._view(frames, 1 - k, rough, REACH_PX), self.target) for rough in asked]
 
-    def _alone(self, frames: Frames, networks: Networks, k: int, triple: Triple) -> View:
+    def _seen_at(self, frames: Frames, networks: Networks, k: int, triple: Triple) -> View:
         """What one view shows where its three circles may be."""
         rough = segmentation.rough_ellipses(frames[k], triple.points, networks, self.target)
         return views.judged(views.renamed(self._view(frames, k, rough, ROUGH_PX), self.target), self.target)
@@ -228,6 +229,11 @@ class _Watch:
     def stop(self, stage: str) -> None:
         now = perf_counter()
         self.seconds[stage], self.since = now - self.since, now
+
+
+def _unlikely(result: Tracking) -> tuple[int, float]:
+    """What a pose with a wrong tilt has more of: circles that it misses, or else misfit."""
+    return -result.pose.freedom, result.pose.misfit
 
 
 def _absent(candidates: detection.Candidates) -> str:

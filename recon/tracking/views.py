@@ -14,7 +14,7 @@ from recon.tracking.pose import NAMES, Sighting, allowed
 
 Array = NDArray[np.float64]
 
-ALONE = 0.6  # of each rim, to be seen by one camera only
+LEAST_UNCONFIRMED = 0.6  # of each rim, to be seen by one camera only
 ELSEWHERE = "not where the others ask for it"
 
 
@@ -77,7 +77,7 @@ def judged(outlines: Outlines, target: Target) -> View:
     return View(outlines)
 
 
-def alone(view: View, camera: Camera, target: Target) -> View:
+def unconfirmed(view: View, camera: Camera, target: Target) -> View:
     """A view that the other one doesn't confirm: shapes must be those of a pose, and no rim may be another thing's edge."""
     if not view.found:
         return view
@@ -86,12 +86,12 @@ def alone(view: View, camera: Camera, target: Target) -> View:
     little = [
         f"{name}: {100 * seen:.0f} % of its rim seen"
         for name, seen in zip(NAMES, view.outlines.seen, strict=True)
-        if seen < ALONE
+        if seen < LEAST_UNCONFIRMED
     ]
     return replace(view, reason="; ".join(little) + ", by one camera only") if little else view
 
 
-def completed(view: View, told: Ellipses, used: NDArray[np.bool_]) -> View:
+def with_told(view: View, told: Ellipses, used: NDArray[np.bool_]) -> View:
     """The view of a known pose, which tells where the circles are that it wasn't fitted to; what was measured stays as it was."""
     outlines = view.outlines
     centre = np.where(used[:, None], outlines.ellipses.centre, told.centre)

@@ -3,7 +3,10 @@
 
 import os
 import signal
+import subprocess
+import sys
 from dataclasses import replace
+from multiprocessing import active_children
 
 import pytest
 
@@ -66,11 +69,40 @@ def test_an_interrupted_training_ends_with_the_same_weights(name, data_set, tmp_
 
     with pytest.raises(Interrupted):
         fit.fit(small(name), *data, asked, paths[1], fail)
-    parts = fit.fit(small(name), *data, replace(asked, loaders=2), paths[1], lambda step, done, loss: None)
+    helpers = []
+    asked_with_helpers = replace(asked, loaders=2)
+    parts = fit.fit(small(name), *data, asked_with_helpers, paths[1], lambda *_: helpers.append(len(active_children())))
+    assert helpers == [2] * 5
     assert (whole.resumed_at, parts.resumed_at, parts.steps) == (0, 5, 10)
     for one, other in zip(whole.network.state_dict().values(), parts.network.state_dict().values(), strict=True):
         assert torch.equal(one, other)
     assert [row["step"] for row in read_log(paths[1])] == [2, 4, 6, 8, 10]
+
+
+TRAINING = """
+import sys
+from pathlib import Path
+import torch
+from trainers import fit
+from trainers.networks import Segmenter
+from trainers.shards import read_patches, split
+torch.set_num_threads(1)
+plan = fit.Plan("segmenter", 4, 64, 1e-3, 0.01, 3, 100000, None, loaders=2)
+data = split(read_patches(Path(sys.argv[1])), 0.1)
+fit.fit(Segmenter((4, 4, 4)), *data, plan, Path(sys.argv[2]), lambda step, *_: print(step, flush=True))
+"""
+
+
+def test_a_key_press_that_reaches_all_processes_leaves_a_checkpoint(data_set, tmp_path):
+    """Ctrl+C in a terminal goes to those that make batches, too; the training must not fail for want of them."""
+    running = subprocess.Popen(
+        [sys.executable, "-c", TRAINING, str(data_set), str(tmp_path)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    assert running.stdout.readline() == "1\n"
+    os.killpg(running.pid, signal.SIGINT)
+    _, told = running.communicate(timeout=60)
+    assert "KeyboardInterrupt" in told and (tmp_path / fit.CHECKPOINT).is_file(), told
 
 
 def test_the_learning_rate_rises_falls_and_ends(data_set):

@@ -6,7 +6,7 @@ import pytest
 from recon import rigid
 from recon.circles import centre_offsets
 from recon.ellipses import Ellipses
-from recon.tracking import pose
+from recon.tracking import outlines, pose
 from recon.tracking.outline_model import rays_through
 from recon.tracking.outlines import measure
 from tests.recon.tracking import drawings
@@ -70,7 +70,7 @@ def test_a_finger_over_a_quarter_of_the_rim_costs_little(camera, rig, rng):
     image[finger] = np.clip(45 + 2 * rng.standard_normal(finger.sum()), 0, 255).astype(np.uint8)
     found = measure(image, true, 3.0, rig.target)
     assert found.found[1]
-    assert found.seen[1] < 0.85
+    assert found.doubtful.tolist() == [False, True, False]
     off = found.ellipses.centre[1] - true.centre[1]
     assert np.hypot(*off) < 0.06
     assert np.trace(found.covariance[1]) > np.trace(found.covariance[0])
@@ -81,8 +81,29 @@ def test_clipped_white_keeps_the_centre(camera, rig, rng):
     place = drawings.facing(rng)
     true = drawings.shown(camera, place, rig.target)
     found = measure(drawings.frame(camera, [place], rig.target, 500.0, rng), true, 4.0, rig.target)
-    assert found.found.all()
+    assert found.found.all() and found.doubtful.all()
     assert np.hypot(*(found.ellipses.centre - true.centre).T).max() < 0.05
+
+
+@pytest.mark.parametrize(("blur", "smeared"), [(10.0, False), (24.0, True)])
+def test_a_path_longer_than_the_model_allows_is_doubted(camera, rig, rng, blur, smeared):
+    """0.4 of a semi-axis of some 45 px is 18 px; a long path at even speed is nothing that the rim itself shows."""
+    found, true = found_and_true(camera, rig.target, rng, 65.0, blur)
+    assert found.found.all(), found.reasons
+    assert (blur > 0.4 * true.semi_axes.mean(axis=1).max()) == smeared
+    assert (found.doubtful == smeared).all()
+
+
+def test_variances_of_what_is_clipped_are_doubled(camera, rig, rng, monkeypatch):
+    """The same pixels, a grey level below the end of the scale and at it: what differs is that more might have been cut off."""
+    place = drawings.facing(rng)
+    true = drawings.shown(camera, place, rig.target)
+    image = drawings.frame(camera, [place], rig.target, 200.0, rng)
+    below = measure(image, true, 4.0, rig.target)
+    monkeypatch.setattr(outlines, "FULL_DN", below.outside.min())
+    clipped = measure(image, true, 4.0, rig.target)
+    assert not below.doubtful.any() and clipped.doubtful.all()
+    np.testing.assert_allclose(clipped.covariance, 2 * below.covariance)
 
 
 def test_what_is_no_ring_is_not_found(camera, rig, rng):

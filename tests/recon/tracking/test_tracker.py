@@ -1,11 +1,16 @@
 """The tracker finds, follows and loses a drawn target, and says why where it isn't found."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from recon import rigid
-from recon.tracking import following, overlays, photographs, pose
+from recon.ellipses import Ellipses
+from recon.tracking import following, overlays, photographs, pose, views
+from recon.tracking import tracker as tracking
+from recon.tracking.outlines import Outlines
 from recon.tracking.tracker import Tracker
 from tests.recon.tracking import drawings
 from tests.recon.tracking.stand_ins import Told
@@ -126,6 +131,31 @@ def test_a_circle_that_one_camera_does_not_see_is_told_by_the_pose(cameras, rig,
         assert np.isfinite(following.kept(found, 0).blur_px).all()
     neither = tracker.step(covered(pair[0], centres(cameras[0], FACING, rig.target)[which]), hidden)
     assert not neither.found and str(neither.pose.reason).count(f"c{which}: ") == 2, neither.pose.reason
+
+
+def shifted(found: Outlines, which: int, by, doubtful: bool) -> Outlines:
+    """With one rim that was fitted beside its place."""
+    some = np.arange(len(found.reasons)) == which
+    ellipses = Ellipses(found.ellipses.centre + some[:, None] * by, found.ellipses.shape)
+    return replace(found, ellipses=ellipses, doubtful=found.doubtful | (some & doubtful))
+
+
+@pytest.mark.parametrize("doubtful", [True, False])
+def test_a_doubtful_rim_that_is_off_is_told_by_the_pose(cameras, rig, pair, monkeypatch, doubtful):
+    """Half a pixel: the other five tell the pose, and that where it is; a rim that nothing speaks against spoils the frame."""
+    tracker = Tracker(cameras, rig.target)
+    tracker.remember(FACING, 0.0)
+    real = tracking.measure_both
+    monkeypatch.setattr(tracking, "measure_both", lambda *given: shifted(real(*given), 4, [0.5, -0.3], doubtful))
+    found = tracker.step(*pair, time_s=0.02)
+    assert found.found == doubtful
+    if doubtful:
+        assert found.pose.used.tolist() == [[True] * 3, [True, False, True]]
+        assert off_mm(found) < 0.05
+        assert found.views[1].outlines.reasons == (None, views.ELSEWHERE, None)
+        assert found.views[1].found and np.isnan(found.views[1].blur_px[1])
+        true = drawings.shown(cameras[1], FACING, rig.target)
+        assert np.abs(found.views[1].outlines.ellipses.centre - true.centre).max() < 0.1
 
 
 def test_a_camera_that_was_moved_is_told_from_one_that_sees_nothing(cameras, rig, pair):

@@ -11,8 +11,10 @@ from recon import rigid
 from recon.discs import measure
 from recon.ellipses import Ellipses
 from recon.tracking.pose import circle_centres
+from scenes.surroundings import surroundings
 from tests.twin.tracking.takes import facing, plain_take, ranges, rig
 from twin.optics.sampling import sobol_pair
+from twin.tracking import bank as bank_module
 from twin.tracking.bank import build_bank
 from twin.tracking.draw import draw
 from twin.tracking.frames import white_radiance
@@ -182,6 +184,21 @@ def test_projected_fringes_stand_where_the_projector_puts_them(bank):
     lit = light.white > 32
     assert lit.sum() > 30
     assert np.corrcoef(light.radiance[lit], expected[lit])[0, 1] > np.cos(2 * np.pi * distortion_px / 40) - 0.05
+
+
+def test_surroundings_without_a_poster_are_rendered(monkeypatch):
+    """As few variants may have none."""
+
+    def bare(stream):
+        drawn = surroundings(stream)
+        return replace(drawn, parts=[part for part in drawn.parts if part.slot != "poster"], posters=[])
+
+    monkeypatch.setattr(bank_module, "surroundings", bare)
+    few = build_bank(RIG.target, 1, 3)
+    take = replace(draw(ranges(), RIG, 0, 1), body=0, surroundings=0)
+    v, u = np.mgrid[4:1024:40, 4:1280:40]
+    light = light_of(few, take, 0, u, v, 4)
+    assert np.isfinite(light.radiance).all() and (light.radiance > 0).mean() > 0.9
 
 
 def test_a_face_turned_away_shows_no_circle(bank):
