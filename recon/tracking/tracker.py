@@ -198,7 +198,7 @@ class Tracker:
                 others = self._told(frames, k, view)
                 results = [self._posed((view, other) if k == 0 else (other, view), "detected") for other in others]
                 if any(result.found for result in results):
-                    return min((one for one in results if one.found), key=_unlikely)
+                    return min((one for one in results if one.found), key=_rank)
                 likeliest.update((1 - k, other) for other in others if other.found)
         first, second = (likeliest.get(k, views.nothing(_absent(each))) for k, each in enumerate(candidates))
         return self._posed((first, second), "detected")
@@ -231,8 +231,8 @@ class _Watch:
         self.seconds[stage], self.since = now - self.since, now
 
 
-def _unlikely(result: Tracking) -> tuple[int, float]:
-    """What a pose with a wrong tilt has more of: circles that it misses, or else misfit."""
+def _rank(result: Tracking) -> tuple[int, float]:
+    """To find the right tilt first: a wrong one misses circles, or else fits worse."""
     return -result.pose.freedom, result.pose.misfit
 
 

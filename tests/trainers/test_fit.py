@@ -99,9 +99,13 @@ def test_a_key_press_that_reaches_all_processes_leaves_a_checkpoint(data_set, tm
         [sys.executable, "-c", TRAINING, str(data_set), str(tmp_path)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    assert running.stdout.readline() == "1\n"
-    os.killpg(running.pid, signal.SIGINT)
-    _, told = running.communicate(timeout=60)
+    try:
+        assert running.stdout.readline() == "1\n"
+        os.killpg(running.pid, signal.SIGINT)
+        _, told = running.communicate(timeout=60)
+    finally:
+        if running.poll() is None:
+            os.killpg(running.pid, signal.SIGKILL)
     assert "KeyboardInterrupt" in told and (tmp_path / fit.CHECKPOINT).is_file(), told
 
 

@@ -60,7 +60,7 @@ class PairedPoints:
         self._dimension = 0
 
     def split(self, count: int) -> Iterator["PairedPoints"]:
-        """As many points, a power of two, of a set that is larger by as much; independent of this one's."""
+        """`count` points, a power of two, for this sample; those of all samples make one larger set, independent of this one."""
         for k in range(count):
             yield PairedPoints(self._key, self._index * count + k, count << self._bits, mi.UInt32(0))
 

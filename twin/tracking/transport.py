@@ -5,7 +5,7 @@ at that time and into the scene's, meets both, and the nearer is what it sees; i
 is exact, no world is ever rebuilt, and frames of different poses are traced in one launch.
 
 What all sources would give a point without shadows is summed up; a few shadow rays, each towards a source chosen in proportion
-to what it would give, say how much of the sum arrives. Where nothing is in shadow this has no noise at all.
+to what it would give, say how much of the sum arrives. Where nothing is in shadow there is next to no noise.
 
 A ray costs little beside what it takes to fetch a take's parameters, so each thread follows several pixels of one camera.
 """
@@ -86,7 +86,6 @@ def render(
     u, v, sets, circles = mi.Float(lanes.u), mi.Float(lanes.v), mi.UInt32(lanes.set), mi.UInt32(lanes.circle)
     firsts, counts = mi.UInt32(lanes.first), mi.UInt32(lanes.samples)
     results = [dr.zeros(mi.Float, len(lanes.u)) for _ in range(5)]
-    dr.eval(*results)
 
     def body(pixel, k, *sums):
         """Ray k of a pixel; after the last one its sums are stored, and the next pixel's begin."""
@@ -95,10 +94,11 @@ def render(
             return dr.gather(type(column), column, pixel)
 
         points = PairedPoints(its(sets), its(firsts) + k, most_samples, seeds)
-        radiance, *found = path.follow(its(u), its(v), its(circles), points)
-        values = radiance, *(dr.select(one, 1.0, 0.0) for one in found), dr.select(found[-1], radiance, 0.0)
+        radiance, aims, reaches, on_paper = path.follow(its(u), its(v), its(circles), points)
+        flags = (dr.select(one, 1.0, 0.0) for one in (aims, reaches, on_paper))
+        values = radiance, *flags, dr.select(on_paper, radiance, 0.0)
         sums = [total + value for total, value in zip(sums, values, strict=True)]
-        done = k + 1 == its(counts)
+        done = k + 1 >= its(counts)
         for result, total in zip(results, sums, strict=True):
             dr.scatter(result, total, pixel, done)
         return dr.select(done, pixel + step, pixel), dr.select(done, 0, k + 1), *(dr.select(done, 0, total) for total in sums)
@@ -118,10 +118,10 @@ def _shares(lanes: Lanes) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
     ends = np.append(starts[1:], len(lanes.u))
     steps = -(-(ends - starts) // PIXELS)
     first = np.concatenate([start + np.arange(step) for start, step in zip(starts, steps, strict=True)])
-    table = mi.UInt32(np.uint32(np.concatenate([first, np.repeat(steps, steps), np.repeat(ends, steps)])))
-    thread = dr.arange(mi.UInt32, len(first))
+    table = mi.UInt32(np.uint32(np.column_stack([first, np.repeat(steps, steps), np.repeat(ends, steps)])).ravel())
     # fetched by number: what is read in order is compiled anew for each alignment in memory, which NumPy leaves to chance
-    return tuple(dr.gather(mi.UInt32, table, thread + k * len(first)) for k in range(3))
+    thread = dr.arange(mi.UInt32, len(first))
+    return dr.gather(mi.UInt32, table, 3 * thread), *(dr.gather(mi.UInt32, table, 3 * thread + k) for k in (1, 2))
 
 
 class _Source(NamedTuple):
@@ -154,8 +154,7 @@ class _Path:
     def follow(self, u, v, circle, points: PairedPoints) -> tuple:
         """Radiance of one ray; whether it aims at the circle, reaches it, and ends on the target's paper."""
         ray, cosine = self._ray(u, v, points)
-        when = points.mirrored_square()  # with the place in the pixel mirrored too, an edge's sampling errors cancel
-        time = when.x
+        time = points.square().x - 0.5  # not mirrored: a long blur wants as many times as there are rays
         turned = self._body_ray(ray, time)
         x, y, faces = self._on_face(turned)
         aims = faces & self._within_circle(x, y, circle)
@@ -258,17 +257,18 @@ class _Path:
         return 1 + dr.dot(self.gradient, direction)
 
     def _reflected(self, place, normal, view, surface, time, points: PairedPoints) -> mi.Float:
-        """Radiance towards the viewer: what all sources give unshadowed, times the part of the shadow rays that get through."""
-        around, sources = self._sources(place, normal, view, surface, points)
-        total, through = around + sum(source.value for source in sources), mi.Float(0)
+        """Radiance towards the viewer: what all sources give unshadowed, if the shadow ray gets through to one of them."""
+        radiance = mi.Float(0)
         for light in points.split(SHADOWS):
+            around, sources = self._sources(place, normal, view, surface, light)
+            total = around + sum(source.value for source in sources)
             way, weight = self._towards_one(around, sources, light.square().x * total, normal, light.square())
             blocked = self._blocked(place + normal * LIFT_MM, way, time, total > 0)
-            through += dr.select(blocked, 0, weight)
-        return total * through / SHADOWS
+            radiance += dr.select(blocked, 0, total * weight)
+        return radiance / SHADOWS
 
     def _sources(self, place, normal, view, surface, points: PairedPoints) -> tuple[mi.Float, list["_Source"]]:
-        """What comes by the light from around, and by each lamp and the projector, without shadows."""
+        """What comes by the light from around, and by a point of each lamp and the projector, without shadows."""
         around = surface[0] * self.ambient * self._share_from(2 / 3 * normal)  # mean of all directions by their cosines
         ball = mi.Vector3f(mi.warp.square_to_uniform_sphere(points.square()))
         sources = []
@@ -281,9 +281,15 @@ class _Path:
         return around, sources
 
     def _towards_one(self, around, sources: Sequence["_Source"], pick, normal, where) -> tuple[mi.Vector3f, mi.Float]:
-        """The way to the source in whose share `pick` falls, or in some direction; and the light from there over its mean."""
-        any_way = mi.Vector3f(mi.Frame3f(mi.Normal3f(normal)).to_world(mi.warp.square_to_cosine_hemisphere(where)))
-        way, weight = any_way * ROOM_MM, self._share_from(any_way) / self._share_from(2 / 3 * normal)
+        """The way to the source in whose share `pick` falls, or in any direction; and what comes from there, over the mean.
+
+        A direction is turned over about the normal as often as makes it as likely as it is bright.
+        """
+        straight = mi.Vector3f(mi.Frame3f(mi.Normal3f(normal)).to_world(mi.warp.square_to_cosine_hemisphere(where)))
+        opposite = 2 * dr.dot(normal, straight) * normal - straight
+        here, there = self._share_from(straight), self._share_from(opposite)
+        way = dr.select(pick * (here + there) < around * (there - here), opposite, straight) * ROOM_MM
+        weight = (here + there) / (2 * self._share_from(2 / 3 * normal))
         for source in sources:
             chosen = (pick >= around) & (source.value > 0)
             way, weight = dr.select(chosen, source.way, way), dr.select(chosen, 1, weight)

@@ -146,8 +146,8 @@ def test_light_of_several_sources_adds_up_in_their_shadows(bank):
     names = "lamp", "around", "projector"
     tiles = np.ravel_multi_index(np.indices(u.shape) // 6, np.array(u.shape) // 6 + 1).ravel()
     whole, *parts = (
-        np.array([np.bincount(tiles, light_of(bank, lit_by(take, *sources), 0, u, v, seed=k).radiance) for k in range(4)])
-        for sources in (names, *((name,) for name in names))
+        np.array([np.bincount(tiles, light_of(bank, lit_by(take, *sources), 0, u, v, seed=4 * j + k).radiance) for k in range(4)])
+        for j, sources in enumerate((names, *((name,) for name in names)))
     )
     missing = whole.mean(axis=0) - sum(part.mean(axis=0) for part in parts)
     variance = sum(one.var(axis=0, ddof=1) for one in (whole, *parts)) / 4
@@ -157,13 +157,27 @@ def test_light_of_several_sources_adds_up_in_their_shadows(bank):
 
 
 def test_uneven_light_comes_from_where_it_is():
-    """Of light 1 + g x over a place that faces z, 1/2 + 2 g / (3 pi) comes from x > 0: directions are drawn by their cosines."""
-    g, count = 0.6, 1 << 16
+    """Of light 1 + g x + h z over a place that faces z, weighted by cosines, 1/2 + 2 g / (3 pi) + h / 3 comes from x > 0, and
+    1 + 2 h / 3 on the whole."""
+    g, h, count = 0.6, 0.4, 1 << 16
     path = _Path.__new__(_Path)
-    path.gradient = mi.Vector3f(g, 0, 0)
+    path.gradient = mi.Vector3f(g, 0, h)
     where = sobol_pair(dr.arange(mi.UInt32, count), 16, mi.UInt32(1))
-    way, light = path._towards_one(mi.Float(1), [], mi.Float(0), mi.Vector3f(0, 0, 1), where)
-    assert dr.mean(dr.select(way.x > 0, light, 0))[0] == pytest.approx(0.5 + 2 * g / (3 * np.pi), abs=1e-3)
+    expected = (0.5 + 2 * g / (3 * np.pi) + h / 3) / (1 + 2 * h / 3)
+    pick = sobol_pair(dr.arange(mi.UInt32, count), 16, mi.UInt32(2)).x
+    way, light = path._towards_one(mi.Float(1), [], pick, mi.Vector3f(0, 0, 1), where)
+    assert dr.mean(dr.select(way.x > 0, light, 0))[0] == pytest.approx(expected, abs=1e-3)
+    assert dr.mean(light)[0] == pytest.approx(1, abs=1e-3)
+
+
+def test_launches_of_any_size_are_one_kernel(bank):
+    """A renderer that is compiled anew for each window would be three times as slow."""
+    take, hashes = plain_take(facing()), set()
+    for count in (100, 160, 1007):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            light_of(bank, take, 0, np.linspace(0, 1279, count), np.linspace(0, 1023, count), 4)
+            hashes |= {kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT}
+    assert len(hashes) == 1
 
 
 def test_projected_fringes_stand_where_the_projector_puts_them(bank):
