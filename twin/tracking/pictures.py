@@ -105,7 +105,7 @@ class Sketch:
     """A camera image of which only what matters is rendered: the pixels that make its view, and one window in full.
 
     Shrunk to a view it is what the full image would be; the window is the full image's; all else repeats the pixels rendered
-    next to it. For tests of a tracker that looks at the view and then at windows about the target, at a tenth of the cost.
+    next to it. For tests of a tracker that looks at the view and then at windows about the target, at a fraction of the cost.
     """
 
     view: View

@@ -4,8 +4,8 @@ Body and scene are two worlds of the ray tracer. Each ray has its own time withi
 at that time and into the scene's, meets both, and the nearer is what it sees; its shadow is tested in both. So the blur of motion
 is exact, no world is ever rebuilt, and frames of different poses are traced in one launch.
 
-What all sources would give a point without shadows is summed up; a few shadow rays, each towards a source chosen in proportion
-to what it would give, say how much of the sum arrives. Where nothing is in shadow there is next to no noise.
+Each of a ray's few shadow rays stands for all sources: what they would give without shadows is summed up, and counts if the one
+that is followed is seen, chosen in proportion to what it would give. Where nothing is in shadow there is next to no noise.
 
 A ray costs little beside what it takes to fetch a take's parameters, so each thread follows several pixels of one camera.
 """
@@ -257,7 +257,7 @@ class _Path:
         return 1 + dr.dot(self.gradient, direction)
 
     def _reflected(self, place, normal, view, surface, time, points: PairedPoints) -> mi.Float:
-        """Radiance towards the viewer: what all sources give unshadowed, if the shadow ray gets through to one of them."""
+        """Radiance towards the viewer: of all sources without shadows, if one of them is seen; mean of the shadow rays."""
         radiance = mi.Float(0)
         for light in points.split(SHADOWS):
             around, sources = self._sources(place, normal, view, surface, light)

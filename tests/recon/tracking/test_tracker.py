@@ -165,6 +165,14 @@ def test_a_camera_that_was_moved_is_told_from_one_that_sees_nothing(cameras, rig
     assert not found.found and "moved" in str(found.pose.reason)
 
 
+def test_of_two_poses_the_one_of_more_circles_is_taken_then_the_better_fit(tracker, pair):
+    found = tracker.step(*pair)
+    worse = replace(found, pose=replace(found.pose, misfit=found.pose.misfit + 1))
+    fewer = replace(found, pose=replace(found.pose, misfit=0.0, freedom=found.pose.freedom - 2))
+    for order in ([worse, fewer, found], [found, fewer, worse]):
+        assert min(order, key=tracking._rank) is found
+
+
 def test_circles_that_one_view_shows_are_looked_at_once(cameras, rig, pair):
     """Whatever names they may have."""
     told = Told([centres(cameras[0], FACING, rig.target), []], names=(3, 3, 3))
