@@ -103,8 +103,9 @@ def test_a_known_shape_steadies_a_rim_of_which_half_is_covered(cameras, rig, rng
     assert np.mean(np.array(squared) < chi2.ppf(0.95, 2)) > 0.85
 
 
-def test_shapes_of_the_others_keep_a_covered_rim_from_going_astray(cameras, rig, rng, monkeypatch):
-    """With what is known of them in the tracker, 3.5 %: in the dark and half covered, the worst tenth of centres is better."""
+def test_shapes_of_the_others_are_not_trusted_too_far(cameras, rig, rng, monkeypatch):
+    """Perspective takes them from the covered one's: trusted to 3.5 %, more rims are found, and as exactly; to 1 % it would bend
+    them."""
     errors = {covered.SHAPE: [], 1e6: []}
     for _ in range(40):
         place = drawings.facing(rng, 25.0)
@@ -112,12 +113,13 @@ def test_shapes_of_the_others_keep_a_covered_rim_from_going_astray(cameras, rig,
         image = halved(drawings.frame(cameras[0], [place], rig.target, 6.0, rng), true[[1]], 3.5, rng)
         rims = outlines.measure(image, true, 3.0, rig.target)
         rims = replace(rims, reasons=(rims.reasons[0], "covered", rims.reasons[2]))
-        for known, found in errors.items():
+        for known, off in errors.items():
             monkeypatch.setattr(covered, "SHAPE", known)
-            centre = covered.completed(image, rims, rig.target).ellipses.centre[1]
-            found.append(np.linalg.norm(centre - true.centre[1]))
-    with_them, without = (np.quantile(found, 0.9) for found in errors.values())
-    assert 1.2 * with_them < without
+            again = covered.completed(image, rims, rig.target)
+            off.append(np.linalg.norm(again.ellipses.centre[1] - true.centre[1]) if again.found[1] else np.nan)
+    trusted, free = (np.array(off) for off in errors.values())
+    assert np.isfinite(trusted).sum() >= max(np.isfinite(free).sum(), 38)
+    assert np.nanmedian(trusted) < 1.3 * np.nanmedian(free)
 
 
 def test_one_camera_alone_is_not_enough_for_a_rim_of_which_half_is_covered(cameras, rig, rng):
