@@ -103,13 +103,13 @@ def render(
             dr.scatter(result, total, pixel, done)
         return dr.select(done, pixel + step, pixel), dr.select(done, 0, k + 1), *(dr.select(done, 0, total) for total in sums)
 
-    state = (mi.UInt32(first), mi.UInt32(0), *(mi.Float(0) for _ in results))
+    state = (first, mi.UInt32(0), *(mi.Float(0) for _ in results))
     dr.while_loop(state, lambda pixel, *_: pixel < end, body, label="rays")
     radiance, disc, seen, white, white_radiance = (np.array(result) for result in results)
     return Light(radiance / lanes.samples, disc, seen, white, white_radiance)
 
 
-def _shares(lanes: Lanes) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+def _shares(lanes: Lanes) -> mi.Vector3u:
     """Which pixels each thread of the launch follows one after the other: the first, the step to the next, and the end.
 
     A thread keeps to one camera of one take, whose parameters it fetches once; neighbours have neighbouring pixels at a time.
@@ -120,8 +120,7 @@ def _shares(lanes: Lanes) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
     first = np.concatenate([start + np.arange(step) for start, step in zip(starts, steps, strict=True)])
     table = mi.UInt32(np.uint32(np.column_stack([first, np.repeat(steps, steps), np.repeat(ends, steps)])).ravel())
     # fetched by number: what is read in order is compiled anew for each alignment in memory, which NumPy leaves to chance
-    thread = dr.arange(mi.UInt32, len(first))
-    return dr.gather(mi.UInt32, table, 3 * thread), *(dr.gather(mi.UInt32, table, 3 * thread + k) for k in (1, 2))
+    return dr.gather(mi.Vector3u, table, dr.arange(mi.UInt32, len(first)))
 
 
 class _Source(NamedTuple):
