@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from recon.ellipses import Ellipses, joined
 from recon.rig import Target
 from recon.tracking import rims
-from recon.tracking.sectors import SECTORS
 
 Array = NDArray[np.float64]
 
@@ -27,6 +26,9 @@ FULL_DN = 255.0  # the end of the scale, see `frames.grey`
 WHOLE = 0.85  # of the rim: what is seen less of may be something else's edge
 SMEARED = 0.4  # of the semi-axis: a longer path is not as even as the model has it
 EXCEEDED = 2.0  # by which variances grow where the path is longer, or white is clipped; so measured on rendered frames
+SKEWED = 0.03  # of the path, by which clipped white moves a centre, one standard deviation; so measured, too
+UNEVEN = 0.05  # of the contrast: where white differs so from sector to sector it isn't even within one
+BENT_PX = 0.1  # times that share: by how much a centre is off for it, one standard deviation
 LARGEST_BLUR = 0.35  # of the ring's width; beyond that its dark ring is gone
 
 
@@ -42,7 +44,7 @@ class Outlines:
     noise: Array  # (n,) DN, a pixel's, the larger of both sides
     motion: Array  # (n, 2) px, path over the exposure, up to its sign
     seen: Array  # (n,) share of the rim that looks like one
-    doubtful: NDArray[np.bool_]  # (n,) covered in part, clipped or smeared: may be off by more than covariances say
+    doubtful: NDArray[np.bool_]  # (n,) covered in part, clipped, unevenly lit or smeared: may be off by more than covariances say
     reasons: tuple[str | None, ...]  # why it is no ring
 
     @property
@@ -130,17 +132,18 @@ def _hole(target: Target) -> float:
 def _judged(rows: Array, target: Target, middles: bool) -> Outlines:
     hole = _hole(target)
     shape = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-    inside, outside, middle = rows[:, rims.LEVELS], rows[:, rims.LEVELS + 3], rows[:, rims.MIDDLE]
+    inside, outside, middle = rows[:, rims.INSIDE], rows[:, rims.OUTSIDE], rows[:, rims.MIDDLE]
     noise, seen = rows[:, rims.NOISE : rims.NOISE + 2].max(axis=1, initial=0), rows[:, rims.SEEN]
-    chance = 1 + 3 * np.sqrt(2 / (SECTORS * np.maximum(seen, 0.1)))
-    excess = np.maximum(rows[:, rims.EXCESS] / chance, 1)
+    excess = np.maximum(rows[:, rims.EXCESS], 1)
     covariance = rows[:, rims.COVARIANCE : rims.COVARIANCE + 25].reshape(-1, 5, 5)[:, :2, :2] * excess[:, None, None]
     covariance = covariance / np.maximum(seen, 0.1)[:, None, None] ** COVERED + FLOOR_PX**2 * np.eye(2)
     v0, v1, v2 = rows[:, rims.VARIANCE : rims.VARIANCE + 3].T
     path, direction = np.sqrt(24 * np.hypot(v1, v2)), np.arctan2(v2, v1) / 2
     semi = np.trace(shape, axis1=1, axis2=2) / 2
-    beyond = (outside + noise > FULL_DN) | (path > SMEARED * semi)
+    clipped, uneven = outside + noise > FULL_DN, rows[:, rims.UNEVEN] / (outside - inside)
+    beyond = clipped | (path > SMEARED * semi)
     covariance[beyond] *= EXCEEDED
+    covariance += ((BENT_PX * uneven) ** 2 + clipped * (SKEWED * path) ** 2)[:, None, None] * np.eye(2)
     motion = path[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
     reasons: list[str | None] = []
     for i in range(len(rows)):
@@ -159,7 +162,7 @@ def _judged(rows: Array, target: Target, middles: bool) -> Outlines:
             reasons.append(f"an uncertainty of {np.sqrt(np.trace(covariance[i])):.1f} px")
         else:
             reasons.append(None)
-    doubtful = beyond | (seen < WHOLE)
+    doubtful = beyond | (uneven > UNEVEN) | (seen < WHOLE)
     return Outlines(
         Ellipses(rows[:, :2], shape), covariance, inside, outside, middle, noise, motion, seen, doubtful, tuple(reasons)
     )

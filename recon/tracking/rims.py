@@ -1,14 +1,15 @@
 """The fit of a ring's outer rim to the pixels beside it, compiled.
 
-The band of pixels about the rim is modelled as the image of an elliptical edge: dark inside, bright outside, each side a plane,
-blurred by the lens (Gaussian) and by motion (a box along one direction), which together are three numbers, the variance of the
-profile across the edge as it turns with the normal: `V = v0 + v1 cos 2phi + v2 sin 2phi`. Motion by b px along psi makes the
-profile a box of width `b |cos(phi - psi)|`; along the edge it pulls the rim inwards by `curvature (b sin(phi - psi))^2 / 24`. The
-white middle is part of the model as far as it blurs into the band.
+The band of pixels about the rim is modelled as the image of an elliptical edge: dark inside, bright outside, each side a plane
+and what `own_levels` adds to it, blurred by the lens (Gaussian) and by motion (a box along one direction), which together are
+three numbers, the variance of the profile across the edge as it turns with the normal: `V = v0 + v1 cos 2phi + v2 sin 2phi`.
+Motion by b px along psi makes the profile a box of width `b |cos(phi - psi)|`; along the edge it pulls the rim inwards by
+`curvature (b sin(phi - psi))^2 / 24`. The white middle is part of the model as far as it blurs into the band.
 
-Fourteen parameters, Gauss-Newton. The pixels of a sector share their derivatives but for four (where the edge lies, both levels,
-the variance), so sums of four unknowns a sector are all that the loop over pixels makes. Sectors that look otherwise (a finger,
-a cable, the image's border) lose their weight. The noise is told from the residuals, apart for the dark and the bright side.
+Fourteen parameters, Gauss-Newton. The pixels of a sector share their derivatives but for five (where the edge lies, both levels,
+the variance, how light grows), so sums of five unknowns a sector are all that the loop over pixels makes. Sectors that look
+otherwise (a finger, a cable, the image's border) lose their weight. The noise is told from the residuals, apart for the dark and
+the bright side.
 """
 
 import math
@@ -16,22 +17,34 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from recon.tracking import own_levels
 from recon.tracking.cholesky import solve_and_invert
 from recon.tracking.edge_profile import blurred_step
+from recon.tracking.own_levels import COMMON, NONE, REDUCED
 from recon.tracking.sectors import (
     BLUR,
     BOX,
+    BRIGHT,
+    BRIGHT2,
+    BRIGHT_SQUARES,
     COS,
     COUNT,
+    DARK,
+    DARK2,
+    DARK_SQUARES,
+    GROWTH,
     INNER,
+    LEANING,
     LEAST_SECTORS,
     LEAST_VARIANCE,
     LOCAL,
+    MIXED,
     NX,
     NY,
     OUTER,
     OUTERMOST,
     PULL,
+    RIGHT,
     ROUNDING,
     SCATTER,
     SECTORS,
@@ -52,6 +65,7 @@ STARTS = (0, 5, 8, 11, 14)  # of the parameters of offset, inside, outside, vari
 GLOBAL = 14  # centre (2), shape (3), planes inside (3) and outside (3), variance (3)
 CAPTURE_STEPS = 8  # on every second pixel of every second row, from a rough ellipse
 STEPS = 8  # on all pixels
+TOLD = 3  # steps after which spreads stay as they are, so that the rest may settle
 CAPTURED = 0.1  # px
 SETTLED = 4e-3  # px; the step after that is a tenth of it
 RESTLESS = 0.2  # px of the last step: a fit that still moves so has found nothing
@@ -59,8 +73,8 @@ FAST = {"reassoc", "contract", "arcp", "nsz"}  # all but what is not finite
 FEWEST = 4  # pixels of a sector that count
 
 # what a fit returns, by column
-CENTRE, SHAPE, COVARIANCE, LEVELS, NOISE, VARIANCE, SEEN, EXCESS, MIDDLE, FAILED = 0, 2, 5, 30, 36, 38, 41, 42, 43, 44
-COLUMNS = 45
+CENTRE, SHAPE, COVARIANCE, INSIDE, OUTSIDE, NOISE, VARIANCE, SEEN = 0, 2, 5, 30, 31, 32, 34, 37
+EXCESS, MIDDLE, FAILED, UNEVEN, COLUMNS = 38, 39, 40, 41, 42
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -87,18 +101,24 @@ def _fit(image, centre, shape, reach, known, hole, result):
     planes, noise, weights = np.zeros(6), np.ones(2), np.ones(SECTORS)
     if not _first_levels(image, ellipse, variance, reach, hole, planes, noise):
         return
-    sums, inverse = np.zeros((SECTORS, LOCAL)), np.zeros((GLOBAL, GLOBAL))
+    own, spread = own_levels.nothing(), np.full(3, NONE)
+    sums, reduced, follow = np.zeros((SECTORS, LOCAL)), np.zeros((SECTORS, REDUCED)), np.zeros((SECTORS, 3, COMMON + 1))
+    step, inverse, slopes = np.zeros(GLOBAL), np.zeros((GLOBAL, GLOBAL)), np.ones((SECTORS, GLOBAL))
     moved = np.inf
     for capture in (True, False):
         stride = 2 if capture and ellipse[2] + ellipse[4] > 40 else 1
-        for _ in range(CAPTURE_STEPS if capture else STEPS):
+        for k in range(CAPTURE_STEPS if capture else STEPS):
             sectors = geometry(ellipse, variance, reach if capture else 0.0, hole)
-            _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums)
-            if not judge(sums, sectors, planes, weights, noise, capture, FEWEST if stride == 1 else 1):
+            _add_up(image, ellipse, planes, own, noise, sectors, stride, hole, sums)
+            if not judge(sums, sectors, planes, own, weights, noise, capture, FEWEST if stride == 1 else 1):
                 return
-            step = np.zeros(GLOBAL)
-            if not _solve(sums, weights, sectors, planes, before - ellipse, known, step, inverse):
+            if not capture and k < TOLD:
+                own_levels.tell_spread(sums, own, weights, math.pi * (ellipse[2] + ellipse[4]) / SECTORS, spread)
+            own_levels.eliminate(sums, own, spread, reduced, follow)
+            _slopes(sectors, slopes)
+            if not _solve(reduced, weights, slopes, planes, before - ellipse, known, step, inverse):
                 return
+            own_levels.move(own, follow, _by_sector(slopes, step), weights)
             _move(ellipse, planes, variance, step, reach)
             if not _sound(ellipse, image.shape):
                 return
@@ -110,17 +130,18 @@ def _fit(image, centre, shape, reach, known, hole, result):
     freedom = max(weights.sum() - 6, 1.0)
     scores = 0.0
     for j in range(SECTORS):
-        if sums[j, 0] > 0:
-            scores += weights[j] * sums[j, 10] ** 2 / sums[j, 0]
+        if reduced[j, 0] > 0:
+            scores += weights[j] * reduced[j, 10] ** 2 / reduced[j, 0]
     result[CENTRE : CENTRE + 5] = ellipse
     result[COVARIANCE : COVARIANCE + 25] = inverse[:5, :5].copy().ravel()
-    result[LEVELS : LEVELS + 6] = planes
+    result[INSIDE], result[OUTSIDE] = planes[0], planes[3]
     result[NOISE : NOISE + 2] = np.sqrt(noise)
     result[VARIANCE : VARIANCE + 3] = variance
     result[SEEN] = (weights > 0.5).sum() / SECTORS
     result[EXCESS] = scores / freedom
     result[MIDDLE] = _middle(image, ellipse, hole)
     result[FAILED] = 0
+    result[UNEVEN] = spread[1]
 
 
 @njit(cache=True, error_model="numpy")
@@ -143,13 +164,13 @@ def _window(ellipse, beyond, size):
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums):
+def _add_up(image, ellipse, planes, own, noise, sectors, stride, hole, sums):
     """Fill the sums of all sectors: measured less modelled, and the model's slopes."""
     sums[:] = 0
     a, b, c = ellipse[2], ellipse[3], ellipse[4]
     determinant = a * c - b * b
     ia, ib, ic = c / determinant, -b / determinant, a / determinant
-    radius = (a + c) / 2
+    radius, ratio = (a + c) / 2, planes[0] / max(planes[3], 1.0)  # of light on ink and on paper
     shortest = radius - math.hypot((a - c) / 2, b)
     lowest = max(1 - sectors[:, INNER].max() * 1.2 / shortest, 1 - 0.85 * (1 - hole)) ** 2
     highest = min(1 + sectors[:, OUTER].max() * 1.2 / shortest, 1 + OUTERMOST)
@@ -177,7 +198,8 @@ def _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums):
                 continue
             away = math.sqrt(square)
             p, q = p / away, q / away
-            j = sector(p, q)
+            at = sector(p, q)
+            j = int(at)
             sx, sy = ia * p + ib * q, ib * p + ic * q
             slope2 = sx * sx + sy * sy
             slope = math.sqrt(slope2)
@@ -194,66 +216,93 @@ def _add_up(image, ellipse, planes, noise, sectors, stride, hole, sums):
             if hole > 0 and within * within < 16 * wide + sectors[j, BOX] ** 2 / 4:
                 bright += 1 - blurred_step(within, sectors[j, BOX], sectors[j, BLUR], wide)[0]
             xr, yr = x / radius, y / radius
-            inside, outside = planes[0] + planes[1] * xr + planes[2] * yr, planes[3] + planes[4] * xr + planes[5] * yr
+            inside = planes[0] + planes[1] * xr + planes[2] * yr + own[j, DARK]
+            outside = planes[3] + planes[4] * xr + planes[5] * yr + own[j, BRIGHT]
             step = outside - inside
-            bent = wide * peak * ((planes[4] - planes[1]) * sectors[j, NX] + (planes[5] - planes[2]) * sectors[j, NY]) / radius
-            residual = image[v, u] - inside - step * bright - bent
-            expected = noise[0] + (noise[1] - noise[0]) * min(bright, 1.0)
+            bent = wide * peak  # by which light that grows is more, blurred with the edge
+            even = ratio + (1 - ratio) * bright
+            growth = distance * even + bent * (1 - ratio)
+            residual = image[v, u] - inside - step * bright - own[j, GROWTH] * growth - own[j, LEANING] * (at - j - 0.5) * even
+            residual -= bent * ((planes[4] - planes[1]) * sectors[j, NX] + (planes[5] - planes[2]) * sectors[j, NY]) / radius
+            share = min(bright, 1.0)
+            expected = noise[0] + (noise[1] - noise[0]) * share
             squared = residual * residual
             robust = 1 / (1 + squared / (SCATTER * SCATTER * expected)) ** 2
             w = robust / expected
-            c0, c1, c2 = -step * peak, 1 - bright, bright
+            c0, c1, c2, c4 = -step * peak, 1 - bright, bright, growth
             c3 = c0 * distance / (2 * wide)
             row = sums[j]
             row[0] += w * c0 * c0
             row[1] += w * c0 * c1
             row[2] += w * c0 * c2
             row[3] += w * c0 * c3
-            row[4] += w * c1 * c1
-            row[5] += w * c1 * c2
-            row[6] += w * c1 * c3
-            row[7] += w * c2 * c2
-            row[8] += w * c2 * c3
-            row[9] += w * c3 * c3
-            row[10] += w * c0 * residual
-            row[11] += w * c1 * residual
-            row[12] += w * c2 * residual
-            row[13] += w * c3 * residual
+            row[4] += w * c0 * c4
+            row[5] += w * c1 * c1
+            row[6] += w * c1 * c2
+            row[7] += w * c1 * c3
+            row[8] += w * c1 * c4
+            row[9] += w * c2 * c2
+            row[10] += w * c2 * c3
+            row[11] += w * c2 * c4
+            row[12] += w * c3 * c3
+            row[13] += w * c3 * c4
+            row[14] += w * c4 * c4
+            row[RIGHT] += w * c0 * residual
+            row[RIGHT + 1] += w * c1 * residual
+            row[RIGHT + 2] += w * c2 * residual
+            row[RIGHT + 3] += w * c3 * residual
+            row[RIGHT + 4] += w * c4 * residual
             row[SQUARES] += w * squared
             row[COUNT] += robust
-            row[16] += robust * c1 * c1
-            row[17] += robust * c1 * c2
-            row[18] += robust * c2 * c2
-            row[19] += robust * c1 * squared
-            row[20] += robust * c2 * squared
+            row[DARK2] += robust * (1 - share) * (1 - share)
+            row[MIXED] += robust * (1 - share) * share
+            row[BRIGHT2] += robust * share * share
+            row[DARK_SQUARES] += robust * (1 - share) * squared
+            row[BRIGHT_SQUARES] += robust * share * squared
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(sums, weights, sectors, planes, back, sigma, step, inverse):
+def _slopes(sectors, slopes):
+    """How each sector's edge, levels and variance follow the parameters : (SECTORS, GLOBAL), in the order of STARTS."""
+    for j in range(SECTORS):
+        ux, uy, nx, ny = sectors[j, UX], sectors[j, UY], sectors[j, NX], sectors[j, NY]
+        slopes[j, 0], slopes[j, 1], slopes[j, 2], slopes[j, 3], slopes[j, 4] = nx, ny, nx * ux, nx * uy + ny * ux, ny * uy
+        slopes[j, 6], slopes[j, 7] = sectors[j, X], sectors[j, Y]
+        slopes[j, 9], slopes[j, 10] = sectors[j, X], sectors[j, Y]
+        slopes[j, 12], slopes[j, 13] = sectors[j, COS], sectors[j, SIN]
+
+
+@njit(cache=True, error_model="numpy")
+def _by_sector(slopes, step):
+    """A step of the parameters as each sector sees it : (SECTORS, COMMON)."""
+    steps = np.zeros((SECTORS, COMMON))
+    for m in range(COMMON):
+        for p in range(STARTS[m], STARTS[m + 1]):
+            steps[:, m] += slopes[:, p] * step[p]
+    return steps
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(reduced, weights, slopes, planes, back, sigma, step, inverse):
     """The step : (14,) and the inverse of the normal matrix : (14, 14); False if they are undetermined.
 
     `back` : (5,) px is the way to the ellipse as it was before, `sigma` the standard deviation that its shape is known with.
     """
     normal, right = np.zeros((GLOBAL, GLOBAL)), np.zeros(GLOBAL)
-    slopes = np.ones(GLOBAL)
     for j in range(SECTORS):
         if weights[j] < 1e-6:
             continue
-        ux, uy, nx, ny = sectors[j, UX], sectors[j, UY], sectors[j, NX], sectors[j, NY]
-        slopes[0], slopes[1], slopes[2], slopes[3], slopes[4] = nx, ny, nx * ux, nx * uy + ny * ux, ny * uy
-        slopes[6], slopes[7] = sectors[j, X], sectors[j, Y]
-        slopes[9], slopes[10] = sectors[j, X], sectors[j, Y]
-        slopes[12], slopes[13] = sectors[j, COS], sectors[j, SIN]
         k = 0
-        for m in range(4):
-            for n in range(m, 4):
-                known = weights[j] * sums[j, k]
+        for m in range(COMMON):
+            for n in range(m, COMMON):
+                known = weights[j] * reduced[j, k]
                 k += 1
                 for p in range(STARTS[m], STARTS[m + 1]):
                     for q in range(max(STARTS[n], p), STARTS[n + 1]):
-                        normal[p, q] += known * slopes[p] * slopes[q]
+                        normal[p, q] += known * slopes[j, p] * slopes[j, q]
+        for m in range(COMMON):
             for p in range(STARTS[m], STARTS[m + 1]):
-                right[p] += weights[j] * sums[j, 10 + m] * slopes[p]
+                right[p] += weights[j] * reduced[j, k + m] * slopes[j, p]
     for p in range(GLOBAL):
         for q in range(p):
             normal[p, q] = normal[q, p]
@@ -300,7 +349,7 @@ def _first_levels(image, ellipse, variance, reach, hole, planes, noise):
             away = math.sqrt(p * p + q * q)
             if away < hole or away > 1 + OUTERMOST:
                 continue
-            j = sector(p, q)
+            j = int(sector(p, q))
             distance = (away - 1) * away / math.hypot(ia * p + ib * q, ib * p + ic * q)
             if -sectors[j, INNER] < distance < -0.35 * sectors[j, INNER]:
                 totals[j, 0] += 1

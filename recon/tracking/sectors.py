@@ -17,8 +17,13 @@ ROUNDING = 1 / 12  # DN^2
 
 # of a sector, by column
 UX, UY, NX, NY, WIDE, BOX, BLUR, PULL, INNER, OUTER, COS, SIN, X, Y = range(14)
-# sums of a sector: the upper triangle of 4x4 and the right side, squares, count, and five for the noise
-SQUARES, COUNT, LOCAL = 14, 15, 21
+# a sector's own levels: by how much it is off the planes inside and outside (DN), how light grows outwards there (DN/px), and how
+# it leans along the rim (DN)
+DARK, BRIGHT, GROWTH, LEANING, OWN = range(5)
+# sums of a sector: the upper triangle of 5x5 for edge, dark, bright, variance, growth, then the right side, squares, count, and
+# five for the noise
+UNKNOWNS, RIGHT = 5, 15
+SQUARES, COUNT, DARK2, MIXED, BRIGHT2, DARK_SQUARES, BRIGHT_SQUARES, LOCAL = range(20, 28)
 
 
 @njit(cache=True, error_model="numpy")
@@ -61,13 +66,13 @@ def geometry(ellipse, variance, reach, hole):
 
 @njit(cache=True, inline="always", error_model="numpy")
 def sector(x, y):
-    """Number of the sector of a direction."""
+    """Number of the sector of a direction, and how far into it, as one number."""
     total = abs(x) + abs(y)
     if x >= 0:
         at = y / total if y >= 0 else 3 + x / total
     else:
         at = 1 - x / total if y >= 0 else 2 - y / total
-    return min(int(at * (SECTORS / 4)), SECTORS - 1)
+    return min(at * (SECTORS / 4), SECTORS - 1e-9)
 
 
 @njit(cache=True, error_model="numpy")
@@ -78,27 +83,31 @@ def steep(dark, bright, seen):
 
 
 @njit(cache=True, error_model="numpy")
-def _levels(sums, sectors, planes):
-    """What each sector's pixels alone say of the dark and the bright side : two of (SECTORS,) DN."""
-    dark = planes[0] + planes[1] * sectors[:, X] + planes[2] * sectors[:, Y]
-    bright = planes[3] + planes[4] * sectors[:, X] + planes[5] * sectors[:, Y]
+def alone(sums):
+    """What each sector's pixels alone say, where its edge stays: steps of its dark and its bright level, DN, and their variances.
+
+    Two of (SECTORS, 2); 0 of one without pixels on both sides.
+    """
+    free, variance = np.zeros((SECTORS, 2)), np.zeros((SECTORS, 2))
     for j in range(SECTORS):
-        a, b, c, p, q = sums[j, 4] * 1.001, sums[j, 5], sums[j, 7] * 1.001, sums[j, 11], sums[j, 12]
+        a, b, c, p, q = sums[j, 5] * 1.001, sums[j, 6], sums[j, 9] * 1.001, sums[j, RIGHT + 1], sums[j, RIGHT + 2]
         determinant = a * c - b * b
         if determinant > 0:
-            dark[j] += (c * p - b * q) / determinant
-            bright[j] += (a * q - b * p) / determinant
-    return dark, bright
+            free[j, DARK], free[j, BRIGHT] = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+            variance[j, DARK], variance[j, BRIGHT] = c / determinant, a / determinant
+    return free, variance
 
 
 @njit(cache=True, error_model="numpy")
-def judge(sums, sectors, planes, weights, noise, capture, fewest):
+def judge(sums, sectors, planes, own, weights, noise, capture, fewest):
     """Weigh the sectors by how well they fit and follow the noise; False if too little of the rim is in the image."""
     seen = sums[:, COUNT] >= fewest
     if seen.sum() < LEAST_SECTORS:
         return False
     mean = sums[:, SQUARES] / np.maximum(sums[:, COUNT], 1e-9)
-    dark, bright = _levels(sums, sectors, planes)
+    free, _ = alone(sums)
+    dark = planes[0] + planes[1] * sectors[:, X] + planes[2] * sectors[:, Y] + own[:, DARK] + free[:, DARK]
+    bright = planes[3] + planes[4] * sectors[:, X] + planes[5] * sectors[:, Y] + own[:, BRIGHT] + free[:, BRIGHT]
     likely = steep(dark, bright, seen)
     if likely.sum() < LEAST_SECTORS:
         return False
@@ -110,8 +119,8 @@ def judge(sums, sectors, planes, weights, noise, capture, fewest):
     if capture:
         noise[:] = np.maximum(noise.mean() * usual, ROUNDING)
         return True
-    a, b, c = (weights * sums[:, 16]).sum(), (weights * sums[:, 17]).sum(), (weights * sums[:, 18]).sum()
-    p, q = (weights * sums[:, 19]).sum() / KEPT, (weights * sums[:, 20]).sum() / KEPT
+    a, b, c = (weights * sums[:, DARK2]).sum(), (weights * sums[:, MIXED]).sum(), (weights * sums[:, BRIGHT2]).sum()
+    p, q = (weights * sums[:, DARK_SQUARES]).sum() / KEPT, (weights * sums[:, BRIGHT_SQUARES]).sum() / KEPT
     determinant = a * c - b * b
     if determinant > 1e-6 * a * c:
         noise[0], noise[1] = (c * p - b * q) / determinant, (a * q - b * p) / determinant

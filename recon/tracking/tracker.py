@@ -153,6 +153,8 @@ class Tracker:
             each = self._unconfirmed(seen)
             return Tracking(lost(_unseen(each)), each)
         found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target)
+        if found.found and (reason := views.lone(seen, found.used)):
+            found = lost(reason)
         if not found.found:
             both = all(view.found for view in seen)
             return Tracking(found, views.doubted(seen, found.reason) if both else self._unconfirmed(seen))

@@ -83,12 +83,24 @@ def unconfirmed(view: View, camera: Camera, target: Target) -> View:
         return view
     if not allowed(view.sighting(camera), target):
         return replace(view, reason="circles of shapes that no pose gives them")
+    little = _half_seen(view.outlines, np.ones(len(NAMES), bool))
+    return replace(view, reason=little) if little else view
+
+
+def lone(pair: tuple[View, View], used: NDArray[np.bool_]) -> str | None:
+    """Why a pose that uses (2, 3) circles isn't believed: what one camera alone tells of a circle may be another thing's edge."""
+    reasons = (_half_seen(view.outlines, mine & ~other) for view, mine, other in zip(pair, used, used[::-1], strict=True))
+    return next((reason for reason in reasons if reason), None)
+
+
+def _half_seen(outlines: Outlines, which: NDArray[np.bool_]) -> str | None:
+    """Of some of three circles : (3,), those that show too little of their rims to be believed without the other view."""
     little = [
         f"{name}: {100 * seen:.0f} % of its rim seen"
-        for name, seen in zip(NAMES, view.outlines.seen, strict=True)
-        if seen < LEAST_UNCONFIRMED
+        for name, seen, asked in zip(NAMES, outlines.seen, which, strict=True)
+        if asked and seen < LEAST_UNCONFIRMED
     ]
-    return replace(view, reason="; ".join(little) + ", by one camera only") if little else view
+    return "; ".join(little) + ", by one camera only" if little else None
 
 
 def with_told(view: View, told: Ellipses, used: NDArray[np.bool_]) -> View:

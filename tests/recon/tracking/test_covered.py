@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from recon.ellipses import Ellipses
-from recon.tracking import covered, outlines
+from recon.tracking import covered, outlines, views
 from recon.tracking.tracker import Tracker
 from tests.recon.tracking import drawings
 
@@ -145,3 +145,14 @@ def test_a_fingertip_in_a_rings_place_is_not_taken_for_it(cameras, rig, rng, lev
         frames.append(painted(drawings.frame(camera, [place], rig.target, 80.0, rng), within.reshape(u.shape), level, rng))
     found = followed(cameras, rig.target, place, frames)
     assert not any(view.found for view in found.views)
+
+
+def test_a_circle_that_one_camera_alone_tells_must_show_its_rim():
+    """Half a rim is enough where the other camera tells the circle, too, and where the pose isn't fitted to it."""
+    nothing = views.nothing("")
+    half, whole = (replace(nothing, outlines=replace(nothing.outlines, seen=np.array([s, 1.0, 1.0]))) for s in (0.5, 1.0))
+    both, first, second = (np.array([[a, True, True], [b, True, True]]) for a, b in ((True, True), (True, False), (False, True)))
+    assert views.lone((half, whole), first) == "c0: 50 % of its rim seen, by one camera only"
+    assert views.lone((whole, half), second) == "c0: 50 % of its rim seen, by one camera only"
+    for pair, used in (((half, half), both), ((half, whole), second), ((whole, half), first)):
+        assert views.lone(pair, used) is None
