@@ -140,7 +140,8 @@ def _judged(rows: Array, target: Target, middles: bool) -> Outlines:
     v0, v1, v2 = rows[:, rims.VARIANCE : rims.VARIANCE + 3].T
     path, direction = np.sqrt(24 * np.hypot(v1, v2)), np.arctan2(v2, v1) / 2
     semi = np.trace(shape, axis1=1, axis2=2) / 2
-    clipped, uneven = outside + noise > FULL_DN, rows[:, rims.UNEVEN] / (outside - inside)
+    spread = rows[:, rims.UNEVEN]
+    clipped, uneven = outside + 2 * spread + noise > FULL_DN, spread / np.maximum(outside - inside, LEAST_DN)
     beyond = clipped | (path > SMEARED * semi)
     covariance[beyond] *= EXCEEDED
     covariance += ((BENT_PX * uneven) ** 2 + clipped * (SKEWED * path) ** 2)[:, None, None] * np.eye(2)

@@ -1,9 +1,11 @@
 """What light does from sector to sector of a rim beyond a plane: fringes, the edge of a shadow, the sheen of a cable; compiled.
 
 Each sector has three levels of its own, by which it is off the planes inside and outside (DN) and by which light grows outwards
-there (DN/px). They are normal numbers of mean 0 whose spread is told by the sectors themselves, by moments [Morris 1983]: under
-even light it vanishes, and with it all that these levels cost; under fringes each sector all but stands alone. Light is taken to
-change outwards as much as along the rim. Own levels are eliminated from a sector's normal equations before the rim's are solved.
+there (DN/px). They are normal numbers of mean 0 whose spread the sectors themselves tell: under even light it vanishes, and with
+it all that these levels cost; under fringes each sector all but stands alone. Light is taken to change outwards as much as along
+the rim. Own levels are eliminated from a sector's normal equations before the rim's are solved.
+
+Source of the idea: Morris 1983, Parametric empirical Bayes inference, J. Am. Stat. Assoc. 78.
 """
 
 import math
@@ -18,7 +20,6 @@ from recon.tracking.sectors import (
     DARK,
     GROWTH,
     LEANING,
-    OWN,
     RIGHT,
     SECTORS,
     UNKNOWNS,
@@ -34,15 +35,30 @@ HELD = (1, 2, 4)  # of a sector's unknowns, those that have a level of its own
 
 @njit(cache=True, error_model="numpy")
 def tell_spread(sums, own, weights, arc, spread):
-    """Standard deviations of own levels : (3,), from medians over the sectors that count; `arc` is a sector's length, px."""
+    """Standard deviations of own levels : (3,), from medians over the sectors that count; `arc` is a sector's length, px.
+
+    The noise is taken from the median itself, not its share of it: what chance makes of even light is told as even.
+    """
     free, variance = alone(sums)
-    lean2 = own[:, LEANING] ** 2
-    counted = (weights > 0.5) & (variance[:, 0] > 0)
+    counted = (weights > 0.5) & (variance[:, DARK] > 0)
     if counted.sum() > 0:
         for k in (DARK, BRIGHT):
             squares = (own[:, k] + free[:, k]) ** 2 - variance[:, k]
             spread[k] = math.sqrt(max(np.median(squares[counted]) / MEDIAN, NONE**2))
-        spread[GROWTH] = max(math.sqrt(np.median(lean2[counted]) / MEDIAN) / arc, NONE)
+    leaning = own[:, LEANING][own[:, LEANING] != 0]  # of sectors between two that count
+    if len(leaning) > 0:
+        spread[GROWTH] = max(math.sqrt(np.median(leaning**2) / MEDIAN) / arc, NONE)
+
+
+@njit(cache=True, error_model="numpy")
+def _unpack(row, table):
+    """A sector's sums as its normal matrix and right side : (UNKNOWNS, UNKNOWNS + 1)."""
+    k = 0
+    for m in range(UNKNOWNS):
+        for n in range(m, UNKNOWNS):
+            table[m, n] = table[n, m] = row[k]
+            k += 1
+        table[m, UNKNOWNS] = row[RIGHT + m]
 
 
 @njit(cache=True, error_model="numpy")
@@ -57,12 +73,7 @@ def eliminate(sums, own, spread, reduced, follow):
     for j in range(SECTORS):
         if not sums[j, COUNT] > 0:
             continue
-        k = 0
-        for m in range(UNKNOWNS):
-            for n in range(m, UNKNOWNS):
-                table[m, n] = table[n, m] = sums[j, k]
-                k += 1
-            table[m, UNKNOWNS] = sums[j, RIGHT + m]
+        _unpack(sums[j], table)
         for p in range(3):
             hold = 1 / spread[p] ** 2
             for q in range(3):
@@ -96,9 +107,3 @@ def move(own, follow, steps, weights):
         before, after = (j - 1) % SECTORS, (j + 1) % SECTORS
         known = min(weights[before], weights[j], weights[after]) > 0.5
         own[j, LEANING] = (own[after, BRIGHT] - own[before, BRIGHT]) / 2 if known else 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def nothing():
-    """Own levels : (SECTORS, OWN) of an even light."""
-    return np.zeros((SECTORS, OWN))

@@ -43,6 +43,7 @@ from recon.tracking.sectors import (
     NY,
     OUTER,
     OUTERMOST,
+    OWN,
     PULL,
     RIGHT,
     ROUNDING,
@@ -101,7 +102,7 @@ def _fit(image, centre, shape, reach, known, hole, result):
     planes, noise, weights = np.zeros(6), np.ones(2), np.ones(SECTORS)
     if not _first_levels(image, ellipse, variance, reach, hole, planes, noise):
         return
-    own, spread = own_levels.nothing(), np.full(3, NONE)
+    own, spread = np.zeros((SECTORS, OWN)), np.full(3, NONE)
     sums, reduced, follow = np.zeros((SECTORS, LOCAL)), np.zeros((SECTORS, REDUCED)), np.zeros((SECTORS, 3, COMMON + 1))
     step, inverse, slopes = np.zeros(GLOBAL), np.zeros((GLOBAL, GLOBAL)), np.ones((SECTORS, GLOBAL))
     moved = np.inf
@@ -118,12 +119,12 @@ def _fit(image, centre, shape, reach, known, hole, result):
             _slopes(sectors, slopes)
             if not _solve(reduced, weights, slopes, planes, before - ellipse, known, step, inverse):
                 return
-            own_levels.move(own, follow, _by_sector(slopes, step), weights)
             _move(ellipse, planes, variance, step, reach)
+            own_levels.move(own, follow, _by_sector(slopes, step), weights)
             if not _sound(ellipse, image.shape):
                 return
             moved = np.abs(step[:5]).max()
-            if moved < (CAPTURED if capture else SETTLED):
+            if moved < (CAPTURED if capture else SETTLED) and (capture or k > 0):  # growth is told from the second step on
                 break
     if not moved < RESTLESS:
         return
@@ -131,7 +132,7 @@ def _fit(image, centre, shape, reach, known, hole, result):
     scores = 0.0
     for j in range(SECTORS):
         if reduced[j, 0] > 0:
-            scores += weights[j] * reduced[j, 10] ** 2 / reduced[j, 0]
+            scores += weights[j] * reduced[j, REDUCED - COMMON] ** 2 / reduced[j, 0]
     result[CENTRE : CENTRE + 5] = ellipse
     result[COVARIANCE : COVARIANCE + 25] = inverse[:5, :5].copy().ravel()
     result[INSIDE], result[OUTSIDE] = planes[0], planes[3]
@@ -141,7 +142,7 @@ def _fit(image, centre, shape, reach, known, hole, result):
     result[EXCESS] = scores / freedom
     result[MIDDLE] = _middle(image, ellipse, hole)
     result[FAILED] = 0
-    result[UNEVEN] = spread[1]
+    result[UNEVEN] = spread[BRIGHT]
 
 
 @njit(cache=True, error_model="numpy")
@@ -170,7 +171,7 @@ def _add_up(image, ellipse, planes, own, noise, sectors, stride, hole, sums):
     a, b, c = ellipse[2], ellipse[3], ellipse[4]
     determinant = a * c - b * b
     ia, ib, ic = c / determinant, -b / determinant, a / determinant
-    radius, ratio = (a + c) / 2, planes[0] / max(planes[3], 1.0)  # of light on ink and on paper
+    radius, ratio = (a + c) / 2, min(max(planes[0] / max(planes[3], 1.0), 0.0), 1.0)  # ratio of light on ink and on paper
     shortest = radius - math.hypot((a - c) / 2, b)
     lowest = max(1 - sectors[:, INNER].max() * 1.2 / shortest, 1 - 0.85 * (1 - hole)) ** 2
     highest = min(1 + sectors[:, OUTER].max() * 1.2 / shortest, 1 + OUTERMOST)
@@ -320,17 +321,20 @@ def _solve(reduced, weights, slopes, planes, back, sigma, step, inverse):
 
 @njit(cache=True, error_model="numpy")
 def _move(ellipse, planes, variance, step, reach):
+    """Move the parameters; shortens the step to what they did."""
     shortest = (ellipse[2] + ellipse[4]) / 2 - math.hypot((ellipse[2] - ellipse[4]) / 2, ellipse[3])
     limit = min(max(reach, 1.0), 0.3 * shortest)
-    scale = min(1.0, limit / max(np.abs(step[:5]).max(), 1e-12))
-    ellipse += scale * step[:5]
+    step[:5] *= min(1.0, limit / max(np.abs(step[:5]).max(), 1e-12))
+    ellipse += step[:5]
     planes += step[5:11]
+    before = variance.copy()
     limit = 0.85 * variance[0] if step[11] < 0 else 2 * variance[0]
     variance += min(1.0, limit / max(np.abs(step[11:]).max(), 1e-12)) * step[11:]
     variance[0] = max(variance[0], LEAST_VARIANCE)
     strength = math.hypot(variance[1], variance[2])
     if strength > variance[0] - LEAST_VARIANCE:
         variance[1:] *= (variance[0] - LEAST_VARIANCE) / strength
+    step[11:] = variance - before
 
 
 @njit(cache=True, error_model="numpy")

@@ -77,19 +77,20 @@ def shadow(true, rng):
 @pytest.mark.parametrize(("light", "typical"), [(fringes, 0.08), (shadow, 0.022)])
 def test_light_of_any_shape_leaves_the_centres_in_place(camera, rig, rng, light, typical):
     """Rims are found, but for those with a middle in the dark; the median error stays below twice what was measured, and squared
-    normalised errors below chi-square's mean of 2 and 4 standard errors."""
+    normalised errors are those of chi-square with 2 degrees of freedom, or smaller."""
     errors, squared = [], []
     for _ in range(FRAMES):
         place = drawings.facing(rng)
         true = drawings.shown(camera, place, rig.target)
         image = drawings.frame(camera, [place], rig.target, 120.0, rng, light=light(true, rng))
-        found = measure(image, true, 3.0, rig.target)
+        found = measure(image, Ellipses(true.centre + rng.uniform(-1.5, 1.5, (3, 2)), true.shape * 1.02), 4.0, rig.target)
         assert set(found.reasons) <= {None, "no white middle"}
         off = (found.ellipses.centre - true.centre)[found.found]
         errors += list(np.hypot(*off.T))
         squared += [e @ np.linalg.solve(c, e) for e, c in zip(off, found.covariance[found.found], strict=True)]
+    assert len(errors) >= 0.7 * 3 * FRAMES
     assert np.median(errors) < typical
-    assert np.mean(squared) < 2 + 4 * 2 / np.sqrt(len(squared))
+    assert 0.2 < np.mean(squared) < 2 + 4 * 2 / np.sqrt(len(squared))
 
 
 def test_a_finger_over_a_quarter_of_the_rim_costs_little(camera, rig, rng):
@@ -139,7 +140,7 @@ def test_variances_of_what_is_clipped_are_doubled_and_more_if_it_moves(camera, r
     assert not below.doubtful.any() and clipped.doubtful.all()
     path = np.linalg.norm(below.motion, axis=1)
     skewed = ((outlines.SKEWED * path) ** 2)[:, None, None] * np.eye(2)
-    np.testing.assert_allclose(clipped.covariance, 2 * below.covariance + skewed)
+    np.testing.assert_allclose(clipped.covariance, 2 * below.covariance + skewed, rtol=1e-5)
 
 
 def test_what_is_no_ring_is_not_found(camera, rig, rng):

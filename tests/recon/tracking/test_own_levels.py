@@ -66,17 +66,30 @@ def test_light_leans_as_the_neighbours_levels_do(rng):
 
 @pytest.mark.parametrize("true", [0.0, 0.5, 3.0])
 def test_the_spread_of_own_levels_is_told(rng, true):
-    """Within a third for spreads above the noise of a sector's level; below it, no more than that noise."""
+    """Its mean square within 4 standard errors of the true one less 1.2 times the noise's, which keeps even light even."""
     slopes = np.zeros((SECTORS, PIXELS, UNKNOWNS))
     slopes[:, : PIXELS // 2, 1] = slopes[:, PIXELS // 2 :, 2] = 1
-    noise = np.sqrt(2 / PIXELS)
+    variance = 2 / PIXELS
     told = []
-    for _ in range(20):
+    for _ in range(100):
         left = rng.standard_normal((SECTORS, PIXELS))
         left += slopes[:, :, 2] * true * rng.standard_normal((SECTORS, 1))
-        spread = np.zeros(3)
-        own_levels.tell_spread(summed(slopes, left), own_levels.nothing(), np.ones(SECTORS), 5.0, spread)
+        spread = np.full(3, own_levels.NONE)
+        own_levels.tell_spread(summed(slopes, left), np.zeros((SECTORS, OWN)), np.ones(SECTORS), 5.0, spread)
         told.append(spread)
-    dark, bright, growth = np.mean(told, axis=0)
-    assert dark < noise and growth == pytest.approx(own_levels.NONE)
-    assert bright < noise if true == 0 else abs(bright / true - 1) < 1 / 3
+    dark, bright, growth = np.array(told).T
+    assert (dark < np.sqrt(variance)).all() and (growth == own_levels.NONE).all()
+    assert np.mean(dark <= own_levels.NONE) > 0.9
+    expected = max(true**2 - (1 / own_levels.MEDIAN - 1) * variance, 0)
+    assert abs(np.mean(bright**2) - expected) < max(4 * np.std(bright**2) / 10, 0.1 * variance)
+
+
+def test_growth_spreads_as_light_leans_along_the_rim(rng):
+    """Per pixel, over the sectors that know their neighbours; the others lean by nothing and don't count."""
+    own, told = np.zeros((SECTORS, OWN)), []
+    for _ in range(100):
+        own[:30, 3] = 2.0 * rng.standard_normal(30)
+        spread = np.zeros(3)
+        own_levels.tell_spread(np.zeros((SECTORS, LOCAL)), own, np.ones(SECTORS), 5.0, spread)
+        told.append(spread[2])
+    assert abs(np.mean(np.square(told)) / (2.0 / 5.0) ** 2 - 1) < 0.15
