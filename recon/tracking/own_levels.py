@@ -14,17 +14,7 @@ import numpy as np
 from numba import njit
 
 from recon.tracking.cholesky import solve_and_invert
-from recon.tracking.sectors import (
-    BRIGHT,
-    COUNT,
-    DARK,
-    GROWTH,
-    LEANING,
-    RIGHT,
-    SECTORS,
-    UNKNOWNS,
-    alone,
-)
+from recon.tracking.sectors import BRIGHT, COUNT, DARK, GROWTH, LEANING, RIGHT, SECTORS, UNKNOWNS, alone
 
 MEDIAN = 0.455  # of a square of a normal number of mean 0 and variance 1
 NONE = 1e-3  # DN, DN/px: a spread that is as good as none

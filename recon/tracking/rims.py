@@ -141,8 +141,8 @@ def _fit(image, centre, shape, reach, known, hole, result):
     result[SEEN] = (weights > 0.5).sum() / SECTORS
     result[EXCESS] = scores / freedom
     result[MIDDLE] = _middle(image, ellipse, hole)
-    result[FAILED] = 0
     result[UNEVEN] = spread[BRIGHT]
+    result[FAILED] = 0
 
 
 @njit(cache=True, error_model="numpy")

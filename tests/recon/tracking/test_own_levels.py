@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.tracking import own_levels
-from recon.tracking.sectors import COUNT, LOCAL, OWN, RIGHT, SECTORS, UNKNOWNS
+from recon.tracking.sectors import BRIGHT, COUNT, GROWTH, LEANING, LOCAL, OWN, RIGHT, SECTORS, UNKNOWNS
 
 PIXELS = 30  # of a sector
 COMMON = own_levels.COMMON
@@ -52,16 +52,16 @@ def test_own_levels_are_eliminated_as_a_dense_solution_has_them(equations, rng):
     np.testing.assert_allclose(own[:, :3], expected, atol=1e-9)
 
 
-def test_light_leans_as_the_neighbours_levels_do(rng):
+def test_light_leans_as_the_neighbours_levels_do():
     own, follow = np.zeros((SECTORS, OWN)), np.zeros((SECTORS, 3, COMMON + 1))
     levels = np.sin(2 * np.pi * np.arange(SECTORS) / SECTORS)
-    follow[:, 1, COMMON] = levels
+    follow[:, BRIGHT, COMMON] = levels
     weights = np.ones(SECTORS)
     weights[7] = 0
     own_levels.move(own, follow, np.zeros((SECTORS, COMMON)), weights)
     expected = (np.roll(levels, -1) - np.roll(levels, 1)) / 2
     expected[6:9] = 0  # beside a sector that doesn't count
-    np.testing.assert_allclose(own[:, 3], expected, atol=1e-12)
+    np.testing.assert_allclose(own[:, LEANING], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("true", [0.0, 0.5, 3.0])
@@ -88,8 +88,8 @@ def test_growth_spreads_as_light_leans_along_the_rim(rng):
     """Per pixel, over the sectors that know their neighbours; the others lean by nothing and don't count."""
     own, told = np.zeros((SECTORS, OWN)), []
     for _ in range(100):
-        own[:30, 3] = 2.0 * rng.standard_normal(30)
+        own[:30, LEANING] = 2.0 * rng.standard_normal(30)
         spread = np.zeros(3)
         own_levels.tell_spread(np.zeros((SECTORS, LOCAL)), own, np.ones(SECTORS), 5.0, spread)
-        told.append(spread[2])
+        told.append(spread[GROWTH])
     assert abs(np.mean(np.square(told)) / (2.0 / 5.0) ** 2 - 1) < 0.15
