@@ -50,15 +50,18 @@ def depths(points: Array, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.
     away = vertices - np.asarray(camera, float)
     normals = np.asarray(surface.vertex_normals)
     normals = normals * np.where((normals * away).sum(axis=1) > 0, -1, 1)[:, None]  # towards the camera
-    _, nearest = KDTree(vertices).query(np.asarray(points, float))
+    _, nearest = KDTree(vertices).query(np.asarray(points, float), workers=-1)
     offset = points - vertices[nearest]
     behind = -(offset * normals[nearest]).sum(axis=1)  # of the tangent plane there: a vertex's distance would add the way to it
-    return np.where(_on_rim(surface)[nearest], np.nan, behind)
+    return np.where(_on_rim(surface, nearest), np.nan, behind)
 
 
-def _on_rim(surface: trimesh.Trimesh) -> NDArray[np.bool_]:
-    """Vertices of edges that only one triangle has : (n,)."""
-    _, index, counts = np.unique(surface.edges_sorted, axis=0, return_index=True, return_counts=True)
+def _on_rim(surface: trimesh.Trimesh, chosen: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether chosen vertices : (n,) end edges that only one triangle has : (n,)."""
+    near = np.zeros(len(surface.vertices), bool)
+    near[chosen] = True
+    about = surface.faces[near[surface.faces].any(axis=1)]  # all that the edges of the chosen can have
+    edges = np.sort(about[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     rim = np.zeros(len(surface.vertices), bool)
-    rim[surface.edges_sorted[index[counts == 1]]] = True
-    return rim
+    rim[edges[trimesh.grouping.group_rows(edges, require_count=1)]] = True
+    return rim[chosen]
