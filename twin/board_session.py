@@ -22,7 +22,7 @@ from scenes import board, poses
 from scenes.things import Scene, Thing
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.raster import Light
-from twin.optics.transport import Engine, Images, render, render_pixels
+from twin.optics.transport import Engine, Images, meets_something, render_pixels
 from twin.optics.world import build_world, move_things
 from twin.sensor import Exposure, Numbers, auto_exposure, expose
 from twin.session import TRUTH_MARKER, CameraName, Shooting, calibration_of, camera_optics, describe, write_json
@@ -36,6 +36,7 @@ EVEN_SAMPLES = 8  # paths for a pixel of an image without fringes, where all tha
 EDGE_SAMPLES = 256  # paths for a pixel at the edge of a circle, which is half black, half white
 EDGE_RANGE = 0.1  # of the brightest pixel: contrast about a pixel that makes it one of an edge
 EDGE_WINDOW = 3  # px about a pixel
+NEAR_PX = 16  # of what a pixel's middle ray meets: farther than lens, blur and the pixel itself spread the light of any
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def set_exposures(stage: Stage, settings: Settings) -> dict[CameraName, Exposure
         time_s = shooting.exposure_s
         if time_s is None:
             move_things(stage.world, stage.things, closest_pose(settings))
-            radiance = render(stage.world, optics, stage.projector, fully_on(stage.patterns), settings.engine, 0)
+            radiance = render_near(stage, optics, fully_on(stage.patterns), settings.engine, 0)
             time_s = auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
         exposures[camera] = Exposure(time_s, shooting.gain, shooting.bits)
     return exposures
@@ -131,7 +132,7 @@ def shoot_pose(
         light, engine = with_fully_on(stage.patterns), settings.engine
         if camera != FRINGE_CAMERA:
             light, engine = fully_on(stage.patterns), engine.model_copy(update={"samples": EVEN_SAMPLES})
-        radiance = render(stage.world, optics, stage.projector, light, engine, light_seed)
+        radiance = render_near(stage, optics, light, engine, light_seed)
         refine_edges(radiance[-1], stage, optics, settings.engine, edge_seed)
         device, wavelength = getattr(settings.rig, camera), settings.rig.projector.wavelength_nm
         images = expose(radiance, device, wavelength, exposures[camera], sensor_seed)
@@ -139,6 +140,19 @@ def shoot_pose(
         if camera == FRINGE_CAMERA:
             fringes[camera] = images[:-1]
     return lit, fringes
+
+
+def render_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine, seed: int) -> Images:
+    """As `transport.render` : (n, h, w), but only the board and what is near are traced; the rest of an image shows the room."""
+    seen = np.uint8(meets_something(stage.world, optics))
+    pixels = np.flatnonzero(cv2.dilate(seen, np.ones((2 * NEAR_PX + 1, 2 * NEAR_PX + 1), np.uint8))).astype(np.uint32)
+    width, height = optics.camera.size
+    radiance = np.empty((len(light.profiles), height, width), np.float32)
+    radiance[:] = optics.transmission * np.float32(engine.room_radiance)
+    radiance.reshape(len(radiance), -1)[:, pixels] = render_pixels(
+        stage.world, optics, stage.projector, light, engine, seed, pixels
+    )
+    return radiance
 
 
 def refine_edges(radiance: Images, stage: Stage, optics: CameraOptics, engine: Engine, seed: int) -> None:

@@ -133,6 +133,17 @@ def test_other_settings_start_anew(settings, tmp_path):
     assert board_session.missing_poses(tmp_path, settings, {"seed": 4}) == [0, 1, 2]
 
 
+def test_what_is_far_from_the_board_is_the_room(settings):
+    """The image of a tilted board, with all that lens and blur spread of it, as if every pixel were traced."""
+    stage = board_session.set_up(settings)
+    board_session.move_things(stage.world, stage.things, board_session.place_all(settings)[0])
+    optics, light = stage.cameras["cam1"], board_session.with_fully_on(stage.patterns)
+    near = board_session.render_near(stage, optics, light, settings.engine, 5)
+    whole = render(stage.world, optics, stage.projector, light, settings.engine, 5)
+    assert near.shape == whole.shape and (whole[-1] < whole[-1].max() / 50).mean() > 0.3
+    np.testing.assert_allclose(near, whole, rtol=1e-5)
+
+
 @pytest.mark.slow
 def test_rendering_noise_at_edges_is_that_of_the_sensor(rig, settings):
     """In images of full size, pixels at the circles' edges differ between two seeds by about their shot noise, at the nearest.

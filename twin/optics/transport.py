@@ -95,6 +95,12 @@ def render_pixels(
     return np.stack([(np.asarray(total) + np.asarray(room)) * scale for total in sums])
 
 
+def meets_something(scene: mi.Scene, camera: CameraOptics) -> NDArray[np.bool_]:
+    """Whether the ray through the middle of each pixel : (h, w) and of the lens meets any shape."""
+    middle = sample_rays(camera, camera.tables, mi.Point2f(0), mi.Point2f(0))
+    return np.asarray(scene.ray_test(middle)).reshape(camera.camera.size[::-1])
+
+
 def pixel_offset(camera: CameraOptics, points: PairedPoints) -> mi.Point2f:
     """Where in the image a sample lies, in px from its pixel's centre: within the pixel, spread by the lens's blur."""
     offset = points.mirrored_square()
