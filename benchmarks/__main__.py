@@ -6,7 +6,7 @@ from pathlib import Path
 
 from twin.accuracy import rows
 
-GROUPS = ("optics", "surface", "calibration", "ultrasound", "tracking")
+GROUPS = ("optics", "surface", "calibration", "ultrasound", "tracking", "demo")
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "benchmarks.md"
 
 

@@ -59,7 +59,7 @@ def tracked() -> list[Row]:
         Row("g", "locked on: times faster than the same networks in eager fp32 on every frame", theirs / locked, 4, None, "x",
             at_least=True),
         Row("g", "from nothing: times faster than the same networks in eager fp32", theirs / cold, 1, None, "x", at_least=True),
-        Row("g", "from nothing: ms, eager fp32 as the limit", 1e3 * cold, 1e9, 1e3 * theirs, "ms"),
+        Row("g", "from nothing: ms, eager fp32 as the limit", 1e3 * cold, None, 1e3 * theirs, "ms"),
     ]  # fmt: skip
 
 

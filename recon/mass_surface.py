@@ -75,7 +75,7 @@ def _near(rough: trimesh.Trimesh, power: EchoPower) -> tuple[NDArray[np.int64], 
     k, j, i = np.nonzero(power.weight[part] > 0.01)
     index = np.column_stack([i, j, k]) + low
     places = rigid.apply(volume.world_from_voxel, index)
-    away, nearest = KDTree(rough.vertices).query(places, distance_upper_bound=1.5 * REACH_MM)
+    away, nearest = KDTree(rough.vertices).query(places, distance_upper_bound=1.5 * REACH_MM, workers=-1)
     kept = np.isfinite(away)
     places, nearest, index = places[kept], nearest[kept], index[kept]
     distance = ((places - rough.vertices[nearest]) * rough.vertex_normals[nearest]).sum(axis=1)

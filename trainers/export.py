@@ -8,7 +8,8 @@ import numpy as np
 import onnxruntime
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as packed
 from torch import Tensor, nn
 
 from recon import atomic
@@ -26,7 +27,7 @@ def save(path: Path, network: nn.Module) -> None:
         if path.suffix == ".pt":
             torch.save(weights_of(network), temporary)
         else:
-            save_file(dict(weights_of(network)), temporary)
+            temporary.write_bytes(packed(dict(weights_of(network))))  # its own writer lets nobody else read
 
 
 def load(path: Path, network: nn.Module) -> None:

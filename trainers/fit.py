@@ -113,7 +113,7 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
             if not math.isfinite(losses[-1]):
                 raise InputError(f"learning_rate: expected one that training survives, found {plan.learning_rate:g}: step {step}")
             tell(step, progress(plan, step, seconds), losses[-1])
-            if step % plan.log_steps == 0:
+            if step % plan.log_steps == 0 or progress(plan, step, seconds) >= 1:
                 row = {"step": step, "seconds": round(seconds, 2), "loss": float(np.mean(losses)), "rate": rate(done)}
                 _append(folder / LOG, row)
                 losses.clear()

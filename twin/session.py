@@ -142,7 +142,7 @@ def write_session(
     settings : what the session was rendered from; kept with the truth as `settings.json`.
     """
     optics = calibration_of(rig)
-    check_places(out)
+    check_places(out, "surface")
     shutil.rmtree(out / "capture", ignore_errors=True)
     with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
         (folder / "surface").mkdir()

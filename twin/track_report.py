@@ -64,8 +64,8 @@ def section(story: Tracked, metrics: Metrics) -> Section:
     """What the tracker saw, how far off it was, and what it did not find."""
     text = (
         "A hand leads the target past the cameras, in light as dark as the real rig’s: slowly, then so fast that rims are "
-        f"blurred over {metrics['track_blur_most_px']:.0f} px, then partly out of one camera’s view. Networks find its circles; "
-        "from then on their rims are fitted where the last poses let expect them. What the two views "
+        f"blurred by up to {metrics['track_blur_most_px']:.1f} px, then partly out of one camera’s view. Networks find its "
+        "circles; from then on their rims are fitted where the last poses let expect them. What the two views "
         "together don’t show to be the target is not found, rather than found wrongly."
     )
     detail = "With the bound that the tracker’s own covariance sets; shaded: not found."
@@ -93,7 +93,7 @@ def pictures(story: Tracked) -> Iterator[tuple[Colours, str, str]]:
         if (image := cv2.imread(str(story.overlays[number]))) is None:
             continue  # tracked without pictures
         how = f"{story.hows[number]}, off by {story.errors.shift_mm[number]:.3f} mm" if story.hows[number] else "not found"
-        detail = f"Frame {number}, both cameras, brightened; {how}; blurred over {blur[number]:.1f} px."
+        detail = f"Frame {number}, both cameras, brightened; {how}; blurred by {blur[number]:.1f} px."
         yield cv2.cvtColor(image, cv2.COLOR_BGR2RGBA), title, detail
 
 

@@ -64,9 +64,9 @@ def _axes(picture: NDArray[np.uint8], pose: TargetPose, camera: Camera) -> None:
 
 
 def _text(picture: NDArray[np.uint8], text: str, place: tuple[int, ...], colour: tuple[int, int, int]) -> None:
-    scale = max(picture.shape[1] / 1800, 0.35)
-    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), 3, cv2.LINE_AA)
-    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+    scale = max(picture.shape[1] / 1100, 0.4)
+    for shade, width in (((0, 0, 0), 4), (colour, 2)) if scale > 0.7 else ((colour, 1),):
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, shade, width, cv2.LINE_AA)
 
 
 def _fixed(points: NDArray) -> NDArray[np.int32]:

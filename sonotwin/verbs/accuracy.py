@@ -2,7 +2,8 @@
 
 Reads the rig and the pattern sequences from conf/, and real recordings where `real` names their folder. Writes GROUP.json into
 the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}, and figures; and the tables of the Markdown page
-that `document` names. Takes some minutes a group. Exit status 1 if a bar is missed.
+that `document` names. Takes some minutes a group, and about an hour for tracking, for which a thousand pairs of frames are
+rendered. Exit status 1 if a bar is missed.
 
     sonotwin accuracy only=optics
 """
@@ -60,7 +61,8 @@ def run(config: Config) -> int:
         measured = []
         for row in rows.measure(import_module(f"twin.accuracy.{group}").measurements(setup)):
             verdict = "ok  " if row.ok else "MISS"
-            console.print(f"{verdict} {row.id:3}{row.what}: {row.measured:.4g} {row.unit} (bar {row.bar:.4g})", markup=False)
+            asked = "" if row.bar is None else f" (bar {row.bar:.4g})"
+            console.print(f"{verdict} {row.id:3}{row.what}: {row.measured:.4g} {row.unit}{asked}", markup=False)
             measured.append(row)
         rows.write(config.out / f"{group}.json", measured)
         if config.document:

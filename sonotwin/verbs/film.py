@@ -49,7 +49,7 @@ def run(config: Config) -> None:
         If `out` holds something else.
     """
     console = Console(soft_wrap=True, highlight=False)
-    film.check_places(config.out)
+    film.check_places(config.out, "film")
     with console.status("setting up the scene"):
         bank = film.make_bank(config.rig, config.seed)
         made = film.takes(bank, config.rig, ranges(), config, config.seed)

@@ -118,7 +118,7 @@ def render_board(config: Config, chosen: BoardPoses, console: Console) -> None:
 
 def render_surface(config: Config, console: Console) -> None:
     """What each camera sees of the scene under the patterns."""
-    check_places(config.out)
+    check_places(config.out, "surface")
     scene = build_scene(config.scene)
     views = {}
     for camera in dict.fromkeys(config.cameras):

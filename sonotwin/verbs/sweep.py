@@ -75,7 +75,7 @@ def run(config: Config) -> None:
         If the scene has no acoustics or not what the path is about, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    session.check_places(config.out)
+    session.check_places(config.out, "sweep")
     with console.status("setting up the scene"):
         scene = build_scene(config.scene)
         scanned = body(scene)

@@ -3,8 +3,8 @@
 Reads a capture folder with frames of both cameras (sweep/cam1, sweep/cam2) and their calibration; frames are paired by their time
 stamps. Writes into the folder `out`: poses.csv, poses with their covariance in the layout that all verbs read; frames.csv, how
 each pose was found or why not; overlays/, both views side by side with what was seen in them; and metrics.json. Frames are read
-one after the other, so a film may be of any length. Results that are there already are replaced. Takes some seconds, and 20 to
-60 frames a second from then on.
+one after the other, so a film may be of any length. Results that are there already are replaced. Takes some seconds, the first
+time a minute to compile, and 20 to 60 frames a second from then on.
 
 If the capture has B-scans too (sweep/us), `out` becomes a capture itself, those images with these poses, and the verbs that need
 poses are given it instead:

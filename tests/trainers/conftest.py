@@ -16,14 +16,14 @@ BOARD = np.array([[-15.0, -14.0], [39.0, -14.0], [39.0, 54.0], [-15.0, 54.0]])  
 FINER = 4  # subpixel bits of cv2's drawing
 
 
-def draw(rng: np.random.Generator, present: bool) -> tuple[np.ndarray, dict]:
-    """A full frame seen from the front, so that circles stay circles, and its truth."""
+def draw(rng: np.random.Generator, present: bool, sizes: tuple[float, float]) -> tuple[np.ndarray, dict]:
+    """A full frame seen from the front, so that circles stay circles, and its truth; `sizes` : least and most px a mm."""
     image = np.full(SIZE[::-1], rng.integers(20, 90), np.uint8)
     image = np.clip(image + rng.normal(0, 6, image.shape), 0, 255).astype(np.uint8)
     nothing = {"visible": [0.0] * 3, "inside": [False] * 3, "blur_px": [0.0] * 3, "white_dn": None}
     truth = {"camera": {"size": SIZE}, "centres": None, "ellipses": None, **nothing}
     if present:
-        scale, angle = rng.uniform(4.0, 6.5), rng.uniform(-np.pi, np.pi)
+        scale, angle = rng.uniform(*sizes), rng.uniform(-np.pi, np.pi)
         c, s = np.cos(angle), np.sin(angle)
         turned = scale * np.array([[c, s], [s, -c]])  # seen from the front, v down: the cross product is negative
         shift = np.array([640, 512]) + rng.uniform(-200, 200, 2) - turned @ [12, 20]
@@ -48,13 +48,13 @@ def _fixed(points: np.ndarray) -> np.ndarray:
     return np.rint(points * 2**FINER).astype(int)
 
 
-def write_set(folder: Path, count: int, shard: int = 16, seed: int = 0) -> Path:
+def write_set(folder: Path, count: int, shard: int = 16, seed: int = 0, sizes: tuple[float, float] = (4.0, 6.5)) -> Path:
     """Write a data set of `count` samples, every sixth without a target."""
     folder.mkdir(parents=True, exist_ok=True)
     for first in range(0, count, shard):
         with tarfile.open(folder / f"shard-{first // shard:05d}.tar", "w") as archive:
             for k in range(first, min(first + shard, count)):
-                for name, content in members(np.random.default_rng([seed, k]), k).items():
+                for name, content in members(np.random.default_rng([seed, k]), k, sizes).items():
                     entry = tarfile.TarInfo(f"{k:08d}.{name}")
                     entry.size = len(content)
                     archive.addfile(entry, io.BytesIO(content))
@@ -62,11 +62,11 @@ def write_set(folder: Path, count: int, shard: int = 16, seed: int = 0) -> Path:
     return folder
 
 
-def members(rng: np.random.Generator, k: int) -> dict[str, bytes]:
+def members(rng: np.random.Generator, k: int, sizes: tuple[float, float]) -> dict[str, bytes]:
     """The files of one sample by the ends of their names."""
     present, views, files = k % 6 != 5, [], {}
     for camera in (1, 2):
-        image, view = draw(rng, present)
+        image, view = draw(rng, present, sizes)
         centres = rng.uniform(100, 900, (3, 2)) if view["centres"] is None else np.array(view["centres"])
         origins = np.clip(np.rint(centres).astype(int) - 59, 0, np.array(SIZE) - 120)
         view["patch_origins"] = origins.tolist()

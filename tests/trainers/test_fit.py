@@ -134,11 +134,15 @@ def test_a_tiny_segmenter_learns_the_drawn_discs(data_set, tmp_path):
 
 @pytest.mark.slow
 def test_a_small_detector_learns_the_drawn_targets(write, tmp_path):
-    """Some minutes of training find most circles by their names: identity follows from the target's shape alone."""
-    train, held = split(read_views(write(tmp_path / "set", 120)), 0.1)
+    """Some minutes of training find most circles by their names: identity follows from the target's shape alone.
+
+    The target is far away, all of it within a few cells: c0 and c1 have alike surroundings, and to tell them apart by where c2
+    lies takes thousands of steps more if it lies twice as far.
+    """
+    train, held = split(read_views(write(tmp_path / "set", 120, sizes=(2.2, 3.4))), 0.1)
     torch.manual_seed(0)
-    asked = plan("detector", 1400, batch=16, crop_px=160, learning_rate=4e-3)
+    asked = plan("detector", 2500, batch=16, crop_px=96, learning_rate=4e-3)
     fitted = fit.fit(Detector(32), train, held, asked, tmp_path, lambda *_: None)
     figures = fit.measure(fitted.network, held)
-    assert figures["recall"] > 0.6
-    assert figures["identity_accuracy"] > 0.7
+    assert figures["recall"] > 0.8
+    assert figures["identity_accuracy"] > 0.8

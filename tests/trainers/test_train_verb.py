@@ -28,7 +28,7 @@ def test_writes_the_network_and_goes_on(data_set, tmp_path, capsys):
     assert train(data_set, out, "steps=2") == 0
     assert {path.name for path in out.iterdir()} == {
         *(f"segmenter.{suffix}" for suffix in ("onnx", "safetensors", "pt")),
-        *("metrics.json", "curves.png", "training.json", "checkpoint.pt"),
+        *("metrics.json", "curves.png", "training.json", "checkpoint.pt", "log.jsonl"),
     }
     assert json.loads((out / "metrics.json").read_text())["patches"] == 6
     assert "wrote" in capsys.readouterr().out

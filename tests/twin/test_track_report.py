@@ -63,7 +63,7 @@ def test_the_section_tells_what_was_found_and_what_not(folders, figures):
     assert "4 to 5" in text and "only camera 2 sees the target" in text and "no rim" in text
     assert "<b>.</b>" not in text and "&lt;b&gt;" in "".join(section.blocks), "what others wrote is text"
     assert text.count("<img") == 4 and text.count("<svg") == 2
-    assert "off by 0.020 mm; blurred over 9.0 px" in text
+    assert "off by 0.020 mm; blurred by 9.0 px" in text
 
 
 def test_frames_are_chosen_for_what_they_show(folders):

@@ -100,7 +100,7 @@ def summary(tried: Tried) -> list[Row]:
     return [
         *(Row("f", f"{tried.name}: {what}", float(share.mean()), 0, None, "%", at_least=True) for what, share in shares.items()),
         *(
-            Row("f", f"{tried.name}: {what} {where}", float(np.nanmedian(values)), np.inf, None, unit)
+            Row("f", f"{tried.name}: {what} {where}", float(np.nanmedian(values)), None, None, unit)
             for what, unit, values in exact
             if np.isfinite(values).any()
         ),

@@ -22,7 +22,7 @@ class Row:
     id: str
     what: str
     measured: float
-    bar: float  # what is asked
+    bar: float | None  # what is asked, if anything is
     limit: float | None  # what physics allows, or the peer's figure
     unit: str
     at_least: bool = False  # whether the bar is a least value; else it is a largest one
@@ -30,7 +30,9 @@ class Row:
 
     @property
     def ok(self) -> bool:
-        """Whether the bar is met; a figure that is not a number never is."""
+        """Whether the bar is met; a figure that is not a number never is, and what nothing is asked of always."""
+        if self.bar is None:
+            return True
         return bool(self.measured >= self.bar if self.at_least else self.measured <= self.bar)
 
 
@@ -72,11 +74,10 @@ def table(rows: Sequence[Row], limit: str) -> str:
     """Rows as a Markdown table; `limit` heads the column of what they are compared with."""
     lines = [f"| id | what | measured | bar | {limit} | unit | ok |", "|---|---|---|---|---|---|---|"]
     for row in rows:
-        bar = f"{'>=' if row.at_least else '<='} {row.bar:.4g}"
+        asked = "" if row.bar is None else f"{'>=' if row.at_least else '<='} {row.bar:.4g}"
         beside = "" if row.limit is None else f"{row.limit:.4g}"
-        lines.append(
-            f"| {row.id} | {row.what} | {row.measured:.4g} | {bar} | {beside} | {row.unit} | {'yes' if row.ok else '**no**'} |"
-        )
+        met = "" if row.bar is None else "yes" if row.ok else "**no**"
+        lines.append(f"| {row.id} | {row.what} | {row.measured:.4g} | {asked} | {beside} | {row.unit} | {met} |")
     return "\n".join(lines)
 
 

@@ -204,7 +204,7 @@ def write_session(
 
     settings : what the film was made from; kept with the truth.
     """
-    check_places(out)
+    check_places(out, "film")
     optics = Calibration({name: getattr(rig, name).optics.camera() for name in capture.CAMERAS})
     devices = {
         name: Device(size=getattr(rig, name).optics.size, exposure_s=filming.exposure_s, gain=filming.gain)

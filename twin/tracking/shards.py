@@ -13,7 +13,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 from pathlib import Path
 from threading import Thread
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import drjit as dr
@@ -86,10 +86,12 @@ def prepare(place: Place, settings: Settings) -> list[int]:
         if not isinstance(found, dict) or not isinstance(found.get("samples"), int):
             raise InputError(f"{told}: expected a data set's settings, found something else")
         if found["samples"] > settings.samples:
-            raise InputError(f"{told}: samples: expected at least the {found['samples']} there are, found {settings.samples}")
-        differing = [key for key in written if key != "samples" and found.get(key) != written[key]]
-        if differing:
-            raise InputError(f"{told}: {differing[0]}: expected as in this run, found another data set; choose another out")
+            expected = f"expected at least the {found['samples']} it was begun with"
+            raise InputError(f"{told}: samples: {expected}, found {settings.samples}")
+        name, wanted, there = _first_difference(written, found | {"samples": settings.samples}, "")
+        if name:
+            expected = f"expected {wanted} as in this run, found {there}, another data set"
+            raise InputError(f"{told}: {name}: {expected}; choose another out")
     elif place.folder.exists() and any(place.folder.iterdir()):
         raise InputError(f"{place.folder}: expected an empty folder or a data set, found other files")
     place.folder.mkdir(parents=True, exist_ok=True)
@@ -246,3 +248,14 @@ def write_index(place: Place, settings: Settings) -> None:
             })  # fmt: skip
     with atomic.new_file(place.folder / INDEX) as path:
         pq.write_table(pa.Table.from_pylist(rows), path)
+
+
+def _first_difference(wanted: Any, found: Any, name: str) -> tuple[str, Any, Any]:
+    """Dotted name and both values of the first field that differs; no name if none does."""
+    if not (isinstance(wanted, dict) and isinstance(found, dict)):
+        return ("", None, None) if wanted == found else (name, wanted, found)
+    for key in wanted:
+        different = _first_difference(wanted[key], found.get(key), f"{name}.{key}".removeprefix("."))
+        if different[0]:
+            return different
+    return "", None, None

@@ -119,7 +119,7 @@ def write_session(
     probe : of the capture; None where it is still to be calibrated.
     settings : what the sweep was rendered from; kept with the truth.
     """
-    check_places(out)
+    check_places(out, "sweep")
     with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
         (folder / LABELS).mkdir(parents=True)
         np.savez(folder / POSES, world_from_image=planned.truth.poses, times_ns=planned.truth.times)

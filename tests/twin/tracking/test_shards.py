@@ -112,7 +112,7 @@ def test_the_index_has_a_row_a_sample(made):
 
 
 def test_a_data_set_of_other_settings_is_not_mixed_with(made):
-    with pytest.raises(InputError, match="seed: expected as in this run"):
+    with pytest.raises(InputError, match="seed: expected 6 as in this run, found 5"):
         prepare(made, settings(seed=6))
 
 
