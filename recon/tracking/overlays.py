@@ -64,9 +64,10 @@ def _axes(picture: NDArray[np.uint8], pose: TargetPose, camera: Camera) -> None:
 
 
 def _text(picture: NDArray[np.uint8], text: str, place: tuple[int, ...], colour: tuple[int, int, int]) -> None:
-    scale = max(picture.shape[1] / 1100, 0.4)
-    for shade, width in (((0, 0, 0), 4), (colour, 2)) if scale > 0.7 else ((colour, 1),):
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, shade, width, cv2.LINE_AA)
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, max(picture.shape[1] / 1100, 0.4)
+    (width, _), _ = cv2.getTextSize(text, font, scale, 2)
+    scale *= min(1.0, 0.92 * (picture.shape[1] - place[0]) / max(width, 1))  # a long reason is read whole; widths are rough
+    cv2.putText(picture, text, place, font, scale, colour, 2, cv2.LINE_AA)
 
 
 def _fixed(points: NDArray) -> NDArray[np.int32]:

@@ -98,7 +98,7 @@ def summary(tried: Tried) -> list[Row]:
     exact = [("translation", "mm", still[0]), ("rotation", "deg", still[1])]
     where = f"at rest, white {LIT_DN:g} and more, median"
     return [
-        *(Row("f", f"{tried.name}: {what}", float(share.mean()), 0, None, "%", at_least=True) for what, share in shares.items()),
+        *(Row("f", f"{tried.name}: {what}", float(share.mean()), None, None, "%") for what, share in shares.items()),
         *(
             Row("f", f"{tried.name}: {what} {where}", float(np.nanmedian(values)), None, None, unit)
             for what, unit, values in exact
