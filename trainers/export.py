@@ -6,10 +6,9 @@ from pickle import UnpicklingError
 
 import numpy as np
 import onnxruntime
+import safetensors.torch
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file
-from safetensors.torch import save as packed
 from torch import Tensor, nn
 
 from recon import atomic
@@ -27,7 +26,7 @@ def save(path: Path, network: nn.Module) -> None:
         if path.suffix == ".pt":
             torch.save(weights_of(network), temporary)
         else:
-            temporary.write_bytes(packed(dict(weights_of(network))))  # its own writer lets nobody else read
+            temporary.write_bytes(safetensors.torch.save(dict(weights_of(network))))  # its own writer lets nobody else read
 
 
 def load(path: Path, network: nn.Module) -> None:
@@ -78,7 +77,7 @@ def _read(path: Path) -> dict[str, Tensor]:
         raise InputError(f"{path}: expected weights, .safetensors or .pt, found none")
     if path.suffix == ".safetensors":
         try:
-            return load_file(path)
+            return safetensors.torch.load_file(path)
         except SafetensorError as error:
             raise InputError(f"{path}: expected weights as safetensors, found a damaged file: {_first(error)}") from None
     weights = read_state(path)

@@ -5,6 +5,7 @@ finished set then takes its place as `OUT/capture/` and `OUT/truth/`.
 """
 
 import json
+import math
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,8 +25,9 @@ from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.raster import Light
 from twin.optics.transport import Engine, Images, meets_something, render_pixels
 from twin.optics.world import build_world, move_things
+from twin.places import TRUTH_MARKER, check_places
 from twin.sensor import Exposure, Numbers, auto_exposure, expose
-from twin.session import TRUTH_MARKER, CameraName, Shooting, calibration_of, camera_optics, describe, write_json
+from twin.session import CameraName, Shooting, calibration_of, camera_optics, describe, write_json
 
 FRINGE_CAMERA: CameraName = "cam1"  # sees the fringes; others see the board lit only
 CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
@@ -36,7 +38,6 @@ EVEN_SAMPLES = 8  # paths for a pixel of an image without fringes, where all tha
 EDGE_SAMPLES = 256  # paths for a pixel at the edge of a circle, which is half black, half white
 EDGE_RANGE = 0.1  # of the brightest pixel: contrast about a pixel that makes it one of an edge
 EDGE_WINDOW = 3  # px about a pixel
-NEAR_PX = 16  # of what a pixel's middle ray meets: farther than lens, blur and the pixel itself spread the light of any
 
 
 @dataclass(frozen=True)
@@ -144,14 +145,19 @@ def shoot_pose(
 
 def render_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine, seed: int) -> Images:
     """As `transport.render` : (n, h, w), but only the board and what is near are traced; the rest of an image shows the room."""
-    seen = np.uint8(meets_something(stage.world, optics))
-    pixels = np.flatnonzero(cv2.dilate(seen, np.ones((2 * NEAR_PX + 1, 2 * NEAR_PX + 1), np.uint8))).astype(np.uint32)
+    box = stage.world.bbox()
+    corners = np.array([box.corner(k) for k in range(8)]).reshape(8, 3)
+    depths = rigid.apply(optics.camera.camera_from_world, corners)[:, 2]
+    reach = math.ceil(optics.reach_px(np.maximum(depths, 1.0)))
+    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    seen = cv2.dilate(np.uint8(meets_something(stage.world, optics)), window)
+    pixels = np.flatnonzero(seen).astype(np.uint32)
     width, height = optics.camera.size
     radiance = np.empty((len(light.profiles), height, width), np.float32)
     radiance[:] = optics.transmission * np.float32(engine.room_radiance)
-    radiance.reshape(len(radiance), -1)[:, pixels] = render_pixels(
-        stage.world, optics, stage.projector, light, engine, seed, pixels
-    )
+    if len(pixels):
+        near = render_pixels(stage.world, optics, stage.projector, light, engine, seed, pixels)
+        radiance.reshape(len(radiance), -1)[:, pixels] = near
     return radiance
 
 
@@ -196,8 +202,8 @@ def missing_poses(out: Path, settings: Settings, described: Mapping[str, object]
 
     described : the settings, as they are kept with the truth.
     """
-    for folder, marker in (("truth", TRUTH_MARKER), ("capture", capture.MANIFEST), (UNFINISHED, SETTINGS)):
-        atomic.check_folder(out / folder, marker)
+    check_places(out, "board")
+    atomic.check_folder(out / UNFINISHED, SETTINGS)
     kept = out / UNFINISHED / SETTINGS
     if not kept.is_file() or json.loads(kept.read_text(encoding="utf-8")) != described:
         with atomic.new_folder(out / UNFINISHED, SETTINGS) as folder:

@@ -1,5 +1,7 @@
 """Pictures of what the tracker saw: ellipses, names, the target's axes, or the reason why there is none."""
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +34,7 @@ def drawn(image: NDArray, view: View, pose: TargetPose | None = None, camera: Ca
         _axes(picture, pose, camera)
     reason = pose.reason if pose is not None else view.reason
     if reason is not None:
-        _text(picture, f"not found: {reason}", (10, picture.shape[0] - 12), BAD)
+        _text(picture, f"not found: {reason}", (10, picture.shape[0] - 12), BAD, picture.shape[1] - 20)
     return picture
 
 
@@ -63,10 +65,13 @@ def _axes(picture: NDArray[np.uint8], pose: TargetPose, camera: Camera) -> None:
             cv2.line(picture, start, stop, COLOURS[k], 2, cv2.LINE_AA, FRACTION)
 
 
-def _text(picture: NDArray[np.uint8], text: str, place: tuple[int, ...], colour: tuple[int, int, int]) -> None:
+def _text(
+    picture: NDArray[np.uint8], text: str, place: tuple[int, ...], colour: tuple[int, int, int], most: float = math.inf
+) -> None:
+    """Text at a place, made smaller where it would be wider than `most` px."""
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, max(picture.shape[1] / 1100, 0.4)
     (width, _), _ = cv2.getTextSize(text, font, scale, 2)
-    scale *= min(1.0, 0.92 * (picture.shape[1] - place[0]) / max(width, 1))  # a long reason is read whole; widths are rough
+    scale *= min(1.0, 0.92 * most / max(width, 1))  # 0.92: sizes come in steps
     cv2.putText(picture, text, place, font, scale, colour, 2, cv2.LINE_AA)
 
 

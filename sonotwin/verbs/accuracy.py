@@ -60,7 +60,7 @@ def run(config: Config) -> int:
     for group in groups:
         measured = []
         for row in rows.measure(import_module(f"twin.accuracy.{group}").measurements(setup)):
-            verdict = "ok  " if row.ok else "MISS"
+            verdict = "    " if row.bar is None else "ok  " if row.ok else "MISS"
             asked = "" if row.bar is None else f" (bar {row.bar:.4g})"
             console.print(f"{verdict} {row.id:3}{row.what}: {row.measured:.4g} {row.unit}{asked}", markup=False)
             measured.append(row)

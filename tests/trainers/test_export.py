@@ -45,6 +45,8 @@ def test_weights_come_back_to_the_bit(suffix, tmp_path):
     save(tmp_path / f"weights{suffix}", module)
     load(tmp_path / f"weights{suffix}", other)
     assert all(torch.equal(one, two) for one, two in zip(module.state_dict().values(), other.state_dict().values(), strict=True))
+    (tmp_path / "other").touch()
+    assert (tmp_path / f"weights{suffix}").stat().st_mode == (tmp_path / "other").stat().st_mode  # whoever may read files here
 
 
 def test_published_files_of_older_torch_are_read(tmp_path):

@@ -9,7 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import board_capture, rigid
+from recon import board_capture, manifest, rigid
+from recon.errors import InputError
+from recon.manifest import SCHEMA, Device, Manifest, SweepPart
 from recon.patterns import Fringes, GrayCode, Patterns
 from scenes import board, poses
 from twin import board_session
@@ -133,15 +135,34 @@ def test_other_settings_start_anew(settings, tmp_path):
     assert board_session.missing_poses(tmp_path, settings, {"seed": 4}) == [0, 1, 2]
 
 
-def test_what_is_far_from_the_board_is_the_room(settings):
-    """The image of a tilted board, with all that lens and blur spread of it, as if every pixel were traced."""
+@pytest.mark.parametrize("aperture_mm", [0.0, 60.0])
+def test_what_is_far_from_the_board_is_the_room(settings, aperture_mm):
+    """The image of a tilted board, sharp or far out of focus, as if every pixel were traced."""
     stage = board_session.set_up(settings)
     board_session.move_things(stage.world, stage.things, board_session.place_all(settings)[0])
-    optics, light = stage.cameras["cam1"], board_session.with_fully_on(stage.patterns)
+    light = board_session.with_fully_on(stage.patterns)
+    optics = replace(stage.cameras["cam1"], aperture_mm=aperture_mm, focus_mm=400.0)
     near = board_session.render_near(stage, optics, light, settings.engine, 5)
     whole = render(stage.world, optics, stage.projector, light, settings.engine, 5)
     assert near.shape == whole.shape and (whole[-1] < whole[-1].max() / 50).mean() > 0.3
     np.testing.assert_allclose(near, whole, rtol=1e-5)
+
+
+def test_a_board_out_of_sight_leaves_the_room(settings):
+    stage = board_session.set_up(settings)
+    board_session.move_things(stage.world, stage.things, rigid.transform(np.eye(3), [5000.0, 0.0, 600.0]))
+    optics = stage.cameras["cam1"]
+    image = board_session.render_near(stage, optics, board_session.fully_on(stage.patterns), settings.engine, 5)[0]
+    np.testing.assert_allclose(image, optics.transmission * settings.engine.room_radiance, rtol=1e-6)
+
+
+def test_a_board_does_not_take_the_place_of_a_film(settings, tmp_path):
+    (tmp_path / "capture").mkdir()
+    images = {"cam1": "sweep/cam1", "cam2": "sweep/cam2"}
+    devices = {name: Device(size=(64, 48)) for name in images}
+    manifest.write_manifest(tmp_path / "capture", Manifest(schema=SCHEMA, devices=devices, sweep=SweepPart(images=images)))
+    with pytest.raises(InputError, match="capture: expected nothing or an earlier board, found a film"):
+        board_session.missing_poses(tmp_path, settings, DESCRIBED)
 
 
 @pytest.mark.slow

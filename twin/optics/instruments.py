@@ -73,6 +73,12 @@ class CameraOptics:
         half = np.interp(fractions, below, offset)
         return mi.Float(np.float32(np.concatenate([-half[::-1], half])))
 
+    def reach_px(self, depths: NDArray[np.float64]) -> float:
+        """How far from its sharp place a point's light may fall, px, at any of the depths : (n,) mm from the lens."""
+        focal = max(self.camera.matrix[0, 0], self.camera.matrix[1, 1])
+        defocus = focal * self.aperture_mm / 2 * np.abs(1 / depths - 1 / self.focus_mm).max()
+        return float(0.5 + 6 * self.blur_px + 1.2 * defocus + 1)  # 1.2: what distortion stretches; 1: the place's own pixel
+
     def spread(self, square: mi.Point2f) -> mi.Point2f:
         """Points of the square [-1/2, 1/2]^2 spread over a pixel's footprint, px; opposite ones stay opposite."""
         position = (square + 0.5) * (FOOTPRINT - 1)

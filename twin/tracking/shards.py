@@ -254,8 +254,8 @@ def _first_difference(wanted: Any, found: Any, name: str) -> tuple[str, Any, Any
     """Dotted name and both values of the first field that differs; no name if none does."""
     if not (isinstance(wanted, dict) and isinstance(found, dict)):
         return ("", None, None) if wanted == found else (name, wanted, found)
-    for key in wanted:
-        different = _first_difference(wanted[key], found.get(key), f"{name}.{key}".removeprefix("."))
+    for key in wanted | found:
+        different = _first_difference(wanted.get(key), found.get(key), f"{name}.{key}".removeprefix("."))
         if different[0]:
             return different
     return "", None, None

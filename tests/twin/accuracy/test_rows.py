@@ -21,6 +21,14 @@ def test_bars_have_a_direction():
     assert Row("d", "", 0.97, 0.97, None, "", at_least=True).ok
 
 
+def test_of_some_nothing_is_asked(tmp_path):
+    """They are never missed, and neither table nor JSON names a bar."""
+    row = Row("e", "the peer's", 12.0, None, None, "ms")
+    write(tmp_path / "group.json", [row])
+    assert row.ok and json.loads((tmp_path / "group.json").read_text())[0]["bar"] is None
+    assert table([row], "limit").endswith("| e | the peer's | 12 |  |  | ms |  |")
+
+
 def test_time_is_measured():
     """Rows of one measurement share its time; the rest is kept."""
     (first, second) = measure([lambda: ROWS[:2]])

@@ -116,6 +116,20 @@ def test_a_data_set_of_other_settings_is_not_mixed_with(made):
         prepare(made, settings(seed=6))
 
 
+@pytest.mark.parametrize(("name", "there"), [("window", 64), ("old", 2)])
+def test_what_differs_is_named_however_deep(tmp_path, name, there):
+    """Also what an earlier version knew and this one doesn't."""
+    place = Place(tmp_path / "set")
+    prepare(place, settings())
+    kept = place.folder / shards.SETTINGS
+    told = json.loads(kept.read_text())
+    expected = told["quality"].get(name)
+    told["quality"][name] = there
+    kept.write_text(json.dumps(told))
+    with pytest.raises(InputError, match=f"dataset.json: quality.{name}: expected {expected} as in this run, found {there}"):
+        prepare(place, settings())
+
+
 def test_a_folder_of_other_things_is_left_alone(tmp_path):
     (tmp_path / "letter.txt").write_text("keep me")
     with pytest.raises(InputError, match="expected an empty folder or a data set"):
