@@ -99,6 +99,7 @@ def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path):
     assert metrics["surface_rms_mm"] < 0.1  # better than the paper's planes
     assert metrics["coverage"] > 0.98 and metrics["gross_error_fraction"] < 1e-4
     assert metrics["z_std"] == pytest.approx(1, abs=0.1)
+    assert metrics["seconds_demo"] < 300
     assert metrics["tumours_found"] == 3 and metrics["tumours_false"] == 0
     assert metrics["track_visible_found"] == metrics["track_visible"] > 12 and metrics["track_false"] == 0
     assert metrics["track_shift_median_mm"] < 0.1 and metrics["track_within_bound"] > 0.8

@@ -140,7 +140,7 @@ def test_variances_of_what_is_clipped_are_doubled_and_more_if_it_moves(camera, r
     assert not below.doubtful.any() and clipped.doubtful.all()
     path = np.linalg.norm(below.motion, axis=1)
     skewed = ((outlines.SKEWED * path) ** 2)[:, None, None] * np.eye(2)
-    np.testing.assert_allclose(clipped.covariance, 2 * below.covariance + skewed, rtol=1e-5)
+    np.testing.assert_allclose(clipped.covariance, 2 * below.covariance + skewed)
 
 
 def test_what_is_no_ring_is_not_found(camera, rig, rng):
