@@ -24,14 +24,15 @@ $(INSTALLED): pyproject.toml constraints.txt .ci/setup
 demo: setup  ## render a phantom, reconstruct its surface, compare with the truth
 	@$(BIN)/sonotwin demo
 
-test: lint  ## check style and types, then run the fast tests
+test: lint  ## check style, types and arrows, then run the fast tests
 	@bash .ci/browser
 	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
 
-lint: setup  ## check style and types
+lint: setup  ## check style, types and which package may import which
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/ruff format --check --quiet .
 	@$(BIN)/pyrefly check --summary=none --output-format min-text
+	@said=$$($(BIN)/lint-imports --no-logo) || { echo "$$said"; exit 1; }
 
 slow: setup  ## run the slow tests
 	@$(BIN)/python -m pytest -m slow $(ARGS)
@@ -43,5 +44,5 @@ benchmark: setup  ## measure speed
 	@$(BIN)/python -m benchmarks $(ONLY)
 
 clean:  ## delete compiled code and caches; .venv and outputs stay
-	@rm -rf .pytest_cache .ruff_cache
+	@rm -rf .pytest_cache .ruff_cache .import_linter_cache
 	@find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +

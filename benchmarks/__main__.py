@@ -4,7 +4,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-from twin.accuracy import rows
+from twin.accuracy import table_rows
 
 GROUPS = ("optics", "surface", "calibration", "ultrasound", "tracking", "demo")
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "benchmarks.md"
@@ -18,10 +18,10 @@ def main(groups: list[str]) -> int:
         return 2
     met = True
     for group in groups or GROUPS:
-        measured = list(rows.measure(import_module(f"benchmarks.{group}").measurements()))
-        rows.write(Path("outputs/benchmark") / f"{group}.json", measured)
-        text = rows.table(measured, "peer")
-        rows.refresh(DOCUMENT, group, text)
+        measured = list(table_rows.measure(import_module(f"benchmarks.{group}_speed").measurements()))
+        table_rows.write(Path("outputs/benchmark") / f"{group}.json", measured)
+        text = table_rows.table(measured, "peer")
+        table_rows.refresh(DOCUMENT, group, text)
         print(f"\n{group}\n{text}")
         met &= all(row.ok for row in measured)
     return 0 if met else 1

@@ -8,8 +8,9 @@ import numpy as np
 from matplotlib.colors import LightSource
 
 from sonotwin.verbs.demo import compared
-from twin import evaluate, sweep_pictures, sweep_report
-from twin.evaluate_sweep import nearest_frame
+from twin.evaluation import surface_errors
+from twin.evaluation.sweep_errors import nearest_frame
+from twin.reports import sweep_pictures, sweep_report
 
 DEMO = Path("outputs/demo")
 INCH_PX = 80
@@ -20,8 +21,8 @@ SMOOTHED_PX = 2.0  # for the shading alone: bare noise of 0.02 mm would show
 def outside() -> None:
     """Four panels: the scene, its fringes, the reconstructed surface, its errors."""
     images = [cv2.imread(str(DEMO / "capture/surface/cam1" / f"{k:04d}.png"), cv2.IMREAD_GRAYSCALE) for k in range(9)]
-    points, sigma = evaluate.read_points(DEMO / "surface/points.npz")
-    error = evaluate.compare(points, sigma, evaluate.read_truth(DEMO / "truth")).error
+    points, sigma = surface_errors.read_points(DEMO / "surface/points.npz")
+    error = surface_errors.compare(points, sigma, surface_errors.read_truth(DEMO / "truth")).error
     known = np.isfinite(points[..., 2])
     weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), SMOOTHED_PX)
     height = -cv2.GaussianBlur(np.where(known, points[..., 2], 0).astype(np.float32), (0, 0), SMOOTHED_PX) / np.maximum(
@@ -50,7 +51,7 @@ def inside() -> None:
     story = sweep_report.read({name: DEMO / name for name in ("sweep", "bottom", "probe", "lag", "volume")}, findings, truth)
     figure = plt.figure(figsize=(16, 3.4), layout="constrained")
     axes = figure.add_subplot(1, 4, 1, projection="3d", computed_zorder=False)
-    skin = evaluate.read_points(DEMO / "surface/points.npz")[0][::8, ::8]
+    skin = surface_errors.read_points(DEMO / "surface/points.npz")[0][::8, ::8]
     breast = np.where((skin[..., 2] < TABLE_MM)[..., None], skin, np.nan)
     axes.plot_wireframe(*shown(breast), rcount=60, ccount=60, color="0.6", linewidth=0.3)
     for finding in findings:

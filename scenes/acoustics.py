@@ -8,7 +8,7 @@ tissue substitutes for ultrasound imaging, Ultrasound Med. Biol. 36(6); [K] Kaye
 from dataclasses import dataclass
 
 from recon.errors import InputError
-from scenes.things import Scene, Thing
+from scenes.scene_types import Scene, Thing
 
 
 @dataclass(frozen=True)

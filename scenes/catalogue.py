@@ -1,4 +1,4 @@
-"""Find a scene by its kind. A kind is a module of this package that has a `Config` and a `build`."""
+"""Find a scene by its kind. A kind is a module of `scenes.kinds`, with a `Config` and a `build`."""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -8,14 +8,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
-import scenes
+import scenes.kinds
 from recon.errors import InputError, one_line
-from scenes.things import Scene
+from scenes.scene_types import Scene
 
 
 def kinds() -> list[str]:
     """Names of all kinds of scene, in alphabetical order."""
-    return [name for name in _modules() if _is_scene(import_module(f"scenes.{name}"))]
+    return sorted(module.name for module in iter_modules(scenes.kinds.__path__))
 
 
 def build_scene(config: Mapping[str, Any]) -> Scene:
@@ -40,18 +40,10 @@ def parse_scene(config: Mapping[str, Any]) -> tuple[ModuleType, Any]:
     if "kind" not in config:
         raise InputError(f"scene: kind: expected one of {', '.join(kinds())}, found none")
     kind = config["kind"]
-    module = import_module(f"scenes.{kind}") if kind in _modules() else None
-    if module is None or not _is_scene(module):
+    if kind not in kinds():
         raise InputError(f"scene: kind: expected one of {', '.join(kinds())}, found {kind!r}")
+    module = import_module(f"scenes.kinds.{kind}")
     try:
         return module, module.Config(**{key: value for key, value in config.items() if key != "kind"})
     except ValidationError as error:
         raise InputError(f"scene: {kind}: {one_line(error)}") from error
-
-
-def _modules() -> list[str]:
-    return sorted(module.name for module in iter_modules(scenes.__path__))
-
-
-def _is_scene(module: ModuleType) -> bool:
-    return hasattr(module, "Config") and hasattr(module, "build")

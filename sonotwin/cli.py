@@ -145,7 +145,7 @@ def _complain(message: str, status: int = 2) -> int:
 
 def _how_to_install(module: str) -> str | None:
     """Say how to get a missing package, or None if it is none of sonotwin's requirements."""
-    from sonotwin.doctor import extra_of
+    from sonotwin.installation import extra_of
 
     extra = extra_of(module)
     if extra is None:

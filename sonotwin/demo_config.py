@@ -7,14 +7,14 @@ from typing import Annotated, Any
 import yaml
 from pydantic import Field, PrivateAttr, model_validator
 
-from recon.rig import Positive
-from recon.water import Speed
+from recon.model.probe import Speed
+from recon.model.rig import Positive
 from scenes.acoustics import MADE_OF
 from sonotwin.config import folder as conf
 from sonotwin.verbs import film, render, sweep
-from twin import session
-from twin.ultrasound.session import AnyPath
-from twin.ultrasound.sweep import Clocks, PoseNoise
+from twin import surface_session
+from twin.ultrasound.sweep_session import AnyPath
+from twin.ultrasound.timed_sweep import Clocks, PoseNoise
 from twin.ultrasound.transducer import Transducer
 
 CALIBRATION = "calibration"  # folder
@@ -31,7 +31,7 @@ class Config(render.Config):
     and those of `conf/sweep.yaml`.
     """
 
-    cameras: Annotated[list[session.CameraName], Field(min_length=1, max_length=1)]
+    cameras: Annotated[list[surface_session.CameraName], Field(min_length=1, max_length=1)]
     board: Path
     ultrasound: Transducer
     path: AnyPath | None

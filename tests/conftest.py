@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from recon.rig import Rig
+from recon.model.rig import Rig
 from twin.ultrasound.transducer import Transducer
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -11,11 +11,11 @@ import pytest
 
 from recon.errors import InputError
 from recon.tracking import networks
+from sonotwin import pipeline
 from sonotwin.cli import main
 from sonotwin.config import compose, load
+from sonotwin.pipeline import Step
 from sonotwin.verbs.demo import Config, commands, followed, looked_inside
-from twin import demo
-from twin.demo import Step
 
 SMALL = (  # camera 1 at half its size: fringes of ten pixels a period
     "rig.cam1.optics.size=[640,512]",
@@ -126,7 +126,7 @@ def step(name, works=True, makes=(), refines=(), figure=None):
 
 def test_steps_see_the_figures_before_them(tmp_path):
     told = []
-    metrics = demo.play([step("first"), step("second")], tmp_path / "demo", {"seed": 3}, told.append)
+    metrics = pipeline.play([step("first"), step("second")], tmp_path / "demo", {"seed": 3}, told.append)
     assert told == ["1/2 do first", "2/2 do second"]
     assert (metrics["first"], metrics["second"]) == (0, 2)  # its figure, and its seconds
     assert metrics == figures(tmp_path / "demo")
@@ -137,14 +137,14 @@ def test_a_run_that_was_killed_leaves_nothing_to_the_next(tmp_path):
     """A first run is complete, a second dies halfway, killed ones have left temporary folders and files, a third starts clean."""
     folder = tmp_path / "demo"
     report = step("report", makes=("report.html",))
-    demo.play([step("render", makes=("truth",)), report], folder, {}, silent)
+    pipeline.play([step("render", makes=("truth",)), report], folder, {}, silent)
     (folder / ".truth.4194305.new").mkdir()
     (folder / ".report.4194305.new.html").write_text("half")
     (folder / ".demo.4194305.new.json").write_text("half")
     with pytest.raises(KeyboardInterrupt):
-        demo.play([step("render", works=False, makes=("truth",)), report], folder, {}, silent)
+        pipeline.play([step("render", works=False, makes=("truth",)), report], folder, {}, silent)
     assert sorted(path.name for path in folder.iterdir()) == ["demo.json"]  # no old report beside a new capture
-    demo.play([step("render"), report], folder, {}, silent)
+    pipeline.play([step("render"), report], folder, {}, silent)
     assert sorted(path.name for path in folder.iterdir()) == ["demo.json", "metrics.json", "report.html"]
 
 
@@ -152,11 +152,11 @@ def test_hidden_files_of_others_stay(tmp_path):
     """What isn't a step's own temporary is nobody's to delete."""
     folder = tmp_path / "demo"
     report = step("report", makes=("report.html",))
-    demo.play([report], folder, {}, silent)
+    pipeline.play([report], folder, {}, silent)
     others = {".git", ".notes.2024.md", ".report.html", ".other.4194305.new"}
     for name in others:
         (folder / name).mkdir()
-    demo.play([report], folder, {}, silent)
+    pipeline.play([report], folder, {}, silent)
     assert others < {path.name for path in folder.iterdir()}
 
 
@@ -164,15 +164,15 @@ def test_a_figure_has_one_meaning(tmp_path):
     """A step that contradicts an earlier one is stopped, unless it is there to know better."""
     first, second = step("first", figure="points"), step("second", figure="points")
     with pytest.raises(ValueError, match="second: points: expected 0 as before, found 2"):
-        demo.play([first, second], tmp_path / "a", {}, silent)
+        pipeline.play([first, second], tmp_path / "a", {}, silent)
     better = step("second", figure="points", refines=("points",))
-    assert demo.play([first, better], tmp_path / "b", {}, silent)["points"] == 2
+    assert pipeline.play([first, better], tmp_path / "b", {}, silent)["points"] == 2
 
 
 def test_other_peoples_files_are_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
     with pytest.raises(InputError, match="found other files"):
-        demo.play([step("render")], tmp_path, {}, silent)
+        pipeline.play([step("render")], tmp_path, {}, silent)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from trainers.augment import WHITE, moved, occlude, photograph, turns, uniform, warp
 from trainers.labels import HIDDEN, SEEN, Labels, label_offset, labels, seen_in_view
-from trainers.shards import PATCH, Data, Patches, Views
+from trainers.shard_reader import PATCH, Data, Patches, Views
 
 TARGET_IN_CROP = 0.85  # of crops from views with a target are about it; the others are of anywhere
 COVERED = (HIDDEN + SEEN) / 2  # visible fraction of a circle whose centre something was put before: neither answer is wrong

@@ -11,10 +11,10 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from recon import atomic
 from recon.errors import InputError
-from trainers.networks import Name, is_detector, weights_of
-from trainers.shards import PATCH, VIEW
+from recon.files import atomic
+from trainers.architectures import Name, is_detector, weights_of
+from trainers.shard_reader import PATCH, VIEW
 
 OPSET = 17
 AGREEMENT = 1e-4  # of the largest logit, most between torch and ONNX Runtime

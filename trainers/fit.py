@@ -17,14 +17,14 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from recon import atomic
 from recon.errors import InputError
+from recon.files import atomic
+from trainers.architectures import Name, is_detector
 from trainers.batches import Batches
 from trainers.export import read_state
 from trainers.labels import Labels, detector_loss, segmenter_loss
-from trainers.metrics import measure_detector, measure_segmenter
-from trainers.networks import Name, is_detector
-from trainers.shards import Data, Views, chosen
+from trainers.network_metrics import measure_detector, measure_segmenter
+from trainers.shard_reader import Data, Views, chosen
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
 WARM_UP = 0.05  # of the training, over which the learning rate rises
@@ -131,7 +131,7 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
 
 
 def measure(module: nn.Module, data: Data) -> dict[str, float | int]:
-    """Figures of a network, as of `trainers.metrics`, in 32 bits."""
+    """Figures of a network, as of `trainers.network_metrics`, in 32 bits."""
     looked_at = deepcopy(module).cpu().float()
     return measure_detector(looked_at, data) if isinstance(data, Views) else measure_segmenter(looked_at, data)
 

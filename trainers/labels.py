@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 
-from trainers.networks import CELL, IDENTITIES, NO_CIRCLE, NO_PIXEL
+from trainers.architectures import CELL, IDENTITIES, NO_CIRCLE, NO_PIXEL
 
 SEEN = 0.35  # of its disc, least that a circle is labelled with
 HIDDEN = 0.05  # of its disc, most that a circle is nothing with; in between either answer is right

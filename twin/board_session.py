@@ -15,19 +15,22 @@ import cv2
 import mitsuba as mi
 import numpy as np
 
-from recon import atomic, board_capture, calibration, capture, rigid
-from recon.manifest import BoardPart, Device
-from recon.patterns import Patterns
-from recon.rig import Rig
-from scenes import board, poses
-from scenes.things import Scene, Thing
+from recon.capture import board_part, calibration_files, surface_part
+from recon.capture.manifest import BoardPart, Device
+from recon.files import atomic
+from recon.geometry import rigid
+from recon.model.patterns import Patterns
+from recon.model.rig import Rig
+from scenes import board_poses
+from scenes.kinds import board
+from scenes.scene_types import Scene, Thing
 from twin.optics.instruments import CameraOptics, ProjectorOptics
+from twin.optics.light_transport import Engine, Images, meets_something, render_pixels
 from twin.optics.raster import Light
-from twin.optics.transport import Engine, Images, meets_something, render_pixels
-from twin.optics.world import build_world, move_things
-from twin.places import TRUTH_MARKER, check_places
+from twin.optics.ray_world import build_world, move_things
+from twin.output_folders import TRUTH_MARKER, check_places
 from twin.sensor import Exposure, Numbers, auto_exposure, expose
-from twin.session import CameraName, Shooting, calibration_of, camera_optics, describe, write_json
+from twin.surface_session import CameraName, Shooting, calibration_of, camera_optics, describe, write_json
 
 FRINGE_CAMERA: CameraName = "cam1"  # sees the fringes; others see the board lit only
 CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
@@ -58,7 +61,7 @@ class Settings:
 
     rig: Rig
     board: board.Config
-    poses: poses.Config
+    poses: board_poses.Config
     patterns: Patterns
     cameras: tuple[CameraName, ...]
     engine: Engine
@@ -82,7 +85,7 @@ def set_up(settings: Settings) -> Stage:
 def place_all(settings: Settings) -> rigid.Array:
     """Poses `world_from_board` : (p, 4, 4) of a session; every device sees the whole board, whichever takes part."""
     devices = list(calibration_of(settings.rig).cameras.values())
-    return poses.random_poses(settings.poses, board.design(settings.board), devices)
+    return board_poses.random_poses(settings.poses, board.design(settings.board), devices)
 
 
 def set_exposures(stage: Stage, settings: Settings) -> dict[CameraName, Exposure]:
@@ -193,7 +196,7 @@ def pose_name(number: int) -> str:
 def is_finished(out: Path, described: Mapping[str, object]) -> bool:
     """Whether the session with these settings is there already, whole."""
     kept = out / "truth" / SETTINGS
-    whole = kept.is_file() and (out / "capture" / capture.MANIFEST).is_file()
+    whole = kept.is_file() and (out / "capture" / surface_part.MANIFEST).is_file()
     return whole and json.loads(kept.read_text(encoding="utf-8")) == described
 
 
@@ -213,7 +216,7 @@ def missing_poses(out: Path, settings: Settings, described: Mapping[str, object]
 
 def write_pose(out: Path, number: int, lit: Mapping[str, Numbers], fringes: Mapping[str, Numbers]) -> None:
     """Keep one pose's images, whole or not at all."""
-    board_capture.write_pose(out / UNFINISHED / "capture", pose_name(number), lit, fringes)
+    board_part.write_pose(out / UNFINISHED / "capture", pose_name(number), lit, fringes)
 
 
 def finish(out: Path, settings: Settings, exposures: Mapping[CameraName, Exposure], placed: rigid.Array) -> None:
@@ -223,20 +226,20 @@ def finish(out: Path, settings: Settings, exposures: Mapping[CameraName, Exposur
     shutil.rmtree(truth, ignore_errors=True)
     (truth / "calibration").mkdir(parents=True)
     optics = calibration_of(settings.rig)
-    calibration.write(truth / "calibration" / "optics.yaml", optics)
+    calibration_files.write(truth / "calibration" / "optics.yaml", optics)
     np.savez(truth / "board.npz", **board_truth(settings, placed))
     write_json(truth / TRUTH_MARKER, describe(Scene("board", board.things(settings.board))))
     shutil.copy(unfinished / SETTINGS, truth / SETTINGS)
 
     names = [pose_name(k) for k in range(len(placed))]
     counts: dict[str, int] = {FRINGE_CAMERA: settings.patterns.count}
-    records = tuple(board_capture.describe_pose(name, settings.cameras, counts) for name in names)
+    records = tuple(board_part.describe_pose(name, settings.cameras, counts) for name in names)
     part = BoardPart(board=board.design(settings.board), patterns=settings.patterns, poses=records)
     devices = {"projector": Device(size=settings.patterns.projector_size)}
     for camera, exposure in exposures.items():
         size = getattr(settings.rig, camera).optics.size
         devices[camera] = Device(size=size, bits=exposure.bits, exposure_s=exposure.time_s, gain=exposure.gain)
-    board_capture.write_manifest(unfinished / "capture", devices, part, "board")
+    board_part.write_manifest(unfinished / "capture", devices, part, "board")
 
     shutil.rmtree(out / "capture", ignore_errors=True)
     shutil.rmtree(out / "truth", ignore_errors=True)
@@ -258,4 +261,4 @@ def board_truth(settings: Settings, placed: rigid.Array) -> dict[str, np.ndarray
 
 
 def _pose_folder(out: Path, number: int) -> Path:
-    return out / UNFINISHED / "capture" / board_capture.pose_folder(pose_name(number))
+    return out / UNFINISHED / "capture" / board_part.pose_folder(pose_name(number))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.constants import c as LIGHT_SPEED
 from scipy.constants import h as PLANCK
 
-from recon.rig import CameraDevice, Sensor
+from recon.model.rig import CameraDevice, Sensor
 
 SMOOTHING_E = 4.0  # dark noise that leaves nothing of the steps of single electrons, and a skewness below 0.1 at any mean
 

@@ -12,9 +12,9 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.ellipses import Ellipses, root
-from recon.rig import Target
-from recon.tracking.detection import LEAST_SCORE, Candidates
+from recon.geometry.ellipses import Ellipses, root
+from recon.model.rig import Target
+from recon.tracking.circle_detector import LEAST_SCORE, Candidates
 from recon.tracking.pose import circle_centres, distances
 
 Array = NDArray[np.float64]

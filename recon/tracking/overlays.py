@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon import rigid
-from recon.camera import Camera
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
 from recon.tracking.frames import grey
 from recon.tracking.pose import NAMES, TargetPose
 from recon.tracking.views import View

@@ -4,13 +4,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.ellipses import Ellipses
 from recon.errors import InputError
-from recon.rig import Target
-from recon.tracking import detection, identity, segmentation, views
+from recon.geometry.ellipses import Ellipses
+from recon.model.rig import Target
+from recon.tracking import circle_detector, circle_segmenter, identity, views
 from recon.tracking.frames import grey
 from recon.tracking.networks import Networks
-from recon.tracking.outlines import Outlines, measure
+from recon.tracking.rims import Outlines, measure
 from recon.tracking.views import View
 
 FRAME = (1280, 1024)  # width, height, px, of the cameras that the networks know
@@ -30,11 +30,11 @@ def find(image: NDArray, networks: Networks, target: Target, bits: int | None = 
     except InputError as error:
         return views.nothing(str(error))
     frame, scale = _framed(image)
-    candidates = detection.detect([frame], networks)[0]
+    candidates = circle_detector.detect([frame], networks)[0]
     choices = identity.triples(candidates, target, FRAME[0])
     result = views.nothing(f"{len(candidates.points)} places like circles, no three that lie like the target's")
     for triple in choices:
-        rough = segmentation.rough_ellipses(frame, triple.points, networks, target)
+        rough = circle_segmenter.rough_ellipses(frame, triple.points, networks, target)
         back = Ellipses((rough.centre + 0.5) / scale - 0.5, rough.shape / scale)
         outlines = measure(image, back, max(ROUGH_PX / scale, LEAST_REACH_PX), target)
         outlines = views.renamed(outlines, target)

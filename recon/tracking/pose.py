@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from recon import rigid
-from recon.camera import Camera
-from recon.rig import Target
-from recon.tracking import one_view
-from recon.tracking.outline_model import ellipses_of, rays_through, slopes_at
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.model.rig import Target
+from recon.tracking import pose_hypotheses
+from recon.tracking.rim_fit.circle_outline import ellipses_of, rays_through, slopes_at
 
 Array = NDArray[np.float64]
 
@@ -140,7 +140,7 @@ def allowed(sighting: Sighting, target: Target) -> bool:
 def _starts(views: Sequence[Sighting], model: Array) -> list[Array]:
     """Poses that the view of all three circles allows."""
     whole = next(view for view in views if view.seen.all())
-    return one_view.poses(whole.camera, whole.centres, model)
+    return pose_hypotheses.poses(whole.camera, whole.centres, model)
 
 
 def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Target) -> TargetPose:

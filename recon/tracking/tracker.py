@@ -12,18 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recon import rigid
-from recon.camera import Camera
-from recon.ellipses import Ellipses, joined
 from recon.errors import InputError
-from recon.rig import Target
-from recon.tracking import covered, detection, identity, one_view, segmentation, views
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.geometry.ellipses import Ellipses, joined
+from recon.model.rig import Target
+from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, pose_hypotheses, views
 from recon.tracking.frames import grey
 from recon.tracking.identity import Triple
 from recon.tracking.networks import Networks
-from recon.tracking.outline_model import ellipses_of
-from recon.tracking.outlines import Outlines, measure, measure_both
 from recon.tracking.pose import TargetPose, circle_centres, estimate, lost
+from recon.tracking.rim_fit.circle_outline import ellipses_of
+from recon.tracking.rims import Outlines, measure, measure_both
 from recon.tracking.views import View
 
 Array = NDArray[np.float64]
@@ -143,7 +143,7 @@ class Tracker:
     def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str) -> Tracking:
         """From six rough ellipses to the pose."""
         outlines = measure_both(*frames, rough, np.arange(6) >= 3, reach, self.target)
-        halves = [covered.completed(*each, self.target) for each in zip(frames, (outlines[:3], outlines[3:]), strict=True)]
+        halves = [covered_circle.completed(*each, self.target) for each in zip(frames, (outlines[:3], outlines[3:]), strict=True)]
         seen = (views.judged(halves[0], self.target), views.judged(halves[1], self.target))
         return self._posed(seen, how)
 
@@ -170,18 +170,18 @@ class Tracker:
     def _segmented(self, frames: Frames, networks: Networks, rough: Ellipses, before: Tracking) -> Tracking:
         """From six rough ellipses to the pose, by the segmenter."""
         cuts = [
-            segmentation.patches(frame, at, segmentation.step_for(at, self.target))
+            circle_segmenter.patches(frame, at, circle_segmenter.step_for(at, self.target))
             for frame, at in zip(frames, (rough.centre[:3], rough.centre[3:]), strict=True)
         ]
         masks = networks.segment(np.concatenate([cut.images for cut in cuts]))
-        halves = [segmentation.read(half, cut) for half, cut in zip((masks[:3], masks[3:]), cuts, strict=True)]
+        halves = [circle_segmenter.read(half, cut) for half, cut in zip((masks[:3], masks[3:]), cuts, strict=True)]
         if min(np.isfinite(half.centre[:, 0]).sum() for half in halves) < 2:
             return before
         return self._fitted(frames, joined(halves), ROUGH_PX, "segmented")
 
     def _detected(self, frames: Frames, networks: Networks) -> Tracking:
         """From nothing to the pose: a view alone tells it but for a tilt, and the other view is asked for each of these."""
-        candidates = detection.detect(list(frames), networks)
+        candidates = circle_detector.detect(list(frames), networks)
         choices = [
             (k, triple)
             for k, frame in enumerate(frames)
@@ -207,18 +207,18 @@ class Tracker:
 
     def _told(self, frames: Frames, k: int, view: View) -> list[View]:
         """What the other camera shows where each pose that camera k's view allows asks for its circles."""
-        poses = one_view.poses(self.cameras[k], view.outlines.ellipses.centre, circle_centres(self.target))
+        poses = pose_hypotheses.poses(self.cameras[k], view.outlines.ellipses.centre, circle_centres(self.target))
         asked = [self._asked(1 - k, pose) for pose in poses]
         return [views.judged(self._view(frames, 1 - k, rough, REACH_PX), self.target) for rough in asked]
 
     def _seen_at(self, frames: Frames, networks: Networks, k: int, triple: Triple) -> View:
         """What one view shows where its three circles may be."""
-        rough = segmentation.rough_ellipses(frames[k], triple.points, networks, self.target)
+        rough = circle_segmenter.rough_ellipses(frames[k], triple.points, networks, self.target)
         return views.judged(views.renamed(self._view(frames, k, rough, ROUGH_PX), self.target), self.target)
 
     def _view(self, frames: Frames, k: int, rough: Ellipses, reach: float) -> Outlines:
         """Camera k's rims, from three rough ellipses."""
-        return covered.completed(frames[k], measure(frames[k], rough, reach, self.target), self.target)
+        return covered_circle.completed(frames[k], measure(frames[k], rough, reach, self.target), self.target)
 
 
 @dataclass
@@ -238,7 +238,7 @@ def _rank(result: Tracking) -> tuple[int, float]:
     return -result.pose.freedom, result.pose.misfit
 
 
-def _absent(candidates: detection.Candidates) -> str:
+def _absent(candidates: circle_detector.Candidates) -> str:
     count = len(candidates.points)
     return f"{count} of 3 circles" if count < 3 else f"{count} places like circles, no three that lie like the target's"
 

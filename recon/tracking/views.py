@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.camera import Camera
-from recon.ellipses import Ellipses
-from recon.rig import Target
+from recon.geometry.camera import Camera
+from recon.geometry.ellipses import Ellipses
+from recon.model.rig import Target
 from recon.tracking import identity
-from recon.tracking.outlines import Outlines
 from recon.tracking.pose import NAMES, Sighting, allowed
+from recon.tracking.rims import Outlines
 
 Array = NDArray[np.float64]
 

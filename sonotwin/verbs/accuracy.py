@@ -16,12 +16,12 @@ import yaml
 from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
-from recon.capture import read_patterns
+from recon.capture.surface_part import read_patterns
 from recon.errors import InputError
-from recon.rig import Rig
+from recon.model.rig import Rig
 from sonotwin.config import folder
-from twin.accuracy import rows
-from twin.tracking.ranges import DataRanges
+from twin.accuracy import table_rows
+from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
 Group = Literal["optics", "surface", "calibration", "ultrasound", "tracking"]
@@ -50,7 +50,7 @@ def run(config: Config) -> int:
     groups = [config.only] if config.only else get_args(Group)
     if config.document:
         for group in groups:
-            rows.check_place(config.document, group)
+            table_rows.check_place(config.document, group)
     if config.real and not config.real.is_dir():
         raise InputError(f"accuracy: real: expected a folder of recordings, found none at {config.real}")
     config.out.mkdir(parents=True, exist_ok=True)
@@ -59,20 +59,20 @@ def run(config: Config) -> int:
     met = True
     for group in groups:
         measured = []
-        for row in rows.measure(import_module(f"twin.accuracy.{group}").measurements(setup)):
+        for row in table_rows.measure(import_module(f"twin.accuracy.{group}_accuracy").measurements(setup)):
             verdict = "    " if row.bar is None else "ok  " if row.ok else "MISS"
             asked = "" if row.bar is None else f" (bar {row.bar:.4g})"
             console.print(f"{verdict} {row.id:3}{row.what}: {row.measured:.4g} {row.unit}{asked}", markup=False)
             measured.append(row)
-        rows.write(config.out / f"{group}.json", measured)
+        table_rows.write(config.out / f"{group}.json", measured)
         if config.document:
-            rows.refresh(config.document, group, rows.table(measured, "limit"))
+            table_rows.refresh(config.document, group, table_rows.table(measured, "limit"))
         console.print(f"wrote {config.out / f'{group}.json'}", markup=False)
         met &= all(row.ok for row in measured)
     return 0 if met else 1
 
 
-def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> rows.Setup:
+def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> table_rows.Setup:
     """What measurements are made with: a rig, all sequences and scanners of conf/, and real recordings if they are at hand."""
     sequences = {path.stem: read_patterns(path) for path in (folder() / "patterns").glob("*.yaml")}
     scanners = {
@@ -80,4 +80,4 @@ def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> row
         for path in (folder() / "ultrasound").glob("*.yaml")
     }
     frames = DataRanges(**yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"])
-    return rows.Setup(rig, sequences, real, scanners, frames, out)
+    return table_rows.Setup(rig, sequences, real, scanners, frames, out)

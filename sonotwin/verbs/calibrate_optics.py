@@ -20,24 +20,26 @@ import numpy as np
 from pydantic import PrivateAttr
 from rich.console import Console
 
-from recon import atomic, authors, board_capture, calibration, calibration_metrics, calibration_page, metrics
-from recon.board_capture import BoardCapture
-from recon.calibrate import Result, Settings, calibrate
-from recon.calibration import Calibration
+from recon.capture import board_part, calibration_files, meza2021
+from recon.capture.board_part import BoardCapture
 from recon.errors import InputError
-from recon.lens_models import ModelName
-from recon.metrics import Metrics, shown
-from recon.observations import Size
-from recon.sight import Sighting, sight
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics, shown
+from recon.model.calibration import Calibration
+from recon.optical_calibration import calibration_report, figures_of_merit
+from recon.optical_calibration.distortion_selection import ModelName
+from recon.optical_calibration.joint_calibration import Result, Settings, calibrate
+from recon.optical_calibration.observations import Size
+from recon.optical_calibration.sightings import Sighting, sight
 
 PAGE = "calibration.html"  # by which the folder of a calibration is known
 OPTICS = "optics.yaml"
 DEVICES = ("cam1", "cam2", "projector")  # in the order in which they are adjusted; the first is the world
 CONTENTS = {
     OPTICS: "all devices with the covariance of their parameters; OpenCV FileStorage",
-    authors.PARAMETERS: "camera 1 and projector in the rig authors' layout",
-    authors.STEREO_PARAMETERS: "camera 1 and camera 2 in the rig authors' layout",
-    authors.STEREO_XML: "the same as OpenCV FileStorage",
+    meza2021.PARAMETERS: "camera 1 and projector in the rig authors' layout",
+    meza2021.STEREO_PARAMETERS: "camera 1 and camera 2 in the rig authors' layout",
+    meza2021.STEREO_XML: "the same as OpenCV FileStorage",
     metrics.FILE: "the figures of this page",
     PAGE: "this page",
 }
@@ -69,7 +71,7 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     inputs = [path for path in (config.capture, config.truth) if path is not None]
     atomic.check_folder(config.out, PAGE, inputs=inputs)
-    captured = board_capture.read_board(config.capture)
+    captured = board_part.read_board(config.capture)
     sizes = sizes_of(captured)
     truth = None if config.truth is None else read_truth(config.truth, sizes)
 
@@ -92,7 +94,7 @@ def run(config: Config) -> None:
         result = calibrate(sightings, captured.board, sizes, settings, name=captured.name)
         result = with_absent(result, sizes, captured.cameras)
     seconds["seconds_adjust"] = round(perf_counter() - start, 3)
-    figures = calibration_metrics.measure(result, truth)
+    figures = figures_of_merit.measure(result, truth)
     contradicting = {name: reason for name, reason in result.dropped.items() if name not in missed}
     for line in (*dropped(contradicting), *describe(result, figures, seconds["seconds_adjust"])):
         console.print(line, markup=False)
@@ -125,7 +127,7 @@ def read_truth(folder: Path, sizes: Mapping[str, Size]) -> Calibration:
         If it is missing or damaged, or of other devices.
     """
     path = folder / "calibration" / OPTICS
-    found = calibration.read(path)
+    found = calibration_files.read(path)
     for name, size in sizes.items():
         if name not in found.cameras or found.cameras[name].size != size:
             raise InputError(f"{path}: expected {name} of {size[0]}x{size[1]} px as in the capture, found another or none")
@@ -205,10 +207,10 @@ def write(config: Config, result: Result, figures: Metrics, truth: Calibration |
     """Write all files, whole or not at all; returns their names."""
     found = result.adjustment.calibration
     with atomic.new_folder(config.out, PAGE) as folder:
-        calibration.write(folder / OPTICS, found)
-        names = [OPTICS, *authors.write_parameters(folder, found), metrics.FILE, PAGE]
+        calibration_files.write(folder / OPTICS, found)
+        names = [OPTICS, *meza2021.write_parameters(folder, found), metrics.FILE, PAGE]
         metrics.write(folder / metrics.FILE, figures)
         outputs = [(name, CONTENTS[name]) for name in names]
         command = shlex.join(["sonotwin", "calibrate-optics", *config._overrides])
-        calibration_page.write(folder / PAGE, result, figures, outputs, [command], truth)
+        calibration_report.write(folder / PAGE, result, figures, outputs, [command], truth)
     return names

@@ -26,27 +26,17 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from recon import (
-    atomic,
-    metrics,
-    probe_calibration,
-    probe_checks,
-    probe_files,
-    repeatability,
-    sweep_capture,
-    sweep_tables,
-    water,
-    wires,
-)
-from recon.capture import Size
-from recon.crosswire import Appearance, Crossing
+from recon.capture import probe_files, sweep_part, sweep_tables
+from recon.capture.images import Size
+from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
-from recon.metrics import Metrics
-from recon.probe import ProbeCalibration
-from recon.probe_calibration import MIN_FRAMES, Adjustment, Noise, Sightings
-from recon.rig import Finite, NotNegative, Probe, Rig
-from recon.sweep_capture import SweepCapture
-from recon.water import Speed
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics
+from recon.model.probe import ProbeCalibration, Speed
+from recon.model.rig import Finite, NotNegative, Probe, Rig
+from recon.probe_calibration import point_calibration, probe_checks, repeatability, sound_in_water, wires
+from recon.probe_calibration.cross_wire import Appearance, Crossing
+from recon.probe_calibration.point_calibration import MIN_FRAMES, Adjustment, Noise, Sightings
 from sonotwin.verbs.measure_lag import LagSeconds
 
 PROBE = "probe.yaml"
@@ -68,7 +58,7 @@ class Config(BaseModel):
     lag_s: LagSeconds = 0.0
     temperature_c: Finite | None = None
     temperature_sigma_c: NotNegative = 0.5
-    assumed_speed: Speed = water.SCANNER_SPEED
+    assumed_speed: Speed = sound_in_water.SCANNER_SPEED
     medium_speed: Speed | None = None
     wire_radius_mm: NotNegative = 0.1
     wire_speed: Annotated[float, Field(ge=300, le=10000)] = 2600.0
@@ -136,7 +126,7 @@ def run(config: Config) -> None:
     assert source is not None
     atomic.check_folder(config.out, FRAMES, inputs=[source])
     if config.temperature_c is not None:
-        water.speed_of_sound(config.temperature_c)  # a mistake shows before the work
+        sound_in_water.speed_of_sound(config.temperature_c)  # a mistake shows before the work
     start = perf_counter()
     seen = _look(config, console)
     seconds = {"seconds_find": round(perf_counter() - start, 3)}
@@ -147,7 +137,7 @@ def run(config: Config) -> None:
     start = perf_counter()
     expected = config.rig.probe.target_from_image.matrix()
     try:
-        found = probe_calibration.calibrate(
+        found = point_calibration.calibrate(
             seen.sightings, seen.size, config.noise, expected, config.seed, ahead_mm=echo_ahead(config)
         )
         probe_checks.speed(implied_speed(found.calibration, config)[0])
@@ -166,7 +156,7 @@ def _look(config: Config, console: Console) -> Seen:
     if config.pairs is not None:
         return read_pairs(config.pairs, config.rig.probe)
     assert config.capture is not None
-    sweep = sweep_capture.read_sweep(config.capture)
+    sweep = sweep_part.read_sweep(config.capture)
     with console.status("") as status:
         return look(sweep, config.lag_s, config.appearance, status.update)
 
@@ -180,7 +170,7 @@ def look(sweep: SweepCapture, lag_s: float, appearance: Appearance, tell: Callab
             tell(f"looking for the crossing, B-scan {number + 1} of {len(sweep.paths)}")
             yield image
 
-    sightings, crossings = probe_calibration.from_images(images(), poses, appearance)
+    sightings, crossings = point_calibration.from_images(images(), poses, appearance)
     seen = Seen(sweep.name, sweep.size, sightings, sweep.frames, tuple(crossings))
     if covariance is None:
         return seen
@@ -229,22 +219,22 @@ def refuse_few(seen: Seen) -> None:
 def echo_ahead(config: Config) -> float:
     """By how much the wires' echo lies before their axes, mm."""
     temperature = ORDINARY_C if config.temperature_c is None else config.temperature_c
-    return wires.echo_ahead(config.wire_radius_mm, config.wire_speed, float(water.speed_of_sound(temperature)))
+    return wires.echo_ahead(config.wire_radius_mm, config.wire_speed, float(sound_in_water.speed_of_sound(temperature)))
 
 
 def implied_speed(calibration: ProbeCalibration, config: Config) -> tuple[float, float]:
     """Speed of sound and its standard deviation, m/s, that sy tells beside the design's."""
-    return water.implied_speed(calibration, config.rig.probe.scale_mm_per_px[1], config.assumed_speed)
+    return sound_in_water.implied_speed(calibration, config.rig.probe.scale_mm_per_px[1], config.assumed_speed)
 
 
 def with_speed(calibration: ProbeCalibration, config: Config) -> ProbeCalibration:
     """For the medium that will be scanned, where the water's temperature is known; else as it is, for the speed that sy tells."""
     if config.temperature_c is None:
         return replace(calibration, speed_m_s=implied_speed(calibration, config)[0])
-    in_water = float(water.speed_of_sound(config.temperature_c))
+    in_water = float(sound_in_water.speed_of_sound(config.temperature_c))
     wanted = config.medium_speed or config.assumed_speed
-    sigma = wanted / in_water**2 * float(water.speed_sigma(config.temperature_c, config.temperature_sigma_c))
-    return water.in_medium(calibration, in_water, wanted, ratio_sigma=sigma)
+    sigma = wanted / in_water**2 * float(sound_in_water.speed_sigma(config.temperature_c, config.temperature_sigma_c))
+    return sound_in_water.in_medium(calibration, in_water, wanted, ratio_sigma=sigma)
 
 
 def measure(seen: Seen, found: Adjustment, calibration: ProbeCalibration, config: Config) -> Metrics:
@@ -252,7 +242,7 @@ def measure(seen: Seen, found: Adjustment, calibration: ProbeCalibration, config
     design = config.rig.probe
     expected = design.target_from_image.matrix()
     pixels = repeatability.five_points(seen.size)
-    sigma = np.sqrt(np.trace(probe_calibration.point_covariance(calibration, pixels), axis1=1, axis2=2))
+    sigma = np.sqrt(np.trace(point_calibration.point_covariance(calibration, pixels), axis1=1, axis2=2))
     speed, speed_sigma = implied_speed(found.calibration, config)
     turn = Rotation.from_matrix(expected[:3, :3].T @ calibration.target_from_image[:3, :3]).magnitude()
     away = calibration.to_target(pixels[0]) - ProbeCalibration(expected, np.array(design.scale_mm_per_px)).to_target(pixels[0])
@@ -276,7 +266,9 @@ def measure(seen: Seen, found: Adjustment, calibration: ProbeCalibration, config
         **{f"sigma_{name}_mm": float(value) for name, value in zip(names, sigma, strict=True)},
         "implied_speed_m_per_s": speed,
         "implied_speed_sigma_m_per_s": speed_sigma,
-        "water_speed_m_per_s": np.nan if config.temperature_c is None else float(water.speed_of_sound(config.temperature_c)),
+        "water_speed_m_per_s": np.nan
+        if config.temperature_c is None
+        else float(sound_in_water.speed_of_sound(config.temperature_c)),
         "speed_m_per_s": calibration.speed_m_s,
         "design_turn_deg": float(np.degrees(turn)),
         "design_centre_mm": float(np.linalg.norm(away)),
@@ -308,7 +300,7 @@ def describe(seen: Seen, found: Adjustment, figures: Metrics, config: Config) ->
         yield f"depth       {same}; temperature_c=... converts it"
         return
     in_water, assumed = figures["water_speed_m_per_s"], config.assumed_speed
-    deep = float(water.shown_too_deep(SHOWN_DEPTH_MM, in_water, assumed))
+    deep = float(sound_in_water.shown_too_deep(SHOWN_DEPTH_MM, in_water, assumed))
     shown = f"{abs(deep):.2f} mm too {'deep' if deep > 0 else 'shallow'} at {SHOWN_DEPTH_MM:g} mm"
     yield f"water       {config.temperature_c:g} °C, {in_water:.1f} m/s: assuming {assumed:g}, the scanner shows echoes {shown}"
     scales = f"sy {figures['sy_measured_mm_per_px']:.5f} to {figures['sy_mm_per_px']:.5f} mm/px"

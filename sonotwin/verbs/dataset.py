@@ -17,10 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from rich.progress import Progress
 
-from recon.rig import Rig
-from twin.tracking.frames import Quality
-from twin.tracking.ranges import DataRanges
-from twin.tracking.shards import Place, Settings, generate, prepare, write_index
+from recon.model.rig import Rig
+from twin.tracking.dataset_shards import Place, Settings, generate, prepare, write_index
+from twin.tracking.rendered_views import Quality
+from twin.tracking.sampling_ranges import DataRanges
 
 
 class Config(BaseModel):

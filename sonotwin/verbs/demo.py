@@ -24,13 +24,18 @@ import numpy as np
 import trimesh
 from rich.console import Console
 
-from recon import atomic, metrics, probe_files, sequences, sweep_capture, water
-from recon.capture import read_patterns
-from recon.metrics import Metrics, shown
+from recon.capture import probe_files, sweep_part
+from recon.capture.surface_part import read_patterns
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics, shown
+from recon.freehand import sequences
+from recon.probe_calibration import sound_in_water
 from recon.tracking import networks
+from sonotwin import pipeline
 from sonotwin.config import folder as conf
 from sonotwin.demo_commands import commands
 from sonotwin.demo_config import BOARD, BOARD_PATTERNS, CALIBRATION, WATER_C, Config
+from sonotwin.pipeline import Step
 from sonotwin.verbs import (
     calibrate_optics,
     calibrate_probe,
@@ -44,9 +49,9 @@ from sonotwin.verbs import (
     sweep,
     track,
 )
-from twin import demo, evaluate_sweep, evaluate_track, report, sweep_report, track_report
-from twin.demo import Step
-from twin.evaluate import things
+from twin.evaluation import sweep_errors, track_errors
+from twin.evaluation.surface_errors import things
+from twin.reports import demo_report, sweep_report, track_report
 from twin.ultrasound.probe_path import Bob, WirePath
 
 Figures = Mapping[str, float | int]
@@ -87,7 +92,7 @@ def run(config: Config) -> None:
     steps = (calibration_steps(config) if config.poses else []) + surface_steps(config)
     steps += sweep_steps(config) if config.looks_inside else []
     steps += [*(film_steps(config) if config.film_frames else []), telling_step(config)]
-    found = demo.play(
+    found = pipeline.play(
         steps, config.out, config.model_dump(mode="json"), lambda text: console.print(text, style="bold cyan", markup=False)
     )
     console.print()
@@ -181,11 +186,11 @@ def sweep_steps(config: Config) -> list[Step]:
 
     def comparison(folder: Path, _: Figures) -> Figures:
         findings, truth = compared(folder)
-        captured, placed = sweep_capture.read_sweep(folder / "sweep" / "capture"), _placed(folder)
+        captured, placed = sweep_part.read_sweep(folder / "sweep" / "capture"), _placed(folder)
         calibration = probe_files.read(placed["probe"])
-        shown = sequences.target_from_pixel(water.for_tissue(calibration, truth.transducer.assumed_speed))
-        apart = evaluate_sweep.placement(captured.poses(placed["lag_s"]) @ shown, truth)
-        figures = evaluate_sweep.measure(findings, truth, metrics.read(folder / "tumours" / metrics.FILE))
+        shown = sequences.target_from_pixel(sound_in_water.for_tissue(calibration, truth.transducer.assumed_speed))
+        apart = sweep_errors.placement(captured.poses(placed["lag_s"]) @ shown, truth)
+        figures = sweep_errors.measure(findings, truth, metrics.read(folder / "tumours" / metrics.FILE))
         return figures | {"sweep_placement_rms_mm": float(np.sqrt(np.nanmean(apart**2)))}
 
     return [
@@ -211,7 +216,7 @@ def film_steps(config: Config) -> list[Step]:
         track.run(track.Config(rig=config.rig, capture=folder / "film" / "capture", out=folder / "track"))
         tracked = track_report.read(folder / "film", folder / "track")
         own = _named("track", metrics.read(folder / "track" / metrics.FILE))
-        return own | evaluate_track.measure(tracked.errors, tracked.truth)
+        return own | track_errors.measure(tracked.errors, tracked.truth)
 
     return [
         Step("film", f"render {config.film_frames} pairs of frames of the moving target", filming, ("film",)),
@@ -223,7 +228,7 @@ def telling_step(config: Config) -> Step:
     """The report of all steps before it."""
 
     def telling(folder: Path, figures: Figures) -> Figures:
-        story = report.read(folder / "capture", folder / "truth", folder / "surface" / surface.POINTS, config.cameras[0])
+        story = demo_report.read(folder / "capture", folder / "truth", folder / "surface" / surface.POINTS, config.cameras[0])
         inside = None
         if config.looks_inside:
             findings, truth = compared(folder)
@@ -232,18 +237,18 @@ def telling_step(config: Config) -> Step:
         tracked = track_report.read(folder / "film", folder / "track") if config.film_frames else None
         outputs = [(name, text) for name, text in OUTPUTS if (folder / name.partition(",")[0]).exists() or name == "report.html"]
         lines = commands(folder, config, config._overrides, inside.lag_s if inside else 0.0)
-        report.write(folder / "report.html", story, dict(figures), outputs, lines, inside, tracked)
+        demo_report.write(folder / "report.html", story, dict(figures), outputs, lines, inside, tracked)
         return {}
 
     return Step("report", "write the report", telling, ("report.html",))
 
 
-def compared(folder: Path) -> tuple[list[evaluate_sweep.Finding], evaluate_sweep.SweepTruth]:
+def compared(folder: Path) -> tuple[list[sweep_errors.Finding], sweep_errors.SweepTruth]:
     """The true tumours with what was found of each, and the truth."""
-    truth = evaluate_sweep.read_truth(folder / "sweep" / "truth")
+    truth = sweep_errors.read_truth(folder / "sweep" / "truth")
     count = int(metrics.read(folder / "tumours" / metrics.FILE)["masses"])
     found = [trimesh.load_mesh(folder / "tumours" / f"mass{number}.ply", process=False) for number in range(count)]
-    return evaluate_sweep.compare(found, truth), truth
+    return sweep_errors.compare(found, truth), truth
 
 
 def summary(config: Config, found: Metrics) -> list[str]:
@@ -283,9 +288,9 @@ def looked_inside(config: Config, found: Metrics) -> list[str]:
             if config.path is None
             else [f"left out    ultrasound: nothing is to be found inside the scene ({config.scene['kind']})"]
         )
-    errors = evaluate_sweep.of_each(found, "centre_error_mm")
+    errors = sweep_errors.of_each(found, "centre_error_mm")
     off = f", centres off by {', '.join(f'{error:.2f}' for error in errors)} mm" if errors else ""
-    count = sum(value == 1 for value in evaluate_sweep.of_each(found, "inside"))
+    count = sum(value == 1 for value in sweep_errors.of_each(found, "inside"))
     false = f"; {found['tumours_false']} more are none" if found["tumours_false"] else ""
     return [
         f"probe       from {found['probe_frames_used']} B-scans of crossed wires: {found['probe_rms_mm']:.3f} mm RMS; image "

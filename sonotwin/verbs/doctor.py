@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
 from recon.errors import InputError
-from sonotwin import doctor
+from sonotwin import installation
 
 STYLES = {"ok": "green", "absent": "yellow", "unused": "dim", "problem": "bold red"}
 
@@ -29,7 +29,7 @@ def run(config: Config) -> None:
     InputError
         If the core can't be used.
     """
-    findings = doctor.examine()
+    findings = installation.examine()
     console = Console(soft_wrap=True, highlight=False)
     for finding in findings:
         console.print(f"{finding.part:8}{finding.what:32}", end="")

@@ -10,10 +10,11 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from recon import atomic, figures, metrics
-from recon.metrics import Metrics, shown
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics, shown
+from recon.reports import figures
 from sonotwin.verbs.surface import POINTS
-from twin import evaluate
+from twin.evaluation import surface_errors
 
 ERROR_MAP = "error_map.png"  # by which the folder of an evaluation is known
 
@@ -39,10 +40,10 @@ def run(config: Config) -> None:
     """
     out = config.out or config.surface / "evaluation"
     atomic.check_folder(out, ERROR_MAP, inputs=(config.surface, config.truth))
-    truth = evaluate.read_truth(config.truth, config.camera)
-    points, sigma = evaluate.read_points(config.surface / POINTS)
-    comparison = evaluate.compare(points, sigma, truth)
-    found = evaluate.measure(points, comparison, truth)
+    truth = surface_errors.read_truth(config.truth, config.camera)
+    points, sigma = surface_errors.read_points(config.surface / POINTS)
+    comparison = surface_errors.compare(points, sigma, truth)
+    found = surface_errors.measure(points, comparison, truth)
     with atomic.new_folder(out, ERROR_MAP) as folder:
         (folder / ERROR_MAP).write_bytes(figures.error_map_png(comparison.error, comparison.interior))
         metrics.write(folder / metrics.FILE, found)

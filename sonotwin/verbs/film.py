@@ -21,14 +21,14 @@ from pydantic import ConfigDict, Field
 from rich.console import Console
 from rich.progress import Progress
 
-from recon.rig import Rig
+from recon.model.rig import Rig
 from sonotwin.config import folder as conf
-from twin.tracking import film
-from twin.tracking.frames import Frames, Quality
-from twin.tracking.ranges import DataRanges
+from twin.tracking import film_session
+from twin.tracking.rendered_views import Frames, Quality
+from twin.tracking.sampling_ranges import DataRanges
 
 
-class Config(film.Filming):
+class Config(film_session.Filming):
     """Fields of `conf/film.yaml`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -49,17 +49,17 @@ def run(config: Config) -> None:
         If `out` holds something else.
     """
     console = Console(soft_wrap=True, highlight=False)
-    film.check_places(config.out, "film")
+    film_session.check_places(config.out, "film")
     with console.status("setting up the scene"):
-        bank = film.make_bank(config.rig, config.seed)
-        made = film.takes(bank, config.rig, ranges(), config, config.seed)
+        bank = film_session.make_bank(config.rig, config.seed)
+        made = film_session.takes(bank, config.rig, ranges(), config, config.seed)
     start = perf_counter()
     blurs: list[float] = []
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        shot = film.shoot(bank, config.rig, made, config.quality, config.seed, config.pixels)
+        shot = film_session.shoot(bank, config.rig, made, config.quality, config.seed, config.pixels)
         frames = progress.track(shot, total=len(made), description="rendering")
         settings = config.model_dump(mode="json", exclude={"out"})
-        film.write_session(config.out, config.rig, config, made, _noted(frames, blurs), settings)
+        film_session.write_session(config.out, config.rig, config, made, _noted(frames, blurs), settings)
     seconds = perf_counter() - start
     console.print(f"render      {len(made)} pairs of frames, blurred by up to {max(blurs):.1f} px, {seconds:.1f} s")
     console.print(f"wrote       {config.out}/{{capture,truth}}", markup=False)

@@ -22,13 +22,16 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 
-from recon import atomic, freehand, holes, metrics, plus_config, probe_files, sequences, sweep_capture, volumes, water
+from recon.capture import probe_files, sweep_part
+from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
-from recon.freehand import Clip, Compounding, Interpolation, Reconstruction
-from recon.metrics import Metrics
-from recon.probe import ProbeCalibration
-from recon.sweep_capture import SweepCapture
-from recon.water import SCANNER_SPEED, Speed
+from recon.files import atomic, metrics, volumes
+from recon.files.metrics import Metrics
+from recon.freehand import hole_filling, plus_config, sequences, volume_compounding
+from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction
+from recon.model.probe import ProbeCalibration, Speed
+from recon.probe_calibration import sound_in_water
+from recon.probe_calibration.sound_in_water import SCANNER_SPEED
 from sonotwin.verbs.measure_lag import LagSeconds
 
 VOLUME = "volume.nrrd"  # by which the folder of a volume is known
@@ -54,9 +57,9 @@ class Config(BaseModel):
     compounding: Compounding = "mean"
     interpolation: Interpolation = "nearest"
     clip: tuple[int, int, Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] | None = None
-    hole_voxels: Annotated[int, Field(ge=0, le=1000)] = holes.MOST_VOXELS
-    hole_sticks: Annotated[int, Field(ge=1, le=len(holes.STICKS))] = 1
-    most_gib: Annotated[float, Field(gt=0, le=1024)] = freehand.MOST_BYTES / 2**30
+    hole_voxels: Annotated[int, Field(ge=0, le=1000)] = hole_filling.MOST_VOXELS
+    hole_sticks: Annotated[int, Field(ge=1, le=len(hole_filling.STICKS))] = 1
+    most_gib: Annotated[float, Field(gt=0, le=1024)] = volume_compounding.MOST_BYTES / 2**30
 
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
@@ -104,7 +107,7 @@ def run(config: Config) -> None:
     inputs = [path for path in (config.capture, config.probe, config.sequence, config.config) if path is not None]
     atomic.check_folder(config.out, VOLUME, inputs=inputs)
     if config.capture is not None:
-        sweep = sweep_capture.read_sweep(config.capture)
+        sweep = sweep_part.read_sweep(config.capture)
         probe = probe_of(sweep, config.capture, config.probe)
         scans = scans_of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
     else:
@@ -150,7 +153,7 @@ def probe_of(sweep: SweepCapture, capture: Path, given: Path | None) -> ProbeCal
 
 def scans_of_sweep(sweep: SweepCapture, probe: ProbeCalibration, lag_s: float, tissue_m_s: float | None) -> Scans:
     """The B-scans of a capture, in the world; of tissue with a speed of sound other than the calibration's, if it is known."""
-    converted = water.for_tissue(probe, tissue_m_s)
+    converted = sound_in_water.for_tissue(probe, tissue_m_s)
     world_from_pixel = sweep.poses(lag_s) @ sequences.target_from_pixel(converted)
     return Scans(sweep.size[::-1], world_from_pixel, sweep.images, converted.speed_m_s, probe.speed_m_s, converted)
 
@@ -172,8 +175,8 @@ def scans_of_sequence(path: Path, probe: Path | None, config: Path | None, tissu
     valid = frames.valid["Image"][:, None, None]
     calibrated = SCANNER_SPEED if given is None else given.speed_m_s
     speed = tissue_m_s or calibrated
-    matrices = water.in_tissue(np.where(valid, world_from_pixel, np.nan), calibrated, speed)
-    converted = None if given is None else water.for_tissue(given, tissue_m_s)
+    matrices = sound_in_water.in_tissue(np.where(valid, world_from_pixel, np.nan), calibrated, speed)
+    converted = None if given is None else sound_in_water.for_tissue(given, tissue_m_s)
     return Scans(shape, matrices, lambda: sequences.stream_images(path), speed, calibrated, converted)
 
 
@@ -190,15 +193,15 @@ def reconstruct(scans: Scans, config: Config) -> tuple[Reconstruction, Reconstru
         assert config.sequence is not None
         return plus_config.reconstruct_sequence(config.sequence, plus_config.read_config(config.config))
     clip = None if config.clip is None else Clip(*config.clip)
-    grid_along = freehand.aligned_grid if config.extent == "aligned" else freehand.principal_grid
-    grid = grid_along(freehand.corners(scans.world_from_pixel, scans.shape, clip), config.spacing_mm)
+    grid_along = volume_compounding.aligned_grid if config.extent == "aligned" else volume_compounding.principal_grid
+    grid = grid_along(volume_compounding.corners(scans.world_from_pixel, scans.shape, clip), config.spacing_mm)
     most_bytes = int(config.most_gib * 2**30)
-    pasted = freehand.reconstruct(
+    pasted = volume_compounding.reconstruct(
         scans.stream(), scans.world_from_pixel, grid, config.compounding, config.interpolation, clip, most_bytes=most_bytes
     )
     if config.hole_voxels == 0:
         return pasted, pasted
-    return pasted, holes.fill_holes(pasted, config.hole_voxels, config.hole_sticks)
+    return pasted, hole_filling.fill_holes(pasted, config.hole_voxels, config.hole_sticks)
 
 
 def measure(scans: Scans, pasted: Reconstruction, filled: Reconstruction) -> Metrics:

@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from rich.console import Console
 
-from recon import atomic, lag, metrics, sweep_capture, sweep_tables
+from recon.capture import sweep_part, sweep_tables
+from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
-from recon.lag import Lag
-from recon.metrics import Metrics
-from recon.rig import Finite
-from recon.sweep_capture import SweepCapture
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics
+from recon.model.rig import Finite
+from recon.probe_calibration import latency
+from recon.probe_calibration.latency import Lag
 
 LAG = "lag.json"  # by which the folder of a lag is known
 DEPTHS = "depths.csv"
@@ -41,7 +43,7 @@ class Config(BaseModel):
 
     capture: Path
     out: Path
-    search_s: tuple[Finite, Finite] = lag.SEARCH_S
+    search_s: tuple[Finite, Finite] = latency.SEARCH_S
     top_px: Annotated[int, Field(ge=0)] = 40
 
     @field_validator("search_s")
@@ -64,15 +66,15 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     atomic.check_folder(config.out, LAG, inputs=[config.capture])
-    sweep = sweep_capture.read_sweep(config.capture)
+    sweep = sweep_part.read_sweep(config.capture)
     start = perf_counter()
     with console.status("looking for the bottom"):
-        depths = np.array([lag.bottom_depth(image, config.top_px) for image in sweep.images()])
+        depths = np.array([latency.bottom_depth(image, config.top_px) for image in sweep.images()])
     seconds = perf_counter() - start
     found_in = f"bottom in {np.isfinite(depths).sum()} of {len(depths)} B-scans"
     console.print(f"find        {found_in}, {len(sweep.track.times)} poses, {seconds:.0f} s", markup=False)
     try:
-        found = lag.estimate(sweep.times, depths, sweep.track, config.search_s)
+        found = latency.estimate(sweep.times, depths, sweep.track, config.search_s)
     except InputError as error:
         raise InputError(f"{sweep.name}: {error}") from None
     figures = measure(depths, found) | {"seconds_find": round(seconds, 3)}
@@ -100,14 +102,19 @@ def measure(depths: Array, found: Lag) -> Metrics:
 def describe(figures: Metrics) -> Iterator[str]:
     """Lines that say the lag with its interval, and what scatters."""
     interval = f"{figures['lag_low_ms']:.1f} to {figures['lag_high_ms']:.1f} ms"
-    yield f"lag         {figures['lag_ms']:.1f} ms, {interval} ({100 * lag.COVERAGE:.0f} %), the images after the poses"
+    yield f"lag         {figures['lag_ms']:.1f} ms, {interval} ({100 * latency.COVERAGE:.0f} %), the images after the poses"
     scatter = f"{figures['depth_sigma_px']:.2f} px of depth, {figures['jitter_ms']:.1f} ms of the time stamps"
     yield f"scatter     {scatter} (1 sigma); {figures['frames_used']} B-scans used"
 
 
 def write(out: Path, sweep: SweepCapture, depths: Array, found: Lag, figures: Metrics) -> list[str]:
     """Write all files, whole or not at all; returns their names."""
-    content = {"lag_s": found.seconds, "sigma_s": found.sigma_s, "interval_s": list(found.interval_s), "coverage": lag.COVERAGE}
+    content = {
+        "lag_s": found.seconds,
+        "sigma_s": found.sigma_s,
+        "interval_s": list(found.interval_s),
+        "coverage": latency.COVERAGE,
+    }
     with atomic.new_folder(out, LAG) as folder:
         (folder / LAG).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         sweep_tables.write_rows(folder / DEPTHS, HEADER, rows(sweep, depths, found))

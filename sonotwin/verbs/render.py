@@ -19,14 +19,14 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
-from recon.manifest import axes_without_fringes
-from recon.patterns import Patterns
-from recon.rig import Rig
+from recon.capture.manifest import axes_without_fringes
+from recon.model.patterns import Patterns
+from recon.model.rig import Rig
+from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene, parse_scene
-from scenes.poses import Config as BoardPoses
-from twin import board_session, session
-from twin.optics.transport import Engine
-from twin.places import check_places
+from twin import board_session, surface_session
+from twin.optics.light_transport import Engine
+from twin.output_folders import check_places
 
 
 class Config(BaseModel):
@@ -39,9 +39,9 @@ class Config(BaseModel):
     patterns: Patterns
     engine: Engine
     out: Path
-    cameras: Annotated[list[session.CameraName], Field(min_length=1)]
+    cameras: Annotated[list[surface_session.CameraName], Field(min_length=1)]
     seed: Annotated[int, Field(ge=0)]
-    shooting: session.Shooting
+    shooting: surface_session.Shooting
     poses: BoardPoses | None = None
 
     @model_validator(mode="after")
@@ -124,10 +124,12 @@ def render_surface(config: Config, console: Console) -> None:
     for camera in dict.fromkeys(config.cameras):
         start = perf_counter()
         with console.status(f"rendering {config.patterns.count} patterns for {camera}"):
-            view = session.shoot(config.rig, scene, config.patterns, camera, config.engine, config.shooting, config.seed)
+            view = surface_session.shoot(config.rig, scene, config.patterns, camera, config.engine, config.shooting, config.seed)
         views[camera] = view
         console.print(
             f"render      {camera}, {config.patterns.count} patterns, {config.engine.samples} samples/px, "
             f"exposure {view.exposure.time_s * 1e3:.2f} ms, {perf_counter() - start:.1f} s"
         )
-    session.write_session(config.out, config.rig, scene, config.patterns, views, config.model_dump(mode="json", exclude={"out"}))
+    surface_session.write_session(
+        config.out, config.rig, scene, config.patterns, views, config.model_dump(mode="json", exclude={"out"})
+    )

@@ -24,16 +24,17 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 
-from recon import atomic, masses, meshes, metrics, ring, sweep_capture
-from recon.containment import Containment, contain
+from recon.capture import sweep_part
 from recon.errors import InputError
-from recon.mass_paths import Sound
-from recon.masses import Mass
-from recon.metrics import Metrics
-from recon.probe import SCANNER_SPEED, ProbeCalibration
-from recon.rig import Positive
-from recon.ring import Appearance, Ring, Tube
-from recon.water import Speed
+from recon.files import atomic, meshes, metrics
+from recon.files.metrics import Metrics
+from recon.model.probe import SCANNER_SPEED, ProbeCalibration, Speed
+from recon.model.rig import Positive
+from recon.segmentation import masses, tube_wall
+from recon.segmentation.containment import Containment, contain
+from recon.segmentation.masses import Mass
+from recon.segmentation.refraction import Sound
+from recon.segmentation.tube_wall import Appearance, Ring, Tube
 from sonotwin.verbs import freehand
 from sonotwin.verbs.freehand import Scans
 from sonotwin.verbs.measure_lag import LagSeconds
@@ -133,7 +134,7 @@ def read(config: Config) -> Scans:
     if config.capture is None:
         assert config.sequence is not None
         return freehand.scans_of_sequence(config.sequence, config.probe, None, config.tissue_m_s)
-    sweep = sweep_capture.read_sweep(config.capture)
+    sweep = sweep_part.read_sweep(config.capture)
     probe = freehand.probe_of(sweep, config.capture, config.probe)
     return freehand.scans_of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
 
@@ -211,9 +212,9 @@ def find_tube(scans: Scans, config: Config) -> Found:
     """A tube, with its wall in the B-scans."""
     matrices = scans.world_from_pixel
     scale = np.array(masses.pixel_mm(matrices))
-    rings = [ring.find(image, scale, config.tube) for image in scans.stream()]
+    rings = [tube_wall.find(image, scale, config.tube) for image in scans.stream()]
     try:
-        tube = ring.fit_tube(rings, matrices)
+        tube = tube_wall.fit_tube(rings, matrices)
     except InputError as error:
         reasons = [one.reason for one in rings if one.reason]
         found = f"; most others: {max(set(reasons), key=reasons.count)}" if reasons else ""
@@ -246,14 +247,14 @@ def scale_sigma(rings: Sequence[Ring], matrices: Array, tube: Tube, probe: Probe
         k = ("sx", "sy").index(name)
         changed = np.ones(4)
         changed[k] += known.sigma(name) / probe.scale[k]
-        steps.append((ring.fit_tube(rings, matrices * changed).shape.radius - tube.shape.radius) / known.sigma(name))
+        steps.append((tube_wall.fit_tube(rings, matrices * changed).shape.radius - tube.shape.radius) / known.sigma(name))
     order = [known.names.index(name) for name in names]
     return float(np.sqrt(np.array(steps) @ known.covariance[np.ix_(order, order)] @ np.array(steps))) if names else 0.0
 
 
 def tube_mesh(tube: Tube, rings: Sequence[Ring], matrices: Array) -> trimesh.Trimesh:
     """The cylinder, as long as what was seen of it."""
-    points = np.concatenate([ring.in_world(rings[k].pixels, matrices[k]) for k in np.unique(tube.frames)])
+    points = np.concatenate([tube_wall.in_world(rings[k].pixels, matrices[k]) for k in np.unique(tube.frames)])
     along = (points - tube.shape.point) @ tube.shape.axis
     ends = tube.shape.point + np.outer([along.min(), along.max()], tube.shape.axis)
     return trimesh.creation.cylinder(tube.shape.radius, segment=ends, sections=96)

@@ -19,13 +19,15 @@ import numpy as np
 import trimesh
 from pydantic import BaseModel, ConfigDict
 
-from recon import atomic, capture, decode, meshes, metrics, surface
-from recon.camera import Camera
-from recon.capture import SurfaceCapture
-from recon.decode import ProjectorMap, Status
+from recon.capture import surface_part
+from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError
-from recon.metrics import Metrics, shown
-from recon.triangulate import PointMap, Triangulator
+from recon.files import atomic, meshes, metrics
+from recon.files.metrics import Metrics, shown
+from recon.geometry.camera import Camera
+from recon.structured_light import decode, surface_mesh
+from recon.structured_light.decode import ProjectorMap, Status
+from recon.structured_light.triangulate import PointMap, Triangulator
 from sonotwin import config as configuration
 
 POINTS = "points.npz"  # by which the folder of a surface is known
@@ -42,7 +44,7 @@ class Config(BaseModel):
     patterns: str | None = None
     calibration: Path | None = None
     camera: str = "cam1"
-    limits: surface.Limits = surface.Limits()
+    limits: surface_mesh.Limits = surface_mesh.Limits()
 
 
 class Stopwatch:
@@ -83,11 +85,11 @@ def run(config: Config) -> None:
     with watch.stage("triangulate"):
         raw = triangulate(found)
     with watch.stage("clean"):
-        cleaned = surface.clean(raw, camera, found.modulation, config.limits)
+        cleaned = surface_mesh.clean(raw, camera, found.modulation, config.limits)
     if not np.isfinite(cleaned.points).any():
         raise InputError(f"{shots.name}: expected a surface that camera and projector both see, found no point of it")
     with watch.stage("mesh"):
-        mesh = surface.mesh(cleaned, camera, config.limits.max_slope)
+        mesh = surface_mesh.mesh(cleaned, camera, config.limits.max_slope)
     figures = measure(found, raw, cleaned) | {"predicted_rms_mm": predicted_rms(mesh, camera), "triangles": len(mesh.faces)}
     points, sigma = f"{figures['points']:,}".replace(",", " "), shown(figures["predicted_rms_mm"], ".3f", " mm")
     print(f"triangulate {points} points, predicted sigma {sigma}, {figures['removed_px']} px removed as unsure")
@@ -115,11 +117,11 @@ def read(config: Config) -> SurfaceCapture:
     if config.capture is not None:
         if doubled := ", ".join(name for name in given if name != "calibration"):
             raise InputError(f"surface: expected capture, or images with patterns and calibration, found both: {doubled}")
-        return capture.read_surface(config.capture, config.camera, config.calibration)
+        return surface_part.read_surface(config.capture, config.camera, config.calibration)
     if config.images is None or config.patterns is None or config.calibration is None:
         found = ", ".join(given) or "none of them"
         raise InputError(f"surface: expected capture, or images with patterns and calibration, found {found}")
-    return capture.read_bare(config.images, patterns_file(config.patterns), config.calibration, config.camera)
+    return surface_part.read_bare(config.images, patterns_file(config.patterns), config.calibration, config.camera)
 
 
 def sources(config: Config) -> list[Path]:

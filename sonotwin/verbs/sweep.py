@@ -21,13 +21,13 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from rich.console import Console
 from rich.progress import Progress
 
-from recon.rig import Rig
+from recon.model.rig import Rig
 from scenes.catalogue import build_scene
-from twin.ultrasound import session
+from twin.ultrasound import sweep_session
+from twin.ultrasound.bscan import Scan
+from twin.ultrasound.echo_solids import Body, body
 from twin.ultrasound.probe_path import WirePath
-from twin.ultrasound.scan import Scan
-from twin.ultrasound.solids import Body, body
-from twin.ultrasound.sweep import Clocks, Plan, PoseNoise, scans
+from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise, scans
 from twin.ultrasound.transducer import Transducer
 
 
@@ -39,7 +39,7 @@ class Config(BaseModel):
     rig: Rig
     scene: dict
     ultrasound: Transducer
-    path: session.AnyPath
+    path: sweep_session.AnyPath
     out: Path
     clocks: Clocks = Clocks()
     pose_noise: PoseNoise = PoseNoise()
@@ -75,20 +75,20 @@ def run(config: Config) -> None:
         If the scene has no acoustics or not what the path is about, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    session.check_places(config.out, "sweep")
+    sweep_session.check_places(config.out, "sweep")
     with console.status("setting up the scene"):
         scene = build_scene(config.scene)
         scanned = body(scene)
-        planned = session.plan_sweep(
+        planned = sweep_session.plan_sweep(
             config.path, config.rig, scanned, config.ultrasound, config.clocks, config.pose_noise, config.seed
         )
     count = len(planned.times)
     console.print(f"path        {config.path.kind}, {count} B-scans, {len(planned.track.times)} poses")
-    probe = None if isinstance(config.path, WirePath) else session.calibration_of(config.rig, config.ultrasound)
+    probe = None if isinstance(config.path, WirePath) else sweep_session.calibration_of(config.rig, config.ultrasound)
     settings = config.model_dump(mode="json", exclude={"out"})
     start = perf_counter()
     taken = shown(scanned, config, planned, console)
-    session.write_session(config.out, scene, scanned, config.ultrasound, planned, taken, probe, settings)
+    sweep_session.write_session(config.out, scene, scanned, config.ultrasound, planned, taken, probe, settings)
     seconds = perf_counter() - start
     width, height = config.ultrasound.image_size
     console.print(f"render      {count} B-scans, {width}x{height}, {seconds:.1f} s")

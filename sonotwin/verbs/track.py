@@ -27,12 +27,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from rich.progress import Progress
 
-from recon import atomic, metrics
-from recon.metrics import Metrics, shown
-from recon.rig import Rig
-from recon.tracking import capture, following, networks
-from recon.tracking.capture import Film
-from recon.tracking.following import Step
+from recon.capture import stereo_frames
+from recon.capture.stereo_frames import Film
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics, shown
+from recon.model.rig import Rig
+from recon.tracking import networks, results
+from recon.tracking.results import Step
 from recon.tracking.tracker import Tracker
 
 WAYS = ("predicted", "segmented", "detected")
@@ -63,23 +64,23 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     inputs = [path for path in (config.capture, config.calibration, config.networks) if path is not None]
-    atomic.check_folder(config.out, capture.POSES, inputs=inputs)
-    film = capture.read_film(config.capture, config.calibration)
+    atomic.check_folder(config.out, results.POSES, inputs=inputs)
+    film = stereo_frames.read_film(config.capture, config.calibration)
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
     tracker = Tracker(film.cameras, config.rig.target, loaded, film.bits)
     rate = f", {film.rate_hz:.4g} a second" if np.isfinite(film.rate_hz) else ""
     sizes = " and ".join(dict.fromkeys("x".join(map(str, camera.size)) for camera in film.cameras))
     console.print(f"read        {len(film.times)} pairs of frames, {sizes}{rate}", markup=False)
 
-    with atomic.new_folder(config.out, capture.POSES) as folder:
+    with atomic.new_folder(config.out, results.POSES) as folder:
         start = perf_counter()
         steps = follow(film, tracker, folder if config.overlays else None, console)
         figures = measure(steps)
         for line in describe(steps, figures):
             console.print(line, markup=False)
-        capture.write_poses(folder, film, steps)
+        results.write_poses(folder, film, steps)
         metrics.write(folder / metrics.FILE, figures | {"seconds_track": round(perf_counter() - start, 3)})
-        capture.hand_on(folder, config.capture, config.out, config.calibration)
+        results.hand_on(folder, config.capture, config.out, config.calibration)
         written = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
 
@@ -91,9 +92,9 @@ def follow(film: Film, tracker: Tracker, pictures: Path | None, console: Console
         pairs = progress.track(film.pairs(), total=len(film.times), description="tracking")
         for time, (number, _), pair in zip(film.times.tolist(), film.frames.tolist(), pairs, strict=True):
             found = tracker.step(*pair, time * 1e-9)
-            steps.append(following.kept(found, time))
+            steps.append(results.kept(found, time))
             if pictures is not None:
-                capture.write_overlay(pictures, number, capture.overlay(pair, found, film.cameras))
+                results.write_overlay(pictures, number, results.overlay(pair, found, film.cameras))
     return steps
 
 

@@ -22,13 +22,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
-from recon import atomic, metrics
 from recon.errors import InputError
-from recon.metrics import Metrics, shown
-from trainers import export, fit, shards
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics, shown
+from trainers import export, fit, shard_reader
+from trainers.architectures import Name, is_detector, network
 from trainers.fit import Fitted, Plan, Precision
-from trainers.networks import Name, is_detector, network
-from trainers.shards import Data
+from trainers.shard_reader import Data
 
 MARKER = "training.json"  # what a run was asked for
 MAY_CHANGE = {"out", "resume", "steps", "max_minutes", "threads", "loaders", "checkpoint_minutes"}  # when a run goes on
@@ -158,14 +158,14 @@ def prepare(config: Config, goes_on: bool) -> None:
 
 def read(config: Config, console: Console) -> tuple[Data, Data]:
     """What to train and to validate with."""
-    reader = shards.read_views if is_detector(config.network) else shards.read_patches
+    reader = shard_reader.read_views if is_detector(config.network) else shard_reader.read_patches
     with console.status("reading") as status:
         data = reader(
             config.data, lambda count: status.update(f"reading, {count} samples") if count % 100 == 0 else None, config.partial
         )
         if config.validation_data is not None:
             return data, reader(config.validation_data)
-    return shards.split(data, config.validation)
+    return shard_reader.split(data, config.validation)
 
 
 def fitted_with_progress(config: Config, module: torch.nn.Module, train: Data, validation: Data, console: Console) -> Fitted:

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recon import rigid
-from recon.boards import AsymmetricCircles
-from recon.bundle import Estimate
-from recon.calibrate import circle_offsets
-from recon.observations import Observations
-from recon.projection import linearise
-from recon.sight import Sighting
+from recon.geometry import rigid
+from recon.geometry.camera_jacobian import linearise
+from recon.model.boards import AsymmetricCircles
+from recon.optical_calibration.bundle import Estimate
+from recon.optical_calibration.joint_calibration import circle_offsets
+from recon.optical_calibration.observations import Observations
+from recon.optical_calibration.sightings import Sighting
 
 BOARD = AsymmetricCircles(columns=4, rows=11, spacing_mm=15, diameter_mm=9)
 DEVICES = ("cam1", "cam2", "projector")

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from recon import rigid
-from recon.boards import AsymmetricCircles, Charuco, SymmetricCircles
+from recon.geometry import rigid
+from recon.model.boards import AsymmetricCircles, Charuco, SymmetricCircles
 
 SUB = 4  # sub-pixels a pixel and axis
 

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.patterns import Patterns
-from recon.phase import Noise
+from recon.model.patterns import Patterns
+from recon.structured_light.phase import Noise
 
 NOISE = Noise(0.5, 0.033)  # DN^2, DN
 

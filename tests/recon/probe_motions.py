@@ -3,9 +3,10 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recon import probe_calibration, rigid
-from recon.probe import ProbeCalibration
-from recon.probe_calibration import Sightings
+from recon.geometry import rigid
+from recon.model.probe import ProbeCalibration
+from recon.probe_calibration import point_calibration
+from recon.probe_calibration.point_calibration import Sightings
 
 WIRE = np.array([5.0, -10.0, 800.0])  # mm, in the world
 LOOKING_AWAY = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # world_from_image of a probe that looks along the world's z
@@ -19,7 +20,7 @@ def true_probe(rig):
 
 def motion(rig, roll_deg=180.0):
     """Turns and pixels of 30 frames, as recommended, with the roll as far as the tracking allows."""
-    return probe_calibration.motion(rig.probe.image_size, roll_deg=roll_deg)
+    return point_calibration.motion(rig.probe.image_size, roll_deg=roll_deg)
 
 
 def poses_of(probe, turns, pixels):

@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recon import rigid, sweep_capture, water
-from recon.probe import ProbeCalibration
-from recon.tracks import Track
+from recon.capture import sweep_part
+from recon.geometry import rigid
+from recon.model.probe import ProbeCalibration
+from recon.model.tracks import Track
+from recon.probe_calibration import sound_in_water
 from tests.recon import bscans, probe_motions
 
 START_NS = 10**18  # of the clocks: seconds since 1970
@@ -24,7 +26,7 @@ def nanoseconds(seconds):
 def probe_in_water(rig) -> ProbeCalibration:
     """The rig's probe, where the scanner assumes 1540 m/s and the wires are in water."""
     probe = probe_motions.true_probe(rig)
-    return water.in_medium(probe, water.SCANNER_SPEED, float(water.speed_of_sound(WATER_C)))
+    return sound_in_water.in_medium(probe, sound_in_water.SCANNER_SPEED, float(sound_in_water.speed_of_sound(WATER_C)))
 
 
 def wires(folder: Path, rig, rng, lag_s: float = 0.0) -> Path:
@@ -41,7 +43,7 @@ def wires(folder: Path, rig, rng, lag_s: float = 0.0) -> Path:
             yield bscans.image(wire + bscans.face(), rng)
 
     track = Track(nanoseconds((moments[:, None] + [-0.05, 0.05]).ravel()), np.repeat(poses, 2, axis=0))
-    sweep_capture.write_sweep(folder, images(), nanoseconds(moments + lag_s), track, bscans.SIZE, name="wires")
+    sweep_part.write_sweep(folder, images(), nanoseconds(moments + lag_s), track, bscans.SIZE, name="wires")
     return folder
 
 
@@ -57,7 +59,7 @@ def bottom(folder: Path, rng, lag_s: float) -> Path:
     poses[50:53] = np.nan
     images = (bscans.image(bscans.bottom((32 + h) / bscans.MM_PER_PX) + bscans.face(), rng) for h in height(shown))
     times = nanoseconds(shown + lag_s)
-    sweep_capture.write_sweep(folder, images, times, Track(nanoseconds(tracked), poses), bscans.SIZE, name="bottom")
+    sweep_part.write_sweep(folder, images, times, Track(nanoseconds(tracked), poses), bscans.SIZE, name="bottom")
     return folder
 
 
@@ -83,5 +85,5 @@ def ball(folder: Path, rig, lag_s: float = 0.0, count: int = 41, with_probe: boo
     tracked = np.arange(-1.1, 1.1, 0.03)
     poses = np.array([world_from_image(t) @ rigid.invert(probe.target_from_image) for t in tracked])
     times, track = nanoseconds(moments + lag_s), Track(nanoseconds(tracked), poses)
-    sweep_capture.write_sweep(folder, images, times, track, size, probe if with_probe else None, "ball")
+    sweep_part.write_sweep(folder, images, times, track, size, probe if with_probe else None, "ball")
     return folder

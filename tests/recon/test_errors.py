@@ -4,7 +4,7 @@ import pytest
 from pydantic import ValidationError
 
 from recon.errors import one_line
-from recon.patterns import Patterns
+from recon.model.patterns import Patterns
 
 GOOD = {"projector_size": (128, 80), "unwrap": "centre_line", "parts": [{"kind": "centre_line"}]}
 FRINGES = {"kind": "fringes", "pitch": 12, "steps": 4}

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from recon.decode import Status, decode
 from recon.errors import InputError
-from recon.patterns import Fringes, GrayCode, Patterns
-from recon.phase import Noise
+from recon.model.patterns import Fringes, GrayCode, Patterns
+from recon.structured_light.decode import Status, decode
+from recon.structured_light.phase import Noise
 from tests.recon.fringe_scenes import photograph
 
 PROJECTORS = [(1024, 768), (912, 1140), (1920, 1080), (1280, 800)]

@@ -29,7 +29,7 @@ def test_every_configuration_says_what_the_code_defaults_to(kind):
     """The YAML files document all the defaults; the two must not drift apart."""
     fields = yaml.safe_load((CONF / f"{kind}.yaml").read_text())
     del fields["kind"]
-    model = import_module(f"scenes.{kind}").Config
+    model = import_module(f"scenes.kinds.{kind}").Config
     assert model(**fields) == model() and set(fields) == set(model.model_fields)
 
 

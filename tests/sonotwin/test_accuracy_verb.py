@@ -5,8 +5,8 @@ import json
 import pytest
 
 from sonotwin.cli import main
-from twin.accuracy import optics
-from twin.accuracy.rows import Row
+from twin.accuracy import optics_accuracy
+from twin.accuracy.table_rows import Row
 
 
 @pytest.fixture
@@ -14,7 +14,9 @@ def quick(monkeypatch):
     """The optics group with one row, whose figure the test chooses."""
 
     def measure(value: float) -> None:
-        monkeypatch.setattr(optics, "measurements", lambda setup: [lambda: [Row("a", "an error", value, 0.05, None, "mm")]])
+        monkeypatch.setattr(
+            optics_accuracy, "measurements", lambda setup: [lambda: [Row("a", "an error", value, 0.05, None, "mm")]]
+        )
 
     return measure
 

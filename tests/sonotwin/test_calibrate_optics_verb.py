@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import board_capture, calibration, rigid
-from recon.boards import Chessboard
-from recon.calibration import Calibration
-from recon.camera import Camera
-from recon.manifest import BoardPart, Device
-from recon.sight import Sighting
+from recon.capture import board_part, calibration_files
+from recon.capture.manifest import BoardPart, Device
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.model.boards import Chessboard
+from recon.model.calibration import Calibration
+from recon.optical_calibration.sightings import Sighting
 from sonotwin.cli import main
 from sonotwin.verbs.calibrate_optics import found_by
 from tests.recon import board_views
@@ -44,12 +45,12 @@ def session(tmp_path_factory) -> Path:
         lit = {name: np.uint8(board_views.view(BOARD, camera, pose, noise=0.7, rng=rng)) for name, camera in cameras().items()}
         if number == 8:
             lit["cam2"][:] = 2
-        board_capture.write_pose(folder / "capture", f"{number:02d}", lit, {})
-        poses.append(board_capture.describe_pose(f"{number:02d}", list(lit), {}))
+        board_part.write_pose(folder / "capture", f"{number:02d}", lit, {})
+        poses.append(board_part.describe_pose(f"{number:02d}", list(lit), {}))
     part = BoardPart(board=BOARD, poses=tuple(poses))
-    board_capture.write_manifest(folder / "capture", {name: Device(size=SIZE) for name in cameras()}, part, "small")
+    board_part.write_manifest(folder / "capture", {name: Device(size=SIZE) for name in cameras()}, part, "small")
     (folder / "truth" / "calibration").mkdir(parents=True)
-    calibration.write(folder / "truth" / "calibration" / "optics.yaml", Calibration(cameras()))
+    calibration_files.write(folder / "truth" / "calibration" / "optics.yaml", Calibration(cameras()))
     return folder
 
 
@@ -71,7 +72,7 @@ def test_a_capture_becomes_a_calibration(session, calibrated):
     assert any(line.startswith("error ") for line in lines)
     assert sorted(path.name for path in out.iterdir()) == FILES
 
-    found, true = calibration.read(out / "optics.yaml"), cameras()
+    found, true = calibration_files.read(out / "optics.yaml"), cameras()
     assert list(found.cameras) == ["cam1", "cam2"]
     for name, camera in found.cameras.items():
         sigma = found.uncertainty.sigma(f"{name}.fx")
@@ -81,7 +82,7 @@ def test_a_capture_becomes_a_calibration(session, calibrated):
     assert figures["cam2_rotation_error_deg"] < 0.3 and figures["shape_error_rms_mm"] < 1
     assert {"seconds_detect", "seconds_adjust", "scale_sigma_ppm", "cam2_translation_error_mm"} <= figures.keys()
     for name in ("StereoParams.xml", "cam1_cam2_params.npz"):
-        pair = calibration.read(out / name, dict.fromkeys(("cam1", "cam2"), SIZE)).cameras["cam2"]
+        pair = calibration_files.read(out / name, dict.fromkeys(("cam1", "cam2"), SIZE)).cameras["cam2"]
         assert np.allclose(pair.camera_from_world, found.cameras["cam2"].camera_from_world, atol=1e-9)
     page = (out / "calibration.html").read_text(encoding="utf-8")
     assert f"sonotwin calibrate-optics capture={session / 'capture'}" in page and "distortion=radial2" in page, "to make it again"
@@ -97,7 +98,9 @@ def test_opencv_programs_read_it(calibrated):
     seen, _ = cv2.projectPoints(
         point, cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3], node.getNode("matrix").mat(), node.getNode("distortion").mat()
     )
-    assert seen.ravel() == pytest.approx(calibration.read(out / "optics.yaml").cameras["cam2"].project(point).ravel(), abs=1e-6)
+    assert seen.ravel() == pytest.approx(
+        calibration_files.read(out / "optics.yaml").cameras["cam2"].project(point).ravel(), abs=1e-6
+    )
 
 
 def complaint(capsys, *fields: str) -> str:
@@ -121,7 +124,7 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(copied, tmp_pa
     assert complaint(capsys, *fields, "shape.in_plane_mm=-1").startswith("calibrate-optics: shape.in_plane_mm: expected ")
     assert "expected a folder apart from what is read" in complaint(capsys, f"capture={capture}", f"out={copied}")
     assert "expected a calibration file" in complaint(capsys, *fields, f"truth={tmp_path}")
-    calibration.write(copied / "truth" / "calibration" / "optics.yaml", Calibration({"cam1": cameras()["cam1"]}))
+    calibration_files.write(copied / "truth" / "calibration" / "optics.yaml", Calibration({"cam1": cameras()["cam1"]}))
     assert "expected cam2 of 320x256 px as in the capture" in complaint(capsys, *fields, f"truth={copied / 'truth'}")
     image = capture / "board" / "03" / "cam1" / "lit.png"
     image.write_bytes(image.read_bytes()[:-30])
@@ -174,7 +177,7 @@ def test_a_third_camera_is_warned_of(copied, tmp_path, capsys):
     assert [line for line in lines if "cam3" in line] == [
         "warning     cam3: not calibrated, as only cam1, cam2, projector can be"
     ]
-    assert list(calibration.read(tmp_path / "out" / "optics.yaml").cameras) == ["cam1", "cam2"]
+    assert list(calibration_files.read(tmp_path / "out" / "optics.yaml").cameras) == ["cam1", "cam2"]
 
 
 def test_a_device_counts_where_it_sees_points():

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon import probe_calibration, probe_files, repeatability, rigid, sweep_tables, water
+from recon.capture import probe_files, sweep_tables
+from recon.geometry import rigid
+from recon.probe_calibration import point_calibration, repeatability, sound_in_water
 from sonotwin.cli import main
 from tests.recon import bscans, probe_motions, sweep_sets
 
@@ -44,7 +46,7 @@ def test_b_scans_become_a_calibration(calibrated, rig):
     assert sorted(path.name for path in out.iterdir()) == FILES
     found, true = probe_files.read(out / "probe.yaml"), sweep_sets.probe_in_water(rig)
     pixels = repeatability.five_points(bscans.SIZE)
-    sigma = np.sqrt(np.trace(probe_calibration.point_covariance(found, pixels), axis1=1, axis2=2))
+    sigma = np.sqrt(np.trace(point_calibration.point_covariance(found, pixels), axis1=1, axis2=2))
     away = np.linalg.norm(found.to_target(pixels) - true.to_target(pixels), axis=1)
     assert (away < 4 * sigma).all() and sigma.max() < 0.2
     figures = json.loads((out / "metrics.json").read_text())
@@ -81,7 +83,7 @@ def test_every_frame_is_accounted_for(calibrated):
 def test_the_scale_tells_the_speed_of_sound_in_the_water(calibrated):
     """1488 m/s at 22 degrees, though nobody has told the temperature."""
     figures = json.loads((calibrated[0] / "metrics.json").read_text())
-    expected = float(water.speed_of_sound(sweep_sets.WATER_C))
+    expected = float(sound_in_water.speed_of_sound(sweep_sets.WATER_C))
     assert abs(figures["implied_speed_m_per_s"] - expected) < 4 * figures["implied_speed_sigma_m_per_s"] < 10
     assert figures["water_speed_m_per_s"] is None
     assert probe_files.read(calibrated[0] / "probe.yaml").speed_m_s == pytest.approx(figures["implied_speed_m_per_s"])
@@ -91,8 +93,8 @@ def test_the_temperature_makes_it_fit_tissue(capture, calibrated, rig, tmp_path)
     """In water the scanner shows depths 3.4 % too deep; converted, its own scale comes back, which is right for tissue."""
     lines = calibrate(f"capture={capture}", f"out={tmp_path / 'out'}", f"lag_s={LAG_S}", f"temperature_c={sweep_sets.WATER_C}")
     found, measured = (probe_files.read(folder / "probe.yaml") for folder in (tmp_path / "out", calibrated[0]))
-    assert found.speed_m_s == water.SCANNER_SPEED
-    ratio = water.SCANNER_SPEED / float(water.speed_of_sound(sweep_sets.WATER_C))
+    assert found.speed_m_s == sound_in_water.SCANNER_SPEED
+    ratio = sound_in_water.SCANNER_SPEED / float(sound_in_water.speed_of_sound(sweep_sets.WATER_C))
     assert found.scale[1] / measured.scale[1] == pytest.approx(ratio, rel=1e-9)
     assert abs(found.scale[1] - rig.probe.scale_mm_per_px[1]) < 4 * found.uncertainty.sigma("sy")
     assert found.uncertainty.sigma("sy") > ratio * measured.uncertainty.sigma("sy"), "the thermometer's share"

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon import probe_files, sequences, sweep_capture, volumes
+from recon.capture import probe_files, sweep_part
+from recon.files import volumes
+from recon.freehand import sequences
 from sonotwin.cli import main
 from tests.recon import sweep_sets
 
@@ -61,7 +63,7 @@ def test_a_lag_that_is_not_told_moves_the_ball(capture, reconstructed, tmp_path)
 def test_the_sequence_is_the_sweep_for_slicer(capture, reconstructed, rig):
     """Images, poses and times, by which PLUS would put the B-scans where they are put here."""
     frames = sequences.read_sequence(reconstructed / "sequence.igs.mha")
-    sweep = sweep_capture.read_sweep(capture)
+    sweep = sweep_part.read_sweep(capture)
     np.testing.assert_array_equal(frames.images, np.stack(list(sweep.images())))
     ours = sweep.poses(LAG_S) @ sequences.target_from_pixel(sweep.probe)
     np.testing.assert_allclose(sequences.poses(frames, "Reference", "Image"), ours, atol=1e-9)
@@ -103,7 +105,7 @@ def test_fields_of_the_volume(capture, tmp_path, capsys):
 
 def test_another_calibration_takes_the_place_of_the_captures(capture, reconstructed, rig, tmp_path):
     """Moved by 3 mm along the depth, it moves the ball as far."""
-    probe = sweep_capture.read_sweep(capture).probe
+    probe = sweep_part.read_sweep(capture).probe
     moved = probe.target_from_image.copy()
     moved[:3, 3] += 3 * moved[:3, 1]
     probe_files.write(tmp_path / "probe.yaml", type(probe)(moved, probe.scale))
@@ -115,7 +117,7 @@ def test_another_calibration_takes_the_place_of_the_captures(capture, reconstruc
 
 def test_the_tissues_speed_of_sound_scales_depths_alike_in_volume_and_sequence(capture, reconstructed, rig, tmp_path):
     """A calibration for 1488 m/s and tissue of 1450: 2.6 % less deep. A sequence's own calibration counts as one for 1540."""
-    probe = sweep_capture.read_sweep(capture).probe
+    probe = sweep_part.read_sweep(capture).probe
     probe_files.write(tmp_path / "probe.yaml", replace(probe, speed_m_s=1488.0))
     fields = [f"capture={capture}", f"lag_s={LAG_S}", f"probe={tmp_path / 'probe.yaml'}", "tissue_m_s=1450"]
     assert main(["freehand", *fields, f"out={tmp_path / 'out'}"]) == 0

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from recon.board_capture import read_board
+from recon.capture.board_part import read_board
 from sonotwin.cli import main
 
 

@@ -8,13 +8,15 @@ import pytest
 import trimesh
 from scipy.ndimage import gaussian_filter
 
-from recon import rigid, ring, sweep_capture
-from recon.calibration import Uncertainty
-from recon.containment import Containment
-from recon.masses import Mass
-from recon.probe import ProbeCalibration
-from recon.ring import Ring
-from recon.tracks import Track
+from recon.capture import sweep_part
+from recon.geometry import rigid
+from recon.model.calibration import Uncertainty
+from recon.model.probe import ProbeCalibration
+from recon.model.tracks import Track
+from recon.segmentation import tube_wall
+from recon.segmentation.containment import Containment
+from recon.segmentation.masses import Mass
+from recon.segmentation.tube_wall import Ring
 from sonotwin.cli import main
 from sonotwin.verbs import segment
 from tests.recon import probe_motions, sweep_sets
@@ -49,7 +51,7 @@ def capture(tmp_path_factory, rig) -> Path:
     moments, tracked = np.arange(-1.2, 1.2, 0.05), np.arange(-1.3, 1.3, 0.025)
     poses = np.array([world_from_image(t) @ rigid.invert(probe.target_from_image) for t in tracked])
     times, track = sweep_sets.nanoseconds(moments + LAG_S), Track(sweep_sets.nanoseconds(tracked), poses)
-    sweep_capture.write_sweep(folder, (image(t) for t in moments), times, track, SIZE, probe, "mass")
+    sweep_part.write_sweep(folder, (image(t) for t in moments), times, track, SIZE, probe, "mass")
     return folder
 
 
@@ -125,7 +127,7 @@ def test_an_uncertain_scale_is_an_uncertain_diameter(rig):
     pixels = (np.array([16.0, 15.0]) + 6.0 * np.column_stack([np.cos(turned), np.sin(turned)])) / scale
     one = Ring(pixels, np.tile(0.01 * np.eye(2), (len(pixels), 1, 1)))
     matrices = np.stack([rigid.transform(np.eye(3), [0, 0, k]) @ np.diag([*scale, 1, 1]) for k in range(8)])
-    tube = ring.fit_tube([one] * 8, matrices)
+    tube = tube_wall.fit_tube([one] * 8, matrices)
 
     def sigma(covariance: np.ndarray) -> float:
         known = Uncertainty(("sx", "sy"), covariance)

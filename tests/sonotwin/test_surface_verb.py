@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from recon import calibration, capture, primitives, rigid, surface
-from recon.calibration import Calibration
-from recon.camera import Camera
-from recon.capture import Device, Manifest, SurfacePart
-from recon.patterns import CentreLine, Fringes, GrayCode, Patterns
-from recon.triangulate import PointMap
+from recon.capture import calibration_files, images, surface_part
+from recon.capture.surface_part import Device, Manifest, SurfacePart
+from recon.geometry import primitives, rigid
+from recon.geometry.camera import Camera
+from recon.model.calibration import Calibration
+from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns
+from recon.structured_light import surface_mesh
+from recon.structured_light.triangulate import PointMap
 from sonotwin.cli import main
 from sonotwin.verbs.surface import predicted_rms
 
@@ -57,7 +59,7 @@ def shots(request, optics, tmp_path) -> tuple[Path, np.ndarray, Patterns]:
     patterns = SEQUENCES[request.param]
     images = photograph(patterns, optics)
     devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
-    capture.write_surface(tmp_path / "capture", {"cam1": images}, patterns, optics, devices)
+    surface_part.write_surface(tmp_path / "capture", {"cam1": images}, patterns, optics, devices)
     return tmp_path / "capture", images, patterns
 
 
@@ -89,14 +91,14 @@ def test_the_prediction_is_across_the_surface():
     normal = np.array([0.0, np.sqrt(0.75), -0.5])
     rays = camera.rays(camera.pixel_grid())
     points = rays * ((normal @ [0, 0, 700]) / (rays @ normal))[..., None]
-    mesh = surface.mesh(PointMap(np.float32(points), np.full((48, 64), 0.04, np.float32)), camera)
+    mesh = surface_mesh.mesh(PointMap(np.float32(points), np.full((48, 64), 0.04, np.float32)), camera)
     assert predicted_rms(mesh, camera) == pytest.approx(0.02, rel=0.01)  # the view spans 0.7 deg
 
 
 def test_a_bare_folder_gives_the_same(shots, optics, tmp_path):
     folder, _, patterns = shots
     (tmp_path / "sequence.yaml").write_text(patterns.model_dump_json())
-    calibration.write(tmp_path / "optics.yaml", optics)
+    calibration_files.write(tmp_path / "optics.yaml", optics)
     source = [
         f"images={folder / 'surface' / 'cam1'}",
         f"patterns={tmp_path / 'sequence.yaml'}",
@@ -168,7 +170,7 @@ def test_a_place_that_cannot_be_written_to_is_said_first(tmp_path, capsys):
 def test_darkness_is_said(optics, tmp_path, capsys):
     devices = {"cam1": Device(size=SIZE), "projector": Device(size=PROJECTOR)}
     black = np.zeros((9, SIZE[1], SIZE[0]), np.uint8)
-    capture.write_surface(tmp_path / "capture", {"cam1": black}, SEQUENCES["centre_line"], optics, devices)
+    surface_part.write_surface(tmp_path / "capture", {"cam1": black}, SEQUENCES["centre_line"], optics, devices)
     assert main(["surface", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}"]) == 2
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "out").exists()
 
@@ -205,7 +207,7 @@ def test_the_page_names_every_field():
 def test_the_page_runs(rig, tmp_path, monkeypatch):
     """Every manifest, pattern file and command of docs/captures.md, in a folder that holds what the page talks about."""
     optics = Calibration({"cam1": rig.cam1.optics.camera(), "projector": rig.projector.optics.camera()})
-    calibration.write(tmp_path / "optics.yaml", optics)
+    calibration_files.write(tmp_path / "optics.yaml", optics)
     (manifest,) = (json.loads(text) for text in blocks("json"))
     patterns = Patterns.model_validate(manifest["surface"]["patterns"])
     named = [tmp_path / "shots" / name for name in manifest["surface"]["images"]["cam1"]]
@@ -213,8 +215,8 @@ def test_the_page_runs(rig, tmp_path, monkeypatch):
     (tmp_path / "wrapped" / "manifest.json").write_text(json.dumps(manifest))
     devices = {"cam1": Device(size=(1280, 1024)), "projector": Device(size=(1280, 800))}
     pictures = photograph(patterns, optics)
-    capture.write_surface(tmp_path / "capture", {"cam1": pictures}, patterns, optics, devices)
-    paper = capture.read_patterns(Path(__file__).parents[2] / "conf" / "patterns" / "paper_surface.yaml")
+    surface_part.write_surface(tmp_path / "capture", {"cam1": pictures}, patterns, optics, devices)
+    paper = surface_part.read_patterns(Path(__file__).parents[2] / "conf" / "patterns" / "paper_surface.yaml")
     monkeypatch.chdir(tmp_path)
 
     commands = [line for text in blocks("sh") for line in text.splitlines()]
@@ -222,16 +224,16 @@ def test_the_page_runs(rig, tmp_path, monkeypatch):
     for command in commands:
         shutil.rmtree("shots", ignore_errors=True)
         if "images=shots" in command:
-            capture.write_images([tmp_path / "shots" / f"{i}.png" for i in range(paper.count)], photograph(paper, optics))
+            images.write_images([tmp_path / "shots" / f"{i}.png" for i in range(paper.count)], photograph(paper, optics))
         else:
-            capture.write_images(named, pictures)
+            images.write_images(named, pictures)
         program, *arguments = shlex.split(command)
         assert program == "sonotwin" and main(arguments) == 0
         assert json.loads(Path("surface/metrics.json").read_text())["points"] > 500_000
 
     (text,) = blocks("yaml")
     Path("sequence.yaml").write_text(text)
-    sequence = capture.read_patterns(Path("sequence.yaml"))
+    sequence = surface_part.read_patterns(Path("sequence.yaml"))
     shutil.rmtree("shots")
-    capture.write_images([tmp_path / "shots" / f"{i}.png" for i in range(sequence.count)], photograph(sequence, optics))
+    images.write_images([tmp_path / "shots" / f"{i}.png" for i in range(sequence.count)], photograph(sequence, optics))
     assert main(["surface", "images=shots", "patterns=sequence.yaml", "calibration=optics.yaml", "out=surface"]) == 0

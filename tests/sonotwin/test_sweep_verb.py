@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import rigid, volumes
-from recon.sweep_capture import read_sweep
+from recon.capture.sweep_part import read_sweep
+from recon.files import volumes
+from recon.geometry import rigid
 from sonotwin.cli import main
 
 

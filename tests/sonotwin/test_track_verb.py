@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon import sweep_tables
+from recon.capture import sweep_tables
 from recon.tracking import networks
 from sonotwin.cli import main
 from sonotwin.verbs.track import kind, kinds

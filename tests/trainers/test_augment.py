@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 from trainers import augment
 from trainers.augment import moved, photograph, turns, warp
 from trainers.batches import crops, discs, generator_of
-from trainers.shards import read_patches, read_views
+from trainers.shard_reader import read_patches, read_views
 
 
 def test_a_rings_centre_follows_its_label(rng):

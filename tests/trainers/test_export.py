@@ -8,8 +8,8 @@ import onnx
 import onnxruntime
 
 from recon.errors import InputError
+from trainers.architectures import network
 from trainers.export import load, save, save_onnx
-from trainers.networks import network
 
 
 def trained(name, seed=0):

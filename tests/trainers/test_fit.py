@@ -13,9 +13,9 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from trainers import fit
+from trainers.architectures import Detector, Segmenter
 from trainers.fit import Plan, progress, rate, read_log
-from trainers.networks import Detector, Segmenter
-from trainers.shards import read_patches, read_views, split
+from trainers.shard_reader import read_patches, read_views, split
 
 
 def plan(name, steps, **changes):

@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from trainers.labels import IGNORED, detector_loss, label_offset, labels, seen_in_view
-from trainers.metrics import decode
+from trainers.network_metrics import decode
 
 SIZE = (320, 240)
 

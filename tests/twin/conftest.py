@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from recon import calibration, capture
-from recon.calibration import Calibration
-from recon.camera import Camera
-from recon.patterns import Fringes, Patterns
+from recon.capture import calibration_files, surface_part
+from recon.geometry.camera import Camera
+from recon.model.calibration import Calibration
+from recon.model.patterns import Fringes, Patterns
 
 SHRINK = 4  # of camera 1: 320x256 px
 CENTRE, RADIUS, WALL = np.array([4.0, -2.0, 650.0]), 19.8, 710.0  # mm
@@ -73,7 +73,7 @@ def draw(session: Session, rng: np.random.Generator) -> None:
     for folder in ("surface", "calibration"):
         (truth / folder).mkdir(parents=True)
     optics = Calibration({"cam1": camera, "projector": projector})
-    calibration.write(truth / "calibration" / "optics.yaml", optics)
+    calibration_files.write(truth / "calibration" / "optics.yaml", optics)
     np.savez(
         truth / "surface" / "cam1.npz",
         points=np.float32(points),
@@ -87,10 +87,10 @@ def draw(session: Session, rng: np.random.Generator) -> None:
         json.dumps({"name": "drawn", "things": ["ball", "wall"], "shapes": SHAPES}), encoding="utf-8"
     )
     devices = {
-        "cam1": capture.Device(size=camera.size, exposure_s=0.01, gain=1.0),
-        "projector": capture.Device(size=projector.size),
+        "cam1": surface_part.Device(size=camera.size, exposure_s=0.01, gain=1.0),
+        "projector": surface_part.Device(size=projector.size),
     }
-    capture.write_surface(session.folder / "capture", {"cam1": images}, patterns, optics, devices, "drawn")
+    surface_part.write_surface(session.folder / "capture", {"cam1": images}, patterns, optics, devices, "drawn")
 
 
 def distance_to_ball(start, directions):

@@ -7,20 +7,23 @@ import numpy as np
 import trimesh
 import yaml
 
-from recon import containment, lag, rigid, sweep_capture
-from recon.calibration import Uncertainty
-from recon.probe import ProbeCalibration
-from recon.rig import Rig
-from recon.sweep_capture import SweepCapture
-from recon.tracks import Track
-from recon.volumes import Volume
-from scenes.things import Material, Scene, Thing
+from recon.capture import sweep_part
+from recon.capture.sweep_part import SweepCapture
+from recon.files.volumes import Volume
+from recon.geometry import rigid
+from recon.model.calibration import Uncertainty
+from recon.model.probe import ProbeCalibration
+from recon.model.rig import Rig
+from recon.model.tracks import Track
+from recon.probe_calibration import latency
+from recon.segmentation import containment
+from scenes.scene_types import Material, Scene, Thing
 from tests.recon import sweep_sets
 from tests.twin.conftest import CENTRE, RADIUS
-from twin import evaluate_sweep
-from twin.evaluate_sweep import SweepTruth
-from twin.sweep_report import Inside
-from twin.ultrasound.solids import body
+from twin.evaluation import sweep_errors
+from twin.evaluation.sweep_errors import SweepTruth
+from twin.reports.sweep_report import Inside
+from twin.ultrasound.echo_solids import body
 from twin.ultrasound.transducer import Transducer
 
 TUMOURS = ((np.array([-4.0, 0.0, -5.0]) + CENTRE, 6.0), (np.array([9.0, 0.0, -6.0]) + CENTRE, 4.0))  # mm: middle and radius
@@ -64,7 +67,7 @@ def true_sweep(folder: Path, rig: Rig) -> SweepTruth:
         cv2.imwrite(str(paths[-1]), labels)
     true_probe = ProbeCalibration(rig.probe.target_from_image.matrix(), np.array(SCALE))
     scanned = body(Scene("breast", (skin, *hidden)))
-    return SweepTruth(scanned, hidden, evaluate_sweep.facing(skin.mesh), transducer, true_probe, LAG_S, poses(), tuple(paths))
+    return SweepTruth(scanned, hidden, sweep_errors.facing(skin.mesh), transducer, true_probe, LAG_S, poses(), tuple(paths))
 
 
 def calibrated(truth: SweepTruth) -> ProbeCalibration:
@@ -94,16 +97,16 @@ def inside(folder: Path, rig: Rig, rng: np.random.Generator) -> Inside:
     images = (grey[truth.shown(k)] + rng.integers(0, 40, SIZE[::-1], np.uint8) for k in range(COUNT))
     times = sweep_sets.nanoseconds(np.arange(COUNT) / 20)
     track = Track(times, poses() @ rigid.invert(truth.probe.target_from_image))
-    sweep_capture.write_sweep(folder / "sweep", images, times, track, SIZE)
+    sweep_part.write_sweep(folder / "sweep", images, times, track, SIZE)
     bob, depths = bottom(rng)
-    found_lag = lag.estimate(bob.times, depths, bob.track)
+    found_lag = latency.estimate(bob.times, depths, bob.track)
     low = CENTRE - 20
     volume = Volume(rng.integers(1, 200, (40, 40, 40)).astype(np.uint8), low, np.ones(3))
     return Inside(
-        sweep_capture.read_sweep(folder / "sweep"),
+        sweep_part.read_sweep(folder / "sweep"),
         poses() @ np.diag([*IN_TISSUE, 1, 1]),
         volume,
-        evaluate_sweep.compare([ball(TUMOURS[0][0] + SHIFT, TUMOURS[0][1])], truth),
+        sweep_errors.compare([ball(TUMOURS[0][0] + SHIFT, TUMOURS[0][1])], truth),
         truth,
         calibrated(truth),
         bob,
@@ -124,7 +127,7 @@ def segmented(found: list[trimesh.Trimesh], truth: SweepTruth) -> dict[str, floa
 def figures(story: Inside) -> dict[str, float | int]:
     """What the steps of a demonstration found out beside."""
     found = [finding.found for finding in story.findings if finding.found is not None]
-    measured = evaluate_sweep.measure(story.findings, story.truth, segmented(found, story.truth))
+    measured = sweep_errors.measure(story.findings, story.truth, segmented(found, story.truth))
     probe = {"frames_used": 25, "frames_rejected": 5, "rms_mm": 0.4, "sy_measured_mm_per_px": SCALE[1]}
     sound = {"implied_speed_m_per_s": 1490.0, "implied_speed_sigma_m_per_s": 2.0, "water_speed_m_per_s": 1488.4}
     lags = {"ms": 1e3 * story.lag_s, "low_ms": 1e3 * story.lag_s - 3, "high_ms": 1e3 * story.lag_s + 3}

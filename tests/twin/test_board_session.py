@@ -9,16 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import board_capture, manifest, rigid
+from recon.capture import board_part, manifest
+from recon.capture.manifest import SCHEMA, Device, Manifest, SweepPart
 from recon.errors import InputError
-from recon.manifest import SCHEMA, Device, Manifest, SweepPart
-from recon.patterns import Fringes, GrayCode, Patterns
-from scenes import board, poses
+from recon.geometry import rigid
+from recon.model.patterns import Fringes, GrayCode, Patterns
+from scenes import board_poses
+from scenes.kinds import board
 from twin import board_session
 from twin.board_session import Settings
-from twin.optics.transport import Engine, render
+from twin.optics.light_transport import Engine, render
 from twin.sensor import electrons_per_radiance
-from twin.session import Shooting, calibration_of
+from twin.surface_session import Shooting, calibration_of
 
 PATTERNS = Patterns(
     projector_size=(1280, 800),
@@ -45,7 +47,7 @@ def shrunk(device, times: int):
 @pytest.fixture(scope="module")
 def settings(rig) -> Settings:
     small = rig.model_copy(update={"cam1": shrunk(rig.cam1, 4), "cam2": shrunk(rig.cam2, 4)})
-    chosen = poses.Config(count=3, margin_px=4, seed=6)
+    chosen = board_poses.Config(count=3, margin_px=4, seed=6)
     engine, shooting = Engine(samples=4, room_lux=20.0), Shooting()
     return Settings(small, board.Config(), chosen, PATTERNS, ("cam1", "cam2"), engine, shooting, seed=3)
 
@@ -82,7 +84,7 @@ def session(settings, tmp_path_factory) -> Path:
 def test_the_circles_are_where_the_truth_says(session, settings):
     """Dark discs, weighed by their darkness, against the outlines of the true ones."""
     truth = np.load(session / "truth" / "board.npz")
-    read = board_capture.read_board(session / "capture")
+    read = board_part.read_board(session / "capture")
     turn = np.linspace(0, 2 * np.pi, 256, endpoint=False)
     rim = settings.board.diameter_mm / 2 * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
     cameras = calibration_of(settings.rig).cameras
@@ -115,7 +117,7 @@ def weighed(image, middle) -> np.ndarray:
 
 def test_white_is_bright_and_not_saturated(session):
     """One exposure serves all poses."""
-    read = board_capture.read_board(session / "capture")
+    read = board_part.read_board(session / "capture")
     brightest = [image.max() for k in range(len(read.poses)) for image in read.pose(k).lit.values()]
     assert max(brightest) < 255 and min(brightest) > 140
 

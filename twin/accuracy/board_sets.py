@@ -7,23 +7,23 @@ from time import perf_counter
 
 import numpy as np
 
-from recon import rigid
-from recon.boards import AsymmetricCircles
-from recon.bundle import Estimate
-from recon.calibrate import Result, Settings, calibrate, circle_offsets
-from recon.calibration import Calibration
-from recon.camera import Array, Camera
-from recon.observations import PROJECTOR, Observations, Size
-from recon.projection import linearise
-from recon.rig import Rig
-from recon.sight import Sighting, sight
-from scenes import board
-from scenes.poses import Config as Poses
-from scenes.poses import random_poses
+from recon.geometry import rigid
+from recon.geometry.camera import Array, Camera
+from recon.geometry.camera_jacobian import linearise
+from recon.model.boards import AsymmetricCircles
+from recon.model.calibration import Calibration
+from recon.model.rig import Rig
+from recon.optical_calibration.bundle import Estimate
+from recon.optical_calibration.joint_calibration import Result, Settings, calibrate, circle_offsets
+from recon.optical_calibration.observations import PROJECTOR, Observations, Size
+from recon.optical_calibration.sightings import Sighting, sight
+from scenes.board_poses import Config as Poses
+from scenes.board_poses import random_poses
+from scenes.kinds import board
 from twin import board_session
 from twin.board_session import CAMERAS, FRINGE_CAMERA
 from twin.sensor import Numbers
-from twin.session import calibration_of
+from twin.surface_session import calibration_of
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from recon import calibration_metrics, uncertainty
-from recon.calibration import Calibration
-from recon.camera import Array
-from recon.projection import MOTION
+from recon.geometry.camera import Array
+from recon.geometry.camera_jacobian import MOTION
+from recon.model.calibration import Calibration
+from recon.optical_calibration import figures_of_merit, uncertainty
 
 DEPTHS = (606.0, 660.0, 713.0)  # mm: the rig's working range (Meza et al. 2021) and its middle
 REGION = 0.95  # probability of the regions that points are looked for in
@@ -63,7 +63,7 @@ def inside_region(found: Calibration, truth: Calibration, pair: tuple[str, str],
 def point_errors(found: Calibration, truth: Calibration, pair: tuple[str, str], points: Array) -> Array:
     """Error : (k, 3) mm of points that two devices see exactly and that are triangulated with a calibration."""
     pixels = [truth.cameras[name].project(points) for name in pair]
-    return calibration_metrics.triangulated([found.cameras[name] for name in pair], pixels, points) - points
+    return figures_of_merit.triangulated([found.cameras[name] for name in pair], pixels, points) - points
 
 
 def scale_error(measured: Array, true: Array) -> float:

@@ -9,17 +9,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from recon import atomic
-from recon.figures import SEQUENTIAL
-from recon.rig import Target
-from recon.tracking import classical, fiducials
+from recon.files import atomic
+from recon.model.rig import Target
+from recon.reports.figures import SEQUENTIAL
 from recon.tracking.networks import Networks
 from recon.tracking.pose import Sighting, estimate
 from recon.tracking.tracker import Tracker
-from twin.accuracy import frames
-from twin.accuracy.poses import Images, Locate, Pair, cameras_of, pose_errors
-from twin.accuracy.rows import Row, Setup
-from twin.tracking.prints import BitGrid
+from twin.accuracy import tracking_frames
+from twin.accuracy.baselines import classical, fiducials
+from twin.accuracy.pose_accuracy import Images, Locate, Pair, cameras_of, pose_errors
+from twin.accuracy.table_rows import Row, Setup
+from twin.tracking.surface_prints import BitGrid
 
 Array = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ def over_grid(setup: Setup, alike: Sequence[Choice]) -> list[Tried]:
     """Try choices that need the same face on the same frames, in all cells."""
     errors = np.full((len(alike), len(WHITES), len(BLURS), COUNT, 2), np.nan)
     for i, j in np.ndindex(len(WHITES), len(BLURS)):
-        for k, (take, given) in enumerate(frames.study(setup, SEED, COUNT, WHITES[i], BLURS[j], RAYS, alike[0].face)):
+        for k, (take, given) in enumerate(tracking_frames.study(setup, SEED, COUNT, WHITES[i], BLURS[j], RAYS, alike[0].face)):
             for n, choice in enumerate(alike):
                 error = pose_errors(take, choice.locate(cameras_of(take), given.views))
                 if error is not None and error[0] < ELSEWHERE_MM:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from recon import rigid
-from recon.camera import Camera, distorted
-from recon.rig import CameraDevice, Lens, ProjectorDevice
+from recon.geometry import rigid
+from recon.geometry.camera import Camera, distorted
+from recon.model.rig import CameraDevice, Lens, ProjectorDevice
 
 Images = NDArray[np.float32]
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from recon.patterns import Axis, Patterns
-from recon.rig import ProjectorDevice
+from recon.model.patterns import Axis, Patterns
+from recon.model.rig import ProjectorDevice
 
 OVERSAMPLING = 16  # table entries a projector px; read with linear interpolation
 MARGIN = 8  # projector px of the table beyond either end of the raster

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from twin.ultrasound.solids import Body, distance_at
+from twin.ultrasound.echo_solids import Body, distance_at
 
 Array = NDArray[np.float64]
 

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon import rigid
+from recon.geometry import rigid
 from scenes.catalogue import build_scene
+from twin.ultrasound.bscan import scan
+from twin.ultrasound.echo_solids import body
 from twin.ultrasound.probe_path import Hand, SurfacePath, along_surface
-from twin.ultrasound.scan import scan
-from twin.ultrasound.session import surface_of
-from twin.ultrasound.solids import body
+from twin.ultrasound.sweep_session import surface_of
 from twin.ultrasound.transducer import Transducer
 
 TISSUE = Transducer()

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from twin.ultrasound.beam import OVERSAMPLING, STEP_MM, Beam
-from twin.ultrasound.paths import Paths
-from twin.ultrasound.solids import Body, distance_at, label_at
+from twin.ultrasound.echo_solids import Body, distance_at, label_at
+from twin.ultrasound.sound_paths import Paths
 from twin.ultrasound.transducer import Transducer
 
 Field = NDArray[np.complex64]

@@ -10,11 +10,12 @@ from pydantic import Field
 from scipy.ndimage import gaussian_filter1d, map_coordinates
 from scipy.spatial.transform import Rotation
 
-from recon import probe_calibration, rigid
 from recon.errors import InputError
-from recon.rig import Finite, NotNegative, Part, Positive
-from recon.tracks import Track
-from twin.ultrasound.solids import Body, Solid
+from recon.geometry import rigid
+from recon.model.rig import Finite, NotNegative, Part, Positive
+from recon.model.tracks import Track
+from recon.probe_calibration import point_calibration
+from twin.ultrasound.echo_solids import Body, Solid
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -64,7 +65,9 @@ class Bob(Part):
 
 
 class WirePath(Part):
-    """At rest in poses about two crossed wires, as the probe is calibrated: see `recon.probe_calibration.motion`."""
+    """At rest in poses about two crossed wires, as the probe is calibrated; turned as in
+    `recon.probe_calibration.point_calibration.motion`.
+    """
 
     kind: Literal["wire"] = "wire"
     count: Annotated[int, Field(ge=1, le=1000)] = 30  # poses, one image each
@@ -147,7 +150,7 @@ def about_crossing(path: WirePath, body: Body, transducer: Transducer, seed: int
     InputError
         If the scene has no crossing.
     """
-    turns, pixels = probe_calibration.motion(transducer.image_size, path.count, path.tilt_deg, path.roll_deg)
+    turns, pixels = point_calibration.motion(transducer.image_size, path.count, path.tilt_deg, path.roll_deg)
     beside = path.miss_mm * np.random.default_rng(seed).standard_normal(path.count)
     poses = held(body, transducer, turns, pixels, beside)
     steps = np.rint(np.linspace(0, path.rest_s, int(path.rest_s * RATE_HZ) + 1) * 1e9).astype(np.int64)
@@ -157,7 +160,8 @@ def about_crossing(path: WirePath, body: Body, transducer: Transducer, seed: int
 
 
 def held(body: Body, transducer: Transducer, turns: Array, pixels: Array, beside: Array) -> Array:
-    """Poses `world_from_image` : (n, 4, 4) of a probe turned by (n, 3) deg as in `recon.probe_calibration.motion`.
+    """Poses `world_from_image` : (n, 4, 4) of a probe turned by (n, 3) deg as in
+    `recon.probe_calibration.point_calibration.motion`.
 
     The crossing appears at the pixels : (n, 2), delays included, and lies (n,) mm beside the image plane.
     """

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from recon.rig import Finite, NotNegative, Part, Positive
+from recon.model.rig import Finite, NotNegative, Part, Positive
 
 Array = NDArray[np.float64]
 Bandwidth = Annotated[float, Field(ge=0.05, le=1.5)]

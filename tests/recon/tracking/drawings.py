@@ -4,11 +4,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from recon import rigid
-from recon.camera import Camera
-from recon.ellipses import Ellipses
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.geometry.ellipses import Ellipses
 from recon.tracking import pose
-from recon.tracking.outline_model import ellipses_of
+from recon.tracking.rim_fit.circle_outline import ellipses_of
 
 ELECTRONS = 7700 / 255  # a digital number
 DARK_E = 11.0

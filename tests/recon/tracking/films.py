@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from recon import rigid
-from recon.calibration import Calibration
-from recon.manifest import Device
-from recon.tracking import capture, pose
+from recon.capture import stereo_frames
+from recon.capture.manifest import Device
+from recon.geometry import rigid
+from recon.model.calibration import Calibration
+from recon.tracking import pose
 from tests.recon.tracking import drawings
 
 PERIOD_NS = 33_333_333
@@ -27,37 +28,39 @@ def stamps(count: int) -> np.ndarray:
 
 
 def optics(rig) -> Calibration:
-    return Calibration({name: getattr(rig, name).optics.camera() for name in capture.CAMERAS})
+    return Calibration({name: getattr(rig, name).optics.camera() for name in stereo_frames.CAMERAS})
 
 
 def devices(rig, bits: int = 8) -> dict[str, Device]:
-    return {name: Device(size=getattr(rig, name).optics.size, bits=bits) for name in capture.CAMERAS}
+    return {name: Device(size=getattr(rig, name).optics.size, bits=bits) for name in stereo_frames.CAMERAS}
 
 
 def draw(rig, poses, rng, missing=()):
     """Pairs of frames of poses; those missing don't show the target to camera 2."""
     for k, place in enumerate(poses):
-        pair = [drawings.frame(getattr(rig, name).optics.camera(), [place], rig.target, 65.0, rng) for name in capture.CAMERAS]
+        pair = [
+            drawings.frame(getattr(rig, name).optics.camera(), [place], rig.target, 65.0, rng) for name in stereo_frames.CAMERAS
+        ]
         yield pair[0], np.full_like(pair[1], 20) if k in missing else pair[1]
 
 
 def film(folder: Path, rig, rng, count: int = 4, missing=()) -> Path:
     """A film of `places`."""
     pairs = draw(rig, places(count), rng, missing)
-    capture.write_film(folder, pairs, stamps(count), optics(rig), devices(rig), "drawn")
+    stereo_frames.write_film(folder, pairs, stamps(count), optics(rig), devices(rig), "drawn")
     return folder
 
 
 def blank(folder: Path, rig, count: int = 3, bits: int = 8) -> Path:
     """A film of grey frames, each brighter than the one before."""
     kind = np.uint8 if bits == 8 else np.uint16
-    frames = [np.full(getattr(rig, name).optics.size[::-1], 10, kind) for name in capture.CAMERAS]
+    frames = [np.full(getattr(rig, name).optics.size[::-1], 10, kind) for name in stereo_frames.CAMERAS]
     pairs = ((frames[0] + kind(k), frames[1] + kind(2 * k)) for k in range(count))
-    capture.write_film(folder, pairs, stamps(count), optics(rig), devices(rig, bits), "blank")
+    stereo_frames.write_film(folder, pairs, stamps(count), optics(rig), devices(rig, bits), "blank")
     return folder
 
 
 def centres(rig, place) -> list[np.ndarray]:
     """Where each camera sees the circles of a pose : (3, 2) px."""
     points = rigid.apply(place, pose.circle_centres(rig.target))
-    return [getattr(rig, name).optics.camera().project(points) for name in capture.CAMERAS]
+    return [getattr(rig, name).optics.camera().project(points) for name in stereo_frames.CAMERAS]

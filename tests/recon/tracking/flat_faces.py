@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recon import rigid
+from recon.geometry import rigid
 
 SUB = 3  # sub-pixels a pixel and axis
 PAD = 12  # px about the face that are drawn with it

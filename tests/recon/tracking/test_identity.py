@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.tracking import identity
-from recon.tracking.detection import Candidates
+from recon.tracking.circle_detector import Candidates
 from tests.recon.tracking import drawings
 
 

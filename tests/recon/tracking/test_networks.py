@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from recon.ellipses import Ellipses
 from recon.errors import InputError
-from recon.rig import Target
-from recon.tracking import detection, identity, networks, segmentation
+from recon.geometry.ellipses import Ellipses
+from recon.model.rig import Target
+from recon.tracking import circle_detector, circle_segmenter, identity, networks
 from recon.tracking.frames import grey
 from tests.recon.tracking.stand_ins import Told
 
@@ -57,7 +57,7 @@ def test_wrong_files_are_refused_in_one_line(folder):
 
 def test_candidates_are_where_the_logits_are(rng):
     places = np.array([[400.0, 300.0], [520.0, 700.0], [900.0, 310.0]])
-    found = detection.detect([np.zeros((1024, 1280), np.uint8)], Told([places]))[0]
+    found = circle_detector.detect([np.zeros((1024, 1280), np.uint8)], Told([places]))[0]
     order = np.argmax(found.identity[:, :3], axis=1)
     assert np.abs(found.points[np.argsort(order)] - places).max() <= 2.2
     assert (found.scores > 0.5).all()
@@ -87,7 +87,9 @@ def test_masks_become_ellipses():
     specks = np.zeros((120, 120), bool)
     specks[5:9, 5:9] = True
     masks = np.where(np.stack([disc | specks, large, specks, np.zeros_like(disc), np.ones_like(disc)]), 4.0, -4.0)
-    found = segmentation.read(masks, segmentation.Patches(np.zeros((0, 120, 120), np.float32), np.array([[100, 200]] * 5)))
+    found = circle_segmenter.read(
+        masks, circle_segmenter.Patches(np.zeros((0, 120, 120), np.float32), np.array([[100, 200]] * 5))
+    )
     assert np.abs(found.centre[0] - [162, 257]).max() < 0.1 and np.abs(found.semi_axes[0] - [40, 30]).max() < 0.5
     assert np.abs(found.centre[1] - [160, 260]).max() < 0.5 and np.abs(found.semi_axes[1] - 63).max() < 1
     assert np.isnan(found.centre[2:]).all()
@@ -95,7 +97,7 @@ def test_masks_become_ellipses():
 
 def test_patches_go_on_beyond_the_border():
     image = np.arange(200 * 300).reshape(200, 300) % 251
-    cut = segmentation.patches(image.astype(np.uint8), np.array([[150.4, 99.6], [0, 0]]))
+    cut = circle_segmenter.patches(image.astype(np.uint8), np.array([[150.4, 99.6], [0, 0]]))
     assert np.array_equal(cut.corners, [[91, 41], [-59, -59]])
     assert np.allclose(cut.images[0] * 255, image[41:161, 91:211]) and np.allclose(cut.images[1][:59, :59] * 255, image[0, 0])
 
@@ -107,9 +109,9 @@ def test_coarse_patches_hold_large_discs_where_they_are():
     target = Target(c1_mm=25, c2_mm=40, outer_diameter_mm=18, inner_diameter_mm=7.2, board_mm=(60, 65))
     scale = 170 / 18
     points = np.array([[420.0, 334.0], [420.0, 334.0 + 25 * scale], [420.0 + 40 * scale, 334.0]])
-    assert segmentation.step_for(points, target) == 2
-    cut = segmentation.patches(image, points, 2)
-    found = segmentation.read(np.where(cut.images < 0.4, 5.0, -5.0), cut)
+    assert circle_segmenter.step_for(points, target) == 2
+    cut = circle_segmenter.patches(image, points, 2)
+    found = circle_segmenter.read(np.where(cut.images < 0.4, 5.0, -5.0), cut)
     assert np.abs(found.centre[0] - [420.3, 333.6]).max() < 0.6
     assert np.abs(found.semi_axes[0] - 85).max() < 1.5
 

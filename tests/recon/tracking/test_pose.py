@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from recon import rigid
-from recon.circles import centre_offsets
+from recon.geometry import rigid
+from recon.geometry.circle_projection import centre_offsets
 from recon.tracking import pose
 from recon.tracking.pose import Sighting
 from tests.recon.tracking import drawings
-from twin.session import calibration_of
+from twin.surface_session import calibration_of
 
 SIGMA_PX = 0.03
 POSES = 60

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recon import rigid
-from recon.ellipses import Ellipses
-from recon.tracking import following, overlays, photographs, pose, views
+from recon.geometry import rigid
+from recon.geometry.ellipses import Ellipses
+from recon.tracking import overlays, photographs, pose, results, views
 from recon.tracking import tracker as tracking
-from recon.tracking.outlines import Outlines
+from recon.tracking.rims import Outlines
 from recon.tracking.tracker import Tracker
 from tests.recon.tracking import drawings
 from tests.recon.tracking.stand_ins import Told
@@ -72,7 +72,7 @@ def test_it_follows_a_moving_target_as_a_track(tracker, cameras, rig, rng, told)
         found.append(tracker.step(*frames, k / 60))
     assert [each.pose.reason for each in found] == [None] * 4
     assert [each.how for each in found][2:] == ["predicted"] * 2
-    track = following.track_of([following.kept(each, k * 16_666_667) for k, each in enumerate(found)])
+    track = results.track_of([results.kept(each, k * 16_666_667) for k, each in enumerate(found)])
     assert track.found.all() and track.covariance is not None
     assert max(off_mm(each, place) for each, place in zip(found, places, strict=True)) < 0.1
 
@@ -128,7 +128,7 @@ def test_a_circle_that_one_camera_does_not_see_is_told_by_the_pose(cameras, rig,
         assert view.found and not view.outlines.found[which]
         true = drawings.shown(cameras[1], FACING, rig.target)
         assert np.abs(view.outlines.ellipses.centre - true.centre).max() < 0.3
-        assert np.isfinite(following.kept(found, 0).blur_px).all()
+        assert np.isfinite(results.kept(found, 0).blur_px).all()
     neither = tracker.step(covered(pair[0], centres(cameras[0], FACING, rig.target)[which]), hidden)
     assert not neither.found and str(neither.pose.reason).count(f"c{which}: ") == 2, neither.pose.reason
 

@@ -4,9 +4,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from recon.camera import Camera
-from recon.rig import Lens
-from twin.accuracy.optics import STRONG_14
+from recon.geometry.camera import Camera
+from recon.model.rig import Lens
+from twin.accuracy.optics_accuracy import STRONG_14
 from twin.optics.instruments import CameraOptics, ProjectorOptics, light_point, sample_rays, transmission
 
 

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from recon.patterns import CentreLine, Fringes, GrayCode, Patterns, Uniform
+from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns, Uniform
 from twin.optics.raster import MARGIN, OVERSAMPLING, Light, LightTable
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from recon import rigid
-from recon.rig import Rig
-from twin.tracking.draw import LAMPS, Lighting, Motion, Print, Take, draw
-from twin.tracking.ranges import DataRanges
+from recon.geometry import rigid
+from recon.model.rig import Rig
+from twin.tracking.samples import LAMPS, Lighting, Motion, Print, Take, draw
+from twin.tracking.sampling_ranges import DataRanges
 
 CONF = Path(__file__).parents[3] / "conf"
 

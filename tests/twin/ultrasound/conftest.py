@@ -3,7 +3,7 @@
 import pytest
 
 from scenes.acoustics import Tissue
-from twin.ultrasound.solids import Body
+from twin.ultrasound.echo_solids import Body
 from twin.ultrasound.transducer import Transducer
 
 QUIET = {"noise_db": -200.0, "face_ring_mm": 0.0, "reverberations": 0, "tgc_db_per_cm_mhz": 0.0}

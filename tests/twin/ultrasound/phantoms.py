@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon import rigid
+from recon.geometry import rigid
 from scenes.acoustics import TISSUES, Tissue
-from twin.ultrasound.solids import Body, Wire
+from twin.ultrasound.echo_solids import Body, Wire
 from twin.ultrasound.transducer import Transducer
 
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from recon import rigid
+from recon.geometry import rigid
 from scenes.catalogue import build_scene
 from tests.twin.ultrasound.phantoms import down
 from twin.ultrasound import borders
-from twin.ultrasound.solids import body, label_at
+from twin.ultrasound.echo_solids import body, label_at
 
 
 @pytest.fixture(scope="module")

@@ -6,24 +6,24 @@ import numba
 import numpy as np
 import pytest
 
-from recon import rigid
-from scenes import solids as shapes
+from recon.geometry import rigid
+from scenes import solid_meshes as shapes
 from scenes.acoustics import Tissue
-from scenes.things import Cylinder, Material, Thing
+from scenes.scene_types import Cylinder, Material, Thing
 from tests.twin.ultrasound.phantoms import down
-from twin.ultrasound import image
+from twin.ultrasound import bmode_image
 from twin.ultrasound.beam import OVERSAMPLING, STEP_MM, beam
+from twin.ultrasound.bscan import scan
+from twin.ultrasound.echo_solids import Body, label_at, solid
 from twin.ultrasound.medium import field_like, hashed, scatter
-from twin.ultrasound.paths import follow
-from twin.ultrasound.scan import scan
-from twin.ultrasound.solids import Body, label_at, solid
+from twin.ultrasound.sound_paths import follow
 
 FACE = (3.0, -2.0, 650.0)
 
 
 def echoes(body, transducer, pose, seed=1):
     spread = beam(transducer)
-    return image.focused(scatter(body, transducer, spread, follow(body, transducer, pose), pose, seed), spread)
+    return bmode_image.focused(scatter(body, transducer, spread, follow(body, transducer, pose), pose, seed), spread)
 
 
 def correlation(a, b):

@@ -1,0 +1,163 @@
+"""The tracker on rendered frames, whole function from two images to a pose, beside eager fp32; and the making of training data.
+
+The peer runs the same networks in PyTorch without graph, and does the rest as the tracker does when it knows nothing; without
+the train extra its column stays empty.
+"""
+
+import resource
+from collections.abc import Callable
+from importlib.util import find_spec
+from time import perf_counter
+from typing import cast
+
+import numpy as np
+import yaml
+
+from recon.model.rig import Rig
+from recon.tracking import networks as nets
+from recon.tracking.networks import Networks
+from recon.tracking.tracker import Tracker
+from sonotwin.config import folder
+from twin.accuracy.table_rows import Measurement, Row, Setup
+from twin.accuracy.tracking_frames import study
+from twin.tracking.mesh_bank import build_bank
+from twin.tracking.rendered_views import Quality, render_views
+from twin.tracking.samples import draw
+from twin.tracking.sampling_ranges import DataRanges
+
+FRAMES, REPEATS = 4, 12
+BATCHES, BATCH = 8, 5
+
+
+def measurements() -> list[Measurement]:
+    """The rows of the group."""
+    return [tracked, published_shape, rendered]
+
+
+def settings() -> tuple[Rig, DataRanges]:
+    """The rig, and few variants: the time of a sample doesn't depend on their number."""
+    rig = Rig.model_validate(yaml.safe_load((folder() / "rig" / "meza2021.yaml").read_text(encoding="utf-8")))
+    ranges = yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"]
+    return rig, DataRanges(**{**ranges, "variants": 4})
+
+
+def frames_of(rig: Rig, ranges: DataRanges) -> list[tuple]:
+    """A few stereo frames, still and lit, of a target that nothing covers."""
+    return [given.views for _, given in study(Setup(rig, {}, frames=ranges), 1, FRAMES, 100.0, 0.0, 4)]
+
+
+def tracked() -> list[Row]:
+    """Row g with our networks: locked on, and from nothing, beside the same networks in eager fp32 on every frame."""
+    rig, ranges = settings()
+    images = frames_of(rig, ranges)
+    ours = nets.load()
+    locked = locked_seconds(rig, images, ours)
+    cold = cold_seconds(rig, images, ours)
+    theirs = cold_seconds(rig, images, eager("detector", "segmenter")) if find_spec("torch") else float("nan")
+    return [
+        Row("g", "locked on, two 1280x1024 frames to a pose", 1 / locked, 60, None, "1/s", at_least=True),
+        Row("g", "locked on: times faster than the same networks in eager fp32 on every frame", theirs / locked, 4, None, "x",
+            at_least=True),
+        Row("g", "from nothing: times faster than the same networks in eager fp32", theirs / cold, 1, None, "x", at_least=True),
+        Row("g", "from nothing: ms, eager fp32 as the limit", 1e3 * cold, None, 1e3 * theirs, "ms"),
+    ]  # fmt: skip
+
+
+def published_shape() -> list[Row]:
+    """Row g with networks of the published shape, untrained, as their time doesn't depend on weights.
+
+    The peer is their passes alone, two views and six patches in eager fp32, without anything that comes between and after.
+    """
+    if not find_spec("torch"):
+        return []
+    rig, ranges = settings()
+    images = frames_of(rig, ranges)
+    published = median_of(lambda: network_pass(eager("published_detector", "published_segmenter")), 3)
+    return [
+        Row("g", "networks of the published shape alone, eager fp32, one stereo frame, over our locked-on whole function",
+            published / locked_seconds(rig, images, nets.load()), 4, None, "x", at_least=True),
+    ]  # fmt: skip
+
+
+def locked_seconds(rig: Rig, images: list[tuple], networks: Networks) -> float:
+    """Seconds of a step while the target is known from the frames before."""
+    cameras = rig.cam1.optics.camera(), rig.cam2.optics.camera()
+    times = []
+    for pair in images:
+        tracker = Tracker(cameras, rig.target, networks)
+        result = tracker.step(*pair)
+        for _ in range(REPEATS):
+            start = perf_counter()
+            result = tracker.step(*pair)
+            times.append(perf_counter() - start)
+            if result.how != "predicted":
+                times.pop()
+    return float(np.median(times)) if times else float("nan")
+
+
+def cold_seconds(rig: Rig, images: list[tuple], networks: Networks) -> float:
+    """Seconds of a step that starts from nothing."""
+    cameras = rig.cam1.optics.camera(), rig.cam2.optics.camera()
+    return median_of(lambda: [Tracker(cameras, rig.target, networks).step(*pair) for pair in images], 3) / len(images)
+
+
+def median_of(work: Callable[[], object], repeats: int) -> float:
+    """Median seconds, after one run that isn't counted."""
+    work()
+    times = []
+    for _ in range(repeats):
+        start = perf_counter()
+        work()
+        times.append(perf_counter() - start)
+    return float(np.median(times))
+
+
+def network_pass(networks: Networks) -> None:
+    """What one stereo frame takes of the networks: two views and six patches."""
+    networks.detect(np.zeros((2, 240, 320), np.float32))
+    networks.segment(np.zeros((6, 120, 120), np.float32))
+
+
+def eager(detector: str, segmenter: str) -> Networks:
+    """Networks in PyTorch without graph, in 32 bits; ours with the shipped weights."""
+    import torch
+
+    from trainers.architectures import Name, network
+    from trainers.export import load
+
+    modules = []
+    for name, kind in ((detector, "detector"), (segmenter, "segmenter")):
+        module = network(cast(Name, name))
+        if not name.startswith("published"):
+            load(nets.WEIGHTS / f"{kind}.safetensors", module)
+        modules.append(module.eval())
+
+    class Eager:
+        @torch.no_grad()
+        def detect(self, images):
+            places, identities = modules[0](torch.from_numpy(images)[:, None])
+            return places.numpy(), identities.numpy()
+
+        @torch.no_grad()
+        def segment(self, patches):
+            return modules[1](torch.from_numpy(patches)[:, None]).numpy()[:, 0]
+
+    return Eager()
+
+
+def rendered() -> list[Row]:
+    """Row a: default samples a second, and how much memory grows from one batch to the last."""
+    rig, ranges = settings()
+    bank = build_bank(rig.target, ranges.variants, 2)
+    batches = [[draw(ranges, rig, 2, BATCH * b + k) for k in range(BATCH)] for b in range(BATCHES + 1)]
+    render_views(bank, rig, batches[0], Quality(), 2)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = perf_counter()
+    for batch in batches[1:]:
+        render_views(bank, rig, batch, Quality(), 2)
+    seconds = (perf_counter() - start) / (BATCHES * BATCH)
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    return [
+        Row("a", "default samples, stereo view and six patches", 1 / seconds, 2, None, "1/s", at_least=True),
+        Row("a", f"growth of the largest resident memory over {BATCHES * BATCH} samples", grown, 100, None, "MB"),
+    ]

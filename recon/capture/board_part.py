@@ -1,0 +1,130 @@
+"""The board part of a capture: the calibration board in several poses, lit and under fringes, read one pose at a time.
+
+A pose under 50 patterns is 66 MB, so a set of 34 is never held at once.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon.capture import manifest
+from recon.capture.images import Images, read_image, read_images, write_images
+from recon.capture.manifest import MANIFEST, SCHEMA, BoardPart, BoardPose, Device, Manifest
+from recon.errors import InputError
+from recon.files import atomic
+from recon.model.boards import Board
+from recon.model.patterns import Patterns
+
+
+@dataclass(frozen=True)
+class Pose:
+    """What was seen of the board in one pose."""
+
+    name: str
+    lit: dict[str, Images]  # camera: (h, w) digital numbers, the projector fully on
+    fringes: Images | None  # (n, h, w) of camera 1, one image a pattern
+
+
+@dataclass(frozen=True)
+class BoardCapture:
+    """The board part of a capture folder; its manifest is checked and every file is there, but no image is read yet."""
+
+    root: Path  # folder that the image paths start from
+    name: str
+    devices: dict[str, Device]
+    board: Board
+    patterns: Patterns | None
+    records: tuple[BoardPose, ...]  # (p,)
+
+    @property
+    def poses(self) -> tuple[str, ...]:
+        """Names of the poses : (p,)."""
+        return tuple(record.name for record in self.records)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras that saw the board in any pose, in the order of the devices."""
+        seen = {camera for record in self.records for camera in record.lit}
+        return tuple(name for name in self.devices if name in seen)
+
+    def paths(self, number: int) -> list[Path]:
+        """All image files of one pose."""
+        record = self.records[number]
+        names = [*record.lit.values(), *(path for paths in record.fringes.values() for path in paths)]
+        return [self.root / name for name in names]
+
+    def pose(self, number: int) -> Pose:
+        """Read the images of one pose.
+
+        Raises
+        ------
+        InputError
+            If one is damaged, or doesn't fit its device.
+        """
+        record = self.records[number]
+        lit = {
+            camera: read_image(self.root / path, self.devices[camera].size, self.devices[camera].bits)
+            for camera, path in record.lit.items()
+        }
+        paths = [self.root / path for path in record.fringes.get("cam1", ())]
+        camera = self.devices.get("cam1")
+        fringes = read_images(paths, camera.size, camera.bits) if camera and paths else None
+        return Pose(record.name, lit, fringes)
+
+
+def read_board(folder: Path) -> BoardCapture:
+    """Open the board part of a capture folder.
+
+    Raises
+    ------
+    InputError
+        If the manifest is wrong, has no board, or names a file that is not there.
+    """
+    folder = Path(folder)
+    read = manifest.read_manifest(folder)
+    if read.board is None:
+        raise InputError(f"{folder / MANIFEST}: expected board, the poses of a calibration board, found none")
+    part, name = read.board, read.name or folder.resolve().name
+    capture = BoardCapture(folder / read.root, name, read.devices, part.board, part.patterns, part.poses)
+    for number in range(len(part.poses)):
+        for path in capture.paths(number):
+            if not path.is_file():
+                raise InputError(f"{path}: expected a file, found {'something else' if path.exists() else 'none'}")
+    return capture
+
+
+def describe_pose(name: str, cameras: Sequence[str], counts: Mapping[str, int]) -> BoardPose:
+    """Where the images of a pose lie in a capture folder: `cameras` saw it lit, and took `counts` fringe images each."""
+    place = pose_folder(name)
+    lit = {camera: f"{place}/{camera}/lit.png" for camera in cameras}
+    fringes = {camera: tuple(f"{place}/{camera}/{k:04d}.png" for k in range(count)) for camera, count in counts.items()}
+    return BoardPose(name=name, lit=lit, fringes=fringes)
+
+
+def pose_folder(name: str) -> str:
+    """Folder of one pose's images, relative to that of the capture."""
+    return f"board/{name}"
+
+
+def write_pose(folder: Path, name: str, lit: Mapping[str, Images], fringes: Mapping[str, Images]) -> None:
+    """Write the images of one pose into a capture folder, whole or not at all, where `describe_pose` says.
+
+    Parameters
+    ----------
+    lit : camera name -> (h, w) uint8 or uint16
+    fringes : camera name -> (n, h, w) uint8 or uint16
+        One image a pattern; may be empty.
+    """
+    record = describe_pose(name, list(lit), {camera: len(stack) for camera, stack in fringes.items()})
+    place = pose_folder(name)
+    marker = Path(record.lit[next(iter(lit))]).relative_to(place)
+    with atomic.new_folder(folder / place, str(marker)) as temporary:
+        for camera, stack in fringes.items():
+            write_images([temporary / Path(path).relative_to(place) for path in record.fringes[camera]], stack)
+        for camera, image in lit.items():
+            write_images([temporary / Path(record.lit[camera]).relative_to(place)], image[None])
+
+
+def write_manifest(folder: Path, devices: Mapping[str, Device], part: BoardPart, name: str = "") -> None:
+    """Complete a capture folder whose poses are written."""
+    manifest.write_manifest(folder, Manifest(schema=SCHEMA, name=name, devices=dict(devices), board=part))

@@ -1,0 +1,169 @@
+"""Calibration files: sonotwin's own `optics.yaml` and the dialects of others, recognised by their content.
+
+- own: OpenCV FileStorage YAML; for every device a map of `size`, `matrix`, `distortion` and `camera_from_world`; and, if known,
+  `parameters`, their names, and `covariance`.
+- camera and projector of SLMaster: FileStorage with M1, D1 (camera), M4, D4 (projector), Rlp, Tlp (projector from camera), S.
+- stereo pair of the rig's authors: npz, or FileStorage XML, with K1, dist1, K2, dist2, R, t. Device 1 is camera 1; which
+  device 2 is, the content doesn't say: the projector if the file's name has `proj` in it, else camera 2.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from recon.errors import InputError
+from recon.files import atomic, npz, opencv_storage
+from recon.geometry import rigid
+from recon.geometry.camera import Array, Camera
+from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
+from recon.model.calibration import WORLD, Calibration, Uncertainty
+
+SCHEMA = "sonotwin-optics/1"
+SLMASTER_KEYS = ("M1", "D1", "M4", "D4", "Rlp", "Tlp", "S")
+STEREO_KEYS = ("K1", "dist1", "K2", "dist2", "R", "t")
+OWN_KEYS = ("schema", "parameters", "covariance")  # any other is a device
+
+
+def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Calibration:
+    """Read a calibration file of any of the dialects.
+
+    Parameters
+    ----------
+    sizes : device -> (width, height) px
+        Image sizes of devices for which the file stores none; its own are kept where it has them.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, of no known dialect, or a value is missing, not finite, or no rotation.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: expected a calibration file, found {(error.strerror or 'none').lower()}") from None
+    if data.startswith(b"PK"):
+        matrices = npz.read(path, dict.fromkeys(STEREO_KEYS, npz.Form("fiu")))
+        return _stereo_pair(path, {key: value.astype(float) for key, value in matrices.items()}, sizes or {})
+    storage = opencv_storage.opened(path, data)
+    try:
+        keys = storage.root().keys() if storage.root().isMap() else []
+        if "schema" in keys:
+            return _own(path, storage)
+        if "K1" in keys or "K2" in keys:
+            return _stereo_pair(path, _matrices(path, storage, STEREO_KEYS), sizes or {})
+        if "M1" in keys or "M4" in keys:
+            return _slmaster(path, _matrices(path, storage, SLMASTER_KEYS), sizes or {})
+        raise InputError(f"{path}: expected schema, or M1 and M4, or K1 and K2, found {', '.join(keys) or 'no keys'}")
+    finally:
+        storage.release()
+
+
+def write(path: Path, calibration: Calibration) -> None:
+    """Write sonotwin's own format, whole or not at all. The suffix should be `.yaml`."""
+    storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+    storage.write("schema", SCHEMA)
+    for name, camera in calibration.cameras.items():
+        storage.startWriteStruct(name, cv2.FileNode_MAP)
+        storage.startWriteStruct("size", cv2.FileNode_SEQ | cv2.FileNode_FLOW)
+        for length in camera.size:
+            storage.write("", int(length))
+        storage.endWriteStruct()
+        storage.write("matrix", camera.matrix)
+        storage.write("distortion", camera.distortion.reshape(1, -1) if camera.distortion.size else np.zeros((1, 4)))
+        storage.write("camera_from_world", camera.camera_from_world)
+        storage.endWriteStruct()
+    if calibration.uncertainty is not None:
+        storage.startWriteStruct("parameters", cv2.FileNode_SEQ)
+        for name in calibration.uncertainty.names:
+            storage.write("", name)
+        storage.endWriteStruct()
+        storage.write("covariance", calibration.uncertainty.covariance)
+    text = storage.releaseAndGetString()
+    with atomic.new_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _own(path: Path, storage: cv2.FileStorage) -> Calibration:
+    found = storage.getNode("schema").string() if storage.getNode("schema").isString() else "a value that is no text"
+    if found != SCHEMA:
+        raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
+    cameras = {}
+    for name in storage.root().keys():
+        if name in OWN_KEYS:
+            continue
+        node = storage.getNode(name)
+        if not node.isMap():
+            raise InputError(f"{path}: {name}: expected size, matrix, distortion and camera_from_world, found something else")
+        values = {
+            key: opencv_storage.matrix(path, f"{name}.{key}", node.getNode(key))
+            for key in ("matrix", "distortion", "camera_from_world")
+        }
+        size = node.getNode("size")
+        lengths = [size.at(i) for i in range(size.size())] if size.isSeq() else []
+        if len(lengths) != 2 or not all(length.isInt() and length.real() > 0 for length in lengths):
+            raise InputError(f"{path}: {name}.size: expected width and height in px, found something else")
+        width, height = (int(length.real()) for length in lengths)
+        cameras[name] = _camera(path, name, (width, height), values["matrix"], values["distortion"], values["camera_from_world"])
+    if not cameras:
+        raise InputError(f"{path}: expected at least one device, found none")
+    return Calibration(cameras, _uncertainty(path, storage, cameras))
+
+
+def _uncertainty(path: Path, storage: cv2.FileStorage, cameras: Mapping[str, Camera]) -> Uncertainty | None:
+    node = storage.getNode("parameters")
+    if node.empty() and storage.getNode("covariance").empty():
+        return None
+    entries = [node.at(i) for i in range(node.size())] if node.isSeq() else []
+    if not entries or not all(entry.isString() for entry in entries):
+        raise InputError(f"{path}: parameters: expected names of the covariance's parameters, found something else")
+    names = tuple(entry.string() for entry in entries)
+    known = {f"{device}.{name}" for device in cameras for name in MATRIX + DISTORTION + (MOTION if device != WORLD else ())}
+    wrong = next((name for k, name in enumerate(names) if name not in known or name in names[:k]), None)
+    if wrong is not None:
+        raise InputError(f"{path}: parameters: expected a device's parameter like projector.fx, each once, found {wrong}")
+    return Uncertainty(names, opencv_storage.covariance(path, storage, len(names)))
+
+
+def _slmaster(path: Path, values: Mapping[str, Array], sizes: Mapping[str, tuple[int, int]]) -> Calibration:
+    if values["S"].size != 2 or not np.isfinite(values["S"]).all() or values["S"].min() < 1:
+        raise InputError(f"{path}: S: expected the camera's width and height in px, found {values['S'].ravel().tolist()}")
+    width, height = (int(length) for length in values["S"].ravel())
+    projector_from_world = _rigid(path, values, "Rlp", "Tlp")
+    camera = _camera(path, "cam1", (width, height), values["M1"], values["D1"], np.eye(4))
+    projector = _camera(path, "projector", _size(path, "projector", sizes), values["M4"], values["D4"], projector_from_world)
+    return Calibration({"cam1": camera, "projector": projector})
+
+
+def _stereo_pair(path: Path, values: Mapping[str, Array], sizes: Mapping[str, tuple[int, int]]) -> Calibration:
+    second = "projector" if "proj" in path.name.lower() else "cam2"
+    second_from_world = _rigid(path, values, "R", "t")
+    first = _camera(path, "cam1", _size(path, "cam1", sizes), values["K1"], values["dist1"], np.eye(4))
+    other = _camera(path, second, _size(path, second, sizes), values["K2"], values["dist2"], second_from_world)
+    return Calibration({"cam1": first, second: other})
+
+
+def _camera(path: Path, name: str, size: tuple[int, int], matrix: Array, distortion: Array, camera_from_world: Array) -> Camera:
+    try:
+        return Camera(size, matrix, distortion, camera_from_world)
+    except ValueError as error:
+        raise InputError(f"{path}: {name}.{error}") from None
+
+
+def _rigid(path: Path, values: Mapping[str, Array], rotation: str, translation: str) -> Array:
+    if values[rotation].shape != (3, 3) or values[translation].size != 3:
+        found = f"{values[rotation].shape} and {values[translation].shape}"
+        raise InputError(f"{path}: {rotation}, {translation}: expected a 3x3 rotation and 3 translations in mm, found {found}")
+    return rigid.transform(values[rotation], values[translation])
+
+
+def _size(path: Path, name: str, sizes: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
+    if name not in sizes:
+        raise InputError(f"{path}: expected a file that stores the image size of {name}, found none, and none was given")
+    return sizes[name]
+
+
+def _matrices(path: Path, storage: cv2.FileStorage, keys: tuple[str, ...]) -> dict[str, Array]:
+    return {key: opencv_storage.matrix(path, key, storage.getNode(key)) for key in keys}

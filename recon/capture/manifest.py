@@ -1,0 +1,185 @@
+"""`manifest.json`, which says what is in a capture folder: devices, patterns, and which image belongs to which.
+
+Everything is checked on load; a fault is an `InputError` of one line that names the file, what was expected and what was found.
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from recon.errors import InputError, one_line
+from recon.files.regular import read_bytes
+from recon.model.boards import Board
+from recon.model.patterns import Axis, Fringes, Patterns
+
+Model = TypeVar("Model", bound=BaseModel)
+
+SCHEMA: Literal["sonotwin-capture/1"] = "sonotwin-capture/1"
+MANIFEST = "manifest.json"
+
+
+class Record(BaseModel):
+    """Base of the manifest's parts: immutable, and refuses unknown keys and numbers that are not finite."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Device(Record):
+    """A camera or the projector, as it was set."""
+
+    size: tuple[Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)]]  # width, height, px
+    bits: Literal[8, 10, 12] = 8  # of the digital numbers; 10 and 12 are stored right-aligned in 16-bit PNG
+    exposure_s: Annotated[float, Field(gt=0)] | None = None
+    gain: Annotated[float, Field(gt=0)] | None = None  # linear; 1 is the sensor's base gain
+
+
+class SurfacePart(Record):
+    """The fringe sequence: what was projected and what each camera saw, in the same order."""
+
+    patterns: Patterns
+    images: dict[str, tuple[str, ...]]  # camera: paths relative to the manifest's root
+
+    @model_validator(mode="after")
+    def _one_image_a_pattern(self) -> "SurfacePart":
+        for camera, paths in self.images.items():
+            if len(paths) != self.patterns.count:
+                raise ValueError(f"images.{camera}: expected {self.patterns.count} images, one a pattern, found {len(paths)}")
+        return self
+
+
+class BoardPose(Record):
+    """What was seen of the calibration board in one pose."""
+
+    name: Annotated[str, Field(min_length=1)]
+    lit: Annotated[dict[str, str], Field(min_length=1)]  # camera: path of the image with the projector fully on
+    fringes: dict[str, tuple[str, ...]] = {}  # camera: paths in the order of the patterns
+
+
+class BoardPart(Record):
+    """The calibration board, held in several poses, lit and perhaps under fringes."""
+
+    board: Board
+    patterns: Patterns | None = None  # along both axes of the projector; none if only cameras are to be calibrated
+    poses: Annotated[tuple[BoardPose, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _fringes_as_shown(self) -> "BoardPart":
+        if self.patterns is not None and (lacking := axes_without_fringes(self.patterns)):
+            raise ValueError(f"patterns: expected fringes along both axes, found none along {' and '.join(lacking)}")
+        for number, pose in enumerate(self.poses):
+            if self.patterns is None and pose.fringes:
+                raise ValueError(f"patterns: expected those of poses.{number}.fringes, found none")
+            for camera, paths in pose.fringes.items():
+                if self.patterns is not None and len(paths) != self.patterns.count:
+                    expected = f"{self.patterns.count} images, one a pattern"
+                    raise ValueError(f"poses.{number}.fringes.{camera}: expected {expected}, found {len(paths)}")
+        return self
+
+    @model_validator(mode="after")
+    def _one_pose_a_name(self) -> "BoardPart":
+        names = [pose.name for pose in self.poses]
+        for number, name in enumerate(names):
+            if name in names[:number]:
+                raise ValueError(f"poses.{number}.name: expected another than that of poses.{names.index(name)}, found {name}")
+        return self
+
+
+class SweepPart(Record):
+    """A freehand ultrasound sweep: each device's frames by its own clock, and what a tracker says of the probe's target.
+
+    Paths are relative to the manifest's root.
+    """
+
+    images: Annotated[dict[str, str], Field(min_length=1)]  # device: folder of its images and timestamps.csv
+    track: str | None = None  # path of the poses; none if they are still to be found in the cameras' images
+
+
+class Manifest(Record):
+    """`manifest.json`. Parts are optional: a capture need not hold all of them."""
+
+    version: Literal["sonotwin-capture/1"] = Field(alias="schema")
+    name: str = ""
+    root: str = "."  # folder of the images: absolute, or relative to the manifest
+    devices: dict[str, Device]
+    calibration: str | None = None  # of cameras and projector; relative to the manifest's folder
+    probe: str | None = None  # the ultrasound probe's calibration; relative to the manifest's folder
+    surface: SurfacePart | None = None
+    board: BoardPart | None = None
+    sweep: SweepPart | None = None
+
+    @model_validator(mode="after")
+    def _known_cameras(self) -> "Manifest":
+        for place, cameras in self._places():
+            for camera in cameras:
+                if camera not in self.devices:
+                    raise ValueError(f"{place}.{camera}: expected one of the devices {', '.join(self.devices)}, found {camera}")
+        return self
+
+    @model_validator(mode="after")
+    def _one_raster(self) -> "Manifest":
+        for part, patterns in (
+            ("surface", self.surface.patterns if self.surface else None),
+            ("board", self.board.patterns if self.board else None),
+        ):
+            if patterns is None or "projector" not in self.devices:
+                continue
+            wanted, found = patterns.projector_size, self.devices["projector"].size
+            if found != wanted:
+                expected = f"{wanted[0]}x{wanted[1]} as in {part}.patterns"
+                raise ValueError(f"devices.projector.size: expected {expected}, found {found[0]}x{found[1]}")
+        return self
+
+    def _places(self) -> Iterator[tuple[str, Iterable[str]]]:
+        """Where cameras are named, and their names."""
+        if self.surface is not None:
+            yield "surface.images", self.surface.images
+        for number, pose in enumerate(self.board.poses if self.board else ()):
+            yield f"board.poses.{number}.lit", pose.lit
+            yield f"board.poses.{number}.fringes", pose.fringes
+        if self.sweep is not None:
+            yield "sweep.images", self.sweep.images
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read and check the manifest of a capture folder, leaving the files that it names alone.
+
+    Raises
+    ------
+    InputError
+        If it is missing, not JSON, of another version, or a field is wrong.
+    """
+    path = Path(folder) / MANIFEST
+    try:
+        content = json.loads(read_bytes(path), parse_constant=lambda value: _refuse_constant(path, value))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected JSON, found {error}") from None
+    except RecursionError:
+        raise InputError(f"{path}: expected JSON, found values nested too deeply") from None
+    return validated(Manifest, content, path)
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write the manifest into a capture folder."""
+    text = manifest.model_dump_json(indent=2, by_alias=True, exclude_none=True)
+    (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
+
+
+def axes_without_fringes(patterns: Patterns) -> list[Axis]:
+    """Axes of the projector along which a sequence has no fringes; a board's needs both."""
+    axes: tuple[Axis, Axis] = ("columns", "rows")
+    return [axis for axis in axes if not any(isinstance(part, Fringes) and part.axis == axis for part in patterns.parts)]
+
+
+def _refuse_constant(path: Path, value: str) -> None:
+    raise InputError(f"{path}: expected finite numbers, found {value}")
+
+
+def validated(model: type[Model], content: object, path: Path) -> Model:
+    """A record from the content of a file; raises InputError with the file, the field, what was expected and found."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise InputError(f"{path}: {one_line(error)}") from None

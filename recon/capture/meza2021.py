@@ -1,0 +1,127 @@
+"""The layout of the rig authors' public program: `SLdata/images`, `SLdata/mask.png` and the files of pairs of devices.
+
+The images in natural order are the centre line, the eight fringe images and, last, the fully lit one; others in between are
+left out. Pitch 12 projector px, phase shifts 2 pi k / 8 for k = 1 to 8, projector column (width - 1) / 2 at phase zero.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.capture import calibration_files
+from recon.capture.images import Size, image_size, natural_key, read_image, read_images, write_images
+from recon.capture.surface_part import SurfaceCapture
+from recon.errors import InputError
+from recon.files import atomic
+from recon.geometry import rigid
+from recon.geometry.camera import Array, Camera
+from recon.model.calibration import Calibration
+from recon.model.patterns import CentreLine, Fringes, Patterns, Uniform
+
+STEPS = 8
+PITCH = 12.0  # projector px
+PROJECTOR_SIZE = (1280, 800)  # px; their files don't store it
+PARAMETERS = "cam1_proj_params.npz"
+STEREO_PARAMETERS = "cam1_cam2_params.npz"
+STEREO_XML = "StereoParams.xml"  # the same, as OpenCV FileStorage
+
+
+def patterns(projector_size: Size = PROJECTOR_SIZE) -> Patterns:
+    """Their sequence, as far as it is decoded: centre line, fringes, fully lit."""
+    fringes = Fringes(pitch=PITCH, steps=STEPS, first=1)
+    return Patterns(projector_size=projector_size, unwrap="centre_line", parts=(CentreLine(), fringes, Uniform()))
+
+
+def read(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[SurfaceCapture, NDArray[np.bool_]]:
+    """Read their folder.
+
+    Parameters
+    ----------
+    projector_size : (width, height) px
+        Of the projector that their calibration belongs to.
+
+    Returns
+    -------
+    SurfaceCapture, mask
+        The mask (h, w) is true where they reconstruct; everywhere, if there is no `mask.png`.
+
+    Raises
+    ------
+    InputError
+        If images or calibration are missing, too few, or damaged.
+    """
+    folder = Path(folder)
+    sequence = patterns(projector_size)
+    images_dir = folder / "SLdata" / "images"
+    paths = sorted(images_dir.glob("*.png"), key=natural_key)
+    if len(paths) < sequence.count:
+        raise InputError(f"{images_dir}: expected at least {sequence.count} PNG images, found {len(paths)}")
+    paths = paths[: sequence.count - 1] + paths[-1:]
+    size = image_size(paths[0])
+    images = read_images(paths, size, bits=8)
+    mask = np.ones(images.shape[1:], bool)
+    if (folder / "SLdata" / "mask.png").exists():
+        mask = read_image(folder / "SLdata" / "mask.png", size, bits=8) > 0
+    optics = calibration_files.read(folder / PARAMETERS, sizes={"cam1": size, "projector": projector_size})
+    return SurfaceCapture(images, sequence, 8, optics, folder.resolve().name), mask
+
+
+def write(folder: Path, surface: SurfaceCapture, mask: NDArray[np.bool_]) -> None:
+    """Write a surface capture of camera 1 in their layout, whole or not at all.
+
+    Raises
+    ------
+    ValueError
+        If the capture is not 8-bit or its patterns are not theirs.
+    InputError
+        If the place is taken by something else, or can't be written to.
+    """
+    if surface.bits != 8 or surface.patterns != patterns(surface.patterns.projector_size):
+        raise ValueError("expected an 8-bit capture of the authors' patterns")
+    with atomic.new_folder(folder, PARAMETERS) as temporary:
+        structured_light = temporary / "SLdata"
+        write_images([structured_light / "images" / f"{i}.png" for i in range(len(surface.images))], surface.images)
+        write_images([structured_light / "mask.png"], np.where(mask, 255, 0).astype(np.uint8)[None])
+        np.savez(temporary / PARAMETERS, **parameters(surface.calibration))
+
+
+def write_parameters(folder: Path, optics: Calibration) -> list[str]:
+    """Write the files of all pairs of camera 1 with another device into a folder that is there; returns their names."""
+    written = []
+    if "projector" in optics.cameras:
+        np.savez(folder / PARAMETERS, **parameters(optics))
+        written.append(PARAMETERS)
+    if "cam2" in optics.cameras:
+        pair = parameters(optics, "cam2")
+        np.savez(folder / STEREO_PARAMETERS, **pair)
+        storage = cv2.FileStorage(".xml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+        for name, value in pair.items():
+            storage.write(name, np.ascontiguousarray(value))  # a view would lose its strides
+        (folder / STEREO_XML).write_text(storage.releaseAndGetString(), encoding="utf-8")
+        written += [STEREO_PARAMETERS, STEREO_XML]
+    return written
+
+
+def parameters(optics: Calibration, second: str = "projector") -> dict[str, Array]:
+    """Their names for a pair of devices: K1, dist1, K2, dist2, R, t (second from camera 1, mm) and the fundamental matrix F."""
+    first, other = optics.cameras["cam1"], optics.cameras[second]
+    other_from_first = other.camera_from_world @ rigid.invert(first.camera_from_world)
+    rotation, t = other_from_first[:3, :3], other_from_first[:3, 3]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    fundamental = np.linalg.inv(other.matrix).T @ cross @ rotation @ np.linalg.inv(first.matrix)
+    return {
+        "K1": first.matrix,
+        "dist1": _distortion(first),
+        "K2": other.matrix,
+        "dist2": _distortion(other),
+        "R": rotation,
+        "t": t.reshape(3, 1),
+        "F": fundamental / fundamental[2, 2],
+    }
+
+
+def _distortion(camera: Camera) -> Array:
+    """Coefficients : (1, 4 or more). OpenCV's files can't hold an empty matrix, so no distortion is four zeros."""
+    return camera.distortion.reshape(1, -1) if camera.distortion.size else np.zeros((1, 4))

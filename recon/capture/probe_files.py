@@ -1,0 +1,130 @@
+"""Files of the probe's calibration: sonotwin's own `probe.yaml`, and the rig authors' `US_params.npz`.
+
+- own: OpenCV FileStorage YAML with `schema`, `target_from_image` (4x4, mm), `scale` (sx, sy in mm/px), `speed_m_s`, the speed of
+  sound for which sy holds (1540 if it is missing), and, if known, `parameters`, their names as in `recon.model.probe`, and
+  `covariance`.
+- the authors': npz with sx, sy and T_I_T, which is `target_from_image`; no speed, so that 1540 m/s is taken.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.files import atomic, npz, opencv_storage
+from recon.model.calibration import Uncertainty
+from recon.model.probe import SCANNER_SPEED, SPEEDS, ProbeCalibration
+
+Array = NDArray[np.float64]
+
+SCHEMA = "sonotwin-probe/1"
+PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
+AUTHORS = "US_params.npz"
+ORTHOGONAL = 1e-3  # of a rotation; files of few digits pass
+
+
+def read(path: Path) -> ProbeCalibration:
+    """Read a probe's calibration of either kind, recognised by its content.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, of another kind, or a value is missing, not finite, no rotation, scale or speed of sound.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: expected a probe's calibration, found {(error.strerror or 'none').lower()}") from None
+    if data.startswith(b"PK"):
+        return _authors(path)
+    storage = opencv_storage.opened(path, data)
+    try:
+        return _own(path, storage)
+    finally:
+        storage.release()
+
+
+def write(path: Path, calibration: ProbeCalibration) -> None:
+    """Write sonotwin's own format, whole or not at all. The suffix should be `.yaml`."""
+    storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+    storage.write("schema", SCHEMA)
+    storage.write("target_from_image", calibration.target_from_image)
+    storage.write("scale", np.asarray(calibration.scale, float).reshape(1, 2))
+    storage.write("speed_m_s", float(calibration.speed_m_s))
+    if calibration.uncertainty is not None:
+        storage.startWriteStruct("parameters", cv2.FileNode_SEQ)
+        for name in calibration.uncertainty.names:
+            storage.write("", name)
+        storage.endWriteStruct()
+        storage.write("covariance", calibration.uncertainty.covariance)
+    text = storage.releaseAndGetString()
+    with atomic.new_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_authors(path: Path, calibration: ProbeCalibration) -> None:
+    """Write the rig authors' `US_params.npz`, whole or not at all; it has no room for uncertainty and speed."""
+    sx, sy = calibration.scale
+    with atomic.new_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, sx=sx, sy=sy, T_I_T=calibration.target_from_image)
+
+
+def _authors(path: Path) -> ProbeCalibration:
+    number = npz.Form("fiu")
+    values = npz.read(path, {"sx": number, "sy": number, "T_I_T": npz.Form("fiu", (4, 4))})
+    for name in ("sx", "sy"):
+        if values[name].size != 1:
+            raise InputError(f"{path}: {name}: expected one number, found {values[name].size}")
+    scale = np.array([values["sx"].item(), values["sy"].item()], float)
+    return _checked(path, "T_I_T", values["T_I_T"].astype(float), scale, None, SCANNER_SPEED)
+
+
+def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
+    node = storage.getNode("schema") if storage.root().isMap() else None
+    found = node.string() if node is not None and node.isString() else "none"
+    if found != SCHEMA:
+        raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
+    pose, scale = (
+        opencv_storage.matrix(path, "target_from_image", storage.getNode("target_from_image")),
+        opencv_storage.matrix(path, "scale", storage.getNode("scale")).ravel(),
+    )
+    return _checked(path, "target_from_image", pose, scale, _uncertainty(path, storage), _speed(path, storage))
+
+
+def _checked(
+    path: Path, name: str, pose: Array, scale: Array, uncertainty: Uncertainty | None, speed_m_s: float
+) -> ProbeCalibration:
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise InputError(f"{path}: {name}: expected a 4x4 rigid transform in mm, found shape {pose.shape} or values not finite")
+    turn = pose[:3, :3]
+    orthogonal = np.abs(turn @ turn.T - np.eye(3)).max() < ORTHOGONAL and np.abs(pose[3] - [0, 0, 0, 1]).max() < ORTHOGONAL
+    if not orthogonal or np.linalg.det(turn) < 0:
+        raise InputError(f"{path}: {name}: expected a 4x4 rigid transform, found a matrix with no right-handed rotation in it")
+    if scale.shape != (2,) or not np.isfinite(scale).all() or scale.min() <= 0:
+        raise InputError(f"{path}: scale: expected sx and sy above zero in mm/px, found {scale.tolist()}")
+    return ProbeCalibration(pose, scale, uncertainty, speed_m_s)
+
+
+def _speed(path: Path, storage: cv2.FileStorage) -> float:
+    node = storage.getNode("speed_m_s")
+    if node.empty():
+        return SCANNER_SPEED
+    value = node.real() if node.isReal() or node.isInt() else None
+    if value is None or not SPEEDS[0] <= value <= SPEEDS[1]:
+        found = "something else" if value is None else f"{value:g}"
+        raise InputError(f"{path}: speed_m_s: expected a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s, found {found}")
+    return float(value)
+
+
+def _uncertainty(path: Path, storage: cv2.FileStorage) -> Uncertainty | None:
+    node = storage.getNode("parameters")
+    if node.empty() and storage.getNode("covariance").empty():
+        return None
+    entries = [node.at(i) for i in range(node.size())] if node.isSeq() else []
+    names = tuple(entry.string() for entry in entries if entry.isString())
+    if not names or len(names) < len(entries) or len(set(names)) < len(names) or not set(names) <= set(PARAMETERS):
+        raise InputError(f"{path}: parameters: expected some of {' '.join(PARAMETERS)}, each once, found something else")
+    return Uncertainty(names, opencv_storage.covariance(path, storage, len(names)))

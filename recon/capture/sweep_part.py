@@ -1,0 +1,192 @@
+"""The sweep part of a capture: B-scans with their time stamps, and the poses of the probe's target, each by its own clock.
+
+B-scans are read one at a time: a sweep of some minutes is larger than it needs to be in memory.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.capture import manifest, probe_files, sweep_tables
+from recon.capture.images import Size, read_image, write_images
+from recon.capture.manifest import MANIFEST, SCHEMA, Device, Manifest, SweepPart
+from recon.errors import InputError
+from recon.files import atomic
+from recon.model import tracks
+from recon.model.probe import ProbeCalibration
+from recon.model.tracks import Track
+
+Array = NDArray[np.float64]
+
+SCANNER = "us"  # the device
+STAMPS = "timestamps.csv"  # in each device's folder
+FOLDER = "sweep"
+TRACK = f"{FOLDER}/track.csv"
+PROBE = "calibration/probe.yaml"
+
+
+@dataclass(frozen=True)
+class SweepCapture:
+    """A sweep of n B-scans; its tables are checked and every image is there, but none is read yet."""
+
+    name: str
+    size: Size  # of the B-scans: width, height, px
+    paths: tuple[Path, ...]  # (n,)
+    frames: NDArray[np.int64]  # (n,) numbers of the B-scans, increasing; a scanner may have dropped some
+    times: NDArray[np.int64]  # (n,) ns, of the scanner's clock
+    track: Track  # of the target, of the tracker's clock
+    probe: ProbeCalibration | None = None
+
+    def image(self, number: int) -> NDArray[np.uint8]:
+        """Read one B-scan : (h, w), counted from 0 whatever its frame's number; InputError if it is damaged."""
+        return read_image(self.paths[number], self.size, bits=8)
+
+    def images(self) -> Iterator[NDArray[np.uint8]]:
+        """Read all B-scans : (h, w), one by one."""
+        return (self.image(number) for number in range(len(self.paths)))
+
+    def poses(self, lag_s: float = 0.0) -> Array:
+        """Poses `world_from_target` : (n, 4, 4) at which the B-scans were taken, NaN where the target wasn't tracked.
+
+        Parameters
+        ----------
+        lag_s : float
+            How late the B-scans' time stamps are; see `recon.probe_calibration.latency.Lag`.
+
+        Raises
+        ------
+        InputError
+            If no B-scan has a pose.
+        """
+        poses = tracks.poses_at(self.track, self.times, lag_s)
+        if not np.isfinite(poses).any():
+            scans, track = (f"{_span(times)} s" for times in (self.times - round(lag_s * 1e9), self.track.times))
+            found = f"B-scans at {scans} and poses at {track}: are the clocks others?" if self.track.found.any() else "none found"
+            raise InputError(f"{self.name}: expected poses of the target while the B-scans were taken, found {found}")
+        return poses
+
+    def pose_covariance(self, lag_s: float = 0.0) -> Array | None:
+        """Covariance : (n, 6, 6) of these poses, as in `recon.model.tracks`; NaN where there is none. None if the track has none.
+
+        A pose between two others shares the errors of both, taken as independent: halfway its variance is half of theirs.
+        """
+        covariance = self.track.covariance
+        if covariance is None or self.track.found.sum() < 2:
+            return None
+        moments, known = self.track.times[self.track.found], covariance[self.track.found]
+        wanted = self.times - round(lag_s * 1e9)
+        after = np.clip(np.searchsorted(moments, wanted), 1, len(moments) - 1)
+        share = ((wanted - moments[after - 1]) / (moments[after] - moments[after - 1]))[:, None, None]
+        return np.where((share >= 0) & (share <= 1), (1 - share) ** 2 * known[after - 1] + share**2 * known[after], np.nan)
+
+
+def read_sweep(folder: Path) -> SweepCapture:
+    """Open the sweep part of a capture folder.
+
+    Raises
+    ------
+    InputError
+        If the manifest is wrong or has no sweep, a table or the probe's calibration is wrong, or an image is not there.
+    """
+    folder = Path(folder)
+    read = manifest.read_manifest(folder)
+    part, root = read.sweep, folder / read.root
+    if part is None:
+        raise InputError(f"{folder / MANIFEST}: expected sweep, B-scans and the poses of the probe, found none")
+    for name, found in ((f"sweep.images.{SCANNER}", part.images.get(SCANNER)), ("sweep.track", part.track)):
+        if found is None:
+            raise InputError(f"{folder / MANIFEST}: {name}: expected a path, found none")
+    device = read.devices[SCANNER]
+    if device.bits != 8:
+        raise InputError(f"{folder / MANIFEST}: devices.{SCANNER}.bits: expected 8, found {device.bits}")
+    place = root / part.images[SCANNER]
+    frames, times = sweep_tables.read_stamps(place / STAMPS)
+    paths = tuple(place / image_name(frame) for frame in frames.tolist())
+    for path in paths:
+        if not path.is_file():
+            raise InputError(f"{path}: expected a file, found {'something else' if path.exists() else 'none'}")
+    track = sweep_tables.read_track(root / str(part.track))
+    probe = None if read.probe is None else probe_files.read(folder / read.probe)
+    return SweepCapture(read.name or folder.resolve().name, device.size, paths, frames, times, track, probe)
+
+
+def write_part(
+    folder: Path, images: Iterable[NDArray[np.uint8]], times: NDArray[np.int64], track: Track, size: Size
+) -> SweepPart:
+    """Write B-scans and poses into a capture folder, whole or not at all.
+
+    Parameters
+    ----------
+    images : n of (h, w) uint8
+        Taken one by one.
+    times : (n,) ns
+        Of the scanner's clock, strictly increasing.
+
+    Returns
+    -------
+    SweepPart
+        For the manifest, beside the device `us` and other parts.
+
+    Raises
+    ------
+    ValueError
+        If images are of another size or no bytes, their number is not that of the times, or times don't increase.
+    """
+    times = np.asarray(times, np.int64)
+    if (np.diff(times) <= 0).any() or (np.diff(track.times) <= 0).any():
+        raise ValueError("times: expected them strictly increasing")
+    part = SweepPart(images={SCANNER: f"{FOLDER}/{SCANNER}"}, track=TRACK)
+    with atomic.new_folder(folder / FOLDER, str(Path(TRACK).relative_to(FOLDER))) as temporary:
+        place = temporary / SCANNER
+        place.mkdir()
+        count = 0
+        for image in images:
+            if image.shape != size[::-1] or image.dtype != np.uint8:
+                raise ValueError(f"image {count}: expected {size[0]}x{size[1]} uint8, found {image.shape} {image.dtype}")
+            write_images([place / image_name(count)], image[None])
+            count += 1
+        if count != len(times):
+            raise ValueError(f"images: expected {len(times)}, one a time, found {count}")
+        sweep_tables.write_stamps(place / STAMPS, times)
+        sweep_tables.write_track(temporary / Path(TRACK).relative_to(FOLDER), track)
+    return part
+
+
+def write_sweep(
+    folder: Path,
+    images: Iterable[NDArray[np.uint8]],
+    times: NDArray[np.int64],
+    track: Track,
+    size: Size,
+    probe: ProbeCalibration | None = None,
+    name: str = "",
+) -> None:
+    """Write a capture folder with a sweep part alone, whole or not at all; see `write_part`.
+
+    Raises
+    ------
+    InputError
+        If the place is taken by something that is not a capture, or can't be written to.
+    ValueError
+        As `write_part`.
+    """
+    with atomic.new_folder(folder, MANIFEST) as temporary:
+        part = write_part(temporary, images, times, track, size)
+        if probe is not None:
+            (temporary / PROBE).parent.mkdir()
+            probe_files.write(temporary / PROBE, probe)
+        devices = {SCANNER: Device(size=size)}
+        content = Manifest(schema=SCHEMA, name=name, devices=devices, probe=PROBE if probe is not None else None, sweep=part)
+        manifest.write_manifest(temporary, content)
+
+
+def image_name(frame: int) -> str:
+    """File name of a frame, in its device's folder."""
+    return f"{frame:04d}.png"
+
+
+def _span(times: NDArray[np.int64]) -> str:
+    return f"{times[0] * 1e-9:.3f} to {times[-1] * 1e-9:.3f}"

@@ -1,0 +1,191 @@
+"""Tables of a sweep as CSV files with a header: when images were taken, where the target stood, and pairs of pose and pixel.
+
+Numbers are written with as many digits as it takes to read the same ones back.
+"""
+
+import csv
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.files import atomic
+from recon.files.regular import read_bytes
+from recon.model.tracks import Track
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+STAMPS = ("frame", "time_ns")
+POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))  # of world_from_target, row by row; mm
+TRIANGLE = np.triu_indices(6)
+COVARIANCE = tuple(f"c{row}{column}" for row, column in zip(*TRIANGLE, strict=True))  # as of recon.model.tracks, upper triangle
+TRACK = ("time_ns", "found", *POSE)
+PAIRS = (*POSE, "u", "v")
+ORTHOGONAL = 1e-3  # of a rotation; files of few digits pass
+LONGEST_NS = 1 << 63
+
+
+def read_stamps(path: Path) -> tuple[NDArray[np.int64], Times]:
+    """Read a device's `timestamps.csv`: numbers of the frames : (n,), and their times : (n,) ns, both strictly increasing.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, or frames or times don't increase.
+    """
+    _, rows = _read(path, STAMPS)
+    table = np.array([[_whole(path, k, name, word) for name, word in zip(STAMPS, row, strict=True)] for k, row in rows], np.int64)
+    lines = [k for k, _ in rows]
+    for name, column in zip(STAMPS, table.T, strict=True):
+        _increasing(path, lines, name, column)
+    if table[0, 0] < 0:
+        raise InputError(f"{path}: line {lines[0]}: frame: expected a number from 0 on, found {table[0, 0]}")
+    return table[:, 0], table[:, 1]
+
+
+def write_stamps(path: Path, times: Times) -> None:
+    """Write `timestamps.csv` for frames numbered from 0, taken at times : (n,) ns."""
+    write_rows(path, STAMPS, ([frame, int(time)] for frame, time in enumerate(times)))
+
+
+def read_track(path: Path) -> Track:
+    """Read poses over time: `time_ns`, `found` (1 or 0), 12 numbers of `world_from_target`, and perhaps 21 of the covariance.
+
+    Where the target was not found the numbers are left alone.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, times don't increase, a pose has values that are not finite or no rotation, or a
+        covariance is none.
+    """
+    header, rows = _read(path, TRACK, COVARIANCE)
+    lines = [k for k, _ in rows]
+    times = np.array([_whole(path, k, "time_ns", row[0]) for k, row in rows], np.int64)
+    _increasing(path, lines, "time_ns", times)
+    poses = np.full((len(rows), 4, 4), np.nan)
+    covariance = np.full((len(rows), 6, 6), np.nan) if len(header) > len(TRACK) else None
+    for i, (k, row) in enumerate(rows):
+        if row[1] not in ("0", "1"):
+            raise InputError(f"{path}: line {k}: found: expected 0 or 1, found {row[1]!r}")
+        if row[1] == "0":
+            continue
+        poses[i] = _pose(path, k, row[2 : len(TRACK)])
+        if covariance is not None:
+            covariance[i] = _covariance(path, k, row[len(TRACK) :])
+    return Track(times, poses, covariance)
+
+
+def write_track(path: Path, track: Track) -> None:
+    """Write poses over time, with their covariance if the track has one; where the target was not found the fields are empty."""
+    header = TRACK if track.covariance is None else (*TRACK, *COVARIANCE)
+
+    def row(k: int, found: bool) -> list[int | float | str]:
+        if not found:
+            return [int(track.times[k]), 0, *[""] * (len(header) - 2)]
+        numbers = [] if track.covariance is None else track.covariance[k][TRIANGLE].tolist()
+        return [int(track.times[k]), 1, *track.poses[k, :3].ravel().tolist(), *numbers]
+
+    write_rows(path, header, (row(k, bool(found)) for k, found in enumerate(track.found)))
+
+
+def read_pairs(path: Path) -> tuple[Array, Array]:
+    """Read pairs of a pose and the pixel where a point at rest was seen: `world_from_target` (n, 4, 4) mm and u, v : (n, 2) px.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, or a value is not finite or no rotation.
+    """
+    _, rows = _read(path, PAIRS)
+    poses = np.array([_pose(path, k, row[: len(POSE)]) for k, row in rows])
+    pixels = [[_number(path, k, name, word) for name, word in zip("uv", row[len(POSE) :], strict=True)] for k, row in rows]
+    return poses, np.array(pixels)
+
+
+def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table, whole or not at all, with a header and lines that end as on Unix."""
+    with atomic.new_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow(header)
+        table.writerows(rows)
+
+
+def _read(path: Path, header: Sequence[str], optional: Sequence[str] = ()) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The header, and the rows with the numbers of their lines; at least one."""
+    try:
+        lines = read_bytes(path).decode("utf-8-sig").splitlines()
+        rows = [(k, [word.strip() for word in row]) for k, row in enumerate(csv.reader(lines), start=1) if row]
+    except (UnicodeDecodeError, csv.Error):
+        raise InputError(f"{path}: expected a table as CSV text, found other or damaged data") from None
+    found = rows[0][1] if rows else []
+    if found not in (list(header), [*header, *optional]):
+        expected = f"a header {_brief(header)}" + (f", perhaps followed by {_brief(optional)}" if optional else "")
+        raise InputError(f"{path}: line 1: expected {expected}, found {_brief(found) or 'none'}")
+    for k, row in rows[1:]:
+        if len(row) != len(found):
+            raise InputError(f"{path}: line {k}: expected {len(found)} columns, found {len(row)}")
+    if len(rows) < 2:
+        raise InputError(f"{path}: expected one row or more below the header, found none")
+    return found, rows[1:]
+
+
+def _whole(path: Path, line: int, name: str, word: str) -> int:
+    try:
+        value = int(word)
+    except ValueError:
+        value = LONGEST_NS
+    if abs(value) >= LONGEST_NS:
+        raise InputError(f"{path}: line {line}: {name}: expected a whole number, found {word[:40]!r}")
+    return value
+
+
+def _number(path: Path, line: int, name: str, word: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError(f"{path}: line {line}: {name}: expected a finite number, found {word[:40]!r}")
+    return value
+
+
+def _numbers(path: Path, line: int, names: Sequence[str], words: Sequence[str]) -> list[float]:
+    return [_number(path, line, name, word) for name, word in zip(names, words, strict=True)]
+
+
+def _increasing(path: Path, lines: Sequence[int], name: str, values: NDArray[np.int64]) -> None:
+    wrong = np.flatnonzero(values[1:] <= values[:-1]) + 1
+    if len(wrong):
+        k = wrong[0]
+        expected = f"more than the {values[k - 1]} before, in order of time"
+        raise InputError(f"{path}: line {lines[k]}: {name}: expected {expected}, found {values[k]}")
+
+
+def _pose(path: Path, line: int, words: Sequence[str]) -> Array:
+    pose = np.vstack([np.reshape(_numbers(path, line, POSE, words), (3, 4)), [0, 0, 0, 1]])
+    turn = pose[:3, :3]
+    if np.abs(turn @ turn.T - np.eye(3)).max() > ORTHOGONAL:
+        raise InputError(f"{path}: line {line}: expected a pose, its rotation row by row, found a matrix that is no rotation")
+    if np.linalg.det(turn) < 0:
+        raise InputError(f"{path}: line {line}: expected a pose of a right-handed frame, found a left-handed one")
+    return pose
+
+
+def _covariance(path: Path, line: int, words: Sequence[str]) -> Array:
+    upper = np.zeros((6, 6))
+    upper[TRIANGLE] = _numbers(path, line, COVARIANCE, words)
+    matrix = upper + np.triu(upper, 1).T
+    sigma = np.sqrt(np.abs(np.diag(matrix)))
+    unit = np.where(sigma > 0, sigma, 1.0)
+    if np.linalg.eigvalsh(matrix / np.outer(unit, unit)).min() < -1e-6:
+        raise InputError(f"{path}: line {line}: expected the upper triangle of a covariance, found a matrix that is none")
+    return matrix
+
+
+def _brief(names: Sequence[str]) -> str:
+    text = ",".join(names)
+    return text if len(text) <= 60 else f"{text[:28]}...{text[-28:]}"

@@ -1,0 +1,236 @@
+"""Headers of MetaImage (.mha, .mhd) and NRRD (.nrrd, .nhdr) files with fields of one's own, and their pixels a block at a time.
+
+Both are text, name and value a line, followed by the pixels or by the name of the file that has them. What the fields mean is for
+`recon.freehand.sequences` and `recon.files.volumes`; here they are found, and the pixels are unpacked without ever being in
+memory at once.
+"""
+
+import math
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+
+META_TYPES = {
+    "MET_UCHAR": "u1",
+    "MET_CHAR": "i1",
+    "MET_USHORT": "u2",
+    "MET_SHORT": "i2",
+    "MET_UINT": "u4",
+    "MET_INT": "i4",
+    "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
+}
+NRRD_BYTES = ("unsigned char", "uchar", "uint8", "uint8_t")  # one type, four names
+LONGEST_LINE = 1 << 20  # bytes; a file of another kind may have no line breaks at all
+READ_AT_ONCE = 1 << 18  # bytes
+MOST_UNPACKED = 1100  # times the packed size: deflate reaches 1032
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """An image file whose header was read: what it says, and where the pixels are."""
+
+    path: Path  # of the header
+    fields: dict[str, str]  # as they stand in the header, in its order
+    size: tuple[int, ...]  # px along each axis, the fastest first
+    pixel: np.dtype
+    packed: bool  # by zlib or gzip
+    data_path: Path
+    data_offset: int  # bytes before the pixels
+
+    @property
+    def data_bytes(self) -> int:
+        """Unpacked size of all pixels."""
+        return math.prod(self.size) * self.pixel.itemsize
+
+    def fault(self, field: str, expected: object, found: object) -> InputError:
+        """The error that says what is wrong with a field of this file."""
+        return fault(self.path, field, expected, found)
+
+
+def fault(path: Path, field: str, expected: object, found: object) -> InputError:
+    """The error that says what is wrong with a field of a file; long values are shortened."""
+    text = str(found)
+    return InputError(f"{path}: {field}: expected {expected}, found {text if len(text) <= 60 else text[:57] + '...'}")
+
+
+def read_header(path: Path) -> ImageFile:
+    """Read the header of a MetaImage or NRRD file, told apart by how it begins.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it is of another kind, or the header is incomplete, contradicts itself or asks for more pixels
+        than the file can hold.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(4)
+            stream.seek(0)
+            file = _nrrd(path, stream) if start == b"NRRD" else _metaimage(path, stream)
+        _check_length(file)
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a file, found none") from None
+    except OSError as error:
+        raise InputError(f"{path}: expected a file to read, found {error.strerror}") from None
+    return file
+
+
+def blocks(file: ImageFile, length: int) -> Iterator[bytes]:
+    """The pixels in blocks of `length` bytes, which divides their total; one block is in memory at a time.
+
+    Raises
+    ------
+    InputError
+        If there are fewer or more pixels than the header says, or packed ones are damaged.
+    """
+    waiting, got = bytearray(), 0
+    for piece in _pieces(file):
+        got += len(piece)
+        if got > file.data_bytes:
+            raise file.fault("pixels", f"{file.data_bytes} bytes", "more")
+        waiting += piece
+        while len(waiting) >= length:
+            yield bytes(waiting[:length])
+            del waiting[:length]
+    if got < file.data_bytes:
+        raise file.fault("pixels", f"{file.data_bytes} bytes", f"{got}, the file has been cut short or damaged")
+
+
+def pack(images: NDArray, gzip: bool) -> bytes:
+    """One zlib or gzip stream of images, packed one by one; fast rather than small, B-scans being mostly noise."""
+    packer = zlib.compressobj(level=1, wbits=31 if gzip else 15)
+    return b"".join([*(packer.compress(np.ascontiguousarray(image)) for image in images), packer.flush()])
+
+
+def whole_numbers(path: Path, field: str, text: str, least: int = 0, pieces: int | None = None) -> tuple[int, ...]:
+    """Whole numbers of a header's field, separated by any number of spaces; any number of them if `pieces` is not given."""
+    try:
+        numbers = tuple(int(word) for word in text.split())
+    except ValueError:
+        numbers = ()
+    if not numbers or min(numbers) < least or len(numbers) != (pieces or len(numbers)):
+        expected = "a whole number" if pieces == 1 else f"{pieces or ''} whole numbers".lstrip()
+        raise fault(path, field, f"{expected} of at least {least}", repr(text))
+    return numbers
+
+
+def numbers(path: Path, field: str, text: str, count: int) -> np.ndarray:
+    """Finite decimal numbers of a header's field, as float64."""
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.array([np.nan])
+    if len(values) != count or not np.isfinite(values).all():
+        raise fault(path, field, "a finite number" if count == 1 else f"{count} finite numbers", repr(text))
+    return values
+
+
+def _metaimage(path: Path, stream: BinaryIO) -> ImageFile:
+    fields: dict[str, str] = {}
+    while "ElementDataFile" not in fields:
+        line = _line(path, stream)
+        if not line:
+            raise fault(path, "ElementDataFile", "a value at the header's end", "the end of the file")
+        name, sign, value = line.partition("=")
+        if not sign:
+            raise InputError(f"{path}: expected lines of a MetaImage header, 'name = value', found {line.strip()[:40]!r}")
+        fields[name.strip()] = value.strip()
+    size = whole_numbers(path, "DimSize", _value(path, fields, "DimSize"))
+    dimensions = whole_numbers(path, "NDims", fields.get("NDims", str(len(size))))
+    if dimensions != (len(size),):
+        raise fault(path, "DimSize", f"{dimensions[0]} numbers as in NDims", repr(fields["DimSize"]))
+    if fields.get("BinaryData", "True").lower() != "true":
+        raise fault(path, "BinaryData", "True", fields["BinaryData"])
+    if fields.get("ElementNumberOfChannels", "1") != "1":
+        raise fault(path, "ElementNumberOfChannels", 1, fields["ElementNumberOfChannels"])
+    kind = _value(path, fields, "ElementType")
+    if kind not in META_TYPES:
+        raise fault(path, "ElementType", f"one of {', '.join(META_TYPES)}", kind)
+    big = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False")).lower() == "true"
+    local = fields["ElementDataFile"].upper() == "LOCAL"
+    return ImageFile(
+        path,
+        fields,
+        size,
+        np.dtype((">" if big else "<") + META_TYPES[kind]),
+        fields.get("CompressedData", "False").lower() == "true",
+        path if local else path.parent / fields["ElementDataFile"],
+        stream.tell() if local else 0,
+    )
+
+
+def _nrrd(path: Path, stream: BinaryIO) -> ImageFile:
+    """The header of an NRRD file of bytes, which is what sequences are; those of other pixels are read by pynrrd."""
+    fields: dict[str, str] = {}
+    _line(path, stream)
+    while (line := _line(path, stream)).strip():
+        if line.startswith("#"):
+            continue
+        name, sign, value = line.partition(":")
+        if not sign:
+            raise InputError(f"{path}: expected lines of an NRRD header, 'name: value', found {line.strip()[:40]!r}")
+        fields[name.strip()] = value.removeprefix("=").strip()  # PLUS writes some fields of its own with ":", some with ":="
+    detached = fields.get("data file", fields.get("datafile"))
+    if not line and not detached:
+        raise fault(path, "header", "an empty line at its end", "the end of the file")
+    size = whole_numbers(path, "sizes", _value(path, fields, "sizes"))
+    if whole_numbers(path, "dimension", _value(path, fields, "dimension")) != (len(size),):
+        raise fault(path, "sizes", f"{fields['dimension']} numbers as in dimension", repr(fields["sizes"]))
+    if _value(path, fields, "type") not in NRRD_BYTES:
+        raise fault(path, "type", "unsigned char", fields["type"])
+    encoding = _value(path, fields, "encoding")
+    if encoding not in ("raw", "gz", "gzip"):
+        raise fault(path, "encoding", "raw or gzip", encoding)
+    data = path.parent / detached if detached else path
+    return ImageFile(path, fields, size, np.dtype("u1"), encoding != "raw", data, 0 if detached else stream.tell())
+
+
+def _line(path: Path, stream: BinaryIO) -> str:
+    line = stream.readline(LONGEST_LINE)
+    if len(line) == LONGEST_LINE:
+        raise InputError(f"{path}: expected a MetaImage or NRRD header, found a line of {LONGEST_LINE} bytes")
+    return line.decode("utf-8", "surrogateescape")
+
+
+def _value(path: Path, fields: Mapping[str, str], name: str) -> str:
+    if name not in fields:
+        raise fault(path, name, "a value", "none")
+    return fields[name]
+
+
+def _check_length(file: ImageFile) -> None:
+    """Refuse at once, before memory is asked for, what can't be complete."""
+    if "\0" in str(file.data_path) or not file.data_path.is_file():
+        raise file.fault("data file", "LOCAL or the name of a file that is there", repr(file.data_path.name))
+    there = file.data_path.stat().st_size - file.data_offset
+    if file.packed:
+        said = file.fields.get("CompressedDataSize", "").split()
+        if said and said[0].isdecimal() and there < int(said[0]):
+            raise file.fault("pixels", f"{said[0]} packed bytes", f"{there}, the file has been cut short")
+    if file.data_bytes > there * (MOST_UNPACKED if file.packed else 1):
+        raise file.fault("pixels", f"{file.data_bytes} bytes", f"{there}, the file has been cut short or damaged")
+
+
+def _pieces(file: ImageFile) -> Iterator[bytes]:
+    unpacker = zlib.decompressobj(wbits=47) if file.packed else None  # 47: a zlib or a gzip stream
+    with file.data_path.open("rb") as stream:
+        stream.seek(file.data_offset)
+        while raw := stream.read(READ_AT_ONCE):
+            if unpacker is None:
+                yield raw
+                continue
+            while raw and not unpacker.eof:
+                try:
+                    yield unpacker.decompress(raw, READ_AT_ONCE)
+                except zlib.error:
+                    raise file.fault("pixels", "packed data", "damaged ones") from None
+                raw = unpacker.unconsumed_tail

@@ -1,0 +1,187 @@
+"""Volumes in space, as `.nrrd` and `.mha` files that 3D Slicer and ITK read.
+
+The files' frame is LPS, as ITK has it. World coordinates are written as they are and declared LPS; 3D Slicer shows RAS, so it
+negates x and y, of volumes and of PLY surfaces alike, and what lies together in the world lies together there. A file in RAS or
+LAS is turned to LPS when it is read.
+"""
+
+import os
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import nrrd
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.files import atomic, medical_images
+from recon.files.medical_images import fault
+
+Array = NDArray[np.float64]
+
+META_NAMES = {np.dtype(code): name for name, code in medical_images.META_TYPES.items()}
+DAMAGE = (  # what pynrrd raises on headers and pixels damaged at random: it parses without checking
+    *(nrrd.NRRDError, ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, MemoryError, EOFError),
+    *(ZeroDivisionError, StopIteration, zlib.error),
+)
+LPS_FROM = {  # signs of x, y, z
+    "left-posterior-superior": (1, 1, 1),
+    "lps": (1, 1, 1),
+    "right-anterior-superior": (-1, -1, 1),
+    "ras": (-1, -1, 1),
+    "left-anterior-superior": (1, -1, 1),
+    "las": (1, -1, 1),
+    "scanner-xyz": (1, 1, 1),  # no anatomy is meant
+    "3d-right-handed": (1, 1, 1),
+}
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Voxels on a grid in space.
+
+    Voxel (i, j, k) is `voxels[k, j, i]`, and its centre lies at `origin + directions @ (spacing * (i, j, k))`.
+    """
+
+    voxels: NDArray  # (nz, ny, nx)
+    origin: Array  # (3,) mm, the centre of voxel (0, 0, 0)
+    spacing: Array  # (3,) mm along x, y, z
+    directions: Array = field(default_factory=lambda: np.eye(3))  # (3, 3), columns: the unit vectors of the voxels' axes
+
+    @property
+    def world_from_voxel(self) -> Array:
+        """The matrix (4, 4) that takes indices (i, j, k) to mm."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.directions * self.spacing
+        matrix[:3, 3] = self.origin
+        return matrix
+
+
+def read_volume(path: Path) -> Volume:
+    """Read a volume from `.nrrd`, `.nhdr`, `.mha` or `.mhd`.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, cut short, damaged, of another kind or no volume of one number a voxel.
+    """
+    path = Path(path)
+    return _read_nrrd(path) if path.suffix in (".nrrd", ".nhdr") else _read_metaimage(path)
+
+
+def write_volume(path: Path, volume: Volume) -> None:
+    """Write a volume as `.nrrd` or `.mha`, by the path's suffix, packed; reading it gives the same numbers, to the last bit.
+
+    Raises
+    ------
+    InputError
+        If the suffix or the type of the voxels is another, or the grid is none.
+    """
+    path = Path(path)
+    if path.suffix not in (".nrrd", ".mha"):
+        raise InputError(f"{path}: expected a name that ends in .nrrd or .mha, found {path.name}")
+    voxels = volume.voxels.astype(np.uint8) if volume.voxels.dtype == bool else volume.voxels
+    if voxels.ndim != 3 or 0 in voxels.shape or voxels.dtype.newbyteorder("<") not in META_NAMES:
+        raise fault(path, "voxels", "z x y x x numbers of 8, 16 or 32 bits or float64", f"{voxels.shape} of {voxels.dtype}")
+    _check_grid(path, volume)
+    voxels = np.ascontiguousarray(voxels, voxels.dtype.newbyteorder("<"))
+    with atomic.new_file(path) as temporary:
+        if path.suffix == ".mha":
+            _write_metaimage(temporary, voxels, volume)
+        else:
+            _write_nrrd(temporary, voxels, volume)
+
+
+def _read_nrrd(path: Path) -> Volume:
+    try:
+        voxels, header = nrrd.read(os.fspath(path), index_order="C")
+    except FileNotFoundError as error:
+        raise InputError(f"{error.filename}: expected a file, found none") from None
+    except OSError as error:
+        raise InputError(f"{path}: expected a file to read, found {error.strerror or error}") from None
+    except DAMAGE as error:
+        raise InputError(f"{path}: expected an NRRD volume, found it damaged: {' '.join(str(error).split())[:100]}") from None
+    if voxels.ndim != 3:
+        raise fault(path, "dimension", "3 axes of one number a voxel", header["dimension"])
+    space = str(header.get("space", "scanner-xyz")).lower()
+    if space not in LPS_FROM:
+        raise fault(path, "space", f"one of {', '.join(LPS_FROM)}", space)
+    signs = np.array(LPS_FROM[space], float)
+    axes = np.asarray(header.get("space directions", np.diag(header.get("spacings", np.ones(3)))), float)  # a row an axis
+    origin = np.asarray(header.get("space origin", np.zeros(3)), float)
+    if axes.shape != (3, 3) or origin.shape != (3,):
+        raise fault(path, "space directions", "3 vectors of 3 numbers", axes.shape)
+    spacing = np.linalg.norm(axes, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        volume = Volume(voxels, signs * origin, spacing, signs[:, None] * (axes / spacing[:, None]).T)
+    _check_grid(path, volume)
+    return volume
+
+
+def _read_metaimage(path: Path) -> Volume:
+    file = medical_images.read_header(path)
+    if len(file.size) != 3 or 0 in file.size:
+        raise file.fault("DimSize", "3 numbers of voxels", " ".join(map(str, file.size)))
+    (data,) = medical_images.blocks(file, file.data_bytes)
+    fields = file.fields
+    origin = fields.get("Offset", fields.get("Position", fields.get("Origin", "0 0 0")))
+    matrix = fields.get("TransformMatrix", fields.get("Rotation", fields.get("Orientation", "1 0 0 0 1 0 0 0 1")))
+    spacing = medical_images.numbers(path, "ElementSpacing", fields.get("ElementSpacing", "1 1 1"), 3)
+    volume = Volume(
+        np.frombuffer(data, file.pixel).reshape(file.size[::-1]),
+        medical_images.numbers(path, "Offset", origin, 3),
+        spacing,
+        medical_images.numbers(path, "TransformMatrix", matrix, 9).reshape(3, 3).T,  # a direction a row
+    )
+    _check_grid(path, volume)
+    return volume
+
+
+def _check_grid(path: Path, volume: Volume) -> None:
+    if np.shape(volume.origin) != (3,) or not np.isfinite(volume.origin).all():
+        raise fault(path, "origin", "3 finite numbers", volume.origin)
+    if np.shape(volume.spacing) != (3,) or not (np.isfinite(volume.spacing).all() and np.min(volume.spacing) > 0):
+        raise fault(path, "spacing", "3 lengths above 0", volume.spacing)
+    if np.shape(volume.directions) != (3, 3) or not np.isfinite(volume.directions).all():
+        raise fault(path, "directions", "3 unit vectors", np.ravel(volume.directions))
+    if abs(abs(np.linalg.det(volume.directions)) - 1) > 1e-3:
+        raise fault(path, "directions", "3 unit vectors at right angles", np.ravel(volume.directions))
+
+
+def _write_metaimage(path: Path, voxels: NDArray, volume: Volume) -> None:
+    packed = medical_images.pack(voxels, gzip=False)
+    nz, ny, nx = voxels.shape
+    fields = {
+        "ObjectType": "Image",
+        "NDims": 3,
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "True",
+        "CompressedDataSize": len(packed),
+        "TransformMatrix": _words(volume.directions.T),
+        "Offset": _words(volume.origin),
+        "CenterOfRotation": "0 0 0",
+        "AnatomicalOrientation": "RAI",  # what ITK calls LPS, by where the axes come from
+        "ElementSpacing": _words(volume.spacing),
+        "DimSize": f"{nx} {ny} {nz}",
+        "ElementType": META_NAMES[voxels.dtype],
+        "ElementDataFile": "LOCAL",
+    }
+    path.write_bytes("".join(f"{name} = {value}\n" for name, value in fields.items()).encode("ascii") + packed)
+
+
+def _write_nrrd(path: Path, voxels: NDArray, volume: Volume) -> None:
+    header = {
+        "space": "left-posterior-superior",
+        "space directions": (volume.directions * volume.spacing).T,
+        "space origin": np.asarray(volume.origin, float),
+        "kinds": ["domain"] * 3,
+        "endian": "little",
+        "encoding": "gzip",
+    }
+    nrrd.write(os.fspath(path), voxels, header, index_order="C", compression_level=1)
+
+
+def _words(values: Array) -> str:
+    return " ".join(repr(value) for value in np.ravel(values).tolist())

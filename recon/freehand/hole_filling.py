@@ -1,0 +1,84 @@
+"""Holes of a reconstructed volume, between one B-scan and the next, filled from the voxels around them."""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from recon.files.volumes import Volume
+from recon.freehand.volume_compounding import Reconstruction
+
+STICKS = np.array(  # one of each pair of opposite directions to the 26 neighbours
+    [
+        (i, j, k)
+        for i in (-1, 0, 1)
+        for j in (-1, 0, 1)
+        for k in (-1, 0, 1)
+        if (k, j, i) > (0, 0, 0)
+    ],
+    np.int64,
+)  # fmt: skip
+MOST_VOXELS = 9  # of a stick, both ends included
+
+
+def fill_holes(reconstruction: Reconstruction, most_voxels: int = MOST_VOXELS, sticks: int = 1) -> Reconstruction:
+    """Fill empty voxels by linear interpolation along sticks.
+
+    A stick is a straight line through the empty voxel, in one of 13 directions, from one filled voxel to another. The value is
+    the mean, weighted by 1/length, over the `sticks` shortest ones and all as short as these. Voxels without a stick of at most
+    `most_voxels` stay empty, so the volume does not grow past what was scanned. Filled voxels keep their values.
+
+    Source: sticks and their limit are those of the PLUS toolkit's hole filling, which weights the two ends slightly otherwise.
+    """
+    volume = reconstruction.volume
+    voxels, filled = volume.voxels.copy(), reconstruction.filled.copy()
+    lengths = np.linalg.norm(STICKS * volume.spacing, axis=1)
+    _fill(volume.voxels, reconstruction.filled, lengths, most_voxels, sticks, voxels, filled)
+    return Reconstruction(Volume(voxels, volume.origin, volume.spacing, volume.directions), filled)
+
+
+@njit(cache=True)
+def _reach(filled: NDArray, k: int, j: int, i: int, dk: int, dj: int, di: int, most: int) -> int:
+    """Steps to the next filled voxel, 0 if there is none within `most`."""
+    nz, ny, nx = filled.shape
+    for step in range(1, most + 1):
+        k, j, i = k + dk, j + dj, i + di
+        if not (0 <= k < nz and 0 <= j < ny and 0 <= i < nx):
+            return 0
+        if filled[k, j, i]:
+            return step
+    return 0
+
+
+@njit(cache=True)
+def _fill(before, known, lengths, most_voxels, sticks, voxels, filled):
+    nz, ny, nx = before.shape
+    length, found = np.empty(len(lengths)), np.empty(len(lengths))
+    for k in range(nz):
+        for j in range(ny):
+            for i in range(nx):
+                if known[k, j, i]:
+                    continue
+                for s in range(len(lengths)):
+                    di, dj, dk = STICKS[s]
+                    length[s] = np.inf
+                    forth = _reach(known, k, j, i, dk, dj, di, most_voxels - 2)
+                    if forth == 0:
+                        continue
+                    back = _reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth)
+                    if back > 0:
+                        ahead = before[k + forth * dk, j + forth * dj, i + forth * di]
+                        behind = before[k - back * dk, j - back * dj, i - back * di]
+                        length[s] = (forth + back) * lengths[s]
+                        found[s] = (back * ahead + forth * behind) / (forth + back)
+                total, weights, used = 0.0, 0.0, 0
+                while used < sticks and length.min() < np.inf:
+                    shortest = length.min()
+                    for s in range(len(lengths)):
+                        if length[s] <= shortest * (1 + 1e-9):
+                            total += found[s] / length[s]
+                            weights += 1 / length[s]
+                            length[s] = np.inf
+                            used += 1
+                if used > 0:
+                    voxels[k, j, i] = np.uint8(total / weights + 0.5)
+                    filled[k, j, i] = True

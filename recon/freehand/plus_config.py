@@ -1,0 +1,157 @@
+"""The PLUS toolkit's configuration files: the calibration of the probe, and how a sequence is to be reconstructed."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.files import medical_images
+from recon.files.medical_images import fault
+from recon.freehand import hole_filling, sequences, volume_compounding
+from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction
+
+Array = NDArray[np.float64]
+
+COMPOUNDING: dict[str, Compounding] = {"MEAN": "integer_mean", "MAXIMUM": "maximum", "LATEST": "latest"}
+INTERPOLATION: dict[str, Interpolation] = {"NEAREST_NEIGHBOR": "nearest", "LINEAR": "linear"}
+SWITCH = {"ON": True, "TRUE": True, "OFF": False, "FALSE": False}
+
+
+@dataclass(frozen=True)
+class Sticks:
+    """How holes are filled; see `recon.freehand.hole_filling.fill_holes`."""
+
+    most_voxels: int
+    sticks: int
+
+
+@dataclass(frozen=True)
+class PlusConfig:
+    """What a configuration says of coordinates and of the reconstruction."""
+
+    transforms: dict[str, Array]  # "ImageToProbe": (4, 4), mm and px
+    spacing: Array  # (3,) mm
+    clip: Clip | None
+    interpolation: Interpolation
+    compounding: Compounding  # `integer_mean` for MEAN: as PLUS computes it
+    holes: Sticks | None
+    image: str = "Image"
+    reference: str = "Reference"
+
+
+def read_config(path: Path) -> PlusConfig:
+    """Read the elements CoordinateDefinitions and VolumeReconstruction of a PLUS configuration; others are left alone.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or no such configuration, or asks for what is not known here: a fan-shaped clip, another way of
+        compounding or of filling holes.
+    """
+    path = Path(path)
+    try:
+        root = ElementTree.parse(path).getroot()
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a file, found none") from None
+    except OSError as error:
+        raise InputError(f"{path}: expected a file to read, found {error.strerror}") from None
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path}: expected XML, found it broken: {error}") from None
+    element = root if root.tag == "VolumeReconstruction" else root.find(".//VolumeReconstruction")
+    if element is None:
+        raise fault(path, "VolumeReconstruction", "an element", "none")
+    for name in ("FanAngles", "FanAnglesDeg"):
+        if element.get(name) and medical_images.numbers(path, name, element.get(name, ""), 2).any():
+            raise fault(path, name, "none, clips are rectangles", repr(element.get(name)))
+    spacing = medical_images.numbers(path, "OutputSpacing", _text(path, element, "OutputSpacing"), 3)
+    if spacing.min() <= 0:
+        raise fault(path, "OutputSpacing", "3 lengths above 0", repr(element.get("OutputSpacing")))
+    interpolation = INTERPOLATION[_choice(path, element, "Interpolation", "NEAREST_NEIGHBOR", INTERPOLATION)]
+    compounding = COMPOUNDING[_choice(path, element, "CompoundingMode", "MEAN", COMPOUNDING)]
+    return PlusConfig(
+        _transforms(path, root),
+        spacing,
+        _clip(path, element),
+        interpolation,
+        "mean" if compounding == "integer_mean" and interpolation == "linear" else compounding,
+        _sticks(path, element),
+        element.get("ImageCoordinateFrame", "Image"),
+        element.get("ReferenceCoordinateFrame", "Reference"),
+    )
+
+
+def reconstruct_sequence(path: Path, config: PlusConfig) -> tuple[Reconstruction, Reconstruction]:
+    """Reconstruct a sequence file as its configuration says, reading the images one by one.
+
+    Returns
+    -------
+    Reconstruction, Reconstruction
+        Before its holes are filled, and after; the same if they are not to be.
+    """
+    frames = sequences.read_tracking(path)
+    shape = sequences.image_shape(path)
+    try:
+        world_from_pixel = sequences.poses(frames, config.reference, config.image, config.transforms)
+        world_from_pixel = np.where(frames.valid["Image"][:, None, None], world_from_pixel, np.nan)
+        grid = volume_compounding.aligned_grid(volume_compounding.corners(world_from_pixel, shape, config.clip), config.spacing)
+        images = sequences.stream_images(path)
+        pasted = volume_compounding.reconstruct(
+            images, world_from_pixel, grid, config.compounding, config.interpolation, config.clip
+        )
+    except InputError as error:
+        raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from None
+    if config.holes is None:
+        return pasted, pasted
+    return pasted, hole_filling.fill_holes(pasted, config.holes.most_voxels, config.holes.sticks)
+
+
+def _transforms(path: Path, root: Element) -> dict[str, Array]:
+    transforms = {}
+    for element in root.iterfind(".//CoordinateDefinitions/Transform"):
+        name = f"{_text(path, element, 'From')}To{_text(path, element, 'To')}"
+        matrix = medical_images.numbers(path, name, _text(path, element, "Matrix"), 16).reshape(4, 4)
+        if not sequences.is_usable(matrix):
+            raise fault(
+                path, name, "an invertible matrix with the last row 0 0 0 1", repr(" ".join(element.get("Matrix", "").split()))
+            )
+        transforms[name] = matrix
+    return transforms
+
+
+def _clip(path: Path, element: Element) -> Clip | None:
+    if not element.get("ClipRectangleSize"):
+        return None
+    width, height = medical_images.whole_numbers(path, "ClipRectangleSize", _text(path, element, "ClipRectangleSize"), pieces=2)
+    u, v = medical_images.whole_numbers(path, "ClipRectangleOrigin", element.get("ClipRectangleOrigin", "0 0"), pieces=2)
+    return Clip(u, v, width + 1, height + 1) if width and height else None  # PLUS takes the pixels on both borders
+
+
+def _sticks(path: Path, element: Element) -> Sticks | None:
+    if not SWITCH[_choice(path, element, "FillHoles", "OFF", SWITCH)]:
+        return None
+    rules = element.findall("HoleFilling/HoleFillingElement")
+    if len(rules) != 1 or rules[0].get("Type") != "STICK":
+        raise fault(
+            path, "HoleFilling", "one element of type STICK", ", ".join(rule.get("Type", "?") for rule in rules) or "none"
+        )
+    (most,) = medical_images.whole_numbers(path, "StickLengthLimit", _text(path, rules[0], "StickLengthLimit"), 1, 1)
+    (sticks,) = medical_images.whole_numbers(path, "NumberOfSticksToUse", rules[0].get("NumberOfSticksToUse", "1"), 1, 1)
+    return Sticks(most, sticks)
+
+
+def _choice(path: Path, element: Element, name: str, usual: str, known: dict) -> str:
+    word = element.get(name, usual).upper()
+    if word not in known:
+        raise fault(path, name, f"one of {', '.join(known)}", word)
+    return word
+
+
+def _text(path: Path, element: Element, name: str) -> str:
+    text = element.get(name)
+    if text is None:
+        raise fault(path, f"{element.tag}.{name}", "a value", "none")
+    return text

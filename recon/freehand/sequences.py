@@ -1,0 +1,371 @@
+"""Tracked ultrasound as sequence files of the PLUS toolkit and 3D Slicer, `.igs.mha` and `.igs.nrrd`: B-scans with their poses.
+
+A transform `AToB` takes points of frame A to frame B. The frame `Image` is in pixels: (u, v, 0) is the centre of pixel (u, v).
+"""
+
+import re
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from recon.errors import InputError
+from recon.files import atomic, medical_images
+from recon.files.medical_images import ImageFile
+from recon.model.probe import ProbeCalibration
+
+Array = NDArray[np.float64]
+
+FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
+TRANSFORM = re.compile(r"([A-Z]\w*?)To([A-Z]\w*)")
+ORIENTATIONS = {"MF": (1, 1), "UF": (1, -1), "MN": (-1, 1), "UN": (-1, -1)}  # steps along v and u that turn one into MF
+STRUCTURE = {  # what follows from the images and from the format, in either of the two
+    *("ObjectType", "NDims", "DimSize", "Kinds", "ElementType", "ElementNumberOfChannels", "ElementSpacing", "Offset"),
+    *("TransformMatrix", "CenterOfRotation", "AnatomicalOrientation", "BinaryData", "BinaryDataByteOrderMSB", "CompressedData"),
+    *("CompressedDataSize", "ElementDataFile", "ElementByteOrderMSB", "UltrasoundImageOrientation", "UltrasoundImageType"),
+    *(
+        "type",
+        "dimension",
+        "sizes",
+        "kinds",
+        "encoding",
+        "endian",
+        "space",
+        "space dimension",
+        "space directions",
+        "space origin",
+    ),
+    *("data file", "datafile", "ultrasound image orientation", "ultrasound image type"),
+}
+FRAME_STRUCTURE = {"Timestamp", "ImageStatus", "Status", ""}
+
+
+@dataclass(frozen=True)
+class Frames:
+    """A tracked sequence of n frames."""
+
+    times_s: Array  # (n,), NaN if the file has none
+    transforms: dict[str, Array]  # "ProbeToTracker": tracker_from_probe (n, 4, 4), mm; the identity in frames that have none
+    valid: dict[str, NDArray[np.bool_]]  # (n,) by the transforms' names, whether to use it; and by "Image", if there are images
+    images: NDArray[np.uint8] | None = None  # (n, h, w), the array's marked side left and depth down; None if tracking only
+    frame_fields: dict[str, tuple[str, ...]] = field(default_factory=dict)  # n texts; empty where a frame has none
+    fields: dict[str, str] = field(default_factory=dict)  # of the whole file
+
+
+def sequence_of(images: ArrayLike, world_from_target: Array, probe: ProbeCalibration, times_s: ArrayLike) -> Frames:
+    """Make a PLUS sequence of one's own B-scans and poses.
+
+    Its frames are `Image`, `Probe` (the target), `Tracker` and `Reference` (both are the world), so that the reconstruction in
+    PLUS or 3D Slicer finds `ImageToReference` without further settings.
+
+    Parameters
+    ----------
+    images : (n, h, w) uint8
+    world_from_target : (n, 4, 4) mm
+        Poses; those with a NaN count as not found.
+    probe : ProbeCalibration
+    times_s : (n,) s
+
+    Raises
+    ------
+    InputError
+        If the numbers of images, poses and times differ, or images are no grey bytes.
+    """
+    images, poses, times = np.asarray(images), np.asarray(world_from_target, float), np.asarray(times_s, float)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise InputError(f"world_from_target: expected n poses of 4 x 4, found {poses.shape}")
+    found = np.isfinite(poses).all(axis=(1, 2))
+    always = np.ones(len(poses), bool)
+    transforms = {
+        "ImageToProbe": np.tile(target_from_pixel(probe), (len(poses), 1, 1)),
+        "ProbeToTracker": np.where(found[:, None, None], poses, np.eye(4)),
+        "ReferenceToTracker": np.tile(np.eye(4), (len(poses), 1, 1)),
+    }
+    valid = {"ImageToProbe": always, "ProbeToTracker": found, "ReferenceToTracker": always, "Image": always}
+    frames = Frames(times, transforms, valid, images)
+    _check(Path("sequence"), frames)
+    return frames
+
+
+def target_from_pixel(probe: ProbeCalibration) -> Array:
+    """The matrix (4, 4) that takes pixels [u, v, 0, 1] to the target's frame in mm; what PLUS calls ImageToProbe."""
+    return probe.target_from_image @ np.diag([*probe.scale, np.mean(probe.scale), 1.0])
+
+
+def poses(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = None) -> Array:
+    """Transforms (n, 4, 4) that take points of frame `of` to frame `to`, along whatever transforms lead there; NaN where invalid.
+
+    Parameters
+    ----------
+    fixed : (4, 4) by name, optional
+        Transforms that do not change, such as "ImageToProbe" of a calibration; they go before those of the file.
+
+    Raises
+    ------
+    InputError
+        If no chain of transforms leads from one to the other.
+    """
+    count = len(frames.times_s)
+    steps: dict[str, dict[str, Array]] = {}
+    for name in [*(fixed or {}), *(name for name in frames.transforms if name not in (fixed or {}))]:
+        if match := TRANSFORM.fullmatch(name):
+            source, destination = match.groups()
+            forth = np.broadcast_to((fixed or {})[name], (count, 4, 4)) if fixed and name in fixed else _usable(frames, name)
+            steps.setdefault(source, {}).setdefault(destination, forth)
+            steps.setdefault(destination, {}).setdefault(source, np.linalg.inv(forth))
+    reached, waiting = {of: np.broadcast_to(np.eye(4), (count, 4, 4))}, deque([of])
+    while waiting and to not in reached:
+        here = waiting.popleft()
+        for there, there_from_here in steps.get(here, {}).items():
+            if there not in reached:
+                reached[there] = there_from_here @ reached[here]
+                waiting.append(there)
+    if to not in reached:
+        known = ", ".join([*(fixed or {}), *frames.transforms]) or "none"
+        raise InputError(f"transforms: expected some that lead from {of} to {to}, found {known}")
+    return reached[to]
+
+
+def read_sequence(path: Path) -> Frames:
+    """Read a whole sequence with its images.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged or cut short, of another kind, or a field is not what it should be; the message names it.
+    """
+    file = medical_images.read_header(path)
+    frames = _without_images(file)
+    count, shape = _layout(file)
+    if not _has_images(file):
+        return frames
+    images = np.empty((count, *shape), np.uint8)
+    for image, read in zip(images, _images(file), strict=True):
+        image[:] = read
+    return Frames(frames.times_s, frames.transforms, frames.valid, images, frames.frame_fields, frames.fields)
+
+
+def read_tracking(path: Path) -> Frames:
+    """Read a sequence without its images, which `stream_images` gives one by one: for sequences larger than memory."""
+    return _without_images(medical_images.read_header(path))
+
+
+def image_shape(path: Path) -> tuple[int, int]:
+    """Height and width of a sequence's images. Raises InputError if it has none."""
+    file = medical_images.read_header(path)
+    if not _has_images(file):
+        raise file.fault("DimSize", "images", "tracking only")
+    return _layout(file)[1]
+
+
+def stream_images(path: Path) -> Iterator[NDArray[np.uint8]]:
+    """The images (h, w) of a sequence one by one; none if it is tracking only. Raises InputError where the data ends early."""
+    file = medical_images.read_header(path)
+    return _images(file) if _has_images(file) else iter(())
+
+
+def write_sequence(path: Path, frames: Frames) -> None:
+    """Write a sequence as `.mha` or `.nrrd`, by the path's suffix, packed. It reads back the same to the last bit.
+
+    Raises
+    ------
+    InputError
+        If the suffix is another, a number is not finite, a shape does not fit or a text would break the header. Nothing is
+        written then.
+    """
+    path = Path(path)
+    if path.suffix not in (".mha", ".nrrd"):
+        raise InputError(f"{path}: expected a name that ends in .igs.mha or .igs.nrrd, found {path.name}")
+    _check(path, frames)
+    images = frames.images if frames.images is not None else np.zeros((len(frames.times_s), 1, 1), np.uint8)
+    head = _meta_head if path.suffix == ".mha" else _nrrd_head
+    sign, status = (" = ", "ImageStatus") if path.suffix == ".mha" else (":=", "Status")
+    lines = _frame_lines(frames, sign, status)
+    with atomic.new_file(path) as temporary, temporary.open("wb") as stream:
+        packed = medical_images.pack(images, gzip=path.suffix == ".nrrd")
+        start, end = head(images.shape, len(packed), frames)
+        stream.write("".join(f"{line}\n" for line in (*start, *lines, *end)).encode("utf-8", "surrogateescape"))
+        stream.write(packed)
+
+
+def _without_images(file: ImageFile) -> Frames:
+    count, _ = _layout(file)
+    fields = {name: value for name, value in file.fields.items() if not FRAME_FIELD.fullmatch(name)}
+    kept = {name: value for name, value in fields.items() if name not in STRUCTURE}
+    table = _frame_table(file, count)
+    transforms, valid = {}, {}
+    if _has_images(file):
+        status = table.pop("ImageStatus", table.pop("Status", [""] * count))
+        valid["Image"] = np.array([word.upper() in ("", "OK") for word in status])
+    for key in [key for key in table if key.endswith("Transform")]:
+        name = key.removesuffix("Transform")
+        texts, words = table.pop(key), table.pop(key + "Status", [""] * count)
+        transforms[name], valid[name] = _matrices(file, key, texts, words)
+        if any(word.upper() not in ("", "OK", "INVALID") for word in words):
+            table[key + "Status"] = words
+    times = np.array([_time(file, index, text) for index, text in enumerate(table.pop("Timestamp", [""] * count))])
+    if np.isnan(times).any() and not np.isnan(times).all():
+        raise file.fault(_key(int(np.isnan(times).argmax()), "Timestamp"), "a value as in other frames", "none")
+    return Frames(times, transforms, valid, None, {name: tuple(texts) for name, texts in table.items()}, kept)
+
+
+def _layout(file: ImageFile) -> tuple[int, tuple[int, int]]:
+    """Number of frames, and height and width of an image; the last axis is time where the kinds don't say."""
+    kinds = file.fields.get("Kinds", file.fields.get("kinds", "")).split()
+    kinds = kinds or ["domain"] * (len(file.size) - 1) + ["list"]
+    if len(kinds) != len(file.size):
+        raise file.fault("Kinds", f"{len(file.size)} words", repr(" ".join(kinds)))
+    space = [length for length, kind in zip(file.size, kinds, strict=True) if kind in ("domain", "space")]
+    time = [length for length, kind in zip(file.size, kinds, strict=True) if kind in ("list", "time")]
+    if len(time) != 1 or len(space) not in (2, 3) or max(space[2:], default=1) > 1:
+        raise file.fault("DimSize", "width, height and the number of frames", f"{' '.join(map(str, file.size))}")
+    return time[0], (space[1], space[0])
+
+
+def _has_images(file: ImageFile) -> bool:
+    """Tracking alone is written with images of no pixels or of one, and without their status."""
+    _, shape = _layout(file)
+    status = any(re.fullmatch(r"Seq_Frame\d+_(Image)?Status", name) for name in file.fields)
+    return shape[0] * shape[1] > 1 or (shape == (1, 1) and status)
+
+
+def _images(file: ImageFile) -> Iterator[NDArray[np.uint8]]:
+    _, shape = _layout(file)
+    if file.pixel != np.uint8:
+        raise file.fault("ElementType", "MET_UCHAR", file.fields["ElementType"])
+    found = file.fields.get("UltrasoundImageOrientation", file.fields.get("ultrasound image orientation", "MF"))
+    if found[:2] not in ORIENTATIONS:  # a third letter is the order of the frames
+        raise file.fault("UltrasoundImageOrientation", f"one of {', '.join(ORIENTATIONS)}", found)
+    down, right = ORIENTATIONS[found[:2]]
+    for block in medical_images.blocks(file, shape[0] * shape[1]):
+        yield np.frombuffer(block, np.uint8).reshape(shape)[::down, ::right]
+
+
+def _frame_table(file: ImageFile, count: int) -> dict[str, list[str]]:
+    table: dict[str, list[str]] = {}
+    for name, text in file.fields.items():
+        if match := FRAME_FIELD.fullmatch(name):
+            if int(match[1]) >= count:
+                raise file.fault(name, f"frames below {count}, their number", match[1])
+            table.setdefault(match[2], [""] * count)[int(match[1])] = text
+    return table
+
+
+def _matrices(file: ImageFile, key: str, texts: list[str], words: list[str]) -> tuple[Array, NDArray[np.bool_]]:
+    matrices, valid = np.tile(np.eye(4), (len(texts), 1, 1)), np.zeros(len(texts), bool)
+    for index, (text, word) in enumerate(zip(texts, words, strict=True)):
+        if not text:
+            continue
+        name = _key(index, key)
+        matrix = medical_images.numbers(file.path, name, text, 16).reshape(4, 4)
+        valid[index] = word.upper() in ("", "OK")
+        if valid[index] and not is_usable(matrix):
+            raise file.fault(name, "an invertible matrix with the last row 0 0 0 1", repr(text))
+        matrices[index] = matrix
+    return matrices, valid
+
+
+def is_usable(matrix: Array) -> bool:
+    """Whether a matrix (4, 4) is an invertible affine transform."""
+    upright = np.abs(matrix[3] - (0, 0, 0, 1)).max() < 1e-6
+    return bool(upright and np.linalg.cond(matrix[:3, :3]) < 1e6)
+
+
+def _time(file: ImageFile, index: int, text: str) -> float:
+    return float(medical_images.numbers(file.path, _key(index, "Timestamp"), text, 1)[0]) if text else np.nan
+
+
+def _usable(frames: Frames, name: str) -> Array:
+    return np.where(frames.valid[name][:, None, None], frames.transforms[name], np.nan)
+
+
+def _check(path: Path, frames: Frames) -> None:
+    """Refuse what would not be read back, or not as it was."""
+    count = len(frames.times_s)
+    known = np.isfinite(frames.times_s)
+    if count == 0:
+        raise medical_images.fault(path, "frames", "at least one", "none")
+    if (not known.all() and known.any()) or np.isinf(frames.times_s).any():
+        raise medical_images.fault(
+            path, _key(int(known.argmin()), "Timestamp"), "a finite number", frames.times_s[known.argmin()]
+        )
+    images = frames.images
+    if images is not None and (images.ndim != 3 or images.dtype != np.uint8 or len(images) != count or 0 in images.shape):
+        raise medical_images.fault(path, "images", f"{count} x height x width of uint8", f"{images.shape} of {images.dtype}")
+    for name, matrices in frames.transforms.items():
+        if matrices.shape != (count, 4, 4) or frames.valid.get(name, np.empty(0)).shape != (count,):
+            raise medical_images.fault(path, name, f"{count} transforms of 4 x 4, valid or not", matrices.shape)
+        for index, matrix in enumerate(matrices):
+            if not np.isfinite(matrix).all() or (frames.valid[name][index] and not is_usable(matrix)):
+                found = repr(" ".join(f"{value:g}" for value in matrix.ravel()))
+                raise medical_images.fault(path, _key(index, name + "Transform"), "an invertible matrix of finite numbers", found)
+    for name in [name for name in frames.transforms if not TRANSFORM.fullmatch(name)]:
+        raise medical_images.fault(path, "transforms", "names such as ProbeToTracker", repr(name))
+    for name, texts in frames.frame_fields.items():
+        if len(texts) != count:
+            raise medical_images.fault(path, name, f"{count} texts", len(texts))
+    for name in [*frames.fields, *frames.frame_fields]:
+        if (
+            name in STRUCTURE | FRAME_STRUCTURE
+            or name.endswith("Transform")
+            or FRAME_FIELD.fullmatch(name)
+            or name != name.strip()
+        ):
+            raise medical_images.fault(path, "fields", "names that the format does not use itself", repr(name))
+    for name, text in [*frames.fields.items(), *((n, t) for n, texts in frames.frame_fields.items() for t in texts)]:
+        if re.search(r"[\r\n]", name + text) or re.search(r"[:=#]", name) or text != text.strip():
+            raise medical_images.fault(path, name, "a text of one line", repr(text))
+
+
+def _key(index: int, name: str) -> str:
+    return f"Seq_Frame{index:04d}_{name}"
+
+
+def _frame_lines(frames: Frames, sign: str, image_status: str) -> Iterator[str]:
+    for index, time in enumerate(frames.times_s):
+        texts = {name: texts[index] for name, texts in frames.frame_fields.items() if texts[index]}
+        for name, matrices in frames.transforms.items():
+            key, valid = name + "Transform", frames.valid[name][index]
+            texts[key] = " ".join(repr(value) for value in matrices[index].ravel().tolist())
+            word = texts.get(key + "Status", "INVALID")
+            texts[key + "Status"] = "OK" if valid else word if word.upper() != "OK" else "INVALID"
+        if np.isfinite(time):
+            texts["Timestamp"] = repr(float(time))
+        if frames.images is not None:
+            texts[image_status] = "OK" if "Image" not in frames.valid or frames.valid["Image"][index] else "INVALID"
+        yield from (f"{_key(index, name)}{sign}{text}" for name, text in texts.items())
+
+
+def _meta_head(shape: tuple[int, ...], packed: int, frames: Frames) -> tuple[list[str], list[str]]:
+    count, height, width = shape
+    start = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "AnatomicalOrientation": "RAI",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CenterOfRotation": "0 0 0",
+        "CompressedData": "True",
+        "CompressedDataSize": str(packed),
+        "DimSize": f"{width} {height} {count}",
+        "ElementNumberOfChannels": "1",
+        "ElementSpacing": "1 1 1",
+        "ElementType": "MET_UCHAR",
+        "Kinds": "domain domain list",
+        "Offset": "0 0 0",
+        "TransformMatrix": "1 0 0 0 1 0 0 0 1",
+        "UltrasoundImageOrientation": "MF",
+        "UltrasoundImageType": "BRIGHTNESS",
+    }
+    return [f"{name} = {value}" for name, value in (start | frames.fields).items()], ["ElementDataFile = LOCAL"]
+
+
+def _nrrd_head(shape: tuple[int, ...], packed: int, frames: Frames) -> tuple[list[str], list[str]]:
+    count, height, width = shape
+    start = ["NRRD0004", "type: unsigned char", "dimension: 3", "space dimension: 2", f"sizes: {width} {height} {count}"]
+    start += ["space directions: (1,0) (0,1) none", "kinds: domain domain list", "endian: little", "encoding: gz"]
+    start += ["space origin: (0,0)", "ultrasound image orientation:=MF", "ultrasound image type:=BRIGHTNESS"]
+    return start + [f"{name}:={value}" for name, value in frames.fields.items()], [""]

@@ -1,0 +1,262 @@
+"""Freehand 3-D ultrasound: B-scans with poses become points, and a volume that is as large as where they have been.
+
+Frames pass one by one; in memory are the volume and one image. `world_from_pixel` is a matrix (4, 4) that takes the pixel
+[u, v, 0, 1] to mm, the poses times the probe's calibration (`recon.freehand.sequences.target_from_pixel`).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import repeat
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from recon.errors import InputError
+from recon.files.volumes import Volume
+from recon.geometry import rigid
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Compounding = Literal["mean", "maximum", "latest", "integer_mean"]
+Interpolation = Literal["nearest", "linear"]
+
+RULES = {"mean": 0, "maximum": 1, "latest": 2, "integer_mean": 3}
+LEAST_WEIGHT = 0.125  # of a voxel that a pixel is the maximum or the latest of: that of all eight where it lies in their middle
+BYTES_PER_VOXEL = 10  # sum and weight in float32; the grey value, and whether it is filled
+MOST_BYTES = 4 << 30
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The part of a B-scan that is used: `width` columns from u on, `height` rows from v on, as far as the image goes."""
+
+    u: int
+    v: int
+    width: int
+    height: int
+
+    def bounds(self, shape: tuple[int, int]) -> tuple[int, int, int, int]:
+        """First and last column, first and last row, of an image (h, w)."""
+        left, top = max(self.u, 0), max(self.v, 0)
+        right, bottom = min(self.u + self.width, shape[1]) - 1, min(self.v + self.height, shape[0]) - 1
+        if left > right or top > bottom:
+            raise InputError(f"clip: expected a part of an image of {shape[1]}x{shape[0]}, found {self}")
+        return left, right, top, bottom
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Where the voxels of a volume lie; see `Volume`."""
+
+    size: tuple[int, int, int]  # nx, ny, nz
+    origin: Array  # (3,) mm
+    spacing: Array  # (3,) mm
+    directions: Array  # (3, 3), columns
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A volume, and which of its voxels a pixel fell into."""
+
+    volume: Volume
+    filled: Mask  # (nz, ny, nx)
+
+
+def points(
+    world_from_pixel: Array, shape: tuple[int, int], mask: Mask | None = None, clip: Clip | None = None
+) -> tuple[Array, NDArray[np.int64]]:
+    """Where the pixels of a B-scan lie.
+
+    Parameters
+    ----------
+    shape : (h, w)
+    mask : (h, w) bool, optional
+        Pixels to take, such as those that were segmented; all of them without it.
+    clip : Clip, optional
+
+    Returns
+    -------
+    points : (n, 3) mm, in the world
+    pixels : (n, 2) u, v
+        With these, `image[pixels[:, 1], pixels[:, 0]]` are the points' grey values.
+    """
+    left, right, top, bottom = (clip or Clip(0, 0, shape[1], shape[0])).bounds(shape)
+    inside = np.zeros(shape, bool)
+    inside[top : bottom + 1, left : right + 1] = True
+    v, u = np.nonzero(inside if mask is None else inside & mask)
+    pixels = np.column_stack([u, v])
+    return rigid.apply(world_from_pixel, np.column_stack([pixels, np.zeros(len(pixels))])), pixels
+
+
+def corners(world_from_pixel: Array, shape: tuple[int, int], clip: Clip | None = None) -> Array:
+    """Centres (m, 3) mm of the corner pixels of all B-scans that have a pose: `world_from_pixel` (n, 4, 4), NaN where not."""
+    left, right, top, bottom = (clip or Clip(0, 0, shape[1], shape[0])).bounds(shape)
+    found = world_from_pixel[np.isfinite(world_from_pixel).all(axis=(1, 2))]
+    if not len(found):
+        raise InputError(f"poses: expected at least one that is valid, found none in {len(world_from_pixel)}")
+    pixels = np.array([[u, v, 0, 1] for u in (left, right) for v in (top, bottom)], float)
+    return (pixels @ found.transpose(0, 2, 1))[..., :3].reshape(-1, 3)
+
+
+def aligned_grid(around: Array, spacing_mm: ArrayLike) -> Grid:
+    """The grid along the world's axes that takes in points (n, 3), from the least coordinates on.
+
+    It ends with the voxel that the greatest coordinates fall into, which is also how the PLUS toolkit sizes its volumes.
+    """
+    return _grid(around, spacing_mm, np.eye(3))
+
+
+def principal_grid(around: Array, spacing_mm: ArrayLike) -> Grid:
+    """The grid along the principal axes of points (n, 3), longest first.
+
+    It is much smaller than the other where the sweep runs across the world's axes.
+    """
+    _, _, rows = np.linalg.svd(around - around.mean(axis=0), full_matrices=False)
+    rows *= np.sign(rows[np.arange(3), np.abs(rows).argmax(axis=1)])[:, None]  # along the world's axes, not against
+    rows[2] *= np.sign(np.linalg.det(rows))
+    return _grid(around, spacing_mm, rows.T)
+
+
+def reconstruct(
+    images: Iterable[NDArray],
+    world_from_pixel: Array,
+    grid: Grid,
+    compounding: Compounding = "mean",
+    interpolation: Interpolation = "nearest",
+    clip: Clip | None = None,
+    masks: Iterable[Mask | None] | None = None,
+    most_bytes: int = MOST_BYTES,
+) -> Reconstruction:
+    """Put B-scans into a volume.
+
+    Parameters
+    ----------
+    images : n times (h, w) uint8
+        Taken one by one; may come from `recon.freehand.sequences.stream_images`.
+    world_from_pixel : (n, 4, 4)
+        Frames with a NaN are left out.
+    grid : Grid
+        Pixels outside are left out.
+    compounding
+        What a voxel gets of the pixels in it: their mean, the greatest, or the latest. `integer_mean` is the running mean in
+        whole grey levels, rounded down at each pixel, of the PLUS toolkit: it is too dark, by levels, and there to compare.
+    interpolation
+        Whether a pixel counts for the nearest voxel or, by its distance, for the eight around it.
+    masks : n times (h, w) bool, optional
+        Pixels to take.
+    most_bytes : int
+        What the volume may take in memory, 10 bytes a voxel.
+
+    Raises
+    ------
+    InputError
+        If the volume would be larger than that, or the numbers of images and poses differ, or an image or mask is no such array.
+    """
+    if compounding not in RULES or interpolation not in ("nearest", "linear"):
+        raise ValueError(f"no compounding {compounding!r} or interpolation {interpolation!r}")
+    if compounding == "integer_mean" and interpolation == "linear":
+        raise ValueError("integer_mean counts whole pixels: nearest only")
+    shape = grid.size[::-1]
+    if np.prod(grid.size, dtype=float) * BYTES_PER_VOXEL > most_bytes:
+        needed = np.prod(grid.size, dtype=float) * BYTES_PER_VOXEL / 2**30
+        found = f"{needed:.1f} GiB for {' x '.join(map(str, grid.size))} voxels; take a larger spacing or clip"
+        raise InputError(f"volume: expected at most {most_bytes / 2**30:.1f} GiB, found {found}")
+    value, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    voxel_from_world = np.linalg.inv(Volume(value, grid.origin, grid.spacing, grid.directions).world_from_voxel)
+    paste = _paste_nearest if interpolation == "nearest" else _paste_linear
+    count = 0
+    for image, mask in zip(images, masks if masks is not None else repeat(None), strict=False):
+        if count == len(world_from_pixel):
+            raise InputError(f"images: expected as many as poses, {count}, found more")
+        matrix = voxel_from_world @ world_from_pixel[count]
+        count += 1
+        if np.isfinite(matrix).all():
+            taken = np.ones(image.shape, bool) if mask is None else np.asarray(mask, bool)
+            if image.ndim != 2 or image.dtype != np.uint8 or taken.shape != image.shape:
+                found = f"{image.shape} of {image.dtype}, mask {taken.shape}"
+                raise InputError(f"image {count - 1}: expected height x width of uint8 and a mask like it, found {found}")
+            bounds = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
+            paste(np.ascontiguousarray(image), taken, bounds, matrix, value, weight, RULES[compounding])
+    if count < len(world_from_pixel):
+        raise InputError(f"images: expected as many as poses, {len(world_from_pixel)}, found {count}")
+    voxels = np.empty(shape, np.uint8)
+    _finish(value, weight, compounding == "mean", voxels)
+    return Reconstruction(Volume(voxels, grid.origin, grid.spacing, grid.directions), weight > 0)
+
+
+def _grid(around: Array, spacing_mm: ArrayLike, directions: Array) -> Grid:
+    spacing = np.broadcast_to(np.asarray(spacing_mm, float), (3,)).copy()
+    if not (np.isfinite(spacing).all() and spacing.min() > 0):
+        raise InputError(f"spacing: expected lengths above 0 mm, found {spacing_mm}")
+    along = around @ directions
+    low, high = along.min(axis=0), along.max(axis=0)
+    nx, ny, nz = np.floor((high - low) / spacing + 0.5).astype(int) + 1
+    return Grid((int(nx), int(ny), int(nz)), directions @ low, spacing, directions)
+
+
+@njit(cache=True)
+def _paste_nearest(image, mask, bounds, voxel_from_pixel, value, weight, rule):
+    m = voxel_from_pixel
+    left, right, top, bottom = bounds
+    nz, ny, nx = value.shape
+    for v in range(top, bottom + 1):
+        for u in range(left, right + 1):
+            if not mask[v, u]:
+                continue
+            i = int(np.floor(m[0, 0] * u + m[0, 1] * v + m[0, 3] + 0.5))
+            j = int(np.floor(m[1, 0] * u + m[1, 1] * v + m[1, 3] + 0.5))
+            k = int(np.floor(m[2, 0] * u + m[2, 1] * v + m[2, 3] + 0.5))
+            if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
+                _compound(value, weight, k, j, i, image[v, u], np.float32(1.0), rule)
+
+
+@njit(cache=True)
+def _paste_linear(image, mask, bounds, voxel_from_pixel, value, weight, rule):
+    m = voxel_from_pixel
+    left, right, top, bottom = bounds
+    nz, ny, nx = value.shape
+    for v in range(top, bottom + 1):
+        for u in range(left, right + 1):
+            if not mask[v, u]:
+                continue
+            x = m[0, 0] * u + m[0, 1] * v + m[0, 3]
+            y = m[1, 0] * u + m[1, 1] * v + m[1, 3]
+            z = m[2, 0] * u + m[2, 1] * v + m[2, 3]
+            i0, j0, k0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+            for k in range(max(k0, 0), min(k0 + 2, nz)):
+                for j in range(max(j0, 0), min(j0 + 2, ny)):
+                    for i in range(max(i0, 0), min(i0 + 2, nx)):
+                        share = np.float32((1 - abs(x - i)) * (1 - abs(y - j)) * (1 - abs(z - k)))
+                        if share >= LEAST_WEIGHT or (rule == 0 and share > 0):
+                            _compound(value, weight, k, j, i, image[v, u], share, rule)
+
+
+@njit(cache=True, inline="always")
+def _compound(value, weight, k, j, i, grey, share, rule):
+    if rule == 0:
+        value[k, j, i] += share * grey
+        weight[k, j, i] += share
+    elif rule == 1:
+        value[k, j, i] = max(value[k, j, i], np.float32(grey))
+        weight[k, j, i] = 1
+    elif rule == 2:
+        value[k, j, i] = grey
+        weight[k, j, i] = 1
+    else:
+        before = int(weight[k, j, i])
+        value[k, j, i] = (int(value[k, j, i]) * before + int(grey)) // (before + 1)
+        weight[k, j, i] = before + 1
+
+
+@njit(cache=True)
+def _finish(value, weight, divide, voxels):
+    for k in range(value.shape[0]):
+        for j in range(value.shape[1]):
+            for i in range(value.shape[2]):
+                if weight[k, j, i] > 0:
+                    mean = value[k, j, i] / weight[k, j, i] if divide else value[k, j, i]
+                    voxels[k, j, i] = np.uint8(mean + np.float32(0.5))
+                else:
+                    voxels[k, j, i] = 0

@@ -1,0 +1,179 @@
+"""Pinhole cameras with OpenCV lens distortion, and projectors as the same model run backwards.
+
+Pixel centres lie at integer coordinates, `u` to the right and `v` down. The distortion is OpenCV's full model, in its order
+`k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tau_x tau_y`; shorter sets leave the rest at zero.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from recon.geometry import rigid
+
+Array = NDArray[np.float64]
+
+DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
+EXACT = 1e-9  # of matrix entries that are zero or one by definition; they come from text files
+NEWTON_STEPS = 20
+NEWTON_TOLERANCE = 1e-13  # normalised image coordinates: far below a thousandth of a pixel at any focal length
+SLOPE_STEP = 1e-6  # normalised image coordinates: to each side, of the Jacobian by central differences
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated pinhole camera with OpenCV distortion; the projector is one too, run backwards.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, a value is not finite, a focal length is not positive, or a matrix is not of its form, as when it is
+        transposed.
+    """
+
+    size: tuple[int, int]  # width, height, px
+    matrix: Array  # (3, 3), px
+    distortion: Array  # (0 | 4 | 5 | 8 | 12 | 14,), OpenCV order
+    camera_from_world: Array = field(default_factory=lambda: np.eye(4))  # (4, 4), mm
+
+    def __post_init__(self) -> None:
+        for name, shape in (("matrix", (3, 3)), ("camera_from_world", (4, 4))):
+            value = np.asarray(getattr(self, name), float)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"{name}: expected a finite {shape[0]}x{shape[1]} matrix, found {value.tolist()}")
+            object.__setattr__(self, name, value)
+        distortion = np.asarray(self.distortion, float).ravel()
+        if distortion.size not in DISTORTION_LENGTHS or not np.isfinite(distortion).all():
+            raise ValueError(f"distortion: expected 0, 4, 5, 8, 12 or 14 finite coefficients, found {distortion.tolist()}")
+        object.__setattr__(self, "distortion", distortion)
+        if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0:
+            raise ValueError(f"matrix: expected positive focal lengths, found {self.matrix[0, 0]:g}, {self.matrix[1, 1]:g}")
+        if not np.allclose(self.matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], rtol=0, atol=EXACT):
+            raise ValueError(f"matrix: expected the form [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {self.matrix.tolist()}")
+        if not np.allclose(self.camera_from_world[3], [0, 0, 0, 1], rtol=0, atol=EXACT):
+            raise ValueError(f"camera_from_world: expected 0 0 0 1 as the last row, found {self.camera_from_world[3].tolist()}")
+        rotation = self.camera_from_world[:3, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+            raise ValueError("camera_from_world: expected a rotation matrix in its upper left 3x3 block")
+
+    @property
+    def centre(self) -> Array:
+        """The pinhole in the world : (3,) mm."""
+        return rigid.invert(self.camera_from_world)[:3, 3]
+
+    @cached_property
+    def coefficients(self) -> Array:
+        """The distortion in a fixed layout for compiled code : (21,), 12 coefficients and the 3x3 tilt matrix, row by row."""
+        padded = np.zeros(14)
+        padded[: self.distortion.size] = self.distortion
+        return np.concatenate([padded[:12], tilt_matrix(padded[12], padded[13]).ravel()])
+
+    def project(self, points: ArrayLike) -> Array:
+        """Project points : (..., 3) mm in the world, to pixels : (..., 2). Points behind the camera give NaN."""
+        local = rigid.apply(self.camera_from_world, points)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            normalised = np.where(local[..., 2:] > 0, local[..., :2] / local[..., 2:], np.nan)
+        return self.to_pixels(_distort_all(np.ascontiguousarray(normalised.reshape(-1, 2)), self.coefficients)).reshape(
+            normalised.shape
+        )
+
+    def undistort(self, pixels: ArrayLike) -> Array:
+        """Undo lens and matrix: pixels : (..., 2), to normalised coordinates x/z, y/z : (..., 2) of the ideal pinhole.
+
+        The forward model is inverted by Newton's method, to 1e-13 in normalised coordinates. A pixel that no ray reaches
+        (outside the range where the polynomial can be inverted) gives NaN.
+        """
+        pixels = np.asarray(pixels, float)
+        flat = pixels.reshape(-1, 2)
+        y = (flat[:, 1] - self.matrix[1, 2]) / self.matrix[1, 1]
+        x = (flat[:, 0] - self.matrix[0, 2] - self.matrix[0, 1] * y) / self.matrix[0, 0]
+        return _undistort_all(np.stack([x, y], axis=-1), self.coefficients).reshape(pixels.shape)
+
+    def rays(self, pixels: ArrayLike) -> Array:
+        """Directions of the rays through pixels : (..., 2), as unit vectors : (..., 3) in the world."""
+        normalised = self.undistort(pixels)
+        local = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1)
+        local /= np.linalg.norm(local, axis=-1, keepdims=True)
+        return rigid.rotate(rigid.invert(self.camera_from_world), local)
+
+    def pixel_grid(self) -> Array:
+        """All pixel centres : (h, w, 2), as (u, v)."""
+        width, height = self.size
+        return np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
+
+    def to_pixels(self, distorted: Array) -> Array:
+        """Distorted normalised coordinates : (..., 2), to pixels : (..., 2)."""
+        return distorted @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+
+
+def tilt_matrix(tau_x: float, tau_y: float) -> Array:
+    """Homography : (3, 3) of a sensor tilted by tau_x, tau_y in rad (Scheimpflug), as in OpenCV's camera model."""
+    cx, sx, cy, sy = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
+    about_x = np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
+    about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
+    rotation = about_y @ about_x
+    onto_sensor = np.array([[rotation[2, 2], 0, -rotation[0, 2]], [0, rotation[2, 2], -rotation[1, 2]], [0, 0, 1]])
+    return onto_sensor @ rotation
+
+
+def distorted(x, y, k):
+    """Distort a normalised point by the coefficients k : (21,) of `Camera.coefficients`; anything with arithmetic will do."""
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+    xd = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x) + r2 * (k[8] + r2 * k[9])
+    yd = y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y + r2 * (k[10] + r2 * k[11])
+    w = k[18] * xd + k[19] * yd + k[20]
+    return (k[12] * xd + k[13] * yd + k[14]) / w, (k[15] * xd + k[16] * yd + k[17]) / w
+
+
+distort = njit(cache=True, inline="always")(distorted)
+
+
+@njit(cache=True, parallel=True)
+def _distort_all(points, k):
+    result = np.empty_like(points)
+    for i in prange(points.shape[0]):
+        result[i, 0], result[i, 1] = distort(points[i, 0], points[i, 1], k)
+    return result
+
+
+@njit(cache=True, inline="always")
+def _slopes(x, y, k):
+    """Jacobian of the distortion at (x, y): dxd/dx, dxd/dy, dyd/dx, dyd/dy."""
+    right, left = distort(x + SLOPE_STEP, y, k), distort(x - SLOPE_STEP, y, k)
+    below, above = distort(x, y + SLOPE_STEP, k), distort(x, y - SLOPE_STEP, k)
+    scale = 1 / (2 * SLOPE_STEP)
+    return (
+        (right[0] - left[0]) * scale,
+        (below[0] - above[0]) * scale,
+        (right[1] - left[1]) * scale,
+        (below[1] - above[1]) * scale,
+    )
+
+
+@njit(cache=True, parallel=True)
+def _undistort_all(points, k):
+    result = np.empty_like(points)
+    for i in prange(points.shape[0]):
+        u, v = points[i, 0], points[i, 1]
+        x, y = u, v
+        error = np.inf
+        for _ in range(NEWTON_STEPS):
+            xd, yd = distort(x, y, k)
+            ex, ey = u - xd, v - yd
+            error = max(abs(ex), abs(ey))
+            if not error > NEWTON_TOLERANCE:
+                break
+            a, b, c, d = _slopes(x, y, k)
+            determinant = a * d - b * c
+            x += (d * ex - b * ey) / determinant
+            y += (a * ey - c * ex) / determinant
+        a, b, c, d = _slopes(x, y, k)
+        # past the fold of a polynomial a root is not a ray: the distortion mirrors there, or throws to the other side
+        if error < 1e-10 and x * u + y * v >= 0 and a * d - b * c > 0:
+            result[i, 0], result[i, 1] = x, y
+        else:
+            result[i, 0], result[i, 1] = np.nan, np.nan
+    return result

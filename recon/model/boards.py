@@ -1,0 +1,88 @@
+"""Calibration boards by their design: which points they carry, in which order, and where these lie.
+
+Board frame: x to the right, y down, z away from the viewer, origin at the first point. Points come in OpenCV's order, row by row.
+"""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from recon.model.rig import Part, Positive
+
+Array = NDArray[np.float64]
+Few = Annotated[int, Field(ge=2, le=100)]
+
+
+class AsymmetricCircles(Part):
+    """Discs in rows that stand half a step off each other."""
+
+    kind: Literal["asymmetric_circles"] = "asymmetric_circles"
+    columns: Few  # circles a row
+    rows: Few
+    spacing_mm: Positive  # between rows; circles of a row stand two spacings apart
+    diameter_mm: Positive
+
+    def points(self) -> Array:
+        """Centres of the discs : (columns * rows, 3) mm."""
+        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        return np.column_stack([2 * column + row % 2, row, np.zeros(row.size)]) * self.spacing_mm
+
+
+class SymmetricCircles(Part):
+    """Discs in a square grid. Half a turn maps it onto itself, so poses must keep to one half."""
+
+    kind: Literal["symmetric_circles"] = "symmetric_circles"
+    columns: Few
+    rows: Few
+    spacing_mm: Positive
+    diameter_mm: Positive
+
+    def points(self) -> Array:
+        """Centres of the discs : (columns * rows, 3) mm."""
+        return _grid(self.columns, self.rows, self.spacing_mm)
+
+
+class Chessboard(Part):
+    """Black and white squares."""
+
+    kind: Literal["chessboard"] = "chessboard"
+    columns: Few  # inner corners a row: one less than squares
+    rows: Few
+    square_mm: Positive
+
+    def points(self) -> Array:
+        """Inner corners : (columns * rows, 3) mm."""
+        return _grid(self.columns, self.rows, self.square_mm)
+
+
+class Charuco(Part):
+    """A chessboard with ArUco markers in its white squares: each corner is known by itself, so a part of the board is enough."""
+
+    kind: Literal["charuco"] = "charuco"
+    columns: Annotated[int, Field(ge=3, le=100)]  # squares a row, as OpenCV counts them here
+    rows: Annotated[int, Field(ge=3, le=100)]
+    square_mm: Positive
+    marker_mm: Positive
+    dictionary: Annotated[str, Field(pattern="^DICT_")] = "DICT_5X5_100"  # OpenCV's name
+    legacy: bool = False  # whether a marker stands in the first square, as OpenCV drew boards before 4.6
+
+    @model_validator(mode="after")
+    def _marker_fits(self) -> "Charuco":
+        if self.marker_mm >= self.square_mm:
+            raise ValueError(f"marker_mm: expected less than square_mm = {self.square_mm:g}, found {self.marker_mm:g}")
+        return self
+
+    def points(self) -> Array:
+        """Inner corners : ((columns - 1) * (rows - 1), 3) mm, relative to the first."""
+        return _grid(self.columns - 1, self.rows - 1, self.square_mm)
+
+
+Circles = AsymmetricCircles | SymmetricCircles
+Board = Annotated[AsymmetricCircles | SymmetricCircles | Chessboard | Charuco, Field(discriminator="kind")]
+
+
+def _grid(columns: int, rows: int, step: float) -> Array:
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    return np.column_stack([column, row, np.zeros(row.size)]) * step

@@ -1,0 +1,37 @@
+"""The ultrasound probe's calibration: where the pixels of its B-scans lie in the frame of the target that it carries."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from recon.geometry import rigid
+from recon.model.calibration import Uncertainty
+
+Array = NDArray[np.float64]
+
+SPEEDS = (300.0, 5000.0)  # m/s, of anything that is scanned
+Speed = Annotated[float, Field(ge=SPEEDS[0], le=SPEEDS[1], allow_inf_nan=False)]  # m/s; of a setting
+SCANNER_SPEED = 1540.0  # m/s, a mean of soft tissues, which scanners assume
+
+
+@dataclass(frozen=True)
+class ProbeCalibration:
+    """A calibrated probe. The image's frame: x along the array, y into the depth, origin at the centre of pixel (0, 0).
+
+    The uncertainty's names are `sx sy` in mm/px, and `rx ry rz` in rad and `tx ty tz` in mm, a turn and a shift of
+    `target_from_image`: `R = exp([r]) R_calibrated`, `t = t_calibrated + (tx, ty, tz)`.
+    """
+
+    target_from_image: Array  # (4, 4), mm
+    scale: Array  # (2,) sx, sy, mm/px
+    uncertainty: Uncertainty | None = None
+    speed_m_s: float = SCANNER_SPEED  # m/s, of the sound for which sy holds
+
+    def to_target(self, pixels: ArrayLike) -> Array:
+        """Pixels : (..., 2) of a B-scan, to points : (..., 3) mm in the target's frame."""
+        pixels = np.asarray(pixels, float)
+        plane = np.concatenate([pixels * self.scale, np.zeros_like(pixels[..., :1])], axis=-1)
+        return rigid.apply(self.target_from_image, plane)

@@ -1,0 +1,53 @@
+"""Poses over time: what a tracker says of a moving body, and its pose at any moment between."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+Array = NDArray[np.float64]
+
+MAX_GAP_S = 0.25  # between two poses, over which none is interpolated
+
+
+@dataclass(frozen=True)
+class Track:
+    """Poses `world_from_target` of n moments, in order of time. Whoever tracks, optically or by other means, hands this on."""
+
+    times: NDArray[np.int64]  # (n,) ns, of the tracker's clock, strictly increasing
+    poses: Array  # (n, 4, 4) mm; NaN where the target was not found
+    covariance: Array | None = None  # (n, 6, 6) of a turn (rad) after the pose's own, and a shift (mm) in the world
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """Where there is a pose : (n,)."""
+        return np.isfinite(self.poses).all(axis=(1, 2))
+
+
+def at(track: Track, times: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> Array:
+    """Poses at other moments : (m,) ns of the track's clock, as (m, 4, 4); NaN outside, and within gaps of the track.
+
+    Between two poses the rotation turns about one axis at constant speed and the origin moves along a straight line.
+    """
+    known = track.found
+    result = np.full((len(times), 4, 4), np.nan)
+    if known.sum() < 2:
+        return result
+    seconds = (track.times[known] - track.times[0]) * 1e-9
+    wanted = (np.asarray(times) - track.times[0]) * 1e-9
+    after = np.clip(np.searchsorted(seconds, wanted), 1, len(seconds) - 1)
+    inside = (wanted >= seconds[0]) & (wanted <= seconds[-1]) & (seconds[after] - seconds[after - 1] <= max_gap_s)
+    poses = track.poses[known]
+    result[inside] = np.eye(4)
+    result[inside, :3, :3] = Slerp(seconds, Rotation.from_matrix(poses[:, :3, :3]))(wanted[inside]).as_matrix()
+    result[inside, :3, 3] = np.column_stack([np.interp(wanted[inside], seconds, poses[:, axis, 3]) for axis in range(3)])
+    return result
+
+
+def poses_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:
+    """Poses : (n, 4, 4) at which images of time stamps : (n,) ns were taken; NaN where the track has a gap.
+
+    lag_s : how late the time stamps are; see `recon.probe_calibration.latency.Lag`.
+    """
+    return at(track, np.asarray(times, np.int64) - np.int64(round(lag_s * 1e9)))

@@ -1,0 +1,224 @@
+"""Joint bundle adjustment: all devices, all poses of the board and, when asked, the board's own shape, in one least squares.
+
+The unknowns are the devices' parameters and the board's shape, which all poses share, and each pose by itself. Poses don't know
+of each other, so each is eliminated from the normal equations on its own (Schur's complement): the system that is solved is as
+small as the shared unknowns, and its inverse is their covariance.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.geometry.camera_jacobian import MATRIX, MOTION
+from recon.model.calibration import Calibration, Uncertainty
+from recon.optical_calibration.bundle import ROBUST, Array, Estimate, Problem, Shape, System, linearised, stepped
+from recon.optical_calibration.observations import PROJECTOR, Observations
+
+Mask = NDArray[np.bool_]
+
+OUTLIER = 6.0  # normalised residual of a sighting that is named an outlier; 1 Gaussian one in 7e7 is beyond
+MEDIAN = np.sqrt(2 * np.log(2))  # of the length of a vector of two standard normal numbers
+LEAST_NOISE = 1e-3  # of the noise that was assumed
+TINY = 1e-12  # keeps a pose that nobody sees from being singular
+SINGULAR = 1e-14  # of the largest eigenvalue: below, rounding decides
+MAX_STEPS = 50
+MAX_ROUNDS = 4  # of measuring the noise
+FIRST_DAMPING, LAST_DAMPING = 1e-4, 1e8  # Marquardt's
+CONVERGED = 1e-10  # relative decrease of the cost
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """The outcome: values, what is left, and how sure they are."""
+
+    calibration: Calibration  # with the uncertainty that follows from the measured noise, and from the board's if not released
+    poses: Array  # (p, 4, 4) world_from_board
+    points: Array  # (n, 3) mm, the board as adjusted
+    residuals: Array  # (p, n, d, 2) px, observed less predicted, NaN where not seen
+    outliers: Mask  # (p, n, d)
+    noise: Mapping[str, float]  # by device: measured noise over that predicted by the detection
+    normalised: Array  # (p, n, d) residuals over their measured noise, each device's own; NaN where not seen
+
+    @property
+    def estimate(self) -> Estimate:
+        """The values alone, to start another adjustment from."""
+        return Estimate(self.calibration.cameras, self.poses, self.points)
+
+
+def adjust(
+    observations: Observations,
+    start: Estimate,
+    free: Mapping[str, Sequence[str]],
+    offsets: Array | None = None,
+    shape: Shape | None = None,
+) -> Adjustment:
+    """Adjust devices, poses and shape to what was seen.
+
+    Parameters
+    ----------
+    observations : Observations
+        With the noise that the detection predicts. How large it really is, is measured on the residuals, device by device.
+    start : Estimate
+        Near the solution: see `start.estimate`.
+    free : device -> names of parameters
+        Those to be adjusted, as in `calibration.Uncertainty`; the rest keep their values. The first device defines the world:
+        it has no motion to adjust.
+    offsets : (p, n, d, 2) px, optional
+        From where a device would see a point to where the detection puts it: see `circles.centre_offsets`.
+    shape : Shape, optional
+        Of the board. A released shape is held to its design by its standard deviations; one that is not released adds what
+        they leave unknown to the covariance ("consider parameters", Schmidt 1966).
+
+    Returns
+    -------
+    Adjustment
+
+    Raises
+    ------
+    ValueError
+        If the observations don't determine the unknowns.
+    """
+    offsets = np.zeros_like(observations.pixels) if offsets is None else offsets
+    problem = Problem(observations, offsets, free, shape or Shape())
+    estimate, noise = start, np.ones(len(observations.devices))
+    for _ in range(MAX_ROUNDS):  # the robust weights need the noise, the noise needs the residuals
+        estimate = _descend(problem, estimate, noise)
+        factor = _measured_noise(linearised(problem, estimate, noise, shaped=False), problem)
+        noise = noise * factor
+        if np.abs(factor - 1).max() < 0.01:
+            break
+    system = linearised(problem, estimate, noise, shaped=bool(problem.shape.sigma.any()))
+    return Adjustment(
+        Calibration(estimate.cameras, Uncertainty(problem.names, _covariance(system, problem))),
+        estimate.poses,
+        estimate.points,
+        np.where(observations.seen[..., None], system.plain, np.nan),
+        _outliers(system.lengths, observations),
+        dict(zip(observations.devices, noise.tolist(), strict=True)),
+        np.where(observations.seen, system.lengths, np.nan),
+    )
+
+
+def free_parameters(devices: Sequence[str], distortion: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+    """All parameters of all devices, with the distortion coefficients given for each; the first device doesn't move."""
+    return {device: (*MATRIX, *distortion[device], *(MOTION if number else ())) for number, device in enumerate(devices)}
+
+
+def _descend(problem: Problem, estimate: Estimate, noise: Array) -> Estimate:
+    """Levenberg-Marquardt from an estimate to the next minimum, at fixed noise."""
+    prior, damping = _prior(problem), FIRST_DAMPING
+    system = linearised(problem, estimate, noise, problem.shape.released)
+    cost = _cost(system, estimate, problem, prior)
+    for _ in range(MAX_STEPS):
+        try:
+            trial = stepped(problem, estimate, *_step(system, _deviation(estimate, problem), prior, damping))
+        except ValueError:  # too long a step, to what is no camera
+            damping *= 10
+            continue
+        candidate = linearised(problem, trial, noise, problem.shape.released)
+        new = _cost(candidate, trial, problem, prior)
+        converged = abs(cost - new) < CONVERGED * cost
+        if new < cost:
+            estimate, system, cost, damping = trial, candidate, new, damping / 10
+        else:
+            damping *= 10
+        if converged or damping > LAST_DAMPING:
+            break
+    return estimate
+
+
+def _prior(problem: Problem) -> Array:
+    """Information on the board's points : (3 n, 3 n) 1/mm^2 if they are released, else (0, 0)."""
+    if not problem.shape.released:
+        return np.zeros((0, 0))
+    return np.linalg.inv(problem.shape.covariance(problem.observations.points))
+
+
+def _deviation(estimate: Estimate, problem: Problem) -> Array:
+    """Of the board's points from their design : (3 n,) mm if they are released, else (0,)."""
+    return (estimate.points - problem.observations.points).ravel() if problem.shape.released else np.zeros(0)
+
+
+def _cost(system: System, estimate: Estimate, problem: Problem, prior: Array) -> float:
+    """Huber's loss of the lengths, and the shape's departure from its design."""
+    lengths, deviation = system.lengths, _deviation(estimate, problem)
+    loss = np.where(lengths <= ROBUST, lengths**2, 2 * ROBUST * lengths - ROBUST**2).sum()
+    return float(loss + deviation @ prior @ deviation)
+
+
+def _step(system: System, deviation: Array, prior: Array, damping: float) -> tuple[Array, Array]:
+    """One damped Gauss-Newton step: shared unknowns (g,), poses (p, 6)."""
+    flat, pose_t = np.concatenate(system.shared), system.pose.swapaxes(1, 2)
+    shared, right = flat.T @ flat, flat.T @ system.residuals.ravel()
+    own = len(right) - len(prior)
+    shared[own:, own:] += prior
+    right[own:] -= prior @ deviation
+    shared[np.diag_indices_from(shared)] *= 1 + damping
+    cross, corner = system.shared.swapaxes(1, 2) @ system.pose, pose_t @ system.pose  # (p, g, 6), (p, 6, 6)
+    corner = corner + np.eye(6) * (damping * np.diagonal(corner, axis1=1, axis2=2)[:, None, :] + TINY)
+    pose_right = np.einsum("pam,pm->pa", pose_t, system.residuals)
+    eliminate = np.linalg.solve(corner, cross.swapaxes(1, 2))  # (p, 6, g)
+    reduced = shared - _sum_of_products(cross, eliminate)
+    solution = _solve(reduced, right - np.einsum("pag,pa->g", eliminate, pose_right))
+    return solution, np.linalg.solve(corner, pose_right[..., None])[..., 0] - eliminate @ solution
+
+
+def _sum_of_products(left: Array, right: Array) -> Array:
+    """Sum over p of the products of (p, g, k) and (p, k, h) : (g, h), as one product of two large matrices."""
+    return np.concatenate(left, axis=1) @ np.concatenate(right)
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    """Solve a symmetric positive system : (g, g), (g,), whose unknowns have different units."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+    return scale * np.linalg.solve(scale[:, None] * matrix * scale, scale * right)
+
+
+def _measured_noise(system: System, problem: Problem) -> Array:
+    """Noise of each device on the residuals over the noise assumed : (d,); 1 for a device that sees nothing.
+
+    The median is used, as it doesn't mind outliers. The unknowns take their part of the residuals, evenly; a released board has
+    three a point, less the six of its place, which the poses have already.
+    """
+    used = problem.observations.used
+    board = 3 * used.shape[1] - 6 if problem.shape.released else 0
+    unknowns = len(problem.names) + board + 6 * np.count_nonzero(used.any(axis=(1, 2)))
+    left = 1 - unknowns / max(2 * np.count_nonzero(used), 1)
+    if left <= 0:
+        raise ValueError("fewer observations than unknowns")
+    lengths = [system.lengths[:, :, d][used[:, :, d]] for d in range(used.shape[2])]
+    factors = [np.median(length) / MEDIAN / np.sqrt(left) if length.size else 1.0 for length in lengths]
+    return np.maximum(factors, LEAST_NOISE)
+
+
+def _covariance(system: System, problem: Problem) -> Array:
+    """Covariance of the devices' parameters : (g, g)."""
+    own, flat = len(problem.names), np.concatenate(system.shared)
+    cross, corner = system.shared.swapaxes(1, 2) @ system.pose, system.pose.swapaxes(1, 2) @ system.pose + TINY * np.eye(6)
+    reduced = flat.T @ flat - _sum_of_products(cross, np.linalg.solve(corner, cross.swapaxes(1, 2)))
+    if problem.shape.released:
+        reduced[own:, own:] += _prior(problem)
+        return _inverse(reduced)[:own, :own]
+    covariance = _inverse(reduced[:own, :own])
+    if len(reduced) > own:  # errors of the board that are not estimated carry over to the parameters
+        carried = covariance @ reduced[:own, own:]
+        covariance = covariance + carried @ problem.shape.covariance(problem.observations.points) @ carried.T
+    return covariance
+
+
+def _inverse(information: Array) -> Array:
+    """Covariance from an information matrix whose unknowns have different units; what is hardly determined varies widely."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
+    values, vectors = np.linalg.eigh(scale[:, None] * information * scale)
+    half = scale[:, None] * vectors / np.sqrt(np.maximum(values, SINGULAR * values.max(initial=0.0)))
+    return half @ half.T
+
+
+def _outliers(lengths: Array, observations: Observations) -> Mask:
+    """Sightings far off : (p, n, d). The projector's is one where camera 1's is: it was read there."""
+    outliers = lengths > OUTLIER
+    if PROJECTOR in observations.devices[1:]:
+        outliers[:, :, observations.devices.index(PROJECTOR)] |= outliers[:, :, 0]
+    return outliers

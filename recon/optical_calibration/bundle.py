@@ -1,0 +1,161 @@
+"""The bundle adjustment's problem: its unknowns, what is seen, and both linearised at an estimate."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from recon.geometry.camera import Camera
+from recon.geometry.camera_jacobian import linearise, moved
+from recon.model.rig import NotNegative, Part
+from recon.optical_calibration.observations import PROJECTOR, Observations
+
+Array = NDArray[np.float64]
+
+ROBUST = 3.0  # normalised residual beyond which a sighting loses weight (Huber); 1 % of Gaussian ones are beyond
+BENT = 0.9  # of a board's variance out of its plane: bending, which neighbours share
+WIDE_MM = np.array([0.1, 0.1, 1.0])  # of a released shape of which nothing is said
+FLOOR_PX = 1e-4  # no sighting counts as more exact than this
+
+
+class Shape(Part):
+    """What is known of the board's shape: how far its points stand from their design, as standard deviations.
+
+    Print errors are each point's own. A board that isn't flat is bent: nine tenths of the variance out of the plane belong to the
+    three ways of bending it (along x, along y, as a saddle), one tenth is each point's own.
+    """
+
+    released: bool = False  # estimate the shape with the rest; else it is taken as designed
+    in_plane_mm: NotNegative = 0.0  # of each point, in x and in y: print
+    out_of_plane_mm: NotNegative = 0.0  # of each point: flatness
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations : (3,) mm; those of a released shape are wide if none are given."""
+        given = np.array([self.in_plane_mm, self.in_plane_mm, self.out_of_plane_mm])
+        return np.where(given > 0, given, WIDE_MM) if self.released else given
+
+    def covariance(self, design: Array) -> Array:
+        """Covariance : (3 n, 3 n) mm^2 of all points' coordinates, for a board of that design : (n, 3) mm."""
+        x, y = ((design - design.mean(axis=0)) / (np.ptp(design, axis=0) / 2 + 1e-9)).T[:2]
+        bends = np.column_stack([x**2, x * y, y**2])
+        bends /= np.sqrt(3 * np.mean(bends**2, axis=0))
+        covariance = np.diag(np.tile(self.sigma**2, len(design)))
+        out = np.arange(2, 3 * len(design), 3)
+        covariance[np.ix_(out, out)] = self.sigma[2] ** 2 * (BENT * bends @ bends.T + (1 - BENT) * np.eye(len(design)))
+        return covariance
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Values of all unknowns."""
+
+    cameras: Mapping[str, Camera]
+    poses: Array  # (p, 4, 4) world_from_board
+    points: Array  # (n, 3) mm, in the board's frame
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is to be adjusted to what."""
+
+    observations: Observations
+    offsets: Array  # (p, n, d, 2) px, from where a device would see a point to where the detection puts it
+    free: Mapping[str, Sequence[str]]  # device: parameters
+    shape: Shape
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The devices' parameters : (g,), as in `calibration.Uncertainty`."""
+        return tuple(f"{device}.{name}" for device in self.observations.devices for name in self.free.get(device, ()))
+
+
+@dataclass(frozen=True)
+class System:
+    """The problem linearised at an estimate. Shared unknowns g: devices' parameters, then the board's 3n if they count."""
+
+    residuals: Array  # (p, m) whitened, weighted; m = n * d * 2
+    shared: Array  # (p, m, g)
+    pose: Array  # (p, m, 6)
+    plain: Array  # (p, n, d, 2) px, observed less predicted
+    lengths: Array  # (p, n, d) of the whitened residuals before robust weights
+
+
+def linearised(problem: Problem, estimate: Estimate, noise: Array, shaped: bool) -> System:
+    """Whitened residuals and their derivatives; with those by the board's points if it is `shaped`.
+
+    noise : (d,) by which the devices' covariances are too small.
+    """
+    observations, count = problem.observations, len(estimate.points)
+    turned = np.einsum("pij,nj->pni", estimate.poses[:, :3, :3], estimate.points)  # (p, n, 3)
+    world = (turned + estimate.poses[:, None, :3, 3]).reshape(-1, 3)
+    shape, own = (len(estimate.poses), count, len(observations.devices), 2), len(problem.names)
+    residual, by_pose = np.zeros(shape), np.zeros((*shape, 6))
+    shared = np.zeros((*shape, own + (3 * count if shaped else 0)))
+    at = 0
+    for d, device in enumerate(observations.devices):
+        lines = linearise(estimate.cameras[device], world, names := problem.free.get(device, ()))
+        by_point = lines.by_point.reshape(*shape[:2], 2, 3)
+        residual[:, :, d] = observations.pixels[:, :, d] - problem.offsets[:, :, d] - lines.pixels.reshape(*shape[:2], 2)
+        shared[:, :, d, :, at : at + len(names)] = lines.by_parameter.reshape(*shape[:2], 2, -1)
+        by_pose[:, :, d, :, :3] = np.cross(turned[:, :, None], by_point)  # (a x b) . c = a . (b x c)
+        by_pose[:, :, d, :, 3:] = by_point
+        if shaped:
+            _put_own_columns(shared[:, :, d, :, own:], by_point @ estimate.poses[:, None, :3, :3])
+        at += len(names)
+    plain = residual.copy()
+    if PROJECTOR in observations.devices[1:]:  # the fringes are read where camera 1 sees the point: take its error out
+        d = observations.devices.index(PROJECTOR)
+        residual[:, :, d] -= np.einsum("pnij,pnj->pni", observations.gradient, residual[:, :, 0])
+        shared[:, :, d] -= observations.gradient @ shared[:, :, 0]
+        by_pose[:, :, d] -= observations.gradient @ by_pose[:, :, 0]
+    return _weighted(plain, residual, shared, by_pose, _whitening(observations, noise))
+
+
+def _put_own_columns(columns: Array, by_shape: Array) -> None:
+    """Each point depends on its own three coordinates alone: put (p, n, 2, 3) on the diagonal of (p, n, 2, 3 n)."""
+    index = np.arange(by_shape.shape[1])
+    for axis in range(3):
+        columns[:, index, :, 3 * index + axis] = by_shape[..., axis].swapaxes(0, 1)
+
+
+def _weighted(plain: Array, residual: Array, shared: Array, by_pose: Array, whitening: Array) -> System:
+    """Whiten all, with the weights of Huber's loss, and lay the rows of a pose below each other."""
+    residual = np.einsum("pndij,pndj->pndi", whitening, np.nan_to_num(residual))
+    lengths = np.linalg.norm(residual, axis=-1)
+    root = np.sqrt(np.minimum(1, ROBUST / np.maximum(lengths, ROBUST)))[..., None]
+    whitening = whitening * root[..., None]
+
+    def rows(values: Array) -> Array:
+        return values.reshape(len(values), int(np.prod(values.shape[1:4])), *values.shape[4:])
+
+    return System(
+        rows(residual * root),
+        rows(whitening @ np.nan_to_num(shared)),
+        rows(whitening @ np.nan_to_num(by_pose)),
+        plain,
+        lengths,
+    )
+
+
+def _whitening(observations: Observations, noise: Array) -> Array:
+    """What turns residuals into standard normal numbers : (p, n, d, 2, 2); zero where nothing was seen."""
+    covariance = np.where(observations.seen[..., None, None], observations.covariance, np.eye(2)) + FLOOR_PX**2 * np.eye(2)
+    inverse = np.linalg.inv(np.linalg.cholesky(covariance)) / noise[:, None, None]
+    return np.where(observations.used[..., None, None], inverse, 0.0)
+
+
+def stepped(problem: Problem, estimate: Estimate, shared: Array, poses: Array) -> Estimate:
+    """An estimate with all unknowns changed by a step."""
+    cameras, at = dict(estimate.cameras), 0
+    for device in problem.observations.devices:
+        names = problem.free.get(device, ())
+        cameras[device] = moved(cameras[device], names, shared[at : at + len(names)])
+        at += len(names)
+    turned = estimate.poses.copy()
+    turned[:, :3, :3] = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ estimate.poses[:, :3, :3]
+    turned[:, :3, 3] += poses[:, 3:]
+    points = estimate.points + shared[at:].reshape(-1, 3) if problem.shape.released else estimate.points
+    return Estimate(cameras, turned, points)

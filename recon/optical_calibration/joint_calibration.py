@@ -1,0 +1,265 @@
+"""Optics calibration: from where the devices see a board's points to their parameters, and how far these can be trusted."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from recon.errors import InputError
+from recon.geometry.camera_jacobian import difference
+from recon.geometry.circle_projection import centre_offsets
+from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
+from recon.model.calibration import Calibration
+from recon.model.rig import Part
+from recon.optical_calibration import initial_estimate
+from recon.optical_calibration import optical_checks as checks
+from recon.optical_calibration.adjustment import Adjustment, adjust, free_parameters
+from recon.optical_calibration.bundle import Array, Estimate, Shape
+from recon.optical_calibration.distortion_selection import MODELS, ModelName, choose
+from recon.optical_calibration.observations import PROJECTOR, Observations, Size
+from recon.optical_calibration.sightings import Sighting, gather, without_scraps
+
+FIRST_MODEL: ModelName = "brown"  # until one is chosen
+BAD_POSE = 5.0  # times the noise: median residual of a pose in one device that doesn't fit the others
+BENT_POINTS = 200  # of a board whose shape is looked at without being asked to
+BENT = 1.3  # times less noise with the board's shape released, that tell of a board unlike its design
+
+
+class Settings(Part):
+    """How the calibration is done."""
+
+    distortion: Literal["auto", ModelName] = "auto"  # auto: by cross-validation, for each device
+    shape: Shape = Shape()  # of the board
+
+
+@dataclass(frozen=True)
+class Result:
+    """A calibration and all that there is to say of it."""
+
+    observations: Observations  # of the poses that were used
+    adjustment: Adjustment
+    model: Mapping[str, ModelName]  # device: distortion model
+    scores: Mapping[str, Mapping[ModelName, float]]  # device: model: cross-validated RMS, px; empty where it was given
+    dropped: Mapping[str, str]  # pose, or pose and device: the reason
+    halves: Array  # (g,) difference between the calibrations of two halves of the poses, in predicted standard deviations
+    warnings: tuple[str, ...]
+    offsets: Array  # (p, n, d, 2) px, from the projected centres of circles to those of their ellipses
+    board: Board
+
+    @property
+    def rms(self) -> dict[str, float]:
+        """Reprojection RMS by device, px: root of the mean squared distance of the points that are no outliers."""
+        return reprojection_rms(self.observations, self.adjustment)
+
+
+def calibrate(
+    sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size], settings: Settings | None = None, name: str = "board"
+) -> Result:
+    """Calibrate all devices that saw the board.
+
+    The devices are calibrated one by one, then together; poses that contradict the others are left out; the centres of circles
+    are corrected for perspective and lens; each device's distortion model is chosen; all is adjusted once more.
+
+    Parameters
+    ----------
+    sightings : sequence of Sighting
+        One a pose.
+    sizes : device -> (width, height) px
+        In the order in which devices are to stand: cam1, which defines the world, first.
+    name : str
+        Of the captures, for messages.
+
+    Raises
+    ------
+    InputError
+        If the sightings don't determine the devices, or contradict each other or the board's design.
+    """
+    try:
+        return _calibrate([without_scraps(sighting) for sighting in sightings], board, sizes, settings or Settings(), name)
+    except InputError:
+        raise
+    except ValueError as error:  # LinAlgError among them
+        raise InputError(f"{name}: expected sightings that determine all devices, found {error}") from None
+
+
+def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size], settings: Settings, name: str) -> Result:
+    """`calibrate`, with sightings of enough points."""
+    dropped = {f"{sighting.name} {device}": reason for sighting in sightings for device, reason in sighting.failures.items()}
+    if not any(sighting.pixels for sighting in sightings):
+        raise InputError(f"{name}: expected the board in {len(sightings)} poses, found it in none: {_commonest(dropped)}")
+    observations = gather(sightings, board, sizes)
+    checks.refuse_unusable(observations, name)
+    first = initial_estimate.estimate(observations)
+    checks.refuse_parallel(observations, first, name)
+    seen = [sighting.radii for sighting in sightings if sighting.pixels]
+    size_warning = checks.refuse_wrong_size(board, seen, first, name)
+
+    free = _free(observations, dict.fromkeys(observations.devices, FIRST_MODEL))
+    adjusted, observations, contradicting = _consistent(observations, first, free, board, name)
+    checks.refuse_unusable(observations, name)
+    estimate, offsets = adjusted.estimate, circle_offsets(observations, adjusted.estimate, board)
+    estimate = adjust(observations, estimate, free, offsets, settings.shape).estimate
+    offsets = circle_offsets(observations, estimate, board)
+    model, scores = _models(observations, estimate, offsets, settings)
+    free = _free(observations, model)
+    bare = _without_distortion(estimate)
+    adjusted = adjust(observations, bare, free, offsets, settings.shape)
+    offsets = circle_offsets(observations, adjusted.estimate, board)
+    adjusted = adjust(observations, adjusted.estimate, free, offsets, settings.shape)
+    halves = compare_halves(observations, adjusted, free, offsets, settings.shape)
+    found = checks.warnings(observations, adjusted, settings.shape) + ([size_warning] if size_warning else [])
+    if not settings.shape.released and (bent := _bent(observations, adjusted, free, offsets)):
+        found.append(bent)
+    return Result(observations, adjusted, model, scores, dropped | contradicting, halves, tuple(found), offsets, board)
+
+
+def circle_offsets(observations: Observations, estimate: Estimate, board: Board) -> Array:
+    """From where devices see the points to where the detection puts them : (p, n, d, 2) px; zero for corners.
+
+    The projector's coordinates were read at the ellipses' centres in camera 1, so they are off by as much, carried over.
+    """
+    offsets = np.zeros_like(observations.pixels)
+    if not isinstance(board, AsymmetricCircles | SymmetricCircles):
+        return offsets
+    for d, device in enumerate(observations.devices):
+        if device != PROJECTOR:
+            for p, pose in enumerate(estimate.poses):
+                offsets[p, :, d] = centre_offsets(estimate.cameras[device], pose, estimate.points, board.diameter_mm / 2)
+    if PROJECTOR in observations.devices[1:]:
+        carried = np.einsum("pnij,pnj->pni", observations.gradient, offsets[:, :, 0])
+        offsets[:, :, observations.devices.index(PROJECTOR)] = carried
+    return offsets
+
+
+def reprojection_rms(observations: Observations, adjusted: Adjustment) -> dict[str, float]:
+    """Root mean square of the points' distances from where they are expected, by device, px; outliers left out."""
+    squares = np.sum(np.where(adjusted.outliers[..., None], np.nan, adjusted.residuals) ** 2, axis=-1)
+    return dict(zip(observations.devices, np.sqrt(np.nanmean(squares, axis=(0, 1))).tolist(), strict=True))
+
+
+def compare_halves(
+    observations: Observations, adjusted: Adjustment, free: Mapping[str, Sequence[str]], offsets: Array, shape: Shape
+) -> Array:
+    """Calibrate every other pose, and the rest, and compare : (g,) differences over their predicted standard deviation.
+
+    Standard normal if the predicted covariance is honest. What both halves share, as the board, doesn't show. NaN if a device
+    sees too few poses of a half.
+    """
+    uncertainty = adjusted.calibration.uncertainty
+    assert uncertainty is not None
+    halves = [np.arange(first, len(observations.poses), 2) for first in (0, 1)]
+    if min(observations.seen[half].any(axis=1).sum(axis=0).min() for half in halves) < checks.FEWEST_POSES:
+        return np.full(len(uncertainty.names), np.nan)
+    alone = shape if shape.released else Shape()  # a tolerance of the board is common to both halves
+    fits = []
+    for half in halves:
+        begin = Estimate(adjusted.calibration.cameras, adjusted.poses[half], adjusted.points)
+        fits.append(adjust(observations.of_poses(half), begin, free, offsets[half], alone))
+    first, second = (fit.calibration for fit in fits)
+    assert first.uncertainty is not None and second.uncertainty is not None
+    variance = np.diag(first.uncertainty.covariance) + np.diag(second.uncertainty.covariance)
+    return deviation(first, second) / np.sqrt(variance)
+
+
+def deviation(first: Calibration, second: Calibration) -> Array:
+    """By how much the second calibration's parameters differ from the first's : (g,), in the order of the first's uncertainty."""
+    assert first.uncertainty is not None
+    steps = []
+    for device, name in (full.split(".") for full in first.uncertainty.names):
+        steps.append(difference(first.cameras[device], second.cameras[device], [name])[0])
+    return np.array(steps)
+
+
+def _free(observations: Observations, model: Mapping[str, ModelName]) -> dict[str, tuple[str, ...]]:
+    return free_parameters(observations.devices, {device: MODELS[model[device]] for device in observations.devices})
+
+
+def _consistent(
+    observations: Observations, estimate: Estimate, free: Mapping[str, Sequence[str]], board: Board, name: str
+) -> tuple[Adjustment, Observations, dict[str, str]]:
+    """Adjust, and leave out the pose that fits the others worst, until all fit.
+
+    Returns
+    -------
+    The adjustment, the observations that are left, and what was left out with the reason.
+    """
+    dropped: dict[str, str] = {}
+    total = len(observations.poses)
+    while True:
+        offsets = circle_offsets(observations, estimate, board)
+        adjusted = adjust(observations, estimate, free, offsets)
+        misfit = np.nan_to_num(np.nanmedian(_filled(adjusted.normalised), axis=1))  # (p, d)
+        worst, device = np.unravel_index(int(np.argmax(misfit)), misfit.shape)
+        if misfit[worst, device] < BAD_POSE:
+            return adjusted, observations, dropped
+        lengths = np.linalg.norm(adjusted.residuals[worst, :, device], axis=-1)
+        dropped[observations.poses[worst]] = (
+            f"contradicts the other poses by {np.nanmedian(lengths):.2g} px in {observations.devices[device]}"
+        )
+        if len(dropped) > initial_estimate.CONTRADICTING * total:
+            raise InputError(
+                f"{name}: expected poses that fit one rig, found {len(dropped)} of {total} that don't, "
+                f"most in {observations.devices[device]}: were images mixed up or mirrored, or did a device move?"
+            )
+        rest = np.delete(np.arange(len(observations.poses)), worst)
+        observations = observations.of_poses(rest)
+        estimate = Estimate(adjusted.calibration.cameras, adjusted.poses[rest], adjusted.points)
+
+
+def _filled(lengths: Array) -> Array:
+    """Residuals with a zero for each pose and device without any, so that a median exists."""
+    nothing = ~np.isfinite(lengths).any(axis=1, keepdims=True)
+    return np.where(nothing, 0.0, lengths)
+
+
+def _models(
+    observations: Observations, estimate: Estimate, offsets: Array, settings: Settings
+) -> tuple[dict[str, ModelName], dict[str, dict[ModelName, float]]]:
+    """Each device's distortion model, and the scores it was chosen by."""
+    if settings.distortion != "auto":
+        return dict.fromkeys(observations.devices, settings.distortion), {}
+    chosen = {device: choose(observations, estimate, device, offsets) for device in observations.devices}
+    return {device: model for device, (model, _) in chosen.items()}, {device: scores for device, (_, scores) in chosen.items()}
+
+
+def _without_distortion(estimate: Estimate) -> Estimate:
+    cameras = {device: replace(camera, distortion=np.zeros(0)) for device, camera in estimate.cameras.items()}
+    return Estimate(cameras, estimate.poses, estimate.points)
+
+
+def _bent(observations: Observations, adjusted: Adjustment, free: Mapping[str, Sequence[str]], offsets: Array) -> str | None:
+    """A warning if the sightings fit another shape of the board far better than the designed one.
+
+    Few poses don't tell, and a board of very many points would take more memory than the question is worth.
+    """
+    if len(observations.poses) < checks.FEW_POSES or len(observations.points) > BENT_POINTS:
+        return None
+    released = adjust(observations, adjusted.estimate, free, offsets, Shape(released=True))
+    noise = np.array([[fit.noise[device] for device in observations.devices] for fit in (adjusted, released)])
+    if (noise[0] / noise[1]).max() < BENT:
+        return None
+    in_plane, out_of_plane = departure(released.points, observations.points)
+    return (
+        f"the board seems to differ from its design by {in_plane:.3f} mm in its plane and {out_of_plane:.3f} mm out of it (RMS): "
+        "release its shape (shape.released=true), or measure it"
+    )
+
+
+def departure(points: Array, design: Array) -> tuple[float, float]:
+    """RMS distance of points : (n, 3) mm from their design, in the plane and out of it, mm, once laid on it."""
+    turn, shift = _laid(points, design)
+    left = points @ turn.T + shift - design
+    return float(np.sqrt(np.mean(np.sum(left[:, :2] ** 2, axis=1)))), float(np.sqrt(np.mean(left[:, 2] ** 2)))
+
+
+def _laid(points: Array, design: Array) -> tuple[Array, Array]:
+    """Rotation and shift that lay points on their design (Kabsch)."""
+    turn = Rotation.align_vectors(design - design.mean(axis=0), points - points.mean(axis=0))[0].as_matrix()
+    return turn, design.mean(axis=0) - turn @ points.mean(axis=0)
+
+
+def _commonest(reasons: Mapping[str, str]) -> str:
+    values = list(reasons.values())
+    return max(set(values), key=values.count) if values else "no images"

@@ -1,0 +1,152 @@
+"""What can be wrong with a calibration's captures, told before it is believed: refusals, and warnings that name a cause."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.geometry.camera_jacobian import linearise
+from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
+from recon.optical_calibration.adjustment import Adjustment
+from recon.optical_calibration.bundle import Array, Estimate, Shape
+from recon.optical_calibration.observations import PROJECTOR, Observations
+
+FEWEST_POSES = 3
+FEW_POSES = 10
+LEAST_TILT_DEG = 5.0  # between two boards, without which focal length and distance are one unknown
+CELLS = 4  # the image is looked at in 4 x 4 cells
+COVERED = 0.8  # least share of cells with points
+DIAMETER_REFUSED, DIAMETER_DOUBTED = 0.04, 0.015  # relative error of the discs' size; ink spreads by up to 1 %
+NOISY = 3.0  # times the predicted noise
+UNSURE_FOCAL = 2e-3  # relative standard deviation of a focal length; 0.2 % is 1.4 mm at 700 mm
+
+
+def refuse_unusable(observations: Observations, name: str) -> None:
+    """Refuse captures that say too little or contradict themselves.
+
+    Raises
+    ------
+    InputError
+        If there are too few poses, or a device sees the board mirrored.
+    """
+    for number, device in enumerate(observations.devices):
+        poses = int(observations.seen[:, :, number].any(axis=1).sum())
+        if poses < FEWEST_POSES:
+            raise InputError(f"{name}: expected {FEWEST_POSES} poses of the board or more for {device}, found {poses}")
+        if device != PROJECTOR and np.mean(handedness(observations, number) < 0) > 0.5:
+            raise InputError(f"{name}: expected {device} to see the board's front, found it mirrored: is the image flipped?")
+    if PROJECTOR in observations.devices:
+        turned = np.linalg.det(observations.gradient)[observations.seen[:, :, observations.devices.index(PROJECTOR)]]
+        if np.mean(turned < 0) > 0.5:
+            raise InputError(
+                f"{name}: expected camera 1 and projector to see the board alike, found one of them mirrored: "
+                "is the camera's or the projector's image flipped?"
+            )
+
+
+def handedness(observations: Observations, number: int) -> Array:
+    """Of the map from the board to a device's image, by poses that it sees : +1, or -1 if it is mirrored."""
+    signs = []
+    for pixels in observations.pixels[:, :, number]:
+        known = np.isfinite(pixels).all(axis=1)
+        if known.sum() >= 3:
+            plane = np.column_stack([observations.points[known, :2], np.ones(known.sum())])
+            signs.append(np.sign(np.linalg.det(np.linalg.lstsq(plane, pixels[known], rcond=None)[0][:2])))
+    return np.array(signs)
+
+
+def refuse_parallel(observations: Observations, start: Estimate, name: str) -> None:
+    """Refuse boards that are all parallel: focal length and distance can't be told apart.
+
+    The directions are those of a first estimate. Parallel boards come out parallel whatever its focal length.
+
+    Raises
+    ------
+    InputError
+        If no two boards are tilted against each other.
+    """
+    normals = start.poses[:, :3, 2]
+    tilt = float(np.rad2deg(np.arccos(np.clip(normals @ normals.T, -1, 1))).max())
+    if tilt < LEAST_TILT_DEG:
+        raise InputError(
+            f"{name}: expected boards tilted against each other by {LEAST_TILT_DEG:g} deg or more, found all within "
+            f"{tilt:.1f} deg: focal length and distance can't be told apart"
+        )
+
+
+def refuse_wrong_size(board: Board, radii: Sequence[Mapping[str, Array]], start: Estimate, name: str) -> str | None:
+    """Compare the discs' size with the design: the one thing in the images that tells a wrong spacing.
+
+    radii : pose by pose, camera -> (n, 2) px, semi-axes of the discs' images.
+
+    Returns
+    -------
+    str or None
+        A warning, if the sizes differ a little; nothing of boards without discs, or whose sizes weren't measured.
+
+    Raises
+    ------
+    InputError
+        If they differ by more than any printer's ink spreads.
+    """
+    if not isinstance(board, AsymmetricCircles | SymmetricCircles):
+        return None
+    ratios = []
+    for pose, found in zip(start.poses, radii, strict=True):
+        for device in found.keys() & start.cameras.keys():
+            lines = linearise(start.cameras[device], rigid.apply(pose, start.points), ())
+            magnified = np.abs(np.linalg.det(lines.by_point @ pose[:3, :2]))  # px^2 / mm^2 on the board
+            ratios.append(np.sqrt(found[device].prod(axis=1) / magnified) / (board.diameter_mm / 2))
+    if not ratios:
+        return None
+    ratio = float(np.nanmedian(np.concatenate(ratios)))
+    designed = board.diameter_mm / board.spacing_mm
+    measured = ratio * designed
+    text = f"discs of {measured:.3f} times the spacing, where diameter_mm / spacing_mm is {designed:.3f}"
+    if abs(ratio - 1) > DIAMETER_REFUSED:
+        raise InputError(f"{name}: board: found {text}: spacing_mm or diameter_mm is wrong, and with it all lengths may be")
+    return f"{text}: measure the board" if abs(ratio - 1) > DIAMETER_DOUBTED else None
+
+
+def warnings(observations: Observations, adjustment: Adjustment, shape: Shape) -> list[str]:
+    """What a careful person would say about a calibration."""
+    found = []
+    if shape.released and len(observations.poses) < FEW_POSES:
+        found.append(
+            f"the board's shape is released on {len(observations.poses)} poses: {FEW_POSES} or more are needed to tell it"
+        )
+    if len(observations.poses) < FEW_POSES:
+        found.append(f"only {len(observations.poses)} poses: {FEW_POSES} to 40 are usual")
+    uncertainty = adjustment.calibration.uncertainty
+    for number, device in enumerate(observations.devices):
+        camera = adjustment.calibration.cameras[device]
+        covered = coverage(observations.pixels[:, :, number].reshape(-1, 2), camera)
+        if covered.mean() < COVERED:
+            found.append(
+                f"{device}: points cover {100 * covered.mean():.0f} % of the image; "
+                f"none {_where(~covered)}, where distortion is a guess"
+            )
+        if (factor := adjustment.noise[device]) > NOISY:
+            found.append(
+                f"{device}: residuals are {factor:.1f} times what detection predicts: board not flat or not to measure, "
+                "moved between images, or a lens that the model doesn't describe"
+            )
+        if uncertainty and (sigma := uncertainty.sigma(f"{device}.fx") / camera.matrix[0, 0]) > UNSURE_FOCAL:
+            found.append(f"{device}: focal length is known to {100 * sigma:.2g} % only: more poses, tilted more")
+    return found
+
+
+def coverage(pixels: Array, camera: Camera) -> Array:
+    """Cells of the image, CELLS a side : (CELLS, CELLS) bool, in which points : (m, 2) px fell."""
+    known = pixels[np.isfinite(pixels).all(axis=1)]
+    width, height = camera.size
+    counts, *_ = np.histogram2d(known[:, 1], known[:, 0], bins=CELLS, range=((-0.5, height - 0.5), (-0.5, width - 0.5)))
+    return counts > 0
+
+
+def _where(empty: Array) -> str:
+    """The sides of the image along which all of some cells are empty, in words."""
+    sides = {"at the top": empty[0], "at the bottom": empty[-1], "at the left": empty[:, 0], "at the right": empty[:, -1]}
+    return " and ".join(name for name, cells in sides.items() if cells.all()) or "in some corners"

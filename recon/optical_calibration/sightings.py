@@ -1,0 +1,125 @@
+"""From the images of one pose of the board to where each device sees its points; from all poses to one set of observations."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.board_detection.detect import BoardNotFound, Detection, detect
+from recon.errors import InputError
+from recon.model.boards import Board
+from recon.model.patterns import Patterns
+from recon.optical_calibration.observations import PROJECTOR, Observations, Size
+from recon.optical_calibration.projector_points import correspondences
+from recon.structured_light.decode import decode
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+CORNER_REACH = 0.45  # of the distance between corners: window of the fringes' local model
+DISC_REACH = 1.7  # of a disc's radius
+ENOUGH = 8  # points of a pose that a device must see, to place it
+FIRST = "cam1"
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What the devices see of one pose; devices that see nothing have no entry."""
+
+    name: str
+    pixels: Mapping[str, Array]  # device: (n, 2) px, NaN where a point isn't seen
+    covariance: Mapping[str, Array]  # device: (n, 2, 2) px^2
+    gradient: Array  # (n, 2, 2) projector px / cam1 px
+    radii: Mapping[str, Array] = field(default_factory=dict)  # camera: (n, 2) px, semi-axes of the discs
+    failures: Mapping[str, str] = field(default_factory=dict)  # device: why it sees nothing
+
+
+def sight(
+    name: str, board: Board, lit: Mapping[str, Image], fringes: Image | None, patterns: Patterns | None, bits: Mapping[str, int]
+) -> Sighting:
+    """Find the board in the images of one pose.
+
+    Parameters
+    ----------
+    lit : camera -> (h, w)
+        The board under even light.
+    fringes : (n, h, w), optional
+        What camera 1 sees of a pattern sequence with fringes along both axes.
+    patterns : Patterns, optional
+        That sequence.
+    bits : camera -> int
+        Full scale of its images is `2**bits - 1`.
+
+    Returns
+    -------
+    Sighting
+        A camera that doesn't find the board is left out, with the reason; so is the projector if its fringes can't be decoded.
+    """
+    found: dict[str, Detection] = {}
+    failures = {}
+    for camera, image in lit.items():
+        try:
+            found[camera] = detect(image, board, full=2.0 ** bits[camera] - 1)
+        except BoardNotFound as reason:
+            failures[camera] = str(reason)
+    pixels = {camera: detection.pixels for camera, detection in found.items()}
+    covariance = {camera: detection.covariance for camera, detection in found.items()}
+    radii = {camera: detection.radii for camera, detection in found.items() if detection.radii is not None}
+    gradient = np.zeros((len(board.points()), 2, 2))
+    if fringes is not None and patterns is not None and FIRST in found:
+        try:
+            projector_map = decode(fringes, patterns, bits=bits[FIRST], name=f"{name}: fringes")
+            seen = correspondences(projector_map, lit[FIRST], found[FIRST].pixels, _reach(found[FIRST], board))
+            pixels[PROJECTOR], covariance[PROJECTOR], gradient = seen.pixels, seen.covariance, seen.gradient
+        except InputError as reason:
+            failures[PROJECTOR] = str(reason)
+    return without_scraps(Sighting(name, pixels, covariance, gradient, radii, failures))
+
+
+def without_scraps(sighting: Sighting) -> Sighting:
+    """The sighting without devices that see too few points to tell the pose; they get a reason instead."""
+    counts = {device: int(np.isfinite(pixels).all(axis=1).sum()) for device, pixels in sighting.pixels.items()}
+    scraps = {device: count for device, count in counts.items() if count < ENOUGH}
+    reasons = {
+        device: f"only {count} of {len(sighting.pixels[device])} points, {ENOUGH} are needed" for device, count in scraps.items()
+    }
+
+    def kept(values: Mapping[str, Array]) -> dict[str, Array]:
+        return {device: value for device, value in values.items() if device not in scraps}
+
+    pixels, covariance, radii = kept(sighting.pixels), kept(sighting.covariance), kept(sighting.radii)
+    return replace(sighting, pixels=pixels, covariance=covariance, radii=radii, failures={**sighting.failures, **reasons})
+
+
+def gather(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size]) -> Observations:
+    """Lay the sightings of all poses side by side, those of poses that no device sees left out.
+
+    sizes : device -> (width, height) px, in the order in which devices are to stand: camera 1 first.
+    """
+    used = [sighting for sighting in sightings if sighting.pixels]
+    devices = [device for device in sizes if any(device in sighting.pixels for sighting in used)]
+    count = len(board.points())
+    nowhere, unknown = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
+    pixels = [[sighting.pixels.get(device, nowhere) for device in devices] for sighting in used]
+    covariance = [[sighting.covariance.get(device, unknown) for device in devices] for sighting in used]
+    return Observations(
+        tuple(sighting.name for sighting in used),
+        tuple(devices),
+        tuple(sizes[device] for device in devices),
+        board.points(),
+        np.array(pixels).swapaxes(1, 2),
+        np.array(covariance).swapaxes(1, 2),
+        np.nan_to_num(np.array([sighting.gradient for sighting in used])),
+    )
+
+
+def _reach(detection: Detection, board: Board) -> Array:
+    """Radius of the window : (n,) px, in which the fringes around each point are looked at."""
+    if detection.radii is not None:
+        return np.nan_to_num(DISC_REACH * detection.radii.max(axis=1), nan=1.0)
+    points, pixels = board.points()[:, :2], detection.pixels
+    known = np.isfinite(pixels[:, 0])
+    magnified = np.sqrt(np.linalg.det(np.cov(pixels[known].T)) / np.linalg.det(np.cov(points[known].T)))  # (px / mm)^2
+    step = np.linalg.norm(points[1] - points[0])
+    return np.full(len(pixels), CORNER_REACH * step * np.sqrt(magnified))

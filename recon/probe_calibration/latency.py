@@ -1,0 +1,255 @@
+"""Time calibration: by how much the scanner's images lag behind the poses, from an up-and-down motion over a flat bottom.
+
+The bottom's depth in the image follows the probe: `depth(t) = a + b . x(t - lag)` with six coordinates x of its pose. Above all
+it follows the height; but the target stands off from the array, so that a hand that tilts by half a degree moves the one by a
+millimetre and not the other. For tilts of some degrees depth is linear in the coordinates, and needs no calibrated probe. Both
+streams have time stamps of their own, so neither jitter nor dropped frames matter beyond the errors that they are: the pose is
+interpolated at the moment that each image was taken. Wanted is an offset of the clocks and delays together; where the clocks
+drift against each other by 50 ppm it changes by 3 ms a minute, so calibrate anew for long sessions.
+
+Move the probe by 10 mm or more, three times or more, at an uneven pace: a motion that repeats itself fits at more than one lag.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.interpolate import BSpline, make_lsq_spline
+from scipy.spatial.transform import Rotation
+
+from recon.errors import InputError
+from recon.model import tracks
+from recon.model.tracks import Track
+
+Array = NDArray[np.float64]
+
+SEARCH_S = (-0.5, 0.5)
+STEP_S = 0.01  # of the search
+MIN_FRAMES = 20
+MIN_RANGE_MM = 4.0  # of the motion, between its 5th and 95th percentile
+KNOT_S = 0.1  # of the spline through the motion: hands move below 3 Hz
+STILL = 1e-9  # mm or rad: a coordinate that changes by less tells nothing
+MIN_OVERLAP = 0.6  # of the images with a pose
+MIN_CORRELATION = 0.6  # of depth and height, by ranks, outliers among them
+MIN_AGREEMENT = 0.95  # their correlation without outliers
+MAX_OUTLIERS = 0.4  # of the images
+RIVAL = 0.98  # correlation of another lag, over the best, that makes the motion ambiguous
+VALLEY = 0.8  # correlation between two such lags, over the best, that tells them apart
+GATE = 4.0  # normalised residual of an outlier
+COVERAGE = 0.95  # of the interval
+BLOCK_PX = 8  # columns taken together
+BOTTOM_SIGMA_PX = 1.5  # smoothing in depth
+BOTTOM_CONTRAST = 30.0  # grey levels above the median of its columns
+BOTTOM_NEAR_PX = 3.0  # of the line
+BOTTOM_SHARE = 0.5  # of the columns that show it
+
+
+@dataclass(frozen=True)
+class Lag:
+    """How late the images' time stamps are: an image stamped t shows the probe as it stood at t - lag, of the poses' clock."""
+
+    seconds: float
+    sigma_s: float
+    interval_s: tuple[float, float]  # of 95 %
+    jitter_s: float  # of the time stamps: what of the residuals grows with speed
+    depth_sigma: float  # what doesn't, in units of the depths
+    used: NDArray[np.bool_]  # (n,) images: with a pose and a depth, and no outlier
+    residuals: Array  # (n,) in units of the depths; NaN without a pose or a depth
+
+
+def estimate(times: NDArray[np.int64], depths: Array, track: Track, search_s: tuple[float, float] = SEARCH_S) -> Lag:
+    """Estimate the lag of an image stream.
+
+    Parameters
+    ----------
+    times : (n,) int64, ns
+        Of the images, of their own clock.
+    depths : (n,) float
+        Of the bottom in each image, in any unit, as of `bottom_depth`; NaN where it isn't seen.
+    search_s : (first, last) s
+        Lags looked at. Where the clocks have nothing to do with each other, give the difference of their starts, and around it as
+        much as is unsure.
+
+    Raises
+    ------
+    InputError
+        If there are too few images or poses, the motion is too small or repeats itself, the depths don't follow it at any lag, or
+        the best lag lies at the end of the search.
+    """
+    times, depths = np.asarray(times), np.asarray(depths, float)
+    seen = np.isfinite(depths)
+    if seen.sum() < MIN_FRAMES:
+        raise InputError(f"depths: expected at least {MIN_FRAMES} images that show the bottom, found {seen.sum()}")
+    if track.found.sum() < MIN_FRAMES:
+        raise InputError(f"track: expected at least {MIN_FRAMES} poses, found {track.found.sum()}")
+    coordinates = _coordinates(track)
+    origin = int(track.times[0])
+    seconds = (times - origin) * 1e-9
+    moments = (track.times[track.found] - origin) * 1e-9
+    start = _search(seconds[seen], depths[seen], moments, coordinates[:, 0], search_s)
+    return _refined(seconds, depths, moments, _smooth(moments, coordinates), start)
+
+
+def bottom_depth(image: NDArray, top_px: int = 40) -> float:
+    """Depth in px of a flat bottom at the middle column of a B-scan : (h, w), 8-bit; NaN if there is none.
+
+    Every few columns the brightest echo below `top_px` counts, where reverberation at the probe's face ends; the line is the one
+    that most columns agree on.
+    """
+    level = np.asarray(image, np.float32)
+    blocks = level.shape[1] // BLOCK_PX
+    profiles = level[:, : blocks * BLOCK_PX].reshape(level.shape[0], blocks, BLOCK_PX).mean(axis=2)
+    profiles = cv2.GaussianBlur(profiles, (1, 0), sigmaX=1e-6, sigmaY=BOTTOM_SIGMA_PX) if blocks else profiles
+    below = profiles[top_px:-1]
+    if blocks < 4 or len(below) < 8:
+        return np.nan
+    rows = below.argmax(axis=0) + top_px
+    columns = np.arange(blocks)
+    before, peak, after = profiles[rows - 1, columns], profiles[rows, columns], profiles[rows + 1, columns]
+    bend = np.minimum(before - 2 * peak + after, -1e-3)
+    v = rows + np.clip((before - after) / (2 * bend), -0.5, 0.5)
+    u = (columns + 0.5) * BLOCK_PX - 0.5 - (level.shape[1] - 1) / 2
+    clear = (peak - np.median(profiles, axis=0) > BOTTOM_CONTRAST) & (rows > top_px)
+    if clear.sum() < BOTTOM_SHARE * blocks:
+        return np.nan
+    return _line_at_zero(u[clear], v[clear], blocks)
+
+
+def _line_at_zero(u: Array, v: Array, blocks: int) -> float:
+    """Where the line that most points are near passes u = 0; NaN if too few are."""
+    first, second = np.triu_indices(len(u), 1)
+    slopes = (v[second] - v[first]) / (u[second] - u[first])
+    starts = v[first] - slopes * u[first]
+    near = np.abs(v - starts[:, None] - slopes[:, None] * u) < BOTTOM_NEAR_PX
+    agreed = near[near.sum(axis=1).argmax()]
+    if agreed.sum() < BOTTOM_SHARE * blocks:
+        return np.nan
+    return float(np.polynomial.polynomial.polyfit(u[agreed], v[agreed], 1)[0])
+
+
+def _coordinates(track: Track) -> Array:
+    """Of the poses that were found, about their mean : (n, 3 to 6).
+
+    The height along the main direction of the motion, mm; the place across it; the turn, rad. What doesn't change is left out.
+    """
+    poses = track.poses[track.found]
+    places = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
+    places = places @ np.linalg.svd(places, full_matrices=False)[2].T
+    extent = np.subtract(*np.percentile(places[:, 0], [95, 5]))
+    if extent < MIN_RANGE_MM:
+        raise InputError(f"track: expected an up-and-down motion of at least {MIN_RANGE_MM:g} mm, found {extent:.1f} mm")
+    rotations = Rotation.from_matrix(poses[:, :3, :3])
+    coordinates = np.column_stack([places, (rotations * rotations.mean().inv()).as_rotvec()])
+    return coordinates[:, np.ptp(coordinates, axis=0) > STILL]
+
+
+def _smooth(moments: Array, coordinates: Array) -> BSpline:
+    """Motion by a cubic spline with a knot every KNOT_S, or at every other pose where there are fewer; least squares.
+
+    Through the poses themselves it would carry their noise, and less of it between poses than at them: lags at which images fall
+    between poses would seem to fit better.
+    """
+    step = max(2, round(KNOT_S / float(np.median(np.diff(moments)))))
+    knots = moments[step:-step:step]
+    return make_lsq_spline(moments, coordinates, np.r_[[moments[0]] * 4, knots, [moments[-1]] * 4], k=3)
+
+
+def _within(moments: Array, wanted: Array) -> NDArray[np.bool_]:
+    """Whether there are poses on both sides of a moment, near enough."""
+    after = np.clip(np.searchsorted(moments, wanted), 1, len(moments) - 1)
+    near = moments[after] - moments[after - 1] <= tracks.MAX_GAP_S
+    return near & (wanted >= moments[0]) & (wanted <= moments[-1])
+
+
+def _search(seconds: Array, depths: Array, moments: Array, heights: Array, search_s: tuple[float, float]) -> float:
+    """The lag at which ranks of depth and height agree best."""
+    lags = np.arange(search_s[0], search_s[1] + STEP_S / 2, STEP_S)
+    agreement = np.zeros(len(lags))
+    overlap = np.zeros(len(lags))
+    for k, lag in enumerate(lags):
+        inside = _within(moments, seconds - lag)
+        overlap[k] = inside.mean()
+        if inside.sum() >= MIN_FRAMES and overlap[k] >= MIN_OVERLAP:
+            agreement[k] = abs(stats.spearmanr(depths[inside], np.interp(seconds[inside] - lag, moments, heights)).statistic)
+    agreement = np.nan_to_num(agreement)
+    if overlap.max() < MIN_OVERLAP:
+        found = f"{100 * overlap.max():.0f} % at most: are the clocks others?"
+        raise InputError(f"times: expected poses at {100 * MIN_OVERLAP:.0f} % of the images or more, found {found}")
+    best = int(agreement.argmax())
+    if agreement[best] < MIN_CORRELATION:
+        found = f"a correlation of {agreement[best]:.2f} at most"
+        raise InputError(f"depths: expected them to follow the probe's height, found {found}")
+    if best in (0, len(lags) - 1):
+        found = f"the best at its end, {lags[best]:g} s"
+        raise InputError(f"search_s: expected the lag within {search_s[0]:g} to {search_s[1]:g} s, found {found}")
+    alike = np.flatnonzero(agreement > RIVAL * agreement[best])
+    rivals = [k for k in alike if agreement[min(k, best) : max(k, best) + 1].min() < VALLEY * agreement[best]]
+    if rivals:
+        found = f"one that repeats itself: {lags[best]:.2f} s and {lags[rivals[0]]:.2f} s fit alike"
+        raise InputError(f"track: expected a motion at an uneven pace, found {found}")
+    return float(lags[best])
+
+
+def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, start: float) -> Lag:
+    """Weighted least squares over a, b and the lag, with variances of depth and of time that the residuals tell."""
+    lag, speed = start, spline.derivative()
+    seen = np.isfinite(depths)
+    used = seen & _within(moments, seconds - lag)
+    line = np.zeros(1 + spline(start).size)  # a, b
+    line[1::-1] = stats.theilslopes(depths[used], spline(seconds[used] - lag)[:, 0])[:2]
+    variance = np.ones(len(depths))
+    for round_ in range(15):
+        inside = seen & _within(moments, seconds - lag)
+        weights = np.where(used & inside, 1 / variance, 0)
+        design = np.column_stack([np.ones_like(seconds), spline(seconds - lag), -speed(seconds - lag) @ line[1:]])
+        missing = np.where(seen, depths, 0) - design[:, :-1] @ line
+        root = np.sqrt(weights)
+        step = np.linalg.lstsq(design * root[:, None], missing * root, rcond=None)[0]
+        line, lag = line + step[:-1], lag + float(np.clip(step[-1], -0.05, 0.05))
+        predicted = line[0] + spline(seconds - lag) @ line[1:]
+        residuals = np.where(inside, depths - predicted, np.nan)
+        rates = (speed(seconds - lag) @ line[1:]) ** 2
+        spread = 1.4826 * np.nanmedian(np.abs(residuals))
+        near = inside & (np.abs(residuals) < (8 * spread if round_ < 3 else GATE * np.sqrt(variance)))
+        depth_variance, jitter = _two_variances(residuals[near], rates[near], spread)
+        variance = depth_variance + jitter**2 * rates
+        used = inside & (np.abs(residuals) < GATE * np.sqrt(variance))
+        if used.sum() < MIN_FRAMES:
+            raise InputError(f"depths: expected at least {MIN_FRAMES} images that agree on a lag, found {used.sum()}")
+        if round_ > 4 and abs(step[-1]) < 1e-7:
+            break
+    _agree(predicted, depths, inside, used)
+    sigma = _sigma(design[used], residuals[used], 1 / variance[used])
+    reach = float(stats.t.ppf((1 + COVERAGE) / 2, used.sum() - design.shape[1])) * sigma
+    return Lag(lag, sigma, (lag - reach, lag + reach), jitter, float(np.sqrt(depth_variance)), used, residuals)
+
+
+def _agree(predicted: Array, depths: Array, inside: NDArray[np.bool_], used: NDArray[np.bool_]) -> None:
+    """Refuse depths that don't follow the height, or of which too many don't."""
+    outliers = 1 - used.sum() / inside.sum()
+    agreement = abs(np.corrcoef(predicted[used], depths[used])[0, 1])
+    if agreement < MIN_AGREEMENT or outliers > MAX_OUTLIERS:
+        found = f"a correlation of {agreement:.2f} with {100 * outliers:.0f} % outliers left out"
+        raise InputError(f"depths: expected them to follow the probe's height, found {found}")
+
+
+def _two_variances(residuals: Array, rates: Array, spread: float) -> tuple[float, float]:
+    """Variance of the depth, and standard deviation of the time, by least squares on the squared residuals; neither negative."""
+    floor = (0.1 * spread) ** 2 + 1e-12
+    design = np.column_stack([np.ones_like(rates), rates])
+    depth, time = np.linalg.lstsq(design, residuals**2, rcond=None)[0]
+    if time < 0:
+        return max(float((residuals**2).mean()), floor), 0.0
+    if depth < floor:
+        depth, time = floor, max(float((residuals**2 * rates).sum() / (rates**2).sum()), 0.0)
+    return float(depth), float(np.sqrt(time))
+
+
+def _sigma(design: Array, residuals: Array, weights: Array) -> float:
+    """Of the lag, from the residuals as they are (a sandwich, each enlarged by its leverage), whatever the variances are."""
+    inverse = np.linalg.pinv(design.T @ (design * weights[:, None]))
+    leverage = np.einsum("ni,ij,nj->n", design, inverse, design) * weights
+    pulls = design * (weights * residuals / (1 - np.minimum(leverage, 0.9)))[:, None]
+    return float(np.sqrt((inverse @ (pulls.T @ pulls) @ inverse)[-1, -1]))

@@ -1,0 +1,383 @@
+"""Calibration of a tracked ultrasound probe by one point: the crossing of two wires, seen in many B-scans.
+
+Where pixel i lies in the world is the same for all frames (equation 1 of Meza et al. 2021):
+`world_from_target_i @ target_from_image @ [sx u_i, sy v_i, 0, 1] = wire`, the crossing, unknown and at rest. Unknown are the six
+of `target_from_image`, sx, sy and the wire's three. Written with the columns `sx x`, `sy y` and the image's origin it is linear,
+which gives a start in closed form; Levenberg and Marquardt do the rest.
+
+**Which motion is best.** An error of the tracked angle moves the wire by the lever, here 140 mm, so 0.08 degrees are 0.2 mm: far
+more than the errors of position or pixel. Frames are therefore weighted by their covariance, which has this lever in it. Turns
+decide how well the image's place is told from the wire's: roll the probe about its depth axis as far as the tracking allows, tilt
+it 35 degrees to all sides, mostly forward and backward, and bring the crossing near all corners of the image in turn. `motion`
+lists such frames. Predicted errors (1 sigma, of the place in space) of 30 frames with 0.08 degrees and 0.05 mm of noise per axis,
+for the rig of the paper:
+
+    roll both ways     centre     corners
+    180 degrees        0.07       0.11 to 0.12 mm
+    90 degrees         0.08       0.11 to 0.13 mm
+    35 degrees         0.09       0.12 to 0.14 mm
+
+With the crossing spread evenly over the image the corners are some 10 % worse; with 0.3 mm of slice thickness all are 50 % worse.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.model.calibration import Uncertainty
+from recon.model.probe import ProbeCalibration
+from recon.probe_calibration import cross_wire, point_equation, probe_checks, wires
+from recon.probe_calibration.cross_wire import Appearance, Crossing
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Size = tuple[int, int]  # width, height, px
+
+NAMES = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")  # of the uncertainty; the wire's three follow in the normal equations
+NO_POSE = "the target was not tracked"
+MIN_FRAMES = 6
+DRAWS = 500  # random sixes of frames; at 30 % outliers 0.7**6 = 12 % of them are clean
+GATE = 16.27  # squared normalised residual of a frame beyond which it is an outlier; 1 of 1000 good ones (chi-square, 3)
+MEDIAN = 2.366  # of chi-square with 3 degrees of freedom
+MAX_FACTOR = 8.0  # measured over assumed noise beyond which frames don't show one point at rest
+MAX_RMS_MM = 3.0  # of residuals beyond which they don't either, however long the lever; Meza et al. 2021 have 0.423
+MIN_INLIERS = 0.5  # of the frames
+REACH = (0.43, 0.40)  # of the crossing from the middle, of the image's width and height: spots stay whole and clear of the face
+ROCK = 0.6  # most of a tilt that is about the image's normal, where wires are seen edge-on
+FLOOR_MM = 1e-3  # no sighting counts as more exact than this
+APART_MM = 1.0  # 1 sigma of the distance of wires that cross, before it is measured
+MAX_STEPS = 50
+CONVERGED = 1e-10  # relative decrease of the cost
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations, per axis, of what has no covariance of its own."""
+
+    angle_deg: float = 0.08  # of the target's pose
+    position_mm: float = 0.05  # of the target's pose
+    pixel_px: float = 0.5  # of the crossing in the B-scan
+    slice_mm: float = 0.2  # of the crossing across the image plane: the slice is thick, so the crossing shines from beside it
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """The crossing, as seen in n frames."""
+
+    poses: Array  # (n, 4, 4) world_from_target, mm
+    pixels: Array  # (n, 2) px
+    pose_covariance: Array | None = None  # (n, 6, 6) as in recon.model.tracks: a turn (rad) after the pose's own, a shift (mm)
+    pixel_covariance: Array | None = None  # (n, 2, 2) px^2
+    slice_mm: Array | None = None  # (n,) standard deviation across the image plane
+    directions: Array | None = None  # (n, 2, 2) px, along the wires' lines; NaN where they were seen as a spot
+    beside: Array | None = None  # (n, 2) px a mm: where lines meet, by the distance of the wires; `calibrate` finds it
+
+    def of(self, chosen: ArrayLike) -> "Sightings":
+        """Those of some frames, by number or mask."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Sightings(**{name: None if value is None else value[chosen] for name, value in values.items()})
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """The outcome: values, what is left, and how sure they are."""
+
+    calibration: ProbeCalibration
+    wire: Array  # (3,) mm, in the world
+    residuals: Array  # (n, 3) mm, in the world: where the pixel is put, less the wire
+    normalised: Array  # (n,) length of the residual over its standard deviation; sqrt(3) for a typical frame
+    outliers: Mask  # (n,)
+    noise_factor: float  # measured noise over the assumed; the covariance is scaled by its square
+    apart_mm: float = 0.0  # between the wires' axes, where they were seen as lines
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square distance from the wire, outliers left out: the "equation RMS" of Meza et al. 2021."""
+        return float(np.sqrt((self.residuals[~self.outliers] ** 2).sum(axis=1).mean()))
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    target_from_image: Array  # (4, 4)
+    scale: Array  # (2,)
+    wire: Array  # (3,)
+    apart: float = 0.0  # mm, of the wires
+
+    def moved(self, step: Array) -> "_Estimate":
+        """After a step : (12,) of sx, sy, the turn, the shift, the wire and the wires' distance."""
+        turn = Rotation.from_rotvec(step[2:5]).as_matrix()
+        shifted = self.target_from_image[:3, 3] + step[5:8]
+        turned = rigid.transform(turn @ self.target_from_image[:3, :3], shifted)
+        return _Estimate(turned, self.scale + step[:2], self.wire + step[8:11], self.apart + step[11])
+
+    def pixels(self, sightings: Sightings) -> Array:
+        """Where the midpoint between the wires is : (n, 2) px."""
+        return sightings.pixels if sightings.beside is None else sightings.pixels - self.apart * sightings.beside
+
+
+def calibrate(
+    sightings: Sightings,
+    size: Size,
+    noise: Noise | None = None,
+    expected: Array | None = None,
+    seed: int = 0,
+    ahead_mm: float = 0.0,
+) -> Adjustment:
+    """Calibrate a probe from poses and pixels of one point at rest: of two wires, the midpoint between their axes.
+
+    Seen as two lines, the wires meet beside that point, one being above the other. Where six frames or more show lines, it is
+    found which is whose, and the distance of the axes is adjusted with the rest.
+
+    Parameters
+    ----------
+    size : (width, height) px
+        Of the B-scans.
+    noise : Noise
+        Of what the sightings give no covariance for. Only its proportions matter: the level is measured.
+    expected : (4, 4)
+        `target_from_image` as the bracket was designed, to within some 30 degrees and 30 mm. A mirrored image, or swapped axes of
+        image or target, fit the equations as well as the truth does; they are known by this alone.
+    seed : int
+        Of the random draws of frames for the robust start.
+    ahead_mm : float
+        By how much the echo lies before the wires' axes: see `recon.probe_calibration.wires.echo_ahead`.
+
+    Raises
+    ------
+    InputError
+        If there are too few frames, the poses or pixels are none, the motion leaves something undetermined, most frames
+        contradict each other, or the outcome is none of a probe; it says which.
+    """
+    noise = noise or Noise()
+    sightings = _checked(sightings, size)
+    probe_checks.motion(sightings.poses, sightings.pixels, size)
+    start = _robust_start(sightings, noise, np.random.default_rng(seed))
+    estimate, inliers, factor = _without_outliers(start, sightings, noise)
+    sightings = _with_wires(estimate, sightings, inliers)
+    if sightings.beside is not None:
+        estimate, inliers, factor = _without_outliers(estimate, sightings, noise)
+    rms = float(np.sqrt((_residuals(estimate, sightings.of(inliers)) ** 2).sum(axis=1).mean()))
+    if factor > MAX_FACTOR or rms > MAX_RMS_MM or inliers.mean() < MIN_INLIERS:
+        _say_why(sightings, noise, rms, factor, inliers)
+    information = _normal_equations(estimate, sightings.of(inliers), noise, np.ones(inliers.sum()))[0] / factor**2
+    probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
+    probe_checks.information(estimate.target_from_image, estimate.scale, information, sightings.of(inliers), size)
+    covariance = np.linalg.inv(information)[: len(NAMES), : len(NAMES)]
+    uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
+    ahead = rigid.transform(np.eye(3), [0, -ahead_mm, 0])
+    calibration = ProbeCalibration(estimate.target_from_image @ ahead, estimate.scale, uncertainty)
+    probe_checks.outcome(calibration, size, expected)
+    chi = np.sqrt(_squared(estimate, sightings, noise)) / factor
+    return Adjustment(calibration, estimate.wire, _residuals(estimate, sightings), chi, ~inliers, factor, abs(estimate.apart))
+
+
+def from_images(
+    images: Iterable[NDArray], poses: Array, appearance: Appearance | None = None
+) -> tuple[Sightings, list[Crossing]]:
+    """Find the crossing in B-scans : n of (h, w), tracked at poses : (n, 4, 4), NaN where the target wasn't found.
+
+    Returns
+    -------
+    Sightings
+        Of the m frames that have both a pose and a crossing.
+    list of n
+        Of all frames: the crossing, or the reason why the frame was rejected.
+    """
+    tracked = np.isfinite(poses).all(axis=(1, 2))
+    found = [cross_wire.find(image, appearance) for image in images]
+    found = [each if known else replace(each, reason=each.reason or NO_POSE) for each, known in zip(found, tracked, strict=True)]
+    good = [k for k, each in enumerate(found) if each.found]
+    pixels = np.array([found[k].pixel for k in good]).reshape(-1, 2)
+    covariance = np.array([found[k].covariance for k in good]).reshape(-1, 2, 2)
+    unseen = np.full((2, 2), np.nan)
+    lines = np.array([unseen if found[k].directions is None else found[k].directions for k in good]).reshape(-1, 2, 2)
+    return Sightings(poses[good], pixels, pixel_covariance=covariance, directions=lines), found
+
+
+def point_covariance(calibration: ProbeCalibration, pixels: ArrayLike) -> Array:
+    """Covariance : (k, 3, 3) mm^2, in the target's frame, of where pixels : (k, 2) are put; zero if the calibration has none."""
+    pixels = np.asarray(pixels, float)
+    if calibration.uncertainty is None:
+        return np.zeros((len(pixels), 3, 3))
+    order = [NAMES.index(name) for name in calibration.uncertainty.names]
+    jacobian = point_equation.point_jacobian(calibration.target_from_image, calibration.scale, pixels)[..., order]
+    return jacobian @ calibration.uncertainty.covariance @ np.swapaxes(jacobian, -1, -2)
+
+
+def motion(size: Size, count: int = 30, tilt_deg: float = 35.0, roll_deg: float = 180.0) -> tuple[Array, Array]:
+    """Frames of a good calibration: which way to hold the probe, and where to have the crossing in the image.
+
+    Returns
+    -------
+    turns : (count, 3) deg
+        Tilt about the array's axis x, roll about the depth axis y and tilt about the normal z, done in the order y, x, z in
+        axes that go with the image. Tilts are `tilt_deg` to all sides, but mostly forward and backward: rocked in its own plane
+        only, the probe sees both wires on one line. Rolls are up to `roll_deg` both ways.
+    pixels : (count, 2) px
+        Near the four corners, each round in another order: they tell the scales and the image's attitude best.
+    """
+    steps = np.arange(count)
+    phase = 2 * np.pi * np.sqrt(2) * steps  # irrational, as the roll's: no two frames are alike, and no two angles go together
+    roll = roll_deg * (2 * ((steps * (np.sqrt(5) - 1) / 2) % 1) - 1)
+    rock = ROCK * np.sin(phase)
+    turns = np.column_stack([tilt_deg * np.sign(np.cos(phase)) * np.sqrt(1 - rock**2), roll, tilt_deg * rock])
+    corners = np.array([[-1, -1], [1, 1], [1, -1], [-1, 1]])
+    return turns, (np.array(size) - 1) / 2 + np.array(size) * REACH * corners[(steps + steps // 4) % 4]
+
+
+def _checked(sightings: Sightings, size: Size) -> Sightings:
+    """As float arrays, or refused."""
+    poses, pixels = np.asarray(sightings.poses, float), np.asarray(sightings.pixels, float)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or pixels.shape != (len(poses), 2):
+        raise InputError(f"sightings: expected n poses of 4x4 and n pixels of 2, found {poses.shape} and {pixels.shape}")
+    if len(poses) < MIN_FRAMES:
+        raise InputError(f"sightings: expected at least {MIN_FRAMES} frames with a pose and a crossing, found {len(poses)}")
+    probe_checks.poses(poses)
+    probe_checks.pixels(pixels, size)
+    return replace(sightings, poses=poses, pixels=pixels, beside=None)
+
+
+def _with_wires(estimate: _Estimate, sightings: Sightings, inliers: Mask) -> Sightings:
+    """With the places where lines meet by the wires' distance, if both wires can be told."""
+    if sightings.directions is None:
+        return sightings
+    lines = np.isfinite(sightings.directions).all(axis=(1, 2))
+    turns, chosen = sightings.poses[:, :3, :3] @ estimate.target_from_image[:3, :3], lines & inliers
+    found = wires.directions_of(wires.planes(turns[chosen], estimate.scale, sightings.directions[chosen]))
+    if found is None:
+        return sightings
+    return replace(sightings, beside=np.where(lines[:, None], wires.beside(turns, estimate.scale, found), 0))
+
+
+def _residuals(estimate: _Estimate, sightings: Sightings) -> Array:
+    points = ProbeCalibration(estimate.target_from_image, estimate.scale).to_target(estimate.pixels(sightings))
+    return np.einsum("nij,nj->ni", sightings.poses[:, :3, :3], points) + sightings.poses[:, :3, 3] - estimate.wire
+
+
+def _covariances(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
+    """Of the residuals : (n, 3, 3) mm^2: the pose's, with its lever, and in the image's axes the crossing's."""
+    n = len(sightings.pixels)
+    turns = sightings.poses[:, :3, :3]
+    points = ProbeCalibration(estimate.target_from_image, estimate.scale).to_target(estimate.pixels(sightings))
+    pose = sightings.pose_covariance
+    if pose is None:
+        pose = np.diag([np.radians(noise.angle_deg) ** 2] * 3 + [noise.position_mm**2] * 3)
+    lever = np.concatenate([-rigid.cross(np.einsum("nij,nj->ni", turns, points)), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=-1)
+    local = np.broadcast_to(FLOOR_MM**2 * np.eye(3), (n, 3, 3)).copy()
+    pixel = np.eye(2) * noise.pixel_px**2 if sightings.pixel_covariance is None else sightings.pixel_covariance
+    local[:, :2, :2] += pixel * np.outer(estimate.scale, estimate.scale)
+    local[:, 2, 2] += (noise.slice_mm if sightings.slice_mm is None else sightings.slice_mm) ** 2
+    world_from_image = turns @ estimate.target_from_image[:3, :3]
+    return lever @ pose @ np.swapaxes(lever, 1, 2) + world_from_image @ local @ np.swapaxes(world_from_image, 1, 2)
+
+
+def _squared(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
+    """Squared normalised residuals : (n,), chi-square with 3 degrees of freedom."""
+    residuals = _residuals(estimate, sightings)
+    return np.einsum(
+        "ni,ni->n", residuals, np.linalg.solve(_covariances(estimate, sightings, noise), residuals[..., None])[..., 0]
+    )
+
+
+def _normal_equations(estimate: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> tuple[Array, Array, float]:
+    """Matrix (12, 12), right-hand side (12,) and cost, with the covariances as they are at the estimate."""
+    turns, n = sightings.poses[:, :3, :3], len(sightings.pixels)
+    jacobian = turns @ point_equation.point_jacobian(estimate.target_from_image, estimate.scale, estimate.pixels(sightings))
+    beside = np.zeros((n, 2)) if sightings.beside is None else sightings.beside
+    apart = -np.einsum("nij,jk,nk->ni", turns, estimate.target_from_image[:3, :2] * estimate.scale, beside)
+    jacobian = np.concatenate([jacobian, np.broadcast_to(-np.eye(3), (n, 3, 3)), apart[..., None]], axis=-1)
+    residuals = _residuals(estimate, sightings)
+    whiten = np.linalg.inv(np.linalg.cholesky(_covariances(estimate, sightings, noise))) * np.sqrt(weights)[:, None, None]
+    white, left = (whiten @ jacobian).reshape(-1, 12), (whiten @ residuals[..., None]).ravel()
+    matrix, rhs, cost = white.T @ white, -white.T @ left, float(left @ left)
+    matrix[11, 11] += 1 / APART_MM**2
+    rhs[11] -= estimate.apart / APART_MM**2
+    return matrix, rhs, cost + (estimate.apart / APART_MM) ** 2
+
+
+def _levenberg_marquardt(start: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> _Estimate:
+    estimate, damping = start, 1e-4
+    matrix, rhs, cost = _normal_equations(estimate, sightings, noise, weights)
+    for _ in range(MAX_STEPS):
+        diagonal = np.maximum(np.diag(matrix), 1e-12)
+        trial = estimate.moved(np.linalg.lstsq(matrix + damping * np.diag(diagonal), rhs)[0])
+        following = _normal_equations(trial, sightings, noise, weights)
+        if following[2] >= cost:
+            damping *= 10
+            if damping > 1e8:
+                break
+            continue
+        done = cost - following[2] < CONVERGED * cost
+        estimate, damping = trial, damping / 10
+        matrix, rhs, cost = following
+        if done:
+            break
+    return estimate
+
+
+def _robust_start(sightings: Sightings, noise: Noise, rng: np.random.Generator) -> _Estimate:
+    """Least median of squares over closed forms: of all frames, and of random sixes. The best few are refined first."""
+    n = len(sightings.pixels)
+    draws = np.argsort(rng.random((DRAWS, n)), axis=1)[:, :MIN_FRAMES]
+    starts = [_Estimate(*point_equation.closed_form(sightings.poses, sightings.pixels))]
+    starts += [
+        _Estimate(*each)
+        for each in zip(*point_equation.closed_form(sightings.poses[draws], sightings.pixels[draws]), strict=True)
+    ]
+    medians = np.array([np.median((_residuals(start, sightings) ** 2).sum(axis=1)) for start in starts])
+    best = [_refined_on_half(starts[k], sightings, noise) for k in np.argsort(medians)[:5]]
+    return min(best, key=lambda estimate: np.median(_squared(estimate, sightings, noise)))
+
+
+def _refined_on_half(start: _Estimate, sightings: Sightings, noise: Noise) -> _Estimate:
+    """After two rounds of least squares on the better half of the frames, or on nine where that is fewer."""
+    keep = max(len(sightings.pixels) // 2 + 1, min(9, len(sightings.pixels)))
+    for _ in range(2):
+        chosen = np.argsort((_residuals(start, sightings) ** 2).sum(axis=1))[:keep]
+        start = _levenberg_marquardt(start, sightings.of(chosen), noise, np.ones(keep))
+    return start
+
+
+def _without_outliers(start: _Estimate, sightings: Sightings, noise: Noise) -> tuple[_Estimate, Mask, float]:
+    """Biweight least squares, then plain least squares on those within the gate, until these are the same ones again."""
+    estimate = start
+    for _ in range(5):
+        squared = _squared(estimate, sightings, noise)
+        scale = max(np.median(squared) / MEDIAN, 1e-12)
+        weights = np.maximum(1 - squared / (2 * GATE * scale), 0) ** 2
+        estimate = _levenberg_marquardt(estimate, sightings, noise, weights)
+    inliers = np.zeros(len(sightings.pixels), bool)
+    factor = np.sqrt(scale)
+    for _ in range(20):
+        squared = _squared(estimate, sightings, noise)
+        inside = squared <= GATE * factor**2
+        if inside.sum() < MIN_FRAMES:
+            break
+        if (inside == inliers).all():
+            break
+        inliers = inside
+        estimate = _levenberg_marquardt(estimate, sightings.of(inliers), noise, np.ones(inliers.sum()))
+        freedom = 3 * inliers.sum() - 11 - (sightings.beside is not None)
+        factor = np.sqrt(max(_squared(estimate, sightings.of(inliers), noise).sum() / freedom, 1e-12))
+    return estimate, inliers, float(factor)
+
+
+def _say_why(sightings: Sightings, noise: Noise, rms: float, factor: float, inliers: Mask) -> None:
+    """Refuse frames that don't show one point at rest, and name the reading of the poses under which they would."""
+    distances = {}
+    for meaning, poses in probe_checks.readings(sightings.poses).items():
+        other = Sightings(poses, sightings.pixels)
+        start = _robust_start(other, noise, np.random.default_rng(0))
+        if np.median(_squared(start, other, noise)) < MAX_FACTOR**2 * MEDIAN:
+            distances[meaning] = np.median(np.linalg.norm(_residuals(start, other), axis=1))
+    likely = min(distances, key=lambda meaning: distances[meaning], default="")
+    if likely and distances[likely] < min(rms / 2, MAX_RMS_MM):
+        raise InputError(f"poses: expected world_from_target, found {likely}: read so, the crossing is at rest")
+    few = f"only {inliers.sum()} of {len(inliers)} that agree"
+    found = few if inliers.mean() < MIN_INLIERS else f"residuals of {rms:.1f} mm (rms), {factor:.1f} times the assumed noise"
+    raise InputError(f"sightings: expected frames of one point at rest, found {found}")

@@ -1,0 +1,211 @@
+"""What can be wrong with a probe's calibration, and its name: poses, pixels, a motion that leaves something open, the outcome."""
+
+from itertools import permutations, product
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.model.probe import SPEEDS, ProbeCalibration
+
+Array = NDArray[np.float64]
+Size = tuple[int, int]  # width, height, px
+
+ORTHOGONAL = 1e-3  # of a pose's rotation; files of few digits pass
+MIN_TURN_DEG = 2.0  # rms, about the second axis
+MIN_SPREAD = 0.02  # rms, of the crossing in the image, as a fraction of the width or height
+MAX_SIGMA_MM = 1.0  # predicted, of any pixel's place in any direction
+SCALES = (0.005, 2.0)  # mm/px, of any scanner
+FAR_DEG, FAR_MM = 45.0, 60.0  # from the design of the bracket
+AXES = ("c0-c1", "c0-c2", "normal")  # of the target
+
+
+class _Frames(Protocol):
+    @property
+    def poses(self) -> Array: ...
+    @property
+    def pixels(self) -> Array: ...
+
+
+def poses(world_from_target: Array) -> None:
+    """Refuse poses that are no rigid transforms of a right-handed frame."""
+    for k, pose in enumerate(world_from_target):
+        turn = pose[:3, :3]
+        if not np.isfinite(pose).all():
+            raise InputError(f"poses: frame {k}: expected a pose, found values that are not finite")
+        if np.abs(turn @ turn.T - np.eye(3)).max() > ORTHOGONAL or np.abs(pose[3] - [0, 0, 0, 1]).max() > ORTHOGONAL:
+            raise InputError(f"poses: frame {k}: expected a 4x4 rigid transform, found another matrix")
+        if np.linalg.det(turn) < 0:
+            found = "a left-handed one: two axes swapped or one mirrored"
+            raise InputError(f"poses: frame {k}: expected the rotation of a right-handed frame, found {found}")
+
+
+def pixels(of_crossing: Array, size: Size) -> None:
+    """Refuse pixels outside the image, and say if they were inside with u and v swapped."""
+    limit = np.array(size, float) - 0.5
+    outside = ~((of_crossing >= -0.5) & (of_crossing <= limit)).all(axis=1)
+    if not outside.any():
+        return
+    k = int(np.argmax(outside))
+    swapped = ((of_crossing[:, ::-1] >= -0.5) & (of_crossing[:, ::-1] <= limit)).all()
+    hint = ": u and v are swapped" if swapped else ""
+    found = f"({of_crossing[k, 0]:g}, {of_crossing[k, 1]:g})"
+    raise InputError(f"pixels: frame {k}: expected (u, v) in an image of {size[0]}x{size[1]} px, found {found}{hint}")
+
+
+def motion(world_from_target: Array, of_crossing: Array, size: Size) -> None:
+    """Refuse a motion that leaves unknowns open whatever the noise, and name the rotation, depth or width that is missing."""
+    axes, rms = turns(world_from_target)
+    if rms[0] < MIN_TURN_DEG:
+        raise InputError(f"motion: expected turns of the probe about two axes, found none: at most {rms[0]:.1f} deg (rms)")
+    if rms[1] < MIN_TURN_DEG:
+        raise InputError(f"motion: expected turns of the probe about two axes, found {_one_axis(axes, rms)}")
+    spread = of_crossing.std(axis=0) / size
+    lengths = {"depth": spread[1], "lateral position": spread[0]}
+    for name, value in lengths.items():
+        if value < MIN_SPREAD:
+            found = f"one {name} only: {100 * value:.1f} % of the image (rms)"
+            raise InputError(f"motion: expected the crossing at various places of the image, found {found}")
+    across = np.linalg.svd((of_crossing - of_crossing.mean(axis=0)) / size, compute_uv=False)[1] / np.sqrt(len(of_crossing))
+    if across < MIN_SPREAD:
+        found = f"all on one line, where depth goes with lateral position: {100 * across:.1f} % of the image across it (rms)"
+        raise InputError(f"motion: expected the crossing at various places of the image, found {found}")
+
+
+def turns(world_from_target: Array) -> tuple[Array, Array]:
+    """Axes about which a probe was turned : (3, 3), rows, in the target's frame, strongest first, and rms angles : (3,) deg."""
+    rotations = Rotation.from_matrix(world_from_target[:, :3, :3])
+    vectors = (rotations.mean().inv() * rotations).as_rotvec(degrees=True)
+    _, lengths, axes = np.linalg.svd(vectors - vectors.mean(axis=0), full_matrices=True)
+    return axes, np.pad(lengths, (0, 3 - len(lengths))) / np.sqrt(len(vectors))
+
+
+def information(target_from_image: Array, scale: Array, matrix: Array, frames: _Frames, size: Size) -> None:
+    """Refuse a motion by which some pixel's place stays open by more than MAX_SIGMA_MM, and name what is weakest.
+
+    Parameters
+    ----------
+    matrix : (12, 12)
+        Normal equations by sx, sy, turn, shift, wire and the wires' distance, with the measured noise.
+    """
+    unit = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
+    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
+    root = (vectors / np.sqrt(np.maximum(values, 1e-14))) / unit[:, None]
+    right, bottom = size[0] - 1, size[1] - 1
+    worst, open_ = 0.0, np.zeros(3)
+    for u, v in ((0, 0), (right, 0), (0, bottom), (right, bottom)):
+        x, y = target_from_image[:3, 0], target_from_image[:3, 1]
+        arm = u * scale[0] * x + v * scale[1] * y
+        moved = np.column_stack([u * x, v * y, np.cross(np.eye(3), arm).T, np.eye(3)]) @ root[:8]
+        left, lengths, _ = np.linalg.svd(moved)
+        if lengths[0] > worst:
+            worst, open_ = float(lengths[0]), left[:, 0]
+    if worst <= MAX_SIGMA_MM:
+        return
+    axes, rms = turns(frames.poses)
+    spread = frames.pixels.std(axis=0) / size
+    weak = {
+        f"turns about one axis only, {_axis(axes[0])}, others {rms[1]:.1f} deg (rms)": rms[1] / 10,
+        f"nearly one depth only, {100 * spread[1]:.0f} % of the image (rms)": spread[1] / 0.1,
+        f"nearly one lateral position only, {100 * spread[0]:.0f} % of the image (rms)": spread[0] / 0.1,
+    }
+    named = min(weak, key=lambda name: weak[name])
+    found = f"{worst:.2g} mm along {_axis(open_)}: {named}" if weak[named] < 1 else f"{worst:.2g} mm: too few or too noisy frames"
+    raise InputError(f"motion: expected pixels to be placed to {MAX_SIGMA_MM:g} mm (1 sigma), found {found}")
+
+
+def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -> None:
+    """Refuse what is no probe's calibration: scales of other units, a target under the probe's face, axes swapped."""
+    for name, value in zip(("sx", "sy"), calibration.scale, strict=True):
+        if not SCALES[0] <= value <= SCALES[1]:
+            found = f"{value:.3g}: are the poses in mm?"
+            raise InputError(f"calibration: {name}: expected {SCALES[0]:g} to {SCALES[1]:g} mm/px, found {found}")
+    depth = rigid.invert(calibration.target_from_image)[1, 3]
+    if expected is not None:
+        _as_designed(calibration, size, expected)
+    elif depth > 0:
+        found = f"it {depth:.0f} mm below: the image is upside down, or u and v are swapped"
+        raise InputError(f"calibration: expected the target above the probe's face, found {found}")
+
+
+def speed(implied: float) -> None:
+    """Refuse a calibration whose sy, beside the scanner's, tells a speed of sound (m/s) that nothing has."""
+    if not SPEEDS[0] <= implied <= SPEEDS[1]:
+        expected = f"calibration: sy: expected to tell a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s"
+        raise InputError(f"{expected}, found {implied:.0f}: are the poses in mm, and rig.probe.scale_mm_per_px the scanner's?")
+
+
+def _as_designed(calibration: ProbeCalibration, size: Size, expected: Array) -> None:
+    found = calibration.target_from_image[:3, :3]
+    near = _angle(expected[:3, :3].T @ found) < FAR_DEG
+    centre = (np.array(size) - 1) / 2
+    away = np.linalg.norm(calibration.to_target(centre) - ProbeCalibration(expected, calibration.scale).to_target(centre))
+    if near and away < FAR_MM:
+        return
+    if near:
+        name = "are the poses in mm, and is rig.probe this bracket's?"
+    elif away < FAR_MM:  # the image lies where it should, so its own axes differ
+        name = min(IMAGE_AXES, key=lambda key: _angle(IMAGE_AXES[key].T @ expected[:3, :3].T @ found))
+    else:
+        turn = min(_SIGNED, key=lambda signed: _angle(signed.T @ found @ expected[:3, :3].T))
+        signs = "".join(" -"[int(row.sum() < 0)] + "xyz"[int(np.argmax(np.abs(row)))] for row in turn).strip()
+        name = f"the target's axes are swapped: ({signs.replace(' ', ', ').replace('-', ', -').strip(', ')}) of the design"
+    off = f"{_angle(expected[:3, :3].T @ found):.0f} deg and {away:.0f} mm off"
+    raise InputError(f"calibration: expected target_from_image near its design, found it {off}: {name}")
+
+
+def readings(world_from_target: Array) -> dict[str, Array]:
+    """Common other meanings of 4x4 poses, which a fit may tell."""
+    inverse = np.linalg.inv(world_from_target)
+    transposed = world_from_target.copy()
+    transposed[:, :3, :3] = np.swapaxes(world_from_target[:, :3, :3], 1, 2)
+    result = {"target_from_world, the inverse": inverse, "transposed rotations": transposed}
+    for order, name in (((1, 0, 2), "x and y"), ((0, 2, 1), "y and z"), ((2, 1, 0), "x and z")):
+        swapped = world_from_target.copy()
+        swapped[:, :3, 3] = swapped[:, order, 3]
+        result[f"axes {name} swapped in the translations"] = swapped
+    for axis, name in enumerate("xyz"):
+        mirrored = world_from_target.copy()
+        mirrored[:, axis, 3] *= -1
+        result[f"translations of the wrong handedness, {name} mirrored"] = mirrored
+    return result
+
+
+def _one_axis(axes: Array, rms: Array) -> str:
+    return f"planar motion, about {_axis(axes[0])} only: {rms[0]:.1f} deg, others {rms[1]:.1f} deg (rms)"
+
+
+def _axis(direction: Array) -> str:
+    """A direction in the target's frame, in words where it is near an axis."""
+    k = int(np.argmax(np.abs(direction)))
+    direction = direction * np.sign(direction[k])
+    text = f"({', '.join(f'{value:.2f}' for value in direction)})"
+    return f"the target's {'xyz'[k]} ({AXES[k]})" if direction[k] > np.cos(np.radians(20)) else f"{text} in the target's frame"
+
+
+def _angle(rotation: Array) -> float:
+    return float(np.degrees(Rotation.from_matrix(rotation).magnitude()))
+
+
+def _signed_permutations() -> list[Array]:
+    """The 24 turns that take axes to axes."""
+    all_ = [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order in permutations(range(3))
+        for signs in product((1, -1), repeat=3)
+    ]
+    return [matrix for matrix in all_ if np.linalg.det(matrix) > 0]
+
+
+_SIGNED = _signed_permutations()
+IMAGE_AXES = {  # found = expected @ this
+    "the image is mirrored left to right": np.diag([-1.0, 1, -1]),
+    "the image is upside down": np.diag([1.0, -1, -1]),
+    "the image is upside down and mirrored": np.diag([-1.0, -1, 1]),
+    "u and v are swapped": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
+    "the image is turned by 90 degrees": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+    "the image is turned by -90 degrees": np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+}

@@ -1,0 +1,143 @@
+"""Mean echo power of tissue on a grid along the beams, from tracked B-scans.
+
+Speckle's power averages to the tissue's backscatter, its grey levels don't: they are logarithms, in which a dark mass seems
+smaller than it is by what pulse and beam spill into it. So grey levels are turned back into power before they are averaged.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.files.volumes import Volume
+from recon.freehand import volume_compounding
+from recon.freehand.volume_compounding import Clip, Grid
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+
+BRIGHTEST = 10**0.8  # times tissue: what is brighter counts as 8 dB above it, such as walls square to the beam
+MEDIAN_OF_MEAN = np.log(2)  # of the power of speckle, which is exponentially distributed
+
+
+@dataclass(frozen=True)
+class EchoPower:
+    """Mean power, relative to the tissue's typical one, and where a pixel fell."""
+
+    volume: Volume  # voxels (nz, ny, nx) float32; x along the array, y into the depth, z across the images
+    weight: Map  # (nz, ny, nx) pixels that a voxel is the mean of
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Voxels that a pixel fell into : (nz, ny, nx)."""
+        return self.weight > 0
+
+
+def typical_grey(images: NDArray, rows: slice) -> float:
+    """Median grey level of some rows of images : (n, h, w): that of tissue, where most of what they show is tissue."""
+    return float(np.median(images[:, rows]))
+
+
+def beam_grid(world_from_pixel: Array, shape: tuple[int, int], spacing_mm: float, clip: Clip | None = None) -> Grid:
+    """The grid along the mean array (x) and beam (y) of images (h, w) with poses : (n, 4, 4), that takes in all of them."""
+    around = volume_compounding.corners(world_from_pixel, shape, clip)
+    found = world_from_pixel[np.isfinite(world_from_pixel).all(axis=(1, 2))]
+    axes = found[:, :3, :2] / np.linalg.norm(found[:, :3, :2], axis=1, keepdims=True)
+    array, beam = axes.mean(axis=0).T
+    beam = beam / np.linalg.norm(beam)
+    array = array - beam * (array @ beam)
+    if np.linalg.norm(array) < 0.5:
+        raise InputError("poses: expected arrays that point about one way, found them all round")
+    array = array / np.linalg.norm(array)
+    directions = np.column_stack([array, beam, np.cross(array, beam)])
+    low, high = (around @ directions).min(axis=0), (around @ directions).max(axis=0)
+    nx, ny, nz = np.ceil((high - low) / spacing_mm).astype(int) + 1
+    return Grid((int(nx), int(ny), int(nz)), directions @ low, np.full(3, float(spacing_mm)), directions)
+
+
+def averaged(
+    images: Iterable[NDArray],
+    world_from_pixel: Array,
+    grid: Grid,
+    tissue_grey: float,
+    dynamic_range_db: float = 60.0,
+    clip: Clip | None = None,
+) -> EchoPower:
+    """Average the power of B-scans : n times (h, w) uint8, log-compressed, on a grid.
+
+    `tissue_grey` is the median level of tissue, which gets a mean power of 1. A `clip` should leave out the ringing at the face.
+    """
+    table = powers(tissue_grey, dynamic_range_db)
+
+    def parts() -> Iterator[tuple[Map, Map, Map]]:
+        for image in images:
+            left, right, top, bottom = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
+            v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
+            yield table[image[top : bottom + 1, left : right + 1]], u, v
+
+    return accumulated(parts(), world_from_pixel, grid)
+
+
+def powers(tissue_grey: float, dynamic_range_db: float = 60.0) -> Map:
+    """Power of each grey level : (256,), relative to the mean of tissue whose median level is given."""
+    decibels = (np.arange(256) - tissue_grey) * dynamic_range_db / 255
+    table = np.minimum(MEDIAN_OF_MEAN * 10 ** (decibels / 10), BRIGHTEST)
+    table[0] = 0
+    return table.astype(np.float32)
+
+
+def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, grid: Grid) -> EchoPower:
+    """Average powers on a grid, each counting for the eight voxels around it by its distance.
+
+    Parameters
+    ----------
+    parts : n times (power, u, v), of one shape
+        Power, NaN where it isn't to count, and the places in the image.
+    world_from_pixel : (n, 4, 4)
+        Images with a NaN are left out.
+
+    Raises
+    ------
+    InputError
+        If the grid needs too much memory, or there are more or fewer images than poses.
+    """
+    shape = grid.size[::-1]
+    if np.prod(grid.size, dtype=float) * 8 > volume_compounding.MOST_BYTES:
+        raise InputError(
+            f"power: expected at most {volume_compounding.MOST_BYTES / 2**30:.0f} GiB, found {' x '.join(map(str, shape))} voxels"
+        )
+    value, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    voxel_from_world = np.linalg.inv(Volume(value, grid.origin, grid.spacing, grid.directions).world_from_voxel)
+    count = 0
+    for power, u, v in parts:
+        if count == len(world_from_pixel):
+            raise InputError(f"images: expected as many as poses, {count}, found more")
+        matrix = voxel_from_world @ world_from_pixel[count]
+        count += 1
+        if np.isfinite(matrix).all():
+            _add(power.ravel(), u.ravel(), v.ravel(), matrix, value, weight)
+    if count < len(world_from_pixel):
+        raise InputError(f"images: expected as many as poses, {len(world_from_pixel)}, found {count}")
+    value /= np.maximum(weight, 1e-6)
+    return EchoPower(Volume(value, grid.origin, grid.spacing, grid.directions), weight)
+
+
+@njit(cache=True)
+def _add(power, u, v, m, value, weight):
+    nz, ny, nx = value.shape
+    for n in range(power.size):
+        if not np.isfinite(power[n]):
+            continue
+        x = m[0, 0] * u[n] + m[0, 1] * v[n] + m[0, 3]
+        y = m[1, 0] * u[n] + m[1, 1] * v[n] + m[1, 3]
+        z = m[2, 0] * u[n] + m[2, 1] * v[n] + m[2, 3]
+        i0, j0, k0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+        for k in range(max(k0, 0), min(k0 + 2, nz)):
+            for j in range(max(j0, 0), min(j0 + 2, ny)):
+                for i in range(max(i0, 0), min(i0 + 2, nx)):
+                    share = np.float32((1 - abs(x - i)) * (1 - abs(y - j)) * (1 - abs(z - k)))
+                    value[k, j, i] += share * power[n]
+                    weight[k, j, i] += share

@@ -1,0 +1,216 @@
+"""From the images of a pattern sequence to projector coordinates, with their predicted noise."""
+
+from collections import Counter
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns
+from recon.structured_light import gray_code, multi_frequency, plausibility
+from recon.structured_light.gray_code import Orders
+from recon.structured_light.phase import DEFAULT_NOISE, Fringe, Noise, estimate_noise, wrapped_phase
+from recon.structured_light.unwrapping import continuity, spatial
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+NoiseSource = Literal["given", "measured", "assumed"]
+Measured = tuple[Fringes, Fringe]
+Guide = tuple[GrayCode | CentreLine, NDArray, int]  # the part, its images, the first one's place in the sequence
+
+DARKEST = 4.0  # DN of 255: default of the least modulation
+SMALLEST = 8  # px, an image's shorter side: what continuity is told from
+WORST_SIGMA = 0.3  # rad of predicted phase noise: beyond, orders can't be decided
+
+
+class Status(IntEnum):
+    """What became of a pixel."""
+
+    OK = 0
+    DARK = 1  # too little modulation
+    SATURATED = 2  # at full scale in a fringe image
+    UNREACHABLE = 3  # a surface that the centre line doesn't reach
+    UNCERTAIN = 4  # the order can't be told: a tear, a border, contradicting bits or pitches
+    OUTSIDE = 5  # decoded to a coordinate beyond the projector's image
+
+
+# Numba takes no enumeration members as constants.
+OK, UNREACHABLE, UNCERTAIN, OUTSIDE = map(int, (Status.OK, Status.UNREACHABLE, Status.UNCERTAIN, Status.OUTSIDE))
+
+
+@dataclass(frozen=True)
+class ProjectorMap:
+    """Projector coordinates seen by a camera. All images (h, w)."""
+
+    columns: Image | None  # projector px, NaN where unknown; None if not encoded
+    rows: Image | None
+    sigma_columns: Image | None  # projector px, predicted standard deviation, NaN where unknown
+    sigma_rows: Image | None
+    modulation: Image  # DN, of the first axis
+    offset: Image  # DN
+    phase: Image  # rad, wrapped, of the first axis
+    status: NDArray[np.uint8]  # Status; OK where every encoded axis is
+    noise: Noise  # of one image
+    summary: dict[str, int]  # pixels by status in lower case; regions, islands, disputed with a centre line
+    noise_source: NoiseSource = "given"  # by the caller, measured on the fringes, or assumed, as they are too few to measure it
+
+
+def decode(
+    images: NDArray,
+    patterns: Patterns,
+    *,
+    bits: int = 8,
+    noise: Noise | None = None,
+    min_modulation_dn: float | None = None,
+    name: str = "images",
+) -> ProjectorMap:
+    """Decode a camera's images of a pattern sequence.
+
+    The projector coordinate is `x = origin + pitch * (phase / 2 pi + k)`, its noise `pitch / (2 pi) * sigma_phase`.
+
+    Parameters
+    ----------
+    images : (n, h, w) uint8 or uint16, DN
+        One an image of the sequence, in its order.
+    patterns : Patterns
+        The sequence.
+    bits : int
+        Full scale is `2**bits - 1`.
+    noise : Noise, optional
+        Of one image. If not given it is measured from fringes of eight or more steps; with fewer steps a default stands in;
+        the map's `noise_source` says which.
+    min_modulation_dn : float, optional
+        Fringes weaker than this are dark; 4 DN of 255 if not given.
+    name : str
+        Of the images, for messages, such as `surface/cam1`.
+
+    Raises
+    ------
+    InputError
+        If the number or the size of the images is wrong, they are black or saturated, or they do not follow the sequence.
+    """
+    images = np.asarray(images)
+    if images.ndim != 3 or len(images) != patterns.count:
+        raise InputError(f"{name}: expected {patterns.count} grey images of one size, found an array of shape {images.shape}")
+    if min(images.shape[1:]) < SMALLEST:
+        found = f"{images.shape[2]}x{images.shape[1]}"
+        raise InputError(f"{name}: expected images of {SMALLEST}x{SMALLEST} px or more, found {found}")
+    full = 2.0**bits - 1
+    least = DARKEST * full / 255 if min_modulation_dn is None else min_modulation_dn
+    parts = patterns.slices()
+    noise, source = _noise(images, parts, full, noise)
+    axes: dict[Axis, tuple[Image, Image]] = {}
+    fringes: dict[Axis, Fringe] = {}
+    status = np.zeros(images.shape[1:], np.uint8)
+    counts: Counter[str] = Counter()
+    for axis in patterns.axes:
+        sets = []
+        for part, place in parts:
+            if isinstance(part, Fringes) and part.axis == axis:
+                fringe = wrapped_phase(images[place], part.shifts, noise=noise, saturation=full)
+                where = f"{name}: images {place.start} to {place.stop - 1}"
+                plausibility.check_fringes(images[place], part, fringe, least, full, where, place.start)
+                sets.append((part, fringe))
+        part, fringe = min(sets, key=lambda pair: pair[0].pitch)
+        stage = _quality([f for _, f in sets], least)
+        guides = [
+            (p, images[place], place.start) for p, place in parts if isinstance(p, GrayCode | CentreLine) and p.axis == axis
+        ]
+        orders, unreachable, found = _orders(patterns, axis, sets, guides, stage == Status.OK, noise, name)
+        counts.update(found)
+        x, sigma = _coordinates(fringe.phase, fringe.sigma, orders.order, orders.trusted, unreachable, stage,
+                                part.zero(patterns.length(axis)), part.pitch, patterns.length(axis))  # fmt: skip
+        axes[axis], fringes[axis] = (x, sigma), fringe
+        status = np.where(status == Status.OK, stage, status)
+    first = fringes[patterns.axes[0]]
+    columns, rows = axes.get("columns", (None, None)), axes.get("rows", (None, None))
+    pixels = np.bincount(status.ravel(), minlength=len(Status)).tolist()
+    summary = {s.name.lower(): pixels[s] for s in Status} | dict(counts)
+    return ProjectorMap(
+        columns[0], rows[0], columns[1], rows[1], first.modulation, first.offset, first.phase, status, noise, summary, source
+    )
+
+
+def _noise(images: NDArray, parts: list[tuple[AnyPart, slice]], full: float, given: Noise | None) -> tuple[Noise, NoiseSource]:
+    """The noise given, else measured on the first fringes that allow it, else a common camera's."""
+    if given is not None:
+        return given, "given"
+    for part, place in parts:
+        if isinstance(part, Fringes) and (found := estimate_noise(images[place], part.shifts, saturation=full)) is not None:
+            return found, "measured"
+    return DEFAULT_NOISE.scaled(full / 255), "assumed"
+
+
+def _quality(fringes: list[Fringe], least: float) -> NDArray[np.uint8]:
+    """OK, DARK or SATURATED : (h, w), the worst over the sets of fringes."""
+    dark = np.zeros(fringes[0].phase.shape, bool)
+    saturated = dark.copy()
+    for fringe in fringes:
+        dark |= (fringe.modulation < least) | (fringe.sigma > WORST_SIGMA)
+        saturated |= fringe.saturated
+    return np.where(saturated, np.uint8(Status.SATURATED), np.where(dark, np.uint8(Status.DARK), np.uint8(Status.OK)))
+
+
+def _orders(
+    patterns: Patterns, axis: Axis, sets: list[Measured], guides: list[Guide], valid: Mask, noise: Noise, name: str
+) -> tuple[Orders, Mask, dict[str, int]]:
+    """Fringe orders by the sequence's way of unwrapping, where no line reaches, and what there is to count."""
+    length = patterns.length(axis)
+    nowhere = np.zeros(valid.shape, bool)
+    part, fringe = min(sets, key=lambda pair: pair[0].pitch)
+    if patterns.unwrap == "heterodyne":
+        orders = multi_frequency.fringe_order(sets, length)
+        plausibility.check_pitches(orders.trusted, valid, f"{name}: fringes of {axis}")
+        return orders, nowhere, {}
+    guide, images, start = guides[0]
+    if isinstance(guide, CentreLine):
+        return _from_line(guide, images[0], part, fringe, valid, length, axis, f"{name}: image {start}")
+    orders, residual = gray_code.fringe_order(images, guide, part, fringe, length, noise)
+    place = f"{name}: images {start} to {start + guide.count - 1}"
+    plausibility.check_code(orders.order, residual, guide, part, fringe.phase, valid, length, place)
+    if not guide.complementary:  # a fifth of the pixels lies too near the period borders: fill in from both sides
+        cycles = fringe.phase * np.float32(1 / (2 * np.pi))
+        flags = continuity.continuity(cycles, fringe.sigma, valid)
+        known = orders.trusted & valid
+        orders = Orders(*continuity.carry(orders.order, known, cycles, fringe.sigma, flags, continuity.CLEAN, continuity.REACH))
+    return orders, nowhere, {}
+
+
+def _from_line(
+    line: CentreLine, image: NDArray, part: Fringes, fringe: Fringe, valid: Mask, length: int, axis: Axis, place: str
+) -> tuple[Orders, Mask, dict[str, int]]:
+    """Orders by the centre line; for rows everything is turned, so that the line stands upright."""
+    plausibility.check_light(image, fringe, valid, place)
+    turned = axis == "rows"
+    if turned:
+        fringe = Fringe(*(np.ascontiguousarray(getattr(fringe, f.name).T) for f in fields(fringe)))
+        image, valid = np.ascontiguousarray(image.T), np.ascontiguousarray(valid.T)
+    turns = (line.middle(length) - part.zero(length)) / part.pitch
+    found = spatial.unwrap(fringe, valid, image, turns, line.width / part.pitch)
+    plausibility.check_line(found.sightings, found.votes, found.residual, place)
+    order, known, unreachable = (m.T if turned else m for m in (found.order, found.known, found.unreachable))
+    return Orders(order, known), unreachable, {"regions": found.regions, "islands": found.islands, "disputed": found.disputed}
+
+
+@njit(cache=True, parallel=True)
+def _coordinates(phase, sigma, order, trusted, unreachable, status, origin, pitch, length):
+    """Projector coordinates and their noise, NaN where unknown; writes the reasons into `status`."""
+    height, width = phase.shape
+    x, sx = np.full((height, width), np.nan, np.float32), np.full((height, width), np.nan, np.float32)
+    for v in prange(height):
+        for u in range(width):
+            if status[v, u] != OK:
+                continue
+            if not trusted[v, u]:
+                status[v, u] = UNREACHABLE if unreachable[v, u] else UNCERTAIN
+                continue
+            value = origin + pitch * (phase[v, u] / (2 * np.pi) + order[v, u])
+            if value < -0.5 or value > length - 0.5:
+                status[v, u] = OUTSIDE
+                continue
+            x[v, u], sx[v, u] = value, pitch / (2 * np.pi) * sigma[v, u]
+    return x, sx

@@ -1,0 +1,165 @@
+"""Do the images follow the sequence? What only a wrong order, exposure or file would show is refused, in one line."""
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.model.patterns import Fringes, GrayCode
+from recon.structured_light.phase import Fringe, sample_pixels
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+CHECK_SAMPLES = 10_000  # pixels looked at to judge a sequence
+LIT_SHARE = 0.002  # share of the image that must carry fringes
+SATURATED_SHARE = 0.5  # share of the lit image that may be saturated
+HARMONIC_SHARE = 0.08  # of the modulation, found in the high harmonics: more is not an N-step sequence
+LINE_SHARE = 0.3  # share of the fringes' area that may be lit in the image of a line
+MIN_SIGHTINGS = 10  # rows in which the line must be seen
+LINE_OFF = 0.06  # cycle that the line may lie off the fringes; a fringe image out of its place is a step, 1/8 or so
+LOPSIDED = 0.05  # share of the pixels by which residuals of the Gray code may lie to one side, beyond what cells allow
+ASTRAY = 0.3  # share that may lie beyond on both sides; of fringes that run backwards it is 0.75
+JUMPS = 0.025  # share of the code's borders at which the order may jump; the coarsest bits change at 3 % of them
+CROWDED = 4.0  # times as often as elsewhere: steps of the surface lie anywhere, wrong bits at the borders
+CONTINUES = 0.6 / (2 * np.pi)  # cycle between two pixels: less is taken for one surface
+FEW = 20  # pixels that prove nothing
+CONTRADICTED = 0.7  # share of the pixels whose pitches contradict each other; of unrelated phases it is 0.8 or more
+
+
+def check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, full: float, place: str, start: int) -> None:
+    """Refuse black, saturated and out-of-order fringes."""
+    samples, beside = (sample_pixels(view, CHECK_SAMPLES) for view in (images[:, :, :-1], images[:, :, 1:]))
+    swing = np.ptp(samples, axis=0)
+    if np.mean(swing > 2 * least) < LIT_SHARE:
+        if np.median(samples) > 0.95 * full:
+            raise InputError(f"{place} are saturated all over, expected fringes: shorten the exposure")
+        level = np.median(swing) / 2
+        raise InputError(f"{place} hold no fringes: expected a modulation of {least:.0f} DN or more, found {level:.1f} DN")
+    saturated, lit = np.count_nonzero(fringe.saturated), np.count_nonzero(fringe.saturated | (fringe.modulation > least))
+    if saturated > SATURATED_SHARE * lit:
+        share = 100 * saturated / lit
+        raise InputError(f"{place} are saturated in {share:.0f} % of the lit pixels, expected under half: shorten the exposure")
+    useful = (swing > 2 * least) & (samples.max(axis=0) < full)
+    if useful.any():
+        _check_order(samples[:, useful], beside[:, useful], part, place, start)
+
+
+def _check_order(samples: Image, beside: Image, part: Fringes, place: str, start: int) -> None:
+    """Refuse images that don't follow the N-step sequence: swapped images put power into the high temporal harmonics.
+
+    A projector's gamma fills harmonic 2, binary fringes the odd ones; those are not looked at. Noise differs between the
+    samples and the pixels beside them, swapped images do not: their product is free of noise.
+    """
+    n = part.steps
+    harmonics = [k for k in range(3, n // 2 + 1) if part.waveform == "sine" or (n % 2 == 0 and k % 2 == 0)]
+    if not harmonics:
+        return
+    spread = np.sum((samples - samples.mean(axis=0)) * (beside - beside.mean(axis=0)))
+
+    def strange(order: NDArray[np.intp]) -> float:
+        time = 2 * np.pi * np.outer(harmonics, np.arange(n)) / n
+        waves = np.concatenate([np.cos(time), np.sin(time)])[:, order]
+        return float(np.sqrt(max(np.sum((waves @ samples) * (waves @ beside)) * 2 / n / max(spread, 1.0), 0.0)))
+
+    if strange(np.arange(n)) < HARMONIC_SHARE:
+        return
+    best, suspects = HARMONIC_SHARE, ""
+    for a, b in itertools.combinations(range(n), 2):
+        order = np.arange(n)
+        order[[a, b]] = b, a
+        if (left := strange(order)) < best:
+            best, suspects = left, f", {start + a} and {start + b} look exchanged"
+    raise InputError(f"{place} do not follow the {n}-step sequence{suspects}: are they in the manifest's order?")
+
+
+def check_light(image: NDArray, fringe: Fringe, valid: Mask, place: str) -> None:
+    """Refuse an image in the place of the line that is lit all over."""
+    bright = np.mean((image > fringe.offset)[valid]) if valid.any() else 0.0
+    if bright > LINE_SHARE:
+        raise InputError(
+            f"{place} is bright over {100 * bright:.0f} % of the fringes, not a line: is it in the manifest's order?"
+        )
+
+
+def check_line(sightings: int, votes: int, residual: float, place: str) -> None:
+    """Refuse a line that isn't seen, or whose middle doesn't have the phase that it must have: fringes in a wrong order.
+
+    Images shifted round by one turn every phase by one step, reversed ones count from the other end; either is a perfect N-step
+    sequence.
+    """
+    if sightings >= MIN_SIGHTINGS and abs(residual) > LINE_OFF:
+        raise InputError(
+            f"{place}: the line lies {abs(residual):.2f} period off the fringes: are the images in the manifest's order?"
+        )
+    if votes < MIN_SIGHTINGS:
+        raise InputError(f"{place} shows no centre line: expected it in {MIN_SIGHTINGS} rows or more, found it in {votes}")
+
+
+def check_code(
+    order: NDArray[np.int32],
+    residual: Image,
+    code: GrayCode,
+    fringes: Fringes,
+    phase: Image,
+    valid: Mask,
+    length: int,
+    place: str,
+) -> None:
+    """Refuse bits or fringes in a wrong order.
+
+    Parameters
+    ----------
+    order, residual : (h, w)
+        Of `graycode.fringe_order`, trusted or not.
+    code, fringes : GrayCode, Fringes
+    phase : (h, w), rad
+    valid : (h, w) bool
+    length : int, projector px
+    place : str
+        The code's images, for messages.
+    """
+    if code.complementary:
+        _check_residuals(residual[valid], place)
+    if code.axis == "rows":
+        order, phase, valid = order.T, phase.T, valid.T
+    # A cell's borders lie at these phases, in cycles; without the complementary bit noise moves the order by one at them.
+    cells, slip = (2, 0) if code.complementary else (1, 1)
+    border = (code.origin(length) - fringes.zero(length)) / fringes.pitch
+    order, cycles, valid = order[::4], phase[::4] / np.float32(2 * np.pi), valid[::4]
+    turn = np.diff(cycles, axis=1)
+    whole = np.rint(turn)
+    continues = valid[:, 1:] & valid[:, :-1] & (np.abs(turn - whole) < CONTINUES)
+    jump = continues & (np.abs(np.diff(order, axis=1) + whole) > slip + 0.5)
+    left, right = (np.floor((c - border) * cells) for c in (cycles[:, :-1], cycles[:, 1:] - whole))
+    crossed = left != right
+    near = crossed.copy()  # a blurred bit flips a pixel early or late
+    near[:, 1:] |= crossed[:, :-1]
+    near[:, :-1] |= crossed[:, 1:]
+    borders, there, elsewhere = (np.count_nonzero(continues & m) for m in (crossed, near, ~near))
+    wrong, chance = np.count_nonzero(jump & near), np.count_nonzero(jump & ~near) / max(elsewhere, 1) * there
+    if wrong > max(JUMPS * borders, FEW, CROWDED * chance):
+        share = 100 * min(wrong / max(borders, 1), 1)
+        raise InputError(f"{place}: fringe orders jump at {share:.0f} % of the code's borders: are they in the manifest's order?")
+
+
+def _check_residuals(residual: Image, place: str) -> None:
+    """Refuse fringes that don't fit the cells of the code; in the right order the residual spreads over +-0.25 cycle."""
+    above, below = (np.count_nonzero(side) for side in (residual > 0.25, residual < -0.25))
+    if max(abs(above - below) - LOPSIDED * residual.size, above + below - ASTRAY * residual.size) > FEW:
+        off = abs(float(residual.mean()))
+        raise InputError(
+            f"{place}: the code lies {off:.2f} period off the fringes in the mean, and over a quarter period in "
+            f"{100 * (above + below) / residual.size:.0f} % of the pixels: are the images in the manifest's order?"
+        )
+
+
+def check_pitches(trusted: Mask, valid: Mask, place: str) -> None:
+    """Refuse sets of fringes whose phases contradict each other nearly everywhere."""
+    lit = np.count_nonzero(valid)
+    lost = lit - np.count_nonzero(trusted & valid)
+    if lost > max(CONTRADICTED * lit, FEW):
+        raise InputError(
+            f"{place} contradict each other in {100 * lost / lit:.0f} % of the pixels: are they in the manifest's order?"
+        )

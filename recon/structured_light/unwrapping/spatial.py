@@ -1,0 +1,241 @@
+"""Spatial unwrapping from a projected centre line: surfaces that continue to the line get its absolute fringe order.
+
+A wrapped phase can be followed across a surface, not across a jump. Pixels are gathered into cells of 4x4 that are continuous
+in themselves; cells into basins, cut off at bottlenecks; basins into regions, where most of their common border is continuous.
+Two surfaces that touch in the image with a varying jump between them agree by chance wherever the jump passes a whole number
+of periods: that opening in an otherwise torn border is a bottleneck, and is refused. The line then gives each region its
+absolute order, by vote. A region without the line is reported as unreachable, one whose votes disagree as disputed.
+
+Only a jump that is a whole number of periods (within the noise, some 0.2 to 0.4 rad) along most of the border between two
+surfaces, or along an opening as wide as the smaller of them, can fool this, as it fools anything that sees the phase alone: Gray
+code or a second pitch is needed there. Gaps (shadow, dark spots) every few pixels leave no continuous cell and cost coverage.
+"""
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from recon.structured_light.phase import Fringe
+from recon.structured_light.unwrapping import continuity, watershed
+from recon.structured_light.unwrapping.continuity import CLEAN, INCOMPLETE, TORN, VOID, wrap
+from recon.structured_light.unwrapping.merging import Borders, join
+from recon.structured_light.unwrapping.watershed import CELL, NONE
+
+MARGIN_CELLS = 3  # cells that a basin grows into torn ground, so that neighbours across a tear meet
+LINE_LEVEL = 0.25  # of full light: brighter is the line
+RESIDUAL = 0.2  # cycle that a vote may be off a whole order
+
+Flags = NDArray[np.uint8]
+Integers = NDArray[np.int32]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Unwrapped:
+    """Absolute fringe orders from the centre line."""
+
+    order: Integers  # (h, w)
+    known: Mask  # (h, w) where the order holds
+    unreachable: Mask  # (h, w) continuous surface that no line reaches
+    regions: int  # with the line
+    islands: int  # without
+    disputed: int  # in which the line's votes disagree
+    votes: int  # sightings of the line on continuous surface that name an order
+    sightings: int  # all of them
+    residual: float  # cycle, in +-0.5, by which the line lies off the fringes, in the median over the sightings
+
+
+def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: float) -> Unwrapped:
+    """Unwrap along the surface, starting from the centre line.
+
+    Parameters
+    ----------
+    fringe : Fringe
+        The decoded fringes, (h, w); the line may run in any direction but along the rows.
+    valid : (h, w) bool
+        Pixels with enough modulation.
+    line : (h, w), DN
+        The image of the line.
+    turns : float, cycles
+        The absolute phase of the line's middle: (line - origin) / pitch.
+    width : float, cycles
+        The line's width.
+
+    Returns
+    -------
+    Unwrapped
+        With `sightings` zero if the line is nowhere to be seen, `residual` far from zero if the fringes are not what they are
+        taken for; both are for the caller to judge.
+    """
+    phase = fringe.phase * np.float32(1 / (2 * np.pi))
+    flags = continuity.continuity(phase, fringe.sigma, valid)
+    relative, state, right, down = watershed.gather(phase, flags)
+    distance = watershed.depth(state)
+    basin, offset, broken = watershed.flood(distance, right, down)
+    basin, broken, count = watershed.number(basin, broken)
+    light = (line, fringe.offset, fringe.modulation, fringe.sigma)
+    places, values, residuals = _sight(*light, valid, phase, relative, basin, offset, turns, width)
+    near = np.abs(residuals) < RESIDUAL
+    votes: dict[int, Counter] = defaultdict(Counter)
+    for place, value in zip(places[near].tolist(), values[near].tolist(), strict=True):
+        votes[place][value] += 1
+    ground = _grow(state, basin)
+    found = join(count, _borders(state, ground, offset, right, down), votes, broken)
+    base = np.array([found.absolute.get(r, 0) for r in found.region.tolist()], np.int32)
+    resolved = np.array([r in found.absolute for r in found.region.tolist()], bool)
+    contested = np.array([r in found.disputed for r in found.region.tolist()], bool)
+    cells = offset + np.append(base + found.lift, 0)[basin].astype(np.int32)
+    home = np.where(basin >= 0, np.append(found.region, -1)[basin], -1).astype(np.int32)
+    frontier = _frontier(np.where(ground >= 0, np.append(found.region, -1)[ground], -1))
+    # A continuous cell right at the frontier may hold pixels of both surfaces; no order is carried within two cells of it.
+    closed = _leaks(distance, home, cells, right, down) | _dilated(frontier, 1) | ((basin < 0) & _dilated(frontier, 2))
+    reached = (basin >= 0) & np.append(resolved, False)[basin] & ~closed
+    island = (basin >= 0) & ~np.append(resolved | contested, True)[basin] & ~closed
+    order, known, unreachable = _to_pixels(relative, flags, basin, cells, reached, island, closed)
+    order, known = continuity.carry(order, known, phase, fringe.sigma, flags, CLEAN, continuity.REACH)
+    order, known = continuity.carry(order, known, phase, fringe.sigma, flags, INCOMPLETE, continuity.BLIND_REACH)
+    islands = len(set(found.region.tolist()) - set(found.absolute) - found.disputed)
+    sighted = int(np.count_nonzero(near)), len(values), _circular_median(residuals)
+    return Unwrapped(order, known, unreachable, len(found.absolute), islands, len(found.disputed), *sighted)
+
+
+@njit(cache=True)
+def _sight(line, offset, modulation, sigma, valid, phase, relative, basin, cell_order, turns, width):
+    """Sightings of the line on continuous ground: the basin, the absolute order of the basin's root cell, cycles off a whole."""
+    rows, columns = basin.shape
+    places, values, residuals = [np.int32(0) for _ in range(0)], [np.int32(0) for _ in range(0)], [0.0 for _ in range(0)]
+    for v in range(rows * CELL):
+        u = 0
+        while u < columns * CELL:
+            start, weight, moment, extent = u, 0.0, 0.0, 0.0
+            while u < columns * CELL and valid[v, u]:
+                level = (line[v, u] - max(offset[v, u] - modulation[v, u], np.float32(0))) / (2 * modulation[v, u])
+                if level < LINE_LEVEL + 4 * sigma[v, u]:
+                    break
+                if u > start:
+                    extent += abs(wrap(phase[v, u] - phase[v, u - 1]))
+                weight += level
+                moment += level * u
+                u += 1
+            if u - start >= 2 and extent < 1.5 * width + 0.3:
+                middle = moment / weight
+                near = int(np.floor(middle + 0.5))
+                place = basin[v // CELL, near // CELL]
+                if place >= 0:
+                    other = near + 1 if middle > near else near - 1
+                    here = phase[v, near] + abs(middle - near) * wrap(phase[v, other] - phase[v, near])
+                    whole = np.floor(turns - here + 0.5)
+                    places.append(place)
+                    values.append(np.int32(whole) - relative[v, near] - cell_order[v // CELL, near // CELL])
+                    residuals.append(turns - here - whole)
+            u = max(u, start + 1)
+    return np.array(places), np.array(values), np.array(residuals)
+
+
+def _circular_median(cycles: NDArray[np.float64]) -> float:
+    """The median of values in +-0.5 that wrap around, 0 of none: about their mean direction."""
+    if not cycles.size:
+        return 0.0
+    middle = float(np.angle(np.mean(np.exp(2j * np.pi * cycles))) / (2 * np.pi))
+    return float(wrap(np.float64(middle + np.median(wrap(cycles - middle)))))
+
+
+def _borders(state: Flags, ground: Integers, offset: Integers, right: NDArray[np.int8], down: NDArray[np.int8]) -> Borders:
+    """Count the contacts between basins that have grown into the torn ground between them."""
+    continuous: dict[tuple[int, int], Counter] = defaultdict(Counter)
+    torn: Counter = Counter()
+    for steps, here, there in ((right, np.s_[:, :-1], np.s_[:, 1:]), (down, np.s_[:-1], np.s_[1:])):
+        p, q, step = ground[here], ground[there], steps[here]
+        meet = (p != q) & (p >= 0) & (q >= 0)
+        jump = step + offset[here] - offset[there]  # order of q's root less that of p's, as the two cells see it
+        ripped = (state[here] == TORN) | (state[there] == TORN) | ((state[here] == CLEAN) & (state[there] == CLEAN))
+        whole, rip = meet & (step != NONE), meet & (step == NONE) & ripped
+        for a, b, k in zip(p[whole].tolist(), q[whole].tolist(), jump[whole].tolist(), strict=True):
+            continuous[min(a, b), max(a, b)][k if a < b else -k] += 1
+        torn.update((min(a, b), max(a, b)) for a, b in zip(p[rip].tolist(), q[rip].tolist(), strict=True))
+    return Borders(continuous, torn)
+
+
+@njit(cache=True)
+def _grow(state, basin):
+    """Let the basins grow into torn cells, one ring a pass; a cell in reach of several takes the first it meets."""
+    rows, columns = basin.shape
+    ground = basin.copy()
+    for _ in range(MARGIN_CELLS):
+        before = ground.copy()
+        for i in range(rows):
+            for j in range(columns):
+                if before[i, j] >= 0 or state[i, j] == VOID:
+                    continue
+                for di, dj in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+                    if 0 <= i + di < rows and 0 <= j + dj < columns and before[i + di, j + dj] >= 0:
+                        ground[i, j] = before[i + di, j + dj]
+                        break
+    return ground
+
+
+@njit(cache=True)
+def _leaks(distance, home, cells, right, down):
+    """Cells near a continuous contact that was refused: the jump between the two surfaces lies somewhere in the opening.
+
+    The opening is as wide as the contact is far from the nearest gap, on both sides; the border can bulge that far.
+    """
+    rows, columns = distance.shape
+    leaking = np.zeros((rows, columns), np.bool_)
+    for i in range(rows):
+        for j in range(columns):
+            for way in range(2):
+                step = down[i, j] if way else right[i, j]
+                if step == NONE:
+                    continue
+                y, x = (i + 1, j) if way else (i, j + 1)
+                if home[i, j] == home[y, x] and cells[y, x] - cells[i, j] == step:
+                    continue
+                reach = min(distance[i, j], distance[y, x]) + 2
+                for a in range(max(i - reach, 0), min(y + reach + 1, rows)):
+                    for b in range(max(j - reach, 0), min(x + reach + 1, columns)):
+                        leaking[a, b] = True
+    return leaking
+
+
+def _frontier(home: Integers) -> Mask:
+    """Cells at the border between the grounds of two regions."""
+    border = np.zeros(home.shape, bool)
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        meet = (home[here] != home[there]) & (home[here] >= 0) & (home[there] >= 0)
+        border[here] |= meet
+        border[there] |= meet
+    return border
+
+
+def _dilated(mask: Mask, cells: int) -> Mask:
+    """The mask, grown by a number of cells all round."""
+    side = 2 * cells + 1
+    return cv2.dilate(mask.view(np.uint8), np.ones((side, side), np.uint8)).view(bool)
+
+
+@njit(cache=True, parallel=True)
+def _to_pixels(relative, flags, basin, cells, reached, island, closed):
+    """Orders of the cells to their pixels.
+
+    Islands, leaks and frontiers are marked in the flags, so that no order is carried into them.
+    """
+    height, width = flags.shape
+    rows, columns = basin.shape
+    order = np.zeros((height, width), np.int32)
+    known, unreachable = np.zeros((height, width), np.bool_), np.zeros((height, width), np.bool_)
+    for v in prange(rows * CELL):
+        for u in range(columns * CELL):
+            i, j = v // CELL, u // CELL
+            if reached[i, j]:
+                order[v, u], known[v, u] = cells[i, j] + relative[v, u], True
+            elif closed[i, j]:
+                flags[v, u] = min(flags[v, u], np.uint8(TORN))
+            elif basin[i, j] >= 0:
+                unreachable[v, u] = island[i, j]
+                flags[v, u] = VOID
+    return order, known, unreachable

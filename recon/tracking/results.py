@@ -1,0 +1,128 @@
+"""Results of tracking: a step of a kilobyte for each pair of frames, the track that the steps make, its tables and pictures."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.capture import manifest, sweep_tables
+from recon.capture.stereo_frames import Film, Pair
+from recon.capture.sweep_part import SCANNER, image_name
+from recon.geometry.camera import Camera
+from recon.model.tracks import Track
+from recon.tracking import overlays
+from recon.tracking.tracker import Tracking
+
+Array = NDArray[np.float64]
+
+POSES, FRAMES, OVERLAYS = "poses.csv", "frames.csv", "overlays"
+COLUMNS = (
+    "time_ns", "frame_cam1", "frame_cam2", "found", "how", "sigma_mm", "sigma_deg", "blur_px_cam1", "blur_px_cam2", "reason",
+)  # fmt: skip
+OVERLAY_WIDTH = 640  # px, of each view
+QUALITY = 88  # of JPEG
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A pair of frames, tracked: without its images and rims."""
+
+    time_ns: int
+    world_from_target: Array  # (4, 4) mm; NaN if it wasn't found
+    covariance: Array  # (6, 6), as in tracks.Track
+    how: str | None  # as of Tracking
+    reason: str | None  # None where the target was found
+    blur_px: tuple[float, float]  # the longest of each view
+    seconds: float  # that it took
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a pose."""
+        return self.reason is None
+
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """Predicted standard deviations, over all directions: mm and deg; NaN without a pose."""
+        turn, shift = (float(np.sqrt(np.trace(self.covariance[part, part]))) for part in (slice(0, 3), slice(3, 6)))
+        return shift, float(np.rad2deg(turn))
+
+
+def kept(found: Tracking, time_ns: int) -> Step:
+    """What is kept of a pair."""
+    pose, (first, second) = found.pose, found.views
+    blurs = float(np.fmax.reduce(first.blur_px)), float(np.fmax.reduce(second.blur_px))
+    return Step(time_ns, pose.world_from_target, pose.covariance, found.how, pose.reason, blurs, sum(found.seconds.values()))
+
+
+def track_of(steps: Sequence[Step]) -> Track:
+    """The track that n pairs make, in order of time."""
+    return Track(
+        np.array([step.time_ns for step in steps], np.int64),
+        np.array([step.world_from_target for step in steps]).reshape(-1, 4, 4),
+        np.array([step.covariance for step in steps]).reshape(-1, 6, 6),
+    )
+
+
+def write_poses(folder: Path, film: Film, steps: Sequence[Step]) -> None:
+    """Write `poses.csv`, the table that other verbs read, and `frames.csv`: how each pose was found, or why not."""
+    sweep_tables.write_track(folder / POSES, track_of(steps))
+    rows = (
+        [step.time_ns, *numbers, int(step.found), step.how or "", *_rounded([*step.sigmas, *step.blur_px]), step.reason or ""]
+        for numbers, step in zip(film.frames.tolist(), steps, strict=True)
+    )
+    sweep_tables.write_rows(folder / FRAMES, COLUMNS, rows)
+
+
+def overlay(pair: Pair, found: Tracking, cameras: Sequence[Camera]) -> NDArray[np.uint8]:
+    """Both views side by side : (h, w, 3) BGR, scaled down, with what was seen in them."""
+    shown = []
+    for image, view, camera in zip(pair, found.views, cameras, strict=True):
+        height = round(image.shape[0] * OVERLAY_WIDTH / image.shape[1])
+        size = (OVERLAY_WIDTH, height)
+        shown.append(cv2.resize(overlays.drawn(image, view, found.pose, camera), size, interpolation=cv2.INTER_AREA))
+    tallest = max(len(each) for each in shown)
+    return np.hstack([np.pad(each, ((0, tallest - len(each)), (0, 0), (0, 0))) for each in shown])
+
+
+def write_overlay(folder: Path, number: int, picture: NDArray[np.uint8]) -> None:
+    """Write an overlay as `overlays/0007.jpg`, making the folder."""
+    (folder / OVERLAYS).mkdir(exist_ok=True)
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    (folder / OVERLAYS / overlay_name(number)).write_bytes(data.tobytes())
+
+
+def overlay_name(number: int) -> str:
+    """File name of the overlay of camera 1's frame of a number."""
+    return image_name(number).replace(".png", ".jpg")
+
+
+def hand_on(folder: Path, source: Path, out: Path, optics: Path | None = None) -> bool:
+    """Make a folder of poses a capture: the one that they were found in, with them as its track. Only if it has B-scans.
+
+    Parameters
+    ----------
+    folder : where to write.
+    source : the capture.
+    out : where the folder is going to be.
+    optics : the calibration that they were found with, if it isn't the capture's own.
+    """
+    read = manifest.read_manifest(source)
+    if read.sweep is None or SCANNER not in read.sweep.images:
+        return False
+    source, out = source.resolve(), out.resolve()
+    root = source / read.root
+    files = {name: os.path.relpath(source / path, out) for name in ("calibration", "probe") if (path := getattr(read, name))}
+    if optics is not None:
+        files["calibration"] = os.path.relpath(optics.resolve(), out)
+    sweep = read.sweep.model_copy(update={"track": os.path.relpath(out / POSES, root)})
+    change = {"root": os.path.relpath(root, out), "sweep": sweep, **files}
+    manifest.write_manifest(folder, read.model_copy(update=change))
+    return True
+
+
+def _rounded(values: Sequence[float]) -> list[float | str]:
+    return [round(value, 5) if np.isfinite(value) else "" for value in values]

@@ -1,0 +1,311 @@
+"""What moves with the probe: the target's board, its bracket, the probe with its cable, and a hand or a robot that holds it.
+
+Everything is in the target's frame: c0 at the origin, c1 on x, c2 on y, z to the viewer, the board's front exactly in z = 0. The
+probe stands beside the board along z and points away from the viewer, as on the rig of Meza et al. 2021.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from recon.geometry import rigid
+from recon.model.rig import Target
+from scenes.handheld import hand as hands
+from scenes.handheld import lofts
+from scenes.handheld.mesh_parts import Part
+from scenes.handheld.probe_bodies import Body, body, parts_of
+
+Array = NDArray[np.float64]
+
+MARGIN_MM = 3.0  # of white around each disc, at least
+SHEET_MM = 0.05  # the print lies this far in front of the board's body, so that no two surfaces coincide
+TRIES = 40  # of a pose for the hand that covers no circle
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """How variants differ; fractions are of all variants."""
+
+    board: float = 0.08  # relative change of each side of the board
+    thickness_mm: tuple[float, float] = (1.5, 6.0)  # of the board
+    gap_mm: tuple[float, float] = (10.0, 48.0)  # between the board's edge and the probe
+    behind_mm: tuple[float, float] = (60.0, 125.0)  # the array behind the board's front
+    tilt_deg: float = 9.0  # standard deviation of the probe's axis from the board's normal
+    no_hand: float = 0.05  # neither a hand nor a robot
+    robot: float = 0.08
+    cable_in_front: float = 0.15
+    finger_in_front: float = 0.13
+
+
+@dataclass(frozen=True)
+class Board:
+    """The white front: a rectangle in z = 0."""
+
+    low: tuple[float, float]  # smallest x, y, mm
+    high: tuple[float, float]
+    thickness: float  # mm, with the plate behind it
+
+    @property
+    def middle(self) -> Array:
+        """The middle of the front : (2,) mm."""
+        return (np.array(self.low) + np.array(self.high)) / 2
+
+    @property
+    def size(self) -> Array:
+        """Width and height : (2,) mm."""
+        return np.array(self.high) - np.array(self.low)
+
+
+def held(rng: np.random.Generator, target: Target, ranges: Ranges | None = None) -> tuple[Part, ...]:
+    """One variant of all that moves rigidly with the target.
+
+    The first part is the target: one rectangle of two triangles in z = 0, facing +z. All other parts are closed bodies.
+    """
+    ranges = ranges or Ranges()
+    board_rng, probe_rng, bracket_rng, holder_rng, cable_rng, choice_rng = rng.spawn(6)
+    holder, cable_in_front = _choices(choice_rng, ranges)
+    board, parts = _board(board_rng, target, ranges)
+    target_from_body, probe, beside = _probe_pose(probe_rng, board, ranges)
+    parts += [_moved(part, target_from_body) for part in parts_of(probe, probe_rng)]
+    parts += _bracket(bracket_rng, board, probe, target_from_body)
+    discs = np.array([[0, 0], [target.c1_mm, 0], [0, target.c2_mm]])
+    if holder == "hand":
+        parts += _grip(holder_rng, board, probe, target_from_body, beside)
+    elif holder == "pinch":
+        parts += _pinch(holder_rng, board, discs, target.outer_diameter_mm / 2, beside)
+    elif holder == "robot":
+        parts += _robot(holder_rng, probe, target_from_body, beside)
+    covered = discs[cable_rng.integers(3)] if cable_in_front else None
+    parts += _cable(cable_rng, probe, target_from_body, beside, covered, target.outer_diameter_mm / 2)
+    return tuple(parts)
+
+
+def _choices(rng: np.random.Generator, ranges: Ranges) -> tuple[str, bool]:
+    """Who holds the probe, and whether the cable covers a part of a circle."""
+    draw = rng.uniform()
+    limits = np.cumsum([ranges.no_hand, ranges.robot, ranges.finger_in_front])
+    holder = ("none", "robot", "pinch", "hand")[int(np.searchsorted(limits, draw, side="right"))]
+    other = 1 - ranges.robot - ranges.finger_in_front
+    return holder, bool(holder in ("none", "hand") and rng.uniform() < ranges.cable_in_front / other)
+
+
+def _moved(part: Part, to_from: Array) -> Part:
+    return Part(part.slot, lofts.placed(part.mesh, to_from), part.smooth)
+
+
+def _board(rng: np.random.Generator, target: Target, ranges: Ranges) -> tuple[Board, list[Part]]:
+    """The print, the board's body behind it, and perhaps a mount plate that stands out all round."""
+    room = target.outer_diameter_mm / 2 + MARGIN_MM
+    needed_low, needed_high = -room * np.ones(2), np.array([target.c1_mm, target.c2_mm]) + room
+    size = np.maximum(np.array(target.board_mm) * rng.uniform(1 - ranges.board, 1 + ranges.board, 2), needed_high - needed_low)
+    low = needed_high - size + rng.beta(1.5, 1.5, 2) * (needed_low - needed_high + size)
+    high = low + size
+    thickness = rng.uniform(*ranges.thickness_mm)
+    x, y = np.array([low[0], high[0], high[0], low[0]]), np.array([low[1], low[1], high[1], high[1]])
+    front = trimesh.Trimesh(np.column_stack([x, y, np.zeros(4)]), [[0, 1, 2], [0, 2, 3]], process=False)
+    middle = np.append((low + high) / 2, 0)
+    solid = lofts.box([*size, thickness - SHEET_MM], middle - [0, 0, (thickness + SHEET_MM) / 2])
+    parts = [Part("target", front, False), Part("board", solid, False)]
+    total = thickness
+    if rng.uniform() < 0.45:
+        plate = rng.uniform(1.5, 5.0)
+        grown = size + 2 * rng.uniform(-4, 4) * (rng.uniform() < 0.8)
+        outline = lofts.rounded(grown, rng.uniform(0.3, 4))
+        mesh = lofts.prism(outline, plate, 0.4)
+        shift = middle - [0, 0, thickness + plate + 0.02] + np.append(rng.normal(0, 0.6, 2), 0)
+        parts.append(Part("bracket", lofts.placed(mesh, rigid.transform(np.eye(3), shift)), False))
+        total += plate
+    return Board((low[0], low[1]), (high[0], high[1]), total), parts
+
+
+def _probe_pose(rng: np.random.Generator, board: Board, ranges: Ranges) -> tuple[Array, Body, Array]:
+    """Where the probe stands: `target_from_body` : (4, 4), its body, and the direction : (3,) from the board to it."""
+    probe = body(rng)
+    way = rng.choice([np.pi, np.pi / 2, -np.pi / 2, 0.0], p=[0.45, 0.35, 0.1, 0.1]) + rng.normal(0, 0.2)
+    beside = np.array([np.cos(way), np.sin(way), 0.0])
+    width_turn = way + np.pi / 2 + (rng.normal(0, 0.2) if rng.uniform() < 0.7 else rng.uniform(0, np.pi))
+    behind, gap = rng.uniform(*ranges.behind_mm), rng.uniform(*ranges.gap_mm)
+    tilt = np.append(rng.normal(0, np.deg2rad(ranges.tilt_deg), 2), 0)
+    along = lofts.unit(np.array([tilt[0], tilt[1], 1.0]) + 0.1 * beside)
+    turned = lofts.frame(np.zeros(3), along, [np.cos(width_turn), np.sin(width_turn), 0])
+    reach = np.abs(beside[:2]) @ (board.size / 2)
+    shape = rigid.rotate(turned, probe.outline_at(0.5)) @ beside
+    aside = rng.normal(0, 8) * np.array([-beside[1], beside[0], 0])
+    level = probe.length * rng.uniform(0.55, 0.95)  # of the body that the board is beside
+    at_board = np.append(board.middle, 0) + (reach + gap - shape.min()) * beside + aside
+    origin = at_board - along * min(level, behind)
+    return rigid.transform(turned[:3, :3], origin), probe, beside
+
+
+def _bracket(rng: np.random.Generator, board: Board, probe: Body, target_from_body: Array) -> list[Part]:
+    """A clamp around the probe's body, an arm to the board, and screws."""
+    axis, origin = target_from_body[:3, 2], target_from_body[:3, 3]
+    level = np.clip((-board.thickness - rng.uniform(6, 18) - origin[2]) / axis[2], 0.3 * probe.length, 0.82 * probe.length)
+    height = rng.uniform(10, 34)
+    outline = probe.outline_at(level / probe.length)[:, :2]
+    if rng.uniform() < 0.5:
+        half = np.abs(outline).max(axis=0) + rng.uniform(2, 5)
+        outline = lofts.rounded(2 * half, rng.uniform(1, 8), 5)
+    else:
+        outline = outline * (1 + rng.uniform(3, 7) / np.abs(outline).max(axis=0))
+    clamp = lofts.placed(
+        lofts.prism(outline, height, 0.8), target_from_body @ rigid.transform(np.eye(3), [0, 0, level - height / 2])
+    )
+    slot = "metal" if rng.uniform() < 0.3 else "bracket"
+    parts = [Part(slot, clamp, True)]
+
+    inward = np.append(board.middle, 0) - (origin + level * axis)
+    inward[2] = 0
+    inward = lofts.unit(inward)
+    reach = (rigid.rotate(target_from_body, np.column_stack([outline, np.zeros(len(outline))])) @ inward).max()
+    start = origin + level * axis + (reach - 3) * inward
+    end = np.append(board.middle, 0) - 0.25 * board.size.min() * inward * rng.uniform(0, 1)
+    end[2] = -board.thickness - rng.uniform(3.5, 7)
+    side = np.array([-inward[1], inward[0], 0])
+    style = rng.choice(["bar", "rod", "two rods"], p=[0.55, 0.25, 0.2])
+    if style == "bar":
+        size = np.array([rng.uniform(8, 26), rng.uniform(4, 9)])
+        arm = lofts.tube(np.stack([start, end]), lofts.rounded(size, 1.0, 2))
+        along = lofts.unit(end - start)
+        to_bar = lofts.frame(start, along, side)
+        arm = lofts.placed(lofts.prism(lofts.rounded(size, 1.0, 2), float(np.linalg.norm(end - start)), 0.5), to_bar)
+        parts.append(Part(slot, arm, False))
+    else:
+        shifts = [0.0] if style == "rod" else [-rng.uniform(8, 14), rng.uniform(8, 14)]
+        radius = rng.uniform(2.5, 5)
+        parts += [Part("metal", lofts.strut(start + s * side, end + s * side, radius), True) for s in shifts]
+    end_block = lofts.prism(lofts.rounded([rng.uniform(14, 30), rng.uniform(14, 30)], 1.5, 3), -end[2] - board.thickness + 4, 0.5)
+    parts.append(Part("bracket", lofts.placed(end_block, lofts.frame(end - [0, 0, 4], [0, 0, 1], inward)), False))
+    parts += _screws(rng, outline, level, height, target_from_body)
+    if rng.uniform() < 0.5:  # a block that stands up beside the board's edge, with a screw in it
+        edge = _to_edge(board, -inward)
+        foot = np.append(board.middle - inward[:2] * (edge + rng.uniform(9, 12)), -board.thickness - 8)
+        to_block = lofts.frame(foot, [0, 0, 1], inward)
+        tall = board.thickness + 8 + rng.uniform(-6, 3)
+        parts.append(Part("bracket", lofts.placed(lofts.prism(lofts.rounded([12, 14], 1, 2), tall, 0.5), to_block), False))
+        screw = lofts.rod(rng.uniform(2.5, 4), 2.5, 20)
+        parts.append(Part("metal", lofts.placed(screw, to_block @ rigid.transform(np.eye(3), [0, 0, tall - 0.5])), True))
+    return parts
+
+
+def _to_edge(board: Board, way: Array) -> float:
+    """Distance from the board's middle to its edge along a direction in its plane, mm."""
+    return float((board.size / 2 / np.maximum(np.abs(way[:2]), 1e-6)).min())
+
+
+def _screws(rng: np.random.Generator, outline: Array, level: float, height: float, target_from_body: Array) -> list[Part]:
+    """Screws through the clamp's ears, along its rim."""
+    parts = []
+    half = np.abs(outline).max(axis=0)
+    for sign in (-1, 1):
+        if rng.uniform() < 0.4:
+            continue
+        length, radius = rng.uniform(10, 24), rng.uniform(1.4, 2.5)
+        centre = np.array([half[0] * rng.uniform(0.5, 0.9), sign * (half[1] + 0.5), level + height / 2 - rng.uniform(4, 8)])
+        to_screw = target_from_body @ lofts.frame(centre, [0, sign, 0])
+        shank = lofts.placed(lofts.rod(radius, length, 16), to_screw)
+        head = lofts.placed(lofts.prism(lofts.superellipse((2 * radius, 2 * radius), 2, 6), 2.5), to_screw)
+        parts += [Part("metal", shank, True), Part("metal", head, False)]
+    return parts
+
+
+def _covers(points: Array, board: Board, margin: float = 1.0) -> bool:
+    """Whether any ball : (n, 4) of x, y, z, radius lies over the board's front, or pierces the board."""
+    x, y, z, radius = points.T
+    low, high = np.array(board.low) - margin, np.array(board.high) + margin
+    over = (x > low[0] - radius) & (x < high[0] + radius) & (y > low[1] - radius) & (y < high[1] + radius)
+    return bool((over & (z > -board.thickness - radius - 1)).any())
+
+
+def _grip(rng: np.random.Generator, board: Board, probe: Body, target_from_body: Array, beside: Array) -> list[Part]:
+    """A hand around the probe, its forearm leading away from the board."""
+    skeleton = None
+    left = bool(rng.uniform() < 0.4)
+    for _ in range(TRIES):
+        level = probe.length * rng.uniform(0.3, 0.68)
+        away = np.arctan2(*(target_from_body[:3, :3].T @ beside)[[1, 0]])
+        outline = probe.outline_at(level / probe.length)[:, :2]
+        grip = hands.gripping(rng, outline, left, away + rng.normal(0, 0.9))
+        to_grip = target_from_body @ rigid.transform(np.eye(3), [0, 0, level])
+        skeleton = hands.turned(grip, to_grip[:3, :3], to_grip[:3, 3])
+        arm = skeleton.wrist + np.linspace(0, 300, 20)[:, None] * skeleton.forearm
+        balls = np.concatenate([skeleton.points(), np.column_stack([arm, np.full(20, 45.0)])])
+        if not _covers(balls, board) and skeleton.forearm[2] < 0.75:
+            return hands.clothed(rng, skeleton)
+    return []
+
+
+def _pinch(rng: np.random.Generator, board: Board, discs: Array, radius: float, beside: Array) -> list[Part]:
+    """A hand that holds the board by an edge, its thumb over a part of a circle."""
+    edges = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], float)
+    edges = edges[edges @ beside[:2] < 0.5]
+    way = edges[rng.integers(len(edges))]
+    reach = [_beyond(board, disc, way) for disc in discs]
+    disc = discs[int(np.argmin(reach))] if rng.uniform() < 0.8 else discs[rng.integers(3)]
+    tip = disc + way * radius * rng.uniform(-0.6, 0.85) + rng.uniform(-0.5, 0.5) * radius * np.array([-way[1], way[0]])
+    pinch = hands.pinching(rng, bool(rng.uniform() < 0.5), board.thickness)
+    turn = np.arctan2(way[1], way[0]) + np.pi / 2 + rng.normal(0, 0.25)
+    cos, sin = np.cos(turn), np.sin(turn)
+    rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    return hands.clothed(rng, hands.turned(pinch, rotation, [*tip, 0.0]))
+
+
+def _beyond(board: Board, disc: Array, way: Array) -> float:
+    """Distance from a disc's centre to the board's edge along an axis, mm."""
+    corner = np.where(way > 0, board.high, board.low)
+    return float(abs((corner - disc) @ way))
+
+
+def _robot(rng: np.random.Generator, probe: Body, target_from_body: Array, beside: Array) -> list[Part]:
+    """A robot's flange behind the probe and two links that lead away from the board."""
+    axis = target_from_body[:3, 2]
+    back = target_from_body[:3, 3] + 0.9 * probe.length * axis
+    radius, slot = rng.uniform(26, 40), rng.choice(["metal", "bracket", "thing_a"])
+    out = lofts.unit(beside + rng.normal(0, 0.25) * np.cross(axis, beside) + rng.uniform(0.0, 0.45) * axis)
+    start = back + (radius - 0.5 * np.abs(probe.outline_at(0.9)).max()) * beside * 0.8
+    flange = lofts.placed(lofts.rod(radius, 14, 48, 1.5), lofts.frame(start, axis))
+    wrist = lofts.placed(lofts.rod(0.92 * radius, rng.uniform(50, 80), 48, 6), lofts.frame(start + 13 * axis, axis))
+    joint = start + 50 * axis
+    link = lofts.placed(lofts.rod(rng.uniform(0.75, 0.95) * radius, rng.uniform(250, 400), 48, 4), lofts.frame(joint, out))
+    ring = lofts.placed(lofts.rod(radius * 1.02, 8, 48, 1), lofts.frame(joint + rng.uniform(60, 110) * out, out))
+    bolts = []
+    for turn in np.arange(6) * np.pi / 3 + rng.uniform(0, 1):
+        to_flange = lofts.frame(start, axis)
+        bolt = lofts.prism(lofts.superellipse((2.6, 2.6), 2, 12), 4, 0.5)
+        spot = [0.84 * radius * np.cos(turn), 0.84 * radius * np.sin(turn), -3]
+        bolts.append(lofts.placed(bolt, to_flange @ rigid.transform(np.eye(3), spot)))
+    shell = lofts.joined([wrist, link])
+    return [Part("metal", lofts.joined([flange, *bolts]), True), Part(str(slot), shell, True), Part("thing_b", ring, True)]
+
+
+def _cable(
+    rng: np.random.Generator, probe: Body, target_from_body: Array, beside: Array, covered: Array | None, radius: float
+) -> list[Part]:
+    """The strain relief and the cable; the cable bends away from the board, or passes before the circle `covered` : (2,)."""
+    axis = target_from_body[:3, 2]
+    back = target_from_body[:3, 3] + probe.length * axis
+    thick = rng.uniform(2.8, 4.6)
+    ribs = np.linspace(0, rng.uniform(18, 34), 12)
+    swell = 1 + 0.05 * (np.arange(12) % 2) * (rng.uniform() < 0.5)
+    cone = lofts.turned(np.column_stack([np.linspace(probe.neck, thick + 1.2, 12) * swell, ribs - 4]), 32)
+    relief = Part("cable" if rng.uniform() < 0.5 else "probe", lofts.placed(cone, lofts.frame(back, axis)), True)
+    exit_point, side = back + (ribs[-1] - 8) * axis, np.cross(axis, beside)
+    if covered is None:
+        way = lofts.unit(beside * rng.uniform(0.25, 1) + rng.normal(0, 0.6) * side)
+        rise = rng.uniform(20, 60)
+        knots = [exit_point, exit_point + 14 * axis, exit_point + rise * axis + rng.uniform(15, 50) * way]
+        fall = rng.uniform(-60, 30)
+        knots.append(exit_point + (rise + 0.6 * fall) * axis + rng.uniform(80, 120) * way + rng.normal(0, 12) * side)
+        knots.append(exit_point + (rise + 1.6 * fall) * axis + rng.uniform(170, 240) * way + rng.normal(0, 40) * side)
+    else:
+        turn = rng.uniform(0, 2 * np.pi)
+        over = np.append(covered + rng.uniform(0.3, 1.0) * radius * np.array([np.cos(turn), np.sin(turn)]), rng.uniform(10, 35))
+        high = max(float(exit_point[2]) + 20, over[2] + 10)
+        lift = np.append((exit_point + 0.4 * (over - exit_point))[:2], high)
+        onward = lofts.unit(np.append((over - exit_point)[:2], 0) + rng.normal(0, 12, 3) * [1, 1, 0])
+        knots = [exit_point, exit_point + 10 * axis, lift, over]
+        knots += [over + 60 * onward + [0, 0, rng.uniform(-10, 8)], over + 150 * onward - [0, 0, rng.uniform(0, 40)]]
+        knots.append(over + 260 * onward + [*rng.normal(0, 40, 2), -rng.uniform(0, 90)])
+    return [relief, Part("cable", lofts.cord(lofts.curve(np.array(knots), 56), thick, 14), True)]

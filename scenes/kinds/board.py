@@ -1,0 +1,142 @@
+"""The calibration board: black discs in OpenCV's asymmetric layout, as geometry, so that their edges are crisp.
+
+The white ground has round holes and each disc fills one, sharing its vertices, so nothing overlaps. Board frame: x to the
+right, y down, z away from the viewer, origin at the first circle.
+"""
+
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.spatial import Delaunay
+
+from recon.geometry import rigid
+from recon.model.boards import AsymmetricCircles
+from recon.model.rig import Fraction, NotNegative, Part, Positive, Vector
+from scenes import solid_meshes
+from scenes.noise import Seed
+from scenes.scene_types import Material, Scene, Thing
+
+Array = rigid.Array
+
+SIDES = 256  # of a disc's outline: a radius of 4.5 mm is met within 0.0004 mm
+CELL_MM = 4.0  # of the ground's triangles, small enough to follow a warp
+THICKNESS_MM = 3.0
+MAX_ERRORS = 4  # standard deviations that a print error reaches in x and in y; room for them is kept between circles
+
+
+class Config(Part):
+    """The board's print and pose."""
+
+    columns: Annotated[int, Field(ge=2, le=20)] = 4  # circles a row, as OpenCV counts them
+    rows: Annotated[int, Field(ge=2, le=30)] = 11
+    spacing_mm: Positive = 15.0  # between rows; circles of a row stand two spacings apart
+    diameter_mm: Positive = 9.0
+    margin_mm: Positive = 12.0  # white beyond the outermost centres
+    centre_mm: Vector = (4.0, -2.0, 660.0)  # the middle of the circles in the world
+    rotation_deg: Vector = (0.0, 0.0, 90.0)  # rotation vector, axis times angle; 90 about z lays the board along x
+    warp_mm: NotNegative = 0.0  # amplitude of a saddle: the long edges bow back by this, the short ones forward
+    print_error_mm: Annotated[float, Field(ge=0, le=1)] = 0.0  # standard deviation of each centre, in x and in y
+    white: Fraction = 0.75  # reflectance of paper
+    black: Fraction = 0.05  # reflectance of printed ink
+    roughness: Annotated[float, Field(gt=0, le=1)] | None = None  # GGX alpha of a glossy coat, which glares; None is matt
+    seed: Seed = 1  # of the print errors
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Config":
+        nearest = np.sqrt(2) * (self.spacing_mm - 2 * MAX_ERRORS * self.print_error_mm)  # two centres, along the diagonal
+        room = nearest / (1 + np.sin(np.pi / SIDES) / 2)  # leaves half a side of the outline between two discs
+        if self.diameter_mm >= room:
+            raise ValueError(f"diameter_mm: expected less than {room:.4g} to keep circles apart, found {self.diameter_mm:g}")
+        if self.diameter_mm / 2 + (MAX_ERRORS + 1) * self.print_error_mm >= self.margin_mm:
+            raise ValueError(f"margin_mm: expected more than half of diameter_mm, found {self.margin_mm:g}")
+        return self
+
+
+def design(config: Config) -> AsymmetricCircles:
+    """The board as it was meant, which is all that a calibration knows."""
+    return AsymmetricCircles(
+        columns=config.columns, rows=config.rows, spacing_mm=config.spacing_mm, diameter_mm=config.diameter_mm
+    )
+
+
+def printed_centres(config: Config) -> Array:
+    """Centres of the circles as printed on the warped board : (columns * rows, 3) mm in the board's frame, in OpenCV's order."""
+    centres = _printed(config)
+    return np.column_stack([centres, _saddle(config, centres)])
+
+
+def circle_centres(config: Config) -> Array:
+    """Centres of the circles as printed on the warped board : (columns * rows, 3) mm in the world, in the same order."""
+    return rigid.apply(world_from_board(config), printed_centres(config))
+
+
+def world_from_board(config: Config) -> Array:
+    """The board's pose : (4, 4)."""
+    place = rigid.from_rotation_vector(np.deg2rad(config.rotation_deg), (0, 0, 0))
+    place[:3, 3] = np.array(config.centre_mm) - place[:3, :3] @ np.append(_middle(config), 0)
+    return place
+
+
+def build(config: Config) -> Scene:
+    """The white ground and the black discs. There is no shape to fit: see `circle_centres`."""
+    world = world_from_board(config)
+    return Scene("board", tuple(replace(thing, mesh=solid_meshes.moved(thing.mesh, world)) for thing in things(config)))
+
+
+def things(config: Config) -> tuple[Thing, Thing]:
+    """Ground and discs in the board's frame."""
+    points, triangles, black = _print(config)
+    parts = []
+    for name, chosen, reflectance in (("ground", ~black, config.white), ("discs", black, config.black)):
+        used, faces = np.unique(triangles[chosen], return_inverse=True)
+        part = points[used]
+        mesh = solid_meshes.slab(part, faces.reshape(-1, 3), THICKNESS_MM, _saddle(config, part))
+        parts.append(Thing(name, mesh, Material(reflectance, config.roughness), smooth=False))
+    return parts[0], parts[1]
+
+
+def _printed(config: Config) -> Array:
+    errors = np.random.default_rng(config.seed).standard_normal((config.rows * config.columns, 2))
+    errors = np.clip(errors, -MAX_ERRORS, MAX_ERRORS)
+    return design(config).points()[:, :2] + config.print_error_mm * errors
+
+
+def _middle(config: Config) -> Array:
+    return np.array([2 * config.columns - 1, config.rows - 1]) * config.spacing_mm / 2
+
+
+def _saddle(config: Config, points: Array) -> Array:
+    half = _middle(config) + config.margin_mm
+    x, y = ((points - _middle(config)) / half).T
+    return config.warp_mm * (x**2 - y**2)
+
+
+def _print(config: Config) -> tuple[Array, solid_meshes.Faces, np.ndarray]:
+    """Triangulate the board: points (n, 2) mm, triangles (m, 3), whether each is black (m,).
+
+    No point lies nearer to a side of a disc than half that side's length, so a Delaunay triangulation keeps all the sides.
+    """
+    centres, radius = _printed(config), config.diameter_mm / 2
+    turn = 2 * np.pi * np.arange(SIDES) / SIDES
+    circle = radius * np.column_stack([np.cos(turn), np.sin(turn)])
+    inner = 0.5 * circle[:: SIDES // 32]
+    discs = (centres[:, None] + np.concatenate([circle, inner, [[0.0, 0.0]]])).reshape(-1, 2)
+
+    size = 2 * (_middle(config) + config.margin_mm)
+    cells = np.ceil(size / CELL_MM).astype(int)
+    ground = solid_meshes.grid(tuple(size), tuple(cells))[0] + _middle(config)
+    apart = np.linalg.norm(ground[:, None] - centres, axis=-1).min(axis=1) > 1.1 * radius
+    points = np.concatenate([ground[apart], discs])
+
+    triangles = Delaunay(points).simplices.astype(np.int64)
+    middles = points[triangles].mean(axis=1)
+    black = np.linalg.norm(middles[:, None] - centres, axis=-1).min(axis=1) < radius * np.cos(np.pi / SIDES)
+    return points, _anticlockwise(points, triangles), black
+
+
+def _anticlockwise(points: Array, triangles: solid_meshes.Faces) -> solid_meshes.Faces:
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    negative = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) < (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    return np.where(negative[:, None], triangles[:, ::-1], triangles)

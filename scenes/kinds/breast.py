@@ -1,0 +1,178 @@
+"""The breast phantom: a silicone breast with three lobulated tumours, lying on a dark table with its apex to the camera.
+
+Skin relief, areola, table and tumours are drawn from a seed; sizes are exact.
+"""
+
+from typing import Annotated
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.model.rig import Finite, Fraction, NotNegative, Part, Positive, Vector
+from scenes import solid_meshes
+from scenes.dome import Dome, Form, dome
+from scenes.noise import Seed, smooth_noise
+from scenes.scene_types import Material, Scene, Thing
+from scenes.table import table
+from scenes.tumour import tumour
+
+Array = rigid.Array
+
+APART_MM = 1.0  # of tissue between two tumours
+
+
+class Tumour(Part):
+    """One tumour: its greatest extent, and where its middle lies in the phantom's frame (z up from the base)."""
+
+    size_mm: Annotated[float, Field(ge=2, le=80)]
+    centre_mm: Vector
+
+
+class Config(Part):
+    """The phantom of Meza et al. 2021: 170 x 130 x 55 mm with tumours of 27, 14 and 12 mm. The rest is our choice."""
+
+    size_mm: tuple[Positive, Positive, Positive] = (170.0, 130.0, 55.0)  # length, width, height with the nipple
+    middle_mm: tuple[Finite, Finite] = (4.0, -2.0)  # x, y of the footprint's middle in the world
+    turn_deg: Finite = 0.0  # about the line of sight
+    table_mm: Positive = 700.0  # z of the table's top
+    apex_mm: tuple[Finite, Finite] = (11.0, -7.0)  # nipple from the footprint's middle, towards the fuller side
+    taper: Annotated[float, Field(ge=-0.4, le=0.4)] = 0.14  # relative change of width from the middle to an end: a teardrop
+    fullness: Annotated[float, Field(ge=0, le=0.25)] = 0.12  # swell of the full side, as a part of the way to the rim
+    steepness: Annotated[float, Field(ge=0.3, le=0.97)] = 0.86  # 1 would meet the table at a right angle
+    nipple_width_mm: Positive = 10.0  # at half height
+    nipple_height_mm: Positive = 7.0
+    areola_width_mm: Positive = 38.0
+    areola_height_mm: NotNegative = 0.8
+    montgomery_bumps: Annotated[int, Field(ge=0, le=40)] = 9
+    unevenness_mm: Annotated[float, Field(ge=0, le=2)] = 0.5  # standard deviation of the slow irregularity, over some 70 mm
+    relief_mm: Annotated[float, Field(ge=0, le=0.2)] = 0.03  # standard deviation of the skin's texture, over 3 to 9 mm
+    edge_mm: Annotated[float, Field(ge=0.3, le=5)] = 0.75  # of a facet
+    reflectance: Fraction = 0.45
+    areola_reflectance: Fraction = 0.27
+    nipple_reflectance: Fraction = 0.23
+    roughness: Annotated[float, Field(gt=0, le=1)] = 0.38
+    ior: Annotated[float, Field(ge=1, le=3)] = 1.4
+    tumours: tuple[Tumour, ...] = (
+        Tumour(size_mm=27.0, centre_mm=(-14.0, 6.0, 20.0)),
+        Tumour(size_mm=14.0, centre_mm=(24.0, 16.0, 24.0)),
+        Tumour(size_mm=12.0, centre_mm=(22.0, -22.0, 19.0)),
+    )
+    tissue_mm: NotNegative = 5.0  # least tissue between a tumour and the skin or the base
+    seed: Seed = 7
+
+    @model_validator(mode="after")
+    def _proportions(self) -> "Config":
+        length, width, height = self.size_mm
+        if self.nipple_height_mm + self.areola_height_mm >= height / 2:
+            raise ValueError(
+                f"nipple_height_mm: expected less than half the height of {height:g}, found {self.nipple_height_mm:g}"
+            )
+        if self.nipple_width_mm >= 0.6 * self.areola_width_mm:
+            raise ValueError(f"nipple_width_mm: expected less than 0.6 of areola_width_mm, found {self.nipple_width_mm:g}")
+        if np.hypot(self.apex_mm[0] / length, self.apex_mm[1] / width) > 0.15:
+            raise ValueError(f"apex_mm: expected within 0.15 of size_mm from the middle, found {self.apex_mm}")
+        if self.areola_width_mm > 0.45 * min(length, width):
+            raise ValueError(f"areola_width_mm: expected up to {0.45 * min(length, width):g}, found {self.areola_width_mm:g}")
+        return self
+
+
+def build(config: Config) -> Scene:
+    """Breast, tumours (inside) and table.
+
+    Raises
+    ------
+    InputError
+        If a tumour lies too near to the skin, to the base or to another tumour.
+    """
+    shape_rng, colour_rng, tumour_rng = np.random.default_rng(config.seed).spawn(3)
+    skin = dome(_form(config), shape_rng)
+    breast = closed(skin)
+    streams = tumour_rng.spawn(len(config.tumours))
+    masses = [
+        solid_meshes.moved(tumour(wanted.size_mm, rng), rigid.transform(np.eye(3), wanted.centre_mm))
+        for wanted, rng in zip(config.tumours, streams, strict=True)
+    ]
+    for k, mass in enumerate(masses):
+        _check_depth(k, mass, skin, config.tissue_mm)
+        _check_apart(k, masses)
+
+    world = world_from_phantom(config)
+    material = Material(config.reflectance, config.roughness, config.ior)
+    things = [Thing("breast", solid_meshes.moved(breast, world), material, _albedo(config, skin, colour_rng))]
+    things += [
+        Thing(f"tumour{k}", solid_meshes.moved(mass, world), Material(config.reflectance), inside=True)
+        for k, mass in enumerate(masses)
+    ]
+    return Scene("breast", (*things, table(config.table_mm, config.seed)))
+
+
+def world_from_phantom(config: Config) -> Array:
+    """The phantom's pose : (4, 4), its base on the table and its z axis towards the camera."""
+    upright = Rotation.from_euler("xz", (180, config.turn_deg), degrees=True)
+    return rigid.transform(upright.as_matrix(), (*config.middle_mm, config.table_mm))
+
+
+def closed(skin: Dome) -> trimesh.Trimesh:
+    """The dome closed by a flat base, fanned from its middle; the base's middle is the last vertex."""
+    middle = len(skin.vertices)
+    rim = np.arange(middle - skin.rim, middle)
+    base = np.stack([np.roll(rim, -1), rim, np.full(skin.rim, middle)], axis=1)
+    vertices = np.concatenate([skin.vertices, [[0, 0, 0]]])
+    return trimesh.Trimesh(vertices, np.concatenate([skin.faces, base]), process=False)
+
+
+def _form(config: Config) -> Form:
+    return Form(
+        size=config.size_mm,
+        apex=config.apex_mm,
+        taper=config.taper,
+        fullness=config.fullness,
+        steepness=config.steepness,
+        nipple_width=config.nipple_width_mm,
+        nipple_height=config.nipple_height_mm,
+        areola_width=config.areola_width_mm,
+        areola_height=config.areola_height_mm,
+        montgomery_bumps=config.montgomery_bumps,
+        unevenness=config.unevenness_mm,
+        relief=config.relief_mm,
+        edge=config.edge_mm,
+    )
+
+
+def _albedo(config: Config, skin: Dome, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Reflectance of the closed mesh's vertices : skin, darker areola and nipple, paler Montgomery bumps, slightly mottled."""
+    mottle = 1 + 0.02 * smooth_noise(skin.vertices, 25, rng) + 0.015 * smooth_noise(skin.vertices, 5, rng)
+    areola = np.clip(skin.areola * (1 + 0.12 * smooth_noise(skin.vertices, 4, rng)), 0, 1)
+    value = config.reflectance + areola * (config.areola_reflectance - config.reflectance)
+    value += skin.nipple * (config.nipple_reflectance - config.areola_reflectance)
+    value += 0.3 * skin.bumps * (config.reflectance - value)
+    return np.clip(np.append(mottle * value, config.reflectance), 0, 1).astype(np.float32)
+
+
+def _check_depth(k: int, mass: trimesh.Trimesh, skin: Dome, least_mm: float) -> None:
+    """Refuse tumour k if it has less than `least_mm` of tissue to the skin or the base, or lies outside."""
+    to_skin = _depth(mass.vertices, trimesh.Trimesh(skin.vertices, skin.faces, process=False)).min()
+    tissue = min(to_skin, mass.vertices[:, 2].min())
+    if tissue < least_mm:
+        raise InputError(f"tumours.{k}: expected at least {least_mm:g} mm of tissue to skin and base, found {tissue:.2f} mm")
+
+
+def _check_apart(k: int, masses: list[trimesh.Trimesh]) -> None:
+    """Refuse tumour k if it comes nearer than `APART_MM` to an earlier one, or one lies within the other."""
+    for other in range(k):
+        gap = -max(_depth(masses[k].vertices, masses[other]).max(), _depth(masses[other].vertices, masses[k]).max())
+        if gap < APART_MM:
+            raise InputError(f"tumours.{k}: expected at least {APART_MM:g} mm from tumours.{other}, found {gap:.2f} mm")
+
+
+def _depth(points: Array, surface: trimesh.Trimesh) -> Array:
+    """Distance of points : (n, 3) to a surface's nearest vertex : (n,) mm, positive on the inner side."""
+    distance, nearest = KDTree(surface.vertices).query(points)
+    outwards = ((points - surface.vertices[nearest]) * surface.vertex_normals[nearest]).sum(axis=1) > 0
+    return np.where(outwards, -distance, distance)

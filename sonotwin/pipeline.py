@@ -1,0 +1,76 @@
+"""A demonstration: named steps that work in one folder, one after the other, each adding its figures to those before it."""
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics
+
+MARKER = "demo.json"  # by which the folder of a demonstration is known
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step."""
+
+    name: str  # a verb, in one word
+    does: str  # what a person reads while it runs
+    work: Callable[[Path, Mapping[str, float | int]], Mapping[str, float | int]]  # (folder, figures so far) -> its own figures
+    makes: Sequence[str] = ()  # files and folders at the top of the folder
+    refines: Sequence[str] = ()  # figures of earlier steps that it knows better
+
+
+def play(steps: Sequence[Step], folder: Path, settings: Mapping[str, object], announce: Callable[[str], None]) -> Metrics:
+    """Run the steps and write `metrics.json`: all their figures, and the seconds that each took.
+
+    The folder is marked before the first step, and what an earlier demonstration left there is taken away as far as it would
+    mix with the new: after a run that was killed, the next one starts clean.
+
+    Parameters
+    ----------
+    settings : mapping
+        What the demonstration is made from; written to the folder as its marker.
+    announce : callable
+        Told each step's number and what it does.
+
+    Raises
+    ------
+    InputError
+        If the folder holds something else, or can't be written to.
+    ValueError
+        If a step contradicts a figure of an earlier one that it doesn't refine.
+    """
+    atomic.check_folder(folder, MARKER)
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic.new_file(folder / MARKER) as temporary:
+        temporary.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
+    _clear(folder, [metrics.FILE, *(name for step in steps for name in step.makes)])
+    found: Metrics = {}
+    beginning = time.perf_counter()
+    for number, step in enumerate(steps, 1):
+        announce(f"{number}/{len(steps)} {step.does}")
+        start = time.perf_counter()
+        new = dict(step.work(folder, found))
+        new[f"seconds_{step.name}"] = round(time.perf_counter() - start, 2)
+        for name in (new.keys() & found.keys()) - set(step.refines):
+            if new[name] != found[name]:
+                raise ValueError(f"{step.name}: {name}: expected {found[name]} as before, found {new[name]}")
+        found |= new
+    found["seconds_demo"] = round(time.perf_counter() - beginning, 2)
+    metrics.write(folder / metrics.FILE, found)
+    return found
+
+
+def _clear(folder: Path, names: Sequence[str]) -> None:
+    """Remove the files that an earlier run made, and what one that was killed left while it made them.
+
+    Folders stay: the step that makes one replaces it.
+    """
+    atomic.remove_leftovers(folder / MARKER)
+    for path in (folder / name for name in names):
+        atomic.remove_leftovers(path)
+        if not path.is_dir():
+            path.unlink(missing_ok=True)

@@ -1,0 +1,168 @@
+"""Poses of a board come back as written, one at a time; what is wrong with a set is said in one line before images are read."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.capture import board_part, manifest
+from recon.capture.manifest import BoardPart, Device
+from recon.errors import InputError
+from recon.model.boards import AsymmetricCircles
+from recon.model.patterns import Fringes, GrayCode, Patterns
+
+SIZE, PROJECTOR = (64, 48), (128, 80)
+BOARD = AsymmetricCircles(columns=4, rows=11, spacing_mm=15.0, diameter_mm=9.0)
+PATTERNS = Patterns(
+    projector_size=PROJECTOR,
+    unwrap="gray",
+    parts=tuple(
+        part
+        for axis in ("columns", "rows")
+        for part in (Fringes(axis=axis, pitch=18, steps=3), GrayCode(axis=axis, pitch=18, bits=3))
+    ),
+)
+NAMES = ("00", "01", "02")
+
+
+def images(name: str, bits: int = 8) -> tuple[dict, dict]:
+    """Lit images of two cameras, and the fringes of the first; noise, other for each pose."""
+    rng = np.random.default_rng(int(name))
+    stack = rng.integers(0, 1 << bits, (PATTERNS.count + 2, SIZE[1], SIZE[0])).astype(np.uint8 if bits == 8 else np.uint16)
+    return {"cam1": stack[-2], "cam2": stack[-1]}, {"cam1": stack[:-2]}
+
+
+def write(folder: Path, bits: int = 8) -> Path:
+    for name in NAMES:
+        board_part.write_pose(folder, name, *images(name, bits))
+    records = tuple(board_part.describe_pose(name, ["cam1", "cam2"], {"cam1": PATTERNS.count}) for name in NAMES)
+    devices = {
+        "cam1": Device(size=SIZE, bits=bits),
+        "cam2": Device(size=SIZE, bits=bits),
+        "projector": Device(size=PROJECTOR),
+    }
+    board_part.write_manifest(folder, devices, BoardPart(board=BOARD, patterns=PATTERNS, poses=records), "set")
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    return write(tmp_path / "capture")
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+def test_a_set_comes_back(tmp_path, bits):
+    found = board_part.read_board(write(tmp_path / "capture", bits))
+    assert (found.board, found.patterns, found.poses, found.cameras) == (BOARD, PATTERNS, NAMES, ("cam1", "cam2"))
+    for number, name in enumerate(NAMES):
+        pose = found.pose(number)
+        lit, fringes = images(name, bits)
+        assert pose.name == name and list(pose.lit) == ["cam1", "cam2"]
+        np.testing.assert_array_equal(pose.fringes, fringes["cam1"])
+        for camera, image in lit.items():
+            np.testing.assert_array_equal(pose.lit[camera], image)
+
+
+def edit(folder: Path, change) -> None:
+    content = json.loads((folder / "manifest.json").read_text())
+    change(content)
+    (folder / "manifest.json").write_text(json.dumps(content))
+
+
+def test_cameras_alone_make_a_set(folder):
+    """Without fringes, and with a second camera that missed a pose."""
+    edit(folder, lambda m: m["board"].pop("patterns"))
+    edit(folder, lambda m: [pose.pop("fringes") for pose in m["board"]["poses"]])
+    edit(folder, lambda m: m["board"]["poses"][1]["lit"].pop("cam2"))
+    edit(folder, lambda m: m["devices"].pop("projector"))
+    found = board_part.read_board(folder)
+    assert found.patterns is None and found.pose(0).fringes is None
+    assert [list(found.pose(k).lit) for k in range(3)] == [["cam1", "cam2"], ["cam1"], ["cam1", "cam2"]]
+
+
+def test_a_failed_write_leaves_no_half_pose(tmp_path, monkeypatch):
+    """What was written of a pose before the disk was full goes away; poses before it stay."""
+    board_part.write_pose(tmp_path, "00", *images("00"))
+    calls = iter([board_part.write_images])
+
+    def fail_later(*arguments):
+        next(calls, fail)(*arguments)
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(board_part, "write_images", fail_later)
+    with pytest.raises(OSError, match="No space"):
+        board_part.write_pose(tmp_path, "01", *images("01"))
+    assert [path.name for path in (tmp_path / "board").iterdir()] == ["00"]
+
+
+FAULTS = {
+    "no board": (
+        lambda f: edit(f, lambda m: m.pop("board")),
+        "manifest.json: expected board, the poses of a calibration board, found none",
+    ),
+    "unknown camera": (
+        lambda f: edit(f, lambda m: m["devices"].pop("cam2")),
+        "manifest.json: board.poses.0.lit.cam2: expected one of the devices cam1, projector, found cam2",
+    ),
+    "unknown camera of fringes": (
+        lambda f: edit(f, lambda m: m["board"]["poses"][2]["fringes"].update(cam3=m["board"]["poses"][2]["fringes"]["cam1"])),
+        "manifest.json: board.poses.2.fringes.cam3: expected one of the devices cam1, cam2, projector, found cam3",
+    ),
+    "an image short": (
+        lambda f: edit(f, lambda m: m["board"]["poses"][1]["fringes"]["cam1"].pop()),
+        "manifest.json: board.poses.1.fringes.cam1: expected 12 images, one a pattern, found 11",
+    ),
+    "two of a name": (
+        lambda f: edit(f, lambda m: m["board"]["poses"][2].update(name="00")),
+        "manifest.json: board.poses.2.name: expected another than that of poses.0, found 00",
+    ),
+    "no poses": (lambda f: edit(f, lambda m: m["board"].update(poses=[])), "manifest.json: board.poses: expected"),
+    "nothing lit": (lambda f: edit(f, lambda m: m["board"]["poses"][0].update(lit={})), "manifest.json: board.poses.0.lit: "),
+    "one axis": (
+        lambda f: edit(f, lambda m: m["board"]["patterns"].update(parts=m["board"]["patterns"]["parts"][:2])),
+        "manifest.json: board.patterns: expected fringes along both axes, found none along rows",
+    ),
+    "fringes of no patterns": (
+        lambda f: edit(f, lambda m: m["board"].pop("patterns")),
+        "manifest.json: board.patterns: expected those of poses.0.fringes, found none",
+    ),
+    "another raster": (
+        lambda f: edit(f, lambda m: m["devices"]["projector"].update(size=[200, 100])),
+        "manifest.json: devices.projector.size: expected 128x80 as in board.patterns, found 200x100",
+    ),
+    "another kind of board": (
+        lambda f: edit(f, lambda m: m["board"]["board"].update(kind="triangles")),
+        "manifest.json: board.board",
+    ),
+    "lost image": (lambda f: (f / "board/02/cam2/lit.png").unlink(), "02/cam2/lit.png: expected a file, found none"),
+    "folder for an image": (
+        lambda f: ((f / "board/02/cam1/0000.png").unlink(), (f / "board/02/cam1/0000.png").mkdir()),
+        "02/cam1/0000.png: expected a file, found something else",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_said_before_images_are_read(folder, fault):
+    spoil, complaint = FAULTS[fault]
+    spoil(folder)
+    with pytest.raises(InputError) as caught:
+        board_part.read_board(folder)
+    assert complaint in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_damaged_image_is_named_with_its_pose(folder):
+    path = folder / "board" / "01" / "cam1" / "0004.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    found = board_part.read_board(folder)
+    found.pose(0)
+    with pytest.raises(InputError, match=r"board/01/cam1/0004\.png: expected a whole PNG image, found it cut short"):
+        found.pose(1)
+
+
+def test_a_surface_and_a_board_share_a_manifest(folder):
+    """Parts are independent: one that is not there is none."""
+    assert manifest.read_manifest(folder).surface is None

@@ -1,0 +1,283 @@
+"""Calibration files of every dialect come back as they were, and bad ones are refused in one line."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon.capture import calibration_files, meza2021
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.model.calibration import Calibration, Uncertainty
+
+SIZES = {"cam1": (1280, 1024), "cam2": (1280, 1024), "projector": (1280, 800)}
+
+
+def device(name: str, seed: int, coefficients: int = 5) -> Camera:
+    rng = np.random.default_rng(seed)
+    matrix = np.array([[3320.0 + rng.normal(), 0, 618.0], [0, 3331 + rng.normal(), 523], [0, 0, 1]])
+    pose = np.eye(4) if name == "cam1" else rigid.from_rotation_vector(rng.normal(0, 0.2, 3), rng.normal(0, 100, 3))
+    return Camera(SIZES[name], matrix, rng.normal(0, 0.05, coefficients), pose)
+
+
+@pytest.fixture
+def optics() -> Calibration:
+    return Calibration({"cam1": device("cam1", 1), "cam2": device("cam2", 2, 14), "projector": device("projector", 3, 8)})
+
+
+def uncertain(names: tuple[str, ...], seed: int = 0) -> Uncertainty:
+    """A covariance over many powers of ten, as those of focal lengths and of distortions are."""
+    rng = np.random.default_rng(seed)
+    mixed = rng.normal(size=(len(names), len(names) + 2)) * 10 ** rng.uniform(-6, 1, (len(names), 1))
+    return Uncertainty(names, mixed @ mixed.T)
+
+
+NAMES = ("cam1.fx", "cam1.k2", "cam2.tau_x", "cam2.rz", "projector.cy", "projector.tx")
+
+
+def same(a: Camera, b: Camera) -> bool:
+    parts = ((a.matrix, b.matrix), (a.distortion, b.distortion), (a.camera_from_world, b.camera_from_world))
+    return a.size == b.size and all(np.allclose(x, y, rtol=0, atol=1e-12) for x, y in parts)
+
+
+def write_storage(path, values):
+    storage = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)
+    for key, value in values.items():
+        storage.write(key, value)
+    storage.release()
+
+
+def slmaster(optics: Calibration) -> dict:
+    camera, projector = optics.cameras["cam1"], optics.cameras["projector"]
+    rotation, translation = projector.camera_from_world[:3, :3].copy(), projector.camera_from_world[:3, 3:].copy()
+    matrices = {"M1": camera.matrix, "D1": camera.distortion.reshape(1, -1), "S": np.array([[1280.0], [1024.0]])}
+    return matrices | {"M4": projector.matrix, "D4": projector.distortion.reshape(1, -1), "Rlp": rotation, "Tlp": translation}
+
+
+def test_own_format_comes_back(optics, tmp_path):
+    calibration_files.write(tmp_path / "optics.yaml", optics)
+    found = calibration_files.read(tmp_path / "optics.yaml").cameras
+    assert list(found) == list(optics.cameras)
+    assert all(same(found[name], camera) for name, camera in optics.cameras.items())
+    first = (tmp_path / "optics.yaml").read_bytes()
+    calibration_files.write(tmp_path / "optics.yaml", optics)
+    assert (tmp_path / "optics.yaml").read_bytes() == first and len(list(tmp_path.iterdir())) == 1
+
+
+def test_own_format_is_opencvs(optics, tmp_path):
+    """Any OpenCV program finds the values by name."""
+    calibration_files.write(tmp_path / "optics.yaml", optics)
+    storage = cv2.FileStorage(str(tmp_path / "optics.yaml"), cv2.FileStorage_READ)
+    node = storage.getNode("projector")
+    assert np.array_equal(node.getNode("matrix").mat(), optics.cameras["projector"].matrix)
+    assert [node.getNode("size").at(i).real() for i in range(2)] == [1280, 800]
+
+
+def test_the_covariance_comes_back(optics, tmp_path):
+    path = tmp_path / "optics.yaml"
+    known = Calibration(optics.cameras, uncertain(NAMES))
+    calibration_files.write(path, known)
+    found = calibration_files.read(path)
+    assert list(found.cameras) == list(optics.cameras), "neither names nor covariance are taken for a device"
+    assert found.uncertainty.names == NAMES
+    assert np.array_equal(found.uncertainty.covariance, known.uncertainty.covariance)
+    storage = cv2.FileStorage(str(path), cv2.FileStorage_READ)
+    assert storage.getNode("parameters").at(3).string() == "cam2.rz"
+    assert storage.getNode("covariance").mat().shape == (6, 6)
+
+
+def test_a_file_from_before_covariances_has_none(optics, tmp_path):
+    calibration_files.write(tmp_path / "optics.yaml", optics)
+    assert "covariance" not in (tmp_path / "optics.yaml").read_text()
+    assert calibration_files.read(tmp_path / "optics.yaml").uncertainty is None
+
+
+@settings(max_examples=30, deadline=None)
+@given(data=st.data())
+def test_any_calibration_comes_back(data, tmp_path_factory):
+    """Whatever the numbers, however few or many parameters are uncertain."""
+    number = st.floats(-1e6, 1e6)
+    small = st.floats(-10, 10)
+    cameras = {}
+    for name in data.draw(st.sampled_from([("cam1",), ("cam1", "cam2"), ("cam1", "projector"), ("cam1", "cam2", "projector")])):
+        focal = data.draw(st.tuples(*[st.floats(1e-3, 1e6)] * 2))
+        matrix = np.array([[focal[0], data.draw(small), data.draw(number)], [0, focal[1], data.draw(number)], [0, 0, 1]])
+        count = data.draw(st.sampled_from([4, 5, 8, 12, 14]))
+        distortion = np.array(data.draw(st.lists(small, min_size=count, max_size=count)))
+        pose = rigid.from_rotation_vector(data.draw(st.tuples(small, small, small)), data.draw(st.tuples(number, number, number)))
+        size = data.draw(st.tuples(*[st.integers(1, 20000)] * 2))
+        cameras[name] = Camera(size, matrix, distortion, np.eye(4) if name == "cam1" else pose)
+    choice = [f"{device}.{name}" for device in cameras for name in ("fx", "fy", "cx", "cy", "k1", "k5", "tau_y")]
+    names = tuple(data.draw(st.lists(st.sampled_from(choice), min_size=1, unique=True)))
+    path = tmp_path_factory.mktemp("any") / "optics.yaml"
+    written = Calibration(cameras, uncertain(names, data.draw(st.integers(0, 1000))))
+    calibration_files.write(path, written)
+    found = calibration_files.read(path)
+    assert list(found.cameras) == list(cameras) and found.uncertainty.names == names
+    assert np.array_equal(found.uncertainty.covariance, written.uncertainty.covariance)
+    for name, camera in cameras.items():
+        assert found.cameras[name].size == camera.size
+        for part in ("matrix", "distortion", "camera_from_world"):
+            assert np.array_equal(getattr(found.cameras[name], part), getattr(camera, part))
+
+
+def test_a_standard_deviation_is_asked_for_by_name():
+    assert Uncertainty(("cam1.fx", "cam1.fy"), np.diag([4.0, 9.0])).sigma("cam1.fy") == 3
+    assert Uncertainty(("cam1.fx",), np.eye(1)).sigma("cam1.k1") == 0, "held fixed"
+
+
+def spoilt(names=("cam1.fx", "projector.rx"), covariance=((1.0, 0.5), (0.5, 2.0))) -> dict:
+    return {"parameters": list(names), "covariance": np.array(covariance)}
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"parameters": ["cam1.fx"]}, "covariance: expected a matrix, found none"),
+        ({"covariance": np.eye(2)}, "parameters: expected names of the covariance's parameters, found something else"),
+        ({"parameters": 3.0, "covariance": np.eye(1)}, "parameters: expected names of the covariance's parameters"),
+        ({"parameters": "cam1.fx", "covariance": np.eye(1)}, "parameters: expected names of the covariance's parameters"),
+        (spoilt(("cam1.fx", "cam3.fx")), "parameters: expected a device's parameter like projector.fx, each once, found cam3.fx"),
+        (spoilt(("cam1.fx", "cam1.focal")), "parameters: expected a device's parameter like projector.fx, each once"),
+        (spoilt(("cam1.fx", "cam1.rx")), "parameters: expected a device's parameter like projector.fx, each once, found cam1.rx"),
+        (spoilt(("cam1.fx", "cam1.fx")), "parameters: expected a device's parameter like projector.fx, each once, found cam1.fx"),
+        (
+            spoilt(covariance=np.eye(3)),
+            "covariance: expected 2x2 variances and covariances of the parameters, found shape (3, 3)",
+        ),
+        (
+            spoilt(covariance=[[1, 0.5], [0.4, 2]]),
+            "covariance: expected 2x2 variances and covariances of the parameters, found a mat",
+        ),
+        (
+            spoilt(covariance=[[np.nan, 0], [0, 1]]),
+            "covariance: expected 2x2 variances and covariances of the parameters, found val",
+        ),
+        (
+            spoilt(covariance=[[-1, 0], [0, 1]]),
+            "covariance: expected 2x2 variances and covariances of the parameters, found a vari",
+        ),
+        (
+            spoilt(covariance=[[1, 2], [2, 1]]),
+            "covariance: expected 2x2 variances and covariances of the parameters, found a variance",
+        ),
+    ],
+)
+def test_a_wrong_covariance_is_refused_in_one_line(optics, tmp_path, values, complaint):
+    path = tmp_path / "optics.yaml"
+    calibration_files.write(path, optics)
+    storage = cv2.FileStorage(str(path), cv2.FileStorage_APPEND)
+    for key, value in values.items():
+        storage.write(key, value)
+    storage.release()
+    with pytest.raises(InputError) as refusal:
+        calibration_files.read(path)
+    assert str(refusal.value).startswith(f"{path}: {complaint}") and "\n" not in str(refusal.value)
+
+
+def test_a_camera_without_distortion_comes_back_as_such_in_effect(tmp_path):
+    plain = Camera((64, 48), np.diag([50.0, 50, 1]), np.zeros(0))
+    calibration_files.write(tmp_path / "optics.yaml", Calibration({"cam1": plain}))
+    assert not calibration_files.read(tmp_path / "optics.yaml").cameras["cam1"].distortion.any()
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+def test_slmaster_dialect(optics, tmp_path, suffix):
+    write_storage(tmp_path / f"calibration.{suffix}", slmaster(optics))
+    found = calibration_files.read(tmp_path / f"calibration.{suffix}", SIZES).cameras
+    assert same(found["cam1"], optics.cameras["cam1"]) and same(found["projector"], optics.cameras["projector"])
+
+
+@pytest.mark.parametrize(
+    ("name", "second"), [("cam1_proj_params.npz", "projector"), ("cam1_cam2_params.npz", "cam2"), ("StereoParams.xml", "cam2")]
+)
+def test_authors_dialects(optics, tmp_path, name, second):
+    values = meza2021.parameters(optics, second)
+    if name.endswith("npz"):
+        np.savez(tmp_path / name, **values)
+    else:
+        write_storage(tmp_path / name, {key: np.ascontiguousarray(value) for key, value in values.items()})
+    found = calibration_files.read(tmp_path / name, SIZES).cameras
+    assert list(found) == ["cam1", second]
+    assert same(found["cam1"], optics.cameras["cam1"]) and same(found[second], optics.cameras[second])
+
+
+def test_the_fundamental_matrix_holds_the_epipolar_constraint(optics):
+    """Distortion-free pixels of the same point: x2' F x1 = 0, in units of the distance to the epipolar line, px."""
+    points = np.random.default_rng(0).uniform((-100, -80, 600), (100, 80, 700), (50, 3))
+    first, second = (optics.cameras[name] for name in ("cam1", "projector"))
+    pixels = []
+    for camera in (first, second):
+        local = rigid.apply(camera.camera_from_world, points)
+        pixels.append(local / local[:, 2:] @ camera.matrix.T)
+    lines = pixels[0] @ meza2021.parameters(optics)["F"].T
+    assert np.abs((pixels[1] * lines).sum(axis=1) / np.linalg.norm(lines[:, :2], axis=1)).max() < 1e-6
+
+
+def without(values, key):
+    return {name: value for name, value in values.items() if name != key}
+
+
+@pytest.mark.parametrize(
+    ("fault", "complaint"),
+    [
+        (lambda v: without(v, "Tlp"), "Tlp: expected a matrix, found none"),
+        (lambda v: v | {"M1": np.full((3, 3), np.nan)}, "cam1.matrix: expected a finite 3x3 matrix"),
+        (lambda v: v | {"D4": np.zeros((1, 7))}, "projector.distortion: expected 0, 4, 5, 8, 12 or 14"),
+        (lambda v: v | {"Rlp": 2 * np.eye(3)}, "projector.camera_from_world: expected a rotation matrix"),
+        (lambda v: v | {"Rlp": np.eye(2)}, "Rlp, Tlp: expected a 3x3 rotation"),
+        (lambda v: v | {"S": np.array([[0.0], [10.0]])}, "S: expected the camera's width and height"),
+        (lambda v: v | {"M4": "text"}, "M4: expected a matrix, found something else"),
+        (lambda v: {"A": np.eye(3)}, "expected schema, or M1 and M4, or K1 and K2, found A"),
+    ],
+)
+def test_wrong_values_are_refused_in_one_line(optics, tmp_path, fault, complaint):
+    path = tmp_path / "calibration.yml"
+    write_storage(path, fault(slmaster(optics)))
+    with pytest.raises(InputError) as refusal:
+        calibration_files.read(path, SIZES)
+    assert str(refusal.value).startswith(f"{path}: {complaint}") and "\n" not in str(refusal.value)
+
+
+def test_damaged_files_are_refused_in_one_line(optics, tmp_path):
+    """Cut at every tenth of its length, or not a calibration at all."""
+    calibration_files.write(tmp_path / "optics.yaml", Calibration(optics.cameras, uncertain(NAMES)))
+    whole = (tmp_path / "optics.yaml").read_bytes()
+    np.savez(tmp_path / "a.npz", **meza2021.parameters(optics))
+    archive = (tmp_path / "a.npz").read_bytes()
+    np.savez_compressed(tmp_path / "a.npz", **meza2021.parameters(optics))
+    spoilt = bytearray((tmp_path / "a.npz").read_bytes())
+    spoilt[60:80] = 20 * b"\xff"  # within the first matrix
+    cut = [bytes(spoilt), *(data[: len(data) * i // 10] for data in (whole, archive) for i in range(1, 10))]
+    newer = whole.replace(b"sonotwin-optics/1", b"sonotwin-optics/2")
+    path = tmp_path / "damaged.yaml"
+    for data in [b"", b"hello", b"\xff\xfe\x00", b"%YAML:1.0\n---\n- 3\n", b"PK\x03\x04", newer, *cut]:
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=r"^[^\n]*damaged\.yaml: [^\n]*expected [^\n]*found [^\n]*$"):
+            calibration_files.read(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("", "expected at least one device, found none"),
+        ("cam1: 3\n", "cam1: expected size, matrix, distortion and camera_from_world, found something else"),
+        ("cam1: [ 1, 2 ]\n", "cam1: expected size, matrix, distortion and camera_from_world, found something else"),
+    ],
+)
+def test_a_file_of_ours_without_devices_is_refused(tmp_path, content, complaint):
+    path = tmp_path / "optics.yaml"
+    path.write_text(f'%YAML:1.0\n---\nschema: "sonotwin-optics/1"\n{content}')
+    with pytest.raises(InputError) as refusal:
+        calibration_files.read(path)
+    assert str(refusal.value) == f"{path}: {complaint}"
+
+
+def test_a_missing_file_or_size_is_named(optics, tmp_path):
+    with pytest.raises(InputError, match=r"none\.yaml: expected a calibration file, found no such file"):
+        calibration_files.read(tmp_path / "none.yaml")
+    write_storage(tmp_path / "c.yml", slmaster(optics))
+    with pytest.raises(InputError, match="expected a file that stores the image size of projector"):
+        calibration_files.read(tmp_path / "c.yml")

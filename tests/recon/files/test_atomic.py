@@ -1,0 +1,91 @@
+"""What is written appears whole; what was there is replaced only if it is of the same kind, and never what is read."""
+
+import os
+
+import pytest
+
+from recon.errors import InputError
+from recon.files import atomic
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path):
+    with atomic.new_file(tmp_path / "a.txt") as temporary:
+        assert temporary.suffix == ".txt"
+        temporary.write_text("first")
+        assert not (tmp_path / "a.txt").exists()
+    with pytest.raises(KeyboardInterrupt), atomic.new_file(tmp_path / "a.txt") as temporary:
+        temporary.write_text("sec")
+        raise KeyboardInterrupt
+    assert (tmp_path / "a.txt").read_text() == "first" and names(tmp_path) == ["a.txt"]
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    for text in ("first", "second"):
+        with atomic.new_folder(tmp_path / "out", "mark") as folder:
+            (folder / "mark").write_text(text)
+    with pytest.raises(KeyboardInterrupt), atomic.new_folder(tmp_path / "out", "mark") as folder:
+        (folder / "mark").write_text("third")
+        raise KeyboardInterrupt
+    assert (tmp_path / "out" / "mark").read_text() == "second" and names(tmp_path) == ["out"]
+
+
+def test_a_folder_of_another_kind_is_left_alone(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("years of work")
+    with pytest.raises(InputError, match="found other files"), atomic.new_folder(tmp_path / "out", "mark"):
+        pass
+    assert names(tmp_path / "out") == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("source", ["out", "out/inner/file", "link"])
+def test_what_is_read_is_never_replaced(tmp_path, source):
+    """Not if it is the folder itself, lies in it, or is the same folder by another name."""
+    (tmp_path / "out" / "inner").mkdir(parents=True)
+    (tmp_path / "out" / "mark").write_text("")
+    (tmp_path / "link").symlink_to("out")
+    atomic.check_folder(tmp_path / "out", "mark", inputs=[tmp_path, tmp_path / "outer"])
+    with pytest.raises(InputError, match="expected a folder apart from what is read"):
+        atomic.check_folder(tmp_path / "out", "mark", inputs=[tmp_path / source])
+
+
+@pytest.mark.parametrize("name", ["a.txt", "folder"])
+def test_what_a_killed_run_has_left_is_found(tmp_path, name):
+    """The temporary as a kill would leave it goes; hidden files and folders that are merely alike stay."""
+    path = tmp_path / name
+    with atomic.new_file(path) as temporary:
+        temporary.write_text("")
+    others = {
+        ".a.txt",
+        ".a.2024.txt",
+        ".a.notes.new.txt",
+        ".b.4194305.new.txt",
+        ".folder",
+        ".folder.2024",
+        ".folders.4194305.new",
+    }
+    for other in others:
+        (tmp_path / other).write_text("")
+    left = tmp_path / temporary.name.replace(str(os.getpid()), "4194305")  # above the largest process number
+    left.mkdir()
+    (left / "half").write_text("")
+    path.unlink()
+    atomic.remove_leftovers(path)
+    assert set(names(tmp_path)) == others
+
+
+def test_the_folder_set_aside_is_found_too(tmp_path):
+    (tmp_path / ".out.4194305.old").mkdir()
+    atomic.remove_leftovers(tmp_path / "out")
+    assert names(tmp_path) == []
+
+
+def test_what_another_run_is_writing_is_left_alone(tmp_path):
+    """A temporary of a process that still runs is no leftover; ours stands in for another's."""
+    living = tmp_path / f".folder.{os.getpid()}.new"
+    living.mkdir()
+    atomic.remove_leftovers(tmp_path / "folder")
+    assert living.is_dir()

@@ -1,0 +1,90 @@
+"""The camera model against OpenCV's, and against itself backwards."""
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+
+MATRIX = np.array([[3320.0, 0, 618], [0, 3331, 523], [0, 0, 1]])
+WIDE = np.array([[1250.0, 0, 650], [0, 1240, 500], [0, 0, 1]])
+
+# realistic lenses first, then strong ones; all stay invertible over the image
+LENSES = {
+    "none": (MATRIX, []),
+    "four": (MATRIX, [-0.11, 0.25, 0.0004, -0.0006]),
+    "five": (MATRIX, [-0.11, 0.25, 0.0004, -0.0006, 0.3]),
+    "rational": (WIDE, [0.9, -0.3, 0.001, -0.002, 0.05, 1.2, -0.2, 0.04]),
+    "thin prism": (WIDE, [-0.2, 0.1, 0.001, -0.001, 0.02, 0.01, 0.02, 0.0, 0.004, -0.003, 0.005, 0.002]),
+    "tilted": (WIDE, [-0.25, 0.12, 0.002, -0.001, -0.03, 0.02, -0.01, 0.005, 0.003, -0.002, 0.002, 0.001, 0.06, -0.09]),
+    "barrel": (WIDE, [-0.32, 0.14, 0, 0, -0.03]),
+    "pincushion": (WIDE, [0.35, 0.2, 0.004, -0.003, 0.1]),
+}
+
+
+@pytest.fixture(params=LENSES, ids=str)
+def camera(request) -> Camera:
+    matrix, distortion = LENSES[request.param]
+    pose = rigid.from_rotation_vector([0.1, -0.25, 0.05], [-150.0, 20.0, 30.0])
+    return Camera((1280, 1024), matrix, np.array(distortion), pose)
+
+
+def test_every_pixel_returns_to_itself(camera):
+    """Along its ray and back through the lens, everywhere in the image, to 1e-6 px: the solver's tolerance times f."""
+    pixels = camera.pixel_grid()[::3, ::3]
+    points = camera.centre + 660 * camera.rays(pixels)
+    assert np.abs(camera.project(points) - pixels).max() < 1e-6
+
+
+def test_projection_is_opencvs(camera):
+    """Same model as cv2.projectPoints, to rounding."""
+    points = camera.centre + 660 * camera.rays(camera.pixel_grid()[::16, ::16].reshape(-1, 2))
+    rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
+    distortion = camera.distortion if camera.distortion.size else None
+    expected, _ = cv2.projectPoints(points.reshape(-1, 1, 3), cv2.Rodrigues(rotation)[0], translation, camera.matrix, distortion)
+    assert np.abs(camera.project(points) - expected.reshape(-1, 2)).max() < 1e-8
+
+
+def test_undistortion_is_opencvs(camera):
+    """OpenCV's iterative inverse, run long enough to converge, finds the same ideal points: 1e-3 px as normalised coordinates."""
+    pixels = camera.pixel_grid()[::16, ::16].reshape(-1, 2)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-12)
+    distortion = camera.distortion if camera.distortion.size else np.zeros(4)
+    iterate = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 4, 5
+    expected = iterate(pixels.reshape(-1, 1, 2), camera.matrix, distortion, R=None, P=None, criteria=criteria)
+    assert np.abs(camera.undistort(pixels) - expected.reshape(-1, 2)).max() < 1e-3 / camera.matrix[0, 0]
+
+
+def test_points_behind_give_nan(camera):
+    in_front = camera.centre + 100 * camera.rays(np.array([640.0, 512.0]))
+    behind = camera.centre - 100 * camera.rays(np.array([640.0, 512.0]))
+    assert np.isfinite(camera.project(in_front)).all() and np.isnan(camera.project(behind)).all()
+
+
+def test_unreachable_pixels_give_nan():
+    """Past the radius where a barrel polynomial turns back, no ray reaches a pixel."""
+    camera = Camera((1280, 1024), np.array([[500.0, 0, 640], [0, 500, 512], [0, 0, 1]]), np.array([-0.4, 0, 0, 0, 0]))
+    normalised = camera.undistort(np.array([[640.0, 512.0], [0.0, 0.0]]))
+    assert np.isfinite(normalised[0]).all() and np.isnan(normalised[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"matrix": np.eye(2)}, "matrix"),
+        ({"matrix": np.diag([-1.0, 1, 1])}, "matrix"),
+        ({"matrix": MATRIX.T}, "matrix"),
+        ({"matrix": MATRIX * 2}, "matrix"),
+        ({"matrix": MATRIX + np.array([[0, 0, 0], [0.1, 0, 0], [0, 0, 0]])}, "matrix"),
+        ({"distortion": np.zeros(6)}, "distortion"),
+        ({"distortion": np.array([np.nan, 0, 0, 0])}, "distortion"),
+        ({"camera_from_world": np.full((4, 4), np.nan)}, "camera_from_world"),
+        ({"camera_from_world": np.diag([1.0, 1, -1, 1])}, "camera_from_world"),
+        ({"camera_from_world": rigid.from_rotation_vector([0.1, 0, 0], [1.0, 2, 3]).T}, "camera_from_world"),
+    ],
+)
+def test_nonsense_is_refused_by_name(change, field):
+    good = {"size": (1280, 1024), "matrix": MATRIX, "distortion": np.zeros(5)}
+    with pytest.raises(ValueError, match=f"^{field}: expected"):
+        Camera(**(good | change))

@@ -1,0 +1,263 @@
+"""The whole calibration, from sightings to a result that knows how sure it is; and captures that must not be trusted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.model.boards import AsymmetricCircles, Charuco, Chessboard
+from recon.model.calibration import Calibration
+from recon.optical_calibration import joint_calibration
+from recon.optical_calibration.adjustment import adjust, free_parameters
+from recon.optical_calibration.bundle import Estimate, Shape
+from recon.optical_calibration.joint_calibration import Settings, departure, deviation
+from tests.recon.board_sets import BOARD, DEVICES, corners, devices, observe, random_poses, sightings
+
+QUICK = Settings(distortion="decentred")
+
+
+@pytest.fixture(scope="module")
+def cameras(rig):
+    return devices(rig)
+
+
+@pytest.fixture(scope="module")
+def sizes(cameras):
+    return {name: camera.size for name, camera in cameras.items()}
+
+
+@pytest.fixture(scope="module")
+def good(cameras):
+    """Sightings of 12 sensible poses."""
+    rng = np.random.default_rng(12)
+    return sightings(cameras, random_poses(cameras, 12, rng), rng)
+
+
+def test_a_good_set_is_calibrated_to_its_noise_without_a_warning(cameras, sizes, good):
+    found = joint_calibration.calibrate(good, BOARD, sizes)
+    assert found.dropped == {} and found.warnings == ()
+    for name, model in found.model.items():
+        assert model in ("decentred", "brown"), name
+    # the projector's points carry half of camera 1's noise beside the fringes': its pixels are twice as wide on the board
+    for name, expected in {"cam1": 0.0141, "cam2": 0.0141, "projector": 0.0108}.items():
+        assert found.rms[name] == pytest.approx(expected, rel=0.15)
+    error = deviation(found.adjustment.calibration, Calibration(cameras))
+    assert error @ np.linalg.solve(found.adjustment.calibration.uncertainty.covariance, error) < chi2.ppf(0.999, len(error))
+
+
+def test_without_the_correction_of_centres_the_baseline_is_off(cameras, sizes, monkeypatch):
+    """Ellipses' centres taken for circles' centres give a calibration that is sure of itself and wrong."""
+    rng = np.random.default_rng(13)
+    good = sightings(cameras, random_poses(cameras, 12, rng), rng, noise=dict.fromkeys(DEVICES, 0.002))
+    corrected = joint_calibration.calibrate(good, BOARD, sizes, QUICK).adjustment.calibration
+    monkeypatch.setattr(joint_calibration, "circle_offsets", lambda observations, *_: np.zeros_like(observations.pixels))
+    ignored = joint_calibration.calibrate(good, BOARD, sizes, QUICK).adjustment.calibration
+
+    def squared_error(calibration):
+        error = deviation(calibration, Calibration(cameras))
+        return error @ np.linalg.solve(calibration.uncertainty.covariance, error) / len(error)
+
+    assert squared_error(corrected) < 2
+    assert squared_error(ignored) > 4
+
+
+def test_the_projector_carries_the_correction_along(cameras):
+    """The fringes are read at the ellipse's centre: a point there has the projector's coordinate that the offset predicts."""
+    rng = np.random.default_rng(3)
+    pose = random_poses(cameras, 1, rng)
+    seen = observe(cameras, pose, rng, noise=dict.fromkeys(DEVICES, 0.0))
+    offsets = joint_calibration.circle_offsets(seen, Estimate(cameras, pose, seen.points), BOARD)[0]
+    rays = cameras["cam1"].rays(seen.pixels[0, :, 0] + offsets[:, 0])
+    normal, point = pose[0][:3, 2], pose[0][:3, 3]
+    on_board = rays * (point @ normal / (rays @ normal))[:, None]
+    np.testing.assert_allclose(cameras["projector"].project(on_board), seen.pixels[0, :, 2] + offsets[:, 2], atol=1e-4)
+    assert np.abs(offsets[:, 0]).max() > 0.01
+
+
+def test_a_pose_whose_images_were_mixed_up_is_left_out_by_name(sizes, good):
+    mixed = replace(good[5], pixels={**good[5].pixels, "cam2": good[6].pixels["cam2"]})
+    found = joint_calibration.calibrate([*good[:5], mixed, *good[6:]], BOARD, sizes, QUICK)
+    assert list(found.dropped) == ["05"] and "cam2" in found.dropped["05"]
+    assert len(found.observations.poses) == 11 and found.rms["cam2"] < 0.02
+
+
+def test_poses_that_mostly_contradict_each_other_are_refused(sizes, good):
+    order = np.roll(np.arange(12), 1)
+    shuffled = [replace(one, pixels={**one.pixels, "cam2": good[k].pixels["cam2"]}) for one, k in zip(good, order, strict=True)]
+    with pytest.raises(InputError, match=r"stand still beside the first device.*mixed up"):
+        joint_calibration.calibrate(shuffled, BOARD, sizes, QUICK)
+
+
+def test_too_few_poses_are_refused_and_few_are_warned_of(sizes, good):
+    with pytest.raises(InputError, match="expected 3 poses of the board or more for cam1, found 2"):
+        joint_calibration.calibrate(good[:2], BOARD, sizes, QUICK)
+    assert any("only 5 poses" in warning for warning in joint_calibration.calibrate(good[:5], BOARD, sizes, QUICK).warnings)
+
+
+def test_a_board_found_nowhere_says_why(sizes, good):
+    blind = [replace(one, pixels={}, failures={"cam1": "found 12 of 44 circles"}) for one in good]
+    with pytest.raises(InputError, match="found it in none: found 12 of 44 circles"):
+        joint_calibration.calibrate(blind, BOARD, sizes, QUICK)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 25.0])
+def test_parallel_boards_are_refused(cameras, sizes, tilt_deg):
+    """All in one plane's direction, upright or tilted alike: any focal length fits."""
+    rng = np.random.default_rng(4)
+    turn = rigid.from_rotation_vector(np.deg2rad([tilt_deg, 0, 0]), [0, 0, 0])[:3, :3]
+    poses = random_poses(cameras, 10, rng, tilt_deg=0)
+    for pose in poses:
+        middle = rigid.apply(pose, BOARD.points().mean(axis=0))
+        pose[:3, :3] = turn @ pose[:3, :3]
+        pose[:3, 3] += middle - rigid.apply(pose, BOARD.points().mean(axis=0))
+    with pytest.raises(InputError, match=r"tilted against each other|all parallel"):
+        joint_calibration.calibrate(sightings(cameras, poses, rng), BOARD, sizes, QUICK)
+
+
+def test_a_wrong_spacing_is_refused_by_the_discs_size(sizes, good):
+    wrong = AsymmetricCircles(columns=4, rows=11, spacing_mm=14, diameter_mm=9)
+    with pytest.raises(InputError, match=r"discs of 0\.600 times the spacing.*is 0\.643"):
+        joint_calibration.calibrate(good, wrong, sizes, QUICK)
+
+
+def test_a_flipped_image_is_refused(sizes, good):
+    flipped = [replace(one, pixels={**one.pixels, "cam2": one.pixels["cam2"] * [-1, 1] + [1279, 0]}) for one in good]
+    with pytest.raises(InputError, match="expected cam2 to see the board's front, found it mirrored"):
+        joint_calibration.calibrate(flipped, BOARD, sizes, QUICK)
+
+
+def test_a_flipped_camera_1_is_refused_by_the_projector(sizes, good):
+    flipped = []
+    for one in good:  # a detector can't tell: the board's design is its own mirror image, rows counted from the other end
+        order = np.arange(44).reshape(11, 4)[::-1].ravel()
+        pixels = {**one.pixels, "cam1": one.pixels["cam1"] * [1, -1] + [0, 1023]}
+        flipped.append(
+            replace(
+                one,
+                pixels={name: at[order] if name != "cam2" else at for name, at in pixels.items()},
+                gradient=(one.gradient @ np.diag([1, -1]))[order],
+            )
+        )
+    with pytest.raises(InputError, match="mirrored"):
+        joint_calibration.calibrate(flipped, BOARD, sizes, QUICK)
+
+
+def test_a_board_in_one_corner_is_warned_of(cameras, sizes):
+    rng = np.random.default_rng(6)
+    poses = [pose for pose in random_poses(cameras, 120, rng) if (pose[:3, :3] @ [52.5, 75, 0] + pose[:3, 3])[0] < -40][:10]
+    found = joint_calibration.calibrate(sightings(cameras, np.array(poses), rng), BOARD, sizes, QUICK)
+    assert any(warning.startswith("cam1: points cover") and "right" in warning for warning in found.warnings)
+
+
+def test_a_bent_board_is_noticed_and_releasing_its_shape_mends_it(cameras, sizes):
+    rng = np.random.default_rng(7)
+    points = BOARD.points()
+    half = points.max(axis=0)[:2] / 2
+    x, y = ((points[:, :2] - half) / half).T
+    bent = points + np.column_stack([0 * x, 0 * x, 0.2 * (x**2 - y**2)])
+    seen = sightings(cameras, random_poses(cameras, 15, rng), rng, points=bent)
+    trusting = joint_calibration.calibrate(seen, BOARD, sizes, QUICK)
+    assert any("release its shape" in warning for warning in trusting.warnings)
+    released = joint_calibration.calibrate(seen, BOARD, sizes, Settings(distortion="decentred", shape=Shape(released=True)))
+    assert not any("release" in warning for warning in released.warnings)
+    assert max(released.rms.values()) < 0.02 < max(trusting.rms.values())
+    in_plane, out_of_plane = departure(released.adjustment.points, bent)
+    assert in_plane < 0.005 and out_of_plane < 0.02
+
+
+def test_departure_sees_shape_and_not_place(rng):
+    design = BOARD.points()
+    placed = rigid.apply(rigid.from_rotation_vector([0.1, 0.2, -0.3], [1, 2, 3]), design)
+    np.testing.assert_allclose(departure(placed, design), 0, atol=1e-12)
+    wavy = design + np.column_stack([np.zeros((44, 2)), 0.1 * rng.standard_normal(44)])
+    assert departure(wavy, design)[1] == pytest.approx(0.1, rel=0.3)
+
+
+def test_halves_agree_as_predicted(cameras):
+    """Differences between two halves, over their predicted sigma, are standard normal: 6 sets, 99.9 %, for correlated numbers."""
+    free = free_parameters(DEVICES, dict.fromkeys(DEVICES, ("k1", "k2", "p1", "p2")))
+    found = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        poses = random_poses(cameras, 14, rng)
+        seen = observe(cameras, poses, rng)
+        nothing = np.zeros_like(seen.pixels)
+        whole = adjust(seen, Estimate(cameras, poses, BOARD.points()), free, nothing)
+        found.append(np.mean(joint_calibration.compare_halves(seen, whole, free, nothing, Shape()) ** 2))
+    assert 0.4 < np.mean(found) < 2.0
+
+
+def test_one_camera_and_projector_are_enough(cameras):
+    rng = np.random.default_rng(8)
+    pair = {name: cameras[name] for name in ("cam1", "projector")}
+    seen = sightings(pair, random_poses(cameras, 12, rng), rng)
+    found = joint_calibration.calibrate(seen, BOARD, {name: camera.size for name, camera in pair.items()}, QUICK)
+    assert list(found.adjustment.calibration.cameras) == ["cam1", "projector"]
+
+
+@pytest.mark.parametrize("hidden", [{"cam2": [1]}, {"cam2": [3, 8]}, {"cam2": [0, 2, 4, 6, 8, 10]}, {"projector": [3]}])
+def test_devices_may_miss_poses(sizes, good, hidden):
+    """The distortion's choice, the halves and the noise all live with what is there."""
+    partly = []
+    for number, one in enumerate(good):
+        gone = [device for device, poses in hidden.items() if number in poses]
+        partly.append(replace(one, pixels={device: at for device, at in one.pixels.items() if device not in gone}))
+    found = joint_calibration.calibrate(partly, BOARD, sizes, QUICK if len(hidden.get("cam2", [])) > 1 else None)
+    assert max(found.rms.values()) < 0.02
+    np.testing.assert_allclose(list(found.adjustment.noise.values()), 1, atol=0.2)
+
+
+def test_a_scrap_of_a_board_is_left_out_with_the_reason(sizes, good):
+    scrap = good[4].pixels["cam2"].copy()
+    scrap[7:] = np.nan
+    found = joint_calibration.calibrate(
+        [*good[:4], replace(good[4], pixels={**good[4].pixels, "cam2": scrap}), *good[5:]], BOARD, sizes, QUICK
+    )
+    assert found.dropped == {"04 cam2": "only 7 of 44 points, 8 are needed"}
+
+
+def test_with_few_poses_the_lens_is_not_made_poorer_than_it_is(cameras, sizes):
+    """Sets of four: no parameter is off by more than five of its standard deviations."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        found = joint_calibration.calibrate(
+            sightings(cameras, random_poses(cameras, 4, rng), rng), BOARD, sizes
+        ).adjustment.calibration
+        error = deviation(found, Calibration(cameras)) / np.sqrt(np.diag(found.uncertainty.covariance))
+        assert np.abs(error).max() < 5
+
+
+def test_a_flat_board_is_not_called_bent(cameras, sizes):
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        found = joint_calibration.calibrate(sightings(cameras, random_poses(cameras, 10, rng), rng), BOARD, sizes, QUICK)
+        assert not any("design" in warning for warning in found.warnings)
+
+
+def test_outliers_of_camera_1_do_not_count_as_the_projectors(sizes, good):
+    """Two of its points off by a pixel: the projector's figure stays what it is, for it was read there."""
+    off = good[2].pixels["cam1"].copy()
+    off[[5, 20]] += 1.0
+    spoilt = [*good[:2], replace(good[2], pixels={**good[2].pixels, "cam1": off}), *good[3:]]
+    before, after = (joint_calibration.calibrate(those, BOARD, sizes, QUICK).rms["projector"] for those in (good, spoilt))
+    assert after == pytest.approx(before, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "board, share",
+    [(Chessboard(columns=9, rows=6, square_mm=16), 1.0), (Charuco(columns=10, rows=7, square_mm=16, marker_mm=12), 0.6)],
+    ids=["chessboard", "charuco in part"],
+)
+def test_corners_calibrate_a_projector_too_and_need_not_all_be_seen(cameras, sizes, board, share):
+    """No centres to correct; of the ChArUco board each camera sees another part, and the projector what camera 1 sees."""
+    rng = np.random.default_rng(15)
+    seen = corners(cameras, random_poses(cameras, 14, rng, points=board.points()), board, rng, share)
+    found = joint_calibration.calibrate(seen, board, sizes, QUICK)
+    assert len(found.observations.poses) == 14 and found.dropped == {} and not found.offsets.any()
+    assert np.isfinite(found.observations.pixels[..., 0]).mean(axis=(0, 1)) == pytest.approx(share, abs=0.02)
+    error = deviation(found.adjustment.calibration, Calibration(cameras))
+    length = error @ np.linalg.solve(found.adjustment.calibration.uncertainty.covariance, error)
+    assert chi2.ppf(0.001, len(error)) < length < chi2.ppf(0.999, len(error))

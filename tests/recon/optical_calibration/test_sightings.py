@@ -1,0 +1,57 @@
+"""From the images of one pose to where each device sees the board, on synthetic photographs."""
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.model.boards import Chessboard
+from recon.model.patterns import Fringes, GrayCode, Patterns
+from recon.optical_calibration.sightings import sight
+from tests.recon.board_views import pose, view
+
+BOARD = Chessboard(columns=5, rows=4, square_mm=28)
+CAMERA = Camera((320, 256), np.array([[830.0, 0, 158], [0, 832, 127], [0, 0, 1]]), np.zeros(4))
+PROJECTOR = Camera(
+    (256, 160),
+    np.array([[560.0, 0, 127], [0, 560, 80], [0, 0, 1]]),
+    np.zeros(4),
+    rigid.from_rotation_vector(np.deg2rad([0, -15, 0]), [172.0, 4, 45]),
+)
+PATTERNS = Patterns(
+    projector_size=PROJECTOR.size,
+    unwrap="gray",
+    parts=tuple(
+        part
+        for axis in ("columns", "rows")
+        for part in (Fringes(axis=axis, pitch=16, steps=8), GrayCode(axis=axis, pitch=16, bits=4))
+    ),
+)
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+def test_images_of_any_depth_tell_the_points_of_camera_and_projector(bits, rng):
+    """The same light in finer steps: the points lie where they should, and as well as is said."""
+    world_from_board = pose(BOARD, 640, (0.3, -0.25), 0.1)
+    lit, full = view(BOARD, CAMERA, world_from_board, dark=80), 2**bits - 1
+    board_from_world = rigid.invert(world_from_board)
+    rays, normal = CAMERA.rays(CAMERA.pixel_grid()), board_from_world[2]
+    surface = rays * (-normal[3] / (rays @ normal[:3]))[..., None]
+    at = PROJECTOR.project(surface).astype(np.float32)
+    light = np.stack([cv2.remap(np.float32(image), at[..., 0], at[..., 1], cv2.INTER_LINEAR) for image in PATTERNS.images()])
+    kind = np.uint8 if bits == 8 else np.uint16
+    photographs = [
+        np.clip(np.rint((image + rng.normal(0, 0.7, image.shape)) * full / 255), 0, full).astype(kind)
+        for image in (lit, *(lit * light))
+    ]
+
+    found = sight("00", BOARD, {"cam1": photographs[0]}, np.stack(photographs[1:]), PATTERNS, {"cam1": bits})
+    assert not found.failures
+    truth = rigid.apply(world_from_board, BOARD.points())
+    for name, camera in (("cam1", CAMERA), ("projector", PROJECTOR)):
+        error = found.pixels[name] - camera.project(truth)
+        known = np.isfinite(error).all(axis=1)
+        assert known.mean() > 0.8 and np.abs(error[known]).max() < 0.1, name
+    error = found.pixels["cam1"] - CAMERA.project(truth)
+    assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance["cam1"]), error)) < 4

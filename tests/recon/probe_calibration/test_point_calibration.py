@@ -1,0 +1,310 @@
+"""A probe's calibration is repeatable, right, as sure as it says, and refuses what leaves it open."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.model.probe import ProbeCalibration
+from recon.probe_calibration import point_calibration, point_equation, probe_checks, repeatability, sound_in_water
+from recon.probe_calibration.point_calibration import Noise, Sightings, calibrate
+from tests.recon import bscans
+from tests.recon.probe_motions import (
+    ANGLE_DEG,
+    PIXEL_PX,
+    POSITION_MM,
+    SLICE_MM,
+    motion,
+    observe,
+    poses_of,
+    true_probe,
+    with_outliers,
+)
+
+NOISE = Noise(ANGLE_DEG, POSITION_MM, PIXEL_PX, SLICE_MM)
+SIZE = bscans.SIZE
+POINTS = repeatability.five_points(SIZE)
+CENTRE, MIDDLE = 0, (np.array(SIZE) - 1) / 2
+
+
+@pytest.fixture
+def probe(rig):
+    return true_probe(rig)
+
+
+@pytest.fixture
+def frames(rig):
+    return motion(rig)
+
+
+def errors(calibration, probe):
+    """Distances (5,) mm of the five points from where they are."""
+    return np.linalg.norm(calibration.to_target(POINTS) - probe.to_target(POINTS), axis=1)
+
+
+def test_without_noise_the_calibration_is_the_truth(probe, frames):
+    result = calibrate(Sightings(poses_of(probe, *frames), frames[1]), SIZE, NOISE)
+    assert errors(result.calibration, probe).max() < 1e-6
+    assert result.rms_mm < 1e-6
+
+
+def test_the_closed_form_is_exact_for_four_frames(probe, frames):
+    poses = poses_of(probe, *frames)[:4]
+    pose, scale, _ = point_equation.closed_form(poses, frames[1][:4])
+    assert errors(ProbeCalibration(pose, scale), probe).max() < 1e-5
+
+
+@pytest.mark.parametrize("roll_deg", [180, 35])
+def test_five_calibrations_agree_and_are_right(rig, probe, rng, roll_deg):
+    """Bars of CR1, CR2 at centre, corners and mean, and of the true error; a probe that can't be rolled keeps them too."""
+    turns, pixels = motion(rig, roll_deg)
+    made = [calibrate(observe(probe, turns, pixels, rng), SIZE, NOISE).calibration for _ in range(5)]
+    first, second = repeatability.cr1(made, POINTS), repeatability.cr2(made, POINTS)
+    assert first[CENTRE] <= 0.20 and first[1:].mean() <= 0.25 and first.mean() <= 0.30
+    assert second[CENTRE] <= 0.13 and second[1:].mean() <= 0.17 and second.mean() <= 0.20
+    assert max(errors(each, probe).max() for each in made) <= 0.30
+    assert errors(repeatability.average(made), probe).max() < 0.15  # 0.3 / sqrt(5)
+
+
+def test_the_covariance_is_honest(probe, frames, rng):
+    """Errors of 25 calibrations, normalised by their covariance, are chi-square with 8 degrees of freedom each."""
+    total = 0.0
+    for _ in range(25):
+        made = calibrate(observe(probe, *frames, rng), SIZE, NOISE).calibration
+        turn = Rotation.from_matrix(probe.target_from_image[:3, :3] @ made.target_from_image[:3, :3].T).as_rotvec()
+        shift = probe.target_from_image[:3, 3] - made.target_from_image[:3, 3]
+        error = np.concatenate([probe.scale - made.scale, turn, shift])
+        total += error @ np.linalg.solve(made.uncertainty.covariance, error)
+    low, high = stats.chi2.ppf([0.0005, 0.9995], 8 * 25)
+    assert low < total < high * 79 / 77  # the noise level itself is measured, from 79 degrees of freedom
+
+
+def test_the_level_of_the_noise_is_measured(probe, frames, rng):
+    """Told half the noise, it finds a factor of two and the same covariance."""
+    sightings = observe(probe, *frames, rng)
+    right = calibrate(sightings, SIZE, NOISE)
+    half = calibrate(sightings, SIZE, Noise(ANGLE_DEG / 2, POSITION_MM / 2, PIXEL_PX / 2, SLICE_MM / 2))
+    assert half.noise_factor == pytest.approx(2 * right.noise_factor, rel=1e-3)
+    expected = np.diag(right.calibration.uncertainty.covariance)
+    assert np.diag(half.calibration.uncertainty.covariance) == pytest.approx(expected, rel=1e-2)
+
+
+def test_a_third_of_wrong_crossings_does_no_harm(probe, frames, rng):
+    """The bars with 30 % outliers are 1.5 times those without."""
+    made = []
+    for _ in range(5):
+        sightings, wrong = with_outliers(observe(probe, *frames, rng), 0.3, rng)
+        result = calibrate(sightings, SIZE, NOISE)
+        assert result.outliers[wrong].all() and result.outliers.sum() <= len(wrong) + 1
+        made.append(result.calibration)
+    first, second = repeatability.cr1(made, POINTS), repeatability.cr2(made, POINTS)
+    assert first[CENTRE] <= 0.30 and first[1:].mean() <= 0.375 and first.mean() <= 0.45
+    assert second[CENTRE] <= 0.195 and second[1:].mean() <= 0.255 and second.mean() <= 0.30
+    assert max(errors(each, probe).max() for each in made) <= 0.45
+
+
+def test_outliers_that_agree_with_each_other_are_still_outliers(probe, frames, rng):
+    """A reverberation, always 50 px below the wire, in a third of the upper frames."""
+    sightings = observe(probe, *frames, rng)
+    shallow = np.flatnonzero(sightings.pixels[:, 1] < 200)[::3]
+    sightings.pixels[shallow, 1] += 50
+    result = calibrate(sightings, SIZE, NOISE)
+    assert result.outliers[shallow].all()
+    assert errors(result.calibration, probe).max() < 0.45
+
+
+def test_wires_are_found_in_images_by_themselves(probe, frames, rng):
+    turns, pixels = frames
+    turns, pixels = turns[::2], pixels[::2]
+    images = [bscans.image(bscans.spot(pixel) + bscans.face(), rng) for pixel in pixels]
+    images[3] = bscans.image(bscans.face(), rng)
+    poses = observe(probe, turns, pixels, rng).poses
+    poses[5] = np.nan
+    sightings, found = point_calibration.from_images(images, poses)
+    assert {k: each.reason for k, each in enumerate(found) if not each.found} == {
+        3: "no echo stands out",
+        5: point_calibration.NO_POSE,
+    }
+    assert errors(calibrate(sightings, SIZE, NOISE).calibration, probe).max() < 0.45  # half the frames: 0.3 * sqrt(2)
+
+
+def test_predicted_errors_of_pixels_are_those_of_the_parameters(probe, frames, rng):
+    """Pixels placed by calibrations drawn from the covariance scatter as predicted."""
+    made = calibrate(observe(probe, *frames, rng), SIZE, NOISE).calibration
+    draws = rng.multivariate_normal(np.zeros(8), made.uncertainty.covariance, 4000)
+    placed = []
+    for step in draws:
+        turn = Rotation.from_rotvec(step[2:5]).as_matrix() @ made.target_from_image[:3, :3]
+        moved = rigid.transform(turn, made.target_from_image[:3, 3] + step[5:])
+        placed.append(ProbeCalibration(moved, made.scale + step[:2]).to_target(POINTS))
+    predicted = point_calibration.point_covariance(made, POINTS)
+    sampled = np.array([np.cov(np.array(placed)[:, k], rowvar=False) for k in range(len(POINTS))])
+    assert np.trace(sampled, axis1=1, axis2=2) == pytest.approx(np.trace(predicted, axis1=1, axis2=2), rel=0.1)  # 3 sigma: 0.07
+
+
+def test_poses_known_to_differ_are_weighted_so(probe, frames, rng):
+    """With half of the poses ten times worse, telling so gives a better calibration, and an honest level of noise."""
+    good, bad = observe(probe, *frames, rng), observe(probe, *frames, rng)
+    sigma = np.where(np.arange(30) % 2, 10, 1)
+    poses = good.poses.copy()
+    for k in np.flatnonzero(sigma > 1):
+        poses[k, :3, :3] = Rotation.from_rotvec(np.radians(0.8) * rng.standard_normal(3)).as_matrix() @ bad.poses[k, :3, :3]
+    covariance = np.array([np.diag([np.radians(ANGLE_DEG * s) ** 2] * 3 + [POSITION_MM**2] * 3) for s in sigma])
+    result = calibrate(Sightings(poses, good.pixels, pose_covariance=covariance), SIZE, NOISE)
+    assert 0.7 < result.noise_factor < 1.3
+    assert errors(result.calibration, probe).max() < 0.45
+
+
+@pytest.mark.parametrize(
+    ("kept", "named"),
+    [
+        ((0, 0, 0), "found none"),
+        ((1, 0, 0), "planar motion.*c0-c1"),
+        ((0, 1, 0), "planar motion.*normal"),
+        ((0, 0, 1), "planar motion.*c0-c2"),
+    ],
+)
+def test_a_missing_rotation_is_named(probe, frames, rng, kept, named):
+    """The rig's image has its depth axis along the target's normal, and its array along c0-c1."""
+    turns = np.outer(np.linspace(-35, 35, 30), kept)
+    with pytest.raises(InputError, match=named):
+        calibrate(observe(probe, turns, frames[1], rng), SIZE, NOISE)
+
+
+@pytest.mark.parametrize(
+    ("place", "named"),
+    [
+        (lambda u, v: (u, 0 * v + 200), "one depth only"),
+        (lambda u, v: (0 * u + 160, v), "one lateral position only"),
+        (lambda u, v: (u, 0.8 * u + 50), "all on one line"),
+    ],
+)
+def test_a_missing_place_in_the_image_is_named(probe, frames, rng, place, named):
+    with pytest.raises(InputError, match=named):
+        pixels = np.column_stack(place(*frames[1].T))
+        calibrate(observe(probe, frames[0], pixels, rng), SIZE, NOISE)
+
+
+def test_planar_motion_is_seen_behind_outliers(probe, frames, rng):
+    turns = np.outer(np.linspace(-35, 35, 30), [1, 0, 0])
+    sightings, _ = with_outliers(observe(probe, turns, frames[1], rng), 0.3, rng)
+    with pytest.raises(InputError, match="planar motion"):
+        calibrate(sightings, SIZE, NOISE)
+
+
+def test_one_depth_is_seen_behind_outliers(probe, frames, rng):
+    sightings, _ = with_outliers(observe(probe, frames[0], frames[1] * [1, 0] + [0, 200], rng), 0.3, rng)
+    with pytest.raises(InputError, match="one depth only"):
+        calibrate(sightings, SIZE, NOISE)
+
+
+SWAPPED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+DOWN = np.diag([1.0, 1, -1, 1])
+
+
+def transposed(poses):
+    result = poses.copy()
+    result[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    return result
+
+
+def shifts(poses, matrix):
+    result = poses.copy()
+    result[:, :3, 3] = poses[:, :3, 3] @ matrix[:3, :3]
+    return result
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        (lambda poses: poses @ SWAPPED, "left-handed"),
+        (lambda poses: SWAPPED @ poses, "left-handed"),
+        (np.linalg.inv, "target_from_world"),
+        (transposed, "transposed rotations"),
+        (lambda poses: shifts(poses, SWAPPED), "axes x and y swapped in the translations"),
+        (lambda poses: shifts(poses, DOWN), "wrong handedness, z mirrored"),
+        (lambda poses: poses @ np.diag([1, 1, 1, 2.0]), "rigid transform"),
+        (lambda poses: poses * np.nan, "not finite"),
+        (lambda poses: shifts(poses, np.eye(4) / 1000), "are the poses in mm"),
+        (lambda poses: poses[::-1], "one point at rest"),
+    ],
+)
+def test_poses_that_mean_something_else_are_named(probe, frames, rng, wrong, named):
+    sightings = observe(probe, *frames, rng)
+    with pytest.raises(InputError, match=named) as raised:
+        calibrate(Sightings(wrong(sightings.poses), sightings.pixels), SIZE, NOISE)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        (lambda poses, pixels: (poses, 2 * MIDDLE * [1, 0] + pixels * [-1, 1]), "mirrored left to right"),
+        (lambda poses, pixels: (poses, 2 * MIDDLE * [0, 1] + pixels * [1, -1]), "upside down"),
+        (lambda poses, pixels: (poses, MIDDLE + 0.6 * (pixels - MIDDLE)[:, ::-1]), "u and v are swapped"),
+        (lambda poses, pixels: (poses @ SWAPPED @ DOWN, pixels), r"target's axes are swapped: \(y, x, -z\)"),
+    ],
+)
+def test_axes_swapped_without_contradiction_are_known_by_the_design(probe, frames, rng, wrong, named):
+    """They fit as well as the truth; the design of the bracket, good to 10 degrees, tells."""
+    designed = probe.target_from_image @ rigid.from_rotation_vector([0.1, -0.1, 0.1], [5, -5, 5])
+    poses, pixels = observe(probe, *frames, rng).poses, frames[1]
+    if "u and v" in named:
+        poses = observe(probe, frames[0], MIDDLE + 0.6 * (pixels - MIDDLE), rng).poses
+    assert calibrate(observe(probe, *frames, rng), SIZE, NOISE, designed)
+    with pytest.raises(InputError, match=named):
+        calibrate(Sightings(*wrong(poses, pixels)), SIZE, NOISE, designed)
+
+
+def test_u_and_v_swapped_leave_the_image(probe, frames, rng):
+    sightings = observe(probe, *frames, rng)
+    with pytest.raises(InputError, match="u and v are swapped"):
+        calibrate(Sightings(sightings.poses, sightings.pixels[:, ::-1]), SIZE, NOISE)
+
+
+def test_an_image_upside_down_puts_the_target_under_water(probe, frames, rng):
+    sightings = observe(probe, *frames, rng)
+    with pytest.raises(InputError, match="upside down"):
+        calibrate(Sightings(sightings.poses, [0, SIZE[1] - 1] + sightings.pixels * [1, -1]), SIZE, NOISE)
+
+
+def test_five_frames_are_too_few(probe, frames, rng):
+    with pytest.raises(InputError, match="at least 6 frames"):
+        calibrate(observe(probe, *frames, rng).of(range(5)), SIZE, NOISE)
+
+
+def test_a_calibration_in_water_shows_its_speed_of_sound_and_is_corrected_for_it(probe, frames, rng):
+    """The scanner assumes 1540 m/s, so wires in water of 22 degrees stand deeper in its image than they are."""
+    speed = sound_in_water.speed_of_sound(22.0)
+    in_water = ProbeCalibration(probe.target_from_image, probe.scale * [1, speed / sound_in_water.SCANNER_SPEED])
+    made = calibrate(observe(in_water, *frames, rng), SIZE, NOISE).calibration
+    assert errors(made, in_water).max() < 0.30
+    implied, sigma = sound_in_water.implied_speed(made, probe.scale[1])
+    assert abs(implied - speed) < 4 * sigma < 20
+    uncorrected = errors(made, probe).max()
+    assert uncorrected == pytest.approx(sound_in_water.shown_too_deep(50.0, speed), abs=0.3)
+    assert errors(sound_in_water.in_medium(made, float(speed), sound_in_water.SCANNER_SPEED), probe).max() < 0.31
+
+
+def test_poses_in_cm_are_told_by_the_brackets_length(probe, frames, rng):
+    """They fit as well, with all lengths a tenth: only the design tells."""
+    sightings = observe(probe, *frames, rng)
+    in_cm = Sightings(shifts(sightings.poses, np.eye(4) / 10), sightings.pixels)
+    small = Noise(ANGLE_DEG, POSITION_MM / 10, PIXEL_PX, SLICE_MM / 10)
+    with pytest.raises(InputError, match=r"found it \d deg and 1\d\d mm off: are the poses in mm, and is rig.probe") as raised:
+        calibrate(in_cm, SIZE, small, probe.target_from_image)
+    assert "\n" not in str(raised.value)
+
+
+def test_exact_poses_need_no_noise(probe, frames):
+    """Nothing is inverted that is singular: a floor of a micrometre stands for none."""
+    result = calibrate(Sightings(poses_of(probe, *frames), frames[1]), SIZE, Noise(0, 0, 0, 0))
+    assert errors(result.calibration, probe).max() < 1e-6
+
+
+@pytest.mark.parametrize("implied", [154.0, 15400.0])
+def test_a_scale_that_tells_no_speed_of_sound_is_refused(implied):
+    with pytest.raises(InputError, match=f"300 to 5000 m/s, found {implied:.0f}: are the poses in mm"):
+        probe_checks.speed(implied)

@@ -1,0 +1,53 @@
+"""Does an object lie under the surface that the cameras saw?"""
+
+import numpy as np
+import pytest
+import trimesh
+
+from recon.segmentation.containment import contain, depths
+
+DOME_MM, MIDDLE = 60.0, np.array([5.0, -3.0, 690.0])
+
+
+@pytest.fixture(scope="module")
+def dome():
+    """The cap of a sphere that faces a camera at the origin, open below, with the winding that the camera sees as its back."""
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=DOME_MM)
+    front = (sphere.triangles_center[:, 2] < -15).nonzero()[0]
+    cap = sphere.submesh([front], append=True)
+    return trimesh.Trimesh(cap.vertices + MIDDLE, cap.faces[:, ::-1], process=False)
+
+
+def test_depth_is_the_distance_to_the_skin(dome, rng):
+    """Facets of 2 mm on a radius of 60 sag by 0.01 mm; half an edge beside the nearest vertex, 1 mm, adds 0.03 at 15 mm."""
+    direction = rng.normal(size=(300, 3)) * 0.4 - [0, 0, 1]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = direction[direction[:, 2] < -0.5]
+    radius = rng.uniform(45, 70, len(direction))
+    found = depths(MIDDLE + radius[:, None] * direction, dome)
+    assert np.abs(found - (DOME_MM - radius)).max() < 0.1
+    assert np.isfinite(found).all()
+
+
+def test_an_object_within_is_inside_and_one_that_pierces_the_skin_is_not(dome):
+    within = trimesh.creation.icosphere(radius=8).apply_translation(MIDDLE - [10, 5, 35])
+    piercing = trimesh.creation.icosphere(radius=8).apply_translation(MIDDLE - [0, 0, 54])
+    assert contain(within, dome).inside
+    assert contain(within, dome).least_mm == pytest.approx(DOME_MM - 8 - np.linalg.norm([10, 5, 35]), abs=0.15)
+    assert contain(piercing, dome).inside is False
+    assert contain(piercing, dome).least_mm == pytest.approx(-2, abs=0.1)
+
+
+def test_what_lies_beside_the_surface_is_not_said_to_be_inside(dome):
+    beside = trimesh.creation.icosphere(radius=5).apply_translation(MIDDLE + np.array([90, 0, 0]))
+    result = contain(beside, dome)
+    assert result.covered == 0 and result.inside is None and np.isnan(result.least_mm)
+
+
+def test_less_than_half_under_the_surface_is_not_enough_to_tell(dome):
+    """A ball under the rim: what is seen of it lies deep enough, but that is the smaller part; one that pierces it is outside."""
+    rim = MIDDLE + np.array([58, 0, -15])
+    hardly = contain(trimesh.creation.icosphere(radius=5).apply_translation(rim + np.array([-5.0, 0, 3])), dome)
+    assert 0 < hardly.covered < 0.5 and hardly.least_mm > 0 and hardly.inside is None
+    piercing = contain(trimesh.creation.icosphere(radius=5).apply_translation(rim), dome)
+    assert 0 < piercing.covered < 0.5 and piercing.inside is False

@@ -1,0 +1,112 @@
+"""What the probe carries: a print that stays whole, closed bodies, and now and then something before a circle."""
+
+import numpy as np
+import pytest
+
+from scenes.handheld.handheld_assembly import Ranges, held
+from scenes.handheld.mesh_parts import SLOTS, merged
+
+VARIANTS = 24
+DIRECTIONS = np.deg2rad(np.arange(0, 360, 5))
+
+
+@pytest.fixture(scope="module")
+def variants(rig):
+    return [held(np.random.default_rng([5, k]), rig.target) for k in range(VARIANTS)]
+
+
+def discs(target):
+    return np.array([[0, 0], [target.c1_mm, 0], [0, target.c2_mm]])
+
+
+def test_the_target_is_one_rectangle_in_its_plane_with_white_around_each_disc(variants, rig):
+    radius = rig.target.outer_diameter_mm / 2 + 3
+    rims = discs(rig.target)[:, None] + radius * np.stack([np.cos(DIRECTIONS), np.sin(DIRECTIONS)], axis=-1)
+    for parts in variants:
+        (front,) = [part.mesh for part in parts if part.slot == "target"]
+        assert len(front.faces) == 2 and (front.vertices[:, 2] == 0).all()
+        assert np.allclose(front.face_normals, [0, 0, 1])
+        low, high = front.bounds[:, :2]
+        assert front.area == pytest.approx(np.prod(high - low))
+        assert (rims >= low - 1e-9).all() and (rims <= high + 1e-9).all()
+        assert np.all(np.abs((high - low) / rig.target.board_mm - 1) <= 0.08 + 1e-9)
+
+
+def test_the_board_s_place_varies(variants, rig):
+    """The circles are not in the board's middle by rule: a network that relies on it would fail on a real board."""
+    middles = np.array([parts[0].mesh.bounds[:, :2].mean(axis=0) for parts in variants])
+    assert (np.ptp(middles, axis=0) > [4, 0.5]).all()
+
+
+def test_all_but_the_print_is_closed_and_faces_outwards(variants):
+    for parts in variants:
+        for part in parts:
+            assert part.slot in SLOTS and np.isfinite(part.mesh.vertices).all()
+            if part.slot != "target":
+                assert part.mesh.is_watertight and part.mesh.is_winding_consistent, part.slot
+                assert part.mesh.volume > 0, part.slot
+
+
+def test_nothing_of_the_body_is_in_front_of_the_print_s_plane_within_it(variants):
+    """The board's own solids stay behind their print, or they would hide it."""
+    for parts in variants:
+        for part in parts:
+            if part.slot in ("board", "bracket"):
+                low, high = parts[0].mesh.bounds[:, :2]
+                xy = part.mesh.vertices[:, :2]
+                within = ((xy > low + 0.5) & (xy < high - 0.5)).all(axis=1)
+                assert (part.mesh.vertices[within, 2] < 0).all(), part.slot
+
+
+def covered(parts, target):
+    """Part of each outer disc : (3,) that something hides from a viewer straight above."""
+    low, step = -20.0, 0.5
+    cells = np.zeros((220, 220), bool)
+    for part in parts:
+        if part.slot == "target":
+            continue
+        points = part.mesh.triangles
+        points = points[(points[:, :, 2] > 0.2).any(axis=1)]
+        inside = ((points[:, :, :2].max(axis=1) > low) & (points[:, :, :2].min(axis=1) < low + 110)).all(axis=1)
+        for weights in np.random.default_rng(0).dirichlet([1, 1, 1], 40):  # finer than the cells on triangles of 3 mm
+            spots = np.floor((np.einsum("k,nkd->nd", weights, points[inside])[:, :2] - low) / step).astype(int)
+            spots = spots[((spots >= 0) & (spots < 220)).all(axis=1)]
+            cells[spots[:, 0], spots[:, 1]] = True
+    centres = low + step * (np.arange(220) + 0.5)
+    x, y = np.meshgrid(centres, centres, indexing="ij")
+    radius = target.outer_diameter_mm / 2
+    return np.array([cells[np.hypot(x - cx, y - cy) < radius].mean() for cx, cy in discs(target)])
+
+
+def test_a_quarter_of_the_variants_hide_a_part_of_a_circle(variants, rig):
+    """28 % are meant to (some of those miss); 24 draws deviate by 9 % (one sigma). Hardly any hides all three circles."""
+    hidden = np.array([covered(parts, rig.target) for parts in variants])
+    some = (hidden > 0.02).any(axis=1)
+    assert 0.08 <= some.mean() <= 0.5
+    assert ((hidden > 0.5).all(axis=1)).mean() < 0.1
+
+
+def test_nothing_covers_a_circle_unless_asked_to(rig):
+    ranges = Ranges(cable_in_front=0, finger_in_front=0, robot=0.3)
+    for k in range(8):
+        parts = held(np.random.default_rng([9, k]), rig.target, ranges)
+        assert covered(parts, rig.target).max() < 0.02, k
+
+
+def test_most_variants_have_a_hand_and_some_have_none(variants):
+    hands = np.mean([any(part.slot == "skin" for part in parts) for parts in variants])
+    assert 0.6 < hands < 1
+
+
+def test_a_variant_is_small_and_near(variants):
+    for parts in variants:
+        assert sum(len(part.mesh.faces) for part in parts) <= 30_000
+        for part in parts:
+            if part.slot in ("board", "probe", "marking"):
+                assert np.abs(part.mesh.vertices).max() < 280, part.slot
+
+
+def test_the_same_seed_gives_the_same_bytes(rig):
+    once, twice = (merged(held(np.random.default_rng(3), rig.target)) for _ in range(2))
+    for name in ("vertices", "normals", "faces", "slot"):
+        assert getattr(once, name).tobytes() == getattr(twice, name).tobytes()

@@ -1,0 +1,78 @@
+"""The doctor on sound and on damaged installations, the damage simulated."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from sonotwin import cli, installation
+from twin import llvm
+
+PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
+
+
+def find(findings, what: str) -> list[installation.Finding]:
+    return [finding for finding in findings if finding.what == what]
+
+
+def test_requirements_are_those_of_the_project():
+    project = tomllib.loads(PYPROJECT.read_text())["project"]
+    expected = {"core": len(project["dependencies"])} | {k: len(v) for k, v in project["optional-dependencies"].items()}
+    parts = [part for part, _, _ in installation.requirements()]
+    assert {part: parts.count(part) for part in expected} == expected
+
+
+def test_this_installation_is_sound(capsys):
+    """The tests run in it, so its core is."""
+    assert cli.main(["doctor"]) == 0
+    assert "numpy" in capsys.readouterr().out
+
+
+def test_a_bad_llvm_is_caught_before_it_ends_the_process(tmp_path, monkeypatch, capsys):
+    bad = tmp_path / "libLLVM-15.so.1"
+    bad.touch()
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    monkeypatch.setattr(llvm, "candidates", lambda: [bad])
+    monkeypatch.setattr(installation, "_version", lambda name: "1.5.0")
+    state, verdict = list(installation._llvm())
+    assert (state.state, verdict.state) == ("unused", "problem")
+    assert "LLVM 15" in state.found
+    assert "19" in verdict.remedy
+
+
+def test_a_missing_core_package_is_status_2(monkeypatch, capsys):
+    real = installation._version
+    monkeypatch.setattr(installation, "_version", lambda name: None if name == "scipy" else real(name))
+    assert cli.main(["doctor"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err == "sonotwin: doctor: the core can't be used, because of scipy\n"
+    assert "core scipy: pip install '.' in sonotwin's folder" in captured.out
+
+
+def test_a_missing_twin_is_status_0(monkeypatch, capsys):
+    real = installation._version
+    monkeypatch.setattr(installation, "_version", lambda name: None if name in ("mitsuba", "drjit") else real(name))
+    assert cli.main(["doctor"]) == 0
+    assert "twin mitsuba: pip install '.[twin]' in sonotwin's folder" in capsys.readouterr().out
+
+
+def test_a_package_that_crashes_does_not_take_the_doctor_along(tmp_path, monkeypatch):
+    (tmp_path / "crashes.py").write_text("import os; os.abort()")
+    (tmp_path / "lacks.py").write_text("import nothing_of_the_kind")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    failures = installation._failing_imports(["json", "crashes", "lacks", "csv"])
+    assert set(failures) == {"crashes", "lacks"}
+    assert "nothing_of_the_kind" in failures["lacks"]
+
+
+def test_an_unwritable_cache_is_a_problem_with_a_remedy(monkeypatch, tmp_path):
+    monkeypatch.setattr(installation.os, "access", lambda path, mode: False)
+    findings = list(installation._folders())
+    assert all(finding.state == "problem" and finding.remedy for finding in findings)
+
+
+@pytest.mark.parametrize(
+    ("module", "part"), [("matplotlib.figure", "core"), ("omegaconf", "core"), ("torch", "train"), ("recon", None)]
+)
+def test_a_module_belongs_to_a_part(module, part):
+    assert installation.extra_of(module) == part

@@ -1,0 +1,144 @@
+"""Data sets are the same bytes however they are made, and damaged or foreign folders are refused."""
+
+import io
+import json
+import shutil
+import tarfile
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from recon.errors import InputError
+from tests.twin.tracking.takes import ranges, rig
+from twin.tracking import dataset_shards
+from twin.tracking.dataset_shards import Place, Settings, generate, prepare, write_index
+from twin.tracking.mesh_bank import build_bank
+from twin.tracking.rendered_views import Quality
+
+QUALITY = Quality(view=1, patch=2, window=2)
+
+
+def settings(samples: int = 4, **changes) -> Settings:
+    fields = {"rig": rig(), "ranges": ranges(), "quality": QUALITY, "frames": "views", "seed": 5, "shard": 2}
+    return Settings(samples=samples, **{**fields, **changes})
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A data set of two shards."""
+    place = Place(tmp_path_factory.mktemp("data") / "set")
+    list(generate(place, settings(), prepare(place, settings()), 1))
+    write_index(place, settings())
+    return place
+
+
+def members(path) -> dict[str, bytes]:
+    with tarfile.open(path) as archive:
+        return {entry.name: archive.extractfile(entry).read() for entry in archive}
+
+
+def test_a_killed_run_goes_on_to_the_same_bytes(made, tmp_path, monkeypatch):
+    place, wanted = Place(tmp_path / "set"), settings()
+    written = []
+
+    def dies(tar, sample):
+        written.append(sample["__key__"])
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        return write(tar, sample)
+
+    write = dataset_shards.wds.TarWriter.write
+    monkeypatch.setattr(dataset_shards.wds.TarWriter, "write", dies)
+    with pytest.raises(KeyboardInterrupt):
+        list(generate(place, wanted, prepare(place, wanted), 1))
+    assert not list(place.folder.glob("*.tar"))
+    monkeypatch.undo()
+    missing = prepare(place, wanted)
+    assert missing == [0, 1]
+    list(generate(place, wanted, missing[1:], 1))
+    assert prepare(place, wanted) == [0]
+    list(generate(place, wanted, [0], 1))
+    for number in (0, 1):
+        assert place.shard(number).read_bytes() == made.shard(number).read_bytes()
+
+
+def test_a_sample_does_not_know_its_batch(made, monkeypatch, tmp_path):
+    monkeypatch.setattr(dataset_shards, "BATCH", 1)
+    place = Place(tmp_path / "set")
+    place.folder.mkdir()
+    bank = build_bank(rig().target, ranges().variants, 5)
+    dataset_shards.write_shard(place, settings(), bank, 1)
+    assert place.shard(1).read_bytes() == made.shard(1).read_bytes()
+
+
+@pytest.mark.slow
+def test_two_workers_write_the_same_bytes(made, tmp_path):
+    place = Place(tmp_path / "set")
+    list(generate(place, settings(), prepare(place, settings()), 2))
+    for number in (0, 1):
+        assert place.shard(number).read_bytes() == made.shard(number).read_bytes()
+
+
+def test_what_is_in_a_shard(made):
+    files = members(made.shard(0))
+    keys = {name.split(".")[0] for name in files}
+    assert keys == {"00000000", "00000001"}
+    for key in keys:
+        truth = json.loads(files[f"{key}.json"])
+        for number, view in enumerate(truth["views"], 1):
+            image = cv2.imdecode(np.frombuffer(files[f"{key}.cam{number}.png"], np.uint8), cv2.IMREAD_UNCHANGED)
+            assert image.shape == (240, 320)
+            patches = cv2.imdecode(np.frombuffer(files[f"{key}.patches{number}.png"], np.uint8), cv2.IMREAD_UNCHANGED)
+            masks = cv2.imdecode(np.frombuffer(files[f"{key}.masks{number}.png"], np.uint8), cv2.IMREAD_UNCHANGED)
+            assert patches.shape == masks.shape == (360, 120)
+            if not truth["present"]:
+                assert not masks.any()
+                continue
+            for circle in range(3):  # the mask's middle is the ellipse's, where the patch holds it all
+                piece = masks[120 * circle : 120 * circle + 120]
+                if piece[0].any() or piece[-1].any() or piece[:, 0].any() or piece[:, -1].any() or not piece.any():
+                    continue
+                v, u = np.nonzero(piece)
+                middle = np.array([u.mean(), v.mean()]) + view["patch_origins"][circle]
+                assert np.abs(middle - np.array(view["ellipses"][circle])[:2]).max() < 0.1
+
+
+def test_the_index_has_a_row_a_sample(made):
+    table = pq.read_table(io.BytesIO((made.folder / dataset_shards.INDEX).read_bytes())).to_pylist()
+    assert [row["k"] for row in table] == [0, 1, 2, 3]
+    assert [row["shard"] for row in table] == ["shard-00000.tar"] * 2 + ["shard-00001.tar"] * 2
+
+
+def test_a_data_set_of_other_settings_is_not_mixed_with(made):
+    with pytest.raises(InputError, match="seed: expected 6 as in this run, found 5"):
+        prepare(made, settings(seed=6))
+
+
+@pytest.mark.parametrize(("name", "there"), [("window", 64), ("old", 2)])
+def test_what_differs_is_named_however_deep(tmp_path, name, there):
+    """Also what an earlier version knew and this one doesn't."""
+    place = Place(tmp_path / "set")
+    prepare(place, settings())
+    kept = place.folder / dataset_shards.SETTINGS
+    told = json.loads(kept.read_text())
+    expected = told["quality"].get(name)
+    told["quality"][name] = there
+    kept.write_text(json.dumps(told))
+    with pytest.raises(InputError, match=f"dataset.json: quality.{name}: expected {expected} as in this run, found {there}"):
+        prepare(place, settings())
+
+
+def test_a_folder_of_other_things_is_left_alone(tmp_path):
+    (tmp_path / "letter.txt").write_text("keep me")
+    with pytest.raises(InputError, match="expected an empty folder or a data set"):
+        prepare(Place(tmp_path), settings())
+
+
+def test_more_samples_may_be_asked_for_later(made, tmp_path):
+    grown = Place(tmp_path / "set")
+    shutil.copytree(made.folder, grown.folder)
+    assert prepare(grown, settings(8)) == [2, 3]
+    with pytest.raises(InputError, match="samples: expected at least the 8"):
+        prepare(grown, settings(4))

@@ -1,0 +1,163 @@
+"""A film's motion is that of its path, its light is one light, and what is written is what was made."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recon.capture import stereo_frames
+from recon.geometry import rigid
+from recon.tracking.tracker import Tracker
+from sonotwin.cli import main
+from sonotwin.config import load
+from sonotwin.verbs.film import Config, ranges
+from tests.twin.tracking import takes
+from twin.evaluation import track_errors
+from twin.tracking import film_session
+from twin.tracking.rendered_views import Frames, white_radiance
+from twin.tracking.target_truth import view_truth
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load("film", ["out=unused", "frames=24"], Config)
+
+
+@pytest.fixture(scope="module")
+def bank(config):
+    return film_session.make_bank(config.rig, config.seed)
+
+
+@pytest.fixture(scope="module")
+def made(config, bank):
+    return film_session.takes(bank, config.rig, ranges(), config, config.seed)
+
+
+@pytest.fixture(scope="module")
+def way(config):
+    return film_session.lead(config.path, config.rig.target, np.array([80.0, 0.0, 0.0]), 5)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.31, 0.77])
+def test_the_velocity_is_the_paths_derivative(way, seconds):
+    """Of the origin and of the rotation, by central differences, to their own error of 1e-4 of it."""
+    step = 1e-3
+    before, after = way.pose(seconds - step), way.pose(seconds + step)
+    speed, spin = way.velocity(seconds)
+    assert speed == pytest.approx((after - before)[:3, 3] / (2 * step), rel=1e-3, abs=0.05)
+    assert spin == pytest.approx(Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec() / (2 * step), abs=2e-3)
+
+
+def test_a_round_is_closed_and_smooth(way, config):
+    assert way.pose(0.0) == pytest.approx(way.pose(config.path.seconds), abs=1e-9)
+    for early, late in zip(way.velocity(0.0), way.velocity(config.path.seconds), strict=True):
+        assert early == pytest.approx(late, abs=1e-9)
+
+
+def test_over_an_exposure_the_target_moves_as_the_path(way):
+    """Evenly, so it differs from the path by the third derivative alone: a hundredth of a mm at 10 ms."""
+    motion = way.motion(0.5, 0.01)
+    for part in (-0.5, 0.5):
+        apart = motion.at(part)[:3, 3] - way.pose(0.5 + 0.01 * part)[:3, 3]
+        assert np.linalg.norm(apart) < 0.03 and np.linalg.norm(motion.shift_mm) > 1
+
+
+def test_frames_lie_on_the_path(made, config):
+    """From one frame's motion to the next frame's pose: what is left over is the acceleration's."""
+    poses = np.array([take.motion.world_from_target for take in made])
+    speed = np.array([take.motion.shift_mm for take in made]) / config.exposure_s
+    expected = (speed[1:] + speed[:-1]) / 2 / config.camera_hz
+    assert np.abs(np.diff(poses[:, :3, 3], axis=0) - expected).max() < 0.15
+    assert [take.k for take in made] == list(range(24)) and len({take.noise_seed for take in made}) == 24
+
+
+def test_the_default_film_has_what_a_tracker_fails_at(made, config):
+    """Slow and fast stretches, and one where camera 1 misses a circle that camera 2 sees whole."""
+    views = [[view_truth(take, device, config.rig.target) for device in take.cameras] for take in made]
+    blur = np.array([[view.blur_px.max() for view in both] for both in views]).max(axis=1)
+    inside = np.array([[view.inside.all() for view in both] for both in views])
+    assert blur[0] < 4 and 9 < blur.max() < 14
+    assert (inside[:, 1] & ~inside[:, 0]).sum() >= 4 and inside.all(axis=1).sum() >= 12
+
+
+def test_there_is_one_light_and_one_exposure(made, config):
+    """What a radiance of one comes to is the same in all frames; the target's white is as dark as asked for."""
+    gains = [take.white_dn / white_radiance(take, config.rig) for take in made]
+    assert gains == pytest.approx([gains[0]] * 24)
+    whites = np.array([take.white_dn for take in made])
+    assert whites.mean() == pytest.approx(65) and whites.std() > 0.5
+    assert all(take.lighting is made[0].lighting and take.body == made[0].body for take in made)
+    assert (made[0].scene_from_world == made[5].scene_from_world).all()
+
+
+def test_fingers_leave_the_circles_free(bank, made, config):
+    """Eyes in front see the body that was chosen best; eyes behind the board see nothing through it."""
+    target = config.rig.target
+    front, behind = np.array([[0, 0, 600.0], [150, 0, 600]]), np.array([[10.0, 15, -600]])
+    seen = [film_session.uncovered(bank, body, target, front) for body in range(film_session.BODIES)]
+    assert seen[made[0].body] == max(seen) == 1.0
+    assert film_session.uncovered(bank, 0, target, behind) == 0
+
+
+def blanks(made, size=(1280, 1024)):
+    """Frames of a film that nobody rendered, one by one."""
+    for take in made:
+        first, second = (view_truth(take, device, takes.rig().target) for device in take.cameras)
+        image = np.full(size[::-1], take.k, np.uint8)
+        yield Frames((image, image), np.zeros((2, 3, 1, 1), np.uint8), (first, second))
+
+
+def test_what_is_written_is_what_was_made(config, made, tmp_path):
+    few = config.model_copy(update={"frames": 3})
+    film_session.write_session(tmp_path, config.rig, few, made[:3], blanks(made[:3]), {"seed": 0})
+    read = stereo_frames.read_film(tmp_path / "capture")
+    assert read.times.tolist() == [0, 33_333_333, 66_666_667]
+    assert [int(left[0, 0]) for left, _ in read.pairs()] == [0, 1, 2]
+    truth = track_errors.read_truth(tmp_path / "truth")
+    assert (truth.poses == [take.motion.world_from_target for take in made[:3]]).all()
+    assert truth.times.tolist() == read.times.tolist() and truth.inside.shape == (3, 2, 3)
+    assert json.loads((tmp_path / "truth" / "settings.json").read_text()) == {"seed": 0}
+
+
+def test_frames_are_rendered_as_they_are_asked_for(made, bank, config, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        film_session, "render_sketches", lambda bank, rig, batch, *_: asked.append(len(batch)) or list(blanks(batch))
+    )
+    frames = film_session.shoot(bank, config.rig, made, config.quality, 0)
+    assert not asked
+    next(frames)
+    assert asked == [film_session.BATCH]
+    assert sum(1 for _ in frames) == 23 and sum(asked) == 24
+
+
+def test_what_is_wrong_is_said_in_one_line(tmp_path, capsys):
+    def complaint(*fields: str) -> str:
+        assert main(["film", f"out={tmp_path / 'film'}", *fields]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("sonotwin: ")
+
+    assert complaint("exposure_s=0.05").startswith("film: exposure_s: expected at most 1 / camera_hz = 0.03333, found 0.05")
+    assert complaint("frames=0").startswith("film: frames: expected")
+    assert complaint("path.places_mm=[[0,0,650]]").startswith("film: path.places_mm: expected")
+    (tmp_path / "film" / "capture").mkdir(parents=True)
+    (tmp_path / "film" / "capture" / "thesis.tex").write_text("")
+    assert "found other files" in complaint()
+
+
+@pytest.mark.slow
+def test_a_rendered_film_is_tracked(tmp_path, config):
+    """Three slow frames, by a tracker that is told where the first one is: off by less than four sigma, and 0.2 mm."""
+    assert main(["film", f"out={tmp_path / 'film'}", "frames=3"]) == 0
+    read = stereo_frames.read_film(tmp_path / "film" / "capture")
+    truth = track_errors.read_truth(tmp_path / "film" / "truth")
+    assert track_errors.visible_whole(truth).all()
+    tracker = Tracker(read.cameras, config.rig.target)
+    tracker.remember(rigid.transform(truth.poses[0][:3, :3], truth.poses[0][:3, 3] + [0.3, 0, 0]), -0.03)
+    for (left, right), time, true in itertools.islice(zip(read.pairs(), read.times, truth.poses, strict=True), 3):
+        found = tracker.step(left, right, time * 1e-9)
+        assert found.found, found.pose.reason
+        error = np.linalg.norm(found.pose.world_from_target[:3, 3] - true[:3, 3])
+        assert error < min(4 * np.sqrt(np.trace(found.pose.covariance[3:, 3:])), 0.2)

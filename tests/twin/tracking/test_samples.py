@@ -1,0 +1,91 @@
+"""What is drawn at random keeps to its ranges and shares."""
+
+import numpy as np
+import pytest
+
+from recon.geometry import rigid
+from recon.tracking.pose import circle_centres
+from tests.twin.tracking.takes import ranges, rig
+from twin.tracking.samples import draw, facing
+from twin.tracking.sampling_ranges import PoseRanges
+from twin.tracking.study_samples import TILT_DEG, VOLUME_MM, study_take
+from twin.tracking.target_truth import view_truth
+
+RIG, COUNT = rig(), 150
+
+
+@pytest.fixture(scope="module")
+def takes():
+    return [draw(ranges(), RIG, 7, k) for k in range(COUNT)]
+
+
+def share(flags, expected: float) -> None:
+    """Within 4 standard deviations of a binomial."""
+    assert abs(np.mean(flags) - expected) < 4 * np.sqrt(expected * (1 - expected) / len(flags))
+
+
+def test_shares_are_as_asked(takes):
+    asked = ranges()
+    share([not take.present for take in takes], asked.pose.empty_share)
+    share([take.cameras[0] == RIG.cam1 for take in takes], asked.cameras.own_share)
+    share([take.lighting.projector[0] > 0 for take in takes], asked.light.projector_share)
+
+
+def test_a_take_depends_on_seed_and_number_alone(takes):
+    again = draw(ranges(), RIG, 7, 11)
+    assert again.noise_seed == takes[11].noise_seed
+    assert (again.motion.world_from_target == takes[11].motion.world_from_target).all()
+    assert draw(ranges(), RIG, 8, 11).noise_seed != again.noise_seed
+
+
+def test_targets_face_both_cameras_and_mostly_lie_in_their_images(takes):
+    inside = []
+    for take in takes:
+        pose = take.motion.world_from_target
+        middle = rigid.apply(pose, circle_centres(RIG.target)).mean(axis=0)
+        for device in take.cameras:
+            camera = device.optics.camera()
+            assert (camera.centre - middle) @ pose[:3, 2] > 0
+            pixel = camera.project(middle)
+            inside.append(((pixel > 0) & (pixel < np.array(camera.size))).all())
+    assert np.mean(inside) > 0.9
+
+
+def test_blur_is_the_path_that_was_asked_for(takes):
+    still, moving = [], []
+    for take in takes:
+        length = np.median(view_truth(take, take.cameras[0], RIG.target).blur_px) if take.present else np.nan
+        (still if np.linalg.norm(take.motion.shift_mm) < 0.3 * take.motion.world_from_target[2, 3] / 3320 else moving).append(
+            length
+        )
+    assert np.nanmax(still) < 1
+    assert 1.7 < np.nanmedian(moving) < 5  # log-uniform from 0.3 to 24: 2.7; turns add
+
+
+def test_tilts_fill_the_cone_evenly(rng):
+    cosines = [facing(np.array([0.2, -0.1, -1]), 58, rng)[:, 2] @ np.array([0.2, -0.1, -1]) / np.sqrt(1.05) for _ in range(2000)]
+    low = np.cos(np.deg2rad(58))
+    assert min(cosines) >= low - 1e-12
+    assert abs(np.mean(cosines) - (1 + low) / 2) < 4 * (1 - low) / np.sqrt(12 * 2000)
+
+
+def test_studies_keep_to_the_working_volume():
+    low, high = np.array(VOLUME_MM)
+    for k in range(20):
+        take = study_take(RIG, ranges(), 3, k, 100.0, 12.0)
+        pose = take.motion.world_from_target
+        middle = rigid.apply(pose, [RIG.target.c1_mm / 2, RIG.target.c2_mm / 2, 0])
+        eyes = (RIG.cam1.optics.camera().centre + RIG.cam2.optics.camera().centre) / 2
+        assert ((middle - [eyes[0], 0, 0] >= low - 1) & (middle - [eyes[0], 0, 0] <= high + 1)).all()
+        towards = (eyes - middle) / np.linalg.norm(eyes - middle)
+        assert np.rad2deg(np.arccos(pose[:3, 2] @ towards)) <= TILT_DEG + 1e-9
+        for device in take.cameras:
+            truth = view_truth(take, device, RIG.target)
+            assert truth.inside.all()
+            assert truth.blur_px == pytest.approx(12, abs=5)
+
+
+def test_ranges_the_wrong_way_round_are_refused_by_name():
+    fields = ranges().pose.model_dump()
+    with pytest.raises(ValueError, match="working_mm: expected the least first"):
+        PoseRanges(**{**fields, "working_mm": (730, 590)})

@@ -1,0 +1,58 @@
+"""Signed distances of what echoes come from."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from recon.errors import InputError
+from scenes.acoustics import TISSUES
+from scenes.catalogue import build_scene
+from scenes.scene_types import Material, Thing
+from twin.ultrasound.echo_solids import body, distance_at, label_at, solid
+
+
+def distances(one, points):
+    flat, where = one.distance.ravel(), np.array([0, *one.distance.shape])
+    frame = np.array([*one.origin, *(1 / one.spacing)])
+    return np.array([distance_at(flat, where, frame, *point) for point in points])
+
+
+def test_a_meshs_distance_is_that_of_the_shape(rng):
+    """A ball of fine facets, known by its vertices alone; the grid's own error is spacing² / (8 R) = 2 µm."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=15.0)
+    made = solid(Thing("ball", ball, Material(0.5)), TISSUES["tumour"], None)
+    way = rng.standard_normal((500, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    for radius in (14.0, 15.0, 16.0):
+        assert distances(made, radius * way) == pytest.approx(np.full(500, radius - 15.0), abs=0.03)
+    assert (distances(made, 5.0 * way) < 0).all()
+    assert (distances(made, 17.9 * way) > 0).all()
+
+
+@pytest.fixture(scope="module")
+def breast():
+    return body(build_scene({"kind": "breast"}))
+
+
+def test_the_breast_is_full(breast):
+    """Downwards from its skin to the table there is tissue and no gap, though its flat base has no vertices of its own."""
+    flat, where, frame = breast.packed()
+    names = ["", *(one.name for one in breast.solids)]
+    for x, y in ((4.0, -2.0), (26.0, 20.0), (-30.0, 10.0), (40.0, 2.0), (-25.0, 1.0)):
+        column = [names[label_at(flat, where, frame, x, y, z)] for z in np.arange(640.0, 705.0, 0.25)]
+        first, last = column.index("breast"), len(column) - 1 - column[::-1].index("breast")
+        assert set(column[:first]) == {""}
+        assert "" not in column[first:]
+        assert 640.0 + 0.25 * last == pytest.approx(700.0, abs=0.5)
+
+
+def test_tumours_lie_within_the_breast(breast):
+    flat, where, frame = breast.packed()
+    names = ["", *(one.name for one in breast.solids)]
+    for name, (x, y, z) in (("tumour0", (-10, -8, 680)), ("tumour1", (28, -18, 676)), ("tumour2", (26, 20, 681))):
+        assert names[label_at(flat, where, frame, float(x), float(y), float(z))] == name
+
+
+def test_a_scene_without_acoustics_is_refused():
+    with pytest.raises(InputError, match="expected one with acoustics"):
+        body(build_scene({"kind": "sphere"}))

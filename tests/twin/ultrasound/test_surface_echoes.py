@@ -1,0 +1,96 @@
+"""Echoes of walls: what apertures see of a curved one, how it repeats, and what roughness scatters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.geometry import rigid
+from scenes import solid_meshes as shapes
+from scenes.acoustics import TISSUES, Tissue
+from scenes.catalogue import build_scene
+from scenes.scene_types import Cylinder, Material, Thing
+from tests.twin.ultrasound.phantoms import down, filament
+from twin.ultrasound.bscan import scan
+from twin.ultrasound.echo_solids import Body, body, solid
+
+WATER = TISSUES["water"]
+DEPTH_MM, RADIUS_MM = 25.0, 8.0
+
+
+def rod(tissue: Tissue) -> Body:
+    """A rod across the image plane in water, its front 17 mm deep."""
+    pose = rigid.transform([[0, -1, 0], [1, 0, 0], [0, 0, 1]], (0, 0, DEPTH_MM))
+    thing = Thing("rod", shapes.moved(shapes.rod(RADIUS_MM, 30.0), pose), Material(0.5))
+    shape = Cylinder("rod", np.array([0.0, 0.0, DEPTH_MM]), np.array([0.0, 1.0, 0.0]), RADIUS_MM)
+    return Body(WATER, (solid(thing, tissue, shape),), ())
+
+
+def on_wall(envelope, array, angle_deg):
+    """Brightest echo within 0.6 mm of the rod's wall, at an angle from its crest on the image's right."""
+    angle = np.deg2rad(angle_deg)
+    beside, depth = RADIUS_MM * np.sin(angle), (DEPTH_MM - RADIUS_MM * np.cos(angle)) * array.assumed_speed / WATER.speed
+    u = round((beside + array.width_mm / 2) / array.scale_mm_per_px[0])
+    v = round(depth / array.scale_mm_per_px[1])
+    return envelope[v - 5 : v + 6, u - 5 : u + 6].max()
+
+
+def test_a_smooth_rod_is_seen_where_it_is_square_to_the_beam(clean):
+    """Both apertures together accept slopes up to the mean of their half angles, 12 degrees; beyond are Hann's side lobes."""
+    smooth = replace(TISSUES["polymer"], roughness=0.0)
+    envelope = scan(rod(smooth), clean, down(clean, (0, 0, 0)), 1).envelope
+    crest = on_wall(envelope, clean, 0)
+    assert 20 * np.log10(on_wall(envelope, clean, 5) / crest) > -6
+    assert 20 * np.log10(on_wall(envelope, clean, 20) / crest) < -25
+    assert all(20 * np.log10(on_wall(envelope, clean, angle) / crest) < -60 for angle in (40, 50, 60, 70, 80))
+
+
+def test_roughness_fades_along_the_flank(clean):
+    """Small roughness scatters as cos³ of the tilt a projected area, and no more beyond the critical angle of 33 degrees.
+
+    Means over 48 echoes, some 20 of them independent: 1 dB each.
+    """
+    rough = replace(TISSUES["polymer"], roughness=0.003)
+    envelopes = [scan(rod(rough), clean, down(clean, (0, 0.7 * k, 0)), k).envelope for k in range(6)]
+
+    def power(low, high):
+        angles = [side * angle for angle in range(low, high, 3) for side in (1, -1)]
+        return np.mean([on_wall(one, clean, angle) ** 2 for one in envelopes for angle in angles])
+
+    expected = 30 * np.log10(np.cos(np.deg2rad(61.5)) / np.cos(np.deg2rad(31.5)))
+    assert 10 * np.log10(power(57, 67) / power(27, 37)) == pytest.approx(expected, abs=3.0)
+
+
+def test_a_repeat_of_a_curved_wall_fades_twice_as_fast(small):
+    """The second echo sees twice the slope, so it is narrower than the first, and there is nothing else below it."""
+    smooth = replace(TISSUES["polymer"], roughness=0.0, attenuation=40.0)  # nothing from the back
+    repeating = small.model_copy(update={"reverberations": 2})
+    envelope = scan(rod(smooth), repeating, down(small, (0, 0, 0)), 1).envelope
+    first = round((DEPTH_MM - RADIUS_MM) * small.assumed_speed / WATER.speed / small.scale_mm_per_px[1])
+    crest = envelope[first - 4 : first + 5].max(axis=0)
+    repeat = envelope[2 * first - 4 : 2 * first + 5].max(axis=0)
+    widths = [np.count_nonzero(one > one.max() / 4) * small.scale_mm_per_px[0] for one in (crest, repeat)]
+    assert widths[1] < widths[0]
+    assert -45 < 20 * np.log10(repeat.max() / crest.max()) < -10
+    assert 20 * np.log10(envelope[2 * first + 10 :].max() / repeat.max()) < -20
+
+
+def test_a_plate_repeats_by_its_reflection_and_the_face(small):
+    """At 2 y the echo is `R face` of the first, less the beam's spreading, which the two-way focus turns into a few dB."""
+    tank = body(build_scene({"kind": "tank"}))
+    bounce = (TISSUES["polymer"].impedance - WATER.impedance) / (TISSUES["polymer"].impedance + WATER.impedance)
+    levels = []
+    for face in (0.1, 0.3):
+        array = small.model_copy(update={"reverberations": 1, "face_reflection": face})
+        envelope = scan(tank, array, down(small, (4.0, -2.0, 682.0)), 1).envelope
+        row = round(18 * array.assumed_speed / WATER.speed / array.scale_mm_per_px[1])
+        levels.append(envelope[2 * row - 4 : 2 * row + 5].max() / envelope[row - 4 : row + 5].max())
+    assert levels[1] / levels[0] == pytest.approx(3.0, rel=0.02)
+    assert 20 * np.log10(levels[1] / (0.3 * bounce)) == pytest.approx(0, abs=6)
+
+
+def test_a_wire_rings_but_does_not_come_again(small):
+    """Echoes from its back follow within a diameter or two; at twice its depth there is nothing."""
+    repeating = small.model_copy(update={"reverberations": 2})
+    envelope = scan(filament(15.0), repeating, down(small, (0, 0, 0)), 1).envelope
+    assert envelope[200:].max() < 1e-3 * envelope.max()

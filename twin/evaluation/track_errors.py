@@ -1,0 +1,139 @@
+"""How far a tracker's poses are from those that a film was rendered from.
+
+Ground truth of a film is read here, nowhere else.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from recon.capture import sweep_tables
+from recon.errors import InputError
+from recon.files import npz
+from recon.files.metrics import Metrics
+from recon.files.npz import Form
+from recon.model.tracks import Track
+from twin.tracking.film_session import TRUTH
+
+Array = NDArray[np.float64]
+
+LEVEL = 0.95  # of the bounds that errors are held against
+FALSE_MM, FALSE_DEG = 2.0, 2.0  # beyond which what was found is something else
+
+
+@dataclass(frozen=True)
+class FilmTruth:
+    """What was true of n frames."""
+
+    times: NDArray[np.int64]  # (n,) ns
+    poses: Array  # (n, 4, 4) world_from_target, mm, in the middle of the exposure
+    blur_px: Array  # (n, 2, 3) of each view's circles
+    visible: Array  # (n, 2, 3) part of each disc, 0 to 1, where it lies in the image
+    inside: NDArray[np.bool_]  # (n, 2, 3) whether the whole disc lies in the image
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of n frames, NaN where the target was not found: of the target's origin, mm, and of its turn, deg."""
+
+    shift_mm: Array  # (n,)
+    turn_deg: Array  # (n,)
+    shift_bound_mm: Array  # (n,) which LEVEL of the errors should keep to, by the predicted covariance
+    turn_bound_deg: Array  # (n,)
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """Where there is a pose : (n,)."""
+        return np.isfinite(self.shift_mm)
+
+
+def read_truth(folder: Path) -> FilmTruth:
+    """Read a film's truth folder.
+
+    Raises
+    ------
+    InputError
+        If it is missing or damaged.
+    """
+    forms = {
+        "times_ns": Form("fiu", (None,)),
+        "world_from_target": Form("f", (None, 4, 4)),
+        "blur_px": Form("f", (None, 2, 3)),
+        "visible": Form("f", (None, 2, 3)),
+        "inside": Form("b", (None, 2, 3)),
+    }
+    content = npz.read(folder / TRUTH, forms)
+    return FilmTruth(*(content[name] for name in forms))
+
+
+def read_track(poses: Path, expected: FilmTruth) -> Track:
+    """Read the poses of all frames of a film.
+
+    Raises
+    ------
+    InputError
+        If the table is missing, damaged, or of other frames.
+    """
+    track = sweep_tables.read_track(poses)
+    if not np.array_equal(track.times, expected.times):
+        raise InputError(f"{poses}: expected the {len(expected.times)} frames of the film, found {len(track.times)} others")
+    return track
+
+
+def compare(track: Track, expected: FilmTruth) -> Errors:
+    """Errors of a track, frame by frame, with what its covariance predicts."""
+    count = len(expected.times)
+    shift, turn = np.full((2, count), np.nan)
+    bounds = np.full((2, count), np.nan)
+    for k in np.flatnonzero(track.found):
+        found, true = track.poses[k], expected.poses[k]
+        shift[k] = np.linalg.norm(found[:3, 3] - true[:3, 3])
+        turn[k] = np.linalg.norm(Rotation.from_matrix(found[:3, :3] @ true[:3, :3].T).as_rotvec())
+        if track.covariance is not None:
+            bounds[:, k] = length_bound(track.covariance[k, 3:, 3:]), length_bound(track.covariance[k, :3, :3])
+    return Errors(shift, np.rad2deg(turn), bounds[0], np.rad2deg(bounds[1]))
+
+
+def length_bound(covariance: Array, level: float = LEVEL) -> float:
+    """Length that a normal vector of mean zero and a covariance : (3, 3) keeps to, with a probability.
+
+    Its square is a sum of weighted chi-squares, taken for one with the same mean and variance [Satterthwaite 1946].
+    """
+    mean, variance = np.trace(covariance), 2 * np.trace(covariance @ covariance)
+    freedom = 2 * mean**2 / variance
+    return float(np.sqrt(mean / freedom * chi2.ppf(level, freedom)))
+
+
+def visible_whole(expected: FilmTruth) -> NDArray[np.bool_]:
+    """Frames : (n,) in which all circles lie in both images, nearly uncovered."""
+    return (expected.inside & (expected.visible > 0.9)).all(axis=(1, 2))
+
+
+def measure(errors: Errors, expected: FilmTruth) -> Metrics:
+    """Figures of a tracked film, each named with its unit."""
+    found, whole = errors.found, visible_whole(expected)
+    wrong = found & ~((errors.shift_mm < FALSE_MM) & (errors.turn_deg < FALSE_DEG))
+    within = [bound[found] >= error[found] for error, bound in _pairs(errors)]
+    figures: Metrics = {
+        "track_frames": len(found),
+        "track_found": int(found.sum()),
+        "track_visible": int(whole.sum()),
+        "track_visible_found": int((whole & found).sum()),
+        "track_false": int(wrong.sum()),
+        "track_blur_most_px": float(expected.blur_px.max()),
+        "track_within_bound": float(np.mean(within)) if found.any() else np.nan,
+    }
+    for name, values in (("shift_mm", errors.shift_mm), ("turn_deg", errors.turn_deg)):
+        kind, unit = name.split("_")
+        known = values[found]
+        figures[f"track_{kind}_median_{unit}"] = float(np.median(known)) if known.size else np.nan
+        figures[f"track_{kind}_p95_{unit}"] = float(np.quantile(known, 0.95)) if known.size else np.nan
+    return figures
+
+
+def _pairs(errors: Errors) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    return (errors.shift_mm, errors.shift_bound_mm), (errors.turn_deg, errors.turn_bound_deg)

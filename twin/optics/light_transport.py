@@ -1,0 +1,141 @@
+"""Light transport: one path-traced pass carries all patterns of a sequence.
+
+Light is linear in the projected pattern. A camera path is traced once; at each of its vertices that the projector lights, the
+values of all N patterns at that projector pixel are looked up and added, each to its own image. The cost of tracing is paid
+once, not N times.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from recon.model.rig import NotNegative
+from twin.optics.instruments import CameraOptics, ProjectorOptics, light_point, sample_rays
+from twin.optics.raster import Light, LightTable
+from twin.optics.sampling import PairedPoints
+
+Images = NDArray[np.float32]
+
+LUMENS_PER_WATT = 542.0  # photopic efficacy at 525 nm (683 lm/W, CIE V = 0.793), to turn room light in lux into W/mm^2
+
+
+class Engine(BaseModel):
+    """How light is traced."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    samples: int = Field(default=16, ge=2, le=65536)  # paths a pixel, a power of two
+    bounces: int = Field(default=1, ge=1, le=16)  # reflections between projector and camera; 1 is direct light
+    room_lux: NotNegative = 0.0  # illuminance on an unshadowed surface, even from all sides
+
+    @field_validator("samples")
+    @classmethod
+    def _power_of_two(cls, value: int) -> int:
+        if value & (value - 1):
+            raise ValueError(f"expected a power of two, found {value}")
+        return value
+
+    @property
+    def room_radiance(self) -> float:
+        """Radiance of the room, W/mm^2/sr."""
+        return self.room_lux / LUMENS_PER_WATT / np.pi * 1e-6
+
+
+def render(scene: mi.Scene, camera: CameraOptics, projector: ProjectorOptics, light: Light, engine: Engine, seed: int) -> Images:
+    """Render what a camera receives while the projector shows a sequence.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+        Shapes in the world, mm; its emitters are not used.
+    light : Light
+        The sequence of n patterns as the projector shows it.
+    seed : int
+        The same seed gives the same images.
+
+    Returns
+    -------
+    (n, h, w) float32
+        Radiance that arrives at each pixel, W/mm^2/sr, times the lens's transmission.
+    """
+    width, height = camera.camera.size
+    everywhere = np.arange(width * height, dtype=np.uint32)
+    return render_pixels(scene, camera, projector, light, engine, seed, everywhere).reshape(-1, height, width)
+
+
+def render_pixels(
+    scene: mi.Scene,
+    camera: CameraOptics,
+    projector: ProjectorOptics,
+    light: Light,
+    engine: Engine,
+    seed: int,
+    pixels: NDArray[np.uint32],
+) -> Images:
+    """Render some pixels : (m,) numbers `v * width + u`, as `render` does all : (n, m) float32, W/mm^2/sr."""
+    table = LightTable.of(light)
+    pixel = mi.UInt32(pixels)
+    centre, across, down = camera.tables
+    tables = dr.gather(mi.Point2f, centre, pixel), dr.gather(mi.Vector2f, across, pixel), dr.gather(mi.Vector2f, down, pixel)
+    seed_word = dr.opaque(mi.UInt32, seed)
+    samples = dr.opaque(mi.UInt32, engine.samples)
+
+    def body(index: mi.UInt32, sums: list[mi.Float], room: mi.Float) -> tuple:
+        points = PairedPoints(pixel, index, engine.samples, seed_word)
+        ray = sample_rays(camera, tables, pixel_offset(camera, points), points.mirrored_disc())
+        values, from_room = trace(scene, projector, table, engine, points, ray)
+        return index + 1, [total + value for total, value in zip(sums, values, strict=True)], room + from_room
+
+    state = (mi.UInt32(0), [dr.zeros(mi.Float, len(pixels)) for _ in range(table.count)], dr.zeros(mi.Float, len(pixels)))
+    _, sums, room = dr.while_loop(state, lambda index, sums, room: index < samples, body, label="samples")
+    dr.eval(sums, room)
+    scale = camera.transmission.ravel()[pixels] / np.float32(engine.samples)
+    return np.stack([(np.asarray(total) + np.asarray(room)) * scale for total in sums])
+
+
+def meets_something(scene: mi.Scene, camera: CameraOptics) -> NDArray[np.bool_]:
+    """Whether the ray through the middle of each pixel : (h, w) and of the lens meets any shape."""
+    middle = sample_rays(camera, camera.tables, mi.Point2f(0), mi.Point2f(0))
+    return np.asarray(scene.ray_test(middle)).reshape(camera.camera.size[::-1])
+
+
+def pixel_offset(camera: CameraOptics, points: PairedPoints) -> mi.Point2f:
+    """Where in the image a sample lies, in px from its pixel's centre: within the pixel, spread by the lens's blur."""
+    offset = points.mirrored_square()
+    return camera.spread(offset) if camera.blur_px > 0 else offset
+
+
+def trace(
+    scene: mi.Scene, projector: ProjectorOptics, table: LightTable, engine: Engine, points: PairedPoints, ray: mi.Ray3f
+) -> tuple[list[mi.Float], mi.Float]:
+    """Follow camera rays: radiance of each pattern, and of the room, W/mm^2/sr."""
+    context = mi.BSDFContext()
+    sums = [mi.Float(0)] * table.count
+    room, throughput, active = mi.Float(0), mi.Float(1), mi.Bool(True)
+    for bounce in range(engine.bounces):
+        hit = scene.ray_intersect(ray, active)
+        if engine.room_radiance > 0:
+            room += dr.select(active & ~hit.is_valid(), throughput * engine.room_radiance, 0)
+        active &= hit.is_valid()
+        bsdf = hit.bsdf(ray)
+
+        source, projector_pixel, irradiance = light_point(projector, hit.p, points.mirrored_disc())
+        shadow_ray = hit.spawn_ray_to(source)
+        lit = active & (irradiance > 0) & (dr.dot(shadow_ray.d, hit.n) > 0)
+        lit &= ~scene.ray_test(shadow_ray, lit)
+        reflected = bsdf.eval(context, hit, hit.to_local(shadow_ray.d), lit)[0]  # BRDF times cosine
+        weight = dr.select(lit, throughput * reflected * irradiance, 0)
+        sums = [total + weight * value for total, value in zip(sums, table.lookup(projector_pixel, lit), strict=True)]
+
+        last = bounce + 1 == engine.bounces
+        if last and engine.room_radiance == 0:
+            break
+        sample, factor = bsdf.sample(context, hit, points.square().x, points.square(), active)
+        throughput *= dr.select(active, factor[0], 0)
+        ray = hit.spawn_ray(hit.to_world(sample.wo))
+        active &= throughput > 0
+        if last:
+            room += dr.select(active & ~scene.ray_test(ray, active), throughput * engine.room_radiance, 0)
+    return sums, room

@@ -1,0 +1,92 @@
+"""Things become shapes of the ray tracer."""
+
+from collections.abc import Sequence
+
+import mitsuba as mi
+import numpy as np
+
+from recon.geometry import rigid
+from scenes.scene_types import Material, Scene, Sphere, Thing
+
+RAMP = 1024  # texels of the texture that turns a texture coordinate into a reflectance
+
+
+def build_world(scene: Scene) -> mi.Scene:
+    """Build the ray tracer's scene from the things that light can reach; shape k is visible thing k."""
+    return mi.load_dict({"type": "scene", **named_shapes(scene)})
+
+
+def move_things(world: mi.Scene, things: Sequence[Thing], to_from: rigid.Array) -> None:
+    """Put the meshes of a world, flat-faced and built from `things` in order, elsewhere: by a 4x4 transform of where these are.
+
+    A world that stays one, with its meshes moved, leaves the ray tracer's memory and compiled code as they are.
+    """
+    parameters = mi.traverse(world)
+    for key, thing in zip(named(things), things, strict=True):
+        if thing.smooth or thing.primitive is not None:
+            raise ValueError(f"{thing.name}: expected a mesh with flat faces")
+        parameters[f"{key}.vertex_positions"] = np.float32(rigid.apply(to_from, thing.mesh.vertices)).ravel()
+    parameters.update()
+
+
+def named_shapes(scene: Scene) -> dict[str, mi.Shape]:
+    """The visible things as shapes, under names that keep their order."""
+    things = visible(scene)
+    return dict(zip(named(things), map(to_shape, things), strict=True))
+
+
+def named(things: Sequence[Thing]) -> list[str]:
+    """Names of shapes that keep their order."""
+    return [f"thing{k:03d}" for k in range(len(things))]
+
+
+def visible(scene: Scene) -> list[Thing]:
+    """The things that light can reach, in order."""
+    return [thing for thing in scene.things if not thing.inside]
+
+
+def to_shape(thing: Thing) -> mi.Shape:
+    """One thing as a shape with its material: an exact sphere where it is one, else its mesh."""
+    bsdf = mi.load_dict(to_bsdf(thing.material, thing.albedo is not None))
+    if isinstance(thing.primitive, Sphere):
+        center = [float(value) for value in thing.primitive.centre]
+        return mi.load_dict({"type": "sphere", "center": center, "radius": float(thing.primitive.radius), "bsdf": bsdf})
+    properties = mi.Properties()
+    properties["bsdf"] = bsdf
+    properties["face_normals"] = not thing.smooth
+    vertices, faces = np.float32(thing.mesh.vertices), np.uint32(thing.mesh.faces)
+    mesh = mi.Mesh(thing.name, len(vertices), len(faces), properties, thing.smooth, thing.albedo is not None)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = vertices.ravel()
+    parameters["faces"] = faces.ravel()
+    if thing.smooth:
+        parameters["vertex_normals"] = np.float32(thing.mesh.vertex_normals).ravel()
+    if thing.albedo is not None:
+        parameters["vertex_texcoords"] = np.stack([thing.albedo, np.full_like(thing.albedo, 0.5)], axis=1).ravel()
+    parameters.update()
+    return mesh
+
+
+def to_bsdf(material: Material, has_albedo: bool) -> dict:
+    """A material as a Mitsuba plugin: Lambertian, or a rough dielectric coat on it."""
+    reflectance = albedo_ramp() if has_albedo else material.reflectance
+    if material.roughness is None:
+        return {"type": "diffuse", "reflectance": reflectance}
+    return {
+        "type": "roughplastic",
+        "distribution": "ggx",
+        "alpha": material.roughness,
+        "int_ior": material.ior,
+        "nonlinear": False,
+        "diffuse_reflectance": reflectance,
+    }
+
+
+def albedo_ramp() -> dict:
+    """A texture whose value is its first coordinate: vertices carry their reflectance in it.
+
+    Mitsuba's own mesh attributes can't be used: its rough plastic asks a texture for its mean, which they don't have.
+    """
+    ramp = (np.arange(RAMP, dtype=np.float32) + 0.5) / RAMP
+    bitmap = mi.Bitmap(np.repeat(ramp[None, :, None], 2, axis=0))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}

@@ -1,0 +1,176 @@
+"""A measuring session in the twin: from a rig, a scene and a pattern sequence to a capture folder and its ground truth."""
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from recon.capture import calibration_files, surface_part
+from recon.errors import InputError
+from recon.files import atomic
+from recon.model.calibration import Calibration
+from recon.model.patterns import Fringes, Patterns
+from recon.model.rig import CameraDevice, Positive, Rig
+from scenes.scene_types import Scene
+from twin.optics.instruments import CameraOptics, ProjectorOptics
+from twin.optics.light_transport import Engine, Images, render
+from twin.optics.raster import Light
+from twin.optics.ray_world import build_world, visible
+from twin.optics.surface_truth import SurfaceTruth, surface_truth
+from twin.output_folders import TRUTH_MARKER, check_places
+from twin.sensor import Exposure, Numbers, auto_exposure, electrons_per_radiance, expose, noise_dn, number_per_electron
+
+CameraName = Literal["cam1", "cam2"]
+
+
+class Shooting(BaseModel):
+    """How the cameras take their images."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    exposure_s: Positive | None = None  # if not given, set for the scene: see level
+    level: Annotated[float, Field(gt=0, le=1)] = 0.9  # of full scale, for the brightest thousandth of the pixels
+    gain: Positive = 1.0  # linear; 1 fills the range with the sensor's saturation charge
+    bits: Literal[8, 10, 12] = 8  # of the images; at most the sensor's ADC has
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera's share of a rendered surface capture."""
+
+    images: Numbers  # (n, h, w)
+    exposure: Exposure
+    truth: SurfaceTruth
+    limit_px: Images  # (h, w, 2) see `noise_limit_px`
+
+
+def shoot(rig: Rig, scene: Scene, patterns: Patterns, camera: CameraName, engine: Engine, shooting: Shooting, seed: int) -> View:
+    """Render what one camera sees of a pattern sequence, and take the images with its sensor.
+
+    The same seed gives the same bytes. Rendering noise, sensor noise and the two cameras draw from separate streams.
+    """
+    device: CameraDevice = getattr(rig, camera)
+    light_seed, sensor_seed = np.random.SeedSequence([seed, ("cam1", "cam2").index(camera)]).generate_state(2).tolist()
+    optics = camera_optics(rig, camera)
+    world = build_world(scene)
+    radiance = render(
+        world,
+        optics,
+        ProjectorOptics.of(rig.projector),
+        Light.of(patterns, rig.projector),
+        engine,
+        light_seed,
+    )
+    wavelength = rig.projector.wavelength_nm
+    time_s = shooting.exposure_s or auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
+    exposure = Exposure(time_s, shooting.gain, shooting.bits)
+    return View(
+        expose(radiance, device, wavelength, exposure, sensor_seed),
+        exposure,
+        surface_truth(world, device.optics.camera(), rig.projector.optics.camera()),
+        noise_limit_px(radiance, patterns, device, wavelength, exposure),
+    )
+
+
+def camera_optics(rig: Rig, camera: CameraName) -> CameraOptics:
+    """A camera's optics.
+
+    Raises
+    ------
+    InputError
+        If there are pixels that no ray reaches.
+    """
+    optics = CameraOptics.of(getattr(rig, camera))
+    unreached = np.count_nonzero(np.isnan(optics.transmission))
+    if unreached:
+        raise InputError(
+            f"rig.{camera}.optics.distortion: expected a ray for every pixel, found {unreached} px that no ray reaches"
+        )
+    return optics
+
+
+def noise_limit_px(
+    radiance: Images, patterns: Patterns, device: CameraDevice, wavelength_nm: float, exposure: Exposure
+) -> Images:
+    """Standard deviation of the decoded projector column and row that the sensor's noise alone allows : (h, w, 2) px.
+
+    Infinite in the dark, and for an axis without fringes; of several pitches the finest counts.
+    """
+    electrons = radiance * np.float32(electrons_per_radiance(device, wavelength_nm) * exposure.time_s)
+    limits = np.full((*radiance.shape[1:], 2), np.inf, np.float32)
+    for number, axis in enumerate(("columns", "rows")):
+        sets = [(part, place) for part, place in patterns.slices() if isinstance(part, Fringes) and part.axis == axis]
+        if sets:
+            fringes, place = min(sets, key=lambda pair: pair[0].pitch)
+            sigma = phase_limit(electrons[place], fringes.shifts, device, exposure)
+            limits[..., number] = fringes.pitch / (2 * np.pi) * sigma
+    return limits
+
+
+def phase_limit(electrons: Images, shifts: NDArray[np.float64], device: CameraDevice, exposure: Exposure) -> Images:
+    """Standard deviation of the least-squares phase : (h, w) rad, from noise-free N-step images : (n, h, w) electrons.
+
+    The noise of each image carried through the fit: a change dI_k turns the phase by `-2/(N B) sin(phase + shift_k) dI_k`.
+    """
+    count = len(shifts)
+    phasor = 2 / count * sum(wave * image for wave, image in zip(np.exp(-1j * shifts), electrons, strict=True))
+    dark = device.sensor.dark_current_e_per_s * exposure.time_s
+    variance = sum(
+        (2 / count * np.sin(np.angle(phasor) + shift) * noise_dn(image + dark, device.sensor, exposure)) ** 2
+        for shift, image in zip(shifts, electrons, strict=True)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.sqrt(variance) / (np.abs(phasor) * number_per_electron(device.sensor, exposure))
+
+
+def calibration_of(rig: Rig) -> Calibration:
+    """The rig's true calibration."""
+    devices = {"cam1": rig.cam1, "cam2": rig.cam2, "projector": rig.projector}
+    return Calibration({name: device.optics.camera() for name, device in devices.items()})
+
+
+def write_session(
+    out: Path, rig: Rig, scene: Scene, patterns: Patterns, views: Mapping[CameraName, View], settings: Mapping[str, object]
+) -> None:
+    """Write `out/truth/`, then `out/capture/`, each whole or not at all; an old capture goes first, so that no two sessions mix.
+
+    settings : what the session was rendered from; kept with the truth as `settings.json`.
+    """
+    optics = calibration_of(rig)
+    check_places(out, "surface")
+    shutil.rmtree(out / "capture", ignore_errors=True)
+    with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
+        (folder / "surface").mkdir()
+        (folder / "calibration").mkdir()
+        calibration_files.write(folder / "calibration" / "optics.yaml", optics)
+        for camera, view in views.items():
+            arrays: dict[str, NDArray] = {field.name: getattr(view.truth, field.name) for field in fields(view.truth)}
+            np.savez(folder / "surface" / f"{camera}.npz", **arrays, limit_px=view.limit_px)
+        write_json(folder / "settings.json", settings)
+        write_json(folder / TRUTH_MARKER, describe(scene))
+    devices = {"projector": surface_part.Device(size=patterns.projector_size)}
+    for camera, view in views.items():
+        size, exposure = view.images.shape[:0:-1], view.exposure
+        devices[camera] = surface_part.Device(size=size, bits=exposure.bits, exposure_s=exposure.time_s, gain=exposure.gain)
+    images: dict[str, Numbers] = {camera: view.images for camera, view in views.items()}
+    surface_part.write_surface(out / "capture", images, patterns, optics, devices, scene.name)
+
+
+def describe(scene: Scene) -> dict:
+    """What evaluation needs to know of a scene: the visible things by number, and the primitives to fit."""
+    shapes = []
+    for shape in scene.shapes:
+        values = {key: np.asarray(value).tolist() for key, value in asdict(shape).items()}
+        shapes.append({"kind": type(shape).__name__.lower(), **values})
+    return {"name": scene.name, "things": [thing.name for thing in visible(scene)], "shapes": shapes}
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a file of the truth."""
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,248 @@
+"""Films: a hand leads the target along a smooth path before both cameras, frame by frame, with the truth of each.
+
+One body, one surroundings, one light and one exposure for all frames, all from a seed. Over an exposure the target moves evenly,
+by the path's own derivative in the middle of it.
+"""
+
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from recon.capture import calibration_files, stereo_frames
+from recon.capture.manifest import Device
+from recon.errors import InputError
+from recon.files import atomic
+from recon.geometry import rigid
+from recon.model.calibration import Calibration
+from recon.model.rig import Finite, NotNegative, Part, Positive, Rig, Target, Vector
+from recon.tracking.pose import circle_centres
+from twin.output_folders import TRUTH_MARKER, check_places
+from twin.tracking.mesh_bank import Bank, build_bank
+from twin.tracking.rendered_views import Frames, Quality, render_full, render_sketches, white_radiance
+from twin.tracking.samples import Motion, Take, draw
+from twin.tracking.sampling_ranges import DataRanges
+from twin.tracking.target_truth import outline
+
+Array = NDArray[np.float64]
+
+SETTINGS = "settings.json"
+TRUTH = "sweep/film.npz"
+BODIES = 4  # of which the one is taken whose fingers and cable cover least of the circles
+LOOKS = 8  # frames in which that is looked at
+NEAREST_MM = 100.0  # of a circle before a camera, along its axis
+LIFT_MM = 0.2  # of the rays off the target's face
+BATCH = 3  # frames traced in one launch; doesn't change them
+
+
+class HandPath(Part):
+    """A closed round: the target's middle passes at even times through places, and turns about them as a hand does."""
+
+    seconds: Positive = 1.6  # a round
+    places_mm: Annotated[tuple[Vector, ...], Field(min_length=3)]  # in the world
+    roll_deg: Finite = 180.0  # of the target's x axis in the image, from left to right, on the whole
+    turn_deg: NotNegative = 6.0  # standard deviation about each axis, from place to place
+    unsteady_mm: NotNegative = 1.0  # of the places
+
+
+class Filming(Part):
+    """How a film is taken."""
+
+    frames: Annotated[int, Field(ge=1, le=100_000)] = 30
+    camera_hz: Positive = 30.0
+    exposure_s: Positive = 0.01
+    white_dn: Annotated[float, Field(gt=0, le=1000)] = 65.0  # brightness of the target's white, on the whole
+    gain: Positive = 1.0  # linear
+    path: HandPath
+
+    @model_validator(mode="after")
+    def _one_after_the_other(self) -> "Filming":
+        if self.exposure_s * self.camera_hz > 1:
+            raise ValueError(f"exposure_s: expected at most 1 / camera_hz = {1 / self.camera_hz:.4g}, found {self.exposure_s:g}")
+        return self
+
+    @property
+    def times(self) -> NDArray[np.int64]:
+        """Middles of the exposures : (n,) ns."""
+        return np.rint(np.arange(self.frames) * 1e9 / self.camera_hz).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Way:
+    """A path at any time; both splines are closed."""
+
+    middle: CubicSpline  # (3,) mm in the world over s, of the circles' middle
+    turn: CubicSpline  # (3,) rotation vector in the world over s, from `facing`
+    facing: Array  # (3, 3)
+    middle_target: Array  # (3,) mm
+
+    def pose(self, seconds: float) -> Array:
+        """`world_from_target` : (4, 4) mm."""
+        turned = Rotation.from_rotvec(self.turn(seconds)).as_matrix() @ self.facing
+        return rigid.transform(turned, self.middle(seconds) - turned @ self.middle_target)
+
+    def velocity(self, seconds: float) -> tuple[Array, Array]:
+        """Of the target's origin : (3,) mm/s, and its turn : (3,) rad/s, in the world."""
+        spin = _left_jacobian(self.turn(seconds)) @ self.turn(seconds, 1)
+        lever = self.pose(seconds)[:3, :3] @ self.middle_target
+        return self.middle(seconds, 1) - np.cross(spin, lever), spin
+
+    def motion(self, seconds: float, exposure_s: float) -> Motion:
+        """Over an exposure with its middle at a time."""
+        speed, spin = self.velocity(seconds)
+        return Motion(self.pose(seconds), speed * exposure_s, spin * exposure_s)
+
+
+def lead(path: HandPath, target: Target, eyes: Array, seed: int) -> Way:
+    """Lead the target along a path, its face to the point between the cameras : (3,) mm, as steadily as the path says."""
+    rng = np.random.default_rng([seed, 2])
+    places = np.array(path.places_mm, float)
+    places = places + path.unsteady_mm * rng.standard_normal(places.shape)
+    turns = np.deg2rad(path.turn_deg) * rng.standard_normal(places.shape)
+    times = np.linspace(0, path.seconds, len(places) + 1)
+    middle, turn = (CubicSpline(times, np.vstack([rows, rows[:1]]), bc_type="periodic") for rows in (places, turns))
+    return Way(middle, turn, _facing(eyes - places.mean(axis=0), path.roll_deg), np.array([target.c1_mm, target.c2_mm, 0]) / 2)
+
+
+def _facing(towards: Array, roll_deg: float) -> Array:
+    """Rotation with z along a direction, and x turned by an angle from the image's, clockwise for those who look at the face."""
+    z = towards / np.linalg.norm(towards)
+    roll = np.deg2rad(roll_deg)
+    x = np.array([np.cos(roll), np.sin(roll), 0.0])
+    x = x - (x @ z) * z
+    x = x / np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _left_jacobian(vector: Array) -> Array:
+    """From the rate of a rotation vector to the angular velocity in the fixed frame : (3, 3)."""
+    angle = float(np.linalg.norm(vector))
+    k = rigid.cross(vector)
+    if angle < 1e-4:
+        return np.eye(3) + k / 2 + k @ k / 6
+    return np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * k @ k
+
+
+def make_bank(rig: Rig, seed: int) -> Bank:
+    """The bodies and surroundings that a film is chosen from."""
+    return build_bank(rig.target, BODIES, seed)
+
+
+def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int) -> list[Take]:
+    """What makes each frame: all is drawn once, as for a data set's sample, but the pose, the motion and the noise."""
+    light = ranges.light.model_copy(update={"projector_share": 0.0})
+    drawn = draw(ranges.model_copy(update={"variants": BODIES, "light": light}), rig, seed, 0)
+    cameras = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
+    way = lead(filming.path, rig.target, (cameras[0].centre + cameras[1].centre) / 2, seed)
+    motions = [way.motion(time * 1e-9, filming.exposure_s) for time in filming.times.tolist()]
+    for motion in motions:
+        places = rigid.apply(motion.world_from_target, circle_centres(rig.target))
+        if min(rigid.apply(camera.camera_from_world, places)[:, 2].min() for camera in cameras) < NEAREST_MM:
+            raise InputError(f"path.places_mm: expected places at least {NEAREST_MM:g} mm before both cameras, found nearer ones")
+    some = [motions[k].world_from_target for k in np.linspace(0, len(motions) - 1, min(LOOKS, len(motions))).astype(int)]
+    eyes = np.array([rigid.apply(rigid.invert(pose), camera.centre) for pose in some for camera in cameras])
+    moved = _farthest(filming.path) - drawn.motion.world_from_target[:3, 3]
+    lamps = drawn.lighting.lamps.copy()
+    lamps[:, :3] += moved
+    same = replace(
+        drawn,
+        cameras=(rig.cam1, rig.cam2),
+        present=True,
+        body=int(np.argmax([uncovered(bank, body, rig.target, eyes) for body in range(BODIES)])),
+        lighting=replace(drawn.lighting, lamps=lamps),
+        scene_from_world=drawn.scene_from_world @ rigid.transform(np.eye(3), -moved),
+        gain=filming.gain,
+    )
+    noise = np.random.default_rng([seed, 3]).integers(2**31, size=filming.frames).tolist()
+    made = [replace(same, k=k, motion=motion, noise_seed=noise[k]) for k, motion in enumerate(motions)]
+    falls = np.array([white_radiance(take, rig) for take in made])
+    # one exposure: as bright on the whole as asked for, and in each frame as the light falls
+    return [
+        replace(take, white_dn=filming.white_dn * part) for take, part in zip(made, (falls / falls.mean()).tolist(), strict=True)
+    ]
+
+
+def uncovered(bank: Bank, body: int, target: Target, eyes: Array) -> float:
+    """Share of the circles' rims that eyes : (n, 3) mm in the target's frame see past a body."""
+    rims = outline(circle_centres(target) + np.array([0, 0, LIFT_MM]), target.outer_diameter_mm / 2).reshape(-1, 3)
+    start = np.tile(rims, (len(eyes), 1))
+    ways = np.repeat(eyes, len(rims), axis=0) - start
+    distance = np.linalg.norm(ways, axis=1)
+    ray = mi.Ray3f(mi.Point3f(*np.float32(start + bank.body_at[body]).T), mi.Vector3f(*np.float32(ways / distance[:, None]).T))
+    ray.maxt = mi.Float(np.float32(distance))
+    return 1 - float(np.mean(np.array(bank.bodies.ray_test(ray, dr.full(mi.Bool, True, len(start))))))
+
+
+def _farthest(path: HandPath) -> Array:
+    """Where surroundings are set up : (3,) mm, so that the whole path lies in front of them."""
+    places = np.array(path.places_mm, float)
+    return np.append(places[:, :2].mean(axis=0), places[:, 2].max())
+
+
+def shoot(
+    bank: Bank, rig: Rig, made: Sequence[Take], quality: Quality, seed: int, pixels: Literal["sketch", "full"] = "sketch"
+) -> Iterator[Frames]:
+    """Render the frames one after the other."""
+    render = render_sketches if pixels == "sketch" else render_full
+    for first in range(0, len(made), BATCH):
+        yield from render(bank, rig, made[first : first + BATCH], quality, seed)
+
+
+def write_session(
+    out: Path, rig: Rig, filming: Filming, made: Sequence[Take], frames: Iterable[Frames], settings: Mapping[str, object]
+) -> None:
+    """Write `out/capture/` and `out/truth/`, each whole or not at all, taking the frames one by one.
+
+    settings : what the film was made from; kept with the truth.
+    """
+    check_places(out, "film")
+    optics = Calibration({name: getattr(rig, name).optics.camera() for name in stereo_frames.CAMERAS})
+    devices = {
+        name: Device(size=getattr(rig, name).optics.size, exposure_s=filming.exposure_s, gain=filming.gain)
+        for name in stereo_frames.CAMERAS
+    }
+    with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
+        (folder / TRUTH).parent.mkdir()
+        (folder / "calibration").mkdir()
+        calibration_files.write(folder / "calibration" / "optics.yaml", optics)
+        _write_json(folder / SETTINGS, settings)
+        _write_json(folder / TRUTH_MARKER, {"name": "film", "labels": [], "shapes": []})
+        told = []
+
+        def pairs() -> Iterator[stereo_frames.Pair]:
+            for one in frames:
+                told.append(one.truth)
+                yield one.views
+            np.savez(folder / TRUTH, **_truth_arrays(filming, made, told))
+            shutil.rmtree(out / "truth", ignore_errors=True)  # an old truth goes before the new capture comes
+
+        stereo_frames.write_film(out / "capture", pairs(), filming.times, optics, devices, "film")
+
+
+def _truth_arrays(filming: Filming, made: Sequence[Take], told: Sequence) -> dict[str, NDArray]:
+    """By name: (n, ...) of each frame, (n, 2, ...) of each view; lengths in mm and px."""
+    views = {
+        name: np.array([[getattr(view, name) for view in both] for both in told])
+        for name in ("centres", "ellipses", "inside", "blur_px", "visible", "white_dn")
+    }
+    return {
+        "times_ns": filming.times,
+        "world_from_target": np.array([take.motion.world_from_target for take in made]),
+        "shift_mm": np.array([take.motion.shift_mm for take in made]),
+        "turn_rad": np.array([take.motion.turn_rad for take in made]),
+        **views,
+    }
+
+
+def _write_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

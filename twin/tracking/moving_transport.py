@@ -1,0 +1,334 @@
+"""Light from lamps, surroundings and projector, by a held body that moves and a scene that stands still, to camera pixels.
+
+Body and scene are two worlds of the ray tracer. Each ray has its own time within the exposure: it is taken into the body's frame
+at that time and into the scene's, meets both, and the nearer is what it sees; its shadow is tested in both. So the blur of motion
+is exact, no world is ever rebuilt, and frames of different poses are traced in one launch.
+
+Each of a ray's few shadow rays stands for all sources: what they would give without shadows is summed up, and counts if the one
+that is followed is seen, chosen in proportion to what it would give. Where nothing is in shadow there is next to no noise.
+
+A ray costs little beside what it takes to fetch a take's parameters, so each thread follows several pixels of one camera.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.model.rig import Rig, Target
+from scenes.handheld.mesh_parts import SLOTS
+from twin.optics.sampling import PairedPoints
+from twin.tracking.mesh_bank import Bank
+from twin.tracking.parameter_table import Rows, Turn, camera_columns, take_columns
+from twin.tracking.samples import LAMPS, Take
+from twin.tracking.surface_prints import BitGrid, Face, grid_cover, poster_reflectance, relief, ring_cover, textured
+
+Floats = NDArray[np.float32]
+
+PIXELS = 8  # that a thread follows
+SHADOWS = 2  # shadow rays a ray, a power of two
+UNDISTORTIONS = 8  # fixed-point steps; each leaves a tenth of the error, which starts at a few px
+LIFT_MM = 0.05  # of a shadow ray's start off the surface, more than the coordinates' rounding
+ROOM_MM = 300.0  # things farther than this don't keep a point from the light that comes from all around
+FRESNEL = 0.04  # of a glossy coat at right angles
+TARGET, POSTER = SLOTS.index("target"), SLOTS.index("poster")
+NO_CIRCLE = 3
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """Camera pixels to render, of several takes: n lanes."""
+
+    take: NDArray[np.uint32]  # (n,) which take of the batch
+    camera: NDArray[np.uint32]  # (n,) 0 or 1
+    u: NDArray[np.float32]  # (n,) px
+    v: NDArray[np.float32]
+    samples: NDArray[np.uint32]  # (n,) rays
+    set: NDArray[np.uint32]  # (n,) number of the set of sample points, one of its own for each pixel that is looked at
+    first: NDArray[np.uint32]  # (n,) of the set's points that are the lane's
+    circle: NDArray[np.uint32]  # (n,) of which the visible part is told, or NO_CIRCLE
+
+
+@dataclass(frozen=True)
+class Light:
+    """What the lanes receive: n values each."""
+
+    radiance: Floats  # mean over the rays; the target's white is about 1 / pi times its irradiance
+    disc: Floats  # rays towards the lane's circle, its outline filled, whatever stands before it
+    seen: Floats  # of these, rays that reach it
+    white: Floats  # rays that end on the target's paper
+    white_radiance: Floats  # sum over these
+
+
+def render(
+    bank: Bank, rig: Rig, takes: Sequence[Take], lanes: Lanes, most_samples: int, seed: int, grid: BitGrid | None = None
+) -> Light:
+    """Trace the lanes' rays.
+
+    Parameters
+    ----------
+    most_samples : int
+        Points of the largest set, a power of two.
+    grid : BitGrid or None
+        What the target's face shows instead of the circles.
+    """
+    first, step, end = _shares(lanes)
+    take, camera = dr.gather(mi.UInt32, mi.UInt32(lanes.take), first), dr.gather(mi.UInt32, mi.UInt32(lanes.camera), first)
+    rows = Rows.of(take_columns(takes, rig, bank.body_at, bank.scene_at), take)
+    cameras = Rows.of(camera_columns([device for one in takes for device in one.cameras]), take * 2 + camera)
+    path = _Path(bank, rig.target, rows, cameras, grid)
+    key = dr.gather(mi.UInt32, mi.UInt32([one.k for one in takes]), take) * 4 + camera
+    seeds = mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed), 4)[0]
+    u, v, sets, circles = mi.Float(lanes.u), mi.Float(lanes.v), mi.UInt32(lanes.set), mi.UInt32(lanes.circle)
+    firsts, counts = mi.UInt32(lanes.first), mi.UInt32(lanes.samples)
+    results = [dr.zeros(mi.Float, len(lanes.u)) for _ in range(5)]
+
+    def body(pixel, k, *sums):
+        """Ray k of a pixel; after the last one its sums are stored, and the next pixel's begin."""
+
+        def its(column):
+            return dr.gather(type(column), column, pixel)
+
+        points = PairedPoints(its(sets), its(firsts) + k, most_samples, seeds)
+        radiance, aims, reaches, on_paper = path.follow(its(u), its(v), its(circles), points)
+        flags = (dr.select(one, 1.0, 0.0) for one in (aims, reaches, on_paper))
+        values = radiance, *flags, dr.select(on_paper, radiance, 0.0)
+        sums = [total + value for total, value in zip(sums, values, strict=True)]
+        done = k + 1 >= its(counts)
+        for result, total in zip(results, sums, strict=True):
+            dr.scatter(result, total, pixel, done)
+        return dr.select(done, pixel + step, pixel), dr.select(done, 0, k + 1), *(dr.select(done, 0, total) for total in sums)
+
+    state = (first, mi.UInt32(0), *(mi.Float(0) for _ in results))
+    dr.while_loop(state, lambda pixel, *_: pixel < end, body, label="rays")
+    radiance, disc, seen, white, white_radiance = (np.array(result) for result in results)
+    return Light(radiance / lanes.samples, disc, seen, white, white_radiance)
+
+
+def _shares(lanes: Lanes) -> mi.Vector3u:
+    """Which pixels each thread of the launch follows one after the other: the first, the step to the next, and the end.
+
+    A thread keeps to one camera of one take, whose parameters it fetches once; neighbours have neighbouring pixels at a time.
+    """
+    starts = np.flatnonzero(np.diff(lanes.take * 2 + lanes.camera, prepend=np.uint32(2**32 - 1)))
+    ends = np.append(starts[1:], len(lanes.u))
+    steps = -(-(ends - starts) // PIXELS)
+    first = np.concatenate([start + np.arange(step) for start, step in zip(starts, steps, strict=True)])
+    table = mi.UInt32(np.uint32(np.column_stack([first, np.repeat(steps, steps), np.repeat(ends, steps)])).ravel())
+    # fetched by number: what is read in order is compiled anew for each alignment in memory, which NumPy leaves to chance
+    return dr.gather(mi.Vector3u, table, dr.arange(mi.UInt32, len(first)))
+
+
+class _Source(NamedTuple):
+    """A lamp or the projector as a place sees it."""
+
+    value: mi.Float  # radiance towards the viewer by it, without shadows
+    way: mi.Vector3f  # to a point of it
+
+
+class _Path:
+    """One ray after another through the same takes: fetches what doesn't change from ray to ray once."""
+
+    def __init__(self, bank: Bank, target: Target, rows: Rows, cameras: Rows, grid: BitGrid | None) -> None:
+        self.bank, self.target, self.rows, self.grid = bank, target, rows, grid
+        self.world_from_camera = Turn.of(cameras, "world_from_camera")
+        self.fx, self.fy, self.cx, self.cy = cameras.all("pinhole")
+        self.k1, self.k2, self.p1, self.p2, self.k3 = cameras.all("distortion")
+        self.pupil, self.focus, self.blur, self.vignetting, self.mid_u, self.mid_v, self.corner = cameras.all("lens")
+        self.target_from_world = Turn.of(rows, "target_from_world")
+        self.scene_from_world = Turn.of(rows, "scene_from_world")
+        self.origin, self.shift = rows.vector("origin"), rows.vector("shift")
+        self.axis, self.angle = rows.vector("axis"), rows.number("angle")
+        self.body_at, self.present = rows.vector("body_at"), rows.number("present") > 0
+        self.ambient, self.gradient = rows.number("ambient"), rows.vector("gradient")
+        self.texture_shift = rows.vector("texture_shift")
+        self.face, self.lamps = Face.of(rows), rows.all("lamps")
+        self.projector_from_world = Turn.of(rows, "projector_from_world")
+        self.projector, self.projector_matrix = rows.all("projector"), rows.all("projector_matrix")
+
+    def follow(self, u, v, circle, points: PairedPoints) -> tuple:
+        """Radiance of one ray; whether it aims at the circle, reaches it, and ends on the target's paper."""
+        ray, cosine = self._ray(u, v, points)
+        time = points.square().x - 0.5  # not mirrored: a long blur wants as many times as there are rays
+        turned = self._body_ray(ray, time)
+        x, y, faces = self._on_face(turned)
+        aims = faces & self._within_circle(x, y, circle)
+        place, normal, surface, on_face, nothing = self._nearest(ray, turned, time, x, y)
+        light = self._reflected(place, normal, -ray.d, surface, time, points)
+        radiance = dr.select(nothing, self.ambient * self._share_from(ray.d), light)
+        away = ((u - self.mid_u) ** 2 + (v - self.mid_v) ** 2) * self.corner
+        radiance *= (1 - self.vignetting * away) * cosine**4
+        paper = self.face.paint[1]
+        on_paper = on_face & (surface[0] > 0.8 * paper) & (surface[0] < 1.25 * paper)
+        return radiance, aims, aims & on_face, on_paper
+
+    def _ray(self, u, v, points: PairedPoints) -> tuple[mi.Ray3f, mi.Float]:
+        """Through a point of the pixel, spread by the lens, and a point of the pupil; and its cosine with the optical axis.
+
+        The distortion is undone by fixed-point steps.
+        """
+        offset = points.mirrored_square() + points.mirrored_normal() * self.blur
+        xd, yd = (u + offset.x - self.cx) / self.fx, (v + offset.y - self.cy) / self.fy
+        x, y = mi.Float(xd), mi.Float(yd)
+        for _ in range(UNDISTORTIONS):
+            r2 = x * x + y * y
+            radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+            x, y = (
+                (xd - 2 * self.p1 * x * y - self.p2 * (r2 + 2 * x * x)) / radial,
+                (yd - self.p1 * (r2 + 2 * y * y) - 2 * self.p2 * x * y) / radial,
+            )
+        disc = points.mirrored_disc() * self.pupil
+        start = mi.Vector3f(disc.x, disc.y, 0)
+        direction = dr.normalize(mi.Vector3f(x, y, 1) * self.focus - start)
+        start, way = self.world_from_camera.apply(start), self.world_from_camera.rotate(direction)
+        return mi.Ray3f(mi.Point3f(start), way), dr.rsqrt(1 + x * x + y * y)
+
+    def _untwisted(self, d: mi.Vector3f, time: mi.Float) -> mi.Vector3f:
+        """A direction of the world, turned back by what the target has turned since the middle of the exposure [Rodrigues]."""
+        s, c = dr.sincos(-self.angle * time)
+        return d * c + dr.cross(self.axis, d) * s + self.axis * (dr.dot(self.axis, d) * (1 - c))
+
+    def _twisted(self, d: mi.Vector3f, time: mi.Float) -> mi.Vector3f:
+        return self._untwisted(d, -time)
+
+    def _body_ray(self, ray: mi.Ray3f, time: mi.Float) -> mi.Ray3f:
+        """The ray in the target's frame at its time."""
+        from_origin = mi.Vector3f(ray.o) - self.origin - self.shift * time
+        start = self.target_from_world.rotate(self._untwisted(from_origin, time))
+        return mi.Ray3f(mi.Point3f(start), self.target_from_world.rotate(self._untwisted(ray.d, time)))
+
+    def _on_face(self, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float, mi.Bool]:
+        """Where the ray passes the face's plane, and whether it comes from the front."""
+        distance = -ray.o.z / ray.d.z
+        place = mi.Vector3f(ray.o) + ray.d * distance
+        return place.x, place.y, self.present & (ray.d.z < 0) & (distance > 0)
+
+    def _within_circle(self, x, y, circle) -> mi.Bool:
+        cx = dr.select(circle == 1, self.target.c1_mm, 0.0)
+        cy = dr.select(circle == 2, self.target.c2_mm, 0.0)
+        return (circle < NO_CIRCLE) & ((x - cx) ** 2 + (y - cy) ** 2 < (self.target.outer_diameter_mm / 2) ** 2)
+
+    def _banked(self, ray: mi.Ray3f) -> mi.Ray3f:
+        return mi.Ray3f(ray.o + self.body_at, ray.d)
+
+    def _scene_ray(self, ray: mi.Ray3f) -> mi.Ray3f:
+        return mi.Ray3f(mi.Point3f(self.scene_from_world.apply(mi.Vector3f(ray.o))), self.scene_from_world.rotate(ray.d))
+
+    def _nearest(self, ray: mi.Ray3f, turned: mi.Ray3f, time, x, y) -> tuple:
+        """Place and normal in the world of what the ray meets, its surface, whether that is the target's face, or nothing."""
+        in_body, in_scene = self._banked(turned), self._scene_ray(ray)
+        flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
+        body = self.bank.bodies.ray_intersect(in_body, flags, True, self.present)
+        in_scene.maxt = mi.Float(body.t)  # infinite where the body is missed
+        scene = self.bank.scenes.ray_intersect(in_scene, flags, True, mi.Bool(True))
+        held = body.is_valid() & (body.t < scene.t)
+        nothing = ~body.is_valid() & ~scene.is_valid()
+        distance = dr.minimum(body.t, scene.t)
+        from_body = self._twisted(self.target_from_world.rotate_back(mi.Vector3f(body.sh_frame.n)), time)
+        from_scene = self.scene_from_world.rotate_back(mi.Vector3f(scene.sh_frame.n))
+        normal = dr.select(held, from_body, from_scene)
+        normal = dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
+        poster = scene.is_valid() & ~held & (scene.shape == self.bank.posters)
+        uv = dr.select(held, body.uv.x, dr.select(poster, float(POSTER), scene.uv.x))
+        slot = mi.UInt32(dr.clip(dr.select(nothing, 0, dr.floor(uv + 0.5)), 0, len(SLOTS) - 1))
+        on_face = held & (slot == TARGET)
+        row = self.rows.chosen("surfaces", slot, 6)
+        place = dr.select(held, mi.Vector3f(in_body(body.t)), mi.Vector3f(in_scene(scene.t))) + self.texture_shift
+        seed = mi.UInt32(slot) * 77 + mi.UInt32(self.texture_shift.x * 100 + 1e6)
+        texture = relief(row, place, seed)
+        printed = self.face.reflectance(self._covered(x, y), texture, x, y)
+        reflectance = dr.select(on_face, printed, textured(row, texture))
+        sheet = poster_reflectance(self.target, reflectance, scene.uv.x, scene.uv.y, mi.UInt32(self.texture_shift.y * 100 + 1e6))
+        reflectance = dr.select(poster, sheet, reflectance)
+        return mi.Vector3f(ray(distance)), normal, (reflectance, row[4], row[5]), on_face, nothing
+
+    def _covered(self, x, y) -> mi.Float:
+        if self.grid is not None:
+            return grid_cover(self.grid, x, y)
+        return ring_cover(self.target, x, y, self.face.paint[3])
+
+    def _share_from(self, direction: mi.Vector3f) -> mi.Float:
+        """Light that comes from a direction, over the mean of all."""
+        return 1 + dr.dot(self.gradient, direction)
+
+    def _reflected(self, place, normal, view, surface, time, points: PairedPoints) -> mi.Float:
+        """Radiance towards the viewer: of all sources without shadows, if one of them is seen; mean of the shadow rays."""
+        radiance = mi.Float(0)
+        for light in points.split(SHADOWS):
+            around, sources = self._sources(place, normal, view, surface, light)
+            total = around + sum(source.value for source in sources)
+            way, weight = self._towards_one(around, sources, light.square().x * total, normal, light.square())
+            blocked = self._blocked(place + normal * LIFT_MM, way, time, total > 0)
+            radiance += dr.select(blocked, 0, total * weight)
+        return radiance / SHADOWS
+
+    def _sources(self, place, normal, view, surface, points: PairedPoints) -> tuple[mi.Float, list["_Source"]]:
+        """What comes by the light from around, and by a point of each lamp and the projector, without shadows."""
+        around = surface[0] * self.ambient * self._share_from(2 / 3 * normal)  # mean of all directions by their cosines
+        ball = mi.Vector3f(mi.warp.square_to_uniform_sphere(points.square()))
+        sources = []
+        for k in range(LAMPS):
+            px, py, pz, radius, intensity = self.lamps[5 * k : 5 * k + 5]
+            way = mi.Vector3f(px, py, pz) + ball * radius - place
+            sources.append(_Source(self._lit(way, intensity, normal, view, *surface), way))
+        way = self._projector_way(place)
+        sources.append(_Source(self._lit(way, self._projected(place), normal, view, *surface), way))
+        return around, sources
+
+    def _towards_one(self, around, sources: Sequence["_Source"], pick, normal, where) -> tuple[mi.Vector3f, mi.Float]:
+        """The way to the source in whose share `pick` falls, or in any direction; and what comes from there, over the mean.
+
+        A direction is turned over about the normal as often as makes it as likely as it is bright.
+        """
+        straight = mi.Vector3f(mi.Frame3f(mi.Normal3f(normal)).to_world(mi.warp.square_to_cosine_hemisphere(where)))
+        opposite = 2 * dr.dot(normal, straight) * normal - straight
+        here, there = self._share_from(straight), self._share_from(opposite)
+        way = dr.select(pick * (here + there) < around * (there - here), opposite, straight) * ROOM_MM
+        weight = (here + there) / (2 * self._share_from(2 / 3 * normal))
+        for source in sources:
+            chosen = (pick >= around) & (source.value > 0)
+            way, weight = dr.select(chosen, source.way, way), dr.select(chosen, 1, weight)
+            around = around + source.value
+        return way, weight
+
+    def _lit(self, way, intensity, normal, view, reflectance, gloss, roughness) -> mi.Float:
+        """Radiance by a source of an intensity, at the end of a way."""
+        direction = dr.normalize(way)
+        cosine = dr.maximum(dr.dot(normal, direction), 0)
+        irradiance = intensity * cosine / dr.squared_norm(way)
+        return irradiance * self._brdf(normal, view, direction, cosine, reflectance, gloss, roughness)
+
+    @staticmethod
+    def _brdf(normal, view, direction, cosine, reflectance, gloss, roughness) -> mi.Float:
+        """Lambert's, and a coat with the GGX distribution of facets [Walter et al. 2007], its shadowing simplified."""
+        half = dr.normalize(view + direction)
+        a2 = roughness**4
+        n_h, n_v = dr.dot(normal, half), dr.abs(dr.dot(normal, view))
+        facets = a2 / (dr.pi * (n_h * n_h * (a2 - 1) + 1) ** 2)
+        return reflectance / dr.pi + gloss * FRESNEL * facets / (4 * dr.maximum(dr.maximum(cosine, n_v), 0.1))
+
+    def _projector_way(self, place) -> mi.Vector3f:
+        return -self.projector_from_world.rotate_back(self.projector_from_world.shift) - place
+
+    def _projected(self, place) -> mi.Float:
+        """The projector's intensity towards a place: fringes along its columns or rows, within its raster."""
+        intensity, mean, modulation, period, along_rows = self.projector
+        fx, fy, cx, cy, width, height = self.projector_matrix
+        local = self.projector_from_world.apply(place)
+        u, v = fx * local.x / local.z + cx, fy * local.y / local.z + cy
+        within = (local.z > 0) & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+        value = mean + modulation * dr.cos(2 * dr.pi * dr.select(along_rows > 0, v, u) / period)
+        return dr.select(within, intensity * value, 0)
+
+    def _blocked(self, place, way, time, active) -> mi.Bool:
+        """Whether anything stands in a shadow ray's way."""
+        reach = dr.norm(way)
+        ray = mi.Ray3f(mi.Point3f(place), way / reach)
+        in_body, in_scene = self._banked(self._body_ray(ray, time)), self._scene_ray(ray)
+        in_body.maxt, in_scene.maxt = mi.Float(reach), mi.Float(reach)
+        by_scene = self.bank.scenes.ray_test(in_scene, active)
+        return by_scene | self.bank.bodies.ray_test(in_body, active & self.present & ~by_scene)

@@ -1,0 +1,211 @@
+"""From parameters to what the cameras deliver, with the truth of each image; several takes in one launch."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from recon.geometry import rigid
+from recon.model.rig import CameraDevice, Rig, Target
+from twin.sensor import Exposure, digitise, number_per_electron, read_out
+from twin.tracking.mesh_bank import Bank
+from twin.tracking.moving_transport import NO_CIRCLE, Lanes, Light, render
+from twin.tracking.pixel_selection import HALF, PATCH, VIEW, Picture, Sketch, View, Window, full_frame, joined
+from twin.tracking.samples import Take
+from twin.tracking.surface_prints import BitGrid
+from twin.tracking.target_truth import ViewTruth, inside_share, view_truth
+
+Grey = NDArray[np.uint8]
+
+AROUND = 24  # px of a sketch's window about the target's board
+DARKEST = 0.15  # of the light that falls on a face at right angles: what an exposure is set by is never less
+
+
+class Quality(BaseModel):
+    """Rays a pixel, powers of two."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    view: int = Field(default=1, ge=1, le=256)  # of each of the four camera pixels that make a view's pixel
+    patch: int = Field(default=4, ge=2, le=1024)
+    window: int = Field(default=4, ge=2, le=1024)  # of full frames, and of what a sketch shows in full
+
+    @field_validator("view", "patch", "window")
+    @classmethod
+    def _power_of_two(cls, value: int) -> int:
+        if value & (value - 1):
+            raise ValueError(f"expected a power of two, found {value}")
+        return value
+
+
+@dataclass(frozen=True)
+class Frames:
+    """One sample's images, with the truth of each view."""
+
+    views: tuple[Grey, Grey]  # (240, 320), or (h, w) full frames
+    patches: Grey  # (2, 3, 120, 120)
+    truth: tuple[ViewTruth, ViewTruth]
+
+
+def render_views(bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int) -> list[Frames]:
+    """Views as the detector sees them, and full-resolution patches."""
+    pictures = [[View(device.optics.size, quality.view) for device in take.cameras] for take in takes]
+    return _rendered(bank, rig, takes, pictures, quality, seed)
+
+
+def render_full(
+    bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int, grid: BitGrid | None = None
+) -> list[Frames]:
+    """Full camera images."""
+    pictures = [[full_frame(device.optics.size, quality.window) for device in take.cameras] for take in takes]
+    return _rendered(bank, rig, takes, pictures, quality, seed, grid)
+
+
+def render_sketches(
+    bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int, grid: BitGrid | None = None
+) -> list[Frames]:
+    """Full camera images of which the view and a window about the target are rendered; see `pictures.Sketch`."""
+    pictures = [[_sketch(take, device, rig.target, quality) for device in take.cameras] for take in takes]
+    return _rendered(bank, rig, takes, pictures, quality, seed, grid)
+
+
+def _sketch(take: Take, device: CameraDevice, target: Target, quality: Quality) -> Sketch:
+    size = device.optics.size
+    first, extent = (0, 0), (1, 1)
+    if take.present:
+        corners = board_corners(target)
+        places = np.concatenate([device.optics.camera().project(rigid.apply(take.motion.at(t), corners)) for t in (-0.5, 0.5)])
+        if np.isfinite(places).all():
+            low = np.clip(np.floor(places.min(axis=0)) - AROUND, 0, np.array(size) - 2).astype(int)
+            high = np.clip(np.ceil(places.max(axis=0)) + AROUND, low + 1, np.array(size) - 1).astype(int)
+            first, extent = tuple(low.tolist()), tuple((high - low + 1).tolist())
+    return Sketch(View(size, quality.view), Window(size, first, extent, quality.window, sets=3))
+
+
+def board_corners(target: Target) -> NDArray[np.float64]:
+    """Corners : (4, 3) mm of the board's face, its middle at the circles' middle."""
+    half = np.array(target.board_mm) / 2
+    middle = np.array([target.c1_mm, target.c2_mm]) / 2
+    return np.column_stack([middle + half * [[-1, -1], [1, -1], [1, 1], [-1, 1]], np.zeros(4)])
+
+
+def _rendered(
+    bank: Bank,
+    rig: Rig,
+    takes: Sequence[Take],
+    pictures: Sequence[Sequence[Picture]],
+    quality: Quality,
+    seed: int,
+    grid: BitGrid | None = None,
+) -> list[Frames]:
+    """One launch for all images and patches of all takes; then the sensors, image by image."""
+    truths = [[view_truth(take, device, rig.target) for device in take.cameras] for take in takes]
+    blocks, origins = [], []
+    for i, take in enumerate(takes):
+        for camera, device in enumerate(take.cameras):
+            first = _patch_origins(take, camera, truths[i][camera])
+            circles = range(3) if take.present else [NO_CIRCLE] * 3
+            patches = [
+                Window(device.optics.size, tuple(first[c].tolist()), (PATCH, PATCH), quality.patch, c, circle)
+                for c, circle in enumerate(circles)
+            ]
+            blocks += [picture.lanes(i, camera) for picture in (pictures[i][camera], *patches)]
+            origins.append(first)
+    light = render(bank, rig, takes, joined(blocks), max(4 * quality.view, quality.patch, quality.window), seed, grid)
+    starts = np.cumsum([0, *(len(block.u) for block in blocks)])
+    pieces = [slice(a, b) for a, b in pairwise(starts)]
+    numbers = _sensed(takes, rig, blocks, [light.radiance[piece] for piece in pieces])
+    result = []
+    for i, take in enumerate(takes):
+        views, patches, told = [], [], []
+        for camera, device in enumerate(take.cameras):
+            at = 4 * (2 * i + camera)  # an image and its three patches
+            views.append(pictures[i][camera].image(numbers[at]))
+            patches.append(np.stack(numbers[at + 1 : at + 4]).reshape(3, PATCH, PATCH))
+            seen = pieces[at + 1 : at + 4]
+            told.append(
+                replace(
+                    truths[i][camera],
+                    visible=_visible(light, seen) * inside_share(truths[i][camera].ellipses, device.optics.size),
+                    white_dn=_white(light, seen, take, device, rig),
+                    patch_origins=origins[2 * i + camera],
+                )
+            )
+        result.append(Frames((views[0], views[1]), np.stack(patches), (told[0], told[1])))
+    return result
+
+
+def _patch_origins(take: Take, camera: int, truth: ViewTruth) -> NDArray[np.int64]:
+    """Where patches begin : (3, 2) px, about the circles as a detector that is a pixel off would place them; or anywhere."""
+    rng = np.random.default_rng([take.noise_seed, camera])
+    size = np.array(take.cameras[camera].optics.size)
+    coarse = np.rint(np.nan_to_num(truth.centres) / (size / VIEW) + rng.uniform(-1, 1, (3, 2))) * (size / VIEW)
+    if not take.present or not np.isfinite(truth.centres).all():
+        coarse = rng.uniform([0, 0], size, (3, 2))
+    return np.rint(np.clip(coarse, 0, size - 1)).astype(int) - HALF
+
+
+def _sensed(takes: Sequence[Take], rig: Rig, blocks: Sequence[Lanes], radiance: Sequence[NDArray[np.float32]]) -> list[Grey]:
+    """What the sensors make of the light, block by block; each block belongs to one camera of one take."""
+    streams = {
+        (i, camera): np.random.default_rng([take.noise_seed, camera, 1]) for i, take in enumerate(takes) for camera in (0, 1)
+    }
+    numbers = []
+    for block, light in zip(blocks, radiance, strict=True):
+        i, camera = int(block.take[0]), int(block.camera[0])
+        device = takes[i].cameras[camera]
+        numbers.append(_read(light * _electrons(takes[i], device, rig), block, device, takes[i], streams[i, camera]))
+    return numbers
+
+
+def _electrons(take: Take, device: CameraDevice, rig: Rig) -> float:
+    """Electrons for a radiance of 1, so that the target's white comes to the number that the exposure aims at."""
+    return take.white_dn / number_per_electron(device.sensor, Exposure(1.0, take.gain)) / white_radiance(take, rig)
+
+
+def white_radiance(take: Take, rig: Rig) -> float:
+    """Radiance of the target's white in the middle, nothing in the way."""
+    pose, lighting = take.motion.world_from_target, take.lighting
+    place = pose[:3, 3] + pose[:3, :3] @ [rig.target.c1_mm / 2, rig.target.c2_mm / 2, 0]
+    ways = np.vstack([lighting.lamps[:, :3], rig.projector.optics.camera().centre]) - place
+    distance2 = (ways**2).sum(axis=1)
+    cosine = np.maximum(ways @ pose[:3, 2] / np.sqrt(distance2), DARKEST)
+    intensity = np.append(lighting.lamps[:, 4], lighting.projector[0] * lighting.projector[1])
+    around = np.pi * lighting.ambient * (1 + 2 / 3 * (lighting.gradient @ pose[:3, 2]))
+    return float(take.face.paper / np.pi * ((intensity * cosine / distance2).sum() + around))
+
+
+def _read(electrons, lanes: Lanes, device: CameraDevice, take: Take, rng: np.random.Generator) -> Grey:
+    sensor = device.sensor
+    width, height = device.optics.size
+    response, offset = _unit_pattern(height, width, device.serial)
+    pixel = lanes.v.astype(int) * width + lanes.u.astype(int)
+    mean = electrons * (1 + np.float32(sensor.prnu) * response[pixel])
+    mean = np.float32(np.clip(mean, 0, 20 * sensor.saturation_e))
+    read = read_out(mean[None], sensor.dark_noise_e, rng)[0] + np.float32(sensor.dsnu_e) * offset[pixel]
+    return digitise(read, sensor, Exposure(1.0, take.gain))
+
+
+@lru_cache(maxsize=4)
+def _unit_pattern(height: int, width: int, serial: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A sensor's fixed pattern with all deviations 1 : response and offset (height * width,)."""
+    rng = np.random.default_rng(serial)
+    return rng.standard_normal(height * width, np.float32), rng.standard_normal(height * width, np.float32)
+
+
+def _visible(light: Light, pieces) -> NDArray[np.float64]:
+    """Part of what the image holds of each disc that nothing covers : (3,)."""
+    return np.array([light.seen[piece].sum() / max(light.disc[piece].sum(), 1) for piece in pieces], float)
+
+
+def _white(light: Light, pieces, take: Take, device: CameraDevice, rig: Rig) -> float:
+    """Brightness of the target's white about the circles, in digital numbers above black; NaN where none is seen."""
+    rays = sum(float(light.white[piece].sum()) for piece in pieces)
+    if rays == 0:
+        return float("nan")
+    mean = sum(float(light.white_radiance[piece].sum()) for piece in pieces) / rays
+    return mean * _electrons(take, device, rig) * number_per_electron(device.sensor, Exposure(1.0, take.gain))

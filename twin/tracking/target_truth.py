@@ -1,0 +1,102 @@
+"""What is true of a target in a view: projected centres, outlines, blur, visibility."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.model.rig import CameraDevice, Target
+from recon.tracking.pose import circle_centres
+from twin.tracking.samples import Motion, Take
+
+Array = NDArray[np.float64]
+
+RIM = 64  # points of an outline
+
+
+@dataclass(frozen=True)
+class ViewTruth:
+    """One view's truth in the middle of the exposure; NaN throughout without a target."""
+
+    camera: Camera
+    centres: Array  # (3, 2) px, the circles' projected centres
+    ellipses: Array  # (3, 5) of the outer outlines: middle u, v, semi-axes a >= b px, angle rad of a from u towards v
+    inside: NDArray[np.bool_]  # (3,) whether the whole disc lies in the image
+    blur_px: Array  # (3,) length of a centre's path over the exposure
+    visible: Array = field(default_factory=lambda: np.zeros(3))  # part of each disc, 0 to 1: in the image, nothing before it
+    white_dn: float = float("nan")  # brightness of the target's white, without noise
+    patch_origins: NDArray[np.int64] = field(default_factory=lambda: np.zeros((3, 2), int))
+
+
+def view_truth(take: Take, device: CameraDevice, target: Target) -> ViewTruth:
+    """What one camera should see of a take's target."""
+    camera = device.optics.camera()
+    if not take.present:
+        nothing = np.full((3, 2), np.nan)
+        return ViewTruth(camera, nothing, np.full((3, 5), np.nan), np.zeros(3, bool), np.full(3, np.nan))
+    motion, model = take.motion, circle_centres(target)
+    pose = motion.world_from_target
+    rims = camera.project(rigid.apply(pose, outline(model, target.outer_diameter_mm / 2)))
+    low, high = rims.min(axis=1), rims.max(axis=1)
+    inside = ((low >= 0) & (high <= np.array(camera.size) - 1)).all(axis=1)
+    return ViewTruth(
+        camera, camera.project(rigid.apply(pose, model)), ellipse_rows(rims), inside, path_length(motion, camera, model)
+    )
+
+
+def outline(centres: Array, radius: float) -> Array:
+    """Points of circles in the plane z = 0 of the target : (n, RIM, 3) mm, about centres : (n, 3)."""
+    angle = np.arange(RIM) * 2 * np.pi / RIM
+    rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(RIM)]) * radius
+    return centres[:, None] + rim
+
+
+def inside_share(ellipses: Array, size: tuple[int, int], rings: int = 24) -> Array:
+    """Part of each ellipse's area : (n,) that lies in an image of a size; ellipses : (n, 5) as of `ViewTruth`."""
+    radius = np.sqrt((np.arange(rings) + 0.5) / rings)
+    angle = (np.arange(4 * rings) + 0.5) * np.pi / (2 * rings)
+    x, y = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
+    shares = []
+    for u, v, a, b, turn in ellipses:
+        du, dv = a * x * np.cos(turn) - b * y * np.sin(turn), a * x * np.sin(turn) + b * y * np.cos(turn)
+        within = (np.abs(u + du + 0.5 - size[0] / 2) <= size[0] / 2) & (np.abs(v + dv + 0.5 - size[1] / 2) <= size[1] / 2)
+        shares.append(within.mean())
+    return np.array(shares)
+
+
+def ellipse_rows(rims: Array) -> Array:
+    """Ellipses through outlines : (n, RIM, 2) px, as (n, 5) rows of `ViewTruth.ellipses`: the conics nearest algebraically.
+
+    Exact for a pinhole; a lens's distortion bends an outline by less than 1e-3 px away from an ellipse.
+    """
+    rows = []
+    for rim in rims:
+        middle = rim.mean(axis=0)
+        scale = np.abs(rim - middle).max()
+        x, y = (rim - middle).T / scale
+        a, b, c, d, e = np.linalg.lstsq(np.column_stack([x * x, x * y, y * y, x, y]), np.ones(len(x)))[0]
+        quadratic = np.array([[a, b / 2], [b / 2, c]])
+        centre = np.linalg.solve(quadratic, [-d / 2, -e / 2])
+        values, ways = np.linalg.eigh(quadratic / (1 + centre @ quadratic @ centre))
+        axes = scale / np.sqrt(values)
+        rows.append([*(middle + scale * centre), *axes, np.arctan2(ways[1, 0], ways[0, 0])])
+    return np.array(rows)
+
+
+def path_length(motion: Motion, camera: Camera, model: Array, steps: int = 9) -> Array:
+    """Length of the centres' paths over the exposure : (n,) px."""
+    places = camera.project(np.array([rigid.apply(motion.at(time), model) for time in np.linspace(-0.5, 0.5, steps)]))
+    return np.linalg.norm(np.diff(places, axis=0), axis=-1).sum(axis=0)
+
+
+def disc_masks(ellipses: Array, origins: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
+    """Filled outlines in patches : (n, size, size), 255 inside, for ellipses : (n, 5) and the patches' first pixels : (n, 2)."""
+    masks = np.zeros((len(ellipses), size, size), np.uint8)
+    v, u = np.mgrid[:size, :size]
+    for mask, (cu, cv, a, b, angle), (u0, v0) in zip(masks, ellipses, origins, strict=True):
+        du, dv = u + u0 - cu, v + v0 - cv
+        along, across = du * np.cos(angle) + dv * np.sin(angle), dv * np.cos(angle) - du * np.sin(angle)
+        mask[(along / a) ** 2 + (across / b) ** 2 <= 1] = 255
+    return masks

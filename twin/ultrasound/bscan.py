@@ -1,0 +1,52 @@
+"""One B-scan of a scene, from a pose: the front door of the B-mode model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.ultrasound import bmode_image
+from twin.ultrasound.beam import beam
+from twin.ultrasound.echo_solids import Body
+from twin.ultrasound.medium import scatter
+from twin.ultrasound.sound_paths import Paths, follow
+from twin.ultrasound.surface_echoes import surface_echoes, wire_echoes
+from twin.ultrasound.transducer import Transducer
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A B-scan, and what it was made from."""
+
+    image: NDArray[np.uint8]  # (h, w)
+    envelope: NDArray[np.float32]  # (h, w) after the gain; 1 is the reference tissue
+    paths: Paths
+
+
+def scan(scene: Body, transducer: Transducer, world_from_image: Array, seed: int, frame: int = 0) -> Scan:
+    """Take a B-scan.
+
+    Parameters
+    ----------
+    scene : Body
+        Of `twin.ultrasound.echo_solids.body(scene)`, built once.
+    world_from_image : (4, 4) mm
+        Rigid: where the image plane stands; x along the array, y into the depth, origin at pixel (0, 0) on the face.
+    seed : int
+        Of the tissue: the same from every pose.
+    frame : int
+        Number of the image, which seeds the electronic noise.
+    """
+    spread = beam(transducer)
+    paths = follow(scene, transducer, world_from_image)
+    echoes = scatter(scene, transducer, spread, paths, world_from_image, seed)
+    echoes += surface_echoes(scene, transducer, spread, paths, world_from_image, seed)
+    echoes += wire_echoes(scene, transducer, spread, paths, world_from_image, seed)
+    received = bmode_image.focused(echoes, spread)
+    received += bmode_image.noise(transducer, spread, np.random.default_rng([seed, frame]))
+    received *= bmode_image.gain_over_depth(transducer, spread).astype(np.float32)[:, None]
+    received += bmode_image.face(transducer).astype(np.float32)[:, None]
+    envelope = np.abs(received)
+    return Scan(bmode_image.grey(envelope, transducer), envelope, paths)

@@ -1,0 +1,84 @@
+"""What a B-scan should show: which pixel shows what, the exact section of each object, and the image without any artefact."""
+
+from collections import defaultdict
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from recon.geometry import rigid
+from twin.ultrasound import bmode_image
+from twin.ultrasound.echo_solids import Body
+from twin.ultrasound.sound_paths import Paths
+from twin.ultrasound.transducer import Transducer
+
+Array = NDArray[np.float64]
+
+SAME_MM = 1e-5  # between ends of neighbouring segments of a section
+
+
+def labels(paths: Paths, transducer: Transducer) -> NDArray[np.uint8]:
+    """Label of what each pixel shows : (h, w), 0 the surroundings, k + 1 solid k; delays and refraction included."""
+    lines, depths = paths.shown_mm.shape
+    shown = np.empty((transducer.image_size[1], lines), np.uint8)
+    for line in range(lines):
+        level = np.clip(np.searchsorted(paths.shown_mm[line], transducer.rows_mm), 0, depths - 1)
+        aside = np.rint(line + paths.shift_mm[line, level] / transducer.scale_mm_per_px[0]).astype(int)
+        shown[:, line] = paths.labels[np.clip(aside, 0, lines - 1), level]
+    return shown
+
+
+def masks(shown: NDArray[np.uint8], solids: int) -> NDArray[np.bool_]:
+    """Where each solid is seen : (n, h, w), from the labels."""
+    return shown == np.arange(1, solids + 1)[:, None, None]
+
+
+def echo_free(shown: NDArray[np.uint8], body: Body, transducer: Transducer) -> NDArray[np.uint8]:
+    """Mean grey of each pixel's tissue : (h, w), without speckle, surfaces, loss, blur or noise."""
+    reference = [0.0 if tissue.echogenicity is None else 10 ** (tissue.echogenicity / 20) for tissue in body.tissues]
+    return bmode_image.grey(np.array(reference, np.float32)[shown], transducer)
+
+
+def sections(body: Body, world_from_image: Array) -> dict[str, list[Array]]:
+    """Exact sections with the image plane, by name: closed outlines : (m, 2) mm in the image's frame, of true depth.
+
+    A wire that crosses the plane gives the one point (1, 2) of its axis.
+    """
+    image_from_world = rigid.invert(world_from_image)
+    found = {solid.name: _outlines(solid.mesh, image_from_world) for solid in body.solids}
+    for wire in body.wires:
+        ends = rigid.apply(image_from_world, wire.ends)
+        if ends[0, 2] * ends[1, 2] < 0:
+            share = ends[0, 2] / (ends[0, 2] - ends[1, 2])
+            found[wire.name] = [(ends[:1] + share * (ends[1:] - ends[:1]))[:, :2]]
+    return {name: outlines for name, outlines in found.items() if outlines}
+
+
+def _outlines(mesh: trimesh.Trimesh, image_from_world: Array) -> list[Array]:
+    world_from_image = rigid.invert(image_from_world)
+    segments = trimesh.intersections.mesh_plane(mesh, world_from_image[:3, 2], world_from_image[:3, 3])
+    if len(segments) == 0:
+        return []
+    points = rigid.apply(image_from_world, segments)[..., :2]
+    keys, index = np.unique(np.rint(points.reshape(-1, 2) / SAME_MM).astype(np.int64), axis=0, return_inverse=True)
+    places = keys * SAME_MM
+    return [places[loop] for loop in _loops(index.reshape(-1, 2))]
+
+
+def _loops(edges: NDArray[np.int64]) -> list[list[int]]:
+    """Closed walks over edges : (n, 2) of node numbers, each edge once."""
+    neighbours: dict[int, list[int]] = defaultdict(list)
+    for a, b in edges.tolist():
+        if a != b:
+            neighbours[a].append(b)
+            neighbours[b].append(a)
+    loops = []
+    for start in list(neighbours):
+        walk = [start]
+        while neighbours[walk[-1]]:
+            onwards = neighbours[walk[-1]].pop()
+            neighbours[onwards].remove(walk[-1])
+            walk.append(onwards)
+        if len(walk) > 3:
+            loops.append(walk)
+    return loops

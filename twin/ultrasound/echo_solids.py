@@ -1,0 +1,202 @@
+"""The scene as echoes see it: solids by their signed distance on a grid, wires by their ends.
+
+A distance is negative inside. Solids may lie within one another: where several hold a point, the last one counts, and the
+smaller come later. A plane's distance is linear, and so exact on a grid of two points; a cylinder's is sampled from its formula.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import trimesh
+from numba import njit
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, label, sum_labels
+from scipy.spatial import KDTree
+
+from scenes.acoustics import BACKSCATTER, Tissue, surroundings, tissue_of
+from scenes.scene_types import Cylinder, Scene, Thing
+
+Array = NDArray[np.float64]
+
+SPACING_MM = (0.5, 1.0)  # of the grids, of small and of large solids
+LARGE_MM = 60.0  # greatest extent of a small one
+MARGIN_MM = 3.0  # of the grids, around the solid
+BAND_MM = 3.0  # from a mesh, beyond which only the sign of its distance counts
+THIN_MM = 0.5  # radius, below which a rod is a wire
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A closed body, by its signed distance."""
+
+    name: str
+    tissue: Tissue
+    distance: NDArray[np.float32]  # (nx, ny, nz) mm, negative inside
+    origin: Array  # (3,) mm in the world, of the first grid point
+    spacing: Array  # (3,) mm
+    mesh: trimesh.Trimesh  # for exact sections
+
+
+@dataclass(frozen=True, eq=False)
+class Wire:
+    """A straight, thin, round string."""
+
+    name: str
+    tissue: Tissue
+    ends: Array  # (2, 3) mm in the world
+    radius: float  # mm
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """All of a scene's solids and wires, and the packed tables that compiled code walks through."""
+
+    medium: Tissue
+    solids: tuple[Solid, ...]
+    wires: tuple[Wire, ...]
+
+    @property
+    def tissues(self) -> tuple[Tissue, ...]:
+        """By label: 0 is what surrounds the solids."""
+        return (self.medium, *(solid.tissue for solid in self.solids))
+
+    def packed(self) -> tuple[NDArray[np.float32], NDArray[np.int64], Array]:
+        """Distances : (m,) in a row, per solid start and size : (n, 4), and origin and 1/spacing : (n, 6)."""
+        return self._packed
+
+    @cached_property
+    def _packed(self) -> tuple[NDArray[np.float32], NDArray[np.int64], Array]:
+        sizes = [solid.distance.size for solid in self.solids]
+        starts = np.concatenate([[0], np.cumsum(sizes)])[:-1] if sizes else []
+        where = [(int(start), *solid.distance.shape) for start, solid in zip(starts, self.solids, strict=True)]
+        frame = [(*solid.origin, *(1 / solid.spacing)) for solid in self.solids]
+        flat = np.concatenate([solid.distance.ravel() for solid in self.solids]) if sizes else np.zeros(0, np.float32)
+        return flat, np.array(where, np.int64).reshape(-1, 4), np.array(frame, float).reshape(-1, 6)
+
+    def column(self, name: str) -> Array:
+        """A figure of the tissues by label : (n + 1,)."""
+        return np.array([getattr(tissue, name) for tissue in self.tissues], float)
+
+    def scattering(self) -> Array:
+        """Backscatter coefficient by label : (n + 1,) 1/(mm sr)."""
+        levels = [tissue.echogenicity for tissue in self.tissues]
+        return np.array([0.0 if level is None else BACKSCATTER * 10 ** (level / 10) for level in levels])
+
+
+def body(scene: Scene) -> Body:
+    """What ultrasound meets in a scene. Takes seconds for a large mesh: build it once a scene.
+
+    Raises
+    ------
+    InputError
+        If a thing's tissue is unknown.
+    """
+    shapes = {shape.name: shape for shape in scene.shapes if isinstance(shape, Cylinder)}
+    solids, wires = [], []
+    for thing in scene.things:
+        tissue, shape = tissue_of(scene, thing), shapes.get(thing.name)
+        if shape is not None and shape.radius < THIN_MM:
+            along = (thing.mesh.vertices - shape.point) @ shape.axis
+            ends = shape.point + np.outer([along.min(), along.max()], shape.axis)
+            wires.append(Wire(thing.name, tissue, ends, shape.radius))
+        else:
+            solids.append(solid(thing, tissue, shape))
+    solids.sort(key=lambda one: -float(np.prod(one.mesh.extents)))
+    return Body(surroundings(scene), tuple(solids), tuple(wires))
+
+
+def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
+    """A thing by its signed distance: exact for boxes along the axes, spheres and cylinders, sampled from the mesh otherwise."""
+    bounds = thing.mesh.bounds
+    if shape is not None:
+        along = (thing.mesh.vertices - shape.point) @ shape.axis
+        return _sampled(thing, tissue, lambda points: _in_rod(points, shape, along.min(), along.max()))
+    if thing.primitive is not None:
+        ball = thing.primitive
+        return _sampled(thing, tissue, lambda points: np.linalg.norm(points - ball.centre, axis=1) - ball.radius)
+    if np.isclose(thing.mesh.volume, np.prod(thing.mesh.extents), rtol=1e-6):
+        distance, steps = _box(bounds)
+        return Solid(thing.name, tissue, distance, bounds[0] - MARGIN_MM, steps, thing.mesh)
+    points, low, step = _grid(thing)
+    return Solid(thing.name, tissue, _from_mesh(thing.mesh, points, step), low, np.full(3, step), thing.mesh)
+
+
+def _grid(thing: Thing) -> tuple[Array, Array, float]:
+    """Points : (nx, ny, nz, 3) around a thing, the first of them, and their spacing."""
+    low, high = thing.mesh.bounds[0] - MARGIN_MM, thing.mesh.bounds[1] + MARGIN_MM
+    step = SPACING_MM[int(thing.mesh.extents.max() > LARGE_MM)]
+    counts = np.ceil((high - low) / step).astype(int) + 1
+    axes = [low[k] + step * np.arange(counts[k]) for k in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), low, step
+
+
+def _sampled(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array]) -> Solid:
+    points, low, step = _grid(thing)
+    values = np.stack([distance(sheet.reshape(-1, 3)).reshape(sheet.shape[:-1]) for sheet in points])
+    return Solid(thing.name, tissue, values.astype(np.float32), low, np.full(3, step), thing.mesh)
+
+
+def _in_rod(points: Array, rod: Cylinder, first: float, last: float) -> Array:
+    offset = points - rod.point
+    along = offset @ rod.axis
+    radial = np.linalg.norm(offset - np.outer(along, rod.axis), axis=1) - rod.radius
+    return np.maximum(radial, np.maximum(first - along, along - last))
+
+
+def _box(bounds: Array) -> tuple[NDArray[np.float32], Array]:
+    """Distance on few points: between them it is linear, as far as it matters near a face."""
+    low, high = bounds[0] - MARGIN_MM, bounds[1] + MARGIN_MM
+    counts = np.maximum(np.ceil((high - low) / 5.0).astype(int), 4) + 1
+    steps = (high - low) / (counts - 1)
+    axes = [low[k] + steps[k] * np.arange(counts[k]) for k in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    outside = np.maximum(bounds[0] - points, points - bounds[1])
+    return outside.max(axis=-1).astype(np.float32), steps
+
+
+def _from_mesh(mesh: trimesh.Trimesh, points: Array, step: float) -> NDArray[np.float32]:
+    """Distance along the normal of the nearest vertex, within a band: second order in the facet's size, where vertices are dense.
+
+    Farther away each connected region takes the side of most of its neighbours in the band. The mesh's box bounds it as well,
+    for a flat base may have no vertices of its own.
+    """
+    flat = points.reshape(-1, 3)
+    far, nearest = KDTree(mesh.vertices).query(flat, distance_upper_bound=BAND_MM)
+    near = np.isfinite(far)
+    value = np.full(len(flat), BAND_MM)
+    value[near] = ((flat[near] - mesh.vertices[nearest[near]]) * mesh.vertex_normals[nearest[near]]).sum(axis=1)
+    value, near = value.reshape(points.shape[:-1]), near.reshape(points.shape[:-1])
+    beyond = np.maximum(mesh.bounds[0] - points, points - mesh.bounds[1]).max(axis=-1)
+    source = distance_transform_edt(~near, sampling=step, return_distances=False, return_indices=True)
+    votes = np.sign(value[tuple(source)])
+    regions, count = label(~near & (beyond < 0))
+    side = np.sign(sum_labels(votes, regions, np.arange(count + 1)))
+    value = np.where(near, value, np.where(regions > 0, BAND_MM * side[regions], beyond))
+    return np.maximum(value, beyond).astype(np.float32)
+
+
+@njit(cache=True, inline="always")
+def distance_at(flat, where, frame, x, y, z):
+    """Signed distance of one solid at a point of the world, trilinear; 1e3 and more outside its grid."""
+    gx, gy, gz = (x - frame[0]) * frame[3], (y - frame[1]) * frame[4], (z - frame[2]) * frame[5]
+    nx, ny, nz = where[1], where[2], where[3]
+    if gx < 0 or gy < 0 or gz < 0 or gx > nx - 1 or gy > ny - 1 or gz > nz - 1:
+        return np.float32(1e3)
+    i, j, k = min(int(gx), nx - 2), min(int(gy), ny - 2), min(int(gz), nz - 2)
+    a, b, c = np.float32(gx - i), np.float32(gy - j), np.float32(gz - k)
+    p = where[0] + (i * ny + j) * nz + k
+    q, r, s = p + nz, p + ny * nz, p + ny * nz + nz
+    low = (flat[p] * (1 - c) + flat[p + 1] * c) * (1 - b) + (flat[q] * (1 - c) + flat[q + 1] * c) * b
+    high = (flat[r] * (1 - c) + flat[r + 1] * c) * (1 - b) + (flat[s] * (1 - c) + flat[s + 1] * c) * b
+    return low * (1 - a) + high * a
+
+
+@njit(cache=True, inline="always")
+def label_at(flat, where, frame, x, y, z):
+    """Label of a point: 0 in the surroundings, k + 1 in solid k, the last that holds it."""
+    for k in range(len(where) - 1, -1, -1):
+        if distance_at(flat, where[k], frame[k], x, y, z) < 0:
+            return k + 1
+    return 0

@@ -1,0 +1,153 @@
+"""A sweep in the twin: from a rig, a scene and a path to a capture folder and its ground truth, image by image."""
+
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.capture import sweep_part
+from recon.capture.images import write_images
+from recon.errors import InputError
+from recon.files import atomic
+from recon.geometry import rigid
+from recon.model.probe import ProbeCalibration
+from recon.model.rig import Rig
+from recon.model.tracks import Track
+from scenes.scene_types import Scene
+from twin.output_folders import TRUTH_MARKER, check_places
+from twin.ultrasound import bscan_truth
+from twin.ultrasound.bscan import Scan
+from twin.ultrasound.echo_solids import Body, Solid, label_at
+from twin.ultrasound.probe_path import Bob, SurfacePath, WirePath, about_crossing, along_surface, bobbing
+from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise, moments, plan
+from twin.ultrasound.transducer import Transducer
+
+AnyPath = Annotated[SurfacePath | Bob | WirePath, Field(discriminator="kind")]
+
+SETTINGS = "settings.json"
+POSES = "sweep/sweep.npz"
+LABELS = "sweep/labels"
+SUPPORTS = ("table", "tank")  # what things lie on or in
+GIVES_MM = 5.0  # by which a surface gives way to the probe, at most
+
+
+def plan_sweep(
+    path: SurfacePath | Bob | WirePath, rig: Rig, body: Body, transducer: Transducer, clocks: Clocks, noise: PoseNoise, seed: int
+) -> Plan:
+    """Lead the probe along a path, and say when its images are taken.
+
+    Raises
+    ------
+    InputError
+        If the scene hasn't what the path is about, the probe is led into something, or there are fewer than two images.
+    """
+    path_seed, clock_seed = np.random.SeedSequence(seed).generate_state(2).tolist()
+    match path:
+        case SurfacePath():
+            course = along_surface(path, surface_of(path.surface, body), transducer, path_seed)
+            taken = moments(course, clocks.scanner_hz)
+            refuse_inside(course, body, transducer, GIVES_MM)
+        case Bob():
+            course = bobbing(path, transducer, path_seed)
+            taken = moments(course, clocks.scanner_hz)
+            refuse_inside(course, body, transducer)
+        case WirePath():
+            course, taken = about_crossing(path, body, transducer, path_seed)
+            refuse_inside(course, body, transducer)
+    return plan(rig.probe, course, taken, clocks, noise, clock_seed)
+
+
+def surface_of(name: str, body: Body) -> Solid:
+    """The solid of a name; of none the largest that is no support.
+
+    Raises
+    ------
+    InputError
+        If there is no such solid.
+    """
+    named = {solid.name: solid for solid in body.solids}
+    if name in named:
+        return named[name]
+    others = [solid for solid in body.solids if solid.name not in SUPPORTS]
+    if name or not others:
+        expected = f"one of {', '.join(named) or 'nothing'}" if name else "a scene with a solid to stroke over"
+        raise InputError(f"path.surface: expected {expected}, found {name or 'none'}")
+    return others[0]
+
+
+def refuse_inside(course: Track, body: Body, transducer: Transducer, allowed_mm: float = 0.0) -> None:
+    """Refuse a course on which the array's face gets into a solid, by more than is allowed.
+
+    Raises
+    ------
+    InputError
+        If it does; the solid is named.
+    """
+    tables = body.packed()
+    face = np.column_stack([np.linspace(0, transducer.width_mm, 5), np.full(5, -allowed_mm), np.zeros(5)])
+    for time, pose in zip(course.times, course.poses, strict=True):
+        found = max(label_at(*tables, *point) for point in rigid.apply(pose, face))
+        if found:
+            name = body.solids[found - 1].name
+            raise InputError(f"path: expected the probe in front of all things, found it in {name} after {time * 1e-9:.2f} s")
+
+
+def calibration_of(rig: Rig, transducer: Transducer) -> ProbeCalibration:
+    """The rig's true probe calibration, right where sound travels as the scanner assumes."""
+    scale = np.array(rig.probe.scale_mm_per_px)
+    return ProbeCalibration(rig.probe.target_from_image.matrix(), scale, speed_m_s=transducer.assumed_speed)
+
+
+def write_session(
+    out: Path,
+    scene: Scene,
+    body: Body,
+    transducer: Transducer,
+    planned: Plan,
+    scans: Iterable[Scan],
+    probe: ProbeCalibration | None,
+    settings: Mapping[str, object],
+) -> None:
+    """Write `out/capture/` and `out/truth/`, each whole or not at all, taking the scans one by one.
+
+    Parameters
+    ----------
+    probe : of the capture; None where it is still to be calibrated.
+    settings : what the sweep was rendered from; kept with the truth.
+    """
+    check_places(out, "sweep")
+    with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
+        (folder / LABELS).mkdir(parents=True)
+        np.savez(folder / POSES, world_from_image=planned.truth.poses, times_ns=planned.truth.times)
+        _write_json(folder / SETTINGS, settings)
+        _write_json(folder / TRUTH_MARKER, describe(scene, body))
+
+        def images() -> Iterator[NDArray[np.uint8]]:
+            for number, one in enumerate(scans):
+                write_images([folder / LABELS / sweep_part.image_name(number)], bscan_truth.labels(one.paths, transducer)[None])
+                yield one.image
+            shutil.rmtree(out / "truth", ignore_errors=True)  # an old truth goes before the new capture comes
+
+        size = transducer.image_size
+        sweep_part.write_sweep(out / "capture", images(), planned.times, planned.track, size, probe, scene.name)
+
+
+def describe(scene: Scene, body: Body) -> dict[str, object]:
+    """What evaluation needs to know of a scene: what the labels mean, the wires' ends, and the primitives to fit."""
+    shapes = []
+    for shape in scene.shapes:
+        values = {key: np.asarray(value).tolist() for key, value in asdict(shape).items()}
+        shapes.append({"kind": type(shape).__name__.lower(), **values})
+    labels = ["surroundings", *(solid.name for solid in body.solids)]
+    wires = [{"name": wire.name, "ends_mm": wire.ends.tolist(), "radius_mm": wire.radius} for wire in body.wires]
+    return {"name": scene.name, "labels": labels, "wires": wires, "shapes": shapes}
+
+
+def _write_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

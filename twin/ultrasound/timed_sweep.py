@@ -1,0 +1,123 @@
+"""A freehand sweep: the scanner's images and the cameras' poses, each by its own clock, and what they were in truth."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.model import tracks
+from recon.model.rig import Finite, NotNegative, Part, Positive, Probe
+from recon.model.tracks import Track
+from twin.ultrasound.bscan import Scan, scan
+from twin.ultrasound.bscan_truth import labels
+from twin.ultrasound.echo_solids import Body
+from twin.ultrasound.transducer import Transducer
+
+Array = NDArray[np.float64]
+
+
+class Clocks(Part):
+    """When scanner and cameras take their images, and what their time stamps say. Truth is the cameras' clock."""
+
+    scanner_hz: Positive = 20.0
+    camera_hz: Positive = 40.0
+    lag_s: Finite = 0.05  # of the scanner's stamps: stamped t, an image shows the probe as it stood at t - lag
+    scanner_jitter_s: NotNegative = 0.002  # standard deviation of a stamp
+    camera_jitter_s: NotNegative = 0.0
+
+
+class PoseNoise(Part):
+    """Errors of the tracked poses, independent from frame to frame; standard deviations in each axis."""
+
+    turn_deg: NotNegative = 0.05  # about the target's own axes
+    shift_mm: NotNegative = 0.03  # in the world
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """When a sweep takes its n images, where the probe then is, and what the two clocks and the tracker say of it."""
+
+    times: NDArray[np.int64]  # (n,) ns, the scanner's stamps
+    track: Track  # world_from_target by the cameras
+    truth: Track  # world_from_image at the moments when the images are taken
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """What a sweep records, and its truth."""
+
+    images: NDArray[np.uint8]  # (n, h, w)
+    times: NDArray[np.int64]  # (n,) ns, the scanner's stamps
+    track: Track  # world_from_target by the cameras
+    truth: Track  # world_from_image at the moments when the images were taken
+    labels: NDArray[np.uint8]  # (n, h, w) as of `truth.labels`
+
+
+def sweep(
+    body: Body, transducer: Transducer, probe: Probe, path: Track, clocks: Clocks, pose_noise: PoseNoise, seed: int
+) -> Sweep:
+    """Record a sweep at the scanner's rate, whole in memory; `plan` and `scans` give the same one by one.
+
+    Parameters
+    ----------
+    probe : of the rig, which says how the image stands in the target's frame.
+    path : Track of `world_from_image`, as of `twin.ultrasound.probe_path`.
+
+    Raises
+    ------
+    InputError
+        If the path is shorter than two images.
+    """
+    planned = plan(probe, path, moments(path, clocks.scanner_hz), clocks, pose_noise, seed)
+    taken = list(scans(body, transducer, planned, seed))
+    images, shown = np.stack([one.image for one in taken]), np.stack([labels(one.paths, transducer) for one in taken])
+    return Sweep(images, planned.times, planned.track, planned.truth, shown)
+
+
+def moments(path: Track, rate_hz: float) -> NDArray[np.int64]:
+    """Moments : (n,) ns on a path, at an even rate from its start."""
+    length = (path.times[-1] - path.times[0]) * 1e-9
+    return path.times[0] + np.rint(np.arange(int(length * rate_hz) + 1) * 1e9 / rate_hz).astype(np.int64)
+
+
+def plan(probe: Probe, path: Track, taken: NDArray[np.int64], clocks: Clocks, pose_noise: PoseNoise, seed: int) -> Plan:
+    """Plan a sweep whose images are taken at moments : (n,) ns on the path; the cameras see the probe where the path has poses.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two images.
+    """
+    rng = np.random.default_rng(seed)
+    if len(taken) < 2:
+        length = (path.times[-1] - path.times[0]) * 1e-9
+        raise InputError(f"path: expected one that lasts two images, found {length:.3f} s")
+    stamps = _stamped(taken, clocks.lag_s, clocks.scanner_jitter_s, rng)
+    tracked = moments(path, clocks.camera_hz)
+    poses = tracks.at(path, tracked)
+    known = np.isfinite(poses).all(axis=(1, 2))
+    tracked, poses = tracked[known], poses[known]
+    seen = _noisy(poses @ rigid.invert(probe.target_from_image.matrix()), pose_noise, rng)
+    track = Track(_stamped(tracked, 0.0, clocks.camera_jitter_s, rng), seen)
+    return Plan(stamps, track, Track(taken, tracks.at(path, taken)))
+
+
+def scans(body: Body, transducer: Transducer, planned: Plan, seed: int) -> Iterator[Scan]:
+    """Take the images of a plan, one by one."""
+    return (scan(body, transducer, pose, seed, frame) for frame, pose in enumerate(planned.truth.poses))
+
+
+def _stamped(moments: NDArray[np.int64], lag_s: float, jitter_s: float, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Stamps in order: a jitter beyond the frame's period can't turn two around."""
+    stamps = moments + np.rint(1e9 * (lag_s + jitter_s * rng.standard_normal(len(moments)))).astype(np.int64)
+    return np.maximum.accumulate(stamps) + np.arange(len(stamps))
+
+
+def _noisy(poses: Array, noise: PoseNoise, rng: np.random.Generator) -> Array:
+    turns = np.deg2rad(noise.turn_deg) * rng.standard_normal((len(poses), 3))
+    result = np.stack([pose @ rigid.from_rotation_vector(turn, np.zeros(3)) for pose, turn in zip(poses, turns, strict=True)])
+    result[:, :3, 3] += noise.shift_mm * rng.standard_normal((len(poses), 3))
+    return result
