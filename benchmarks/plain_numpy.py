@@ -1,9 +1,9 @@
 """The surface pipeline in plain NumPy, with a flood fill in Numba: the peer of the fast one, and short enough to check by eye."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.patterns import CentreLine, Fringes, Patterns
@@ -37,7 +37,7 @@ def wrapped_phase(images: Array, shifts: Array) -> tuple[Array, Array, Array]:
     return np.arctan2(-sine, cosine), 2 / len(shifts) * np.hypot(sine, cosine), images.mean(axis=0)
 
 
-@njit(cache=True)
+@njit
 def flood(phase, valid, seeds):
     """Unwrap from the seeds, whose order is zero, to neighbours of neighbours; NaN where no path leads."""
     height, width = phase.shape

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.constants import c as LIGHT_SPEED
 from scipy.constants import h as PLANCK
 
+from recon.compiled import njit
 from recon.model.rig import CameraDevice, Sensor
 
 SMOOTHING_E = 4.0  # dark noise that leaves nothing of the steps of single electrons, and a skewness below 0.1 at any mean
@@ -97,7 +97,7 @@ def read_out(mean: Images, dark_noise_e: float, generator: np.random.Generator) 
     return electrons + np.float32(dark_noise_e) * generator.standard_normal(mean.shape, np.float32)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _bent(mean, normal, dark_variance):
     """Poisson of a mean plus normal noise, from standard normal numbers, by the expansion of Cornish and Fisher (1938)."""
     result = np.empty_like(normal)

@@ -13,9 +13,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.geometry.ellipses import Ellipses, on_ellipse, signed_distance
 
 Array = NDArray[np.float64]
@@ -178,7 +178,7 @@ class _Sums:
         return (np.arange(sectors) + 0.5) / sectors * 2 * np.pi - np.pi + self.turn / np.maximum(self.offset, 1e-12)
 
 
-@njit(cache=True)
+@njit
 def _add_up(
     values, xy, normal, distance, angle, starts, levels, width, offset, limit,
     information, mixed, rest, toward_offset, toward_rest, turn, flat, near,

@@ -1,9 +1,9 @@
 """Holes of a reconstructed volume, between one B-scan and the next, filled from the voxels around them."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.files.volumes import Volume
 from recon.freehand.volume_compounding import Reconstruction
 
@@ -36,7 +36,7 @@ def fill_holes(reconstruction: Reconstruction, most_voxels: int = MOST_VOXELS, s
     return Reconstruction(Volume(voxels, volume.origin, volume.spacing, volume.directions), filled)
 
 
-@njit(cache=True)
+@njit
 def _reach(filled: NDArray, k: int, j: int, i: int, dk: int, dj: int, di: int, most: int) -> int:
     """Steps to the next filled voxel, 0 if there is none within `most`."""
     nz, ny, nx = filled.shape
@@ -49,7 +49,7 @@ def _reach(filled: NDArray, k: int, j: int, i: int, dk: int, dj: int, di: int, m
     return 0
 
 
-@njit(cache=True)
+@njit
 def _fill(before, known, lengths, most_voxels, sticks, voxels, filled):
     nz, ny, nx = before.shape
     length, found = np.empty(len(lengths)), np.empty(len(lengths))

@@ -10,9 +10,9 @@ from itertools import repeat
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from recon.compiled import njit
 from recon.errors import InputError
 from recon.files.volumes import Volume
 from recon.geometry import rigid
@@ -196,7 +196,7 @@ def _grid(around: Array, spacing_mm: ArrayLike, directions: Array) -> Grid:
     return Grid((int(nx), int(ny), int(nz)), directions @ low, spacing, directions)
 
 
-@njit(cache=True)
+@njit
 def _paste_nearest(image, mask, bounds, voxel_from_pixel, value, weight, rule):
     m = voxel_from_pixel
     left, right, top, bottom = bounds
@@ -212,7 +212,7 @@ def _paste_nearest(image, mask, bounds, voxel_from_pixel, value, weight, rule):
                 _compound(value, weight, k, j, i, image[v, u], np.float32(1.0), rule)
 
 
-@njit(cache=True)
+@njit
 def _paste_linear(image, mask, bounds, voxel_from_pixel, value, weight, rule):
     m = voxel_from_pixel
     left, right, top, bottom = bounds
@@ -233,7 +233,7 @@ def _paste_linear(image, mask, bounds, voxel_from_pixel, value, weight, rule):
                             _compound(value, weight, k, j, i, image[v, u], share, rule)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _compound(value, weight, k, j, i, grey, share, rule):
     if rule == 0:
         value[k, j, i] += share * grey
@@ -250,7 +250,7 @@ def _compound(value, weight, k, j, i, grey, share, rule):
         weight[k, j, i] = before + 1
 
 
-@njit(cache=True)
+@njit
 def _finish(value, weight, divide, voxels):
     for k in range(value.shape[0]):
         for j in range(value.shape[1]):

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
+from recon.compiled import njit
 from recon.geometry import rigid
 
 Array = NDArray[np.float64]
@@ -128,10 +129,10 @@ def distorted(x, y, k):
     return (k[12] * xd + k[13] * yd + k[14]) / w, (k[15] * xd + k[16] * yd + k[17]) / w
 
 
-distort = njit(cache=True, inline="always")(distorted)
+distort = njit(inline="always")(distorted)
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _distort_all(points, k):
     result = np.empty_like(points)
     for i in prange(points.shape[0]):
@@ -139,7 +140,7 @@ def _distort_all(points, k):
     return result
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _slopes(x, y, k):
     """Jacobian of the distortion at (x, y): dxd/dx, dxd/dy, dyd/dx, dyd/dy."""
     right, left = distort(x + SLOPE_STEP, y, k), distort(x - SLOPE_STEP, y, k)
@@ -153,7 +154,7 @@ def _slopes(x, y, k):
     )
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _undistort_all(points, k):
     result = np.empty_like(points)
     for i in prange(points.shape[0]):

@@ -15,9 +15,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
+from recon.compiled import njit
 from recon.errors import InputError
 from recon.structured_light.decode import ProjectorMap
 
@@ -103,7 +104,7 @@ def _slope(image: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return level, cv2.magnitude(across, down)
 
 
-@njit(cache=True)
+@njit
 def _blur(level, slope, centres, reach):
     """Width of the edges in each window : (n,) px, from `contrast = sqrt(2 pi) * width * steepest slope`."""
     blur = np.full(len(centres), np.float64(BLUR[0]))
@@ -118,7 +119,7 @@ def _blur(level, slope, centres, reach):
     return blur
 
 
-@njit(cache=True)
+@njit
 def _window(centre, reach, shape):
     """The rows and columns within reach of a point: top, bottom, left, right, ends not included."""
     if not (math.isfinite(centre[0]) and math.isfinite(centre[1])):
@@ -128,7 +129,7 @@ def _window(centre, reach, shape):
     return top, bottom, left, right
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _parabolas(x, sigma, level, slope, centres, reach, blur):
     """Value, its variance and gradient at each point, NaN where the window says too little; chi-square and degrees of freedom."""
     n = len(centres)
@@ -152,7 +153,7 @@ def _parabolas(x, sigma, level, slope, centres, reach, blur):
     return value, variance, gradient, chi, freedom
 
 
-@njit(cache=True)
+@njit
 def _gather(x, sigma, level, slope, centre, reach, blur):
     """The window's trustworthy pixels: terms of the parabola : (m, 6) in units of reach, coordinates and sigmas : (m,) px."""
     top, bottom, left, right = _window(centre, reach, x.shape)
@@ -172,7 +173,7 @@ def _gather(x, sigma, level, slope, centre, reach, blur):
     return design[:m], measured[:m], deviation[:m]
 
 
-@njit(cache=True)
+@njit
 def _normal(design, weight):
     """Normal matrix : (6, 6); a trace of ridge keeps it invertible where pixels lie on a line, and such fits are refused."""
     normal = np.zeros((TERMS, TERMS))
@@ -186,12 +187,12 @@ def _normal(design, weight):
     return normal + np.eye(TERMS) * (1e-12 * np.trace(normal) + 1e-300)
 
 
-@njit(cache=True)
+@njit
 def _solve(design, measured, weight):
     return np.linalg.solve(_normal(design, weight), design.T @ (weight * measured))
 
 
-@njit(cache=True)
+@njit
 def _inliers(design, measured, deviation):
     """Which pixels follow one parabola : (m,) bool, and the parabola : (6,).
 
@@ -214,7 +215,7 @@ def _inliers(design, measured, deviation):
     return kept, beta
 
 
-@njit(cache=True)
+@njit
 def _surrounded(design, deviation, kept):
     """Whether the weight is not mostly outliers, and lies on all sides of the point."""
     total, inside, sides, count = 0.0, 0.0, np.zeros(8), 0
@@ -231,7 +232,7 @@ def _surrounded(design, deviation, kept):
     return count >= FEWEST and inside > KEPT * total and sides.min() > SIDE * inside
 
 
-@njit(cache=True)
+@njit
 def _chi_square(design, residual, deviation, kept, reach):
     """Chi-square of the means over blocks of each size, and its degrees of freedom : (sizes,) each."""
     chi, freedom = np.zeros(len(BLOCKS)), np.full(len(BLOCKS), -float(TERMS))

@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.errors import InputError
 from recon.files.volumes import Volume
 from recon.freehand import volume_compounding
@@ -125,7 +125,7 @@ def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, 
     return EchoPower(Volume(value, grid.origin, grid.spacing, grid.directions), weight)
 
 
-@njit(cache=True)
+@njit
 def _add(power, u, v, m, value, weight):
     nz, ny, nx = value.shape
     for n in range(power.size):

@@ -8,9 +8,10 @@ mass all of this can be followed along each line.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.files.volumes import Volume
 from recon.model.probe import SCANNER_SPEED
 
@@ -52,7 +53,7 @@ def follow(inside: Volume, pixel_mm: tuple[float, float], world_from_pixel: Arra
     return Lines(*_follow(inside.voxels, voxel_from_pixel, *pixel_mm, shape[0], shape[1], sound.mass / sound.tissue))
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _at(field, m, u, v):
     """Signed distance at a pixel, by trilinear interpolation; far away outside of the field."""
     x = m[0, 0] * u + m[0, 1] * v + m[0, 3]
@@ -70,7 +71,7 @@ def _at(field, m, u, v):
     return near * (1 - z) + far * z
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _reflection(ratio, cosine):
     """Reflected over incident pressure where the speed grows by `ratio` at the same density; 1 beyond the critical angle."""
     sine2 = ratio * ratio * (1 - cosine * cosine)
@@ -80,7 +81,7 @@ def _reflection(ratio, cosine):
     return (ratio * cosine - onwards) / (ratio * cosine + onwards)
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _follow(field, m, sx, sy, height, width, ratio):
     us = np.empty((height, width), np.float32)
     vs = np.empty((height, width), np.float32)

@@ -6,9 +6,10 @@ from enum import IntEnum
 from typing import Literal
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.errors import InputError
 from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns
 from recon.structured_light import gray_code, multi_frequency, plausibility
@@ -196,7 +197,7 @@ def _from_line(
     return Orders(order, known), unreachable, {"regions": found.regions, "islands": found.islands, "disputed": found.disputed}
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _coordinates(phase, sigma, order, trusted, unreachable, status, origin, pitch, length):
     """Projector coordinates and their noise, NaN where unknown; writes the reasons into `status`."""
     height, width = phase.shape

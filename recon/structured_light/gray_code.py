@@ -4,9 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.model.patterns import Fringes, GrayCode
 from recon.structured_light.phase import Fringe, Noise
 
@@ -74,7 +75,7 @@ def fringe_order(
     return Orders(order, trusted), residual
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _order(images, inverted, phase, offset, modulation, first, cell, read, gain):
     height, width = phase.shape
     bits = images.shape[0] // 2 if inverted else images.shape[0]

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.errors import InputError
 from recon.model.patterns import Fringes
 from recon.structured_light.gray_code import Orders
@@ -146,7 +147,7 @@ def _typical(sigmas: Image) -> NDArray[np.float64] | None:
     return np.quantile(seen, 0.25, axis=1).astype(float) if seen.size else None
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _climb(phases, sigmas, lead, pitch, weights, middle, origin, half):
     n, height, width = phases.shape
     order = np.zeros((height, width), np.int32)

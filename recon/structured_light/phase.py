@@ -4,8 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import ArrayLike, NDArray
+
+from recon.compiled import njit
 
 Image = NDArray[np.float32]
 
@@ -109,7 +111,7 @@ def _arctangent(y, x):
     return -angle if y < 0 else angle
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(parallel=True, error_model="numpy")
 def _fit(images, weights, quadratic, read, gain, saturation):
     n, height, width = images.shape
     phase = np.empty((height, width), np.float32)

@@ -11,10 +11,11 @@ from typing import Annotated
 import cv2
 import numpy as np
 import trimesh
-from numba import njit, prange
+from numba import prange
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from recon.compiled import njit
 from recon.geometry.camera import Camera
 from recon.structured_light.triangulate import Float32, PointMap
 
@@ -111,7 +112,7 @@ def _difference(sigma: Float32) -> Float32:
     return np.nan_to_num(NOISE * np.sqrt(np.float32(2)) * sigma)
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _norms(points, centre):
     height, width, _ = points.shape
     result = np.empty((height, width), np.float32)
@@ -122,7 +123,7 @@ def _norms(points, centre):
     return result
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _bump(distance):
     """How far each point stands out of its surroundings : (h, w) mm.
 
@@ -153,7 +154,7 @@ def _bump(distance):
     return result
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _torn(distance, noise, step, max_slope, max_bend, min_tear):
     """Pixels on either side of a tear : (h, w) bool."""
     height, width = distance.shape
@@ -197,7 +198,7 @@ def _without_islands(mask: Mask, smallest: int) -> Mask:
     return large[labels]
 
 
-@njit(cache=True)
+@njit
 def _triangles(distance, longest):
     """Corner triples : (n, 3) flat pixel indices. A square is split along the diagonal that is shorter in depth."""
     height, width = distance.shape
@@ -230,7 +231,7 @@ def _triangles(distance, longest):
     return faces[:n]
 
 
-@njit(cache=True)
+@njit
 def _normals(vertices, faces):
     """Unit normals : (n, 3), the mean of the adjoining triangles' weighted by area."""
     result = np.zeros_like(vertices)

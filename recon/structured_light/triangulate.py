@@ -7,9 +7,10 @@ solved for so that this is the decoded coordinate: one axis determines it, two d
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.geometry.camera import Camera, distort
 from recon.structured_light.decode import ProjectorMap
 
@@ -97,7 +98,7 @@ def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: t
     return coordinate, sigma
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(parallel=True, error_model="numpy")
 def _triangulate(rays, centre, projector, decoded, points, sigma):
     """Solve all pixels of an image row side by side, without branches, so that they share vector instructions."""
     projector_from_world, matrix, coefficients = projector

@@ -1,9 +1,10 @@
 """From echoes to grey levels: point spread, noise, gain over depth, envelope, logarithm, quantisation."""
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from scenes.acoustics import BACKSCATTER
 from twin.ultrasound.beam import OVERSAMPLING, Beam
 from twin.ultrasound.transducer import Transducer
@@ -58,7 +59,7 @@ def grey(envelope: NDArray[np.float32], transducer: Transducer) -> NDArray[np.ui
     return np.rint(steps * (255 / levels)).astype(np.uint8)
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(parallel=True, fastmath=True)
 def _in_depth(field, axial):
     lines, samples = field.shape
     rows, taps = axial.shape
@@ -74,7 +75,7 @@ def _in_depth(field, axial):
     return result
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(parallel=True, fastmath=True)
 def _along(field, lateral, reach):
     rows, lines = field.shape
     taps = lateral.shape[1]

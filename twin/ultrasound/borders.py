@@ -5,9 +5,10 @@ are sure to meet no border, so that only the rest has to be walked ray by ray.
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from twin.ultrasound.echo_solids import Body, distance_at
 
 Array = NDArray[np.float64]
@@ -45,7 +46,7 @@ def spans(
     return _spans(*body.packed(), world_from_image, middles[0], middles[1], radius, starts, deepest)
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _spans(flat, where, frame, pose, xs, zs, radius, starts, deepest):
     found = np.zeros((len(xs), len(zs), MOST, 2))
     counts = np.zeros((len(xs), len(zs)), np.int64)

@@ -10,11 +10,11 @@ from functools import cached_property
 
 import numpy as np
 import trimesh
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, label, sum_labels
 from scipy.spatial import KDTree
 
+from recon.compiled import njit
 from scenes.acoustics import BACKSCATTER, Tissue, surroundings, tissue_of
 from scenes.scene_types import Cylinder, Scene, Thing
 
@@ -177,7 +177,7 @@ def _from_mesh(mesh: trimesh.Trimesh, points: Array, step: float) -> NDArray[np.
     return np.maximum(value, beyond).astype(np.float32)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def distance_at(flat, where, frame, x, y, z):
     """Signed distance of one solid at a point of the world, trilinear; 1e3 and more outside its grid."""
     gx, gy, gz = (x - frame[0]) * frame[3], (y - frame[1]) * frame[4], (z - frame[2]) * frame[5]
@@ -193,7 +193,7 @@ def distance_at(flat, where, frame, x, y, z):
     return low * (1 - a) + high * a
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def label_at(flat, where, frame, x, y, z):
     """Label of a point: 0 in the surroundings, k + 1 in solid k, the last that holds it."""
     for k in range(len(where) - 1, -1, -1):

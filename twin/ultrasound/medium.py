@@ -6,10 +6,11 @@ has no echo of its own. A scatterer's length f follows from the backscatter coef
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
+from recon.compiled import njit
 from twin.ultrasound.beam import OVERSAMPLING, STEP_MM, Beam
 from twin.ultrasound.echo_solids import Body, distance_at, label_at
 from twin.ultrasound.sound_paths import Paths
@@ -97,13 +98,13 @@ def deepest_seen(transducer: Transducer, beam: Beam, paths: Paths) -> float:
     return min(paths.step_mm * levels, beam.depth_step_mm * (len(beam.core_mm) - 1))
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def hashed(i, j, k, seed):
     """64 random bits of a cell, by the finaliser of SplitMix64 (Steele, Lea and Flood 2014) over the mixed coordinates."""
     return mixed(np.uint64(i) * MIX[0] ^ np.uint64(j) * MIX[1] ^ np.uint64(k) * MIX[2], seed)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def mixed(x, seed):
     """64 random bits of what the coordinates have been folded to."""
     x = x + seed * np.uint64(0xD6E8FEB86659FD93)
@@ -112,7 +113,7 @@ def mixed(x, seed):
     return x ^ (x >> np.uint64(31))
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def deposit(field, px, py, value):
     """Add an echo at a fractional place of the field, shared among the four samples around it."""
     i, j = int(np.floor(px)), int(np.floor(py))
@@ -125,7 +126,7 @@ def deposit(field, px, py, value):
     field[i + 1, j + 1] += value * (a * b)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def uniform_label(flat, where, frame, x, y, z, radius):
     """Label of all points within a distance of one, or -1 if a border may come as near."""
     found = 0
@@ -138,7 +139,7 @@ def uniform_label(flat, where, frame, x, y, z, radius):
     return found
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(parallel=True, fastmath=True)
 def _scatter(
     flat,
     where,
@@ -244,7 +245,7 @@ def _scatter(
     return touched
 
 
-@njit(cache=True, fastmath=True)
+@njit(fastmath=True)
 def summed(fields, touched):
     """Sum over parts, always in the same order, of the lines that each has touched."""
     total = np.zeros(fields.shape[1:], fields.dtype)

@@ -8,9 +8,10 @@ refraction has bent it sideways.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from twin.ultrasound.beam import DEEPER
 from twin.ultrasound.echo_solids import Body, distance_at, label_at
 from twin.ultrasound.transducer import Transducer
@@ -53,7 +54,7 @@ def follow(body: Body, transducer: Transducer, world_from_image: Array) -> Paths
     return Paths(sy, labels, shown, amplitude, shift)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def reflection(z1, z2, c1, c2, cosine):
     """Reflected over incident pressure at a plane border of two fluids; 1 beyond the critical angle [Kinsler, section 6.4]."""
     sine2 = (c2 / c1) ** 2 * (1 - cosine * cosine)
@@ -63,7 +64,7 @@ def reflection(z1, z2, c1, c2, cosine):
     return (z2 * cosine - z1 * onwards) / (z2 * cosine + z1 * onwards)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def normal_at(flat, where, frame, x, y, z):
     """Outward normal of a solid at a point of the world, from central differences."""
     h = GRADIENT_MM
@@ -74,7 +75,7 @@ def normal_at(flat, where, frame, x, y, z):
     return a / size, b / size, c / size
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _follow(flat, where, frame, pose, lines, depths, sx, step, impedance, speed, loss, assumed, refract):
     labels = np.zeros((lines, depths), np.uint8)
     shown = np.zeros((lines, depths), np.float32)

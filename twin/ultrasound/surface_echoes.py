@@ -6,9 +6,10 @@ tilted that their phases alias reach no aperture, and are left out of the cohere
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from twin.ultrasound import borders
 from twin.ultrasound.beam import OVERSAMPLING, STEP_MM, Beam
 from twin.ultrasound.echo_solids import Body, distance_at
@@ -120,12 +121,12 @@ def wire_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths, wo
     return field
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _sinc(x):
     return np.sin(x) / x if abs(x) > 1e-4 else 1.0
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _unaliased(phase):
     """Weight of a coherent facet, by the phase between its line and the next: 1 for all that apertures accept."""
     share = (abs(phase) - TAPER[0]) / (TAPER[1] - TAPER[0])
@@ -134,20 +135,20 @@ def _unaliased(phase):
     return 1.0 if share <= 0 else np.cos(np.pi / 2 * share) ** 2
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _phase_of_patch(x, y, z, seed):
     bits = hashed(int(np.floor(x / PATCH_MM)), int(np.floor(y / PATCH_MM)), int(np.floor(z / PATCH_MM)), seed)
     return 2 * np.pi * (bits >> np.uint64(11)) / 9007199254740992.0
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _at(table, line, depth, step):
     level = min(int(depth / step), table.shape[1] - 2)
     part = depth / step - level
     return table[line, level] * (1 - part) + table[line, level + 1] * part
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _echo(field, x, seen, depth, z, strength, line, pad, sx, row, step, shift, elevation, half, depth_step, wavenumber):
     plane = min(int(depth / depth_step + 0.5), len(half) - 1)
     if abs(z) >= half[plane]:
@@ -158,7 +159,7 @@ def _echo(field, x, seen, depth, z, strength, line, pad, sx, row, step, shift, e
     deposit(field, (x - shift[line, level]) / sx + pad, seen / row, value)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _in_slice(y, z, orders, half, depth_step):
     """Whether a place across the image's plane lies in the slice, at its depth or at that of one of its repeats."""
     for order in range(1, orders + 2):
@@ -168,7 +169,7 @@ def _in_slice(y, z, orders, half, depth_step):
     return False
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(parallel=True, fastmath=True)
 def _surfaces(
     flat,
     where,
@@ -293,7 +294,7 @@ def _surfaces(
     return touched
 
 
-@njit(cache=True)
+@njit
 def _wire(
     points,
     local,

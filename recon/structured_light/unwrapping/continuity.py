@@ -9,8 +9,10 @@ beside each other, for which any border is straight enough, sees smaller jumps s
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
+
+from recon.compiled import njit
 
 Image = NDArray[np.float32]
 Flags = NDArray[np.uint8]
@@ -30,7 +32,7 @@ def wrap(cycles):
     return cycles - np.floor(cycles + np.float32(0.5))
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def continuity(phase, sigma, valid):
     """Classify pixels by the continuity of their phase.
 
@@ -91,7 +93,7 @@ def _judge(over, x, under, left, y, right, s):
     return torn | np.uint8(4) * np.uint8(x != x) | np.uint8(8) * np.uint8(y != y)
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _combine(jumps, valid):
     """A pixel is torn if any stencil is whose middle it touches, incomplete if any is; clean otherwise."""
     height, width = valid.shape
@@ -112,7 +114,7 @@ def _combine(jumps, valid):
     return flags
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def carry(order, known, phase, sigma, flags, wanted, reach):
     """Carry orders from known pixels to their neighbours, as far as the phase follows the slope it had among the known ones.
 

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.structured_light.phase import Fringe
 from recon.structured_light.unwrapping import continuity, watershed
 from recon.structured_light.unwrapping.continuity import CLEAN, INCOMPLETE, TORN, VOID, wrap
@@ -103,7 +104,7 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     return Unwrapped(order, known, unreachable, len(found.absolute), islands, len(found.disputed), *sighted)
 
 
-@njit(cache=True)
+@njit
 def _sight(line, offset, modulation, sigma, valid, phase, relative, basin, cell_order, turns, width):
     """Sightings of the line on continuous ground: the basin, the absolute order of the basin's root cell, cycles off a whole."""
     rows, columns = basin.shape
@@ -160,7 +161,7 @@ def _borders(state: Flags, ground: Integers, offset: Integers, right: NDArray[np
     return Borders(continuous, torn)
 
 
-@njit(cache=True)
+@njit
 def _grow(state, basin):
     """Let the basins grow into torn cells, one ring a pass; a cell in reach of several takes the first it meets."""
     rows, columns = basin.shape
@@ -178,7 +179,7 @@ def _grow(state, basin):
     return ground
 
 
-@njit(cache=True)
+@njit
 def _leaks(distance, home, cells, right, down):
     """Cells near a continuous contact that was refused: the jump between the two surfaces lies somewhere in the opening.
 
@@ -218,7 +219,7 @@ def _dilated(mask: Mask, cells: int) -> Mask:
     return cv2.dilate(mask.view(np.uint8), np.ones((side, side), np.uint8)).view(bool)
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _to_pixels(relative, flags, basin, cells, reached, island, closed):
     """Orders of the cells to their pixels.
 

@@ -5,9 +5,10 @@ neighbours are gathered from the widest places to the narrow ones, as a watershe
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.structured_light.unwrapping.continuity import CLEAN, INCOMPLETE, TORN, VOID
 
 CELL = 4  # px; a cell's side
@@ -18,7 +19,7 @@ Integers = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def gather(phase, flags):
     """Orders of the pixels relative to their cell's first, the cells' state, and the offsets to the cells right and below."""
     rows, columns = phase.shape[0] // CELL, phase.shape[1] // CELL
@@ -67,7 +68,7 @@ def _offset(phase, relative, v, u, du, dv):
     return result
 
 
-@njit(cache=True)
+@njit
 def depth(state):
     """Chessboard distance of each cell to the nearest that is not continuous, in cells; the image's edge is no obstacle."""
     rows, columns = state.shape
@@ -104,7 +105,7 @@ def _find(parent, shift, cell):
     return root, total
 
 
-@njit(cache=True)
+@njit
 def _descending(distance):
     """Indices of the cells from the greatest distance to the least: counting sort."""
     top = distance.max()
@@ -119,7 +120,7 @@ def _descending(distance):
     return order
 
 
-@njit(cache=True)
+@njit
 def flood(distance, right, down):
     """Gather cells into basins, from the widest places to the narrow ones: a watershed of the distance to the nearest gap.
 

@@ -3,10 +3,11 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from recon.compiled import njit
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def solve_and_invert(matrix, right, solution, inverse):
     """Solve and invert; False if the matrix isn't positive."""
     n = len(right)

@@ -6,9 +6,9 @@ time.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.geometry.camera import NEWTON_STEPS, NEWTON_TOLERANCE, SLOPE_STEP, Camera, distort
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ def rays_through(camera: Camera, pixels: Array) -> Array:
     return local / np.linalg.norm(local, axis=1, keepdims=True) @ camera.camera_from_world[:3, :3]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _undistorted(points, k):
     result = np.full((len(points), 3), np.nan)
     for i in range(len(points)):
@@ -61,7 +61,7 @@ def _undistorted(points, k):
     return result
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _slopes(camera_from_world, points, matrix, k):
     result = np.zeros((len(points), 2, 3))
     for i in range(len(points)):
@@ -83,7 +83,7 @@ def _slopes(camera_from_world, points, matrix, k):
     return result
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _ellipses(camera_from_target, centres, radius, matrix, k):
     result = np.full((len(centres), 5), np.nan)
     x, y = np.empty(POINTS), np.empty(POINTS)
@@ -105,7 +105,7 @@ def _ellipses(camera_from_target, centres, radius, matrix, k):
     return result
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _fit(x, y, ellipse):
     """The ellipse next to points of a closed outline, evenly spread."""
     n = len(x)

@@ -2,18 +2,18 @@
 
 import math
 
-from numba import njit
+from recon.compiled import njit
 
 NARROW = 1.2  # standard deviations of the lens's blur: a box below that is as good as Gaussian
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _primitive(z):
     """Integral of the normal distribution function up to z."""
     return z * 0.5 * math.erfc(-z * 0.7071067811865476) + math.exp(-0.5 * z * z) * 0.3989422804014327
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def blurred_step(distance, box, blur, wide):
     """The blurred step and its derivative by the distance, 1/px."""
     if abs(distance) > box / 2 + 4.5 * blur:

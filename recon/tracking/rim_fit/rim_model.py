@@ -15,8 +15,9 @@ the bright side.
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from recon.compiled import njit
 from recon.tracking.rim_fit import sector_levels
 from recon.tracking.rim_fit.cholesky import solve_and_invert
 from recon.tracking.rim_fit.edge_profile import blurred_step
@@ -78,7 +79,7 @@ CENTRE, SHAPE, COVARIANCE, INSIDE, OUTSIDE, NOISE, VARIANCE, SEEN = 0, 2, 5, 30,
 EXCESS, MIDDLE, FAILED, UNEVEN, COLUMNS = 38, 39, 40, 41, 42
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(parallel=True, error_model="numpy")
 def fit_rims(first, second, of_second, centres, shapes, reach, known, hole):
     """Fit n rims : (n, COLUMNS), each in one of two images of one type, from rough ellipses that may be off by reach : (n,) px.
 
@@ -91,7 +92,7 @@ def fit_rims(first, second, of_second, centres, shapes, reach, known, hole):
     return result
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _fit(image, centre, shape, reach, known, hole, result):
     ellipse = np.array([centre[0], centre[1], shape[0, 0], shape[0, 1], shape[1, 1]])
     before = ellipse.copy()
@@ -145,7 +146,7 @@ def _fit(image, centre, shape, reach, known, hole, result):
     result[FAILED] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _sound(ellipse, size):
     """Whether the numbers are those of an ellipse whose middle is in the image."""
     if not np.isfinite(ellipse).all():
@@ -156,7 +157,7 @@ def _sound(ellipse, size):
     return -1 < ellipse[0] < size[1] and -1 < ellipse[1] < size[0]
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _window(ellipse, beyond, size):
     """Rows and columns that hold the ellipse and what is around it by a share of its size."""
     half_x, half_y = beyond * math.hypot(ellipse[2], ellipse[3]), beyond * math.hypot(ellipse[3], ellipse[4])
@@ -164,7 +165,7 @@ def _window(ellipse, beyond, size):
     return left, right, max(int(ellipse[1] - half_y), 0), min(int(ellipse[1] + half_y) + 2, size[0])
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(error_model="numpy", fastmath=FAST)
 def _add_up(image, ellipse, planes, own, noise, sectors, stride, hole, sums):
     """Fill the sums of all sectors: measured less modelled, and the model's slopes."""
     sums[:] = 0
@@ -262,7 +263,7 @@ def _add_up(image, ellipse, planes, own, noise, sectors, stride, hole, sums):
             row[BRIGHT_SQUARES] += robust * share * squared
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _slopes(sectors, slopes):
     """How each sector's edge, levels and variance follow the parameters : (SECTORS, GLOBAL), in the order of STARTS."""
     for j in range(SECTORS):
@@ -273,7 +274,7 @@ def _slopes(sectors, slopes):
         slopes[j, 12], slopes[j, 13] = sectors[j, COS], sectors[j, SIN]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _by_sector(slopes, step):
     """A step of the parameters as each sector sees it : (SECTORS, COMMON)."""
     steps = np.zeros((SECTORS, COMMON))
@@ -283,7 +284,7 @@ def _by_sector(slopes, step):
     return steps
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _solve(reduced, weights, slopes, planes, back, sigma, step, inverse):
     """The step : (14,) and the inverse of the normal matrix : (14, 14); False if they are undetermined.
 
@@ -319,7 +320,7 @@ def _solve(reduced, weights, slopes, planes, back, sigma, step, inverse):
     return solve_and_invert(normal, right, step, inverse)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _move(ellipse, planes, variance, step, reach):
     """Move the parameters; shortens the step to what they did."""
     shortest = (ellipse[2] + ellipse[4]) / 2 - math.hypot((ellipse[2] - ellipse[4]) / 2, ellipse[3])
@@ -337,7 +338,7 @@ def _move(ellipse, planes, variance, step, reach):
     step[11:] = variance - before
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _first_levels(image, ellipse, variance, reach, hole, planes, noise):
     """Levels inside and outside, medians over the sectors like a rim; False if there is no dark ring on bright ground."""
     sectors = geometry(ellipse, variance, reach, hole)
@@ -373,7 +374,7 @@ def _first_levels(image, ellipse, variance, reach, hole, planes, noise):
     return planes[3] > planes[0]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _middle(image, ellipse, hole):
     """Mean of the white middle, of its inner half."""
     determinant = ellipse[2] * ellipse[4] - ellipse[3] ** 2

@@ -11,8 +11,8 @@ Source of the idea: Morris 1983, Parametric empirical Bayes inference, J. Am. St
 import math
 
 import numpy as np
-from numba import njit
 
+from recon.compiled import njit
 from recon.tracking.rim_fit.cholesky import solve_and_invert
 from recon.tracking.rim_fit.sectors import BRIGHT, COUNT, DARK, GROWTH, LEANING, RIGHT, SECTORS, UNKNOWNS, alone
 
@@ -23,7 +23,7 @@ REDUCED = 14  # the upper triangle of COMMON x COMMON and the right side
 HELD = (1, 2, 4)  # of a sector's unknowns, those that have a level of its own
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def tell_spread(sums, own, weights, arc, spread):
     """Standard deviations of own levels : (3,), from medians over the sectors that count; `arc` is a sector's length, px.
 
@@ -40,7 +40,7 @@ def tell_spread(sums, own, weights, arc, spread):
         spread[GROWTH] = max(math.sqrt(np.median(leaning**2) / MEDIAN) / arc, NONE)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _unpack(row, table):
     """A sector's sums as its normal matrix and right side : (UNKNOWNS, UNKNOWNS + 1)."""
     k = 0
@@ -51,7 +51,7 @@ def _unpack(row, table):
         table[m, UNKNOWNS] = row[RIGHT + m]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def eliminate(sums, own, spread, reduced, follow):
     """Sums over what is common to the rim : (SECTORS, REDUCED), with own levels eliminated.
 
@@ -87,7 +87,7 @@ def eliminate(sums, own, spread, reduced, follow):
             reduced[j, k + m] = table[m, UNKNOWNS] - (across[:, m] * follow[j, :, COMMON]).sum()
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def move(own, follow, steps, weights):
     """Move own levels : (SECTORS, OWN) after steps : (SECTORS, COMMON), and tell from neighbours how light leans."""
     for j in range(SECTORS):

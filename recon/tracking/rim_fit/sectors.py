@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from recon.compiled import njit
 
 SECTORS = 48
 LEAST_SECTORS = 16
@@ -26,7 +27,7 @@ UNKNOWNS, RIGHT = 5, 15
 SQUARES, COUNT, DARK2, MIXED, BRIGHT2, DARK_SQUARES, BRIGHT_SQUARES, LOCAL = range(20, 28)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def geometry(ellipse, variance, reach, hole):
     """Of each sector's middle : (SECTORS, 14): its place, the normal, the profile there, and how far to look."""
     sectors = np.empty((SECTORS, 14))
@@ -64,7 +65,7 @@ def geometry(ellipse, variance, reach, hole):
     return sectors
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def sector(x, y):
     """Number of the sector of a direction, and how far into it, as one number."""
     total = abs(x) + abs(y)
@@ -75,14 +76,14 @@ def sector(x, y):
     return min(at * (SECTORS / 4), SECTORS - 1e-9)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def steep(dark, bright, seen):
     """Sectors : (SECTORS,) bool whose levels are ink's beside paper's, in whatever light: as deep as others."""
     depth = (bright - dark) / np.maximum(np.abs(bright) + np.abs(dark), 1e-9)
     return seen & (depth > STEEP * np.quantile(depth[seen], 0.75))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def alone(sums):
     """What each sector's pixels alone say, where its edge stays: steps of its dark and its bright level, DN, and their variances.
 
@@ -98,7 +99,7 @@ def alone(sums):
     return free, variance
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def judge(sums, sectors, planes, own, weights, noise, capture, fewest):
     """Weigh the sectors by how well they fit and follow the noise; False if too little of the rim is in the image."""
     seen = sums[:, COUNT] >= fewest

@@ -1,0 +1,179 @@
+"""Compiled functions: Numba's `njit`, cached outside the tree by the hash of what was compiled.
+
+Numba's own cache looks at the file of the calling function alone, so that an edited callee or constant of another module goes
+unnoticed; and it lies beside the sources, so that a second clone compiles everything again. Here the key of a module's functions
+is a hash of its source and of all sources of ours that its compiled functions take names from. A function is compiled by one
+process at a time; others wait and load it.
+
+The cache is the user's own, `~/.cache/sonotwin/compiled` on Linux; `SONOTWIN_CACHE` names another place. Deleting it is safe.
+"""
+
+import ast
+import hashlib
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from filelock import FileLock
+from numba.core import caching
+from platformdirs import user_cache_path
+
+log = logging.getLogger(__name__)
+
+UNUSED_DAYS = 30  # after which what was compiled from other sources is deleted
+
+
+def njit(function: Callable | None = None, **options: Any) -> Any:
+    """Compile a function on first use, as the decorator `numba.njit` does with the same options, and keep the result."""
+    if function is None:
+        return lambda decorated: njit(decorated, **options)
+    dispatcher = numba.njit(cache=True, **options)(function)
+    _one_process_compiles(dispatcher)
+    return dispatcher
+
+
+def cache_folder() -> Path:
+    """The folder of everything that was compiled."""
+    place = os.environ.get("SONOTWIN_CACHE")
+    return (Path(place) if place else user_cache_path("sonotwin", appauthor=False)) / "compiled"
+
+
+def source_hash(module: Path, root: Path) -> str:
+    """Hash of a module's source and of those that its compiled functions take names from, one by one through their imports.
+
+    Parameters
+    ----------
+    module : the source file.
+    root : the folder that holds the top-level packages.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(_sources(module, root)):
+        digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:20]
+
+
+def _sources(module: Path, root: Path) -> set[Path]:
+    found, waiting = set(), [module]
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting.extend(_imported_for_kernels(path, root, path.stat().st_mtime_ns))
+    return found
+
+
+@cache
+def _imported_for_kernels(path: Path, root: Path, _: int) -> tuple[Path, ...]:
+    """Modules of ours from which a module takes names that its compiled functions, constants or types use."""
+    tree = ast.parse(path.read_bytes())
+    used = _names_for_kernels(tree)
+    modules = [
+        name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level
+        for alias in node.names
+        if (alias.asname or alias.name) in used
+        for name in (f"{node.module}.{alias.name}", node.module)
+    ]
+    files = (root.joinpath(*name.split(".")).with_suffix(".py") for name in modules)
+    return tuple(file for file in files if file.is_file() and file != Path(__file__))
+
+
+def _names_for_kernels(tree: ast.Module) -> set[str]:
+    """Names that a module's text uses, but for those of its plain functions that are never compiled."""
+    plain = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef) and not node.decorator_list}
+    others = [node for node in tree.body if not isinstance(node, ast.FunctionDef) or node.decorator_list]
+    used = set(_names(others))
+    waiting = [name for name in used if name in plain]  # as in `fast = njit(slow)`
+    while waiting:
+        more = set(_names([plain[waiting.pop()]])) - used
+        used |= more
+        waiting.extend(name for name in more if name in plain)
+    return used
+
+
+def _names(nodes: list[ast.stmt]) -> Iterator[str]:
+    return (node.id for each in nodes for node in ast.walk(each) if isinstance(node, ast.Name))
+
+
+class SourceHashLocator(caching._CacheLocator):
+    """Tells Numba where the compiled functions of a module of ours are kept."""
+
+    def __init__(self, folder: Path, line: int):
+        self._folder, self._line = folder, line
+
+    def get_cache_path(self) -> Any:
+        """The folder, of these very sources."""
+        return str(self._folder)
+
+    def get_source_stamp(self) -> Any:
+        """The sources' hash."""
+        return self._folder.name
+
+    def get_disambiguator(self) -> Any:
+        """The line, for functions of the same name."""
+        return str(self._line)
+
+    @classmethod
+    def from_function(cls, py_func: Callable, py_file: str) -> "SourceHashLocator | None":
+        """For a function of a package beside this one; None for any other, or where nothing can be written."""
+        root, path = Path(__file__).resolve().parent.parent, Path(py_file).resolve()
+        if not path.is_relative_to(root) or not path.is_file() or py_func.__module__ != _module_name(path, root):
+            return None
+        locator = cls(_folder(path, root, path.stat().st_mtime_ns), py_func.__code__.co_firstlineno)
+        try:
+            locator.ensure_cache_path()
+        except OSError:
+            return None
+        return locator
+
+
+@cache
+def _folder(path: Path, root: Path, _: int) -> Path:
+    """The folder of a module's compiled functions; those of its former sources are deleted once they are long unused."""
+    home = cache_folder() / _module_name(path, root)
+    folder = home / source_hash(path, root)
+    try:
+        if folder.is_dir():
+            os.utime(folder)
+        else:
+            for old in home.glob("*/"):
+                if time.time() - old.stat().st_mtime > UNUSED_DAYS * 86400:
+                    shutil.rmtree(old, ignore_errors=True)
+    except OSError:  # someone else's cache, or someone else just deleted it
+        pass
+    return folder
+
+
+def _module_name(path: Path, root: Path) -> str:
+    return ".".join(path.relative_to(root).with_suffix("").parts)
+
+
+def _one_process_compiles(dispatcher: Any) -> None:
+    """Lock the compilation of a function: who waited for another process loads its result."""
+    compiler, cache = dispatcher._compiler, dispatcher._cache
+    compile_now = compiler.compile
+
+    def compile_once(args: tuple, return_type: Any) -> Any:
+        place = Path(cache.cache_path)
+        with FileLock(place / f"{dispatcher.__name__}.lock"):
+            made = cache.load_overload(tuple(args), dispatcher.targetctx)
+            if made is not None:
+                dispatcher.targetctx.insert_user_function(made.entry_point, made.fndesc, [made.library])
+                return made
+            log.info("compiling %s.%s, once", dispatcher.__module__, dispatcher.__name__)
+            made = compile_now(args, return_type)
+            cache.save_overload(tuple(args), made)  # before another process may look
+            return made
+
+    compiler.compile = compile_once
+
+
+locators: list[Any] = caching.CacheImpl._locator_classes  # Numba asks them in this order
+locators.insert(0, SourceHashLocator)
