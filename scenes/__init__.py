@@ -1,0 +1,1 @@
+"""Everything that stands in front of the instruments: meshes, materials, acoustics."""

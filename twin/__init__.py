@@ -1,0 +1,1 @@
+"""The simulated instruments, and the comparison of results with their truth."""

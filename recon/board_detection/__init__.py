@@ -1,0 +1,1 @@
+"""Calibration boards in images: discs and corners, to a hundredth of a pixel."""

@@ -1,0 +1,1 @@
+"""Capture folders and calibration files, read and written."""

@@ -1,0 +1,1 @@
+"""Freehand 3-D ultrasound: tracked sequences, and volumes compounded from them."""

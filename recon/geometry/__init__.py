@@ -1,0 +1,1 @@
+"""Rigid motions, cameras, ellipses and primitives: geometry without files."""

@@ -1,0 +1,1 @@
+"""Joint calibration of cameras and projector from sightings of a board."""

@@ -1,0 +1,1 @@
+"""Masses and tubes in tracked B-scans, as closed surfaces."""

@@ -1,0 +1,1 @@
+"""Fringe projection: from images of a pattern sequence to points and meshes."""

@@ -1,0 +1,1 @@
+"""Errors of surfaces, sweeps and tracks against the ground truth."""

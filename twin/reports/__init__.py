@@ -1,0 +1,1 @@
+"""The demonstration's report and its parts."""

@@ -1,0 +1,1 @@
+"""The simulated scanner: scatterers, surfaces, beams, B-mode images."""

@@ -1,0 +1,1 @@
+"""Spatial phase unwrapping from a projected centre line."""

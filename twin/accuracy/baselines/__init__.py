@@ -1,0 +1,1 @@
+"""Rivals for measurements only: published recipe, thresholds, marker boards, OpenCV."""
