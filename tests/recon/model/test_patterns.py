@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 FILES = sorted((ROOT / "conf/patterns").glob("*.yaml"))
 COUNTS = {"paper_surface": 9, "paper_calibration": 50, "gray_surface": 16, "multi_frequency": 20, "twelve_step_gray": 18}
 

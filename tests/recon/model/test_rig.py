@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from recon.model.rig import Pose, Rig
 
-MEZA2021 = Path(__file__).parents[2] / "conf" / "rig" / "meza2021.yaml"
+MEZA2021 = Path(__file__).parents[3] / "conf" / "rig" / "meza2021.yaml"
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from recon.structured_light.decode import Status, decode
 from recon.structured_light.phase import Noise
 from tests.recon.fringe_scenes import NOISE, breast, photograph
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 SEQUENCES = ["paper_surface", "paper_calibration", "gray_surface", "multi_frequency", "twelve_step_gray"]
 SHAPE = (200, 260)
 

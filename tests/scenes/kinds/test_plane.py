@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from recon.model.rig import Rig
 from scenes.kinds import plane
 
-RIG = Path(__file__).parents[2] / "conf" / "rig" / "meza2021.yaml"
+RIG = Path(__file__).parents[3] / "conf" / "rig" / "meza2021.yaml"
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from recon.model.patterns import CentreLine, Fringes, Patterns
 from recon.structured_light.decode import Status, decode
 from tests.recon.fringe_scenes import breast, island, photograph, whole_jumps
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[4]
 
 
 @pytest.fixture(scope="module")
