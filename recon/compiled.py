@@ -1,4 +1,4 @@
-"""Compiled functions: Numba's `njit`, cached outside the tree by the hash of what was compiled.
+"""Compiled functions: Numba's `njit`, cached outside the tree by the hash of their sources.
 
 Numba's own cache looks at the file of the calling function alone, so that an edited callee or constant of another module goes
 unnoticed; and it lies beside the sources, so that a second clone compiles everything again. Here the key of a module's functions
@@ -26,7 +26,7 @@ from platformdirs import user_cache_path
 
 log = logging.getLogger(__name__)
 
-UNUSED_DAYS = 30  # after which what was compiled from other sources is deleted
+UNUSED_DAYS = 30  # after which code compiled from other sources is deleted
 
 
 def njit(function: Callable | None = None, **options: Any) -> Any:
@@ -103,7 +103,7 @@ def _names(nodes: list[ast.stmt]) -> Iterator[str]:
 
 
 class SourceHashLocator(caching._CacheLocator):
-    """Tells Numba where the compiled functions of a module of ours are kept."""
+    """Numba's cache locator for the modules beside this one: a folder for each hash of sources."""
 
     def __init__(self, folder: Path, line: int):
         self._folder, self._line = folder, line
@@ -156,7 +156,7 @@ def _module_name(path: Path, root: Path) -> str:
 
 
 def _one_process_compiles(dispatcher: Any) -> None:
-    """Lock the compilation of a function: who waited for another process loads its result."""
+    """Lock the compilation of a function: a process that waited for another one loads its result."""
     compiler, cache = dispatcher._compiler, dispatcher._cache
     compile_now = compiler.compile
 
@@ -175,5 +175,5 @@ def _one_process_compiles(dispatcher: Any) -> None:
     compiler.compile = compile_once
 
 
-locators: list[Any] = caching.CacheImpl._locator_classes  # Numba asks them in this order
+locators: list[Any] = caching.CacheImpl._locator_classes  # tried in this order
 locators.insert(0, SourceHashLocator)

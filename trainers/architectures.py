@@ -119,7 +119,7 @@ class Residual(nn.Module):
 class Detector(nn.Module):
     """Ours: strided at the entry, then dilated at 1/8 of the resolution.
 
-    It sees 15 cells to each side, 120 px: the whole target from each of its circles, without which none can be told from another.
+    Its field of view reaches 15 cells to each side, 120 px: the whole target from each circle, as one circle looks like another.
     """
 
     def __init__(self, channels: int = 80) -> None:

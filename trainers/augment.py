@@ -1,4 +1,4 @@
-"""What happens to pictures on the way to a tracker: other poses, light, lenses, noise, compression; for whole batches, in torch.
+"""Augmentation of whole batches in torch: poses, light, lenses, noise, compression.
 
 Images are (n, 1, h, w) float32 in digital numbers, 0 to 255, and every random number comes from the generator passed in. Nothing
 is ever mirrored: no target has its circles in the other order.
@@ -96,7 +96,7 @@ def occlude(images: Tensor, count: int, generator: Generator) -> tuple[Tensor, T
 
 
 def photograph(images: Tensor, white: Tensor, coarsest: float, generator: Generator) -> Tensor:
-    """Pictures as some camera, from nearly black to saturated, and what came after it might have given them.
+    """Pictures as of a random camera, from nearly black to saturated, and of the processing behind it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Batches to train with: views or patches changed at random, and what networks should answer. Batch k is that of (seed, k)."""
+"""Training batches: augmented views or patches and their labels. Batch k depends on (seed, k) alone."""
 
 import os
 from collections.abc import Iterator
@@ -42,7 +42,7 @@ class Discs:
 
 @dataclass(frozen=True)
 class Batches(Dataset[tuple[Tensor, Tensor, Tensor]]):
-    """Batches by the numbers of their steps: images, and what the losses of `trainers.labels` compare answers with."""
+    """Batches by their steps' numbers: images, and the labels for the losses of `trainers.labels`."""
 
     data: Data
     size: int
@@ -58,7 +58,7 @@ class Batches(Dataset[tuple[Tensor, Tensor, Tensor]]):
         return some.images, some.labels.pixel, some.labels.identity
 
     def since(self, step: int, loaders: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Those of a step and all later ones, made ahead by so many processes; by 0, each when it is asked for."""
+        """Batches from a step on, prepared ahead by worker processes; without workers, one at a time on request."""
         return iter(DataLoader(self, batch_size=None, sampler=count(step), num_workers=loaders, worker_init_fn=_apart))
 
 
@@ -118,12 +118,12 @@ def discs(patches: Patches, size: int, generator: Generator) -> Discs:
 
 
 def _fill(images: NDArray[np.uint8], generator: Generator) -> Tensor:
-    """A grey (n,) for what lies beyond images (n, h, w), mostly a dark one."""
+    """Fill grey (n,) beyond the borders of images (n, h, w), mostly a dark one."""
     return torch.from_numpy(images.max((1, 2))) * torch.rand(len(images), generator=generator) ** 2
 
 
 def _at(masks: Tensor, places: Tensor) -> Tensor:
-    """What masks (n, 1, h, w) say at places (n, k, 2), px; no outside."""
+    """Values of masks (n, 1, h, w) at places (n, k, 2), px; false outside."""
     height, width = masks.shape[-2:]
     nearest = torch.nan_to_num(places, nan=-1.0).round().long()
     u, v = nearest[..., 0], nearest[..., 1]

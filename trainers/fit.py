@@ -1,4 +1,4 @@
-"""The loop that trains a network: resumable at any step, since what a step sees depends on the seed and its number alone."""
+"""Training loop, resumable at any step: a step's batch depends on the seed and the step's number alone."""
 
 import json
 import math

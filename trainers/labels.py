@@ -1,4 +1,4 @@
-"""What the networks should answer: a detector's labels from circles' centres, and the losses against them.
+"""Labels of detector and segmenter from circles' centres and masks, and the losses against them.
 
 A circle's coarse place is its centre in full resolution over the scale, rounded to a pixel of the view: the tracker multiplies
 back. A pixel p of the view is not at scale * p of the full image, since `cv2.resize` aligns the images' outer edges: it shows
@@ -29,7 +29,7 @@ class Labels:
 
 
 def label_offset(scale: Tensor) -> Tensor:
-    """By how much a circle's coarse place exceeds where the view shows it, px of the view; scale : (..., 2) as of `Views`."""
+    """Offset of a circle's coarse place from its place in the view, px of the view; scale : (..., 2) as of `Views`."""
     return 0.5 - 0.5 / scale
 
 

@@ -1,4 +1,4 @@
-"""What a network is worth: figures of whole validation views and patches, decoded as the tracker does.
+"""Figures of merit of a network on whole validation views and patches, decoded as in the tracker.
 
 A detector's answer becomes circles as published: softmax over a cell's classes, scores of all pixels, of those within 4 px of
 each other the best, above 0.015 the best three, each with the identity that its cell says.

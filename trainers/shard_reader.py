@@ -29,7 +29,7 @@ Tell = Callable[[int], None]  # of how many samples were read
 
 @dataclass(frozen=True)
 class Views:
-    """Views of n samples, two each, and what is true of them. Without a target centres are NaN and the rest is 0."""
+    """Views of n samples, two each, and their ground truth. Without a target centres are NaN and the rest is 0."""
 
     images: Grey  # (2 n, 240, 320)
     scale: Array  # (2 n, 2) px of full resolution a px of a view, along u and v
@@ -97,7 +97,7 @@ def split(data: Data, validation: float) -> tuple[Data, Data]:
 
 
 def chosen(data: Data, which: NDArray) -> Data:
-    """The views or patches that a mask or index tells."""
+    """The views or patches that a mask or an index selects."""
     return replace(data, **{field.name: getattr(data, field.name)[which] for field in fields(data)})
 
 
@@ -121,7 +121,7 @@ def _read(folder: Path, members: Sequence[str], decode: Callable, tell: Tell, pa
 
 
 def _promised(folder: Path) -> int | None:
-    """How many samples the data set says that it has, if it does."""
+    """Number of samples by the data set's own count, or None."""
     path = folder / "dataset.json"
     if not path.is_file():
         return None
@@ -133,7 +133,7 @@ def _promised(folder: Path) -> int | None:
 
 
 def _samples(shard: Path, members: Sequence[str]) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Where each sample is, for messages, and its members that are asked for; samples lie one after the other."""
+    """Each sample's place, for messages, and its requested members, in the order of the shard."""
     try:
         with tarfile.open(shard, "r:") as archive:
             files = (entry for entry in archive if entry.isfile())

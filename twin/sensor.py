@@ -62,7 +62,7 @@ def expose(radiance: Images, device: CameraDevice, wavelength_nm: float, exposur
     Parameters
     ----------
     radiance : (n, h, w) float32, W/mm^2/sr
-        What the renderer says arrives at each pixel.
+        Radiance at each pixel, from the renderer.
     seed : int
         Of the temporal noise; image k has its own stream, whatever the number of threads. PRNU and DSNU come from the camera's
         serial number: they are the same in every image and every capture.

@@ -231,7 +231,7 @@ def normal(sigma: float, half_range: float) -> Curve:
 
 
 def noise_mixture(sigma: NDArray, half_range: float, label: str) -> Curve:
-    """What errors of different predicted sigma : (n,) give together: the mean of their normal distributions."""
+    """Mixture of normal distributions of predicted sigma : (n,), normalised."""
     x = np.linspace(-half_range, half_range, 301)
     levels = np.quantile(sigma, (np.arange(200) + 0.5) / 200).astype(float)
     return Curve(x, (np.exp(-((x / levels[:, None]) ** 2) / 2) / (levels[:, None] * np.sqrt(2 * np.pi))).mean(axis=0), label)
@@ -274,7 +274,7 @@ def surface_shape(points: Map, shown: Mask, name: str, colour: str, opacity: flo
 
 
 def inside_view(shapes: Sequence[Shape], lines: Sequence[Lines], sheets: Sequence[Sheet]) -> str:
-    """What lies in and under a surface, to be turned, as the JSON of a plotly figure; its legend shows and hides the parts."""
+    """Interactive 3-D view of a surface and the bodies under it, as the JSON of a plotly figure; its legend toggles the parts."""
     traces: list[graph_objects.Mesh3d | graph_objects.Scatter3d | graph_objects.Surface] = []
     named: set[str] = set()
 
@@ -297,7 +297,7 @@ def inside_view(shapes: Sequence[Shape], lines: Sequence[Lines], sheets: Sequenc
         joined = np.concatenate([np.vstack([line, np.full(3, np.nan)]) for line in np.asarray(one.points)]).astype(np.float32)
         style = {"mode": "lines", "line": {"color": one.colour, "width": 2}, "hoverinfo": "skip"}
         traces.append(graph_objects.Scatter3d(**dict(zip("xyz", joined.T, strict=True)), **style, **entry(one.name)))
-    for shape in sorted(shapes, key=lambda shape: -shape.opacity):  # what shines through comes last
+    for shape in sorted(shapes, key=lambda shape: -shape.opacity):  # translucent parts last
         hover = f"{shape.name}<br>x %{{x:.1f}}<br>y %{{y:.1f}}<br>z %{{z:.1f}} mm<extra></extra>"
         look = {"color": shape.colour, "opacity": shape.opacity, "hovertemplate": hover}
         visible = True if shape.shown else "legendonly"

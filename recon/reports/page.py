@@ -20,7 +20,7 @@ FOLDER = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Opening:
-    """The top of a page: what it is about, and what came out."""
+    """The top of a page: its subject and its results."""
 
     kind: str  # a few words above the title
     title: str
@@ -63,7 +63,7 @@ def paragraph(text: str) -> str:
 
 
 def notices(lines: Iterable[str]) -> str:
-    """What a reader must not miss, one item a line."""
+    """Warnings for the reader, one item a line."""
     return '<ul class="notices">' + "".join(f"<li>{_text(line)}</li>" for line in lines) + "</ul>"
 
 
@@ -91,7 +91,7 @@ def switch(name: str) -> str:
 
 
 def key(colours: Mapping[str, str]) -> str:
-    """What the colours of lines in pictures mean."""
+    """Legend of the lines' colours in pictures."""
     entries = "".join(f'<span><i style="background:{colour}"></i>{_text(name)}</span>' for name, colour in colours.items())
     return f'<p class="key">{entries}</p>'
 

@@ -73,7 +73,7 @@ def run(config: Config) -> int:
 
 
 def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> table_rows.Setup:
-    """What measurements are made with: a rig, all sequences and scanners of conf/, and real recordings if they are at hand."""
+    """Inputs of the measurements: a rig, all sequences and scanners of conf/, and real recordings if they are at hand."""
     sequences = {path.stem: read_patterns(path) for path in (folder() / "patterns").glob("*.yaml")}
     scanners = {
         path.stem: Transducer(**yaml.safe_load(path.read_text(encoding="utf-8")))

@@ -39,7 +39,7 @@ class Config(BaseModel):
     ranges: DataRanges
 
     def settings(self) -> Settings:
-        """What the bytes depend on."""
+        """Settings that the bytes depend on."""
         return Settings(**self.model_dump(exclude={"out", "workers"}))
 
 

@@ -67,7 +67,7 @@ class Config(BaseModel):
 
     @property
     def plan(self) -> Plan:
-        """What the training needs to know."""
+        """Settings of the training loop."""
         batch = self.batch or (8 if self.network.startswith("published") else 16)
         return Plan(
             self.network,
@@ -140,7 +140,7 @@ def check_resumed(config: Config) -> bool:
 
 
 def settings(config: Config) -> dict:
-    """What was asked for, as JSON has it; folders by their whole paths."""
+    """The request as JSON; folders by their whole paths."""
     paths = {name: str(path.resolve()) for name in ("data", "out", "init", "validation_data") if (path := getattr(config, name))}
     return config.model_dump(mode="json") | paths
 
@@ -157,7 +157,7 @@ def prepare(config: Config, goes_on: bool) -> None:
 
 
 def read(config: Config, console: Console) -> tuple[Data, Data]:
-    """What to train and to validate with."""
+    """Training and validation samples."""
     reader = shard_reader.read_views if is_detector(config.network) else shard_reader.read_patches
     with console.status("reading") as status:
         data = reader(
@@ -169,7 +169,7 @@ def read(config: Config, console: Console) -> tuple[Data, Data]:
 
 
 def fitted_with_progress(config: Config, module: torch.nn.Module, train: Data, validation: Data, console: Console) -> Fitted:
-    """Train, and show how far it is."""
+    """Train, and show the progress."""
     with Progress(console=console, transient=True, disable=not console.is_terminal) as display:
         task = display.add_task("training", total=1.0)
 
@@ -180,7 +180,7 @@ def fitted_with_progress(config: Config, module: torch.nn.Module, train: Data, v
 
 
 def describe(figures: Metrics) -> str:
-    """One line about what the network is worth."""
+    """One line with the network's figures of merit."""
     if "recall" in figures:
         return (
             f"{shown(100 * figures['recall'], '.1f', ' %')} of circles found with their identity, "
@@ -213,7 +213,7 @@ def write(config: Config, fitted: Fitted, figures: Metrics) -> list[str]:
 
 
 def curves(rows: list[fit.Row]) -> Figure:
-    """Loss, and what validation said on the way, over the steps."""
+    """Loss and validation figures over the steps."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     for axes, names in ((left, ("loss",)), (right, ("recall", "all_three", "iou", "empty_right"))):

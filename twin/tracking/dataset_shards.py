@@ -40,7 +40,7 @@ RENDER = {"views": render_views, "sketches": render_sketches, "full": render_ful
 
 
 class Settings(BaseModel):
-    """All that a data set's bytes depend on, and how many samples it has."""
+    """Everything that a data set's bytes depend on, and the number of its samples."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -139,7 +139,7 @@ def _start(settings: Settings, workers: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """A worker whose parent was killed would render on until its shard is full."""
+    """End a worker whose parent was killed; else it would render on until its shard is full."""
     parent = parent_process()
     if parent is not None:
         wait([parent.sentinel])
@@ -180,7 +180,7 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def truth_record(take: Take, frames: Frames, seed: int) -> dict:
-    """What is true of a sample, as in docs/training.md."""
+    """Ground truth of a sample, as in docs/training.md."""
     motion = take.motion
     return {
         "k": take.k,
@@ -230,7 +230,7 @@ def truths(path: Path) -> Iterator[dict]:
 
 
 def write_index(place: Place, settings: Settings) -> None:
-    """A table with a row a sample: where it is, and what one chooses samples by."""
+    """Index table, a row a sample: its place, and the quantities by which samples are chosen."""
     rows = []
     for number, _ in enumerate(settings.shards()):
         for record in truths(place.shard(number)):

@@ -50,12 +50,12 @@ class Lanes:
     samples: NDArray[np.uint32]  # (n,) rays
     set: NDArray[np.uint32]  # (n,) number of the set of sample points, one of its own for each pixel that is looked at
     first: NDArray[np.uint32]  # (n,) of the set's points that are the lane's
-    circle: NDArray[np.uint32]  # (n,) of which the visible part is told, or NO_CIRCLE
+    circle: NDArray[np.uint32]  # (n,) circle whose visible part is computed, or NO_CIRCLE
 
 
 @dataclass(frozen=True)
 class Light:
-    """What the lanes receive: n values each."""
+    """Values received by the lanes, n each."""
 
     radiance: Floats  # mean over the rays; the target's white is about 1 / pi times its irradiance
     disc: Floats  # rays towards the lane's circle, its outline filled, whatever stands before it
@@ -74,7 +74,7 @@ def render(
     most_samples : int
         Points of the largest set, a power of two.
     grid : BitGrid or None
-        What the target's face shows instead of the circles.
+        Print on the target's face instead of the circles.
     """
     first, step, end = _shares(lanes)
     take, camera = dr.gather(mi.UInt32, mi.UInt32(lanes.take), first), dr.gather(mi.UInt32, mi.UInt32(lanes.camera), first)
@@ -124,14 +124,14 @@ def _shares(lanes: Lanes) -> mi.Vector3u:
 
 
 class _Source(NamedTuple):
-    """A lamp or the projector as a place sees it."""
+    """A lamp or the projector, relative to a place."""
 
     value: mi.Float  # radiance towards the viewer by it, without shadows
     way: mi.Vector3f  # to a point of it
 
 
 class _Path:
-    """One ray after another through the same takes: fetches what doesn't change from ray to ray once."""
+    """Rays through the same takes, one after another; fetches constant parameters once."""
 
     def __init__(self, bank: Bank, target: Target, rows: Rows, cameras: Rows, grid: BitGrid | None) -> None:
         self.bank, self.target, self.rows, self.grid = bank, target, rows, grid
@@ -188,7 +188,7 @@ class _Path:
         return mi.Ray3f(mi.Point3f(start), way), dr.rsqrt(1 + x * x + y * y)
 
     def _untwisted(self, d: mi.Vector3f, time: mi.Float) -> mi.Vector3f:
-        """A direction of the world, turned back by what the target has turned since the middle of the exposure [Rodrigues]."""
+        """A direction of the world, turned back by the target's rotation since the middle of the exposure [Rodrigues]."""
         s, c = dr.sincos(-self.angle * time)
         return d * c + dr.cross(self.axis, d) * s + self.axis * (dr.dot(self.axis, d) * (1 - c))
 
@@ -219,7 +219,7 @@ class _Path:
         return mi.Ray3f(mi.Point3f(self.scene_from_world.apply(mi.Vector3f(ray.o))), self.scene_from_world.rotate(ray.d))
 
     def _nearest(self, ray: mi.Ray3f, turned: mi.Ray3f, time, x, y) -> tuple:
-        """Place and normal in the world of what the ray meets, its surface, whether that is the target's face, or nothing."""
+        """Intersection of a ray: place and normal in the world, surface, whether it is the target's face; or none."""
         in_body, in_scene = self._banked(turned), self._scene_ray(ray)
         flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
         body = self.bank.bodies.ray_intersect(in_body, flags, True, self.present)
@@ -267,7 +267,7 @@ class _Path:
         return radiance / SHADOWS
 
     def _sources(self, place, normal, view, surface, points: PairedPoints) -> tuple[mi.Float, list["_Source"]]:
-        """What comes by the light from around, and by a point of each lamp and the projector, without shadows."""
+        """Unshadowed radiance from the surroundings' light, a point of each lamp, and the projector."""
         around = surface[0] * self.ambient * self._share_from(2 / 3 * normal)  # mean of all directions by their cosines
         ball = mi.Vector3f(mi.warp.square_to_uniform_sphere(points.square()))
         sources = []

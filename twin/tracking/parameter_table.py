@@ -83,7 +83,7 @@ class Turn:
 
 
 def take_columns(takes: Sequence[Take], rig: Rig, body_at: Array, scene_at: Array) -> dict[str, Array]:
-    """Columns of what belongs to a take : (takes, ...); variants stand at body_at, scene_at : (variants, 3) mm in their banks."""
+    """Columns of a take's parameters : (takes, ...); variants stand at body_at, scene_at : (variants, 3) mm in their banks."""
     lights = [take.lighting for take in takes]
     into_target = np.array([rigid.invert(take.motion.world_from_target) for take in takes])
     into_scene = np.array([take.scene_from_world for take in takes])
@@ -116,7 +116,7 @@ def take_columns(takes: Sequence[Take], rig: Rig, body_at: Array, scene_at: Arra
 
 
 def camera_columns(devices: Sequence[CameraDevice]) -> dict[str, Array]:
-    """Columns of what belongs to a camera : (cameras, ...); InputError for a lens with more than five coefficients."""
+    """Columns of a camera's parameters : (cameras, ...); InputError for a lens with more than five coefficients."""
     cameras = [device.optics.camera() for device in devices]
     for camera in cameras:
         if np.any(camera.distortion[5:]):

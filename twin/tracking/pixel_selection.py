@@ -1,4 +1,4 @@
-"""Which camera pixels are rendered, and what image is made of them: views, full frames, patches, or the part that matters."""
+"""Selection of camera pixels to render, and images made of them: views, full frames, patches, sketches."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -80,7 +80,7 @@ class Window:
     first: tuple[int, int]  # its upper left pixel
     extent: tuple[int, int]  # width, height
     samples: int
-    sets: int = 0  # tells the windows of one image apart, so that their sample points differ
+    sets: int = 0  # numbers the windows of one image, so that their sample points differ
     circle: int = NO_CIRCLE
 
     def lanes(self, take: int, camera: int) -> Lanes:
@@ -102,7 +102,7 @@ def full_frame(size: tuple[int, int], samples: int) -> Window:
 
 @dataclass(frozen=True)
 class Sketch:
-    """A camera image of which only what matters is rendered: the pixels that make its view, and one window in full.
+    """A camera image rendered in part: the pixels that make its view, and one window in full.
 
     Shrunk to a view it is what the full image would be; the window is the full image's; all else repeats the pixels rendered
     next to it. For tests of a tracker that looks at the view and then at windows about the target, at a fraction of the cost.

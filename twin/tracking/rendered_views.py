@@ -1,4 +1,4 @@
-"""From parameters to what the cameras deliver, with the truth of each image; several takes in one launch."""
+"""From a sample's parameters to camera images and their ground truth; several takes in one launch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -52,7 +52,7 @@ class Frames:
 
 
 def render_views(bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int) -> list[Frames]:
-    """Views as the detector sees them, and full-resolution patches."""
+    """Views at the detector's size, and full-resolution patches."""
     pictures = [[View(device.optics.size, quality.view) for device in take.cameras] for take in takes]
     return _rendered(bank, rig, takes, pictures, quality, seed)
 
@@ -150,7 +150,7 @@ def _patch_origins(take: Take, camera: int, truth: ViewTruth) -> NDArray[np.int6
 
 
 def _sensed(takes: Sequence[Take], rig: Rig, blocks: Sequence[Lanes], radiance: Sequence[NDArray[np.float32]]) -> list[Grey]:
-    """What the sensors make of the light, block by block; each block belongs to one camera of one take."""
+    """Digital numbers from radiance, block by block; each block belongs to one camera of one take."""
     streams = {
         (i, camera): np.random.default_rng([take.noise_seed, camera, 1]) for i, take in enumerate(takes) for camera in (0, 1)
     }
@@ -198,7 +198,7 @@ def _unit_pattern(height: int, width: int, serial: int) -> tuple[NDArray[np.floa
 
 
 def _visible(light: Light, pieces) -> NDArray[np.float64]:
-    """Part of what the image holds of each disc that nothing covers : (3,)."""
+    """Uncovered share of each disc's area within the image : (3,)."""
     return np.array([light.seen[piece].sum() / max(light.disc[piece].sum(), 1) for piece in pieces], float)
 
 

@@ -68,7 +68,7 @@ class Lighting:
 
 @dataclass(frozen=True)
 class Print:
-    """The face of the target: what it reflects, and what is wrong with it."""
+    """The face of the target: its reflectances and its blemishes."""
 
     ink: float
     paper: float
@@ -189,7 +189,7 @@ def _described(to_world: Array, device: CameraDevice):
 
 
 def _pose(ranges: PoseRanges, rig: Rig, cameras: tuple[CameraDevice, CameraDevice], rng: np.random.Generator) -> Array:
-    """A pose whose middle both cameras see, mostly; the target's face is turned towards them."""
+    """A pose whose middle lies in both cameras' views, mostly; the target's face is turned towards them."""
     views = [device.optics.camera() for device in cameras]
     middle_target = np.array([rig.target.c1_mm, rig.target.c2_mm, 0]) / 2
     anywhere = rng.random() < OUTSIDE_SHARE

@@ -1,4 +1,4 @@
-"""What is drawn at random for a tracking sample, and from which ranges; `conf/dataset.yaml` gives each its reason."""
+"""Ranges of a tracking sample's random parameters; `conf/dataset.yaml` gives each its reason."""
 
 from typing import Annotated
 

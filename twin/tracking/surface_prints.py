@@ -1,4 +1,4 @@
-"""What surfaces look like: the target's print, posters, and textures of everything else, computed where a ray hits."""
+"""Appearance of surfaces: the target's print, posters and textures, computed where a ray hits."""
 
 from dataclasses import dataclass
 
@@ -60,7 +60,7 @@ class Face:
         return cls(rows.all("print"), rows.all("scratches"), rows.all("spots"))
 
     def reflectance(self, covered: mi.Float, relief: mi.Float, x: mi.Float, y: mi.Float) -> mi.Float:
-        """At x, y in mm, by how much is covered with ink: uneven, scratched and spotted."""
+        """Ink coverage at x, y in mm: uneven, scratched and spotted."""
         ink, paper, unevenness, _ = self.paint
         value = dr.lerp(paper, ink, covered) * (1 + unevenness * relief)
         for k in range(SCRATCHES):
@@ -90,7 +90,7 @@ def relief(surface: list[mi.Float], place: mi.Vector3f, seed: mi.UInt32) -> mi.F
 
 
 def ring_cover(target: Target, x: mi.Float, y: mi.Float, softness: mi.Float) -> mi.Float:
-    """How much of the face is ink at x, y: three annuli."""
+    """Share of ink on the face at x, y: three annuli."""
     covered = mi.Float(0)
     for cx, cy in ((0.0, 0.0), (target.c1_mm, 0.0), (0.0, target.c2_mm)):
         r = dr.sqrt((x - cx) ** 2 + (y - cy) ** 2)
@@ -101,7 +101,7 @@ def ring_cover(target: Target, x: mi.Float, y: mi.Float, softness: mi.Float) -> 
 
 
 def grid_cover(grid: BitGrid, x: mi.Float, y: mi.Float) -> mi.Float:
-    """How much of the face is ink at x, y: 1 in black cells."""
+    """Share of ink on the face at x, y: 1 in black cells."""
     rows, columns = grid.cells.shape
     i = dr.floor((x - grid.origin_mm[0]) / grid.cell_mm[0])
     j = dr.floor((y - grid.origin_mm[1]) / grid.cell_mm[1])

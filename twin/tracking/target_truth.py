@@ -1,4 +1,4 @@
-"""What is true of a target in a view: projected centres, outlines, blur, visibility."""
+"""Ground truth of a target in a view: projected centres, outlines, blur, visibility."""
 
 from dataclasses import dataclass, field
 
@@ -31,7 +31,7 @@ class ViewTruth:
 
 
 def view_truth(take: Take, device: CameraDevice, target: Target) -> ViewTruth:
-    """What one camera should see of a take's target."""
+    """Ground truth of a take's target in one camera."""
     camera = device.optics.camera()
     if not take.present:
         nothing = np.full((3, 2), np.nan)
