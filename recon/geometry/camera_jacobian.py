@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera, distorted, tilt_matrix
@@ -69,9 +68,7 @@ def moved(camera: Camera, names: Sequence[str], step: Array) -> Camera:
     distortion = np.zeros(len(DISTORTION))
     distortion[: camera.distortion.size] = camera.distortion
     distortion += [change.get(name, 0.0) for name in DISTORTION]
-    turn = Rotation.from_rotvec([change.get(name, 0.0) for name in MOTION[:3]]).as_matrix()
-    place = rigid.transform(turn @ camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3])
-    place[:3, 3] += [change.get(name, 0.0) for name in MOTION[3:]]
+    place = rigid.moved(camera.camera_from_world, [change.get(name, 0.0) for name in MOTION])
     return replace(camera, matrix=matrix, distortion=_trimmed(distortion, camera.distortion.size), camera_from_world=place)
 
 
@@ -81,9 +78,7 @@ def difference(first: Camera, second: Camera, names: Sequence[str]) -> Array:
     for camera, sign in ((second, 1), (first, -1)):
         for name, value in zip(DISTORTION, camera.distortion, strict=False):
             changes[name] = changes.get(name, 0.0) + sign * value
-    turn = Rotation.from_matrix(second.camera_from_world[:3, :3] @ first.camera_from_world[:3, :3].T).as_rotvec()
-    shift = second.camera_from_world[:3, 3] - first.camera_from_world[:3, 3]
-    changes |= dict(zip(MOTION, [*turn, *shift], strict=True))
+    changes |= dict(zip(MOTION, rigid.difference(first.camera_from_world, second.camera_from_world), strict=True))
     return np.array([changes.get(name, 0.0) for name in names])
 
 

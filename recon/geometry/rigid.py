@@ -36,6 +36,33 @@ def invert(to_from: Array) -> Array:
     return transform(rotation, -rotation @ to_from[:3, 3])
 
 
+def moved(pose: Array, step: ArrayLike) -> Array:
+    """Poses : (..., 4, 4) after steps : (..., 6), `R = exp([r]) R`, `t = t + dt`.
+
+    A step is a turn in rad, then a shift in mm, both about the axes of the frame that the pose leads to. All errors, covariances
+    and least squares of poses are in such steps.
+    """
+    step = np.asarray(step, float)
+    result = np.array(pose, float, order="C")
+    result[..., :3, :3] = Rotation.from_rotvec(step[..., :3]).as_matrix() @ result[..., :3, :3]
+    result[..., :3, 3] += step[..., 3:]
+    return result
+
+
+def difference(first: Array, second: Array) -> Array:
+    """The step : (6,) from one pose to another, rad and mm: the inverse of `moved`."""
+    turn = Rotation.from_matrix(second[:3, :3] @ first[:3, :3].T).as_rotvec()
+    return np.concatenate([turn, second[:3, 3] - first[:3, 3]])
+
+
+def slopes(arms: Array) -> Array:
+    """Derivatives : (..., 3, 6), mm/rad and mm/mm, of points by a step of their pose as in `moved`.
+
+    arms : (..., 3) mm, from the pose's origin to the points: `rotate(pose, points)`.
+    """
+    return np.concatenate([-cross(arms), np.broadcast_to(np.eye(3), (*arms.shape, 3))], axis=-1)
+
+
 def cross(vectors: ArrayLike) -> Array:
     """Matrices : (..., 3, 3) of the cross product with vectors : (..., 3) from the left."""
     vectors = np.asarray(vectors, float)

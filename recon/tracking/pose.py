@@ -12,7 +12,6 @@ from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from recon.geometry import rigid
@@ -180,7 +179,7 @@ def _off_shapes(pose: Array, views: Sequence[Sighting], used: Iterable[NDArray[n
 
 def _distance2(first: TargetPose, second: TargetPose) -> float:
     """Squared distance of two poses in standard deviations of the first."""
-    off = difference(first.world_from_target, second.world_from_target)
+    off = rigid.difference(first.world_from_target, second.world_from_target)
     return float(off @ np.linalg.solve(first.covariance, off))
 
 
@@ -221,17 +220,6 @@ def distances(points: Array) -> Array:
     return np.linalg.norm(points[..., [1, 2, 2], :] - points[..., [0, 0, 1], :], axis=-1)
 
 
-def moved(pose: Array, step: Array) -> Array:
-    """A pose after a turn (rad) in the world and a shift (mm) : (6,)."""
-    return rigid.transform(Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[3:])
-
-
-def difference(first: Array, second: Array) -> Array:
-    """The turn (rad) and shift (mm) : (6,) from one pose to another: undoes `moved`."""
-    turn = Rotation.from_matrix(second[:3, :3] @ first[:3, :3].T).as_rotvec()
-    return np.concatenate([turn, second[:3, 3] - first[:3, 3]])
-
-
 def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Array) -> TargetPose:
     """Least squares on the ellipses' centres, by Gauss-Newton, damped where that leads uphill [Levenberg 1944]."""
     whiten = [np.linalg.inv(np.linalg.cholesky(view.covariance[view.seen])) for view in views]
@@ -251,14 +239,14 @@ def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Arr
             return lost("views that do not determine the pose")
         if np.sum((design @ step) ** 2) < SETTLED:
             break
-        trial = moved(pose, step)
+        trial = rigid.moved(pose, step)
     else:
         return lost(MISFITTING)
     misfit, freedom = float(np.sum((residual - design @ step) ** 2)), len(design) - PARAMETERS
     if not misfit < chdtri(freedom, IMPLAUSIBLE if freedom == PARAMETERS else SUSPICIOUS):
         times = np.sqrt(misfit / freedom)
         return lost(f"a misfit of {times:.0f} times the centres' uncertainty: other circles, or cameras swapped or moved", misfit)
-    pose = moved(pose, step)
+    pose = rigid.moved(pose, step)
     if not all(pose[:3, 2] @ (pose[:3, 3] - view.camera.centre) < 0 for view in views):
         return lost("a target whose front does not face both cameras")
     used = np.stack([view.seen for view in views])
@@ -274,8 +262,7 @@ def _linearised(
         circles = model[view.seen]
         predicted = ellipses_of(view.camera, pose, circles, target.outer_diameter_mm / 2)[0]
         by_point = slopes_at(view.camera, rigid.apply(pose, circles))
-        by_turn, by_shift = -rigid.cross(rigid.rotate(pose, circles)), np.tile(np.eye(3), (len(circles), 1, 1))
-        rows.append((white @ by_point @ np.concatenate([by_turn, by_shift], axis=-1)).reshape(-1, PARAMETERS))
+        rows.append((white @ by_point @ rigid.slopes(rigid.rotate(pose, circles))).reshape(-1, PARAMETERS))
         left.append((white @ (view.centres[view.seen] - predicted)[..., None]).ravel())
     return np.concatenate(rows), np.concatenate(left)
 

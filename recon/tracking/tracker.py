@@ -10,7 +10,6 @@ from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry import rigid
@@ -127,9 +126,7 @@ class Tracker:
         ahead = (now - last) / (last - before)
         if ahead > FORGOTTEN_FRAMES:  # stamps that come in bursts tell no velocity
             return pose
-        turn = Rotation.from_matrix(pose[:3, :3] @ earlier[:3, :3].T).as_rotvec()
-        moved = Rotation.from_rotvec(ahead * turn).as_matrix() @ pose[:3, :3]
-        return rigid.transform(moved, pose[:3, 3] + ahead * (pose[:3, 3] - earlier[:3, 3]))
+        return rigid.moved(pose, ahead * rigid.difference(earlier, pose))
 
     def _rough(self, world_from_target: Array) -> Ellipses:
         """Six ellipses, three a view, of a pose."""

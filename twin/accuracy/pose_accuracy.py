@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter
 from recon.tracking.networks import DETECTOR_SIZE, Networks
-from recon.tracking.pose import difference
 from recon.tracking.tracker import Tracker
 from twin.accuracy import tracking_frames
 from twin.accuracy.baselines import published
@@ -102,7 +102,7 @@ def located(take: Take, given: Frames, target: Target, networks: Networks) -> Lo
         return nothing
     seen = [view.sighting(camera).centres for view, camera in zip(result.views, cameras, strict=True)]
     shift, turn = pose_errors(take, result.pose.world_from_target) or (np.nan, np.nan)
-    error = difference(take.motion.world_from_target, result.pose.world_from_target)
+    error = rigid.difference(take.motion.world_from_target, result.pose.world_from_target)
     misfit = float(error @ np.linalg.solve(result.pose.covariance, error))
     return Located(np.linalg.norm(np.concatenate(seen) - truth, axis=1), limit, shift, turn, misfit)
 
@@ -120,7 +120,7 @@ def pose_errors(take: Take, found: Array | None) -> tuple[float, float] | None:
     left, _, right = np.linalg.svd(found[:3, :3])
     nearest = np.eye(4)
     nearest[:3, :3], nearest[:3, 3] = left @ right, found[:3, 3]
-    error = difference(take.motion.world_from_target, nearest)
+    error = rigid.difference(take.motion.world_from_target, nearest)
     return float(np.linalg.norm(error[3:])), float(np.rad2deg(np.linalg.norm(error[:3])))
 
 

@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from recon.errors import InputError
@@ -139,9 +138,7 @@ def repeatabilities(found: Sequence[ProbeCalibration], rig: Rig) -> Array:
 def squared_length(found: ProbeCalibration, truth: ProbeCalibration) -> float:
     """Squared error of the eight parameters in units of their covariance; 8 are expected."""
     assert found.uncertainty is not None
-    turn = Rotation.from_matrix(truth.target_from_image[:3, :3] @ found.target_from_image[:3, :3].T).as_rotvec()
-    shift = truth.target_from_image[:3, 3] - found.target_from_image[:3, 3]
-    error = np.concatenate([truth.scale - found.scale, turn, shift])
+    error = np.concatenate([truth.scale - found.scale, rigid.difference(found.target_from_image, truth.target_from_image)])
     return float(error @ np.linalg.solve(found.uncertainty.covariance, error))
 
 

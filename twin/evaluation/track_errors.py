@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from recon.capture import sweep_tables
@@ -16,6 +15,7 @@ from recon.errors import InputError
 from recon.files import npz
 from recon.files.metrics import Metrics
 from recon.files.npz import Form
+from recon.geometry import rigid
 from recon.model.tracks import Track
 from twin.tracking.film_session import TRUTH
 
@@ -90,9 +90,8 @@ def compare(track: Track, expected: FilmTruth) -> Errors:
     shift, turn = np.full((2, count), np.nan)
     bounds = np.full((2, count), np.nan)
     for k in np.flatnonzero(track.found):
-        found, true = track.poses[k], expected.poses[k]
-        shift[k] = np.linalg.norm(found[:3, 3] - true[:3, 3])
-        turn[k] = np.linalg.norm(Rotation.from_matrix(found[:3, :3] @ true[:3, :3].T).as_rotvec())
+        error = rigid.difference(expected.poses[k], track.poses[k])
+        turn[k], shift[k] = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
         if track.covariance is not None:
             bounds[:, k] = length_bound(track.covariance[k, 3:, 3:]), length_bound(track.covariance[k, :3, :3])
     return Errors(shift, np.rad2deg(turn), bounds[0], np.rad2deg(bounds[1]))

@@ -8,8 +8,8 @@ import pytest
 
 from recon.geometry import rigid
 from recon.geometry.ellipses import Ellipses
+from recon.geometry.rigid import difference
 from recon.tracking import views
-from recon.tracking.pose import difference
 from tests.twin.tracking.takes import facing, plain_take, rig
 from twin.accuracy import rivals
 from twin.accuracy.detection_rates import percent, score

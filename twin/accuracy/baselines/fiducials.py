@@ -16,7 +16,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
 from recon.model.rig import Target
-from recon.tracking.pose import PARAMETERS, TargetPose, lost, moved
+from recon.tracking.pose import PARAMETERS, TargetPose, lost
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -217,9 +217,7 @@ def _linearised(pose: Array, views: Sequence[View]) -> tuple[Array, Array]:
     rows, left = [], []
     for camera, model, pixels in views:
         shown = linearise(camera, rigid.apply(pose, model), ())
-        by_turn = np.cross(np.eye(3), rigid.rotate(pose, model)[:, None]).swapaxes(-1, -2)
-        motion = np.concatenate([by_turn, np.tile(np.eye(3), (len(model), 1, 1))], axis=-1)
-        rows.append((shown.by_point @ motion).reshape(-1, 6))
+        rows.append((shown.by_point @ rigid.slopes(rigid.rotate(pose, model))).reshape(-1, 6))
         left.append((pixels - shown.pixels).ravel())
     return np.concatenate(rows), np.concatenate(left)
 
@@ -234,7 +232,7 @@ def _refined(pose: Array, views: Sequence[View]) -> tuple[Array, Array, Array] |
         if rank < PARAMETERS:
             return None
         step = step / SCALE
-        pose = moved(pose, step)
+        pose = rigid.moved(pose, step)
         if np.abs(step * SCALE).max() < CONVERGED_PX:
             break
     design, left = _linearised(pose, views)
