@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise, moved
 from recon.model.rig import NotNegative, Part
@@ -154,8 +154,5 @@ def stepped(problem: Problem, estimate: Estimate, shared: Array, poses: Array) -
         names = problem.free.get(device, ())
         cameras[device] = moved(cameras[device], names, shared[at : at + len(names)])
         at += len(names)
-    turned = estimate.poses.copy()
-    turned[:, :3, :3] = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ estimate.poses[:, :3, :3]
-    turned[:, :3, 3] += poses[:, 3:]
     points = estimate.points + shared[at:].reshape(-1, 3) if problem.shape.released else estimate.points
-    return Estimate(cameras, turned, points)
+    return Estimate(cameras, rigid.moved(estimate.poses, poses), points)

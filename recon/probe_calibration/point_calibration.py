@@ -25,7 +25,6 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry import rigid
@@ -110,10 +109,9 @@ class _Estimate:
 
     def moved(self, step: Array) -> "_Estimate":
         """After a step : (12,) of sx, sy, the turn, the shift, the wire and the wires' distance."""
-        turn = Rotation.from_rotvec(step[2:5]).as_matrix()
-        shifted = self.target_from_image[:3, 3] + step[5:8]
-        turned = rigid.transform(turn @ self.target_from_image[:3, :3], shifted)
-        return _Estimate(turned, self.scale + step[:2], self.wire + step[8:11], self.apart + step[11])
+        return _Estimate(
+            rigid.moved(self.target_from_image, step[2:8]), self.scale + step[:2], self.wire + step[8:11], self.apart + step[11]
+        )
 
     def pixels(self, sightings: Sightings) -> Array:
         """Where the midpoint between the wires is : (n, 2) px."""
@@ -267,7 +265,7 @@ def _covariances(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Arr
     pose = sightings.pose_covariance
     if pose is None:
         pose = np.diag([np.radians(noise.angle_deg) ** 2] * 3 + [noise.position_mm**2] * 3)
-    lever = np.concatenate([-rigid.cross(np.einsum("nij,nj->ni", turns, points)), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=-1)
+    lever = rigid.slopes(np.einsum("nij,nj->ni", turns, points))
     local = np.broadcast_to(FLOOR_MM**2 * np.eye(3), (n, 3, 3)).copy()
     pixel = np.eye(2) * noise.pixel_px**2 if sightings.pixel_covariance is None else sightings.pixel_covariance
     local[:, :2, :2] += pixel * np.outer(estimate.scale, estimate.scale)

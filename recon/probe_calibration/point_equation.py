@@ -43,5 +43,4 @@ def point_jacobian(target_from_image: Array, scale: Array, pixels: Array) -> Arr
     """Of points in the target's frame, by sx, sy, turn and shift : (n, 3, 8)."""
     x, y = target_from_image[:3, 0], target_from_image[:3, 1]
     arms = pixels[:, :1] * scale[0] * x + pixels[:, 1:] * scale[1] * y
-    unit = np.broadcast_to(np.eye(3), (len(pixels), 3, 3))
-    return np.concatenate([(pixels[:, :1] * x)[..., None], (pixels[:, 1:] * y)[..., None], -rigid.cross(arms), unit], axis=-1)
+    return np.concatenate([(pixels[:, :1] * x)[..., None], (pixels[:, 1:] * y)[..., None], rigid.slopes(arms)], axis=-1)

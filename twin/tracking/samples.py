@@ -52,8 +52,7 @@ class Motion:
 
     def at(self, time: float) -> Array:
         """`world_from_target` at a time from -1/2 to 1/2 of the exposure."""
-        turned = Rotation.from_rotvec(self.turn_rad * time).as_matrix() @ self.world_from_target[:3, :3]
-        return rigid.transform(turned, self.world_from_target[:3, 3] + self.shift_mm * time)
+        return rigid.moved(self.world_from_target, time * np.concatenate([self.turn_rad, self.shift_mm]))
 
 
 @dataclass(frozen=True)
