@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.files import atomic, npz, opencv_storage
+from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import SCANNER_SPEED, SPEEDS, ProbeCalibration
 
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 SCHEMA = "sonotwin-probe/1"
 PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
 AUTHORS = "US_params.npz"
-ORTHOGONAL = 1e-3  # of a rotation; files of few digits pass
 
 
 def read(path: Path) -> ProbeCalibration:
@@ -97,12 +97,8 @@ def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
 def _checked(
     path: Path, name: str, pose: Array, scale: Array, uncertainty: Uncertainty | None, speed_m_s: float
 ) -> ProbeCalibration:
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise InputError(f"{path}: {name}: expected a 4x4 rigid transform in mm, found shape {pose.shape} or values not finite")
-    turn = pose[:3, :3]
-    orthogonal = np.abs(turn @ turn.T - np.eye(3)).max() < ORTHOGONAL and np.abs(pose[3] - [0, 0, 0, 1]).max() < ORTHOGONAL
-    if not orthogonal or np.linalg.det(turn) < 0:
-        raise InputError(f"{path}: {name}: expected a 4x4 rigid transform, found a matrix with no right-handed rotation in it")
+    if found := rigid.fault(pose):
+        raise InputError(f"{path}: {name}: expected {rigid.RIGID}, in mm, found {found}")
     if scale.shape != (2,) or not np.isfinite(scale).all() or scale.min() <= 0:
         raise InputError(f"{path}: scale: expected sx and sy above zero in mm/px, found {scale.tolist()}")
     return ProbeCalibration(pose, scale, uncertainty, speed_m_s)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from recon.errors import InputError
 from recon.files import atomic
 from recon.files.regular import read_bytes
+from recon.geometry import rigid
 from recon.model.tracks import Track
 
 Array = NDArray[np.float64]
@@ -24,7 +25,6 @@ TRIANGLE = np.triu_indices(6)
 COVARIANCE = tuple(f"c{row}{column}" for row, column in zip(*TRIANGLE, strict=True))  # as of recon.model.tracks, upper triangle
 TRACK = ("time_ns", "found", *POSE)
 PAIRS = (*POSE, "u", "v")
-ORTHOGONAL = 1e-3  # of a rotation; files of few digits pass
 LONGEST_NS = 1 << 63
 
 
@@ -167,11 +167,8 @@ def _increasing(path: Path, lines: Sequence[int], name: str, values: NDArray[np.
 
 def _pose(path: Path, line: int, words: Sequence[str]) -> Array:
     pose = np.vstack([np.reshape(_numbers(path, line, POSE, words), (3, 4)), [0, 0, 0, 1]])
-    turn = pose[:3, :3]
-    if np.abs(turn @ turn.T - np.eye(3)).max() > ORTHOGONAL:
-        raise InputError(f"{path}: line {line}: expected a pose, its rotation row by row, found a matrix that is no rotation")
-    if np.linalg.det(turn) < 0:
-        raise InputError(f"{path}: line {line}: expected a pose of a right-handed frame, found a left-handed one")
+    if found := rigid.fault(pose):
+        raise InputError(f"{path}: line {line}: expected {rigid.RIGID}, row by row, found {found}")
     return pose
 
 

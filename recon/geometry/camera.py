@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 EXACT = 1e-9  # of matrix entries that are zero or one by definition; they come from text files
+ROTATION = 1.1e-5  # of a rotation's products: far stricter than a pose's, as all points depend on it; five digits mostly pass
 NEWTON_STEPS = 20
 NEWTON_TOLERANCE = 1e-13  # normalised image coordinates: far below a thousandth of a pixel at any focal length
 SLOPE_STEP = 1e-6  # normalised image coordinates: to each side, of the Jacobian by central differences
@@ -53,11 +54,8 @@ class Camera:
             raise ValueError(f"matrix: expected positive focal lengths, found {self.matrix[0, 0]:g}, {self.matrix[1, 1]:g}")
         if not np.allclose(self.matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], rtol=0, atol=EXACT):
             raise ValueError(f"matrix: expected the form [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {self.matrix.tolist()}")
-        if not np.allclose(self.camera_from_world[3], [0, 0, 0, 1], rtol=0, atol=EXACT):
-            raise ValueError(f"camera_from_world: expected 0 0 0 1 as the last row, found {self.camera_from_world[3].tolist()}")
-        rotation = self.camera_from_world[:3, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
-            raise ValueError("camera_from_world: expected a rotation matrix in its upper left 3x3 block")
+        if found := rigid.fault(self.camera_from_world, ROTATION):
+            raise ValueError(f"camera_from_world: expected {rigid.RIGID}, found {found}")
 
     @property
     def centre(self) -> Array:

@@ -6,6 +6,9 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
+RIGID = "a rigid transform of a right-handed frame"  # which `fault` expects
+FEW_DIGITS = 1e-3  # of a rotation's products, as text files with few digits have them
+
 
 def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
     """Build a 4x4 transform from a (3, 3) rotation matrix and a (3,) translation in mm."""
@@ -34,6 +37,23 @@ def invert(to_from: Array) -> Array:
     """Return `from_to`, the inverse of a rigid transform."""
     rotation = to_from[:3, :3].T
     return transform(rotation, -rotation @ to_from[:3, 3])
+
+
+def fault(pose: Array, tolerance: float = FEW_DIGITS) -> str | None:
+    """Name the fault of a matrix : (4, 4) that is no rigid transform of a right-handed frame; None for one that is.
+
+    tolerance : of the entries of `R @ R.T` and of the last row.
+    """
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        return "another shape than 4x4, or values that are not finite"
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > tolerance:
+        return "another last row than 0 0 0 1"
+    rotation = pose[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > tolerance:
+        return "a matrix that is no rotation"
+    if np.linalg.det(rotation) < 0:
+        return "a left-handed frame: two axes swapped or one mirrored"
+    return None
 
 
 def moved(pose: Array, step: ArrayLike) -> Array:

@@ -14,7 +14,6 @@ from recon.model.probe import SPEEDS, ProbeCalibration
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width, height, px
 
-ORTHOGONAL = 1e-3  # of a pose's rotation; files of few digits pass
 MIN_TURN_DEG = 2.0  # rms, about the second axis
 MIN_SPREAD = 0.02  # rms, of the crossing in the image, as a fraction of the width or height
 MAX_SIGMA_MM = 1.0  # predicted, of any pixel's place in any direction
@@ -33,14 +32,8 @@ class _Frames(Protocol):
 def poses(world_from_target: Array) -> None:
     """Refuse poses that are no rigid transforms of a right-handed frame."""
     for k, pose in enumerate(world_from_target):
-        turn = pose[:3, :3]
-        if not np.isfinite(pose).all():
-            raise InputError(f"poses: frame {k}: expected a pose, found values that are not finite")
-        if np.abs(turn @ turn.T - np.eye(3)).max() > ORTHOGONAL or np.abs(pose[3] - [0, 0, 0, 1]).max() > ORTHOGONAL:
-            raise InputError(f"poses: frame {k}: expected a 4x4 rigid transform, found another matrix")
-        if np.linalg.det(turn) < 0:
-            found = "a left-handed one: two axes swapped or one mirrored"
-            raise InputError(f"poses: frame {k}: expected the rotation of a right-handed frame, found {found}")
+        if found := rigid.fault(pose):
+            raise InputError(f"poses: frame {k}: expected {rigid.RIGID}, found {found}")
 
 
 def pixels(of_crossing: Array, size: Size) -> None:

@@ -226,7 +226,7 @@ def without(values, key):
         (lambda v: without(v, "Tlp"), "Tlp: expected a matrix, found none"),
         (lambda v: v | {"M1": np.full((3, 3), np.nan)}, "cam1.matrix: expected a finite 3x3 matrix"),
         (lambda v: v | {"D4": np.zeros((1, 7))}, "projector.distortion: expected 0, 4, 5, 8, 12 or 14"),
-        (lambda v: v | {"Rlp": 2 * np.eye(3)}, "projector.camera_from_world: expected a rotation matrix"),
+        (lambda v: v | {"Rlp": 2 * np.eye(3)}, "projector.camera_from_world: expected a rigid transform of a right-"),
         (lambda v: v | {"Rlp": np.eye(2)}, "Rlp, Tlp: expected a 3x3 rotation"),
         (lambda v: v | {"S": np.array([[0.0], [10.0]])}, "S: expected the camera's width and height"),
         (lambda v: v | {"M4": "text"}, "M4: expected a matrix, found something else"),

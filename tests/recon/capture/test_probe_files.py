@@ -73,7 +73,7 @@ def test_a_bad_file_is_refused(probe, tmp_path, old, new, named):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"T_I_T": np.diag([1.0, 1, -1, 1])}, "T_I_T: .*no right-handed rotation"),
+        ({"T_I_T": np.diag([1.0, 1, -1, 1])}, "T_I_T: .*right-handed frame, in mm, found a left-handed frame"),
         ({"T_I_T": np.eye(3)}, "T_I_T"),
         ({"T_I_T": np.full((4, 4), np.nan)}, "T_I_T"),
         ({"sx": -0.1}, "scale"),

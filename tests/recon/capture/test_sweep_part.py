@@ -193,11 +193,11 @@ FAULTS = {
     "no number": (cell(TRACK, 3, 5, "x"), "track.csv: line 3: m03: expected a finite number, found 'x'"),
     "no rotation": (
         cell(TRACK, 3, 2, "1.1"),
-        "track.csv: line 3: expected a pose, its rotation row by row, found a matrix that is",
+        "track.csv: line 3: expected a rigid transform of a right-handed frame, row by row, found a matrix that is no rotation",
     ),
     "left-handed": (
         lambda f: [cell(TRACK, 2, 2 + k, "0" if k % 5 else "-1" if k == 0 else "1")(f) for k in range(12)],
-        "track.csv: line 2: expected a pose of a right-handed frame, found a left-handed one",
+        "track.csv: line 2: expected a rigid transform of a right-handed frame, row by row, found a left-handed frame",
     ),
     "covariance": (
         cell(TRACK, 3, 14, "-1"),

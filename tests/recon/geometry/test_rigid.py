@@ -47,6 +47,22 @@ def test_a_difference_undoes_a_step(pose, step):
     assert np.abs(rigid.difference(pose, rigid.moved(pose, step)) - step).max() < CLOSE
 
 
+@given(poses, st.integers(0, 3), st.integers(0, 3), st.floats(0.01, 2))
+def test_a_rigid_transform_is_told_from_other_matrices(pose, row, column, change):
+    """One entry of a rotation can't change alone: its row gets another length or leaves the right angle, or the frame is mirrored."""
+    assert rigid.fault(pose) is None
+    assert "left-handed" in rigid.fault(pose @ np.diag([1.0, 1, -1, 1]))
+    assert "not finite" in rigid.fault(np.full((4, 4), np.nan)) and "4x4" in rigid.fault(np.eye(3))
+    other = pose.copy()
+    other[row, column] += change
+    if row == 3:
+        assert "last row" in rigid.fault(other)
+    elif column == 3:
+        assert rigid.fault(other) is None
+    else:
+        assert rigid.fault(other, 1e-5) is not None
+
+
 @given(poses, angles, lengths)
 def test_a_step_turns_about_the_origin_and_then_shifts(pose, turn, shift):
     stepped = rigid.moved(pose, [*turn, *shift])
