@@ -21,6 +21,8 @@ EXACT = 1e-9  # of matrix entries that are zero or one by definition; they come 
 ROTATION = 1.1e-5  # of a rotation's products: far stricter than a pose's, as all points depend on it; five digits mostly pass
 NEWTON_STEPS = 20
 NEWTON_TOLERANCE = 1e-13  # normalised image coordinates: far below a thousandth of a pixel at any focal length
+ACCEPTED = 1e-10  # the same, of a root that rounding keeps from the tolerance
+FEW = 64  # points: threads take longer to wake than one core takes for these
 SLOPE_STEP = 1e-6  # normalised image coordinates: to each side, of the Jacobian by central differences
 
 
@@ -88,7 +90,8 @@ class Camera:
         flat = pixels.reshape(-1, 2)
         y = (flat[:, 1] - self.matrix[1, 2]) / self.matrix[1, 1]
         x = (flat[:, 0] - self.matrix[0, 2] - self.matrix[0, 1] * y) / self.matrix[0, 0]
-        return _undistort_all(np.stack([x, y], axis=-1), self.coefficients).reshape(pixels.shape)
+        invert = _undistort_few if len(flat) <= FEW else _undistort_all
+        return invert(np.stack([x, y], axis=-1), self.coefficients).reshape(pixels.shape)
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Directions of the rays through pixels : (..., 2), as unit vectors : (..., 3) in the world."""
@@ -152,27 +155,39 @@ def _slopes(x, y, k):
     )
 
 
-@njit(parallel=True)
+@njit(inline="always")
+def _undistort(u, v, k):
+    """Normalised point whose distortion is (u, v), by Newton's method; NaN where there is none."""
+    x, y = u, v
+    error = np.inf
+    for _ in range(NEWTON_STEPS):
+        xd, yd = distort(x, y, k)
+        ex, ey = u - xd, v - yd
+        error = max(abs(ex), abs(ey))
+        if not error > NEWTON_TOLERANCE:
+            break
+        a, b, c, d = _slopes(x, y, k)
+        determinant = a * d - b * c
+        x += (d * ex - b * ey) / determinant
+        y += (a * ey - c * ex) / determinant
+    a, b, c, d = _slopes(x, y, k)
+    # past the fold of a polynomial a root is not a ray: the distortion mirrors there, or throws to the other side
+    if error < ACCEPTED and x * u + y * v >= 0 and a * d - b * c > 0:
+        return x, y
+    return np.nan, np.nan
+
+
+@njit(parallel=True, error_model="numpy")
 def _undistort_all(points, k):
     result = np.empty_like(points)
     for i in prange(points.shape[0]):
-        u, v = points[i, 0], points[i, 1]
-        x, y = u, v
-        error = np.inf
-        for _ in range(NEWTON_STEPS):
-            xd, yd = distort(x, y, k)
-            ex, ey = u - xd, v - yd
-            error = max(abs(ex), abs(ey))
-            if not error > NEWTON_TOLERANCE:
-                break
-            a, b, c, d = _slopes(x, y, k)
-            determinant = a * d - b * c
-            x += (d * ex - b * ey) / determinant
-            y += (a * ey - c * ex) / determinant
-        a, b, c, d = _slopes(x, y, k)
-        # past the fold of a polynomial a root is not a ray: the distortion mirrors there, or throws to the other side
-        if error < 1e-10 and x * u + y * v >= 0 and a * d - b * c > 0:
-            result[i, 0], result[i, 1] = x, y
-        else:
-            result[i, 0], result[i, 1] = np.nan, np.nan
+        result[i, 0], result[i, 1] = _undistort(points[i, 0], points[i, 1], k)
+    return result
+
+
+@njit(error_model="numpy")
+def _undistort_few(points, k):
+    result = np.empty_like(points)
+    for i in range(points.shape[0]):
+        result[i, 0], result[i, 1] = _undistort(points[i, 0], points[i, 1], k)
     return result

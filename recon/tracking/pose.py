@@ -18,7 +18,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.rig import Target
 from recon.tracking import pose_hypotheses
-from recon.tracking.rim_fit.circle_outline import ellipses_of, rays_through, slopes_at
+from recon.tracking.rim_fit.circle_outline import ellipses_of, slopes_at
 
 Array = NDArray[np.float64]
 
@@ -194,7 +194,7 @@ def meet(first: Sighting, second: Sighting) -> tuple[Array, Array]:
     NaN where rays are parallel or meet behind a camera.
     """
     origins = [view.camera.centre for view in (first, second)]
-    rays = [rays_through(view.camera, view.centres) for view in (first, second)]
+    rays = [view.camera.rays(view.centres) for view in (first, second)]
     base = origins[1] - origins[0]
     cosine = np.einsum("ni,ni->n", *rays)
     along = [ray @ base for ray in rays]

@@ -1,4 +1,4 @@
-"""What a camera shows of a circle, the ellipse of its outline, and where it lies; compiled, for a few circles at a time.
+"""The ellipse of a circle's outline in an image, and its slopes; compiled, for a few circles at a time.
 
 Points of the outline are projected, lens and all; their second moments are nearly the ellipse, and three steps of Gauss-Newton
 on the orthogonal distances make it the one that `recon.geometry.circle_projection.centre_offsets` fits, in a hundredth of the
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.compiled import njit
-from recon.geometry.camera import NEWTON_STEPS, NEWTON_TOLERANCE, SLOPE_STEP, Camera, distort
+from recon.geometry.camera import SLOPE_STEP, Camera, distort
 
 Array = NDArray[np.float64]
 
@@ -27,38 +27,6 @@ def ellipses_of(camera: Camera, world_from_target: Array, centres: Array, radius
 def slopes_at(camera: Camera, points: Array) -> Array:
     """How the projections of points : (n, 3) mm in the world change with the points, in the world's axes : (n, 2, 3) px/mm."""
     return _slopes(camera.camera_from_world, np.ascontiguousarray(points), camera.matrix, camera.coefficients)
-
-
-def rays_through(camera: Camera, pixels: Array) -> Array:
-    """`Camera.rays` of a few pixels : (n, 2), on one core: threads take longer to wake than three points do."""
-    y = (pixels[:, 1] - camera.matrix[1, 2]) / camera.matrix[1, 1]
-    x = (pixels[:, 0] - camera.matrix[0, 2] - camera.matrix[0, 1] * y) / camera.matrix[0, 0]
-    local = _undistorted(np.column_stack([x, y]), camera.coefficients)
-    return local / np.linalg.norm(local, axis=1, keepdims=True) @ camera.camera_from_world[:3, :3]
-
-
-@njit(error_model="numpy")
-def _undistorted(points, k):
-    result = np.full((len(points), 3), np.nan)
-    for i in range(len(points)):
-        u, v = points[i]
-        x, y = u, v
-        for _ in range(NEWTON_STEPS):
-            bent_x, bent_y = distort(x, y, k)
-            off_x, off_y = u - bent_x, v - bent_y
-            if max(abs(off_x), abs(off_y)) <= NEWTON_TOLERANCE:
-                result[i, 0], result[i, 1], result[i, 2] = x, y, 1.0
-                break
-            right, left = distort(x + SLOPE_STEP, y, k), distort(x - SLOPE_STEP, y, k)
-            below, above = distort(x, y + SLOPE_STEP, k), distort(x, y - SLOPE_STEP, k)
-            a, c = (right[0] - left[0]) / (2 * SLOPE_STEP), (right[1] - left[1]) / (2 * SLOPE_STEP)
-            b, d = (below[0] - above[0]) / (2 * SLOPE_STEP), (below[1] - above[1]) / (2 * SLOPE_STEP)
-            determinant = a * d - b * c
-            if not determinant > 0:  # past the fold of the polynomial
-                break
-            x += (d * off_x - b * off_y) / determinant
-            y += (a * off_y - c * off_x) / determinant
-    return result
 
 
 @njit(error_model="numpy")

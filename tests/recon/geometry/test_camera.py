@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from recon.geometry import rigid
-from recon.geometry.camera import Camera
+from recon.geometry.camera import FEW, Camera
 
 MATRIX = np.array([[3320.0, 0, 618], [0, 3331, 523], [0, 0, 1]])
 WIDE = np.array([[1250.0, 0, 650], [0, 1240, 500], [0, 0, 1]])
@@ -60,6 +60,14 @@ def test_points_behind_give_nan(camera):
     in_front = camera.centre + 100 * camera.rays(np.array([640.0, 512.0]))
     behind = camera.centre - 100 * camera.rays(np.array([640.0, 512.0]))
     assert np.isfinite(camera.project(in_front)).all() and np.isnan(camera.project(behind)).all()
+
+
+def test_a_few_rays_are_those_of_all(camera):
+    """A few pixels are undistorted on one core, many on all: to the same bits. A pixel that is none has no ray."""
+    pixels = camera.pixel_grid()[::100, ::100].reshape(-1, 2)
+    assert len(pixels) > FEW
+    assert np.array_equal(camera.rays(pixels), np.concatenate([camera.rays(few) for few in np.array_split(pixels, 50)]))
+    assert np.isnan(camera.rays(np.full((1, 2), np.nan))).all()
 
 
 def test_unreachable_pixels_give_nan():

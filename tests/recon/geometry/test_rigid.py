@@ -49,7 +49,7 @@ def test_a_difference_undoes_a_step(pose, step):
 
 @given(poses, st.integers(0, 3), st.integers(0, 3), st.floats(0.01, 2))
 def test_a_rigid_transform_is_told_from_other_matrices(pose, row, column, change):
-    """One entry of a rotation can't change alone: its row gets another length or leaves the right angle, or the frame is mirrored."""
+    """No entry of a rotation changes alone: a row gets another length, two rows another angle, or the frame is mirrored."""
     assert rigid.fault(pose) is None
     assert "left-handed" in rigid.fault(pose @ np.diag([1.0, 1, -1, 1]))
     assert "not finite" in rigid.fault(np.full((4, 4), np.nan)) and "4x4" in rigid.fault(np.eye(3))

@@ -8,7 +8,6 @@ from recon.geometry import rigid
 from recon.geometry.circle_projection import centre_offsets
 from recon.geometry.ellipses import Ellipses
 from recon.tracking import pose, rims
-from recon.tracking.rim_fit.circle_outline import rays_through
 from recon.tracking.rims import measure
 from tests.recon.tracking import drawings
 
@@ -163,10 +162,3 @@ def test_fitted_ellipses_are_those_of_the_plain_fit(camera, rig, rng):
         place = drawings.facing(rng)
         expected = camera.project(rigid.apply(place, model)) + centre_offsets(camera, place, model, radius)
         assert np.abs(drawings.shown(camera, place, rig.target).centre - expected).max() < 1e-5
-
-
-def test_rays_are_the_cameras(rig, rng):
-    camera = rig.cam2.optics.camera()
-    pixels = rng.uniform(0, 1000, (20, 2))
-    assert np.abs(rays_through(camera, pixels) - camera.rays(pixels)).max() < 1e-12
-    assert np.isnan(rays_through(camera, np.full((1, 2), np.nan))).all()
