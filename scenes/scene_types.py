@@ -4,44 +4,12 @@ World is the frame of camera 1, lengths in mm: z points away from the camera int
 """
 
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Plane:
-    """The plane through a point, with its unit normal towards the camera."""
-
-    name: str
-    point: Array  # (3,), mm
-    normal: Array  # (3,), unit
-
-
-@dataclass(frozen=True, eq=False)
-class Sphere:
-    """A sphere."""
-
-    name: str
-    centre: Array  # (3,), mm
-    radius: float  # mm
-
-
-@dataclass(frozen=True, eq=False)
-class Cylinder:
-    """An infinite circular cylinder: a point of its axis, the unit direction of the axis, the radius."""
-
-    name: str
-    point: Array  # (3,), mm
-    axis: Array  # (3,), unit
-    radius: float  # mm
-
-
-Shape: TypeAlias = Plane | Sphere | Cylinder
+from recon.geometry.primitives import Shape, Sphere
 
 
 @dataclass(frozen=True)

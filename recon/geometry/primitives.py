@@ -1,4 +1,4 @@
-"""Least-squares fits of a plane, a sphere and a cylinder, by orthogonal distance.
+"""Plane, sphere and cylinder, and their least-squares fits by orthogonal distance.
 
 The uncertainty of a fit is the covariance `s^2 (J^T J)^-1` of its free parameters at the solution, where s^2 is the residuals'
 variance; it holds where the points' errors are independent.
@@ -6,7 +6,7 @@ variance; it holds where the points' errors are independent.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,39 +19,55 @@ START_POINTS = 500  # points that choose among them
 CURVED = 5.0  # standard deviations by which a sphere must be curved: below, its radius is chance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plane:
-    """Points with `normal . point = offset`."""
+    """The plane through a point, with its unit normal."""
 
+    name: str
+    point: Array  # (3,), mm; of a fit the middle of the points
     normal: Array  # (3,), unit, towards the origin
-    offset: float  # mm
+
+    def distance(self, points: Array) -> Array:
+        """Signed distance of points : (..., 3) mm, positive on the normal's side : (...)."""
+        return (points - self.point) @ self.normal
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sphere:
-    """Points at `radius` from `centre`."""
+    """A sphere."""
 
+    name: str
     centre: Array  # (3,), mm
     radius: float  # mm
 
+    def distance(self, points: Array) -> Array:
+        """Signed distance of points : (..., 3) mm, positive outside : (...)."""
+        return np.linalg.norm(points - self.centre, axis=-1) - self.radius
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Cylinder:
-    """Points at `radius` from an axis."""
+    """An infinite circular cylinder."""
 
-    point: Array  # (3,), mm, on the axis, nearest to the middle of the points
+    name: str
+    point: Array  # (3,), mm, on the axis; of a fit the one nearest to the middle of the points
     axis: Array  # (3,), unit
     radius: float  # mm
 
+    def distance(self, points: Array) -> Array:
+        """Signed distance of points : (..., 3) mm, positive outside : (...)."""
+        return np.linalg.norm(np.cross(points - self.point, self.axis), axis=-1) - self.radius
 
-Shape = TypeVar("Shape", Plane, Sphere, Cylinder)
+
+Shape: TypeAlias = Plane | Sphere | Cylinder
+Kind = TypeVar("Kind", Plane, Sphere, Cylinder)
 
 
 @dataclass(frozen=True)
-class Fit(Generic[Shape]):
-    """A fitted shape and how well it fits."""
+class Fit(Generic[Kind]):
+    """A fitted shape without a name, and how well it fits."""
 
-    shape: Shape
+    shape: Kind
     residuals: Array  # (n,), mm; positive outside the sphere or cylinder, or on the side of the plane's normal
     covariance: Array  # of the free parameters, which the fitting function names
 
@@ -78,7 +94,7 @@ def fit_plane(points: ArrayLike) -> Fit[Plane]:
     normal = directions[2] * (-1 if directions[2] @ middle > 0 else 1)
     residuals = (points - middle) @ normal
     jacobian = np.column_stack([(points - middle) @ directions[:2].T, -np.ones(len(points))])
-    return Fit(Plane(normal, float(normal @ middle)), residuals, _covariance(jacobian, residuals))
+    return Fit(Plane("", middle, normal), residuals, _covariance(jacobian, residuals))
 
 
 def fit_sphere(points: ArrayLike) -> Fit[Sphere]:
@@ -110,7 +126,7 @@ def fit_sphere(points: ArrayLike) -> Fit[Sphere]:
     if rank < 4 or off_plane - off_sphere <= CURVED**2 * off_sphere / (len(local) - 4):
         raise ValueError("points: expected a piece of a sphere, found points in a plane")
     solution, residuals, covariance = _solve(distances, start, jacobian)
-    return Fit(Sphere(middle + solution[:3], float(solution[3])), residuals, covariance)
+    return Fit(Sphere("", middle + solution[:3], float(solution[3])), residuals, covariance)
 
 
 def fit_cylinder(points: ArrayLike) -> Fit[Cylinder]:
@@ -145,7 +161,7 @@ def fit_cylinder(points: ArrayLike) -> Fit[Cylinder]:
         axis /= np.linalg.norm(axis)
         centre, radius = solution[:2] @ across, float(solution[4])
         centre = centre - (centre @ axis) * axis
-    return Fit(Cylinder(middle + centre, axis, radius), residuals, covariance)
+    return Fit(Cylinder("", middle + centre, axis, radius), residuals, covariance)
 
 
 def _solve(distances: Callable[[Array], Array], start: Array, jacobian: Callable | str = "2-point") -> tuple[Array, Array, Array]:

@@ -290,7 +290,7 @@ def _weighted(points: Array, covariance: Array, frames: NDArray[np.int64]) -> Tu
     scores = np.stack([gradients[frames == k].sum(axis=0) for k in np.unique(frames)])
     variance = bread @ (scores.T @ scores) @ bread * len(scores) / max(len(scores) - 1, 1)
     axis = start.axis + result.x[2:4] @ across
-    shape = Cylinder(start.point + result.x[:2] @ across, axis / np.linalg.norm(axis), float(result.x[4]))
+    shape = Cylinder("", start.point + result.x[:2] @ across, axis / np.linalg.norm(axis), float(result.x[4]))
     return Tube(shape, float(np.sqrt(variance[4, 4])), away(result.x)[0], frames)
 
 

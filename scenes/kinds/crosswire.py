@@ -7,10 +7,11 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from recon.geometry import rigid
+from recon.geometry.primitives import Cylinder
 from recon.model.rig import Finite, Fraction, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.kinds.tank import bottom
-from scenes.scene_types import Cylinder, Material, Scene, Thing
+from scenes.scene_types import Material, Scene, Thing
 
 
 class Config(Part):

@@ -4,10 +4,11 @@ import numpy as np
 from pydantic import model_validator
 
 from recon.geometry import rigid
+from recon.geometry.primitives import Cylinder
 from recon.model.rig import Finite, Fraction, Part, Positive
 from scenes import solid_meshes
 from scenes.noise import Seed
-from scenes.scene_types import Cylinder, Material, Scene, Thing
+from scenes.scene_types import Material, Scene, Thing
 from scenes.table import table
 
 

@@ -3,10 +3,11 @@
 import numpy as np
 
 from recon.geometry import rigid
+from recon.geometry.primitives import Cylinder
 from recon.model.rig import Fraction, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.kinds.tank import bottom
-from scenes.scene_types import Cylinder, Material, Scene, Thing
+from scenes.scene_types import Material, Scene, Thing
 
 
 class Config(Part):

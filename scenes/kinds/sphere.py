@@ -6,9 +6,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from recon.geometry import rigid
+from recon.geometry.primitives import Plane, Shape, Sphere
 from recon.model.rig import Fraction, Part, Positive, Vector
 from scenes import solid_meshes
-from scenes.scene_types import Material, Plane, Scene, Shape, Sphere, Thing
+from scenes.scene_types import Material, Scene, Thing
 
 
 class Config(Part):

@@ -3,9 +3,10 @@
 import numpy as np
 
 from recon.geometry import rigid
+from recon.geometry.primitives import Cylinder
 from recon.model.rig import Finite, Fraction, Part, Positive
 from scenes import solid_meshes
-from scenes.scene_types import Cylinder, Material, Scene, Thing
+from scenes.scene_types import Material, Scene, Thing
 
 
 class Config(Part):

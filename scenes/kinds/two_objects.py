@@ -11,9 +11,10 @@ import numpy as np
 from pydantic import Field
 
 from recon.geometry import rigid
+from recon.geometry.primitives import Plane, Sphere
 from recon.model.rig import Fraction, Part, Positive
 from scenes import solid_meshes
-from scenes.scene_types import Material, Plane, Scene, Sphere, Thing
+from scenes.scene_types import Material, Scene, Thing
 
 Step = Annotated[float, Field(ge=5, le=80)]
 

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from recon.geometry import rigid
+from recon.geometry.primitives import Cylinder
 from scenes import solid_meshes as shapes
 from scenes.acoustics import TISSUES, Tissue
-from scenes.scene_types import Cylinder, Material, Thing
+from scenes.scene_types import Material, Thing
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.ultrasound import bmode_image
 from twin.ultrasound.beam import beam

@@ -20,7 +20,7 @@ from recon.files.metrics import Metrics
 from recon.files.npz import Form
 from recon.geometry import primitives
 from recon.geometry.camera import Array, Camera
-from scenes.scene_types import Cylinder, Plane, Shape, Sphere
+from recon.geometry.primitives import Cylinder, Plane, Shape, Sphere
 
 Map = NDArray[np.float32]  # (h, w)
 Mask = NDArray[np.bool_]  # (h, w)
@@ -202,7 +202,7 @@ def measure(points: Map, comparison: Comparison, truth: Truth) -> Metrics:
     for number, name in enumerate(truth.things):
         metrics[f"thing_{name}_rms_mm"] = rms(error[compared & (truth.objects == number)])
     for shape in truth.shapes:
-        on_shape = fine & (np.abs(_distance(shape, truth.points)) < ON_SHAPE_MM)
+        on_shape = fine & (np.abs(shape.distance(truth.points)) < ON_SHAPE_MM)
         chosen = np.float64(points[on_shape])
         metrics |= fit(shape, chosen[:: max(1, -(-len(chosen) // MOST_FITTED))])
         metrics[f"{shape_key(shape)}_limit_rms_mm"] = rms(comparison.limit[on_shape])
@@ -303,17 +303,6 @@ def _fitted(shape: Shape, points: Array) -> tuple[float, ...]:
 def _angle_deg(first: Array, second: Array) -> float:
     """Angle between two unit vectors of either sign."""
     return float(np.rad2deg(np.arccos(min(abs(float(first @ second)), 1.0))))
-
-
-def _distance(shape: Shape, points: Map) -> Array:
-    """Signed distance of points : (h, w, 3) to a shape's surface : (h, w)."""
-    match shape:
-        case Plane():
-            return (points - shape.point) @ shape.normal
-        case Sphere():
-            return np.linalg.norm(points - shape.centre, axis=-1) - shape.radius
-        case Cylinder():
-            return np.linalg.norm(np.cross(points - shape.point, shape.axis), axis=-1) - shape.radius
 
 
 def _shape(entry: Mapping) -> Shape:

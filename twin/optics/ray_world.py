@@ -6,7 +6,8 @@ import mitsuba as mi
 import numpy as np
 
 from recon.geometry import rigid
-from scenes.scene_types import Material, Scene, Sphere, Thing
+from recon.geometry.primitives import Sphere
+from scenes.scene_types import Material, Scene, Thing
 
 RAMP = 1024  # texels of the texture that turns a texture coordinate into a reflectance
 

@@ -15,8 +15,9 @@ from scipy.ndimage import distance_transform_edt, label, sum_labels
 from scipy.spatial import KDTree
 
 from recon.compiled import njit
+from recon.geometry.primitives import Cylinder
 from scenes.acoustics import BACKSCATTER, Tissue, surroundings, tissue_of
-from scenes.scene_types import Cylinder, Scene, Thing
+from scenes.scene_types import Scene, Thing
 
 Array = NDArray[np.float64]
 
@@ -114,8 +115,7 @@ def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
         along = (thing.mesh.vertices - shape.point) @ shape.axis
         return _sampled(thing, tissue, lambda points: _in_rod(points, shape, along.min(), along.max()))
     if thing.primitive is not None:
-        ball = thing.primitive
-        return _sampled(thing, tissue, lambda points: np.linalg.norm(points - ball.centre, axis=1) - ball.radius)
+        return _sampled(thing, tissue, thing.primitive.distance)
     if np.isclose(thing.mesh.volume, np.prod(thing.mesh.extents), rtol=1e-6):
         distance, steps = _box(bounds)
         return Solid(thing.name, tissue, distance, bounds[0] - MARGIN_MM, steps, thing.mesh)

@@ -48,8 +48,8 @@ def test_cylinder():
 def test_plane():
     fit = primitives.fit_plane(plate(np.random.default_rng(2)))
     assert np.linalg.norm(np.cross(fit.shape.normal, AXIS)) < 5 * np.sqrt(fit.covariance[0, 0] + fit.covariance[1, 1])
-    assert abs(fit.shape.normal @ POSE[:3, 3] - fit.shape.offset) < 0.03
-    assert fit.shape.offset < 0, "the normal points to the origin"
+    assert abs(fit.shape.distance(POSE[:3, 3])) < 0.03
+    assert fit.shape.normal @ fit.shape.point < 0, "the normal points to the origin"
     assert abs(fit.rms / NOISE - 1) < 5 / np.sqrt(2 * 600)
 
 
@@ -68,6 +68,15 @@ def test_predicted_covariance_is_the_scatter(points, fit_shape, parameter, truth
         fit = fit_shape(points(rng, 150))
         z.append((parameter(fit.shape) - truth) / np.sqrt(fit.covariance[index, index]))
     assert abs(np.std(z) - 1) < 4 / np.sqrt(2 * len(z)) and abs(np.mean(z)) < 4 / np.sqrt(len(z))
+
+
+@pytest.mark.parametrize(
+    ("points", "fit_shape"), [(plate, primitives.fit_plane), (cap, primitives.fit_sphere), (half_tube, primitives.fit_cylinder)]
+)
+def test_residuals_are_distances_from_the_fitted_shape(points, fit_shape):
+    measured = points(np.random.default_rng(7))
+    fit = fit_shape(measured)
+    assert np.abs(fit.residuals - fit.shape.distance(measured)).max() < 1e-9
 
 
 def test_the_axis_is_found_whichever_way_it_points():

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from recon.errors import InputError
+from recon.geometry.primitives import Cylinder, Sphere
 from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.phase import DEFAULT_NOISE
 from recon.structured_light.triangulate import triangulate
-from scenes.scene_types import Cylinder, Sphere
 from sonotwin.cli import main
 from sonotwin.verbs.evaluate import describe
 from twin.evaluation import surface_errors

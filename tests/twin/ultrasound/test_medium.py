@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from recon.geometry import rigid
+from recon.geometry.primitives import Cylinder
 from scenes import solid_meshes as shapes
 from scenes.acoustics import Tissue
-from scenes.scene_types import Cylinder, Material, Thing
+from scenes.scene_types import Material, Thing
 from tests.twin.ultrasound.phantoms import down
 from twin.ultrasound import bmode_image
 from twin.ultrasound.beam import OVERSAMPLING, STEP_MM, beam
