@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry.camera_jacobian import MATRIX, MOTION
+from recon.geometry.levenberg_marquardt import descend
 from recon.model.calibration import Calibration, Uncertainty
 from recon.optical_calibration.bundle import ROBUST, Array, Estimate, Problem, Shape, System, linearised, stepped
 from recon.optical_calibration.observations import PROJECTOR, Observations
@@ -23,10 +24,7 @@ MEDIAN = np.sqrt(2 * np.log(2))  # of the length of a vector of two standard nor
 LEAST_NOISE = 1e-3  # of the noise that was assumed
 TINY = 1e-12  # keeps a pose that nobody sees from being singular
 SINGULAR = 1e-14  # of the largest eigenvalue: below, rounding decides
-MAX_STEPS = 50
 MAX_ROUNDS = 4  # of measuring the noise
-FIRST_DAMPING, LAST_DAMPING = 1e-4, 1e8  # Marquardt's
-CONVERGED = 1e-10  # relative decrease of the cost
 
 
 @dataclass(frozen=True)
@@ -108,25 +106,16 @@ def free_parameters(devices: Sequence[str], distortion: Mapping[str, Sequence[st
 
 def _descend(problem: Problem, estimate: Estimate, noise: Array) -> Estimate:
     """Levenberg-Marquardt from an estimate to the next minimum, at fixed noise."""
-    prior, damping = _prior(problem), FIRST_DAMPING
-    system = linearised(problem, estimate, noise, problem.shape.released)
-    cost = _cost(system, estimate, problem, prior)
-    for _ in range(MAX_STEPS):
-        try:
-            trial = stepped(problem, estimate, *_step(system, _deviation(estimate, problem), prior, damping))
-        except ValueError:  # too long a step, to what is no camera
-            damping *= 10
-            continue
-        candidate = linearised(problem, trial, noise, problem.shape.released)
-        new = _cost(candidate, trial, problem, prior)
-        converged = abs(cost - new) < CONVERGED * cost
-        if new < cost:
-            estimate, system, cost, damping = trial, candidate, new, damping / 10
-        else:
-            damping *= 10
-        if converged or damping > LAST_DAMPING:
-            break
-    return estimate
+    prior = _prior(problem)
+
+    def system_and_cost(estimate: Estimate) -> tuple[System, float]:
+        system = linearised(problem, estimate, noise, problem.shape.released)
+        return system, _cost(system, estimate, problem, prior)
+
+    def step(estimate: Estimate, system: System, damping: float) -> tuple[Array, Array]:
+        return _step(system, _deviation(estimate, problem), prior, damping)
+
+    return descend(estimate, system_and_cost, step, lambda estimate, step: stepped(problem, estimate, *step)).estimate
 
 
 def _prior(problem: Problem) -> Array:

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.geometry.levenberg_marquardt import descend
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
 from recon.probe_calibration import cross_wire, point_equation, probe_checks, wires
@@ -50,8 +51,6 @@ REACH = (0.43, 0.40)  # of the crossing from the middle, of the image's width an
 ROCK = 0.6  # most of a tilt that is about the image's normal, where wires are seen edge-on
 FLOOR_MM = 1e-3  # no sighting counts as more exact than this
 APART_MM = 1.0  # 1 sigma of the distance of wires that cross, before it is measured
-MAX_STEPS = 50
-CONVERGED = 1e-10  # relative decrease of the cost
 
 
 @dataclass(frozen=True)
@@ -299,23 +298,15 @@ def _normal_equations(estimate: _Estimate, sightings: Sightings, noise: Noise, w
 
 
 def _levenberg_marquardt(start: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> _Estimate:
-    estimate, damping = start, 1e-4
-    matrix, rhs, cost = _normal_equations(estimate, sightings, noise, weights)
-    for _ in range(MAX_STEPS):
-        diagonal = np.maximum(np.diag(matrix), 1e-12)
-        trial = estimate.moved(np.linalg.lstsq(matrix + damping * np.diag(diagonal), rhs)[0])
-        following = _normal_equations(trial, sightings, noise, weights)
-        if following[2] >= cost:
-            damping *= 10
-            if damping > 1e8:
-                break
-            continue
-        done = cost - following[2] < CONVERGED * cost
-        estimate, damping = trial, damping / 10
-        matrix, rhs, cost = following
-        if done:
-            break
-    return estimate
+    def linearised(estimate: _Estimate) -> tuple[tuple[Array, Array], float]:
+        matrix, rhs, cost = _normal_equations(estimate, sightings, noise, weights)
+        return (matrix, rhs), cost
+
+    def step(_: _Estimate, system: tuple[Array, Array], damping: float) -> Array:
+        matrix, rhs = system
+        return np.linalg.lstsq(matrix + damping * np.diag(np.maximum(np.diag(matrix), 1e-12)), rhs)[0]
+
+    return descend(start, linearised, step, _Estimate.moved).estimate
 
 
 def _robust_start(sightings: Sightings, noise: Noise, rng: np.random.Generator) -> _Estimate:

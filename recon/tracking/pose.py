@@ -16,6 +16,7 @@ from scipy.special import chdtri
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
+from recon.geometry.levenberg_marquardt import Rules, descend
 from recon.model.rig import Target
 from recon.tracking import pose_hypotheses
 from recon.tracking.rim_fit.circle_outline import ellipses_of, slopes_at
@@ -26,10 +27,8 @@ NAMES = ("c0", "c1", "c2")
 PAIRS = ("c0-c1", "c0-c2", "c1-c2")
 GROSS_MM = 4.0  # by which distances between centres may be off, before the fit: a sixth of the least
 APART_MM = 4.0  # by which two views' rays of one centre may miss each other
-STEPS = 20  # of the fit, most: two or three from where rays meet, more from three points seen nearly face on
+RULES = Rules(damping=0, rounding=1e-6, converged=0, steps=20)  # two or three steps from where rays meet, more from one view
 SETTLED = 1e-4  # squared standard deviations of the last step
-ROUNDING = 1e-6  # of squared residuals
-LEAST_DAMPING = 1e-4
 IMPLAUSIBLE = 1e-6  # chance of a misfit so large, by chi-square, below which it isn't the target
 SUSPICIOUS = 1e-3  # chance of a misfit below which circles that are doubtful are left out, one by one
 PARAMETERS = 6
@@ -221,26 +220,20 @@ def distances(points: Array) -> Array:
 
 
 def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Array) -> TargetPose:
-    """Least squares on the ellipses' centres, by Gauss-Newton, damped where that leads uphill [Levenberg 1944]."""
+    """Least squares on the ellipses' centres, by Gauss-Newton, damped where that leads uphill."""
     whiten = [np.linalg.inv(np.linalg.cholesky(view.covariance[view.seen])) for view in views]
-    pose, best, damping = start, None, 0.0
-    trial = start
-    for _ in range(STEPS):
-        design, residual = _linearised(trial, views, whiten, target, model)
+
+    def linearised(pose: Array) -> tuple[tuple[Array, Array], float]:
+        design, residual = _linearised(pose, views, whiten, target, model)
         if not (np.isfinite(design).all() and np.isfinite(residual).all()):
-            return lost(MISFITTING)
-        if best is None or residual @ residual < best[1] @ best[1] + ROUNDING:
-            pose, best, damping = trial, (design, residual), damping / 10
-        else:
-            damping = max(10 * damping, LEAST_DAMPING)
-        design, residual = best
-        step, _, rank, _ = np.linalg.lstsq(*(_damped(design, residual, damping) if damping > 0 else best), RANK)
-        if rank < PARAMETERS:
-            return lost("views that do not determine the pose")
-        if np.sum((design @ step) ** 2) < SETTLED:
-            break
-        trial = rigid.moved(pose, step)
-    else:
+            raise _Astray(MISFITTING)
+        return (design, residual), residual @ residual
+
+    try:
+        pose, (design, residual), step = descend(start, linearised, _solved, rigid.moved, _settled, RULES)
+    except _Astray as astray:
+        return lost(str(astray))
+    if step is None:
         return lost(MISFITTING)
     misfit, freedom = float(np.sum((residual - design @ step) ** 2)), len(design) - PARAMETERS
     if not misfit < chdtri(freedom, IMPLAUSIBLE if freedom == PARAMETERS else SUSPICIOUS):
@@ -267,7 +260,21 @@ def _linearised(
     return np.concatenate(rows), np.concatenate(left)
 
 
-def _damped(design: Array, residual: Array, damping: float) -> tuple[Array, Array]:
-    """Equations that keep the step short, added."""
-    held = np.diag(np.sqrt(damping) * np.linalg.norm(design, axis=0))
-    return np.vstack([design, held]), np.append(residual, np.zeros(PARAMETERS))
+def _solved(_: Array, system: tuple[Array, Array], damping: float) -> Array:
+    """The step : (6,) of the equations, with others that keep it short."""
+    design, residual = system
+    if damping > 0:
+        design = np.vstack([design, np.diag(np.sqrt(damping) * np.linalg.norm(design, axis=0))])
+        residual = np.append(residual, np.zeros(PARAMETERS))
+    step, _, rank, _ = np.linalg.lstsq(design, residual, RANK)
+    if rank < PARAMETERS:
+        raise _Astray("views that do not determine the pose")
+    return step
+
+
+def _settled(system: tuple[Array, Array], step: Array) -> bool:
+    return bool(np.sum((system[0] @ step) ** 2) < SETTLED)
+
+
+class _Astray(Exception):
+    """The reason why a start leads to no pose."""

@@ -1,0 +1,94 @@
+"""The loop of Levenberg and Marquardt, against closed forms and SciPy."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+
+from recon.geometry.levenberg_marquardt import Rules, descend
+
+numbers = st.floats(-5, 5)
+
+
+def valley(p):
+    """Rosenbrock's: a narrow, bent valley with its end at (1, 1)."""
+    return np.array([10 * (p[1] - p[0] ** 2), 1 - p[0]]), np.array([[-20 * p[0], 10.0], [-1.0, 0.0]])
+
+
+def linearised(p):
+    residual, jacobian = valley(p)
+    return (jacobian, residual), residual @ residual
+
+
+def solved(_, system, damping):
+    jacobian, residual = system
+    normal = jacobian.T @ jacobian
+    return np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -jacobian.T @ residual)
+
+
+@given(numbers, numbers)
+def test_the_end_of_a_bent_valley_is_found(x, y):
+    """One start in 150 takes more than 50 steps."""
+    found = descend(np.array([x, y]), linearised, solved, np.add, rules=Rules(steps=500)).estimate
+    assert np.abs(found - 1).max() < 1e-4
+
+
+def test_the_minimum_is_scipys(rng):
+    """Of an exponential with noise, where residuals stay: to the change of a parameter that a cost's 1e-10 is worth."""
+    time = np.linspace(0, 3, 40)
+    values = 2 * np.exp(-1.3 * time) + rng.normal(0, 0.05, 40)
+
+    def residuals(p):
+        return p[0] * np.exp(-p[1] * time) - values
+
+    def both(p):
+        jacobian = np.column_stack([np.exp(-p[1] * time), -p[0] * time * np.exp(-p[1] * time)])
+        return (jacobian, residuals(p)), float(residuals(p) @ residuals(p))
+
+    found = descend(np.array([1.0, 0.5]), both, solved, np.add).estimate
+    expected = least_squares(residuals, [1.0, 0.5], xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    assert np.abs(found - expected).max() < 1e-5
+
+
+@given(numbers, numbers)
+def test_the_cost_never_rises(x, y):
+    costs = []
+
+    def recorded(p):
+        system, cost = linearised(p)
+        costs.append(cost)
+        return system, cost
+
+    found = descend(np.array([x, y]), recorded, solved, np.add)
+    assert linearised(found.estimate)[1] == min(costs)
+
+
+def test_a_step_to_nowhere_is_shortened():
+    """Where an estimate can not be, the damping grows until the step ends short of it."""
+
+    def fenced(p, step):
+        if np.abs(step).max() > 0.5:
+            raise ValueError("too far")
+        return p + step
+
+    assert np.abs(descend(np.array([-1.2, 1.0]), linearised, solved, fenced).estimate - 1).max() < 1e-6
+
+
+def test_a_settled_step_is_handed_on_and_not_taken():
+    """Of a line the first step of Gauss and Newton leads to the solution, and the second is none."""
+    design, values = np.column_stack([np.ones(5), np.arange(5.0)]), np.array([1.0, 2.9, 5.1, 7.0, 9.0])
+    found = descend(
+        np.zeros(2),
+        lambda p: ((design, design @ p - values), float(np.sum((design @ p - values) ** 2))),
+        solved,
+        np.add,
+        settled=lambda system, step: bool(np.abs(step).max() < 1e-9),
+        rules=Rules(damping=0, converged=0, rounding=1e-12),
+    )
+    assert found.estimate == pytest.approx(np.linalg.lstsq(design, values)[0])
+    assert found.step is not None and np.abs(found.step).max() < 1e-9
+
+
+def test_steps_run_out():
+    assert descend(np.array([-4.0, 4.0]), linearised, solved, np.add, rules=Rules(steps=2)).step is None
