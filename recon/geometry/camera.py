@@ -98,7 +98,7 @@ class Camera:
         normalised = self.undistort(pixels)
         local = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1)
         local /= np.linalg.norm(local, axis=-1, keepdims=True)
-        return rigid.rotate(rigid.invert(self.camera_from_world), local)
+        return local @ self.camera_from_world[:3, :3]
 
     def pixel_grid(self) -> Array:
         """All pixel centres : (h, w, 2), as (u, v)."""

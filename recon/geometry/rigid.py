@@ -80,7 +80,9 @@ def slopes(arms: Array) -> Array:
 
     arms : (..., 3) mm, from the pose's origin to the points: `rotate(pose, points)`.
     """
-    return np.concatenate([-cross(arms), np.broadcast_to(np.eye(3), (*arms.shape, 3))], axis=-1)
+    result = np.empty((*arms.shape, 6))
+    result[..., :3], result[..., 3:] = -cross(arms), np.eye(3)
+    return result
 
 
 def cross(vectors: ArrayLike) -> Array:
