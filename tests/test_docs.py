@@ -1,30 +1,96 @@
-"""What the pages tell a reader to run does run, and what they link to is there."""
+"""What the pages tell a reader to run is valid, and runs; what they link to is there."""
 
+import ast
 import re
 import shutil
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from sonotwin.cli import VERBS, main
+from sonotwin.config import load
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+MADE = {  # what a verb writes into its folder `out`, for those that read it; "" is the folder itself
+    "render": {"capture", "truth"},
+    "film": {"capture", "truth"},
+    "sweep": {"capture", "truth"},
+    "demo": {"capture", "truth", "surface"},
+    "surface": {"", "surface.ply"},
+    "track": {""},
+    "dataset": {""},
+    "train": {"", "detector.safetensors", "segmenter.safetensors"},
+    "calibrate-optics": {"optics.yaml"},
+    "calibrate-probe": {"probe.yaml"},
+    "freehand": {"sequence.igs.mha"},
+}
+WRITTEN = ("out", "document")  # fields that name what is written; other paths are read
+BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `make demo`
+    "README.md": {"shots", "optics.yaml", "outputs/board/capture"},
+    "captures.md": {"capture", "session", "shots", "optics.yaml", "wrapped"},
+    "freehand.md": {f"{folder}/capture" for folder in ("wires", "bottom", "sweep", "tank")}
+    | {"pairs.csv", "sweep.igs.mha", "config.xml", "probe/probe.yaml", "surface/surface.ply"},
+    "tracking.md": {"session", "probe.yaml"},
+}
 
 
-def commands(page: Path) -> list[list[str]]:
-    """The `sonotwin` commands in a page's code blocks, without the program's name."""
-    blocks = re.findall(r"^```\w*\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    return [line.split()[1:] for block in blocks for line in block.splitlines() if re.match("sonotwin [a-z]", line)]
+def commands(text: str, fence: str = "```|~~~") -> list[list[str]]:
+    """The `sonotwin` commands in a text's code blocks, without the program's name."""
+    blocks = re.findall(rf"^({fence})\w*\n(.*?)^\1", text, re.MULTILINE | re.DOTALL)
+    return [
+        line.split("#")[0].split()[1:] for _, block in blocks for line in block.splitlines() if re.match("sonotwin [a-z]", line)
+    ]
 
 
+@cache
+def read_by(recipe: tuple[str, ...]) -> tuple[str, ...]:
+    """Validate a command as the command line would; returns the paths that it was given to read."""
+    verb, *overrides = recipe
+    model = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}").Config
+    config = load(verb, overrides, model)
+    given = {override.partition("=")[0] for override in overrides} - set(WRITTEN)
+    return tuple(str(value) for name in sorted(given) if isinstance(value := getattr(config, name, None), Path))
+
+
+def without_training(verb: str) -> bool:
+    return verb == "train" and find_spec("torch") is None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_recipes_are_valid(page):
+    """Each command has a verb and fields that exist and values that fit; what it reads is brought or made by an earlier one."""
+    there = set(BROUGHT.get(page.name, ()))
+    for recipe in commands(page.read_text(encoding="utf-8")):
+        if without_training(recipe[0]):
+            continue
+        assert set(read_by(tuple(recipe))) <= there, recipe
+        out = [Path(field.partition("=")[2]) for field in recipe if field.startswith("out=")]
+        there |= {str(folder / name) for folder in out for name in MADE.get(recipe[0], ())}
+
+
+@pytest.mark.parametrize("verb", VERBS, ids=lambda verb: verb.name)
+def test_examples_of_a_verb_are_valid(verb):
+    """The commands in its help have verbs and fields that exist and values that fit, and show the verb itself."""
+    text = ast.get_docstring(ast.parse((ROOT / (verb.module.replace(".", "/") + ".py")).read_text(encoding="utf-8")))
+    examples = [tuple(line.split()[1:]) for line in text.splitlines() if re.match(" +sonotwin [a-z]", line)]
+    assert verb.name in {example[0] for example in examples}
+    for example in examples:
+        if not without_training(example[0]):
+            read_by(example)
+
+
+@pytest.mark.slow
 def test_the_readme_runs(tmp_path, monkeypatch):
     """Its recipes, one after the other, on images like those that a reader would have."""
     monkeypatch.chdir(tmp_path)
     assert main(["render", "engine.samples=2", "out=made"]) == 0
     shutil.copytree("made/capture/surface/cam1", "shots")
     shutil.copy("made/capture/calibration/optics.yaml", "optics.yaml")
-    recipes = commands(ROOT / "README.md")
+    recipes = commands((ROOT / "README.md").read_text(encoding="utf-8"), fence="```")
     assert len(recipes) >= 5
     few = {  # rays, poses and frames: as they stand the recipes take ten minutes
         "demo": ["poses.count=3", "film_frames=0", "engine.samples=2"],
@@ -44,12 +110,6 @@ def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if not target.startswith("http"):
             assert (page.parent / target).exists(), target
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_name_verbs_that_exist(page):
-    """No page shows a verb that the command doesn't have."""
-    assert {command[0] for command in commands(page)} <= {verb.name for verb in VERBS}
 
 
 def test_make_targets_exist():
