@@ -18,8 +18,11 @@ from recon.model.calibration import Calibration
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns
 from recon.structured_light import surface_mesh
 from recon.structured_light.triangulate import PointMap
+from recon.tracking import networks
 from sonotwin.cli import main
 from sonotwin.verbs.surface import predicted_rms
+from tests.recon.tracking import films
+from tests.recon.tracking.stand_ins import Told
 
 SIZE, PROJECTOR = (320, 256), (640, 400)
 SEQUENCES = {
@@ -203,12 +206,44 @@ def test_the_page_names_every_field():
             assert f"| `{prefix}{field.alias or name}` |" in PAGE
 
 
+def test_the_manifests_of_the_page_are_valid():
+    read = [Manifest.model_validate(json.loads(text)) for text in blocks("json")]
+    assert [(content.surface is not None, sorted(content.sweep.images) if content.sweep else []) for content in read] == [
+        (False, ["us"]),
+        (False, ["cam1", "cam2"]),
+        (True, []),
+    ]
+
+
+def commands(verb: str) -> list[list[str]]:
+    lines = [shlex.split(line) for text in blocks("sh") for line in text.splitlines()]
+    return [arguments[1:] for arguments in lines if arguments[:2] == ["sonotwin", verb]]
+
+
+def test_the_page_is_run_whole():
+    """Each of its commands is of a verb that one of the two tests below runs."""
+    assert len(commands("surface")) + len(commands("track")) == sum(text.count("\n") for text in blocks("sh"))
+
+
+def test_the_page_tracks(rig, tmp_path, monkeypatch):
+    """The manifest of a film, with the frames that it names, by the command below it."""
+    films.film(tmp_path / "session", rig, np.random.default_rng(4), count=2)
+    (manifest,) = (text for text in blocks("json") if "cam2" in text)
+    (tmp_path / "session" / "manifest.json").write_text(manifest, encoding="utf-8")
+    stand_in = Told(films.centres(rig, films.places(1)[0]))
+    monkeypatch.setattr(networks, "load", lambda folder, threads: stand_in)
+    monkeypatch.chdir(tmp_path)
+    (command,) = commands("track")
+    assert main(command) == 0
+    assert json.loads(Path("tracked/metrics.json").read_text())["frames_found"] == 2
+
+
 @pytest.mark.slow
-def test_the_page_runs(rig, tmp_path, monkeypatch):
-    """Every manifest, pattern file and command of docs/captures.md, in a folder that holds what the page talks about."""
+def test_the_page_measures(rig, tmp_path, monkeypatch):
+    """The manifest of a surface, the pattern file and their commands, in a folder that holds what the page talks about."""
     optics = Calibration({"cam1": rig.cam1.optics.camera(), "projector": rig.projector.optics.camera()})
     calibration_files.write(tmp_path / "optics.yaml", optics)
-    (manifest,) = (json.loads(text) for text in blocks("json"))
+    (manifest,) = (json.loads(text) for text in blocks("json") if "surface" in json.loads(text))
     patterns = Patterns.model_validate(manifest["surface"]["patterns"])
     named = [tmp_path / "shots" / name for name in manifest["surface"]["images"]["cam1"]]
     (tmp_path / "wrapped").mkdir()
@@ -219,16 +254,14 @@ def test_the_page_runs(rig, tmp_path, monkeypatch):
     paper = surface_part.read_patterns(Path(__file__).parents[2] / "conf" / "patterns" / "paper_surface.yaml")
     monkeypatch.chdir(tmp_path)
 
-    commands = [line for text in blocks("sh") for line in text.splitlines()]
-    assert len(commands) == 4
-    for command in commands:
+    assert len(commands("surface")) == 4
+    for arguments in commands("surface"):
         shutil.rmtree("shots", ignore_errors=True)
-        if "images=shots" in command:
+        if "images=shots" in arguments:
             images.write_images([tmp_path / "shots" / f"{i}.png" for i in range(paper.count)], photograph(paper, optics))
         else:
             images.write_images(named, pictures)
-        program, *arguments = shlex.split(command)
-        assert program == "sonotwin" and main(arguments) == 0
+        assert main(arguments) == 0
         assert json.loads(Path("surface/metrics.json").read_text())["points"] > 500_000
 
     (text,) = blocks("yaml")
