@@ -104,9 +104,10 @@ def _run(arguments: list[str]) -> int:
     for override in overrides:
         if override.startswith("-"):
             raise InputError(f"{verb.name}: {override}: unknown option; fields are given as field=value")
-    module = import_module(verb.module)
-    from sonotwin import config
+    from sonotwin import config, first_use
 
+    first_use.announce()  # imports may compile, too
+    module = import_module(verb.module)
     return module.run(config.load(verb.name, overrides, module.Config)) or 0
 
 

@@ -1,5 +1,6 @@
 """Fixtures that tests of all packages share."""
 
+import logging
 import os
 import zlib
 from pathlib import Path
@@ -14,6 +15,8 @@ from recon.model.rig import Rig
 from twin.ultrasound.transducer import Transducer
 
 ROOT = Path(__file__).resolve().parent.parent
+
+logging.getLogger("recon.compiled").setLevel(logging.WARNING)  # verbs announce nothing: a test may count their lines
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ Every module of the twin gets Mitsuba from `load_mitsuba()`.
 import ctypes
 import importlib.metadata
 import json
+import logging
 import os
 import platform
 import re
@@ -180,6 +181,8 @@ def load_mitsuba() -> ModuleType:
     import mitsuba
 
     mitsuba.set_variant(variant)
+    if not any((Path.home() / ".drjit").glob("*.bin")):
+        logging.getLogger("recon.compiled").info("compiling %s.%s, once", "twin.optics", "kernels")
     return mitsuba
 
 

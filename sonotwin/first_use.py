@@ -1,0 +1,42 @@
+"""Announces on the console what is compiled on first use: a line for each part of the software, not for each function."""
+
+import logging
+import sys
+
+PARTS = {  # the modules' beginnings, what the console calls them, and the seconds that a core takes for all of their functions
+    "recon.structured_light": ("decoder and mesh", 60),
+    "recon.tracking": ("fit of the target's rims", 40),
+    "recon.optical_calibration": ("images of the board in the projector", 10),
+    "recon.board_detection": ("edges of the board's circles", 5),
+    "recon.freehand": ("volume from B-scans", 10),
+    "recon.segmentation": ("search for masses", 10),
+    "recon.geometry": ("cameras", 5),
+    "twin.ultrasound": ("the rendered scanner", 60),
+    "twin.optics": ("light transport", 20),
+    "twin": ("the rendered sensor", 3),
+}
+
+
+class Announcer(logging.Handler):
+    """Prints a line on stderr for the first function of each part that is compiled."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self._announced: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Announce the part of the function that the record names."""
+        module = str(record.args[0]) if isinstance(record.args, tuple) and record.args else ""
+        part = next((part for part in PARTS if f"{module}.".startswith(f"{part}.")), None)
+        if part is not None and part not in self._announced:
+            self._announced.add(part)
+            name, seconds = PARTS[part]
+            print(f"compile     {name}, once on this machine (up to {seconds} s)", file=sys.stderr, flush=True)
+
+
+def announce() -> None:
+    """Announce what is compiled from now on, unless the logger was given a level of its own."""
+    log = logging.getLogger("recon.compiled")
+    if log.level == logging.NOTSET:
+        log.setLevel(logging.INFO)
+        log.addHandler(Announcer())
