@@ -14,7 +14,7 @@ from scenes.scene_types import Scene
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, Images, render
-from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_pattern
+from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_shown, show_pattern
 from twin.optics.raster import OVERSAMPLING, Light
 from twin.optics.ray_world import build_world
 from twin.optics.surface_truth import surface_truth
@@ -65,11 +65,11 @@ def both_renders(
     ours_world, peer_world = build_world(scene), mitsuba_scene(scene, camera, projector, OVERSAMPLING)
     optics, engine = CameraOptics.pinhole(camera), Engine(samples=samples)
     ours = [block_means(render(ours_world, optics, projector, light, engine, seed))[list(patterns)] for seed in range(repeats)]
-    peer = [
-        [block_means(render_pattern(peer_world, light, pattern, samples, 1000 + seed)) for pattern in patterns]
-        for seed in range(repeats)
-    ]
-    return np.stack(ours), np.stack(peer)
+    peer = []
+    for pattern in patterns:
+        show_pattern(peer_world, light, pattern)
+        peer.append([block_means(render_shown(peer_world, samples, 1000 + seed)) for seed in range(repeats)])
+    return np.stack(ours), np.stack(peer, axis=1)
 
 
 def z_scores(ours: NDArray[np.float64], peer: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -42,7 +42,7 @@ def shrunk_pinhole(camera: Camera, scale: float, camera_from_world: rigid.Array)
 
 
 def mitsuba_scene(scene: Scene, camera: Camera, projector: ProjectorOptics, detail: int = 1) -> mi.Scene:
-    """A scene with Mitsuba's own camera and projector; the pattern is set later, by `render_pattern`.
+    """A scene with Mitsuba's own camera and projector; the pattern is set later, by `show_pattern`.
 
     detail : texels a projector px, a divisor of OVERSAMPLING; Mitsuba interpolates linearly between them.
     """
@@ -82,12 +82,22 @@ def mitsuba_scene(scene: Scene, camera: Camera, projector: ProjectorOptics, deta
 
 def render_pattern(world: mi.Scene, light: Light, pattern: int, samples: int, seed: int, bounces: int = 1) -> Images:
     """Radiance : (h, w) W/mm^2/sr under one pattern of vertical fringes, after up to `bounces` reflections."""
+    show_pattern(world, light, pattern)
+    return render_shown(world, samples, seed, bounces)
+
+
+def show_pattern(world: mi.Scene, light: Light, pattern: int) -> None:
+    """Set the projector's pattern, of vertical fringes; takes as long as a small render."""
     parameters = mi.traverse(world)
     height, width, _ = parameters["projector.irradiance.data"].shape
     fine = light.fine_profiles("columns")[pattern, MARGIN * OVERSAMPLING : -MARGIN * OVERSAMPLING]
     texels = fine.reshape(width, -1).mean(axis=1)
     parameters["projector.irradiance.data"] = mi.TensorXf(np.repeat(texels[None, :, None], height, axis=0))
     parameters.update()
+
+
+def render_shown(world: mi.Scene, samples: int, seed: int, bounces: int = 1) -> Images:
+    """Radiance : (h, w) W/mm^2/sr under the pattern shown, after up to `bounces` reflections."""
     integrator = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 1000})  # its depth counts segments
     return np.asarray(mi.render(world, integrator=integrator, spp=samples, seed=seed))[:, :, 0]
 

@@ -12,7 +12,7 @@ from scenes.scene_types import Material, Scene, Thing
 from twin.accuracy import optics_accuracy
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import LUMENS_PER_WATT, Engine, render
-from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_pattern
+from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_shown, show_pattern
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world
 
@@ -112,7 +112,8 @@ def test_interreflection_matches_mitsuba(rig):
         render(world, CameraOptics.pinhole(camera), projector, light, Engine(samples=64, bounces=4), k)[3].mean()
         for k in range(6)
     ]
-    peer = [render_pattern(peer_world, light, 3, 128, k, bounces=4).mean() for k in range(6)]
+    show_pattern(peer_world, light, 3)
+    peer = [render_shown(peer_world, 128, k, bounces=4).mean() for k in range(6)]
     error = np.sqrt((np.var(ours, ddof=1) + np.var(peer, ddof=1)) / 6)
     assert np.mean(ours) > 1.1 * direct
     assert abs(np.mean(ours) - np.mean(peer)) < 5 * error
