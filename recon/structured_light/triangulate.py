@@ -85,8 +85,8 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera) 
     return Triangulator(camera, projector)(projector_map)
 
 
-def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:
-    """One axis and its sigma for compiled code: empty where the axis is not known, NaN where only the sigma isn't."""
+def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: tuple[int, ...]) -> tuple[Float32, Float32]:
+    """One axis and its sigma for code that is compiled for these types alone: empty without the axis, NaN without its sigma."""
     if coordinate is None:
         nothing = np.empty((0, 0), np.float32)
         return nothing, nothing
@@ -95,7 +95,7 @@ def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: t
     for part, found in ((name, coordinate.shape), (f"sigma_{name}", sigma.shape)):
         if found != shape:
             raise ValueError(f"projector map: {part}: expected an image of shape {shape}, found {found}")
-    return coordinate, sigma
+    return np.ascontiguousarray(coordinate, np.float32), np.ascontiguousarray(sigma, np.float32)
 
 
 @njit(parallel=True, error_model="numpy")
