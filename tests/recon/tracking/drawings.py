@@ -39,24 +39,36 @@ def reflectance(camera: Camera, poses, target, ground=0.25, black=0.04):
 
 
 def _board(camera, rays, world_from_target, target, ground, black, count):
+    """Brightness : (h, w), by sub-pixels where an edge is near; elsewhere the whole pixel looks alike."""
     x, y = _on_board(camera, world_from_target, rays)
-    slopes = [np.gradient(axis) for axis in (x, y)]  # by v, by u
-    part = (np.arange(count) + 0.5) / count - 0.5
-    total = np.zeros_like(x)
-    scale = np.hypot(slopes[0][1], slopes[0][0]) / count
-    for dv in part:
-        for du in part:
-            px, py = (axis + dv * slope[0] + du * slope[1] for axis, slope in zip((x, y), slopes, strict=True))
-            inside = [np.clip((px - BOARD[0, 0]) / scale + 0.5, 0, 1), np.clip((BOARD[1, 0] - px) / scale + 0.5, 0, 1)]
-            inside += [np.clip((py - BOARD[0, 1]) / scale + 0.5, 0, 1), np.clip((BOARD[1, 1] - py) / scale + 0.5, 0, 1)]
-            ink = np.zeros_like(x)
-            for cx, cy, _ in pose.circle_centres(target):
-                away = np.hypot(px - cx, py - cy)
-                outer = np.clip((target.outer_diameter_mm / 2 - away) / scale + 0.5, 0, 1)
-                ink += outer * np.clip((away - target.inner_diameter_mm / 2) / scale + 0.5, 0, 1)
-            board = np.prod(inside, axis=0)
-            total += ground * (1 - board) + board * (1 - (1 - black) * ink)
-    return total / count**2
+    slopes = np.array([np.gradient(axis) for axis in (x, y)])  # of x and y, by v and u
+    scale = np.hypot(slopes[0, 1], slopes[0, 0]) / count
+    reach = np.hypot(*slopes).sum(axis=0) / 2 + scale  # mm, from a pixel's middle to what counts for its corners
+
+    def brightness(px, py, scale):
+        inside = [np.clip((px - BOARD[0, 0]) / scale + 0.5, 0, 1), np.clip((BOARD[1, 0] - px) / scale + 0.5, 0, 1)]
+        inside += [np.clip((py - BOARD[0, 1]) / scale + 0.5, 0, 1), np.clip((BOARD[1, 1] - py) / scale + 0.5, 0, 1)]
+        ink = np.zeros_like(px)
+        for cx, cy, _ in pose.circle_centres(target):
+            away = np.hypot(px - cx, py - cy)
+            outer = np.clip((target.outer_diameter_mm / 2 - away) / scale + 0.5, 0, 1)
+            ink += outer * np.clip((away - target.inner_diameter_mm / 2) / scale + 0.5, 0, 1)
+        board = np.prod(inside, axis=0)
+        return ground * (1 - board) + board * (1 - (1 - black) * ink)
+
+    near = np.minimum(np.abs(x[..., None] - BOARD[:, 0]), np.abs(y[..., None] - BOARD[:, 1])).min(axis=-1) < reach
+    for cx, cy, _ in pose.circle_centres(target):
+        away = np.hypot(x - cx, y - cy)
+        for diameter in (target.outer_diameter_mm, target.inner_diameter_mm):
+            near |= np.abs(away - diameter / 2) < reach
+    total, part = brightness(x, y, scale), (np.arange(count) + 0.5) / count - 0.5
+    places = [
+        [axis[near] + dv * slope[0][near] + du * slope[1][near] for axis, slope in zip((x, y), slopes, strict=True)]
+        for dv in part
+        for du in part
+    ]
+    total[near] = sum(brightness(*place, scale[near]) for place in places) / count**2
+    return total
 
 
 def frame(camera, poses, target, white=100.0, rng=None, lens=LENS_PX, ground=0.25, light=None):
