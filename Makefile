@@ -7,6 +7,8 @@ REAL := $(or $(SONOTWIN_REAL),$(wildcard ../shared/real))
 ARGS ?=
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+# Each worker takes one half of the tests, so that few make the same fixtures; who is done helps the other.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint slow accuracy benchmark clean
@@ -24,9 +26,9 @@ $(INSTALLED): pyproject.toml constraints.txt .ci/setup
 demo: setup  ## render a phantom, reconstruct its surface, compare with the truth
 	@$(BIN)/sonotwin demo
 
-test: lint  ## check style, types and arrows, then run the fast tests
-	@bash .ci/browser
-	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
+test: setup  ## check style, types and arrows, then run the fast tests
+	@bash .ci/browser & browser=$$!; $(MAKE) --no-print-directory lint && wait $$browser
+	@$(PYTEST) -m "not slow" $(ARGS)
 
 lint: setup  ## check style, types and which package may import which
 	@$(BIN)/ruff check --quiet .
@@ -35,7 +37,7 @@ lint: setup  ## check style, types and which package may import which
 	@said=$$($(BIN)/lint-imports --no-logo) || { echo "$$said"; exit 1; }
 
 slow: setup  ## run the slow tests
-	@$(BIN)/python -m pytest -m slow $(ARGS)
+	@$(PYTEST) -m slow $(ARGS)
 
 accuracy: setup  ## measure errors against the ground truth and the paper's figures
 	@$(BIN)/sonotwin accuracy document=docs/accuracy.md $(if $(ONLY),only=$(ONLY)) $(if $(REAL),real=$(REAL))
