@@ -2,8 +2,10 @@
 
 import json
 import re
+import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
 
@@ -96,9 +98,36 @@ def check_place(document: Path, group: str) -> None:
 
 
 def refresh(document: Path, group: str, text: str) -> None:
-    """Replace what stands between `<!-- GROUP -->` and `<!-- /GROUP -->` in a document; see `check_place`."""
+    """Replace the table between `<!-- GROUP -->` and `<!-- /GROUP -->` in a document, under the date and commit of now.
+
+    Raises
+    ------
+    InputError
+        If the document has no place for it.
+    """
     check_place(document, group)
     before = document.read_text(encoding="utf-8")
     place = re.compile(rf"(<!-- {group} -->\n).*?(<!-- /{group} -->)", re.DOTALL)
+    new = f"{measured_line(document.parent)}\n\n{text}"
     with atomic.new_file(document) as temporary:
-        temporary.write_text(place.sub(lambda match: f"{match[1]}\n{text}\n\n{match[2]}", before), encoding="utf-8")
+        temporary.write_text(place.sub(lambda match: f"{match[1]}\n{new}\n\n{match[2]}", before), encoding="utf-8")
+
+
+def measured_line(folder: Path) -> str:
+    """Date of today, UTC, and commit of the folder: `Measured 2026-01-31 at 1a2b3c4.`, `+changes` if other files than pages
+    differ from it.
+
+    Outside a git repository, or without git, the date alone.
+    """
+    day = f"Measured {datetime.now(UTC):%Y-%m-%d}"
+    try:
+        commit = _git(folder, "rev-parse", "--short=7", "HEAD")
+        changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", ":/", ":(top,exclude,glob)**/*.md")
+    except (OSError, subprocess.CalledProcessError):
+        return f"{day}."
+    return f"{day} at {commit}{'+changes' if changed else ''}."
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
+    return done.stdout.strip()

@@ -1,12 +1,14 @@
 """Rows: bars in both directions, the JSON's keys, the table in a document."""
 
 import json
+import re
+import subprocess
 
 import numpy as np
 import pytest
 
 from recon.errors import InputError
-from twin.accuracy.table_rows import Row, measure, refresh, table, write
+from twin.accuracy.table_rows import Row, measure, measured_line, refresh, table, write
 
 ROWS = [
     Row("a", "an error", 0.02, 0.05, 0.01, "mm"),
@@ -51,8 +53,33 @@ def test_a_document_keeps_what_is_around_the_table(tmp_path):
     for _ in range(2):
         refresh(page, "one", table(ROWS, "limit"))
     text = page.read_text()
-    assert text.startswith("before\n<!-- one -->\n\n| id |")
+    assert re.match(r"before\n<!-- one -->\n\nMeasured \d{4}-\d\d-\d\d\.\n\n\| id \|", text) and text.count("Measured") == 1
     assert text.endswith("<!-- /one -->\nbetween\n<!-- two -->\n<!-- /two -->\nafter\n")
     assert "old" not in text and text.count("| a | an error | 0.02 | <= 0.05 | 0.01 | mm | yes |") == 1
     with pytest.raises(InputError, match="<!-- three -->"):
         refresh(page, "three", "")
+
+
+def test_a_table_names_date_and_commit(tmp_path):
+    """The short hash in a repository, marked where a file differs from it; the date alone elsewhere."""
+
+    def git(*arguments):
+        return subprocess.run(
+            ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-C", str(tmp_path), *arguments],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+
+    assert re.fullmatch(r"Measured \d{4}-\d\d-\d\d\.", measured_line(tmp_path))
+    (tmp_path / "code.py").write_text("one\n")
+    (tmp_path / "page.md").write_text("one\n")
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-q", "-m", "one")
+    commit = git("rev-parse", "--short=7", "HEAD")
+    assert measured_line(tmp_path).endswith(f" at {commit}.")
+    (tmp_path / "page.md").write_text("the table of another group\n")
+    assert measured_line(tmp_path).endswith(f" at {commit}.")
+    (tmp_path / "code.py").write_text("two\n")
+    assert measured_line(tmp_path).endswith(f" at {commit}+changes.")
