@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from sonotwin import namesakes
 from twin import llvm
 
 OLDEST_PYTHON = (3, 11)
@@ -41,7 +42,7 @@ class Finding:
 
 def examine() -> list[Finding]:
     """Look at everything; takes some seconds, most of them for importing the packages in another process."""
-    return [*_system(), *_packages(), *_llvm(), *_gpu(), *_folders()]
+    return [*_system(), *_own_packages(), *_packages(), *_llvm(), *_gpu(), *_folders()]
 
 
 def extra_of(module: str) -> str | None:
@@ -82,6 +83,23 @@ def _system_name() -> str:
     if hasattr(platform, "freedesktop_os_release") and Path("/etc/os-release").exists():
         return f"{platform.freedesktop_os_release().get('PRETTY_NAME', 'Linux')}, {platform.machine()}"
     return f"{platform.platform()}, {platform.machine()}"
+
+
+def _own_packages() -> Iterator[Finding]:
+    """Check that `recon`, `twin` ... are ours: found beside `sonotwin`, without another distribution's files among them."""
+    brought = importlib.metadata.packages_distributions()
+    for place in namesakes.places():
+        strangers = sorted(set(brought.get(place.name, ())) - {"sonotwin"})
+        if place.found is None:
+            yield Finding("core", place.name, "problem", "not found", "pip install '.' in sonotwin's folder")
+        elif place.hidden:
+            yield Finding("core", place.name, "problem", f"{place.found} hides ours, {place.ours}", place.remedy)
+        elif strangers and place.found.parent.name == "site-packages":
+            remedy = f"pip uninstall {' '.join(strangers)}, then pip install --force-reinstall '.' in sonotwin's folder"
+            found = f"{place.found} has files of {', '.join(strangers)}, too"
+            yield Finding("core", place.name, "problem", found, remedy)
+        else:
+            yield Finding("core", place.name, "ok", str(place.found))
 
 
 def _packages() -> Iterator[Finding]:

@@ -1,14 +1,18 @@
 """The doctor on sound and on damaged installations, the damage simulated."""
 
+import os
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 
-from sonotwin import cli, installation
+from sonotwin import cli, installation, namesakes
 from twin import llvm
 
-PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
+ROOT = Path(__file__).resolve().parents[2]
+PYPROJECT = ROOT / "pyproject.toml"
 
 
 def find(findings, what: str) -> list[installation.Finding]:
@@ -82,3 +86,38 @@ def test_an_unwritable_cache_is_a_problem_with_a_remedy(monkeypatch, tmp_path):
 )
 def test_a_module_belongs_to_a_part(module, part):
     assert installation.extra_of(module) == part
+
+
+@pytest.mark.parametrize("name", ["recon", "scenes", "twin"])
+def test_a_namesake_that_hides_ours_is_named(tmp_path, name):
+    """Another distribution's package of the same name, in front of ours on the path: one line, whatever the verb."""
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "__init__.py").touch()
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+    command = [sys.executable, "-m", "sonotwin", "doctor"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"sonotwin: {name}: expected {ROOT / name}, found {tmp_path / name}; ")
+
+
+def test_the_doctor_lists_namesakes(tmp_path, monkeypatch):
+    """A hidden `trainers`, which the doctor doesn't import."""
+    (tmp_path / "trainers").mkdir()
+    (tmp_path / "trainers" / "__init__.py").touch()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "trainers", raising=False)  # an imported one would be found first
+    found = {finding.what: finding for finding in installation._own_packages()}
+    assert found["recon"].state == found["twin"].state == found["scenes"].state == "ok"
+    assert found["trainers"].state == "problem" and str(tmp_path / "trainers") in found["trainers"].found
+
+
+def test_two_distributions_in_one_folder_are_named(tmp_path, monkeypatch):
+    """Installed side by side their files mix, and a later one overwrites the earlier."""
+    site = tmp_path / "site-packages"
+    ours = [namesakes.Place(name, site / name, site / name) for name in namesakes.NAMES]
+    monkeypatch.setattr(namesakes, "places", lambda: ours)
+    both = {"recon": ["sonotwin", "other-recon"], "twin": ["sonotwin"]}
+    monkeypatch.setattr(installation.importlib.metadata, "packages_distributions", lambda: both)
+    found = {finding.what: finding for finding in installation._own_packages()}
+    assert found["twin"].state == "ok" and found["recon"].state == "problem"
+    assert "pip uninstall other-recon" in found["recon"].remedy
