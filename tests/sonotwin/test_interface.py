@@ -1,0 +1,64 @@
+"""The public interface: lazy, complete, the same for Python and for type checkers, and its examples run."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sonotwin
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "interface.md").read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+
+
+def test_importing_it_imports_nothing():
+    """`import sonotwin` needs no package, not even NumPy; `dir` lists the names, and another one is an AttributeError."""
+    program = """
+import sys
+before = set(sys.modules)
+import sonotwin
+assert set(sonotwin.__all__) <= set(dir(sonotwin))
+assert not hasattr(sonotwin, "nothing_of_the_kind")
+print(sorted({name.partition(".")[0] for name in set(sys.modules) - before} & {"numpy", "pydantic", "recon", "twin", "scenes"}))
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr
+
+
+def test_all_names_are_in_all_places():
+    """The list, the places, what type checkers read and the signatures' page have the same names; all can be had."""
+    tree = ast.parse((ROOT / "sonotwin" / "__init__.py").read_text(encoding="utf-8"))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    typed = {
+        alias.asname or alias.name: (node.module, alias.name)
+        for node in ast.walk(block)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    lazy = {name: tuple((place if ":" in place else f"{place}:{name}").split(":")) for name, place in sonotwin.PLACES.items()}
+    assert typed == lazy and sonotwin.__all__ == sorted(lazy)
+    signatures = (ROOT / "docs" / "reference" / "signatures.rst").read_text(encoding="utf-8")
+    assert set(re.findall(r":: sonotwin\.(\w+)", signatures)) == set(lazy)
+
+
+@pytest.mark.parametrize("name", sonotwin.__all__)
+def test_each_name_is_documented(name):
+    """It can be imported, has a docstring and stands on the page."""
+    assert getattr(sonotwin, name).__doc__
+    assert re.search(rf"\b{name}\b", PAGE)
+
+
+def test_the_examples_run(tmp_path, monkeypatch):
+    """The blocks of docs/interface.md are one program, and its assertions hold."""
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for number, example in enumerate(EXAMPLES, 1):
+        exec(compile(example, f"docs/interface.md, block {number}", "exec"), names)
+    used = set(re.findall(r"\bsonotwin\.(\w+)\(", "".join(EXAMPLES)))
+    functions = {name for name in sonotwin.__all__ if name[0].islower()}
+    assert functions - used == {"read_board", "read_film", "read_calibration", "read_probe"}, "each function has an example"
+    assert (tmp_path / "surface.ply").is_file()
