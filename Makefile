@@ -11,7 +11,7 @@ INSTALLED := .venv/.installed
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint slow accuracy benchmark clean
+.PHONY: help setup demo test lint slow docs accuracy benchmark clean
 
 help:  ## show this
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -39,6 +39,10 @@ lint: setup  ## check style, types and which package may import which
 slow: setup  ## run the slow tests
 	@$(PYTEST) -m slow $(ARGS)
 
+docs: setup  ## build the documentation site, build/docs/index.html
+	@$(BIN)/python -m sphinx -q -W --keep-going -c docs -d build/doctrees . build/docs
+	@echo "make docs: build/docs/index.html"
+
 accuracy: setup  ## measure errors against the ground truth and the paper's figures
 	@$(BIN)/sonotwin accuracy document=docs/accuracy.md $(if $(ONLY),only=$(ONLY)) $(if $(REAL),real=$(REAL))
 
@@ -46,5 +50,5 @@ benchmark: setup  ## measure speed
 	@$(BIN)/python -m benchmarks $(ONLY)
 
 clean:  ## delete compiled code and caches; .venv and outputs stay
-	@rm -rf .pytest_cache .ruff_cache .import_linter_cache
+	@rm -rf build docs/reference/packages .pytest_cache .ruff_cache .import_linter_cache
 	@find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +

@@ -15,10 +15,11 @@ from sonotwin import namesakes
 from twin import llvm
 
 OLDEST_PYTHON = (3, 11)
-EXTRAS = ("twin", "train", "dev")
+EXTRAS = ("twin", "train", "dev", "docs")
 MODULES = {  # where a package isn't imported by the name that it is installed by
     "hydra-core": "hydra",
     "lightning-fabric": "lightning_fabric",
+    "myst-parser": "myst_parser",
     "opencv-contrib-python-headless": "cv2",
     "pynrrd": "nrrd",
     "simpleitk": "SimpleITK",
@@ -33,7 +34,7 @@ BROUGHT_BY = {"drjit": "mitsuba", "omegaconf": "hydra"}  # imported by us, requi
 class Finding:
     """One thing that was looked at."""
 
-    part: str  # core, twin, train, dev: who needs it; or machine
+    part: str  # core, twin, train, dev, docs: who needs it; or machine
     what: str
     state: Literal["ok", "absent", "unused", "problem"]  # absent: not there, and the core does without
     found: str
@@ -75,8 +76,10 @@ def _system() -> Iterator[Finding]:
         yield Finding("core", "Python", "problem", text, "install Python 3.11 or newer")
     yield Finding("machine", "system", "ok", _system_name())
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    yield Finding("machine", "size", "ok", f"{cores} cores, {memory:.0f} GiB of memory")
+    text = f"{cores} cores"
+    if hasattr(os, "sysconf"):  # not on Windows
+        text += f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB of memory"
+    yield Finding("machine", "size", "ok", text)
 
 
 def _system_name() -> str:

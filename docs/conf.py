@@ -1,0 +1,105 @@
+"""Settings of the documentation site: Sphinx reads README.md, CHANGELOG.md, CONTRIBUTING.md and docs/; `make docs` builds it.
+
+The source folder is the repository's root, so that links between these pages are the same on the site and on a forge.
+"""
+
+import re
+import sys
+from importlib import metadata
+from pathlib import Path
+
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.application import Sphinx
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))  # the packages beside these pages, whatever is installed
+
+project = "sonotwin"
+author = "The sonotwin authors"
+version = release = metadata.version("sonotwin")
+root_doc = "docs/index"
+include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**"]
+exclude_patterns = [".*", "build", "dist", "outputs", "tests", "docs/site"]
+
+extensions = ["myst_parser", "sphinx.ext.apidoc", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4  # as forges have them
+html_theme = "furo"
+html_title = "sonotwin"
+html_extra_path = ["site"]  # index.html, which leads to the front page
+html_math_renderer = "mathml"
+html_show_copyright = False
+html_copy_source = False
+
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_default_options = {"members": True, "undoc-members": False, "exclude-members": "model_config, model_post_init"}
+autodoc_preserve_defaults = True
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+apidoc_modules = [
+    {"path": f"../{package}", "destination": f"reference/packages/{package}", "exclude_patterns": ["**/verbs/*"], "max_depth": 2}
+    for package in ("recon", "scenes", "twin", "trainers", "sonotwin")
+]
+apidoc_exclude_patterns: list[str] = []
+
+ARRAY = re.compile(r"(?:numpy\.)?ndarray\[tuple\[Any, \.\.\.\], (?:numpy\.)?dtype\[(?:[^\[\]]|\[[^\]]*\])*\]\]")
+SECTION = re.compile(r"^-{3,}$")
+
+
+def as_rst(app: Sphinx, what: str, name: str, found: object, options: object, lines: list[str]) -> None:
+    """Turn a docstring's plain text into reStructuredText: `code`, literal asterisks and bars, indented blocks as they stand."""
+    sections = next((k - 1 for k, line in enumerate(lines) if SECTION.match(line.strip())), len(lines))
+    text: list[str] = []
+    for k, line in enumerate(lines):
+        indented = line.startswith(" ") and line.strip()
+        if k < sections and indented and text and (not text[-1].strip() or not text[-1].startswith(" ")):
+            text += ["", "::", "", line] if not text[-1].startswith(" ") else [line]
+        elif k < sections and indented:
+            text.append(line)
+        else:
+            if k < sections and line.strip() and text and text[-1].startswith(" "):
+                text.append("")
+            text.append(_escaped(line))
+    lines[:] = text
+
+
+def _escaped(line: str) -> str:
+    parts = re.split(r"(`[^`]*`)", line)
+    for k, part in enumerate(parts):
+        if k % 2:
+            parts[k] = f"`{part}`"
+        else:
+            parts[k] = re.sub(r"([*|`])|(?<=\w)(_)(?!\w)", lambda match: f"\\{match[0]}", part)
+    return "".join(parts)
+
+
+def short_types(app: Sphinx, what: str, name: str, found: object, options: object, signature: str, returned: str) -> tuple:
+    """Write NumPy's long array types as Array."""
+    return tuple(None if text is None else ARRAY.sub("Array", text) for text in (signature, returned))
+
+
+def mathml(formula: str, block: bool) -> str:
+    """Turn LaTeX into MathML; docutils lacks two commands, which change only sizes and dots."""
+    return tex2mathml(re.sub(r"\\[bB]ig(?![a-zA-Z])", "", formula).replace(r"\dots", r"\ldots"), as_block=block)
+
+
+def inline_math(translator: nodes.NodeVisitor, node: nodes.math) -> None:
+    """Write a formula as MathML, which browsers show without a script or a network."""
+    translator.body.append(mathml(node.astext(), False))
+    raise nodes.SkipNode
+
+
+def block_math(translator: nodes.NodeVisitor, node: nodes.math_block) -> None:
+    """Write a displayed formula as MathML."""
+    translator.body.append(f'<div class="math">{mathml(node.astext(), True)}</div>\n')
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> None:
+    """Connect the steps above."""
+    app.connect("autodoc-process-docstring", as_rst, priority=100)  # before napoleon
+    app.connect("autodoc-process-signature", short_types)
+    app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))

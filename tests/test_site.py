@@ -1,0 +1,117 @@
+"""The documentation: links and anchors lead somewhere, the map of the code is complete, the site builds without a warning."""
+
+import re
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "users").glob("*.md")),
+]
+PACKAGES = ("recon", "scenes", "twin", "trainers", "sonotwin")
+MAP = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that a forge gives a page's headings."""
+    text = re.sub(r"^(```|~~~).*?^\1", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+def modules(package: str) -> set[str]:
+    """A package's modules as `folder/name`, from the root."""
+    paths = ((ROOT / package).rglob("*.py")) if (ROOT / package).is_dir() else ()
+    return {str(path.relative_to(ROOT).with_suffix("")) for path in paths if not path.stem.startswith("__")}
+
+
+def mapped() -> set[str]:
+    """The modules in the tables of section "The rooms", as `folder/name`."""
+    rooms = MAP[MAP.index("## The rooms") : MAP.index("## Types that cross a border")]
+    found = set()
+    for folder, files in re.findall(r"^\| `([\w/]+)` \| (.*) \|$", rooms, re.MULTILINE):
+        for item in files.split("; "):
+            found |= {f"{folder}/{name}" for name in re.findall(r"`(\w+)`", item.partition(": ")[0])}
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_anchors_lead_somewhere(page):
+    """Every relative link names a file, and what follows `#` is a heading of that page."""
+    text = re.sub(r"^(```|~~~).*?^\1", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)[^)]*\)", text):
+        if re.match(r"https?:|mailto:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        there = page if not path else (page.parent / path).resolve()
+        assert there.exists(), target
+        assert not anchor or anchor in anchors(there), f"{target}: no such heading, but {sorted(anchors(there))}"
+
+
+def test_every_page_is_on_the_site():
+    """A page that no table of contents names is found by nobody."""
+    listed = set(re.findall(r"^   (\S+)$", (ROOT / "docs" / "index.rst").read_text(encoding="utf-8"), re.MULTILINE))
+    for page in PAGES:
+        name = page.relative_to(ROOT / "docs") if page.is_relative_to(ROOT / "docs") else Path("/") / page.name
+        assert str(name.with_suffix("")) in listed, page.name
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_the_map_names_every_module(package):
+    """A new module gets its line in "The rooms" of docs/architecture.md, and one that is gone loses it."""
+    written = {name for name in mapped() if name.split("/")[0] == package}
+    assert modules(package) - written == set(), "not in docs/architecture.md"
+    assert written - modules(package) == set(), "in docs/architecture.md, but there is no such module"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "CHANGELOG.md"], ids=lambda page: page.name)
+def test_files_and_modules_that_pages_name_exist(page):
+    """Paths such as `recon/model/rig.py` and dotted names such as `recon.model.rig` are those of today."""
+    text = page.read_text(encoding="utf-8")
+    for path in re.findall(rf"\b((?:{'|'.join(PACKAGES)}|benchmarks|conf|tests)/[\w/]+\.(?:py|yaml))\b", text):
+        if not re.search(r"NAME|GROUP|VERB", path):
+            assert (ROOT / path).is_file(), path
+    for name in re.findall(rf"\b((?:{'|'.join(PACKAGES)})(?:\.[a-z_0-9]+)+)\b", text):
+        parts = name.split(".")
+        if parts[-1] in ("md", "py", "yaml"):
+            continue
+        while len(parts) > 1 and not ((ROOT / Path(*parts)).is_dir() or (ROOT / Path(*parts)).with_suffix(".py").is_file()):
+            parts.pop()  # a function or class of a module
+        folder = ROOT / Path(*parts)
+        rest = name.split(".")[len(parts) :]
+        module = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+        known = module.is_file() and all(
+            re.search(rf"\b{re.escape(part)}\b", module.read_text(encoding="utf-8")) for part in rest
+        )
+        assert known or not rest, name
+
+
+def test_the_python_blocks_import_modules_of_today():
+    """`from recon... import ...` in the pages' examples."""
+    for page in PAGES:
+        blocks = re.findall(r"^ *```python\n(.*?)^ *```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+        for module, names in re.findall(r"^ *from ([\w.]+) import ([\w, ]+)", "".join(blocks), re.MULTILINE):
+            if module.split(".")[0] in PACKAGES:
+                place = find_spec(module)
+                assert place is not None and place.origin is not None, f"{page.name}: {module}"
+                text = Path(place.origin).read_text(encoding="utf-8")
+                for name in re.split(r", *", names.split(" as ")[0]):
+                    inside = Path(place.origin).parent / f"{name}.py"
+                    assert re.search(rf"\b{name}\b", text) or inside.is_file(), f"{page.name}: {module}.{name}"
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path):
+    """As `make docs` does, into another folder."""
+    pytest.importorskip("sphinx")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-c", "docs", "-d", str(tmp_path / "trees"), "."]
+    done = subprocess.run([*command, str(tmp_path / "site")], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "site" / "index.html").is_file()
+    assert "wrapped_phase" in (tmp_path / "site" / "docs/reference/packages/recon/recon.structured_light.html").read_text()
