@@ -1,17 +1,15 @@
 """What a demonstration is made from: its fields, and what it takes as given."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import yaml
 from pydantic import Field, PrivateAttr, model_validator
 
 from recon.model.probe import Speed
 from recon.model.rig import Positive
 from scenes.acoustics import MADE_OF
-from sonotwin.config import folder as conf
-from sonotwin.verbs import film, render, sweep
+from sonotwin.verbs import render, sweep
 from twin import surface_session
 from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.timed_sweep import Clocks, PoseNoise
@@ -19,11 +17,9 @@ from twin.ultrasound.transducer import Transducer
 
 CALIBRATION = "calibration"  # folder
 BOARD_PATTERNS = "paper_calibration"
-WATER = "water"  # setting of the scanner in a tank
 WATER_C = 22.0  # of the tank, as `scenes.acoustics` has it
 ONE_SCANNER = ("ultrasound.image_size", "ultrasound.scale_mm_per_px")  # the same in all its settings
 TUMOURS = "tumour"  # what the things are called that ultrasound looks for
-BOARD = {"scene": {"kind": "board"}, "cameras": ["cam1", "cam2"]}  # the board as conf/scene/board.yaml has it
 
 
 class Config(render.Config):
@@ -58,30 +54,7 @@ class Config(render.Config):
         """Whether there is a sweep: a path was given, and there is something to find."""
         return self.path is not None and TUMOURS in MADE_OF.get(str(self.scene["kind"]), {})
 
-    def rendering(self, changes: Mapping[str, object]) -> render.Config:
-        """What `sonotwin render` is to do, with some fields changed."""
-        fields = {name: getattr(self, name) for name in render.Config.model_fields}
-        return render.Config.model_validate(fields | dict(changes))
-
-    def sweeping(self, out: Path, **changes: object) -> sweep.Config:
-        """What `sonotwin sweep` is to do, with some fields changed."""
-        fields = {name: getattr(self, name) for name in sweep.Config.model_fields}
-        return sweep.Config.model_validate(fields | changes | {"out": out})
-
-    def filming(self, out: Path) -> film.Config:
-        """What `sonotwin film` is to do."""
-        settings = yaml.safe_load((conf() / "film.yaml").read_text(encoding="utf-8"))
-        del settings["defaults"]
-        given = {"rig": self.rig, "seed": self.seed, "frames": self.film_frames, "out": out}
-        return film.Config.model_validate(settings | given)
-
-    def in_water(self) -> Transducer:
-        """The same scanner, set for a tank."""
-        settings = yaml.safe_load((conf() / "ultrasound" / f"{WATER}.yaml").read_text(encoding="utf-8"))
-        one = {name: getattr(self.ultrasound, name) for name in (field.partition(".")[2] for field in ONE_SCANNER)}
-        return Transducer.model_validate(settings | one)
-
     def model_post_init(self, context: Any) -> None:
-        """Keep the overrides, for the commands that the report shows."""
+        """Keep the overrides, which the steps pass on to their verbs."""
         if context:
             self._overrides = context["overrides"]

@@ -14,6 +14,7 @@ from recon.tracking import networks
 from sonotwin import pipeline
 from sonotwin.cli import main
 from sonotwin.config import compose, load
+from sonotwin.demo_steps import VerbStep, verb_steps
 from sonotwin.pipeline import Step
 from sonotwin.verbs.demo import Config, commands, followed, looked_inside
 
@@ -212,6 +213,30 @@ def test_the_commands_of_the_sweep_are_those_of_the_verbs(tmp_path):
     assert all("tissue_m_s=1450" in line for line in lines[-4:-2]), "volume and masses at one speed"
     assert "frames=24" in lines[-2] and f"capture={tmp_path}/film/capture" in lines[-1]
     assert "lag_s=0.0503" in lines[-3] and "path=raster" in lines[8] and "clocks.lag_s=0.08" in lines[8]
+
+
+@pytest.mark.parametrize(
+    "overrides", [[], ["scene=two_objects", "poses.count=4", "shooting.gain=2", "seed=3", "pose_noise.turn_deg=0.1"]]
+)
+def test_each_verb_gets_the_demonstrations_settings(overrides, tmp_path):
+    """The demonstration's fields reach each verb, whose own YAML has the same defaults, but for those that a step sets."""
+    config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
+    own = {
+        "board": {"scene", "patterns", "cameras", "out"},
+        "render": {"poses", "out"},
+        "surface": {"patterns", "out"},
+        "film": {"path", "out"},
+        "wires": {"scene", "path", "ultrasound", "out"},
+        "bottom": {"scene", "path", "ultrasound", "out"},
+    }
+    for step in verb_steps(tmp_path, config, overrides):
+        if not isinstance(step, VerbStep):
+            continue
+        verb, *fields = step.words(0.05)
+        model = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}").Config
+        given = load(verb, fields, model)
+        shared = set(model.model_fields) & set(Config.model_fields) - own.get(step.name, {"out"})
+        assert {name: getattr(given, name) for name in shared} == {name: getattr(config, name) for name in shared}, step.name
 
 
 @pytest.mark.parametrize(("overrides", "inside"), [([], True), (["path=none"], False), (["scene=sphere"], False)])

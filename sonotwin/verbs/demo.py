@@ -13,50 +13,21 @@ started again.
     sonotwin demo scene=sphere patterns=gray_surface out=outputs/sphere
 """
 
-import json
-import os
-import shutil
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import trimesh
 from rich.console import Console
 
-from recon.capture import probe_files, sweep_part
-from recon.capture.surface_part import read_patterns
-from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown
-from recon.freehand import sequences
-from recon.probe_calibration import sound_in_water
 from recon.tracking import networks
 from sonotwin import pipeline
-from sonotwin.config import folder as conf
-from sonotwin.demo_commands import commands
-from sonotwin.demo_config import BOARD, BOARD_PATTERNS, CALIBRATION, WATER_C, Config
+from sonotwin.demo_config import Config
+from sonotwin.demo_steps import Figures, commands, compared, verb_steps
 from sonotwin.pipeline import Step
-from sonotwin.verbs import (
-    calibrate_optics,
-    calibrate_probe,
-    evaluate,
-    film,
-    freehand,
-    measure_lag,
-    render,
-    segment,
-    surface,
-    sweep,
-    track,
-)
-from twin.evaluation import sweep_errors, track_errors
+from sonotwin.verbs import surface
+from twin.evaluation import sweep_errors
 from twin.evaluation.surface_errors import things
 from twin.reports import demo_report, sweep_report, track_report
-from twin.ultrasound.probe_path import Bob, WirePath
 
-Figures = Mapping[str, float | int]
-
-MESHES = ("surface.ply", "surface.glb")
 OUTPUTS = (
     ("report.html", "this page"),
     ("surface.ply", "the surface: triangles, normals and predicted sigma of each vertex, in mm"),
@@ -89,139 +60,16 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     if config.film_frames:
         networks.load()  # before minutes of work
-    steps = (calibration_steps(config) if config.poses else []) + surface_steps(config)
-    steps += sweep_steps(config) if config.looks_inside else []
-    steps += [*(film_steps(config) if config.film_frames else []), telling_step(config)]
+    steps = [each if isinstance(each, Step) else each.step() for each in verb_steps(config.out, config, config._overrides)]
     found = pipeline.play(
-        steps, config.out, config.model_dump(mode="json"), lambda text: console.print(text, style="bold cyan", markup=False)
+        [*steps, telling_step(config)],
+        config.out,
+        config.model_dump(mode="json"),
+        lambda text: console.print(text, style="bold cyan", markup=False),
     )
     console.print()
     for line in summary(config, found):
         console.print(line, markup=False)
-
-
-def calibration_steps(config: Config) -> list[Step]:
-    """From a board in some poses to a calibration. The board's images stay where they are if they are the same."""
-    assert config.poses is not None
-
-    def rendering(folder: Path, _: Figures) -> Figures:
-        patterns = read_patterns(conf() / "patterns" / f"{BOARD_PATTERNS}.yaml")
-        shooting = config.shooting.model_copy(update={"exposure_s": None})  # that of the scene is not that of the board
-        render.run(config.rendering(BOARD | {"patterns": patterns, "shooting": shooting, "out": config.board}))
-        return {}
-
-    def calibration(folder: Path, _: Figures) -> Figures:
-        board = config.board
-        calibrate_optics.run(calibrate_optics.Config(capture=board / "capture", truth=board / "truth", out=folder / CALIBRATION))
-        return metrics.read(folder / CALIBRATION / metrics.FILE)
-
-    return [
-        Step("board", f"render the calibration board in {config.poses.count} poses", rendering),
-        Step("calibrate", "calibrate cameras and projector", calibration, (CALIBRATION,)),
-    ]
-
-
-def surface_steps(config: Config) -> list[Step]:
-    """From a scene to the report of its measured surface."""
-    camera = config.cameras[0]
-
-    def rendering(folder: Path, _: Figures) -> Figures:
-        render.run(config.rendering({"poses": None}))
-        return {}
-
-    def reconstruction(folder: Path, _: Figures) -> Figures:
-        optics = folder / CALIBRATION / calibrate_optics.OPTICS if config.poses else None
-        surface.run(surface.Config(capture=folder / "capture", calibration=optics, out=folder / "surface", camera=camera))
-        for name in MESHES:
-            _offer(folder / "surface" / name, folder / name)
-        return metrics.read(folder / "surface" / metrics.FILE)
-
-    def comparison(folder: Path, _: Figures) -> Figures:
-        places = {"surface": folder / "surface", "truth": folder / "truth", "out": folder / "evaluation"}
-        evaluate.run(evaluate.Config(**places, camera=camera))
-        return metrics.read(folder / "evaluation" / metrics.FILE)
-
-    return [
-        Step("render", f"render {config.patterns.count} images of the scene and its truth", rendering, ("capture", "truth")),
-        Step("surface", "reconstruct the surface from the images", reconstruction, ("surface", *MESHES)),
-        # its prediction is of the points that have a truth, by the true normals
-        Step("evaluate", "compare it with the truth", comparison, ("evaluation",), refines=("predicted_rms_mm",)),
-    ]
-
-
-def sweep_steps(config: Config) -> list[Step]:
-    """From the probe's calibration to the tumours under the surface, and how far they are from the truth."""
-
-    def wires(folder: Path, _: Figures) -> Figures:
-        path = WirePath(count=config.wires)
-        sweep.run(config.sweeping(folder / "wires", scene={"kind": "crosswire"}, path=path, ultrasound=config.in_water()))
-        return {}
-
-    def probe(folder: Path, _: Figures) -> Figures:
-        places = {"capture": folder / "wires" / "capture", "out": folder / "probe"}
-        calibrate_probe.run(calibrate_probe.Config(rig=config.rig, temperature_c=WATER_C, **places))
-        return _named("probe", metrics.read(folder / "probe" / metrics.FILE))
-
-    def bottom(folder: Path, _: Figures) -> Figures:
-        path = Bob(seconds=config.bottom_s)
-        sweep.run(config.sweeping(folder / "bottom", scene={"kind": "tank"}, path=path, ultrasound=config.in_water()))
-        return {}
-
-    def lag(folder: Path, _: Figures) -> Figures:
-        measure_lag.run(measure_lag.Config(capture=folder / "bottom" / "capture", out=folder / "lag"))
-        return _named("lag", metrics.read(folder / "lag" / metrics.FILE))
-
-    def sweeping(folder: Path, _: Figures) -> Figures:
-        sweep.run(config.sweeping(folder / "sweep"))
-        return {}
-
-    def volume(folder: Path, _: Figures) -> Figures:
-        freehand.run(freehand.Config(out=folder / "volume", tissue_m_s=config.tissue_m_s, **_placed(folder)))
-        return _named("volume", metrics.read(folder / "volume" / metrics.FILE))
-
-    def tumours(folder: Path, _: Figures) -> Figures:
-        places = {"surface": folder / "surface" / "surface.ply", "out": folder / "tumours"}
-        segment.run(segment.Config(kind="masses", tissue_m_s=config.tissue_m_s, **places, **_placed(folder)))
-        return {}
-
-    def comparison(folder: Path, _: Figures) -> Figures:
-        findings, truth = compared(folder)
-        captured, placed = sweep_part.read_sweep(folder / "sweep" / "capture"), _placed(folder)
-        calibration = probe_files.read(placed["probe"])
-        shown = sequences.target_from_pixel(sound_in_water.for_tissue(calibration, truth.transducer.assumed_speed))
-        apart = sweep_errors.placement(captured.poses(placed["lag_s"]) @ shown, truth)
-        figures = sweep_errors.measure(findings, truth, metrics.read(folder / "tumours" / metrics.FILE))
-        return figures | {"sweep_placement_rms_mm": float(np.sqrt(np.nanmean(apart**2)))}
-
-    return [
-        Step("wires", f"render {config.wires} B-scans of crossed wires", wires, ("wires",)),
-        Step("probe", "calibrate the ultrasound probe", probe, ("probe",)),
-        Step("bottom", "render B-scans of a flat bottom, up and down", bottom, ("bottom",)),
-        Step("lag", "measure by how much the scanner lags behind the cameras", lag, ("lag",)),
-        Step("sweep", "render a sweep over the scene and its truth", sweeping, ("sweep",)),
-        Step("volume", "put its B-scans into a volume", volume, ("volume",)),
-        Step("tumours", "find tumours in its B-scans", tumours, ("tumours",)),
-        Step("compare", "compare them with the truth", comparison),
-    ]
-
-
-def film_steps(config: Config) -> list[Step]:
-    """From a film of the moving target to its poses, and how far they are from the truth."""
-
-    def filming(folder: Path, _: Figures) -> Figures:
-        film.run(config.filming(folder / "film"))
-        return {}
-
-    def tracking(folder: Path, _: Figures) -> Figures:
-        track.run(track.Config(rig=config.rig, capture=folder / "film" / "capture", out=folder / "track"))
-        tracked = track_report.read(folder / "film", folder / "track")
-        own = _named("track", metrics.read(folder / "track" / metrics.FILE))
-        return own | track_errors.measure(tracked.errors, tracked.truth)
-
-    return [
-        Step("film", f"render {config.film_frames} pairs of frames of the moving target", filming, ("film",)),
-        Step("track", "track the target through them, and compare with the truth", tracking, ("track",)),
-    ]
 
 
 def telling_step(config: Config) -> Step:
@@ -241,14 +89,6 @@ def telling_step(config: Config) -> Step:
         return {}
 
     return Step("report", "write the report", telling, ("report.html",))
-
-
-def compared(folder: Path) -> tuple[list[sweep_errors.Finding], sweep_errors.SweepTruth]:
-    """The true tumours with what was found of each, and the truth."""
-    truth = sweep_errors.read_truth(folder / "sweep" / "truth")
-    count = int(metrics.read(folder / "tumours" / metrics.FILE)["masses"])
-    found = [trimesh.load_mesh(folder / "tumours" / f"mass{number}.ply", process=False) for number in range(count)]
-    return sweep_errors.compare(found, truth), truth
 
 
 def summary(config: Config, found: Metrics) -> list[str]:
@@ -311,24 +151,3 @@ def followed(found: Metrics) -> list[str]:
         f"tracked     the target in {found['track_found']} of {found['track_frames']} frames, in {found['track_visible_found']} "
         f"of {found['track_visible']} that show it whole; off by {medians} in the median, 95 % by less than {most}"
     ]
-
-
-def _placed(folder: Path) -> dict[str, Any]:
-    """What places a sweep's B-scans in the world: fields of `freehand` and `segment`."""
-    lag_s = json.loads((folder / "lag" / measure_lag.LAG).read_text(encoding="utf-8"))["lag_s"]
-    return {"capture": folder / "sweep" / "capture", "probe": folder / "probe" / calibrate_probe.PROBE, "lag_s": lag_s}
-
-
-def _named(step: str, figures: Metrics) -> Metrics:
-    """Figures of a step by names that no other has, less its seconds: `frames` of the probe is `probe_frames`."""
-    kept = {name.removeprefix(f"{step}_"): value for name, value in figures.items() if not name.startswith("seconds_")}
-    return {f"{step}_{name}": value for name, value in kept.items()}
-
-
-def _offer(source: Path, path: Path) -> None:
-    """Give a file a second place, without a second copy where the file system can do that."""
-    with atomic.new_file(path) as temporary:
-        try:
-            os.link(source, temporary)
-        except OSError:
-            shutil.copyfile(source, temporary)

@@ -36,7 +36,7 @@ class Config(film_session.Filming):
     rig: Rig
     out: Path
     pixels: Literal["sketch", "full"] = "sketch"
-    quality: Quality = Quality()
+    quality: Quality = Quality(window=8)
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
 

@@ -1,0 +1,240 @@
+"""The steps of a demonstration: each a verb with its overrides, so that running it and printing its command line are one."""
+
+import json
+import os
+import shlex
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from pydantic import BaseModel
+
+from recon.capture import probe_files, sweep_part
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics
+from recon.freehand import sequences
+from recon.probe_calibration import sound_in_water
+from sonotwin.config import load
+from sonotwin.demo_config import BOARD_PATTERNS, CALIBRATION, ONE_SCANNER, WATER_C, Config
+from sonotwin.pipeline import Step
+from sonotwin.verbs import calibrate_optics, calibrate_probe, film, measure_lag, render, sweep, track
+from twin.evaluation import sweep_errors, track_errors
+from twin.reports import track_report
+
+Figures = Mapping[str, float | int]
+
+MESHES = ("surface.ply", "surface.glb")
+LAG = "lag_s=MEASURED"  # stands for the lag that an earlier step measured
+
+
+@dataclass(frozen=True)
+class VerbStep:
+    """A step that a verb does."""
+
+    name: str  # in one word
+    does: str  # what a person reads while it runs
+    verb: str
+    fields: Sequence[str]  # overrides
+    figures: Callable[[Path], Figures] = field(default=lambda folder: {})  # of the demonstration's folder, after the verb
+    makes: Sequence[str] = ()  # files and folders at the top of the folder
+    refines: Sequence[str] = ()  # figures of earlier steps that it measures better
+
+    def words(self, lag_s: float) -> list[str]:
+        """The command line after `sonotwin`."""
+        return [self.verb, *(f"lag_s={lag_s:.15g}" if each == LAG else each for each in self.fields)]
+
+    def step(self) -> Step:
+        """The step for `pipeline.play`."""
+        return Step(self.name, self.does, self._work, self.makes, self.refines)
+
+    def _work(self, folder: Path, _: Figures) -> Figures:
+        verb, *fields = self.words(measured_lag(folder) if LAG in self.fields else np.nan)
+        module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
+        module.run(load(verb, fields, module.Config))
+        return self.figures(folder)
+
+
+def commands(folder: Path, config: Config, overrides: Sequence[str], lag_s: float) -> list[str]:
+    """The command lines that do the same at once and step by step, with the settings that `sonotwin demo` was given."""
+    at_once = ["demo", *_given(overrides), f"out={folder}"]
+    lines = [at_once, *(step.words(lag_s) for step in verb_steps(folder, config, overrides) if isinstance(step, VerbStep))]
+    return [shlex.join(["sonotwin", *line]) for line in lines]
+
+
+def verb_steps(folder: Path, config: Config, overrides: Sequence[str]) -> list[VerbStep | Step]:
+    """All steps but the report, in order."""
+    given = _given(overrides)
+    steps: list[VerbStep | Step] = [*(calibration_steps(folder, config, given) if config.poses else [])]
+    steps += surface_steps(folder, config, given)
+    steps += sweep_steps(folder, config, given) if config.looks_inside else []
+    return steps + (film_steps(folder, config, given) if config.film_frames else [])
+
+
+def calibration_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbStep]:
+    """From a board in some poses to a calibration. The board's images stay where they are if they are the same."""
+    assert config.poses is not None
+    board = config.board
+    poses = _unless_given(given, "poses", "demo")
+    own = [each for each in _of(given, render.Config, without=("scene", "patterns", "cameras")) if not _sets_exposure(each)]
+    rendering = ["scene=board", *poses, f"patterns={BOARD_PATTERNS}", "cameras=[cam1,cam2]", *own, f"out={board}"]
+    calibrating = [f"capture={board / 'capture'}", f"truth={board / 'truth'}", f"out={folder / CALIBRATION}"]
+    return [
+        VerbStep("board", f"render the calibration board in {config.poses.count} poses", "render", rendering),
+        VerbStep(
+            "calibrate", "calibrate cameras and projector", "calibrate-optics", calibrating, _figures(CALIBRATION), (CALIBRATION,)
+        ),
+    ]
+
+
+def surface_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbStep]:
+    """From a scene to the errors of its measured surface."""
+    camera = f"camera={config.cameras[0]}"
+    optics = [f"calibration={folder / CALIBRATION / calibrate_optics.OPTICS}"] if config.poses else []
+    rendering = [*_of(given, render.Config, without=("poses",)), f"out={folder}"]
+    measuring = [f"capture={folder / 'capture'}", *optics, camera, f"out={folder / 'surface'}"]
+    comparing = [f"surface={folder / 'surface'}", f"truth={folder / 'truth'}", camera, f"out={folder / 'evaluation'}"]
+    images = f"render {config.patterns.count} images of the scene and its truth"
+    return [
+        VerbStep("render", images, "render", rendering, makes=("capture", "truth")),
+        VerbStep("surface", "reconstruct the surface from the images", "surface", measuring, _with_meshes, ("surface", *MESHES)),
+        # its prediction is of the points that have a truth, by the true normals
+        VerbStep(
+            "evaluate",
+            "compare it with the truth",
+            "evaluate",
+            comparing,
+            _figures("evaluation"),
+            ("evaluation",),
+            refines=("predicted_rms_mm",),
+        ),
+    ]
+
+
+def sweep_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbStep | Step]:
+    """From the probe's calibration to the tumours under the surface, and how far they are from the truth."""
+    scanner = [override for override in given if override.startswith(ONE_SCANNER)]
+    tank = ["ultrasound=water", *scanner, *_of(given, sweep.Config, without=("scene", "path", "ultrasound"))]
+    rig = [override for override in given if override.startswith("rig")]
+    path = _unless_given(given, "path", "raster")
+    probe = f"probe={folder / 'probe' / calibrate_probe.PROBE}"
+    placed = [f"capture={folder / 'sweep' / 'capture'}", probe, LAG, f"tissue_m_s={config.tissue_m_s:.15g}"]
+    wires = ["scene=crosswire", "path=wire", f"path.count={config.wires}", *tank, f"out={folder / 'wires'}"]
+    calibrating = [*rig, f"capture={folder / 'wires' / 'capture'}", f"temperature_c={WATER_C:.15g}", f"out={folder / 'probe'}"]
+    bottom = ["scene=tank", "path=bob", f"path.seconds={config.bottom_s:.15g}", *tank, f"out={folder / 'bottom'}"]
+    timing = [f"capture={folder / 'bottom' / 'capture'}", f"out={folder / 'lag'}"]
+    sweeping = [*path, *_of(given, sweep.Config), f"out={folder / 'sweep'}"]
+    finding = [*placed, f"surface={folder / 'surface' / 'surface.ply'}", f"out={folder / 'tumours'}"]
+    return [
+        VerbStep("wires", f"render {config.wires} B-scans of crossed wires", "sweep", wires, makes=("wires",)),
+        VerbStep("probe", "calibrate the ultrasound probe", "calibrate-probe", calibrating, _named("probe"), ("probe",)),
+        VerbStep("bottom", "render B-scans of a flat bottom, up and down", "sweep", bottom, makes=("bottom",)),
+        VerbStep("lag", "measure the scanner's lag behind the cameras", "measure-lag", timing, _named("lag"), ("lag",)),
+        VerbStep("sweep", "render a sweep over the scene and its truth", "sweep", sweeping, makes=("sweep",)),
+        VerbStep(
+            "volume",
+            "put its B-scans into a volume",
+            "freehand",
+            [*placed, f"out={folder / 'volume'}"],
+            _named("volume"),
+            ("volume",),
+        ),
+        VerbStep("tumours", "find tumours in its B-scans", "segment", finding, makes=("tumours",)),
+        Step("compare", "compare them with the truth", lambda folder, _: tumour_errors(folder)),
+    ]
+
+
+def film_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbStep]:
+    """From a film of the moving target to its poses, and how far they are from the truth."""
+    filming = [*_of(given, film.Config, without=("path", "quality")), f"frames={config.film_frames}", f"out={folder / 'film'}"]
+    rig = [override for override in _of(given, track.Config) if override.startswith("rig")]
+    tracking = [*rig, f"capture={folder / 'film' / 'capture'}", f"out={folder / 'track'}"]
+    frames = f"render {config.film_frames} pairs of frames of the moving target"
+    return [
+        VerbStep("film", frames, "film", filming, makes=("film",)),
+        VerbStep(
+            "track", "track the target through them, and compare with the truth", "track", tracking, _pose_errors, ("track",)
+        ),
+    ]
+
+
+def tumour_errors(folder: Path) -> Metrics:
+    """Figures of the tumours found against the true ones, and of where the sweep's pixels are put."""
+    findings, truth = compared(folder)
+    captured = sweep_part.read_sweep(folder / "sweep" / "capture")
+    calibration = probe_files.read(folder / "probe" / calibrate_probe.PROBE)
+    shown = sequences.target_from_pixel(sound_in_water.for_tissue(calibration, truth.transducer.assumed_speed))
+    apart = sweep_errors.placement(captured.poses(measured_lag(folder)) @ shown, truth)
+    figures = sweep_errors.measure(findings, truth, metrics.read(folder / "tumours" / metrics.FILE))
+    return figures | {"sweep_placement_rms_mm": float(np.sqrt(np.nanmean(apart**2)))}
+
+
+def compared(folder: Path) -> tuple[list[sweep_errors.Finding], sweep_errors.SweepTruth]:
+    """The true tumours with what was found of each, and the truth."""
+    truth = sweep_errors.read_truth(folder / "sweep" / "truth")
+    count = int(metrics.read(folder / "tumours" / metrics.FILE)["masses"])
+    found = [trimesh.load_mesh(folder / "tumours" / f"mass{number}.ply", process=False) for number in range(count)]
+    return sweep_errors.compare(found, truth), truth
+
+
+def measured_lag(folder: Path) -> float:
+    """The scanner's lag, s, as a step before measured it."""
+    return json.loads((folder / "lag" / measure_lag.LAG).read_text(encoding="utf-8"))["lag_s"]
+
+
+def _figures(part: str) -> Callable[[Path], Metrics]:
+    return lambda folder: metrics.read(folder / part / metrics.FILE)
+
+
+def _named(part: str) -> Callable[[Path], Metrics]:
+    """Figures of a step by names that no other has, less its seconds: `frames` of the probe is `probe_frames`."""
+
+    def figures(folder: Path) -> Metrics:
+        read = metrics.read(folder / part / metrics.FILE)
+        kept = {name.removeprefix(f"{part}_"): value for name, value in read.items() if not name.startswith("seconds_")}
+        return {f"{part}_{name}": value for name, value in kept.items()}
+
+    return figures
+
+
+def _with_meshes(folder: Path) -> Metrics:
+    for name in MESHES:
+        _offer(folder / "surface" / name, folder / name)
+    return _figures("surface")(folder)
+
+
+def _pose_errors(folder: Path) -> Metrics:
+    tracked = track_report.read(folder / "film", folder / "track")
+    return _named("track")(folder) | track_errors.measure(tracked.errors, tracked.truth)
+
+
+def _offer(source: Path, path: Path) -> None:
+    """Give a file a second place, without a second copy where the file system can do that."""
+    with atomic.new_file(path) as temporary:
+        try:
+            os.link(source, temporary)
+        except OSError:
+            shutil.copyfile(source, temporary)
+
+
+def _given(overrides: Sequence[str]) -> list[str]:
+    return [override for override in overrides if not override.startswith("out=")]
+
+
+def _unless_given(given: Sequence[str], group: str, choice: str) -> list[str]:
+    """The demonstration's own choice of a group, where another verb has another, unless one was given."""
+    return [] if any(override.startswith(f"{group}=") for override in given) else [f"{group}={choice}"]
+
+
+def _sets_exposure(override: str) -> bool:
+    """Whether an override sets the exposure of the scene, which is not that of the board."""
+    return override.lstrip("+~").startswith("shooting.exposure_s")
+
+
+def _of(overrides: Sequence[str], model: type[BaseModel], without: Sequence[str] = ()) -> list[str]:
+    """Those of the overrides that are of a model's fields."""
+    wanted = set(model.model_fields) - set(without)
+    return [override for override in overrides if override.lstrip("+~").partition("=")[0].partition(".")[0] in wanted]
