@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from recon.errors import InputError
-from recon.files import atomic, npz, opencv_storage
+from recon.files import npz, opencv_storage
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
 from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
@@ -76,14 +76,8 @@ def write(path: Path, calibration: Calibration) -> None:
         storage.write("camera_from_world", camera.camera_from_world)
         storage.endWriteStruct()
     if calibration.uncertainty is not None:
-        storage.startWriteStruct("parameters", cv2.FileNode_SEQ)
-        for name in calibration.uncertainty.names:
-            storage.write("", name)
-        storage.endWriteStruct()
-        storage.write("covariance", calibration.uncertainty.covariance)
-    text = storage.releaseAndGetString()
-    with atomic.new_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        opencv_storage.write_covariance(storage, calibration.uncertainty.names, calibration.uncertainty.covariance)
+    opencv_storage.save(path, storage)
 
 
 def _own(path: Path, storage: cv2.FileStorage) -> Calibration:
@@ -113,13 +107,11 @@ def _own(path: Path, storage: cv2.FileStorage) -> Calibration:
 
 
 def _uncertainty(path: Path, storage: cv2.FileStorage, cameras: Mapping[str, Camera]) -> Uncertainty | None:
-    node = storage.getNode("parameters")
-    if node.empty() and storage.getNode("covariance").empty():
+    names = opencv_storage.names(storage)
+    if names is None:
         return None
-    entries = [node.at(i) for i in range(node.size())] if node.isSeq() else []
-    if not entries or not all(entry.isString() for entry in entries):
+    if not names:
         raise InputError(f"{path}: parameters: expected names of the covariance's parameters, found something else")
-    names = tuple(entry.string() for entry in entries)
     known = {f"{device}.{name}" for device in cameras for name in MATRIX + DISTORTION + (MOTION if device != WORLD else ())}
     wrong = next((name for k, name in enumerate(names) if name not in known or name in names[:k]), None)
     if wrong is not None:

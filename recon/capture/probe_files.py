@@ -55,14 +55,8 @@ def write(path: Path, calibration: ProbeCalibration) -> None:
     storage.write("scale", np.asarray(calibration.scale, float).reshape(1, 2))
     storage.write("speed_m_s", float(calibration.speed_m_s))
     if calibration.uncertainty is not None:
-        storage.startWriteStruct("parameters", cv2.FileNode_SEQ)
-        for name in calibration.uncertainty.names:
-            storage.write("", name)
-        storage.endWriteStruct()
-        storage.write("covariance", calibration.uncertainty.covariance)
-    text = storage.releaseAndGetString()
-    with atomic.new_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        opencv_storage.write_covariance(storage, calibration.uncertainty.names, calibration.uncertainty.covariance)
+    opencv_storage.save(path, storage)
 
 
 def write_authors(path: Path, calibration: ProbeCalibration) -> None:
@@ -116,11 +110,9 @@ def _speed(path: Path, storage: cv2.FileStorage) -> float:
 
 
 def _uncertainty(path: Path, storage: cv2.FileStorage) -> Uncertainty | None:
-    node = storage.getNode("parameters")
-    if node.empty() and storage.getNode("covariance").empty():
+    names = opencv_storage.names(storage)
+    if names is None:
         return None
-    entries = [node.at(i) for i in range(node.size())] if node.isSeq() else []
-    names = tuple(entry.string() for entry in entries if entry.isString())
-    if not names or len(names) < len(entries) or len(set(names)) < len(names) or not set(names) <= set(PARAMETERS):
+    if not names or len(set(names)) < len(names) or not set(names) <= set(PARAMETERS):
         raise InputError(f"{path}: parameters: expected some of {' '.join(PARAMETERS)}, each once, found something else")
     return Uncertainty(names, opencv_storage.covariance(path, storage, len(names)))

@@ -1,5 +1,6 @@
 """OpenCV FileStorage as calibrations are kept in it: opened, and its matrices read, or refused in one line."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -7,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
+from recon.files import atomic
 
 Array = NDArray[np.float64]
 
@@ -44,6 +46,31 @@ def matrix(path: Path, name: str, node: cv2.FileNode) -> Array:
     if value is None:
         raise InputError(f"{path}: {name}: expected a matrix, found something else")
     return np.asarray(value, float)
+
+
+def names(storage: cv2.FileStorage) -> tuple[str, ...] | None:
+    """Names of a covariance's parameters; empty where they are no texts, None where there are neither names nor covariance."""
+    node = storage.getNode("parameters")
+    if node.empty() and storage.getNode("covariance").empty():
+        return None
+    entries = [node.at(i) for i in range(node.size())] if node.isSeq() else []
+    return tuple(entry.string() for entry in entries) if all(entry.isString() for entry in entries) else ()
+
+
+def write_covariance(storage: cv2.FileStorage, names: Sequence[str], covariance: Array) -> None:
+    """Write a covariance with the names of its parameters."""
+    storage.startWriteStruct("parameters", cv2.FileNode_SEQ)
+    for name in names:
+        storage.write("", name)
+    storage.endWriteStruct()
+    storage.write("covariance", covariance)
+
+
+def save(path: Path, storage: cv2.FileStorage) -> None:
+    """Write what was gathered in memory to a file, whole or not at all."""
+    text = storage.releaseAndGetString()
+    with atomic.new_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def covariance(path: Path, storage: cv2.FileStorage, count: int) -> Array:

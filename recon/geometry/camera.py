@@ -22,7 +22,7 @@ ROTATION = 1.1e-5  # of a rotation's products: far stricter than a pose's, as al
 NEWTON_STEPS = 20
 NEWTON_TOLERANCE = 1e-13  # normalised image coordinates: far below a thousandth of a pixel at any focal length
 ACCEPTED = 1e-10  # the same, of a root that rounding keeps from the tolerance
-FEW = 64  # points: threads take longer to wake than one core takes for these
+FEW = 16  # points: threads take longer to wake than one core takes for these
 SLOPE_STEP = 1e-6  # normalised image coordinates: to each side, of the Jacobian by central differences
 
 
@@ -90,8 +90,9 @@ class Camera:
         flat = pixels.reshape(-1, 2)
         y = (flat[:, 1] - self.matrix[1, 2]) / self.matrix[1, 1]
         x = (flat[:, 0] - self.matrix[0, 2] - self.matrix[0, 1] * y) / self.matrix[0, 0]
-        invert = _undistort_few if len(flat) <= FEW else _undistort_all
-        return invert(np.stack([x, y], axis=-1), self.coefficients).reshape(pixels.shape)
+        if 0 < len(flat) <= FEW:
+            return np.reshape([_undistort(*point, self.coefficients) for point in zip(x, y, strict=True)], pixels.shape)
+        return _undistort_all(np.stack([x, y], axis=-1), self.coefficients).reshape(pixels.shape)
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Directions of the rays through pixels : (..., 2), as unit vectors : (..., 3) in the world."""
@@ -155,7 +156,7 @@ def _slopes(x, y, k):
     )
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy")
 def _undistort(u, v, k):
     """Normalised point whose distortion is (u, v), by Newton's method; NaN where there is none."""
     x, y = u, v
@@ -181,13 +182,5 @@ def _undistort(u, v, k):
 def _undistort_all(points, k):
     result = np.empty_like(points)
     for i in prange(points.shape[0]):
-        result[i, 0], result[i, 1] = _undistort(points[i, 0], points[i, 1], k)
-    return result
-
-
-@njit(error_model="numpy")
-def _undistort_few(points, k):
-    result = np.empty_like(points)
-    for i in range(points.shape[0]):
         result[i, 0], result[i, 1] = _undistort(points[i, 0], points[i, 1], k)
     return result
