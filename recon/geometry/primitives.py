@@ -88,8 +88,7 @@ def fit_plane(points: ArrayLike) -> Fit[Plane]:
     ValueError
         If there are too few points, or they are not finite.
     """
-    points = _checked(points, 4)
-    middle = points.mean(axis=0)
+    points, middle = _checked(points, 4)
     _, _, directions = np.linalg.svd(points - middle, full_matrices=False)
     normal = directions[2] * (-1 if directions[2] @ middle > 0 else 1)
     residuals = (points - middle) @ normal
@@ -108,8 +107,7 @@ def fit_sphere(points: ArrayLike) -> Fit[Sphere]:
         If there are too few points, they are not finite, or lie in a plane as far as their scatter tells: if a sphere doesn't
         fit them significantly better (F test of the one parameter more, 5 standard deviations).
     """
-    points = _checked(points, 5)
-    middle = points.mean(axis=0)
+    points, middle = _checked(points, 5)
     local = points - middle
     system = np.column_stack([2 * local, np.ones(len(local))])
     (x, y, z, w), _, rank, _ = np.linalg.lstsq(system, (local**2).sum(axis=1), rcond=1e-9)
@@ -142,8 +140,7 @@ def fit_cylinder(points: ArrayLike) -> Fit[Cylinder]:
     ValueError
         If there are too few points, or they are not finite.
     """
-    points = _checked(points, 6)
-    middle = points.mean(axis=0)
+    points, middle = _checked(points, 6)
     local = points - middle
     few = local[:: max(1, len(local) // START_POINTS)]
     axis, centre, radius = min((_circle_along(few, axis) for axis in _half_sphere(AXES_TRIED)), key=lambda start: start[3])[:3]
@@ -202,8 +199,9 @@ def _half_sphere(n: int) -> Array:
     return np.column_stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z])
 
 
-def _checked(points: ArrayLike, least: int) -> Array:
+def _checked(points: ArrayLike, least: int) -> tuple[Array, Array]:
+    """The points as an array, and their middle : (3,)."""
     points = np.asarray(points, float)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < least or not np.isfinite(points).all():
         raise ValueError(f"points: expected at least {least} finite points (n, 3), found an array of shape {points.shape}")
-    return points
+    return points, points.mean(axis=0)

@@ -8,7 +8,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from recon.model.rig import Part
 
 Axis = Literal["columns", "rows"]  # which projector coordinate the pattern encodes
 Unwrapping = Literal["centre_line", "gray", "heterodyne"]
@@ -16,12 +18,6 @@ Image = NDArray[np.float32]
 Side = Annotated[int, Field(ge=8, le=20000)]  # px
 
 MISPLACED = 0.05  # projector px that binary fringes may lie off their origin
-
-
-class Part(BaseModel):
-    """Base of the parts: immutable, refuses unknown keys and numbers that are none."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Fringes(Part):
@@ -149,7 +145,7 @@ class Uniform(Part):
 AnyPart = Annotated[Fringes | GrayCode | CentreLine | Uniform, Field(discriminator="kind")]
 
 
-class Patterns(BaseModel):
+class Patterns(Part):
     """A sequence of patterns and how its fringes are unwrapped.
 
     Raises
@@ -157,8 +153,6 @@ class Patterns(BaseModel):
     pydantic.ValidationError
         If a key is unknown, or the parts don't serve the unwrapping that is asked for.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     projector_size: tuple[Side, Side]  # width, height, px
     unwrap: Unwrapping

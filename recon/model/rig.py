@@ -21,9 +21,9 @@ FOCAL_TOLERANCE = 0.05  # a lens's nominal focal length against the calibrated o
 
 
 class Part(BaseModel):
-    """Base of the rig's parts: immutable, and refuses unknown keys."""
+    """Base of what is read from files and settings: immutable, refuses unknown keys and numbers that are not finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Pose(Part):
