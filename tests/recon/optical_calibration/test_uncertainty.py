@@ -85,6 +85,14 @@ def test_applying_follows_the_definition(optics):
     assert found["cam1"].distortion[1] == optics.cameras["cam1"].distortion[1] + 0.5
 
 
+def overlaid(optics, drawn, volume, pair):
+    """Each drawn cloud with the best rigid motion that lays it over the true one."""
+    pixels = [optics.cameras[name].project(volume) for name in pair]
+    for sample in drawn:
+        cloud = meet(*(sample.cameras[name] for name in pair), pixels, volume)
+        yield cloud, *onto(volume, cloud)
+
+
 @pytest.mark.parametrize("pair", [("cam1", "projector"), ("cam2", "projector"), ("cam1", "cam2")])
 def test_points_scatter_as_predicted(optics, drawn, volume, pair):
     points = volume[::7]
@@ -96,12 +104,7 @@ def test_points_scatter_as_predicted(optics, drawn, volume, pair):
 def test_shapes_scatter_as_predicted(optics, drawn, volume):
     """Each drawn cloud is laid over the true one by the best rigid motion first."""
     pair = ("cam1", "projector")
-    pixels = [optics.cameras[name].project(volume) for name in pair]
-    left = []
-    for sample in drawn:
-        cloud = meet(*(sample.cameras[name] for name in pair), pixels, volume)
-        turn, middle, wanted = onto(volume, cloud)
-        left.append(turn.apply(cloud - middle) + wanted - volume)
+    left = [turn.apply(cloud - middle) + wanted - volume for cloud, turn, middle, wanted in overlaid(optics, drawn, volume, pair)]
     predicted = uncertainty.shape(optics, *pair, volume[::7], volume)
     assert_same(np.array(left)[:, ::7], predicted)
     absolute = uncertainty.triangulation(optics, *pair, volume[::7])
@@ -110,11 +113,8 @@ def test_shapes_scatter_as_predicted(optics, drawn, volume):
 
 def test_lengths_scatter_as_predicted(optics, drawn, volume):
     pair = ("cam1", "projector")
-    pixels = [optics.cameras[name].project(volume) for name in pair]
     ratios = []
-    for sample in drawn:
-        cloud = meet(*(sample.cameras[name] for name in pair), pixels, volume)
-        turn, middle, wanted = onto(volume, cloud)
+    for cloud, turn, middle, wanted in overlaid(optics, drawn, volume, pair):
         ratios.append(((cloud - middle) * turn.inv().apply(volume - wanted)).sum() / ((volume - wanted) ** 2).sum())
     assert np.std(ratios) == pytest.approx(uncertainty.scale(optics, *pair, volume), rel=4 / np.sqrt(2 * DRAWS))
 
