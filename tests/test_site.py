@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -79,7 +80,7 @@ def test_files_and_modules_that_pages_name_exist(page):
             assert (ROOT / path).is_file(), path
     for name in re.findall(rf"\b((?:{'|'.join(PACKAGES)})(?:\.[a-z_0-9]+)+)\b", text):
         parts = name.split(".")
-        if parts[-1] in ("md", "py", "yaml"):
+        if parts[-1] in ("md", "py", "svg", "yaml"):
             continue
         while len(parts) > 1 and not ((ROOT / Path(*parts)).is_dir() or (ROOT / Path(*parts)).with_suffix(".py").is_file()):
             parts.pop()  # a function or class of a module
@@ -104,6 +105,14 @@ def test_the_python_blocks_import_modules_of_today():
                 for name in re.split(r", *", names.split(" as ")[0]):
                     inside = Path(place.origin).parent / f"{name}.py"
                     assert re.search(rf"\b{name}\b", text) or inside.is_file(), f"{page.name}: {module}.{name}"
+
+
+def test_diagrams_are_those_of_the_program(monkeypatch):
+    """docs/images/*.svg are what docs/diagrams.py draws: who changes one has changed the other."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    diagrams = import_module("diagrams")
+    for name, (boxes, arrows) in diagrams.DIAGRAMS.items():
+        assert (ROOT / "docs" / "images" / f"{name}.svg").read_text(encoding="utf-8") == diagrams.svg(boxes, arrows), name
 
 
 @pytest.mark.slow
