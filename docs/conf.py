@@ -39,11 +39,12 @@ autodoc_preserve_defaults = True
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
-apidoc_modules = [
-    {"path": f"../{package}", "destination": f"reference/packages/{package}", "exclude_patterns": ["**/verbs/*"], "max_depth": 2}
+apidoc_module_first = True
+apidoc_automodule_options = {"members", "show-inheritance"}
+apidoc_modules = [  # a page a package, made anew at each build
+    {"path": f"../{package}", "destination": f"docs/reference/packages/{package}", "max_depth": 2}
     for package in ("recon", "scenes", "twin", "trainers", "sonotwin")
 ]
-apidoc_exclude_patterns: list[str] = []
 
 ARRAY = re.compile(r"(?:numpy\.)?ndarray\[tuple\[Any, \.\.\.\], (?:numpy\.)?dtype\[(?:[^\[\]]|\[[^\]]*\])*\]\]")
 SECTION = re.compile(r"^-{3,}$")

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from sonotwin import config
+
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
@@ -105,6 +107,16 @@ def test_the_python_blocks_import_modules_of_today():
                 for name in re.split(r", *", names.split(" as ")[0]):
                     inside = Path(place.origin).parent / f"{name}.py"
                     assert re.search(rf"\b{name}\b", text) or inside.is_file(), f"{page.name}: {module}.{name}"
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs" / "users").glob("*.md")), ids=lambda page: page.name)
+def test_users_pages_name_verbs_and_fields_that_exist(page):
+    """Each command of the pages for the four kinds of users is composed, though not run."""
+    text = page.read_text(encoding="utf-8")
+    commands = re.findall(r"^ *sonotwin ([a-z].*)$", text, re.MULTILINE) + re.findall(r"`sonotwin ([a-z][^`]*=[^`]*)`", text)
+    for command in commands:
+        verb, *fields = command.replace("FOLDER", "folder").split()
+        config.compose(verb, fields)  # raises on an unknown key, and on a field that needs a value
 
 
 def test_diagrams_are_those_of_the_program(monkeypatch):
