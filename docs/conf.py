@@ -46,7 +46,8 @@ apidoc_modules = [  # a page a package, made anew at each build
     for package in ("recon", "scenes", "twin", "trainers", "sonotwin")
 ]
 
-ARRAY = re.compile(r"(?:numpy\.)?ndarray\[tuple\[Any, \.\.\.\], (?:numpy\.)?dtype\[(?:[^\[\]]|\[[^\]]*\])*\]\]")
+ARRAY = re.compile(r"~?(?:numpy\.)?ndarray\[tuple\[[~\w.]*Any, \.\.\.\], ~?(?:numpy\.)?dtype\[(?:[^\[\]]|\[[^\]]*\])*\]\]")
+ARRAY_LIKE = re.compile(r"~?(?:[\w.]+\.)?_Buffer \| .*?_NestedSequence\[~?(?:builtins\.)?complex \| bytes \| str\]")
 SECTION = re.compile(r"^-{3,}$")
 
 
@@ -64,6 +65,8 @@ def as_rst(app: Sphinx, what: str, name: str, found: object, options: object, li
             if k < sections and line.strip() and text and text[-1].startswith(" "):
                 text.append("")
             text.append(_escaped(line))
+    if what in ("attribute", "property") and text:
+        text[0] = text[0].replace(" : ", ", ")  # napoleon would take the words before for a type
     lines[:] = text
 
 
@@ -78,8 +81,9 @@ def _escaped(line: str) -> str:
 
 
 def short_types(app: Sphinx, what: str, name: str, found: object, options: object, signature: str, returned: str) -> tuple:
-    """Write NumPy's long array types as Array."""
-    return tuple(None if text is None else ARRAY.sub("Array", text) for text in (signature, returned))
+    """Write NumPy's long array types as Array and ArrayLike."""
+    short = (None if text is None else ARRAY_LIKE.sub("ArrayLike", ARRAY.sub("Array", text)) for text in (signature, returned))
+    return tuple(short)
 
 
 def mathml(formula: str, block: bool) -> str:
