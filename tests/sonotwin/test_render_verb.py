@@ -9,9 +9,11 @@ from recon.capture.board_part import read_board
 from sonotwin.cli import main
 
 HALF = [  # both cameras at half their size
+    "rig.cam1.sensor.pixel_um=9.6",
     "rig.cam1.optics.size=[640,512]",
     "rig.cam1.optics.focal_px=[1660.0,1665.5]",
     "rig.cam1.optics.centre_px=[308.75,261.25]",
+    "rig.cam2.sensor.pixel_um=9.6",
     "rig.cam2.optics.size=[640,512]",
     "rig.cam2.optics.focal_px=[1659.0,1664.5]",
     "rig.cam2.optics.centre_px=[305.75,258.75]",
