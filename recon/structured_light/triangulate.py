@@ -52,6 +52,8 @@ class Triangulator:
             *_axis("columns", projector_map.columns, projector_map.sigma_columns, shape),
             *_axis("rows", projector_map.rows, projector_map.sigma_rows, shape),
         )
+        kind = np.result_type(*decoded)  # one for all: each mix would be compiled by itself
+        decoded = tuple(np.ascontiguousarray(image, kind) for image in decoded)
         points = np.empty((*shape, 3), np.float32)
         sigma = np.empty(shape, np.float32)
         projector = (self.projector.camera_from_world, self._matrix, self.projector.coefficients)
@@ -85,8 +87,8 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera) 
     return Triangulator(camera, projector)(projector_map)
 
 
-def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: tuple[int, ...]) -> tuple[Float32, Float32]:
-    """One axis and its sigma for code that is compiled for these types alone: empty without the axis, NaN without its sigma."""
+def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:
+    """One axis and its sigma: empty where the axis is not known, NaN where only the sigma isn't."""
     if coordinate is None:
         nothing = np.empty((0, 0), np.float32)
         return nothing, nothing
@@ -95,7 +97,7 @@ def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: t
     for part, found in ((name, coordinate.shape), (f"sigma_{name}", sigma.shape)):
         if found != shape:
             raise ValueError(f"projector map: {part}: expected an image of shape {shape}, found {found}")
-    return np.ascontiguousarray(coordinate, np.float32), np.ascontiguousarray(sigma, np.float32)
+    return coordinate, sigma
 
 
 @njit(parallel=True, error_model="numpy")
