@@ -81,9 +81,9 @@ def test_defocus_lowers_the_modulation_as_a_disc_does(depth):
 
 @pytest.fixture(scope="module", params=["plane", "breast"])
 def renders(rig, request):
-    """Ours and Mitsuba's: the centre line and two fringe images at a quarter of the size."""
+    """Ours and Mitsuba's: the centre line and two fringe images at an eighth of the size, 2000 blocks of pixels."""
     return optics_accuracy.both_renders(
-        rig, build_scene({"kind": request.param}), 0.25, samples=32, repeats=8, patterns=(0, 2, 5)
+        rig, build_scene({"kind": request.param}), 0.125, samples=32, repeats=8, patterns=(0, 2, 5)
     )
 
 
