@@ -3,7 +3,7 @@
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,34 +29,82 @@ def new_folder(path: Path, marker: str) -> Iterator[Path]:
 
     A folder that is already there is replaced if `check_folder` allows it: set aside, and deleted once the new one is there.
     """
-    path = Path(os.path.abspath(path))
-    check_folder(path, marker)
-    remove_leftovers(path)
-    temporary, aside = _beside(path, "new"), _beside(path, "old")
+    with new_folders({path: marker}) as (folder,):
+        yield folder
+
+
+@contextmanager
+def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
+    """Give temporary folders to fill, one a place; on success all are renamed, on failure all old folders stay.
+
+    The last folder is set aside first and renamed last, so it never stands beside an old or a new one that isn't its own.
+
+    Parameters
+    ----------
+    places : path -> marker, as of `check_folder`
+    """
+    paths = [Path(os.path.abspath(path)) for path in places]
+    for path, marker in zip(paths, places.values(), strict=True):
+        check_folder(path, marker)
+    restore(paths)
+    temporaries, asides = [_beside(path, "new") for path in paths], [_beside(path, "old") for path in paths]
     try:
-        temporary.mkdir(parents=True)
-        yield temporary
-        if path.exists():
-            path.rename(aside)
-        try:
+        for temporary in temporaries:
+            temporary.mkdir(parents=True)
+        yield tuple(temporaries)
+        for path, aside in zip(reversed(paths), reversed(asides), strict=True):
+            if path.exists():
+                path.rename(aside)
+        for path, temporary in zip(paths, temporaries, strict=True):
             temporary.rename(path)
-        except OSError:
-            if aside.exists():
-                aside.rename(path)
-            raise
-        shutil.rmtree(aside, ignore_errors=True)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        if temporaries[-1].exists():  # not all are in their places
+            for path, temporary, aside in zip(paths, temporaries, asides, strict=True):
+                if not temporary.exists():
+                    path.rename(temporary)
+                if aside.exists():
+                    aside.rename(path)
+        for folder in (*temporaries, *asides):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def restore(paths: Sequence[Path]) -> None:
+    """Put back what a process has set aside that was killed in `new_folders`, and remove its other leftovers."""
+    stopped = not paths[-1].exists()
+    for path in paths:
+        for aside in _leftovers(path, "old") if stopped else ():
+            shutil.rmtree(path, ignore_errors=True)
+            aside.rename(path)
+        remove_leftovers(path)
+
+
+def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> None:
+    """Let a folder hold the files of another too: as hard links, or as copies where the file system has no links.
+
+    Parameters
+    ----------
+    leave_out : names at the top of `source`
+    """
+
+    def link(file: str, name: str) -> None:
+        try:
+            os.link(file, name)
+        except OSError:
+            shutil.copy2(file, name)
+
+    for entry in source.iterdir():
+        if entry.name in leave_out:
+            continue
+        if entry.is_dir():
+            shutil.copytree(entry, target / entry.name, copy_function=link, dirs_exist_ok=True)
+        else:
+            link(str(entry), str(target / entry.name))
 
 
 def remove_leftovers(path: Path) -> None:
     """Remove the temporary files and folders that a process which was killed while it wrote `path` has left beside it."""
-    path = Path(path)
-    name = re.compile(rf"\.{re.escape(path.stem)}\.(\d+)\.(new|old){re.escape(path.suffix)}")
-    for entry in list(path.parent.iterdir()) if path.parent.is_dir() else ():
-        match = name.fullmatch(entry.name)
-        if match and not _runs(int(match[1])):
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    for entry in _leftovers(path, "new|old"):
+        shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
 
 def check_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
@@ -89,6 +137,13 @@ def check_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
             pass
     except OSError as error:
         raise InputError(f"{path}: expected a place to write to, found {parent} not writable: {error.strerror}") from None
+
+
+def _leftovers(path: Path, states: str) -> list[Path]:
+    """Hidden names of `_beside` in one of the states, of processes that no longer run."""
+    name = re.compile(rf"\.{re.escape(path.stem)}\.(\d+)\.({states}){re.escape(path.suffix)}")
+    entries = list(path.parent.iterdir()) if path.parent.is_dir() else []
+    return [entry for entry in entries if (match := name.fullmatch(entry.name)) and not _runs(int(match[1]))]
 
 
 def _runs(process: int) -> bool:

@@ -1,6 +1,9 @@
 """What is written appears whole; what was there is replaced only if it is of the same kind, and never what is read."""
 
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -89,3 +92,62 @@ def test_what_another_run_is_writing_is_left_alone(tmp_path):
     living.mkdir()
     atomic.remove_leftovers(tmp_path / "folder")
     assert living.is_dir()
+
+
+def write_both(root: Path, text: str) -> None:
+    with atomic.new_folders({root / "truth": "mark", root / "capture": "mark"}) as folders:
+        for folder in folders:
+            (folder / "mark").write_text(text)
+
+
+def test_folders_appear_together_or_not_at_all(tmp_path):
+    write_both(tmp_path, "first")
+    places = dict.fromkeys((tmp_path / "truth", tmp_path / "other"), "mark")
+    with pytest.raises(KeyboardInterrupt), atomic.new_folders(places) as (_, other):
+        (other / "mark").write_text("second")
+        raise KeyboardInterrupt
+    assert names(tmp_path) == ["capture", "truth"] and (tmp_path / "truth" / "mark").read_text() == "first"
+
+
+@pytest.mark.parametrize("steps", range(4))
+def test_what_a_killed_process_has_set_aside_is_put_back(tmp_path, steps):
+    """A process is killed after some of the four renamings: the last folder is gone, or beside its own, and comes back."""
+    write_both(tmp_path, "first")
+    program = f"""
+import itertools, os
+from pathlib import Path
+from recon.files import atomic
+count, rename = itertools.count(), Path.rename
+Path.rename = lambda self, target: os._exit(9) if next(count) == {steps} else rename(self, target)
+with atomic.new_folders({{Path("truth"): "mark", Path("capture"): "mark"}}) as folders:
+    for folder in folders:
+        (folder / "mark").write_text("second")
+"""
+    root = {"PYTHONPATH": str(Path(__file__).resolve().parents[3])}
+    assert subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=os.environ | root, check=False).returncode == 9
+    assert (tmp_path / "capture").is_dir() == (steps == 0)
+    with pytest.raises(KeyboardInterrupt), atomic.new_folders({tmp_path / "truth": "mark", tmp_path / "capture": "mark"}):
+        raise KeyboardInterrupt
+    assert [(tmp_path / name / "mark").read_text() for name in names(tmp_path)] == ["first", "first"]
+
+
+def test_linked_files_outlive_the_folder_that_they_come_from(tmp_path):
+    (tmp_path / "old" / "inner").mkdir(parents=True)
+    for name in ("kept", "left", "inner/left"):
+        (tmp_path / "old" / name).write_text(name)
+    (tmp_path / "new").mkdir()
+    atomic.link_tree(tmp_path / "old", tmp_path / "new", leave_out={"left"})
+    assert names(tmp_path / "new") == ["inner", "kept"] and (tmp_path / "new" / "inner" / "left").read_text() == "inner/left"
+    assert (tmp_path / "old" / "left").read_text() == "left"
+
+
+def test_files_are_copied_where_there_are_no_links(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    (tmp_path / "new").mkdir()
+    (tmp_path / "old" / "inner").mkdir(parents=True)
+    (tmp_path / "old" / "inner" / "file").write_text("text")
+    atomic.link_tree(tmp_path / "old", tmp_path / "new")
+    assert (tmp_path / "new" / "inner" / "file").read_text() == "text"
