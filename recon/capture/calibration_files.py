@@ -61,6 +61,24 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
         storage.release()
 
 
+def read_for(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Calibration:
+    """Read a calibration that is to be that of devices, each with images of a size; as `read` otherwise.
+
+    Raises
+    ------
+    InputError
+        Also if a device isn't there or was calibrated with images of another size.
+    """
+    found = read(path, sizes)
+    for name, (width, height) in sizes.items():
+        if name not in found.cameras:
+            raise InputError(f"{path}: expected {name}, found {', '.join(found.cameras) or 'none'}")
+        if found.cameras[name].size != (width, height):
+            other = "x".join(map(str, found.cameras[name].size))
+            raise InputError(f"{path}: expected {name} of {width}x{height} px, found {other}")
+    return found
+
+
 def write(path: Path, calibration: Calibration) -> None:
     """Write sonotwin's own format, whole or not at all. The suffix should be `.yaml`."""
     storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
@@ -78,6 +96,13 @@ def write(path: Path, calibration: Calibration) -> None:
     if calibration.uncertainty is not None:
         opencv_storage.write_covariance(storage, calibration.uncertainty.names, calibration.uncertainty.covariance)
     opencv_storage.save(path, storage)
+
+
+def extend(path: Path, calibration: Calibration) -> None:
+    """Write a calibration, making the folder; other devices that the file has already stay in it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    before = read(path).cameras if path.is_file() else {}
+    write(path, Calibration({**before, **calibration.cameras}, calibration.uncertainty))
 
 
 def _own(path: Path, storage: cv2.FileStorage) -> Calibration:

@@ -1,4 +1,6 @@
-"""`manifest.json`, which says what is in a capture folder: devices, patterns, and which image belongs to which.
+"""`manifest.json`, the list of what is in a capture folder: devices, patterns, and which image belongs to which.
+
+A capture holds one part or several: a surface, a board, a sweep. Parts stand side by side in the manifest and share the devices.
 
 Everything is checked on load; a fault is an `InputError` of one line that names the file, what was expected and what was found.
 """
@@ -19,6 +21,15 @@ Model = TypeVar("Model", bound=BaseModel)
 
 SCHEMA: Literal["sonotwin-capture/1"] = "sonotwin-capture/1"
 MANIFEST = "manifest.json"
+OPTICS = "calibration/optics.yaml"
+PROBE = "calibration/probe.yaml"
+TRACK = "sweep/track.csv"
+STAMPS = "timestamps.csv"  # in each device's folder of a sweep
+CAMERAS = ("cam1", "cam2")
+SCANNER = "us"
+
+PartName = Literal["surface", "board", "sweep"]
+PARTS: tuple[PartName, ...] = ("surface", "board", "sweep")
 
 
 class Record(BaseModel):
@@ -36,7 +47,13 @@ class Device(Record):
     gain: Annotated[float, Field(gt=0)] | None = None  # linear; 1 is the sensor's base gain
 
 
-class SurfacePart(Record):
+class Part(Record):
+    """A part of a capture."""
+
+    devices: dict[str, Device] | None = None  # those that were set otherwise for this part than the capture's; of the same sizes
+
+
+class SurfacePart(Part):
     """The fringe sequence: what was projected and what each camera saw, in the same order."""
 
     patterns: Patterns
@@ -58,7 +75,7 @@ class BoardPose(Record):
     fringes: dict[str, tuple[str, ...]] = {}  # camera: paths in the order of the patterns
 
 
-class BoardPart(Record):
+class BoardPart(Part):
     """The calibration board, held in several poses, lit and perhaps under fringes."""
 
     board: Board
@@ -87,8 +104,8 @@ class BoardPart(Record):
         return self
 
 
-class SweepPart(Record):
-    """A freehand ultrasound sweep: each device's frames by its own clock, and what a tracker says of the probe's target.
+class SweepPart(Part):
+    """A freehand sweep: B-scans (`us`), frames of the tracking cameras, or both, by each device's clock; and the target's poses.
 
     Paths are relative to the manifest's root.
     """
@@ -119,6 +136,15 @@ class Manifest(Record):
         return self
 
     @model_validator(mode="after")
+    def _one_size_a_device(self) -> "Manifest":
+        for part in self.contents:
+            for name, device in (getattr(self, part).devices or {}).items():
+                if name not in self.devices or device.size != self.devices[name].size:
+                    found = "x".join(map(str, device.size))
+                    raise ValueError(f"{part}.devices.{name}: expected one of the devices, of the same size, found {found}")
+        return self
+
+    @model_validator(mode="after")
     def _one_raster(self) -> "Manifest":
         for part, patterns in (
             ("surface", self.surface.patterns if self.surface else None),
@@ -131,6 +157,20 @@ class Manifest(Record):
                 expected = f"{wanted[0]}x{wanted[1]} as in {part}.patterns"
                 raise ValueError(f"devices.projector.size: expected {expected}, found {found[0]}x{found[1]}")
         return self
+
+    @property
+    def contents(self) -> dict[PartName, tuple[str, ...]]:
+        """The parts that are there, each with the devices whose images it holds."""
+        found: dict[PartName, dict[str, None]] = {part: {} for part in PARTS if getattr(self, part) is not None}
+        for place, devices in self._places():
+            for part in found:
+                if place.startswith(part):
+                    found[part].update(dict.fromkeys(devices))
+        return {part: tuple(devices) for part, devices in found.items()}
+
+    def devices_of(self, part: PartName) -> dict[str, Device]:
+        """All devices, as they were set for a part."""
+        return self.devices | (getattr(self, part).devices or {})
 
     def _places(self) -> Iterator[tuple[str, Iterable[str]]]:
         """Where cameras are named, and their names."""
@@ -165,6 +205,11 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the manifest into a capture folder."""
     text = manifest.model_dump_json(indent=2, by_alias=True, exclude_none=True)
     (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
+
+
+def image_name(frame: int) -> str:
+    """File name of a frame, in its device's folder."""
+    return f"{frame:04d}.png"
 
 
 def axes_without_fringes(patterns: Patterns) -> list[Axis]:

@@ -1,5 +1,6 @@
 """Files read whole, or refused in one line."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from recon.errors import InputError
@@ -13,3 +14,10 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(f"{path}: expected a file, found none") from None
     except OSError as error:
         raise InputError(f"{path}: expected a readable file, found {error.strerror}") from None
+
+
+def check_there(paths: Iterable[Path]) -> None:
+    """Check that files are there, without reading them; InputError names the first that isn't."""
+    for path in paths:
+        if not path.is_file():
+            raise InputError(f"{path}: expected a file, found {'something else' if path.exists() else 'none'}")

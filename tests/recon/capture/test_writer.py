@@ -1,0 +1,245 @@
+"""A capture of several parts comes back part by part; one is written anew without a change to the others."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.capture import stereo_frames, writer
+from recon.capture.board_part import read_board
+from recon.capture.manifest import SCANNER, BoardPart, Device, read_manifest
+from recon.capture.surface_part import read_surface
+from recon.capture.sweep_part import read_sweep
+from recon.capture.writer import CaptureWriter, new_capture
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.model.boards import AsymmetricCircles
+from recon.model.calibration import Calibration
+from recon.model.patterns import Fringes, GrayCode, Patterns
+from recon.model.probe import ProbeCalibration
+from recon.model.tracks import Track
+
+SIZE, PROJECTOR, SCAN = (64, 48), (128, 80), (24, 16)
+BOARD = AsymmetricCircles(columns=4, rows=11, spacing_mm=15.0, diameter_mm=9.0)
+PATTERNS = Patterns(
+    projector_size=PROJECTOR,
+    unwrap="gray",
+    parts=tuple(
+        part
+        for axis in ("columns", "rows")
+        for part in (Fringes(axis=axis, pitch=18, steps=3), GrayCode(axis=axis, pitch=18, bits=3))
+    ),
+)
+TIMES = {SCANNER: 50_000_000 * np.arange(5), "cam1": 25_000_000 * np.arange(3), "cam2": 25_000_000 * np.arange(3) + 7}
+
+
+def optics(*names: str) -> Calibration:
+    matrix = np.array([[200.0, 0, 31.5], [0, 200, 23.5], [0, 0, 1]])
+    beside = rigid.from_rotation_vector([0, -0.2, 0], [150, 0, 0])
+    cameras = {
+        "cam1": Camera(SIZE, matrix, np.zeros(5)),
+        "cam2": Camera(SIZE, matrix, np.zeros(5), beside),
+        "projector": Camera(PROJECTOR, np.diag([190.0, 190, 1]), np.zeros(5), rigid.invert(beside)),
+    }
+    return Calibration({name: cameras[name] for name in names})
+
+
+def track() -> Track:
+    return Track(25_000_000 * np.arange(12), np.tile(np.eye(4), (12, 1, 1)))
+
+
+def probe() -> ProbeCalibration:
+    return ProbeCalibration(rigid.from_rotation_vector([1.5, 0.1, 0], [-7.0, 80, 90]), np.array([0.12, 0.11]))
+
+
+def noise(count: int, size, seed: int, bits: int = 8) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 1 << bits, (count, *size[::-1])).astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def camera(exposure_s: float, bits: int = 8) -> Device:
+    return Device(size=SIZE, bits=bits, exposure_s=exposure_s)
+
+
+def surface(capture: CaptureWriter, seed: int = 1) -> None:
+    capture.add_calibration(optics("cam1", "projector"))
+    devices = {"projector": Device(size=PROJECTOR), "cam1": camera(0.01)}
+    capture.add_surface({"cam1": noise(PATTERNS.count, SIZE, seed)}, PATTERNS, devices)
+
+
+def board(capture: CaptureWriter, seed: int = 2) -> None:
+    devices = {"projector": Device(size=PROJECTOR), "cam1": camera(0.02), "cam2": camera(0.02)}
+    poses = []
+    for number in range(2):
+        first, second, *fringes = noise(PATTERNS.count + 2, SIZE, 10 * seed + number)
+        poses.append(
+            writer.write_pose(capture.folder, f"{number:02d}", {"cam1": first, "cam2": second}, {"cam1": np.array(fringes)})
+        )
+    capture.add_board(BoardPart(board=BOARD, patterns=PATTERNS, poses=tuple(poses)), devices)
+
+
+def frames(seed: int = 3):
+    """Both cameras' frames in turn, in between the B-scans."""
+    scans = noise(5, SCAN, seed)
+    yield from ((SCANNER, scan) for scan in scans[:2])
+    for first, second in zip(noise(3, SIZE, seed + 1, 10), noise(3, SIZE, seed + 2, 10), strict=True):
+        yield from (("cam1", first), ("cam2", second))
+    yield from ((SCANNER, scan) for scan in scans[2:])
+
+
+def sweep(capture: CaptureWriter, seed: int = 3) -> None:
+    capture.add_calibration(optics("cam1", "cam2"))
+    devices = {SCANNER: Device(size=SCAN), "cam1": camera(0.005, bits=10), "cam2": camera(0.005, bits=10)}
+    capture.add_sweep(TIMES, frames(seed), devices, track())
+    capture.add_probe(probe())
+
+
+def scans_alone(capture: CaptureWriter) -> None:
+    capture.add_sweep(
+        {SCANNER: TIMES[SCANNER]}, ((SCANNER, scan) for scan in noise(5, SCAN, 9)), {SCANNER: Device(size=SCAN)}, track()
+    )
+
+
+PARTS = {"surface": surface, "board": board, "sweep": sweep}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture
+def whole(tmp_path) -> Path:
+    """All parts, written at once."""
+    with new_capture(tmp_path / "whole", "session") as capture:
+        for add in PARTS.values():
+            add(capture)
+    return tmp_path / "whole"
+
+
+def check(folder: Path) -> None:
+    """The surface, the board and both kinds of images of the sweep are those that were written."""
+    found = read_surface(folder)
+    assert np.array_equal(found.images, noise(PATTERNS.count, SIZE, 1)) and found.name == "session"
+    read = read_board(folder)
+    assert read.poses == ("00", "01") and read.devices["cam1"].exposure_s == 0.02
+    lit, _, *fringes = noise(PATTERNS.count + 2, SIZE, 21)
+    assert np.array_equal(read.pose(1).lit["cam1"], lit) and np.array_equal(read.pose(1).fringes, np.array(fringes))
+    scans = read_sweep(folder)
+    assert np.array_equal(np.stack(list(scans.images())), noise(5, SCAN, 3)) and len(scans.track.times) == 12
+    assert scans.probe is not None and np.array_equal(scans.probe.scale, probe().scale)
+    film = stereo_frames.read_film(folder)
+    assert film.bits == 10 and film.times.tolist() == TIMES["cam1"].tolist()
+    assert np.array_equal(np.stack([pair[1] for pair in film.pairs()]), noise(3, SIZE, 5, 10))
+
+
+def test_all_parts_come_back_from_one_capture(whole):
+    check(whole)
+    manifest = read_manifest(whole)
+    assert manifest.contents == {"surface": ("cam1",), "board": ("cam1", "cam2"), "sweep": (SCANNER, "cam1", "cam2")}
+    assert [manifest.devices_of(part)["cam1"].exposure_s for part in PARTS] == [0.01, 0.02, 0.005]
+    assert [manifest.devices_of(part)["cam1"].bits for part in PARTS] == [8, 8, 10]
+
+
+@pytest.mark.parametrize("order", [("surface", "board", "sweep"), ("sweep", "board", "surface"), ("board", "sweep", "surface")])
+def test_parts_may_be_added_one_by_one(tmp_path, whole, order):
+    for part in order:
+        with new_capture(tmp_path / "grown", "session", add=part) as capture:
+            PARTS[part](capture)
+    check(tmp_path / "grown")
+    same = {"manifest.json", "calibration/optics.yaml"}  # but for the order of devices
+    grown, once = contents(tmp_path / "grown"), contents(whole)
+    assert {name: grown[name] for name in grown.keys() - same} == {name: once[name] for name in once.keys() - same}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_alone_is_written_as_if_it_were_added_to_nothing(tmp_path, part):
+    """A capture of one part has no entry of its own devices: it is what it was before there were several."""
+    for name, add in (("alone", None), ("added", part)):
+        with new_capture(tmp_path / name, "one", add=add) as capture:
+            PARTS[part](capture)
+    assert contents(tmp_path / "alone") == contents(tmp_path / "added")
+    content = json.loads((tmp_path / "alone" / "manifest.json").read_text())
+    assert "devices" not in content[part] and content.keys() & PARTS.keys() == {part}
+
+
+def test_only_the_part_of_the_same_name_is_replaced(whole):
+    before = contents(whole)
+    with new_capture(whole, "other", add="sweep") as capture:
+        scans_alone(capture)
+    after = contents(whole)
+    kept = {name for name in before if name.startswith(("surface/", "board/"))}
+    assert {name: after[name] for name in kept} == {name: before[name] for name in kept}
+    assert {name for name in after if name.startswith("sweep/cam")} == set() and "calibration/probe.yaml" not in after
+    assert read_sweep(whole).probe is None and read_sweep(whole).name == "session"
+    assert np.array_equal(read_surface(whole).images, noise(PATTERNS.count, SIZE, 1))
+
+
+def test_devices_of_a_replaced_part_go_with_it(tmp_path):
+    """The exposure of a part that is gone stays nowhere, and those of the others stay what they were."""
+    for part in ("surface", "board", "sweep"):
+        with new_capture(tmp_path / "capture", add=part) as capture:
+            PARTS[part](capture)
+    with new_capture(tmp_path / "capture", add="surface") as capture:
+        capture.add_surface(
+            {"cam2": noise(PATTERNS.count, SIZE, 4)}, PATTERNS, {"projector": Device(size=PROJECTOR), "cam2": camera(0.04)}
+        )
+    manifest = read_manifest(tmp_path / "capture")
+    assert [manifest.devices_of("board")[name].exposure_s for name in ("cam1", "cam2")] == [0.02, 0.02]
+    assert [manifest.devices_of("sweep")[name].exposure_s for name in ("cam1", "cam2")] == [0.005, 0.005]
+    assert manifest.devices_of("surface")["cam2"].exposure_s == 0.04
+    assert "0.01" not in (tmp_path / "capture" / "manifest.json").read_text()
+    assert manifest.devices["projector"] == Device(size=PROJECTOR)
+
+
+def test_the_calibration_of_other_devices_stays(tmp_path):
+    for part in ("surface", "sweep"):
+        with new_capture(tmp_path / "capture", add=part) as capture:
+            PARTS[part](capture)
+    assert list(read_surface(tmp_path / "capture").calibration.cameras) == ["cam1", "projector", "cam2"]
+
+
+def test_a_failed_part_leaves_the_capture_as_it_was(whole):
+    before = contents(whole)
+
+    def breaks_off():
+        yield from list(frames(7))[:4]
+        raise KeyboardInterrupt
+
+    devices = {SCANNER: Device(size=SCAN), "cam1": camera(0.005, bits=10), "cam2": camera(0.005, bits=10)}
+    with pytest.raises(KeyboardInterrupt), new_capture(whole, add="sweep") as capture:
+        capture.add_sweep(TIMES, breaks_off(), devices, track())
+    assert contents(whole) == before and [path.name for path in whole.parent.iterdir()] == ["whole"]
+
+
+def test_a_device_of_another_size_is_refused(whole):
+    small = Device(size=(32, 24))
+    complaint = r"surface\.devices\.cam1: expected one of the devices, of the same size, found 32x24"
+    with pytest.raises(ValueError, match=complaint), new_capture(whole, add="surface") as capture:
+        capture.add_surface({"cam1": noise(PATTERNS.count, (32, 24), 1)}, PATTERNS, {"cam1": small})
+    check(whole)
+
+
+def test_a_capture_with_files_elsewhere_is_not_added_to(whole):
+    path = whole / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"root": "../elsewhere"}))
+    with pytest.raises(InputError, match="expected a capture that holds all its files"), new_capture(whole, add="sweep"):
+        pass
+
+
+def test_images_must_be_those_of_the_times(tmp_path):
+    def write(times, images):
+        devices = {SCANNER: Device(size=SCAN), "cam1": camera(0.1)}
+        with new_capture(tmp_path / "capture") as capture:
+            capture.add_sweep(times, images, devices)
+
+    scans = [(SCANNER, scan) for scan in noise(5, SCAN, 9)]
+    for times, images, complaint in (
+        ({SCANNER: TIMES[SCANNER]}, scans[:4], "images of us: expected 5, one a time, found 4"),
+        (TIMES | {"cam2": TIMES["cam2"][::-1]}, scans, "increasing"),
+        ({SCANNER: TIMES[SCANNER]}, [(SCANNER, scans[0][1][:-1])], "image 0 of us: expected 24x16 uint8"),
+        ({SCANNER: TIMES[SCANNER], "cam2": TIMES["cam2"]}, scans, r"sweep\.images\.cam2: expected one of the devices us, cam1"),
+    ):
+        with pytest.raises(ValueError, match=complaint):
+            write(times, images)
+    assert not list(tmp_path.iterdir())
