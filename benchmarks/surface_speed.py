@@ -15,7 +15,7 @@ from scenes.catalogue import build_scene
 from sonotwin.config import compose, folder
 from twin.accuracy.surface_accuracy import ENGINE
 from twin.accuracy.table_rows import Measurement, Row
-from twin.surface_session import Shooting, calibration_of, shoot
+from twin.optics.surface_session import Shooting, calibration_of, shoot
 
 REPEATS = 15
 

@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from recon.capture.manifest import Device
     from recon.capture.probe_files import read as read_probe
     from recon.capture.stereo_frames import read_film
-    from recon.capture.surface_part import read_surface, write_surface
+    from recon.capture.surface_part import read_surface
     from recon.capture.sweep_part import read_sweep
+    from recon.capture.writer import write_surface
     from recon.errors import InputError
     from recon.freehand.volume_compounding import principal_grid
     from recon.freehand.volume_compounding import reconstruct as reconstruct_volume
@@ -40,8 +41,8 @@ if TYPE_CHECKING:
     from scenes.catalogue import build_scene
     from sonotwin.choices import read_patterns, read_rig
     from twin.optics.light_transport import Engine
-    from twin.surface_session import Shooting
-    from twin.surface_session import shoot as render
+    from twin.optics.surface_session import Shooting
+    from twin.optics.surface_session import shoot as render
 
 __all__ = [
     "AsymmetricCircles",
@@ -93,7 +94,7 @@ PLACES = {  # of the public names: module, and name in it where that differs
     "Patterns": "recon.model.patterns",
     "ProbeCalibration": "recon.model.probe",
     "Rig": "recon.model.rig",
-    "Shooting": "twin.surface_session",
+    "Shooting": "twin.optics.surface_session",
     "Track": "recon.model.tracks",
     "Tracker": "recon.tracking.tracker",
     "build_scene": "scenes.catalogue",
@@ -116,9 +117,9 @@ PLACES = {  # of the public names: module, and name in it where that differs
     "read_surface": "recon.capture.surface_part",
     "read_sweep": "recon.capture.sweep_part",
     "reconstruct_volume": "recon.freehand.volume_compounding:reconstruct",
-    "render": "twin.surface_session:shoot",
+    "render": "twin.optics.surface_session:shoot",
     "triangulate": "recon.structured_light.triangulate",
-    "write_surface": "recon.capture.surface_part",
+    "write_surface": "recon.capture.writer",
 }
 
 

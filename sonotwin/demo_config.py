@@ -10,7 +10,7 @@ from recon.model.probe import Speed
 from recon.model.rig import Positive
 from scenes.acoustics import MADE_OF
 from sonotwin.verbs import render, sweep
-from twin import surface_session
+from twin.optics import surface_session
 from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.timed_sweep import Clocks, PoseNoise
 from twin.ultrasound.transducer import Transducer

@@ -9,14 +9,13 @@ import math
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import mitsuba as mi
 import numpy as np
 
-from recon.capture import board_part, calibration_files, surface_part
-from recon.capture.manifest import BoardPart, Device
+from recon.capture import writer
+from recon.capture.manifest import MANIFEST, BoardPart, Device
 from recon.files import atomic
 from recon.geometry import rigid
 from recon.model.patterns import Patterns
@@ -28,14 +27,13 @@ from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, Images, meets_something, render_pixels
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, move_things
-from twin.output_folders import TRUTH_MARKER, check_places
+from twin.optics.surface_session import CameraName, Shooting, calibration_of, camera_optics, describe_visible, device_of
 from twin.sensor import Exposure, Numbers, auto_exposure, expose
-from twin.surface_session import CameraName, Shooting, calibration_of, camera_optics, describe, write_json
+from twin.session import SETTINGS, Session, write_json
 
 FRINGE_CAMERA: CameraName = "cam1"  # sees the fringes; others see the board lit only
 CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
 UNFINISHED = "unfinished"
-SETTINGS = "settings.json"
 
 EVEN_SAMPLES = 8  # paths for a pixel of an image without fringes, where all that it sees has one brightness
 EDGE_SAMPLES = 256  # paths for a pixel at the edge of a circle, which is half black, half white
@@ -193,59 +191,44 @@ def pose_name(number: int) -> str:
     return f"{number:02d}"
 
 
-def is_finished(out: Path, described: Mapping[str, object]) -> bool:
-    """Whether the session with these settings is there already, whole."""
-    kept = out / "truth" / SETTINGS
-    whole = kept.is_file() and (out / "capture" / surface_part.MANIFEST).is_file()
-    return whole and json.loads(kept.read_text(encoding="utf-8")) == described
+def is_finished(session: Session) -> bool:
+    """Whether the board of this session is there already, whole."""
+    kept = session.truth.described / SETTINGS
+    return kept.is_file() and (session.capture / MANIFEST).is_file() and session.truth.settings() == session.settings
 
 
-def missing_poses(out: Path, settings: Settings, described: Mapping[str, object]) -> list[int]:
-    """Numbers of the poses that are still to be rendered; what is left of a run with other settings is removed.
-
-    described : the settings, as they are kept with the truth.
-    """
-    check_places(out, "board")
-    atomic.check_folder(out / UNFINISHED, SETTINGS)
-    kept = out / UNFINISHED / SETTINGS
-    if not kept.is_file() or json.loads(kept.read_text(encoding="utf-8")) != described:
-        with atomic.new_folder(out / UNFINISHED, SETTINGS) as folder:
-            write_json(folder / SETTINGS, described)
-    return [k for k in range(settings.poses.count) if not _pose_folder(out, k).is_dir()]
+def missing_poses(session: Session, settings: Settings) -> list[int]:
+    """Numbers of the poses that are still to be rendered; what is left of a run with other settings is removed."""
+    session.check()
+    unfinished = session.out / UNFINISHED
+    atomic.check_folder(unfinished, SETTINGS)
+    kept = unfinished / SETTINGS
+    if not kept.is_file() or json.loads(kept.read_text(encoding="utf-8")) != session.settings:
+        with atomic.new_folder(unfinished, SETTINGS) as folder:
+            write_json(folder / SETTINGS, session.settings)
+    return [k for k in range(settings.poses.count) if not (unfinished / "capture" / "board" / pose_name(k)).is_dir()]
 
 
-def write_pose(out: Path, number: int, lit: Mapping[str, Numbers], fringes: Mapping[str, Numbers]) -> None:
+def write_pose(session: Session, number: int, lit: Mapping[str, Numbers], fringes: Mapping[str, Numbers]) -> None:
     """Keep one pose's images, whole or not at all."""
-    board_part.write_pose(out / UNFINISHED / "capture", pose_name(number), lit, fringes)
+    writer.write_pose(session.out / UNFINISHED / "capture", pose_name(number), lit, fringes)
 
 
-def finish(out: Path, settings: Settings, exposures: Mapping[CameraName, Exposure], placed: rigid.Array) -> None:
-    """Write manifest and truth, and put both folders in their places; an old capture goes first, so that no two sessions mix."""
-    unfinished = out / UNFINISHED
-    truth = unfinished / "truth"
-    shutil.rmtree(truth, ignore_errors=True)
-    (truth / "calibration").mkdir(parents=True)
-    optics = calibration_of(settings.rig)
-    calibration_files.write(truth / "calibration" / "optics.yaml", optics)
-    np.savez(truth / "board.npz", **board_truth(settings, placed))
-    write_json(truth / TRUTH_MARKER, describe(Scene("board", board.things(settings.board))))
-    shutil.copy(unfinished / SETTINGS, truth / SETTINGS)
-
+def finish(session: Session, settings: Settings, exposures: Mapping[CameraName, Exposure], placed: rigid.Array) -> None:
+    """Write the board, from the poses that are kept, and its truth."""
     names = [pose_name(k) for k in range(len(placed))]
     counts: dict[str, int] = {FRINGE_CAMERA: settings.patterns.count}
-    records = tuple(board_part.describe_pose(name, settings.cameras, counts) for name in names)
+    records = tuple(writer.describe_pose(name, settings.cameras, counts) for name in names)
     part = BoardPart(board=board.design(settings.board), patterns=settings.patterns, poses=records)
     devices = {"projector": Device(size=settings.patterns.projector_size)}
     for camera, exposure in exposures.items():
-        size = getattr(settings.rig, camera).optics.size
-        devices[camera] = Device(size=size, bits=exposure.bits, exposure_s=exposure.time_s, gain=exposure.gain)
-    board_part.write_manifest(unfinished / "capture", devices, part, "board")
-
-    shutil.rmtree(out / "capture", ignore_errors=True)
-    shutil.rmtree(out / "truth", ignore_errors=True)
-    truth.rename(out / "truth")
-    (unfinished / "capture").rename(out / "capture")
-    shutil.rmtree(unfinished)
+        devices[camera] = device_of(getattr(settings.rig, camera).optics.size, exposure)
+    with session.write(describe_visible(Scene("board", board.things(settings.board)))) as (capture, truth):
+        truth.write_optics(calibration_of(settings.rig))
+        truth.write_arrays("board.npz", board_truth(settings, placed))
+        atomic.link_tree(session.out / UNFINISHED / "capture", capture.folder, leave_out={MANIFEST})
+        capture.add_board(part, devices)
+    shutil.rmtree(session.out / UNFINISHED)
 
 
 def board_truth(settings: Settings, placed: rigid.Array) -> dict[str, np.ndarray]:
@@ -258,7 +241,3 @@ def board_truth(settings: Settings, placed: rigid.Array) -> dict[str, np.ndarray
     cameras = calibration_of(settings.rig).cameras
     pixels = np.stack([cameras[name].project(points) for name in ("cam1", "cam2", "projector")], axis=2)
     return {"world_from_board": placed, "points": centres, "pixels": pixels}
-
-
-def _pose_folder(out: Path, number: int) -> Path:
-    return out / UNFINISHED / "capture" / board_part.pose_folder(pose_name(number))

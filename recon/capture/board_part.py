@@ -3,15 +3,14 @@
 A pose under 50 patterns is 66 MB, so a set of 34 is never held at once.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from recon.capture import manifest
-from recon.capture.images import Images, read_image, read_images, write_images
-from recon.capture.manifest import MANIFEST, SCHEMA, BoardPart, BoardPose, Device, Manifest
+from recon.capture.images import Images, read_image, read_images
+from recon.capture.manifest import MANIFEST, BoardPose, Device
 from recon.errors import InputError
-from recon.files import atomic
+from recon.files.regular import check_there
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
 
@@ -85,46 +84,6 @@ def read_board(folder: Path) -> BoardCapture:
     if read.board is None:
         raise InputError(f"{folder / MANIFEST}: expected board, the poses of a calibration board, found none")
     part, name = read.board, read.name or folder.resolve().name
-    capture = BoardCapture(folder / read.root, name, read.devices, part.board, part.patterns, part.poses)
-    for number in range(len(part.poses)):
-        for path in capture.paths(number):
-            if not path.is_file():
-                raise InputError(f"{path}: expected a file, found {'something else' if path.exists() else 'none'}")
+    capture = BoardCapture(folder / read.root, name, read.devices_of("board"), part.board, part.patterns, part.poses)
+    check_there(path for number in range(len(part.poses)) for path in capture.paths(number))
     return capture
-
-
-def describe_pose(name: str, cameras: Sequence[str], counts: Mapping[str, int]) -> BoardPose:
-    """Where the images of a pose lie in a capture folder: `cameras` saw it lit, and took `counts` fringe images each."""
-    place = pose_folder(name)
-    lit = {camera: f"{place}/{camera}/lit.png" for camera in cameras}
-    fringes = {camera: tuple(f"{place}/{camera}/{k:04d}.png" for k in range(count)) for camera, count in counts.items()}
-    return BoardPose(name=name, lit=lit, fringes=fringes)
-
-
-def pose_folder(name: str) -> str:
-    """Folder of one pose's images, relative to that of the capture."""
-    return f"board/{name}"
-
-
-def write_pose(folder: Path, name: str, lit: Mapping[str, Images], fringes: Mapping[str, Images]) -> None:
-    """Write the images of one pose into a capture folder, whole or not at all, where `describe_pose` says.
-
-    Parameters
-    ----------
-    lit : camera name -> (h, w) uint8 or uint16
-    fringes : camera name -> (n, h, w) uint8 or uint16
-        One image a pattern; may be empty.
-    """
-    record = describe_pose(name, list(lit), {camera: len(stack) for camera, stack in fringes.items()})
-    place = pose_folder(name)
-    marker = Path(record.lit[next(iter(lit))]).relative_to(place)
-    with atomic.new_folder(folder / place, str(marker)) as temporary:
-        for camera, stack in fringes.items():
-            write_images([temporary / Path(path).relative_to(place) for path in record.fringes[camera]], stack)
-        for camera, image in lit.items():
-            write_images([temporary / Path(record.lit[camera]).relative_to(place)], image[None])
-
-
-def write_manifest(folder: Path, devices: Mapping[str, Device], part: BoardPart, name: str = "") -> None:
-    """Complete a capture folder whose poses are written."""
-    manifest.write_manifest(folder, Manifest(schema=SCHEMA, name=name, devices=dict(devices), board=part))

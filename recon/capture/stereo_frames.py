@@ -1,11 +1,11 @@
-"""Stereo frames of a sweep: what two cameras saw of a moving target, written, and read as a stream.
+"""Stereo frames of a sweep: images that two cameras took of a moving target, read as a stream.
 
 A film is the sweep part of a capture with images of both cameras, `sweep/cam1` and `sweep/cam2`, each with its `timestamps.csv`.
 The cameras share a clock. Frames belong together by their time stamps, whatever their numbers. Three pairs at most are in memory.
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,16 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.capture import calibration_files, manifest, sweep_tables
-from recon.capture.images import Images, read_image, write_images
-from recon.capture.manifest import MANIFEST, SCHEMA, Device, Manifest, SweepPart
-from recon.capture.sweep_part import FOLDER, STAMPS, image_name
+from recon.capture.images import Images, read_image
+from recon.capture.manifest import CAMERAS, MANIFEST, STAMPS, image_name
 from recon.errors import InputError
-from recon.files import atomic
+from recon.files.regular import check_there
 from recon.geometry.camera import Camera
-from recon.model.calibration import Calibration
 
-CAMERAS = ("cam1", "cam2")
-OPTICS = "calibration/optics.yaml"
 AHEAD = 2  # pairs that are read while one is worked on
 ALONE_NS = 33_000_000  # taken for the period where a single frame tells none
 Pair = tuple[Images, Images]
@@ -86,87 +82,25 @@ def read_film(folder: Path, calibration_file: Path | None = None) -> Film:
             raise InputError(f"{told}: sweep.images.{name}: expected a path, found none")
     if calibration_file is None and read.calibration is None:
         raise InputError(f"{told}: expected calibration, the path of a calibration file, found none")
-    devices = [read.devices[name] for name in CAMERAS]
+    devices = [read.devices_of("sweep")[name] for name in CAMERAS]
     depths = devices[0].bits, devices[1].bits
     if min(depths) > 8 and depths[0] != depths[1]:
         raise InputError(f"{told}: devices.cam2.bits: expected {depths[0]}, as of cam1, found {depths[1]}")
-    source = Path(calibration_file or folder / str(read.calibration))
-    cameras = _cameras(source, devices)
+    sizes = {name: device.size for name, device in zip(CAMERAS, devices, strict=True)}
+    known = calibration_files.read_for(Path(calibration_file or folder / str(read.calibration)), sizes).cameras
+    cameras = known[CAMERAS[0]], known[CAMERAS[1]]
     places = [root / read.sweep.images[name] for name in CAMERAS]
     tables = [sweep_tables.read_stamps(place / STAMPS) for place in places]
     first, second = _partners(places, tables)
     frames = np.column_stack([tables[0][0][first], tables[1][0][second]])
     film = Film(read.name or folder.resolve().name, cameras, depths, (places[0], places[1]), frames, tables[0][1][first])
-    for path in (path for both in film.paths() for path in both):
-        if not path.is_file():
-            raise InputError(f"{path}: expected a file, found {'something else' if path.exists() else 'none'}")
+    check_there(path for both in film.paths() for path in both)
     return film
-
-
-def write_film(
-    folder: Path,
-    pairs: Iterable[Pair],
-    times: NDArray[np.int64],
-    optics: Calibration,
-    devices: Mapping[str, Device],
-    name: str = "",
-) -> None:
-    """Write a capture folder with a film alone, whole or not at all.
-
-    Parameters
-    ----------
-    pairs : n of two (h, w) uint8 or uint16
-        Frames of camera 1 and camera 2, taken one by one; uint16 where the device has more than 8 bits.
-    times : (n,) ns
-        Of both, strictly increasing.
-
-    Raises
-    ------
-    InputError
-        If the place is taken by something that is not a capture, or can't be written to.
-    ValueError
-        If frames, times and devices don't fit together.
-    """
-    times = np.asarray(times, np.int64)
-    if (np.diff(times) <= 0).any():
-        raise ValueError("times: expected them strictly increasing")
-    part = SweepPart(images={camera: f"{FOLDER}/{camera}" for camera in CAMERAS})
-    content = Manifest(schema=SCHEMA, name=name, devices=dict(devices), calibration=OPTICS, sweep=part)
-    with atomic.new_folder(folder, MANIFEST) as temporary:
-        count = 0
-        for pair in pairs:
-            for camera, image in zip(CAMERAS, pair, strict=True):
-                kind = np.uint8 if devices[camera].bits == 8 else np.uint16
-                if image.shape != devices[camera].size[::-1] or image.dtype != kind:
-                    size = "x".join(map(str, devices[camera].size))
-                    raise ValueError(f"{camera}: expected {size} {kind.__name__}, found {image.shape} {image.dtype}")
-                write_images([temporary / part.images[camera] / image_name(count)], image[None])
-            count += 1
-        if count != len(times):
-            raise ValueError(f"pairs: expected {len(times)}, one a time, found {count}")
-        for camera in CAMERAS:
-            sweep_tables.write_stamps(temporary / part.images[camera] / STAMPS, times)
-        (temporary / OPTICS).parent.mkdir()
-        calibration_files.write(temporary / OPTICS, optics)
-        manifest.write_manifest(temporary, content)
 
 
 def _taken(waiting: deque[tuple[Future[Images], ...]]) -> Pair:
     first, second = waiting.popleft()
     return first.result(), second.result()
-
-
-def _cameras(path: Path, devices: Sequence[Device]) -> tuple[Camera, Camera]:
-    """Both cameras of a calibration, whose images are of the devices' sizes."""
-    sizes = {name: device.size for name, device in zip(CAMERAS, devices, strict=True)}
-    known = calibration_files.read(path, sizes=sizes).cameras
-    for name, wanted in sizes.items():
-        if name not in known:
-            raise InputError(f"{path}: expected {name}, found {', '.join(known)}")
-        if known[name].size != wanted:
-            found = "x".join(map(str, known[name].size))
-            raise InputError(f"{path}: {name}: expected {wanted[0]}x{wanted[1]} px, as its frames, found {found}")
-    return known[CAMERAS[0]], known[CAMERAS[1]]
 
 
 def _partners(

@@ -3,7 +3,7 @@
 B-scans are read one at a time: a sweep of some minutes is larger than it needs to be in memory.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,21 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.capture import manifest, probe_files, sweep_tables
-from recon.capture.images import Size, read_image, write_images
-from recon.capture.manifest import MANIFEST, SCHEMA, Device, Manifest, SweepPart
+from recon.capture.images import Size, read_image
+from recon.capture.manifest import MANIFEST, SCANNER, STAMPS, image_name
 from recon.errors import InputError
-from recon.files import atomic
+from recon.files.regular import check_there
 from recon.model import tracks
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 
 Array = NDArray[np.float64]
-
-SCANNER = "us"  # the device
-STAMPS = "timestamps.csv"  # in each device's folder
-FOLDER = "sweep"
-TRACK = f"{FOLDER}/track.csv"
-PROBE = "calibration/probe.yaml"
 
 
 @dataclass(frozen=True)
@@ -99,93 +93,16 @@ def read_sweep(folder: Path) -> SweepCapture:
     for name, found in ((f"sweep.images.{SCANNER}", part.images.get(SCANNER)), ("sweep.track", part.track)):
         if found is None:
             raise InputError(f"{folder / MANIFEST}: {name}: expected a path, found none")
-    device = read.devices[SCANNER]
+    device = read.devices_of("sweep")[SCANNER]
     if device.bits != 8:
         raise InputError(f"{folder / MANIFEST}: devices.{SCANNER}.bits: expected 8, found {device.bits}")
     place = root / part.images[SCANNER]
     frames, times = sweep_tables.read_stamps(place / STAMPS)
     paths = tuple(place / image_name(frame) for frame in frames.tolist())
-    for path in paths:
-        if not path.is_file():
-            raise InputError(f"{path}: expected a file, found {'something else' if path.exists() else 'none'}")
+    check_there(paths)
     track = sweep_tables.read_track(root / str(part.track))
     probe = None if read.probe is None else probe_files.read(folder / read.probe)
     return SweepCapture(read.name or folder.resolve().name, device.size, paths, frames, times, track, probe)
-
-
-def write_part(
-    folder: Path, images: Iterable[NDArray[np.uint8]], times: NDArray[np.int64], track: Track, size: Size
-) -> SweepPart:
-    """Write B-scans and poses into a capture folder, whole or not at all.
-
-    Parameters
-    ----------
-    images : n of (h, w) uint8
-        Taken one by one.
-    times : (n,) ns
-        Of the scanner's clock, strictly increasing.
-
-    Returns
-    -------
-    SweepPart
-        For the manifest, beside the device `us` and other parts.
-
-    Raises
-    ------
-    ValueError
-        If images are of another size or no bytes, their number is not that of the times, or times don't increase.
-    """
-    times = np.asarray(times, np.int64)
-    if (np.diff(times) <= 0).any() or (np.diff(track.times) <= 0).any():
-        raise ValueError("times: expected them strictly increasing")
-    part = SweepPart(images={SCANNER: f"{FOLDER}/{SCANNER}"}, track=TRACK)
-    with atomic.new_folder(folder / FOLDER, str(Path(TRACK).relative_to(FOLDER))) as temporary:
-        place = temporary / SCANNER
-        place.mkdir()
-        count = 0
-        for image in images:
-            if image.shape != size[::-1] or image.dtype != np.uint8:
-                raise ValueError(f"image {count}: expected {size[0]}x{size[1]} uint8, found {image.shape} {image.dtype}")
-            write_images([place / image_name(count)], image[None])
-            count += 1
-        if count != len(times):
-            raise ValueError(f"images: expected {len(times)}, one a time, found {count}")
-        sweep_tables.write_stamps(place / STAMPS, times)
-        sweep_tables.write_track(temporary / Path(TRACK).relative_to(FOLDER), track)
-    return part
-
-
-def write_sweep(
-    folder: Path,
-    images: Iterable[NDArray[np.uint8]],
-    times: NDArray[np.int64],
-    track: Track,
-    size: Size,
-    probe: ProbeCalibration | None = None,
-    name: str = "",
-) -> None:
-    """Write a capture folder with a sweep part alone, whole or not at all; see `write_part`.
-
-    Raises
-    ------
-    InputError
-        If the place is taken by something that is not a capture, or can't be written to.
-    ValueError
-        As `write_part`.
-    """
-    with atomic.new_folder(folder, MANIFEST) as temporary:
-        part = write_part(temporary, images, times, track, size)
-        if probe is not None:
-            (temporary / PROBE).parent.mkdir()
-            probe_files.write(temporary / PROBE, probe)
-        devices = {SCANNER: Device(size=size)}
-        content = Manifest(schema=SCHEMA, name=name, devices=devices, probe=PROBE if probe is not None else None, sweep=part)
-        manifest.write_manifest(temporary, content)
-
-
-def image_name(frame: int) -> str:
-    """File name of a frame, in its device's folder."""
-    return f"{frame:04d}.png"
 
 
 def _span(times: NDArray[np.int64]) -> str:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.capture import manifest, sweep_tables
+from recon.capture.manifest import SCANNER, image_name
 from recon.capture.stereo_frames import Film, Pair
-from recon.capture.sweep_part import SCANNER, image_name
 from recon.geometry.camera import Camera
 from recon.model.tracks import Track
 from recon.tracking import overlays

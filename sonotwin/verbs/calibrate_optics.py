@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import PrivateAttr
 from rich.console import Console
 
-from recon.capture import board_part, calibration_files, meza2021
+from recon.capture import board_part, calibration_files, manifest, meza2021
 from recon.capture.board_part import BoardCapture
 from recon.errors import InputError
 from recon.files import atomic, metrics
@@ -73,7 +73,7 @@ def run(config: Config) -> None:
     atomic.check_folder(config.out, PAGE, inputs=inputs)
     captured = board_part.read_board(config.capture)
     sizes = sizes_of(captured)
-    truth = None if config.truth is None else read_truth(config.truth, sizes)
+    truth = None if config.truth is None else calibration_files.read_for(config.truth / manifest.OPTICS, sizes)
 
     start = perf_counter()
     sightings = []
@@ -116,22 +116,6 @@ def sizes_of(captured: BoardCapture) -> dict[str, Size]:
     if DEVICES[0] not in sizes:
         raise InputError(f"{captured.name}: expected images of {DEVICES[0]}, the world's frame, found {', '.join(sizes)}")
     return {name: sizes[name] for name in DEVICES if name in sizes}
-
-
-def read_truth(folder: Path, sizes: Mapping[str, Size]) -> Calibration:
-    """Read the true calibration that the twin wrote beside a capture.
-
-    Raises
-    ------
-    InputError
-        If it is missing or damaged, or of other devices.
-    """
-    path = folder / "calibration" / OPTICS
-    found = calibration_files.read(path)
-    for name, size in sizes.items():
-        if name not in found.cameras or found.cameras[name].size != size:
-            raise InputError(f"{path}: expected {name} of {size[0]}x{size[1]} px as in the capture, found another or none")
-    return found
 
 
 def look(captured: BoardCapture, number: int) -> Sighting:

@@ -4,7 +4,7 @@ Reads the rig and the path from conf/; body, surroundings and light are drawn fr
 conf/dataset.yaml. The default path goes slowly, then fast, and partly out of camera 1's view, so that failures are seen too.
 Writes OUT/capture/, which `sonotwin track` reads like any hardware's, and OUT/truth/, which only evaluation opens: poses, motion,
 projected centres, blur and visibility. Takes about a second a frame on two cores (pixels=full: four), and a minute more when it
-first compiles.
+first compiles. With `add=true` other parts of a capture in OUT stay; without it they are refused.
 
     sonotwin film out=outputs/film
     sonotwin film out=outputs/film frames=120 seed=3 white_dn=20
@@ -21,8 +21,10 @@ from pydantic import ConfigDict, Field
 from rich.console import Console
 from rich.progress import Progress
 
+from recon.capture.manifest import CAMERAS
 from recon.model.rig import Rig
 from sonotwin.config import folder as conf
+from twin.session import Session
 from twin.tracking import film_session
 from twin.tracking.rendered_views import Frames, Quality
 from twin.tracking.sampling_ranges import DataRanges
@@ -35,6 +37,7 @@ class Config(film_session.Filming):
 
     rig: Rig
     out: Path
+    add: bool = False
     pixels: Literal["sketch", "full"] = "sketch"
     quality: Quality = Quality(window=8)
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
@@ -49,7 +52,8 @@ def run(config: Config) -> None:
         If `out` holds something else.
     """
     console = Console(soft_wrap=True, highlight=False)
-    film_session.check_places(config.out, "film")
+    session = Session(config.out, "sweep", config.model_dump(mode="json", exclude={"out", "add"}), config.add, CAMERAS)
+    session.check()
     with console.status("setting up the scene"):
         bank = film_session.make_bank(config.rig, config.seed)
         made = film_session.takes(bank, config.rig, ranges(), config, config.seed)
@@ -58,8 +62,7 @@ def run(config: Config) -> None:
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         shot = film_session.shoot(bank, config.rig, made, config.quality, config.seed, config.pixels)
         frames = progress.track(shot, total=len(made), description="rendering")
-        settings = config.model_dump(mode="json", exclude={"out"})
-        film_session.write_session(config.out, config.rig, config, made, _noted(frames, blurs), settings)
+        film_session.write_session(session, config.rig, config, made, _noted(frames, blurs))
     seconds = perf_counter() - start
     console.print(f"render      {len(made)} pairs of frames, blurred by up to {max(blurs):.1f} px, {seconds:.1f} s")
     console.print(f"wrote       {config.out}/{{capture,truth}}", markup=False)

@@ -4,6 +4,8 @@ Reads the rig, the scene, the patterns and the engine's settings from conf/. Wri
 any hardware's, and OUT/truth/, which only evaluation opens: points, normals, projector coordinates, the true calibration.
 Takes about five seconds a camera for nine patterns on two cores, and once ten seconds more to compile.
 
+With `add=true` other parts of a capture in OUT stay, such as a board, a sweep; without it they are refused.
+
 With `poses` the scene is the calibration board, held in many poses: lit for each camera, and under the patterns for camera 1.
 Takes about eight seconds a pose on two cores. A run that was stopped goes on where it was when given the same fields again.
 
@@ -24,9 +26,10 @@ from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene, parse_scene
-from twin import board_session, surface_session
+from twin import board_session
+from twin.optics import surface_session
 from twin.optics.light_transport import Engine
-from twin.output_folders import check_places
+from twin.session import Session
 
 
 class Config(BaseModel):
@@ -39,6 +42,7 @@ class Config(BaseModel):
     patterns: Patterns
     engine: Engine
     out: Path
+    add: bool = False
     cameras: Annotated[list[surface_session.CameraName], Field(min_length=1)]
     seed: Annotated[int, Field(ge=0)]
     shooting: surface_session.Shooting
@@ -72,17 +76,17 @@ class Config(BaseModel):
 def run(config: Config) -> None:
     """Render, and say what was written."""
     console = Console(soft_wrap=True, highlight=False)
+    settings = config.model_dump(mode="json", exclude={"out", "add"})
     if config.poses is None:
-        render_surface(config, console)
+        render_surface(config, Session(config.out, "surface", settings, config.add), console)
     else:
-        render_board(config, config.poses, console)
+        render_board(config, config.poses, Session(config.out, "board", settings, config.add), console)
     console.print(f"wrote       {config.out}/{{capture,truth}}", markup=False)
 
 
-def render_board(config: Config, chosen: BoardPoses, console: Console) -> None:
+def render_board(config: Config, chosen: BoardPoses, session: Session, console: Console) -> None:
     """The calibration board in all poses, going on where an earlier run with the same fields was stopped."""
-    described = config.model_dump(mode="json", exclude={"out"})
-    if board_session.is_finished(config.out, described):
+    if board_session.is_finished(session):
         console.print(f"keep        {chosen.count} poses, which are there already")
         return
     settings = board_session.Settings(
@@ -96,7 +100,7 @@ def render_board(config: Config, chosen: BoardPoses, console: Console) -> None:
         config.seed,
     )
     placed = board_session.place_all(settings)
-    missing = board_session.missing_poses(config.out, settings, described)
+    missing = board_session.missing_poses(session, settings)
     if len(missing) < len(placed):
         console.print(f"continue    {len(placed) - len(missing)} of {len(placed)} poses are there already")
     start = perf_counter()
@@ -108,17 +112,17 @@ def render_board(config: Config, chosen: BoardPoses, console: Console) -> None:
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         for number in progress.track(missing, description=f"rendering {config.patterns.count} patterns a pose"):
             images = board_session.shoot_pose(stage, settings, exposures, number, placed[number])
-            board_session.write_pose(config.out, number, *images)
-    board_session.finish(config.out, settings, exposures, placed)
+            board_session.write_pose(session, number, *images)
+    board_session.finish(session, settings, exposures, placed)
     seconds = perf_counter() - start
     console.print(
         f"render      {len(missing)} poses, {config.patterns.count} patterns, {config.engine.samples} samples/px, {seconds:.1f} s"
     )
 
 
-def render_surface(config: Config, console: Console) -> None:
+def render_surface(config: Config, session: Session, console: Console) -> None:
     """What each camera sees of the scene under the patterns."""
-    check_places(config.out, "surface")
+    session.check()
     scene = build_scene(config.scene)
     views = {}
     for camera in dict.fromkeys(config.cameras):
@@ -130,6 +134,4 @@ def render_surface(config: Config, console: Console) -> None:
             f"render      {camera}, {config.patterns.count} patterns, {config.engine.samples} samples/px, "
             f"exposure {view.exposure.time_s * 1e3:.2f} ms, {perf_counter() - start:.1f} s"
         )
-    surface_session.write_session(
-        config.out, config.rig, scene, config.patterns, views, config.model_dump(mode="json", exclude={"out"})
-    )
+    surface_session.write_session(session, config.rig, scene, config.patterns, views)

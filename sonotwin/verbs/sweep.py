@@ -4,7 +4,7 @@ Reads the rig, the scene, the transducer and the probe's path from conf/. Writes
 and freehand read like any hardware's: B-scans and tracked poses by their own clocks, and the probe's calibration, except with
 path=wire, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times, and labels of what
 each pixel shows. Takes about a tenth of a second a B-scan on two cores, a quarter of a minute for the default stroke, and a
-minute more when it first compiles.
+minute more when it first compiles. With `add=true` other parts of a capture in OUT stay; without it they are refused.
 
     sonotwin sweep out=outputs/sweep
     sonotwin sweep scene=tank ultrasound=water path=bob out=outputs/bottom
@@ -21,8 +21,10 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from rich.console import Console
 from rich.progress import Progress
 
+from recon.capture.manifest import SCANNER
 from recon.model.rig import Rig
 from scenes.catalogue import build_scene
+from twin.session import Session
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import Scan
 from twin.ultrasound.echo_solids import Body, body
@@ -41,6 +43,7 @@ class Config(BaseModel):
     ultrasound: Transducer
     path: sweep_session.AnyPath
     out: Path
+    add: bool = False
     clocks: Clocks = Clocks()
     pose_noise: PoseNoise = PoseNoise()
     seed: Annotated[int, Field(ge=0)] = 0
@@ -75,7 +78,9 @@ def run(config: Config) -> None:
         If the scene has no acoustics or not what the path is about, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    sweep_session.check_places(config.out, "sweep")
+    settings = config.model_dump(mode="json", exclude={"out", "add"})
+    session = Session(config.out, "sweep", settings, config.add, (SCANNER,))
+    session.check()
     with console.status("setting up the scene"):
         scene = build_scene(config.scene)
         scanned = body(scene)
@@ -85,10 +90,9 @@ def run(config: Config) -> None:
     count = len(planned.times)
     console.print(f"path        {config.path.kind}, {count} B-scans, {len(planned.track.times)} poses")
     probe = None if isinstance(config.path, WirePath) else sweep_session.calibration_of(config.rig, config.ultrasound)
-    settings = config.model_dump(mode="json", exclude={"out"})
     start = perf_counter()
     taken = shown(scanned, config, planned, console)
-    sweep_session.write_session(config.out, scene, scanned, config.ultrasound, planned, taken, probe, settings)
+    sweep_session.write_session(session, scene, scanned, config.ultrasound, planned, taken, probe)
     seconds = perf_counter() - start
     width, height = config.ultrasound.image_size
     console.print(f"render      {count} B-scans, {width}x{height}, {seconds:.1f} s")

@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recon.capture import sweep_part
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 from recon.probe_calibration import sound_in_water
-from tests.recon import bscans, probe_motions
+from tests.recon import bscans, captures, probe_motions
 
 START_NS = 10**18  # of the clocks: seconds since 1970
 WATER_C = 22.0
@@ -43,7 +42,7 @@ def wires(folder: Path, rig, rng, lag_s: float = 0.0) -> Path:
             yield bscans.image(wire + bscans.face(), rng)
 
     track = Track(nanoseconds((moments[:, None] + [-0.05, 0.05]).ravel()), np.repeat(poses, 2, axis=0))
-    sweep_part.write_sweep(folder, images(), nanoseconds(moments + lag_s), track, bscans.SIZE, name="wires")
+    captures.write_sweep(folder, images(), nanoseconds(moments + lag_s), track, bscans.SIZE, name="wires")
     return folder
 
 
@@ -59,7 +58,7 @@ def bottom(folder: Path, rng, lag_s: float) -> Path:
     poses[50:53] = np.nan
     images = (bscans.image(bscans.bottom((32 + h) / bscans.MM_PER_PX) + bscans.face(), rng) for h in height(shown))
     times = nanoseconds(shown + lag_s)
-    sweep_part.write_sweep(folder, images, times, Track(nanoseconds(tracked), poses), bscans.SIZE, name="bottom")
+    captures.write_sweep(folder, images, times, Track(nanoseconds(tracked), poses), bscans.SIZE, name="bottom")
     return folder
 
 
@@ -85,5 +84,5 @@ def ball(folder: Path, rig, lag_s: float = 0.0, count: int = 41, with_probe: boo
     tracked = np.arange(-1.1, 1.1, 0.03)
     poses = np.array([world_from_image(t) @ rigid.invert(probe.target_from_image) for t in tracked])
     times, track = nanoseconds(moments + lag_s), Track(nanoseconds(tracked), poses)
-    sweep_part.write_sweep(folder, images, times, track, size, probe if with_probe else None, "ball")
+    captures.write_sweep(folder, images, times, track, size, probe if with_probe else None, "ball")
     return folder

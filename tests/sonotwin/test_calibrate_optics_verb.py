@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.capture import board_part, calibration_files
+from recon.capture import calibration_files
 from recon.capture.manifest import BoardPart, Device
+from recon.capture.writer import new_capture, write_pose
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.boards import Chessboard
@@ -45,10 +46,10 @@ def session(tmp_path_factory) -> Path:
         lit = {name: np.uint8(board_views.view(BOARD, camera, pose, noise=0.7, rng=rng)) for name, camera in cameras().items()}
         if number == 8:
             lit["cam2"][:] = 2
-        board_part.write_pose(folder / "capture", f"{number:02d}", lit, {})
-        poses.append(board_part.describe_pose(f"{number:02d}", list(lit), {}))
-    part = BoardPart(board=BOARD, poses=tuple(poses))
-    board_part.write_manifest(folder / "capture", {name: Device(size=SIZE) for name in cameras()}, part, "small")
+        poses.append(lit)
+    with new_capture(folder / "capture", "small") as capture:
+        records = tuple(write_pose(capture.folder, f"{number:02d}", lit, {}) for number, lit in enumerate(poses))
+        capture.add_board(BoardPart(board=BOARD, poses=records), {name: Device(size=SIZE) for name in cameras()})
     (folder / "truth" / "calibration").mkdir(parents=True)
     calibration_files.write(folder / "truth" / "calibration" / "optics.yaml", Calibration(cameras()))
     return folder
@@ -125,7 +126,7 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(copied, tmp_pa
     assert "expected a folder apart from what is read" in complaint(capsys, f"capture={capture}", f"out={copied}")
     assert "expected a calibration file" in complaint(capsys, *fields, f"truth={tmp_path}")
     calibration_files.write(copied / "truth" / "calibration" / "optics.yaml", Calibration({"cam1": cameras()["cam1"]}))
-    assert "expected cam2 of 320x256 px as in the capture" in complaint(capsys, *fields, f"truth={copied / 'truth'}")
+    assert "truth/calibration/optics.yaml: expected cam2, found cam1" in complaint(capsys, *fields, f"truth={copied / 'truth'}")
     image = capture / "board" / "03" / "cam1" / "lit.png"
     image.write_bytes(image.read_bytes()[:-30])
     assert complaint(capsys, *fields).startswith(f"{image}: expected a whole PNG image")

@@ -8,7 +8,6 @@ import pytest
 import trimesh
 from scipy.ndimage import gaussian_filter
 
-from recon.capture import sweep_part
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
@@ -19,7 +18,7 @@ from recon.segmentation.masses import Mass
 from recon.segmentation.tube_wall import Ring
 from sonotwin.cli import main
 from sonotwin.verbs import segment
-from tests.recon import probe_motions, sweep_sets
+from tests.recon import captures, probe_motions, sweep_sets
 
 LAG_S = 0.1
 SIZE, SCALE = (90, 100), np.array([0.35, 0.35])  # px, mm/px: 31.5 x 35 mm
@@ -51,7 +50,7 @@ def capture(tmp_path_factory, rig) -> Path:
     moments, tracked = np.arange(-1.2, 1.2, 0.05), np.arange(-1.3, 1.3, 0.025)
     poses = np.array([world_from_image(t) @ rigid.invert(probe.target_from_image) for t in tracked])
     times, track = sweep_sets.nanoseconds(moments + LAG_S), Track(sweep_sets.nanoseconds(tracked), poses)
-    sweep_part.write_sweep(folder, (image(t) for t in moments), times, track, SIZE, probe, "mass")
+    captures.write_sweep(folder, (image(t) for t in moments), times, track, SIZE, probe, "mass")
     return folder
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from recon.capture import calibration_files, images, surface_part
-from recon.capture.surface_part import Device, Manifest, SurfacePart
+from recon.capture import calibration_files, images, surface_part, writer
+from recon.capture.manifest import Device, Manifest, SurfacePart
 from recon.geometry import primitives, rigid
 from recon.geometry.camera import Camera
 from recon.model.calibration import Calibration
@@ -62,7 +62,7 @@ def shots(request, optics, tmp_path) -> tuple[Path, np.ndarray, Patterns]:
     patterns = SEQUENCES[request.param]
     images = photograph(patterns, optics)
     devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
-    surface_part.write_surface(tmp_path / "capture", {"cam1": images}, patterns, optics, devices)
+    writer.write_surface(tmp_path / "capture", {"cam1": images}, patterns, optics, devices)
     return tmp_path / "capture", images, patterns
 
 
@@ -173,7 +173,7 @@ def test_a_place_that_cannot_be_written_to_is_said_first(tmp_path, capsys):
 def test_darkness_is_said(optics, tmp_path, capsys):
     devices = {"cam1": Device(size=SIZE), "projector": Device(size=PROJECTOR)}
     black = np.zeros((9, SIZE[1], SIZE[0]), np.uint8)
-    surface_part.write_surface(tmp_path / "capture", {"cam1": black}, SEQUENCES["centre_line"], optics, devices)
+    writer.write_surface(tmp_path / "capture", {"cam1": black}, SEQUENCES["centre_line"], optics, devices)
     assert main(["surface", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}"]) == 2
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "out").exists()
 
@@ -250,7 +250,7 @@ def test_the_page_measures(rig, tmp_path, monkeypatch):
     (tmp_path / "wrapped" / "manifest.json").write_text(json.dumps(manifest))
     devices = {"cam1": Device(size=(1280, 1024)), "projector": Device(size=(1280, 800))}
     pictures = photograph(patterns, optics)
-    surface_part.write_surface(tmp_path / "capture", {"cam1": pictures}, patterns, optics, devices)
+    writer.write_surface(tmp_path / "capture", {"cam1": pictures}, patterns, optics, devices)
     paper = surface_part.read_patterns(Path(__file__).parents[2] / "conf" / "patterns" / "paper_surface.yaml")
     monkeypatch.chdir(tmp_path)
 

@@ -7,10 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.capture.manifest import Device, read_manifest
 from recon.capture.sweep_part import read_sweep
 from recon.files import volumes
 from recon.geometry import rigid
+from recon.model.patterns import CentreLine, Fringes, Patterns
+from scenes.scene_types import Scene
 from sonotwin.cli import main
+from twin.session import Session, describe
+
+PARTS = (CentreLine(), Fringes(pitch=12, steps=4))
 
 
 def small(width: int, height: int) -> list[str]:
@@ -138,3 +144,22 @@ def test_a_place_that_is_taken_is_refused(tmp_path, capsys):
     assert main(["sweep", f"out={tmp_path / 'out'}"]) == 2
     assert "expected a new or empty folder" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["capture"]
+
+
+def test_a_sweep_joins_a_surface_if_it_is_added(tmp_path, capsys):
+    """Refused otherwise, before anything is rendered; each part keeps its settings."""
+    out, size, patterns = tmp_path / "out", (64, 48), Patterns(projector_size=(128, 80), unwrap="centre_line", parts=PARTS)
+    with Session(out, "surface", {"seed": 7}).write(describe(Scene("wall", ()))) as (capture, _):
+        images = np.zeros((patterns.count, *size[::-1]), np.uint8)
+        capture.add_surface({"cam1": images}, patterns, {"cam1": Device(size=size)})
+    before = contents(out)
+    fields = ["scene=crosswire", "ultrasound=water", "path=wire", "path.count=2", "path.rest_s=0.2", *small(48, 64), f"out={out}"]
+    assert main(["sweep", *fields]) == 2
+    assert "expected nothing or an earlier sweep of us, found a surface; choose another out, or give" in capsys.readouterr().err
+    assert contents(out) == before
+    assert main(["sweep", *fields, "add=true"]) == 0
+    assert len(read_sweep(out / "capture").paths) == 2
+    assert read_manifest(out / "capture").contents == {"surface": ("cam1",), "sweep": ("us",)}
+    after = contents(out)
+    assert all(after[name] == content for name, content in before.items() if name != "capture/manifest.json")
+    assert json.loads(after["truth/sweep/settings.json"])["path"]["kind"] == "wire"

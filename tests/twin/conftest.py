@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from recon.capture import calibration_files, surface_part
+from recon.capture import calibration_files, writer
+from recon.capture.manifest import Device
 from recon.geometry.camera import Camera
 from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes, Patterns
@@ -87,10 +88,10 @@ def draw(session: Session, rng: np.random.Generator) -> None:
         json.dumps({"name": "drawn", "things": ["ball", "wall"], "shapes": SHAPES}), encoding="utf-8"
     )
     devices = {
-        "cam1": surface_part.Device(size=camera.size, exposure_s=0.01, gain=1.0),
-        "projector": surface_part.Device(size=projector.size),
+        "cam1": Device(size=camera.size, exposure_s=0.01, gain=1.0),
+        "projector": Device(size=projector.size),
     }
-    surface_part.write_surface(session.folder / "capture", {"cam1": images}, patterns, optics, devices, "drawn")
+    writer.write_surface(session.folder / "capture", {"cam1": images}, patterns, optics, devices, "drawn")
 
 
 def distance_to_ball(start, directions):

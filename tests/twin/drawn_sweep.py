@@ -18,7 +18,7 @@ from recon.model.tracks import Track
 from recon.probe_calibration import latency
 from recon.segmentation import containment
 from scenes.scene_types import Material, Scene, Thing
-from tests.recon import sweep_sets
+from tests.recon import captures, sweep_sets
 from tests.twin.conftest import CENTRE, RADIUS
 from twin.evaluation import sweep_errors
 from twin.evaluation.sweep_errors import SweepTruth
@@ -97,7 +97,7 @@ def inside(folder: Path, rig: Rig, rng: np.random.Generator) -> Inside:
     images = (grey[truth.shown(k)] + rng.integers(0, 40, SIZE[::-1], np.uint8) for k in range(COUNT))
     times = sweep_sets.nanoseconds(np.arange(COUNT) / 20)
     track = Track(times, poses() @ rigid.invert(truth.probe.target_from_image))
-    sweep_part.write_sweep(folder / "sweep", images, times, track, SIZE)
+    captures.write_sweep(folder / "sweep", images, times, track, SIZE)
     bob, depths = bottom(rng)
     found_lag = latency.estimate(bob.times, depths, bob.track)
     low = CENTRE - 20

@@ -19,8 +19,9 @@ from scenes.kinds import board
 from twin import board_session
 from twin.board_session import Settings
 from twin.optics.light_transport import Engine, render
+from twin.optics.surface_session import Shooting, calibration_of
 from twin.sensor import electrons_per_radiance
-from twin.surface_session import Shooting, calibration_of
+from twin.session import Session
 
 PATTERNS = Patterns(
     projector_size=(1280, 800),
@@ -54,15 +55,16 @@ def settings(rig) -> Settings:
 
 def run(out: Path, settings: Settings, stop_after: int | None = None) -> list[int]:
     """Render what is missing; returns the numbers of the poses that were."""
-    missing = board_session.missing_poses(out, settings, DESCRIBED)[:stop_after]
+    session = Session(out, "board", DESCRIBED)
+    missing = board_session.missing_poses(session, settings)[:stop_after]
     placed = board_session.place_all(settings)
     stage = board_session.set_up(settings)
     exposures = board_session.set_exposures(stage, settings)
     for number in missing:
         images = board_session.shoot_pose(stage, settings, exposures, number, placed[number])
-        board_session.write_pose(out, number, *images)
+        board_session.write_pose(session, number, *images)
     if stop_after is None:
-        board_session.finish(out, settings, exposures, placed)
+        board_session.finish(session, settings, exposures, placed)
     return missing
 
 
@@ -133,8 +135,8 @@ def test_a_stopped_session_goes_on(session, settings, tmp_path):
 def test_other_settings_start_anew(settings, tmp_path):
     """Poses of one session never mix with another's."""
     run(tmp_path, settings, stop_after=1)
-    assert board_session.missing_poses(tmp_path, settings, DESCRIBED) == [1, 2]
-    assert board_session.missing_poses(tmp_path, settings, {"seed": 4}) == [0, 1, 2]
+    assert board_session.missing_poses(Session(tmp_path, "board", DESCRIBED), settings) == [1, 2]
+    assert board_session.missing_poses(Session(tmp_path, "board", {"seed": 4}), settings) == [0, 1, 2]
 
 
 @pytest.mark.parametrize("aperture_mm", [0.0, 60.0])
@@ -163,8 +165,8 @@ def test_a_board_does_not_take_the_place_of_a_film(settings, tmp_path):
     images = {"cam1": "sweep/cam1", "cam2": "sweep/cam2"}
     devices = {name: Device(size=(64, 48)) for name in images}
     manifest.write_manifest(tmp_path / "capture", Manifest(schema=SCHEMA, devices=devices, sweep=SweepPart(images=images)))
-    with pytest.raises(InputError, match="capture: expected nothing or an earlier board, found a film"):
-        board_session.missing_poses(tmp_path, settings, DESCRIBED)
+    with pytest.raises(InputError, match="capture: expected nothing or an earlier board, found a sweep of cam1 and cam2"):
+        board_session.missing_poses(Session(tmp_path, "board", DESCRIBED), settings)
 
 
 @pytest.mark.slow

@@ -22,8 +22,8 @@ from scenes.board_poses import random_poses
 from scenes.kinds import board
 from twin import board_session
 from twin.board_session import CAMERAS, FRINGE_CAMERA
+from twin.optics.surface_session import calibration_of
 from twin.sensor import Numbers
-from twin.surface_session import calibration_of
 
 
 @dataclass(frozen=True)

@@ -51,8 +51,8 @@ from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import Metrics
 from twin.optics.light_transport import Engine, render
 from twin.optics.ray_world import move_things
+from twin.optics.surface_session import Shooting, calibration_of
 from twin.sensor import Exposure, auto_exposure, expose
-from twin.surface_session import Shooting, calibration_of
 
 ENGINE = Engine(samples=16, room_lux=20)
 PAPER_RMS_PX = {"cam1": 0.138, "cam2": 0.151, "projector": 0.131}

@@ -17,7 +17,7 @@ from scenes.acoustics import TISSUES
 from scenes.catalogue import build_scene
 from twin.accuracy import surface_accuracy
 from twin.accuracy.table_rows import Row, Setup
-from twin.surface_session import calibration_of
+from twin.optics.surface_session import calibration_of
 from twin.ultrasound import sweep_session
 from twin.ultrasound.echo_solids import body
 from twin.ultrasound.probe_path import SurfacePath

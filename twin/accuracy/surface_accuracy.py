@@ -20,7 +20,7 @@ from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import Comparison, Metrics, Truth
 from twin.optics.light_transport import Engine
 from twin.optics.ray_world import visible
-from twin.surface_session import Shooting, View, calibration_of, shoot
+from twin.optics.surface_session import Shooting, View, calibration_of, shoot
 
 ENGINE = Engine(samples=16, room_lux=20)
 PAPER_SPHERE_RADIUS_MM, PAPER_SPHERE_RMS_MM = 0.045, 0.040

@@ -1,10 +1,9 @@
-"""How far a reconstructed surface is from the rendered one, pixel by pixel, and what the sensor's noise alone would allow.
+"""Errors of a reconstructed surface against the rendered one, pixel by pixel, and the limit that the sensor's noise sets.
 
 The error of a point is its signed distance to the plane that touches the true surface where the pixel's ray meets it, positive
-outwards. Ground truth is read here and in the report, nowhere else.
+outwards.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.capture import calibration_files
 from recon.errors import InputError
 from recon.files import npz
 from recon.files.metrics import Metrics
@@ -21,6 +19,7 @@ from recon.files.npz import Form
 from recon.geometry import primitives
 from recon.geometry.camera import Array, Camera
 from recon.geometry.primitives import Cylinder, Plane, Shape, Sphere
+from twin.session import SCENE, TruthFolder
 
 Map = NDArray[np.float32]  # (h, w)
 Mask = NDArray[np.bool_]  # (h, w)
@@ -85,23 +84,22 @@ def read_truth(folder: Path, camera: str = "cam1") -> Truth:
     InputError
         If a file is missing or damaged, or the parts don't fit together.
     """
-    folder = Path(folder)
-    described = _read_json(folder / "scene.json")
-    path = folder / "surface" / f"{camera}.npz"
-    maps = npz.read(path, TRUTH)
-    optics = calibration_files.read(folder / "calibration" / "optics.yaml").cameras
-    for name in (camera, "projector"):
-        if name not in optics:
-            raise InputError(f"{folder / 'calibration' / 'optics.yaml'}: expected {name}, found {', '.join(optics) or 'none'}")
+    kept = TruthFolder(Path(folder), "surface")
+    described = kept.scene()
+    name = f"surface/{camera}.npz"
+    maps = kept.arrays(name, TRUTH)
+    optics = kept.optics(camera, "projector")
     size = optics[camera].size
-    for name, array in maps.items():
+    for field, array in maps.items():
         if array.shape[:2] != size[::-1]:
-            raise InputError(f"{path}: {name}: expected {size[0]}x{size[1]}, found {array.shape[1]}x{array.shape[0]}")
+            raise InputError(
+                f"{kept.folder / name}: {field}: expected {size[0]}x{size[1]}, found {array.shape[1]}x{array.shape[0]}"
+            )
     try:
         scene, things = str(described["name"]), tuple(str(thing) for thing in described["things"])
         shapes = tuple(_shape(entry) for entry in described["shapes"])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{folder / 'scene.json'}: expected name, things and shapes, found them damaged at {error}") from None
+        raise InputError(f"{kept.described / SCENE}: expected name, things and shapes, found them damaged at {error}") from None
     return Truth(
         **maps,
         camera=optics[camera],
@@ -331,15 +329,3 @@ def _mean(values: NDArray) -> float:
 
 def _median(values: NDArray) -> float:
     return float(np.median(values)) if values.size else np.nan
-
-
-def _read_json(path: Path) -> dict:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file of the twin's ground truth, found none") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected JSON, found {error}") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: expected an object, found {type(content).__name__}")
-    return content

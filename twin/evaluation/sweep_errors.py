@@ -1,9 +1,5 @@
-"""How far what a sweep found is from the rendered one: the probe's calibration, the lag, where its pixels lie, the tumours.
+"""Errors of a sweep's results against the rendered truth: the probe's calibration, the lag, the places of pixels, the tumours."""
 
-Ground truth of a sweep is read here and in its report, nowhere else.
-"""
-
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +12,7 @@ from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from recon.capture import sweep_part
+from recon.capture.manifest import image_name
 from recon.errors import InputError, one_line
 from recon.files import npz
 from recon.files.metrics import Metrics
@@ -29,6 +25,7 @@ from recon.segmentation import containment
 from scenes.catalogue import build_scene
 from scenes.scene_types import Thing
 from scenes.tumour import caliper
+from twin.session import SETTINGS, TruthFolder
 from twin.ultrasound import sweep_session
 from twin.ultrasound.echo_solids import Body, body
 from twin.ultrasound.timed_sweep import Clocks
@@ -83,20 +80,17 @@ def read_truth(folder: Path) -> SweepTruth:
     InputError
         If a file is missing or damaged, or the scene hides nothing.
     """
-    folder = Path(folder)
-    path = folder / sweep_session.SETTINGS
+    kept = TruthFolder(Path(folder), "sweep")
+    path, settings = kept.described / SETTINGS, kept.settings()
     try:
-        settings = json.loads(path.read_text(encoding="utf-8"))
         rig, clocks = Rig.model_validate(settings["rig"]), Clocks.model_validate(settings["clocks"])
         transducer, wanted = Transducer.model_validate(settings["ultrasound"]), dict(settings["scene"])
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected the settings of a rendered sweep, found none") from None
     except ValidationError as error:
         raise InputError(f"{path}: {one_line(error)}") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: expected the settings of a rendered sweep, found them damaged at {error}") from None
-    poses = npz.read(folder / sweep_session.POSES, {"world_from_image": npz.Form("f", (None, 4, 4))})["world_from_image"]
-    labels = tuple(folder / sweep_session.LABELS / sweep_part.image_name(number) for number in range(len(poses)))
+    poses = kept.arrays(sweep_session.POSES, {"world_from_image": npz.Form("f", (None, 4, 4))})["world_from_image"]
+    labels = tuple(kept.folder / sweep_session.LABELS / image_name(number) for number in range(len(poses)))
     if missing := [path for path in labels if not path.is_file()]:
         raise InputError(f"{missing[0]}: expected an image of labels, found none")
     scene = build_scene(wanted)

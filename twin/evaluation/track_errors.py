@@ -1,7 +1,4 @@
-"""How far a tracker's poses are from those that a film was rendered from.
-
-Ground truth of a film is read here, nowhere else.
-"""
+"""Errors of a tracker's poses against those that a film was rendered from."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +9,11 @@ from scipy.stats import chi2
 
 from recon.capture import sweep_tables
 from recon.errors import InputError
-from recon.files import npz
 from recon.files.metrics import Metrics
 from recon.files.npz import Form
 from recon.geometry import rigid
 from recon.model.tracks import Track
+from twin.session import TruthFolder
 from twin.tracking.film_session import TRUTH
 
 Array = NDArray[np.float64]
@@ -66,7 +63,7 @@ def read_truth(folder: Path) -> FilmTruth:
         "visible": Form("f", (None, 2, 3)),
         "inside": Form("b", (None, 2, 3)),
     }
-    content = npz.read(folder / TRUTH, forms)
+    content = TruthFolder(folder, "sweep").arrays(TRUTH, forms)
     return FilmTruth(*(content[name] for name in forms))
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.capture import surface_part
-from recon.capture.surface_part import Manifest, SurfaceCapture
+from recon.capture.manifest import Manifest, read_manifest
+from recon.capture.surface_part import SurfaceCapture
 from recon.files import atomic
 from recon.files.metrics import Metrics, shown
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Uniform
@@ -66,7 +67,7 @@ def read(captured: Path, truth: Path, points: Path, camera: str = "cam1") -> Mea
     measured, sigma = surface_errors.read_points(points)
     comparison = surface_errors.compare(measured, sigma, expected)
     found = decode.decode(shots.images, shots.patterns, bits=shots.bits, name=shots.name)
-    return Measurement(surface_part.read_manifest(captured), shots, camera, found, measured, expected, comparison)
+    return Measurement(read_manifest(captured), shots, camera, found, measured, expected, comparison)
 
 
 def write(
@@ -294,7 +295,7 @@ def beside_the_paper(metrics: Metrics) -> Section:
 def settings(measurement: Measurement, metrics: Metrics) -> Section:
     """How the images were taken and what their noise is."""
     shots, found = measurement.shots, measurement.found
-    device = measurement.manifest.devices[measurement.camera]
+    device = measurement.manifest.devices_of("surface")[measurement.camera]
     parts = ", ".join(f"{part.count} × {part.kind.replace('_', ' ')} ({part.axis})" for part in shots.patterns.parts)
     seen = measurement.comparison.compared
     rows = [

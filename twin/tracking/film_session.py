@@ -4,11 +4,8 @@ One body, one surroundings, one light and one exposure for all frames, all from 
 by the path's own derivative in the middle of it.
 """
 
-import json
-import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, Literal
 
 import drjit as dr
@@ -19,15 +16,14 @@ from pydantic import Field, model_validator
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from recon.capture import calibration_files, stereo_frames
-from recon.capture.manifest import Device
+from recon.capture.manifest import CAMERAS, Device
 from recon.errors import InputError
-from recon.files import atomic
 from recon.geometry import rigid
 from recon.model.calibration import Calibration
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig, Target, Vector
 from recon.tracking.pose import circle_centres
-from twin.output_folders import TRUTH_MARKER, check_places
+from scenes.scene_types import Scene
+from twin.session import Session, describe
 from twin.tracking.mesh_bank import Bank, build_bank
 from twin.tracking.rendered_views import Frames, Quality, render_full, render_sketches, white_radiance
 from twin.tracking.samples import Motion, Take, draw
@@ -36,7 +32,6 @@ from twin.tracking.target_truth import outline
 
 Array = NDArray[np.float64]
 
-SETTINGS = "settings.json"
 TRUTH = "sweep/film.npz"
 BODIES = 4  # of which the one is taken whose fingers and cable cover least of the circles
 LOOKS = 8  # frames in which that is looked at
@@ -139,7 +134,7 @@ def make_bank(rig: Rig, seed: int) -> Bank:
 
 
 def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int) -> list[Take]:
-    """What makes each frame: all is drawn once, as for a data set's sample, but the pose, the motion and the noise."""
+    """Parameters of each frame: all is drawn once, as for a data set's sample, but the pose, the motion and the noise."""
     light = ranges.light.model_copy(update={"projector_share": 0.0})
     drawn = draw(ranges.model_copy(update={"variants": BODIES, "light": light}), rig, seed, 0)
     cameras = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
@@ -198,41 +193,30 @@ def shoot(
         yield from render(bank, rig, made[first : first + BATCH], quality, seed)
 
 
-def write_session(
-    out: Path, rig: Rig, filming: Filming, made: Sequence[Take], frames: Iterable[Frames], settings: Mapping[str, object]
-) -> None:
-    """Write `out/capture/` and `out/truth/`, each whole or not at all, taking the frames one by one.
-
-    settings : what the film was made from; kept with the truth.
-    """
-    check_places(out, "film")
-    optics = Calibration({name: getattr(rig, name).optics.camera() for name in stereo_frames.CAMERAS})
+def write_session(session: Session, rig: Rig, filming: Filming, made: Sequence[Take], frames: Iterable[Frames]) -> None:
+    """Write a film, which is a sweep without B-scans, and its truth, taking the frames one by one."""
+    optics = Calibration({name: getattr(rig, name).optics.camera() for name in CAMERAS})
     devices = {
-        name: Device(size=getattr(rig, name).optics.size, exposure_s=filming.exposure_s, gain=filming.gain)
-        for name in stereo_frames.CAMERAS
+        name: Device(size=getattr(rig, name).optics.size, exposure_s=filming.exposure_s, gain=filming.gain) for name in CAMERAS
     }
-    with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
-        (folder / TRUTH).parent.mkdir()
-        (folder / "calibration").mkdir()
-        calibration_files.write(folder / "calibration" / "optics.yaml", optics)
-        _write_json(folder / SETTINGS, settings)
-        _write_json(folder / TRUTH_MARKER, {"name": "film", "labels": [], "shapes": []})
-        told = []
+    with session.write(describe(Scene("film", ()), labels=[])) as (capture, truth):
+        truth.write_optics(optics)
+        seen = []
 
-        def pairs() -> Iterator[stereo_frames.Pair]:
+        def images() -> Iterator[tuple[str, NDArray]]:
             for one in frames:
-                told.append(one.truth)
-                yield one.views
-            np.savez(folder / TRUTH, **_truth_arrays(filming, made, told))
-            shutil.rmtree(out / "truth", ignore_errors=True)  # an old truth goes before the new capture comes
+                seen.append(one.truth)
+                yield from zip(CAMERAS, one.views, strict=True)
 
-        stereo_frames.write_film(out / "capture", pairs(), filming.times, optics, devices, "film")
+        capture.add_sweep(dict.fromkeys(CAMERAS, filming.times), images(), devices)
+        capture.add_calibration(optics)
+        truth.write_arrays(TRUTH, _truth_arrays(filming, made, seen))
 
 
-def _truth_arrays(filming: Filming, made: Sequence[Take], told: Sequence) -> dict[str, NDArray]:
+def _truth_arrays(filming: Filming, made: Sequence[Take], seen: Sequence) -> dict[str, NDArray]:
     """By name: (n, ...) of each frame, (n, 2, ...) of each view; lengths in mm and px."""
     views = {
-        name: np.array([[getattr(view, name) for view in both] for both in told])
+        name: np.array([[getattr(view, name) for view in both] for both in seen])
         for name in ("centres", "ellipses", "inside", "blur_px", "visible", "white_dn")
     }
     return {
@@ -242,7 +226,3 @@ def _truth_arrays(filming: Filming, made: Sequence[Take], told: Sequence) -> dic
         "turn_rad": np.array([take.motion.turn_rad for take in made]),
         **views,
     }
-
-
-def _write_json(path: Path, content: object) -> None:
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -1,26 +1,21 @@
-"""A sweep in the twin: from a rig, a scene and a path to a capture folder and its ground truth, image by image."""
+"""The sweep part of a session: B-scans along a path through a scene, image by image, and the truth about them."""
 
-import json
-import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from recon.capture import sweep_part
 from recon.capture.images import write_images
+from recon.capture.manifest import SCANNER, Device, image_name
 from recon.errors import InputError
-from recon.files import atomic
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import Rig
 from recon.model.tracks import Track
 from scenes.scene_types import Scene
-from twin.output_folders import TRUTH_MARKER, check_places
+from twin.session import Session, describe
 from twin.ultrasound import bscan_truth
 from twin.ultrasound.bscan import Scan
 from twin.ultrasound.echo_solids import Body, Solid, label_at
@@ -30,7 +25,6 @@ from twin.ultrasound.transducer import Transducer
 
 AnyPath = Annotated[SurfacePath | Bob | WirePath, Field(discriminator="kind")]
 
-SETTINGS = "settings.json"
 POSES = "sweep/sweep.npz"
 LABELS = "sweep/labels"
 SUPPORTS = ("table", "tank")  # what things lie on or in
@@ -40,7 +34,7 @@ GIVES_MM = 5.0  # by which a surface gives way to the probe, at most
 def plan_sweep(
     path: SurfacePath | Bob | WirePath, rig: Rig, body: Body, transducer: Transducer, clocks: Clocks, noise: PoseNoise, seed: int
 ) -> Plan:
-    """Lead the probe along a path, and say when its images are taken.
+    """Lead the probe along a path, and set the times of its images.
 
     Raises
     ------
@@ -105,49 +99,36 @@ def calibration_of(rig: Rig, transducer: Transducer) -> ProbeCalibration:
 
 
 def write_session(
-    out: Path,
+    session: Session,
     scene: Scene,
     body: Body,
     transducer: Transducer,
     planned: Plan,
     scans: Iterable[Scan],
     probe: ProbeCalibration | None,
-    settings: Mapping[str, object],
 ) -> None:
-    """Write `out/capture/` and `out/truth/`, each whole or not at all, taking the scans one by one.
+    """Write a sweep and its truth, taking the scans one by one.
 
     Parameters
     ----------
     probe : of the capture; None where it is still to be calibrated.
-    settings : what the sweep was rendered from; kept with the truth.
     """
-    check_places(out, "sweep")
-    with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
-        (folder / LABELS).mkdir(parents=True)
-        np.savez(folder / POSES, world_from_image=planned.truth.poses, times_ns=planned.truth.times)
-        _write_json(folder / SETTINGS, settings)
-        _write_json(folder / TRUTH_MARKER, describe(scene, body))
+    with session.write(describe_sound(scene, body)) as (capture, truth):
+        truth.write_arrays(POSES, {"world_from_image": planned.truth.poses, "times_ns": planned.truth.times})
 
-        def images() -> Iterator[NDArray[np.uint8]]:
+        def images() -> Iterator[tuple[str, NDArray[np.uint8]]]:
             for number, one in enumerate(scans):
-                write_images([folder / LABELS / sweep_part.image_name(number)], bscan_truth.labels(one.paths, transducer)[None])
-                yield one.image
-            shutil.rmtree(out / "truth", ignore_errors=True)  # an old truth goes before the new capture comes
+                labels = bscan_truth.labels(one.paths, transducer)
+                write_images([truth.folder / LABELS / image_name(number)], labels[None])
+                yield SCANNER, one.image
 
-        size = transducer.image_size
-        sweep_part.write_sweep(out / "capture", images(), planned.times, planned.track, size, probe, scene.name)
+        capture.add_sweep({SCANNER: planned.times}, images(), {SCANNER: Device(size=transducer.image_size)}, planned.track)
+        if probe is not None:
+            capture.add_probe(probe)
 
 
-def describe(scene: Scene, body: Body) -> dict[str, object]:
-    """What evaluation needs to know of a scene: what the labels mean, the wires' ends, and the primitives to fit."""
-    shapes = []
-    for shape in scene.shapes:
-        values = {key: np.asarray(value).tolist() for key, value in asdict(shape).items()}
-        shapes.append({"kind": type(shape).__name__.lower(), **values})
+def describe_sound(scene: Scene, body: Body) -> dict[str, object]:
+    """A scene as the scanner shows it: the names of its labels, and the wires' ends."""
     labels = ["surroundings", *(solid.name for solid in body.solids)]
     wires = [{"name": wire.name, "ends_mm": wire.ends.tolist(), "radius_mm": wire.radius} for wire in body.wires]
-    return {"name": scene.name, "labels": labels, "wires": wires, "shapes": shapes}
-
-
-def _write_json(path: Path, content: object) -> None:
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return describe(scene, labels=labels, wires=wires)

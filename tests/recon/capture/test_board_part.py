@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.capture import board_part, manifest
+from recon.capture import board_part, manifest, writer
 from recon.capture.manifest import BoardPart, Device
 from recon.errors import InputError
 from recon.model.boards import AsymmetricCircles
@@ -34,15 +34,14 @@ def images(name: str, bits: int = 8) -> tuple[dict, dict]:
 
 
 def write(folder: Path, bits: int = 8) -> Path:
-    for name in NAMES:
-        board_part.write_pose(folder, name, *images(name, bits))
-    records = tuple(board_part.describe_pose(name, ["cam1", "cam2"], {"cam1": PATTERNS.count}) for name in NAMES)
     devices = {
         "cam1": Device(size=SIZE, bits=bits),
         "cam2": Device(size=SIZE, bits=bits),
         "projector": Device(size=PROJECTOR),
     }
-    board_part.write_manifest(folder, devices, BoardPart(board=BOARD, patterns=PATTERNS, poses=records), "set")
+    with writer.new_capture(folder, "set") as capture:
+        records = tuple(writer.write_pose(capture.folder, name, *images(name, bits)) for name in NAMES)
+        capture.add_board(BoardPart(board=BOARD, patterns=PATTERNS, poses=records), devices)
     return folder
 
 
@@ -83,8 +82,8 @@ def test_cameras_alone_make_a_set(folder):
 
 def test_a_failed_write_leaves_no_half_pose(tmp_path, monkeypatch):
     """What was written of a pose before the disk was full goes away; poses before it stay."""
-    board_part.write_pose(tmp_path, "00", *images("00"))
-    calls = iter([board_part.write_images])
+    writer.write_pose(tmp_path, "00", *images("00"))
+    calls = iter([writer.write_images])
 
     def fail_later(*arguments):
         next(calls, fail)(*arguments)
@@ -92,9 +91,9 @@ def test_a_failed_write_leaves_no_half_pose(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(board_part, "write_images", fail_later)
+    monkeypatch.setattr(writer, "write_images", fail_later)
     with pytest.raises(OSError, match="No space"):
-        board_part.write_pose(tmp_path, "01", *images("01"))
+        writer.write_pose(tmp_path, "01", *images("01"))
     assert [path.name for path in (tmp_path / "board").iterdir()] == ["00"]
 
 

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.capture import calibration_files, manifest, stereo_frames, sweep_part, sweep_tables
+from recon.capture import calibration_files, images, manifest, stereo_frames, sweep_part, sweep_tables
 from recon.errors import InputError
 from recon.model import calibration
 from recon.tracking import results
 from recon.tracking.tracker import Tracker
-from tests.recon import sweep_sets
+from tests.recon import captures, sweep_sets
 from tests.recon.tracking import films
 from tests.recon.tracking.stand_ins import Told
 
@@ -108,7 +108,7 @@ def test_a_damaged_frame_is_named(copy):
 
 
 def test_a_frame_of_another_size_is_named(copy, rig, tmp_path):
-    sweep_part.write_images([copy / "sweep/cam2/0001.png"], np.zeros((1, 512, 640), np.uint8))
+    images.write_images([copy / "sweep/cam2/0001.png"], np.zeros((1, 512, 640), np.uint8))
     assert complaint(copy) == "sweep/cam2/0001.png: expected 1280x1024 8-bit grey, found 640x512 8-bit grey"
 
 
@@ -129,7 +129,7 @@ def test_what_the_manifest_lacks_is_named(copy):
 
 def test_cameras_that_dont_fit_are_named(copy, rig):
     edited(copy, lambda content: content["devices"]["cam2"].update(size=[640, 512]))
-    assert complaint(copy) == "calibration/optics.yaml: cam2: expected 640x512 px, as its frames, found 1280x1024"
+    assert complaint(copy) == "calibration/optics.yaml: expected cam2 of 640x512 px, found 1280x1024"
     edited(copy, lambda content: [content["devices"][name].update(bits=bits) for name, bits in (("cam1", 10), ("cam2", 12))])
     assert complaint(copy) == "manifest.json: devices.cam2.bits: expected 10, as of cam1, found 12"
     edited(copy, lambda content: [content["devices"][name].update(bits=8, size=[1280, 1024]) for name in stereo_frames.CAMERAS])
@@ -143,10 +143,10 @@ def test_cameras_that_dont_fit_are_named(copy, rig):
 def test_nothing_is_left_of_a_film_that_failed(rig, tmp_path):
     frames = np.zeros((1024, 1280), np.uint8)
     with pytest.raises(ValueError, match="expected 3, one a time, found 1"):
-        stereo_frames.write_film(tmp_path / "film", [(frames, frames)], films.stamps(3), films.optics(rig), films.devices(rig))
+        captures.write_film(tmp_path / "film", [(frames, frames)], films.stamps(3), films.optics(rig), films.devices(rig))
     with pytest.raises(ValueError, match="cam2: expected 1280x1024 uint8"):
         pair = frames, frames[:512]
-        stereo_frames.write_film(tmp_path / "film", [pair], films.stamps(1), films.optics(rig), films.devices(rig))
+        captures.write_film(tmp_path / "film", [pair], films.stamps(1), films.optics(rig), films.devices(rig))
     assert not list(tmp_path.iterdir())
 
 

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.capture import calibration_files, images, surface_part
-from recon.capture.surface_part import Device
+from recon.capture import calibration_files, images, surface_part, writer
+from recon.capture.manifest import Device
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
@@ -33,7 +33,7 @@ def stack(bits: int = 8) -> np.ndarray:
 
 def write(folder: Path, optics: Calibration, bits: int = 8) -> np.ndarray:
     devices = {"cam1": Device(size=SIZE, bits=bits, exposure_s=0.01, gain=1.5), "projector": Device(size=PROJECTOR)}
-    surface_part.write_surface(folder, {"cam1": stack(bits)}, PATTERNS, optics, devices, name="test")
+    writer.write_surface(folder, {"cam1": stack(bits)}, PATTERNS, optics, devices, name="test")
     return stack(bits)
 
 
@@ -81,7 +81,7 @@ def test_a_failed_write_leaves_nothing(tmp_path, optics, monkeypatch):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(surface_part, "write_images", fail)
+    monkeypatch.setattr(writer, "write_images", fail)
     with pytest.raises(OSError, match="No space"):
         write(tmp_path / "capture", optics)
     assert list(tmp_path.iterdir()) == []

@@ -13,6 +13,7 @@ from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
+from tests.recon import captures
 
 SIZE = (24, 16)
 START_NS = 1_700_000_000_123_456_789
@@ -44,7 +45,7 @@ def probe() -> ProbeCalibration:
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    sweep_part.write_sweep(tmp_path / "capture", images(), times(), track(), SIZE, probe(), "sweep")
+    captures.write_sweep(tmp_path / "capture", images(), times(), track(), SIZE, probe(), "sweep")
     return tmp_path / "capture"
 
 
@@ -63,7 +64,7 @@ def test_a_sweep_comes_back(folder):
 
 
 def test_what_is_optional(tmp_path):
-    sweep_part.write_sweep(tmp_path / "capture", iter(images()), times(), track(covariance=False), SIZE)
+    captures.write_sweep(tmp_path / "capture", iter(images()), times(), track(covariance=False), SIZE)
     found = sweep_part.read_sweep(tmp_path / "capture")
     assert found.probe is None and found.track.covariance is None and found.pose_covariance() is None
     assert found.name == "capture"
@@ -85,7 +86,7 @@ def test_a_pose_between_two_is_surer_than_either(tmp_path):
     covariance = np.tile(np.diag([1e-6] * 3 + [0.01] * 3), (POSES, 1, 1))
     moments = START_NS + np.array([25_000_000, 37_500_000])
     poses = Track(track().times, track().poses, covariance)
-    sweep_part.write_sweep(tmp_path / "capture", images()[:2], moments, poses, SIZE)
+    captures.write_sweep(tmp_path / "capture", images()[:2], moments, poses, SIZE)
     on, halfway = sweep_part.read_sweep(tmp_path / "capture").pose_covariance()
     np.testing.assert_allclose(on, covariance[0], atol=1e-15)
     np.testing.assert_allclose(halfway, covariance[0] / 2, atol=1e-15)
@@ -122,12 +123,12 @@ def test_a_failed_write_leaves_nothing(tmp_path):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(OSError, match="No space"):
-        sweep_part.write_sweep(tmp_path / "capture", breaks_off(), times(), track(), SIZE)
+        captures.write_sweep(tmp_path / "capture", breaks_off(), times(), track(), SIZE)
     for wrong in (images()[:-1], images()[:, :-1], images().astype(float)):
         with pytest.raises(ValueError, match="expected"):
-            sweep_part.write_sweep(tmp_path / "capture", wrong, times(), track(), SIZE)
+            captures.write_sweep(tmp_path / "capture", wrong, times(), track(), SIZE)
     with pytest.raises(ValueError, match="increasing"):
-        sweep_part.write_sweep(tmp_path / "capture", images(), times()[::-1], track(), SIZE)
+        captures.write_sweep(tmp_path / "capture", images(), times()[::-1], track(), SIZE)
     assert not list(tmp_path.iterdir())
 
 

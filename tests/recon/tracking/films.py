@@ -9,6 +9,7 @@ from recon.capture.manifest import Device
 from recon.geometry import rigid
 from recon.model.calibration import Calibration
 from recon.tracking import pose
+from tests.recon import captures
 from tests.recon.tracking import drawings
 
 PERIOD_NS = 33_333_333
@@ -47,7 +48,7 @@ def draw(rig, poses, rng, missing=()):
 def film(folder: Path, rig, rng, count: int = 4, missing=()) -> Path:
     """A film of `places`."""
     pairs = draw(rig, places(count), rng, missing)
-    stereo_frames.write_film(folder, pairs, stamps(count), optics(rig), devices(rig), "drawn")
+    captures.write_film(folder, pairs, stamps(count), optics(rig), devices(rig), "drawn")
     return folder
 
 
@@ -56,7 +57,7 @@ def blank(folder: Path, rig, count: int = 3, bits: int = 8) -> Path:
     kind = np.uint8 if bits == 8 else np.uint16
     frames = [np.full(getattr(rig, name).optics.size[::-1], 10, kind) for name in stereo_frames.CAMERAS]
     pairs = ((frames[0] + kind(k), frames[1] + kind(2 * k)) for k in range(count))
-    stereo_frames.write_film(folder, pairs, stamps(count), optics(rig), devices(rig, bits), "blank")
+    captures.write_film(folder, pairs, stamps(count), optics(rig), devices(rig, bits), "blank")
     return folder
 
 

@@ -12,7 +12,7 @@ from recon.geometry.circle_projection import centre_offsets
 from recon.tracking import pose
 from recon.tracking.pose import Sighting
 from tests.recon.tracking import drawings
-from twin.surface_session import calibration_of
+from twin.optics.surface_session import calibration_of
 
 SIGMA_PX = 0.03
 POSES = 60

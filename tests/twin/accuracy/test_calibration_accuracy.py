@@ -19,7 +19,7 @@ from twin.accuracy.baselines import opencv_peer
 from twin.accuracy.board_sets import drawn, recalibrated
 from twin.accuracy.calibration_errors import focal_error, motion_error, point_errors, scale_error, squared_length
 from twin.accuracy.table_rows import Setup
-from twin.surface_session import calibration_of
+from twin.optics.surface_session import calibration_of
 
 ROOT = Path(__file__).resolve().parents[3]
 NOISE = (("cam1", 0.005), ("cam2", 0.005), ("projector", 0.003))  # px, as on rendered boards

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recon.capture import stereo_frames
+from recon.capture.manifest import CAMERAS
 from recon.geometry import rigid
 from recon.tracking.tracker import Tracker
 from sonotwin.cli import main
@@ -15,6 +16,7 @@ from sonotwin.config import load
 from sonotwin.verbs.film import Config, ranges
 from tests.twin.tracking import takes
 from twin.evaluation import track_errors
+from twin.session import Session
 from twin.tracking import film_session
 from twin.tracking.rendered_views import Frames, white_radiance
 from twin.tracking.target_truth import view_truth
@@ -111,7 +113,8 @@ def blanks(made, size=(1280, 1024)):
 
 def test_what_is_written_is_what_was_made(config, made, tmp_path):
     few = config.model_copy(update={"frames": 3})
-    film_session.write_session(tmp_path, config.rig, few, made[:3], blanks(made[:3]), {"seed": 0})
+    session = Session(tmp_path, "sweep", {"seed": 0}, devices=CAMERAS)
+    film_session.write_session(session, config.rig, few, made[:3], blanks(made[:3]))
     read = stereo_frames.read_film(tmp_path / "capture")
     assert read.times.tolist() == [0, 33_333_333, 66_666_667]
     assert [int(left[0, 0]) for left, _ in read.pairs()] == [0, 1, 2]

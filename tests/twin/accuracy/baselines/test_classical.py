@@ -9,7 +9,7 @@ from recon.geometry.circle_projection import centre_offsets
 from recon.tracking import pose
 from tests.recon.tracking import flat_faces
 from twin.accuracy.baselines import classical
-from twin.surface_session import calibration_of
+from twin.optics.surface_session import calibration_of
 
 
 @pytest.fixture(scope="module")

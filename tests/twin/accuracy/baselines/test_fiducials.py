@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from recon.geometry import rigid
 from tests.recon.tracking import flat_faces
 from twin.accuracy.baselines import fiducials
-from twin.surface_session import calibration_of
+from twin.optics.surface_session import calibration_of
 
 MAKERS = [fiducials.aruco_board, fiducials.apriltag_board]
 

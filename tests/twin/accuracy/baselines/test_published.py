@@ -8,7 +8,7 @@ from recon.geometry import rigid
 from recon.tracking import pose
 from tests.recon.tracking import flat_faces
 from twin.accuracy.baselines import published
-from twin.surface_session import calibration_of
+from twin.optics.surface_session import calibration_of
 
 SMALL, FULL = (320, 240), (1280, 1024)
 PLACES = np.array([[101.0, 90.0], [140.0, 97.0], [92.0, 30.0]])  # c0, c1, c2 as seen from the front

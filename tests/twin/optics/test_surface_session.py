@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.capture import calibration_files, surface_part
+from recon.capture import calibration_files, surface_part, writer
 from recon.errors import InputError
 from recon.model.patterns import Fringes
 from recon.structured_light.phase import Noise, wrapped_phase
@@ -17,8 +17,9 @@ from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, render
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world
+from twin.optics.surface_session import Shooting, noise_limit_px, shoot, write_session
 from twin.sensor import Exposure, auto_exposure, expose
-from twin.surface_session import Shooting, noise_limit_px, shoot, write_session
+from twin.session import Session
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def session(small_rig, tmp_path_factory) -> Path:
 def write(rig, out: Path, seed: int) -> Path:
     scene, patterns = build_scene({"kind": "sphere"}), paper_surface((1280, 800))
     view = shoot(rig, scene, patterns, "cam1", Engine(samples=4), Shooting(), seed)
-    write_session(out, rig, scene, patterns, {"cam1": view}, {"seed": seed})
+    write_session(Session(out, "surface", {"seed": seed}), rig, scene, patterns, {"cam1": view})
     return out
 
 
@@ -88,12 +89,13 @@ def test_a_lens_that_leaves_pixels_dark_is_refused(small_rig):
 
 
 def test_a_killed_session_does_not_mix_with_an_old_one(small_rig, tmp_path, monkeypatch):
-    """If writing stops after the new truth, the old capture is gone rather than beside it."""
+    """If writing stops after the new truth, the old capture stands beside the old truth."""
     write(small_rig, tmp_path, seed=1)
-    monkeypatch.setattr(surface_part, "write_surface", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    before = digest(tmp_path)
+    monkeypatch.setattr(writer, "write_images", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         write(small_rig, tmp_path, seed=2)
-    assert not (tmp_path / "capture").exists()
+    assert digest(tmp_path) == before
 
 
 def test_noise_limit_is_the_noise(small_rig):

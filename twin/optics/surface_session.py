@@ -1,19 +1,15 @@
-"""A measuring session in the twin: from a rig, a scene and a pattern sequence to a capture folder and its ground truth."""
+"""The surface part of a session: what cameras see of a scene under a pattern sequence, and the truth about it."""
 
-import json
-import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass, fields
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from recon.capture import calibration_files, surface_part
+from recon.capture.manifest import Device
 from recon.errors import InputError
-from recon.files import atomic
 from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes, Patterns
 from recon.model.rig import CameraDevice, Positive, Rig
@@ -23,8 +19,8 @@ from twin.optics.light_transport import Engine, Images, render
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, visible
 from twin.optics.surface_truth import SurfaceTruth, surface_truth
-from twin.output_folders import TRUTH_MARKER, check_places
 from twin.sensor import Exposure, Numbers, auto_exposure, electrons_per_radiance, expose, noise_dn, number_per_electron
+from twin.session import Session, describe
 
 CameraName = Literal["cam1", "cam2"]
 
@@ -135,42 +131,26 @@ def calibration_of(rig: Rig) -> Calibration:
     return Calibration({name: device.optics.camera() for name, device in devices.items()})
 
 
-def write_session(
-    out: Path, rig: Rig, scene: Scene, patterns: Patterns, views: Mapping[CameraName, View], settings: Mapping[str, object]
-) -> None:
-    """Write `out/truth/`, then `out/capture/`, each whole or not at all; an old capture goes first, so that no two sessions mix.
-
-    settings : what the session was rendered from; kept with the truth as `settings.json`.
-    """
+def write_session(session: Session, rig: Rig, scene: Scene, patterns: Patterns, views: Mapping[CameraName, View]) -> None:
+    """Write a surface and its truth."""
     optics = calibration_of(rig)
-    check_places(out, "surface")
-    shutil.rmtree(out / "capture", ignore_errors=True)
-    with atomic.new_folder(out / "truth", TRUTH_MARKER) as folder:
-        (folder / "surface").mkdir()
-        (folder / "calibration").mkdir()
-        calibration_files.write(folder / "calibration" / "optics.yaml", optics)
+    devices = {"projector": Device(size=patterns.projector_size)}
+    for camera, view in views.items():
+        devices[camera] = device_of(view.images.shape[:0:-1], view.exposure)
+    with session.write(describe_visible(scene)) as (capture, truth):
+        truth.write_optics(optics)
         for camera, view in views.items():
             arrays: dict[str, NDArray] = {field.name: getattr(view.truth, field.name) for field in fields(view.truth)}
-            np.savez(folder / "surface" / f"{camera}.npz", **arrays, limit_px=view.limit_px)
-        write_json(folder / "settings.json", settings)
-        write_json(folder / TRUTH_MARKER, describe(scene))
-    devices = {"projector": surface_part.Device(size=patterns.projector_size)}
-    for camera, view in views.items():
-        size, exposure = view.images.shape[:0:-1], view.exposure
-        devices[camera] = surface_part.Device(size=size, bits=exposure.bits, exposure_s=exposure.time_s, gain=exposure.gain)
-    images: dict[str, Numbers] = {camera: view.images for camera, view in views.items()}
-    surface_part.write_surface(out / "capture", images, patterns, optics, devices, scene.name)
+            truth.write_arrays(f"surface/{camera}.npz", {**arrays, "limit_px": view.limit_px})
+        capture.add_calibration(optics)
+        capture.add_surface({camera: view.images for camera, view in views.items()}, patterns, devices)
 
 
-def describe(scene: Scene) -> dict:
-    """What evaluation needs to know of a scene: the visible things by number, and the primitives to fit."""
-    shapes = []
-    for shape in scene.shapes:
-        values = {key: np.asarray(value).tolist() for key, value in asdict(shape).items()}
-        shapes.append({"kind": type(shape).__name__.lower(), **values})
-    return {"name": scene.name, "things": [thing.name for thing in visible(scene)], "shapes": shapes}
+def device_of(size: tuple[int, ...], exposure: Exposure) -> Device:
+    """A camera in the manifest, as it was set."""
+    return Device(size=size, bits=exposure.bits, exposure_s=exposure.time_s, gain=exposure.gain)
 
 
-def write_json(path: Path, content: object) -> None:
-    """Write a file of the truth."""
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+def describe_visible(scene: Scene) -> dict[str, object]:
+    """A scene as cameras see it: its visible things by number."""
+    return describe(scene, things=[thing.name for thing in visible(scene)])

@@ -1,0 +1,20 @@
+"""Captures of one part, written in one call."""
+
+from recon.capture.manifest import CAMERAS, SCANNER, Device
+from recon.capture.writer import new_capture
+
+
+def write_sweep(folder, images, times, track, size, probe=None, name=""):
+    """B-scans : n of (h, w), taken one by one, and the poses of the target."""
+    with new_capture(folder, name) as capture:
+        capture.add_sweep({SCANNER: times}, ((SCANNER, image) for image in images), {SCANNER: Device(size=size)}, track)
+        if probe is not None:
+            capture.add_probe(probe)
+
+
+def write_film(folder, pairs, times, optics, devices, name=""):
+    """Frames of both cameras, taken pair by pair."""
+    frames = (frame for pair in pairs for frame in zip(CAMERAS, pair, strict=True))
+    with new_capture(folder, name) as capture:
+        capture.add_calibration(optics)
+        capture.add_sweep(dict.fromkeys(CAMERAS, times), frames, devices)

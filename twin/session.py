@@ -1,0 +1,183 @@
+"""A session of the twin: a capture, and beside it the truth that it was rendered from. Both are written and read here alone.
+
+OUT/capture/ may hold several parts, and OUT/truth/ then holds the truth of each:
+
+- `surface/`, `board.npz`, `sweep/`: arrays and images of the part of that name;
+- `calibration/optics.yaml`: the true cameras and projector, one for all parts;
+- `scene.json` and `settings.json`: the scene, and all that the part was rendered from; those of the part that was written first
+  lie in `truth/` itself, those of a part that was added to it in `truth/PART/`.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.capture import calibration_files
+from recon.capture.manifest import MANIFEST, OPTICS, PartName, read_manifest
+from recon.capture.writer import CaptureWriter
+from recon.errors import InputError
+from recon.files import atomic, npz
+from recon.geometry.camera import Camera
+from recon.model.calibration import Calibration
+from scenes.scene_types import Scene
+
+CAPTURE, TRUTH = "capture", "truth"
+SCENE = "scene.json"  # by which a folder of truth is known
+SETTINGS = "settings.json"
+
+
+@dataclass(frozen=True)
+class TruthFolder:
+    """The truth of one part, in a folder of truth."""
+
+    folder: Path
+    part: PartName
+
+    @property
+    def described(self) -> Path:
+        """The folder of the part's `scene.json` and `settings.json`."""
+        own = self.folder / self.part
+        return own if (own / SCENE).is_file() else self.folder
+
+    def scene(self) -> dict:
+        """Read the description of the scene; InputError if it is missing or damaged."""
+        return _read_json(self.described / SCENE)
+
+    def settings(self) -> dict:
+        """Read the fields that the part was rendered from; InputError if they are missing or damaged."""
+        return _read_json(self.described / SETTINGS)
+
+    def arrays(self, name: str, forms: Mapping[str, npz.Form]) -> dict[str, NDArray]:
+        """Read arrays from a file in the folder; InputError if one is missing or damaged."""
+        return npz.read(self.folder / name, forms)
+
+    def optics(self, *names: str) -> dict[str, Camera]:
+        """Read the true calibration; InputError if it is missing or damaged, or lacks one of the devices."""
+        path = self.folder / OPTICS
+        cameras = dict(calibration_files.read(path).cameras)
+        if missing := [name for name in names if name not in cameras]:
+            raise InputError(f"{path}: expected {missing[0]}, found {', '.join(cameras) or 'none'}")
+        return cameras
+
+    def write_arrays(self, name: str, arrays: Mapping[str, NDArray]) -> None:
+        """Write arrays into a file in the folder."""
+        (self.folder / name).parent.mkdir(exist_ok=True)
+        np.savez(self.folder / name, **arrays)
+
+    def write_optics(self, optics: Calibration) -> None:
+        """Write the true calibration."""
+        calibration_files.extend(self.folder / OPTICS, optics)
+
+
+@dataclass(frozen=True)
+class Session:
+    """One part that is rendered into a folder `out`."""
+
+    out: Path
+    part: PartName
+    settings: Mapping[str, object]  # that it is rendered from
+    add: bool = False  # to the capture that is there, in place of its part of that name; else only such a part may be there
+    devices: tuple[str, ...] = ()  # of a sweep: those whose images it has
+
+    @property
+    def capture(self) -> Path:
+        """The folder of the capture."""
+        return self.out / CAPTURE
+
+    @property
+    def truth(self) -> TruthFolder:
+        """The part's truth."""
+        return TruthFolder(self.out / TRUTH, self.part)
+
+    def check(self) -> None:
+        """Check, before any long work, that capture and truth can be written; puts back what a process that was killed set aside.
+
+        Raises
+        ------
+        InputError
+            If something else is there: other files, other parts that would be lost, a sweep of other devices in the place of this
+            one, or parts rendered with another rig.
+        """
+        atomic.check_folder(self.truth.folder, SCENE)
+        atomic.check_folder(self.capture, MANIFEST)
+        atomic.restore((self.truth.folder, self.capture))
+        if not (self.capture / MANIFEST).is_file():
+            return
+        held = read_manifest(self.capture).contents
+        mine = {self.part} if self.part != "sweep" or set(held.get("sweep", self.devices)) == set(self.devices) else set()
+        others = [part for part in held if part not in mine]
+        refused = [part for part in others if not self.add or part == self.part]
+        if refused:
+            found = " and ".join(_label(part, held[part]) for part in refused)
+            way = "choose another out" if self.add or self.part in refused else "choose another out, or give add=true"
+            wanted = _label(self.part, self.devices)
+            raise InputError(f"{self.capture}: expected nothing or an earlier {wanted}, found a {found}; {way}")
+        for part in others:
+            path = TruthFolder(self.truth.folder, part).described / SETTINGS
+            rigs = [settings.get("rig") for settings in (_read_json(path) if path.is_file() else {}, self.settings)]
+            if None not in rigs and rigs[0] != rigs[1]:
+                raise InputError(f"{path}: expected the rig that is given, as all parts are of one, found another")
+
+    @contextmanager
+    def write(self, scene: Mapping[str, object]) -> Iterator[tuple[CaptureWriter, TruthFolder]]:
+        """Give the writers of the capture and of its truth; both appear whole and together, or the old ones stay.
+
+        Parameters
+        ----------
+        scene : as of `describe`
+        """
+        self.check()
+        with atomic.new_folders({self.truth.folder: SCENE, self.capture: MANIFEST}) as (folder, capture):
+            writer, truth = CaptureWriter(capture, str(scene["name"])), TruthFolder(folder, self.part)
+            kept = writer.keep(self.capture, self.part) if self.add and (self.capture / MANIFEST).is_file() else ()
+            place = self._keep_truth(folder, kept) if kept else folder
+            place.mkdir(exist_ok=True)
+            write_json(place / SETTINGS, self.settings)
+            write_json(place / SCENE, scene)
+            yield writer, truth
+            writer.finish()
+
+    def _keep_truth(self, folder: Path, kept: tuple[PartName, ...]) -> Path:
+        """Take over the truth of parts that are kept; returns the folder in which the new part is described."""
+        before = self.truth.folder
+        taken = (before / SCENE).is_file() and any(TruthFolder(before, part).described == before for part in kept)
+        mine = {self.part, f"{self.part}.npz"} if taken else {self.part, f"{self.part}.npz", SCENE, SETTINGS}
+        if before.is_dir():
+            atomic.link_tree(before, folder, leave_out=mine)
+        return folder / self.part if taken else folder
+
+
+def describe(scene: Scene, **more: object) -> dict[str, object]:
+    """Describe a scene for evaluation: its name, what a part adds, such as the names of its labels, and the primitives to fit."""
+    shapes = []
+    for shape in scene.shapes:
+        values = {key: np.asarray(value).tolist() for key, value in asdict(shape).items()}
+        shapes.append({"kind": type(shape).__name__.lower(), **values})
+    return {"name": scene.name, **more, "shapes": shapes}
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a description or settings."""
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def _read_json(path: Path) -> dict:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a file of the twin's ground truth, found none") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected JSON, found it damaged: {error}") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected a JSON object, found a {type(content).__name__}, damaged or of something else")
+    return content
+
+
+def _label(part: PartName, devices: tuple[str, ...]) -> str:
+    """A part's name in messages; of a sweep with its devices."""
+    return f"sweep of {' and '.join(devices)}" if part == "sweep" else part
