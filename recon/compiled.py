@@ -158,7 +158,7 @@ def _module_name(path: Path, root: Path) -> str:
 def _one_process_compiles(dispatcher: Any) -> None:
     """Lock the compilation of a function: a process that waited for another one loads its result."""
     compiler, cache = dispatcher._compiler, dispatcher._cache
-    compile_now = compiler.compile
+    compile_now, save_now = compiler.compile, cache.save_overload
 
     def compile_once(args: tuple, return_type: Any) -> Any:
         place = Path(cache.cache_path)
@@ -169,10 +169,11 @@ def _one_process_compiles(dispatcher: Any) -> None:
                 return made
             log.info("compiling %s.%s, once", dispatcher.__module__, dispatcher.__name__)
             made = compile_now(args, return_type)
-            cache.save_overload(tuple(args), made)  # before another process may look
+            save_now(tuple(args), made)  # before another process may look
             return made
 
     compiler.compile = compile_once
+    cache.save_overload = lambda *_: None  # saved already, and a loaded function cannot be saved
 
 
 locators: list[Any] = caching.CacheImpl._locator_classes  # tried in this order

@@ -36,6 +36,14 @@ def described():
 RUN = "import logging; logging.basicConfig(level=logging.INFO); from recon.kernel import scaled; print(scaled(7))"
 
 
+LATE = """
+from recon.kernel import scaled
+load, calls = scaled._cache.load_overload, []
+scaled._cache.load_overload = lambda *args: calls.append(args) or (load(*args) if len(calls) > 1 else None)
+print(scaled(7))
+"""
+
+
 @pytest.fixture
 def clone(tmp_path) -> Path:
     """A tree with a compiled function that takes a constant and another function from a second module."""
@@ -55,10 +63,10 @@ def edit(root: Path, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
 
 
-def run(root: Path) -> tuple[int, int]:
+def run(root: Path, script: str = RUN) -> tuple[int, int]:
     """What the compiled function gives, and how many functions were compiled for it."""
     env = os.environ | {"SONOTWIN_CACHE": str(root.parent / "cache"), "PYTHONPATH": str(root)}
-    done = subprocess.run([sys.executable, "-c", RUN], cwd=root, env=env, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", script], cwd=root, env=env, capture_output=True, text=True, check=True)
     return int(done.stdout), done.stderr.count("compiling")
 
 
@@ -71,6 +79,12 @@ def test_it_is_compiled_once_for_all_clones_and_anew_after_a_change_elsewhere(cl
     value, count = run(clone)
     assert value == 70 and count >= 1
     assert run(clone.parent / "second") == (42, 0)  # what was compiled from other sources is still there
+
+
+def test_a_process_that_waited_for_another_loads_its_result(clone):
+    """It finds nothing at first, and the other process's function once that is done."""
+    run(clone)
+    assert run(clone, LATE) == (42, 0)
 
 
 @pytest.mark.parametrize(
