@@ -1,6 +1,6 @@
 """Outer rims of the target's rings in a frame, to a hundredth of a pixel, from rough ellipses.
 
-The limit is what noise leaves of an edge, `(n/C) sqrt(2 sqrt(pi) s / (pi R))` px along each axis for noise n, contrast C, blur s
+The limit by noise is `(n/C) sqrt(2 sqrt(pi) s / (pi R))` px along each axis for noise n, contrast C, blur s
 and radius R: 0.0012 px for n = 1, C = 100, s = 0.6, R = 45. `recon.tracking.rim_fit.rim_model` has the model that is fitted.
 """
 
@@ -11,30 +11,30 @@ from numpy.typing import NDArray
 
 from recon.geometry.ellipses import Ellipses, joined
 from recon.model.rig import Target
-from recon.tracking.rim_fit import rim_model
+from recon.tracking.rim_fit.rim_model import FIT, START, fit_rims
 
 Array = NDArray[np.float64]
 
-FLOOR_PX = 0.002  # what lens model, print and pixel grid leave however little noise there is
-COVERED = 2  # power of the share that is seen, by which variances are divided: what covers a rim bends it beside
+FLOOR_PX = 0.002  # error by lens model, print and pixel grid, without any noise
+COVERED = 2  # power of the visible share, by which variances are divided: a cover bends the rim beside it
 LEAST_SEEN = 0.4  # of the rim: with less an ellipse is a guess
 LEAST_CONTRAST = 4.0  # times the noise of a pixel over the root of the semi-axis
 LEAST_DN = 1.5
-BRIGHT = 0.3  # of the contrast, by which the middle is brighter than the ring at least: light may fall on it less than around
-LARGEST_SIGMA = 1.5  # px: worse, and the ellipse tells no circle
+BRIGHT = 0.3  # of the contrast, least excess of the middle over the ring: less light may fall on it than around
+LARGEST_SIGMA = 1.5  # px: beyond, the ellipse is no measurement
 FULL_DN = 255.0  # the end of the scale, see `frames.grey`
-WHOLE = 0.85  # of the rim: what is seen less of may be something else's edge
-SMEARED = 0.4  # of the semi-axis: a longer path is not as even as the model has it
-EXCEEDED = 2.0  # by which variances grow where the path is longer, or white is clipped; so measured on rendered frames
-SKEWED = 0.03  # of the path, by which clipped white moves a centre, one standard deviation; so measured, too
-UNEVEN = 0.05  # of the contrast: where white differs so from sector to sector it isn't even within one
-BENT_PX = 0.1  # times that share: by how much a centre is off for it, one standard deviation
+WHOLE = 0.85  # of the rim: with less in view, parts may be the edge of something else
+SMEARED = 0.4  # of the semi-axis: on a longer path the speed isn't constant, as in the model
+EXCEEDED = 2.0  # factor of variances where the path is longer, or white is clipped; measured on rendered frames
+SKEWED = 0.03  # of the path, standard deviation of a centre by clipped white; measured on rendered frames
+UNEVEN = 0.05  # of the contrast: white of a larger spread over the sectors isn't even within one
+BENT_PX = 0.1  # times that share: standard deviation of a centre by uneven white
 LARGEST_BLUR = 0.35  # of the ring's width; beyond that its dark ring is gone
 
 
 @dataclass(frozen=True)
 class Outlines:
-    """n rims, as fitted; NaN where there is none."""
+    """n fitted rims; NaN where there is none."""
 
     ellipses: Ellipses  # of n
     covariance: Array  # (n, 2, 2) px^2, of the centres
@@ -44,8 +44,8 @@ class Outlines:
     noise: Array  # (n,) DN, a pixel's, the larger of both sides
     motion: Array  # (n, 2) px, path over the exposure, up to its sign
     seen: Array  # (n,) share of the rim that looks like one
-    doubtful: NDArray[np.bool_]  # (n,) covered in part, clipped, unevenly lit or smeared: may be off by more than covariances say
-    reasons: tuple[str | None, ...]  # why it is no ring
+    doubtful: NDArray[np.bool_]  # (n,) covered in part, clipped, unevenly lit or smeared: errors may exceed the covariances
+    reasons: tuple[str | None, ...]  # of the rejection; None of a ring
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -63,7 +63,7 @@ class Outlines:
         return self.contrast / (self.outside + self.inside)
 
     def replaced(self, which: int, other: "Outlines") -> "Outlines":
-        """The same with the one of `other` in a place."""
+        """The same, with the one rim of `other` in place of number `which`."""
         order = np.arange(len(self.reasons))
         order[which] = len(order)
         arrays = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in ARRAYS}
@@ -87,7 +87,7 @@ def measure(image: NDArray, rough: Ellipses, reach: float | Array, target: Targe
     rough : Ellipses
         n rough ellipses.
     reach : float or (n,) px
-        By how much their rims may be off; up to a third of the smaller semi-axis.
+        Largest error of the rough rims; up to a third of the smaller semi-axis.
     """
     return measure_both(image, image, rough, np.zeros(len(rough.centre), bool), reach, target)
 
@@ -100,16 +100,16 @@ def measure_both(
     reach: float | Array,
     target: Target,
 ) -> Outlines:
-    """The same for rings in two frames at once; `of_second` : (n,) says in which each is."""
-    return _judged(_rows(first, second, rough, of_second, reach, np.inf, target), target, middles=True)
+    """The same for rings in two frames at once; those of `of_second` : (n,) lie in the second."""
+    return _judged(_fitted(first, second, rough, of_second, reach, np.inf, target), target, middles=True)
 
 
 def measure_covered(image: NDArray, rough: Ellipses, reach: float, known: Array, target: Target) -> Outlines:
-    """The same for rings that may have no white middle that is seen, with shapes known to so many px : (n,), one deviation."""
-    return _judged(_rows(image, image, rough, np.zeros(len(rough.centre), bool), reach, known, target), target, middles=False)
+    """The same for rings whose middle may be hidden, with the standard deviation : (n,) px of shapes that are known before."""
+    return _judged(_fitted(image, image, rough, np.zeros(len(rough.centre), bool), reach, known, target), target, middles=False)
 
 
-def _rows(
+def _fitted(
     first: NDArray,
     second: NDArray,
     rough: Ellipses,
@@ -117,39 +117,42 @@ def _rows(
     reach: float | Array,
     known: float | Array,
     target: Target,
-) -> Array:
-    reach, known = (np.broadcast_to(np.asarray(each, float), len(rough.centre)).copy() for each in (reach, known))
+) -> NDArray:
     kind = np.uint8 if first.dtype == second.dtype == np.uint8 else np.float32
-    first, second = np.ascontiguousarray(first, kind), np.ascontiguousarray(second, kind)
-    centres, shapes = np.ascontiguousarray(rough.centre, float), np.ascontiguousarray(rough.shape, float)
-    return rim_model.fit_rims(first, second, np.asarray(of_second, bool), centres, shapes, reach, known, _hole(target))
+    starts, fits = np.empty(len(rough.centre), START), np.zeros(len(rough.centre), FIT)
+    starts["second"], starts["reach"], starts["sigma"] = of_second, reach, known
+    starts["x"], starts["y"] = rough.centre.T
+    starts["a"], starts["b"], starts["c"] = rough.shape[:, 0, 0], rough.shape[:, 0, 1], rough.shape[:, 1, 1]
+    for name in set(FIT.names) - {"found"}:
+        fits[name] = np.nan
+    fit_rims(np.ascontiguousarray(first, kind), np.ascontiguousarray(second, kind), starts, _hole(target), fits)
+    return fits
 
 
 def _hole(target: Target) -> float:
     return target.inner_diameter_mm / target.outer_diameter_mm
 
 
-def _judged(rows: Array, target: Target, middles: bool) -> Outlines:
+def _judged(fits: NDArray, target: Target, middles: bool) -> Outlines:
     hole = _hole(target)
-    shape = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-    inside, outside, middle = rows[:, rim_model.INSIDE], rows[:, rim_model.OUTSIDE], rows[:, rim_model.MIDDLE]
-    noise, seen = rows[:, rim_model.NOISE : rim_model.NOISE + 2].max(axis=1, initial=0), rows[:, rim_model.SEEN]
-    excess = np.maximum(rows[:, rim_model.EXCESS], 1)
-    covariance = rows[:, rim_model.COVARIANCE : rim_model.COVARIANCE + 25].reshape(-1, 5, 5)[:, :2, :2] * excess[:, None, None]
+    centre = np.stack([fits["x"], fits["y"]], axis=1)
+    shape = np.stack([fits["a"], fits["b"], fits["b"], fits["c"]], axis=1).reshape(-1, 2, 2)
+    inside, outside, middle, seen, spread = (fits[name] for name in ("inside", "outside", "middle", "seen", "uneven"))
+    noise = fits["noise"].max(axis=1, initial=0)
+    covariance = fits["covariance"][:, :2, :2] * np.maximum(fits["excess"], 1)[:, None, None]
     covariance = covariance / np.maximum(seen, 0.1)[:, None, None] ** COVERED + FLOOR_PX**2 * np.eye(2)
-    v0, v1, v2 = rows[:, rim_model.VARIANCE : rim_model.VARIANCE + 3].T
+    v0, v1, v2 = fits["variance"].T
     path, direction = np.sqrt(24 * np.hypot(v1, v2)), np.arctan2(v2, v1) / 2
     semi = np.trace(shape, axis1=1, axis2=2) / 2
-    spread = rows[:, rim_model.UNEVEN]
     clipped, uneven = outside + 2 * spread + noise > FULL_DN, spread / np.maximum(outside - inside, LEAST_DN)
     beyond = clipped | (path > SMEARED * semi)
     covariance[beyond] *= EXCEEDED
     covariance += ((BENT_PX * uneven) ** 2 + clipped * (SKEWED * path) ** 2)[:, None, None] * np.eye(2)
     motion = path[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
     reasons: list[str | None] = []
-    for i in range(len(rows)):
+    for i in range(len(fits)):
         contrast = outside[i] - inside[i]
-        if rows[i, rim_model.FAILED]:
+        if not fits["found"][i]:
             reasons.append("no rim")
         elif not contrast >= max(LEAST_DN, LEAST_CONTRAST * noise[i] / np.sqrt(semi[i])):
             reasons.append(f"a contrast of {contrast:.1f} DN in noise of {noise[i]:.1f}")
@@ -164,6 +167,4 @@ def _judged(rows: Array, target: Target, middles: bool) -> Outlines:
         else:
             reasons.append(None)
     doubtful = beyond | (uneven > UNEVEN) | (seen < WHOLE)
-    return Outlines(
-        Ellipses(rows[:, :2], shape), covariance, inside, outside, middle, noise, motion, seen, doubtful, tuple(reasons)
-    )
+    return Outlines(Ellipses(centre, shape), covariance, inside, outside, middle, noise, motion, seen, doubtful, tuple(reasons))

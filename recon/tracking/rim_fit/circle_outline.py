@@ -25,7 +25,7 @@ def ellipses_of(camera: Camera, world_from_target: Array, centres: Array, radius
 
 
 def slopes_at(camera: Camera, points: Array) -> Array:
-    """How the projections of points : (n, 3) mm in the world change with the points, in the world's axes : (n, 2, 3) px/mm."""
+    """Derivatives of the projections of points : (n, 3) mm in the world by the points, in the world's axes : (n, 2, 3) px/mm."""
     return _slopes(camera.camera_from_world, np.ascontiguousarray(points), camera.matrix, camera.coefficients)
 
 
@@ -58,24 +58,24 @@ def _ellipses(camera_from_target, centres, radius, matrix, k):
     for i in range(len(centres)):
         rotation = camera_from_target[:3, :3]
         place = rotation[:, 0] * centres[i, 0] + rotation[:, 1] * centres[i, 1] + camera_from_target[:3, 3]
-        seen = True
+        in_front = True
         for j in range(POINTS):
             angle = 2 * np.pi * j / POINTS
             point = place + radius * (np.cos(angle) * rotation[:, 0] + np.sin(angle) * rotation[:, 1])
             if not point[2] > 0:
-                seen = False
+                in_front = False
                 break
             bent_x, bent_y = distort(point[0] / point[2], point[1] / point[2], k)
             x[j] = matrix[0, 0] * bent_x + matrix[0, 1] * bent_y + matrix[0, 2]
             y[j] = matrix[1, 1] * bent_y + matrix[1, 2]
-        if seen:
+        if in_front:
             _fit(x, y, result[i])
     return result
 
 
 @njit(error_model="numpy")
 def _fit(x, y, ellipse):
-    """The ellipse next to points of a closed outline, evenly spread."""
+    """The ellipse closest to evenly spread points of a closed outline, by orthogonal distances : (5,), in place."""
     n = len(x)
     ellipse[0], ellipse[1] = x.mean(), y.mean()
     a, b, c = 0.0, 0.0, 0.0
@@ -105,9 +105,14 @@ def _fit(x, y, ellipse):
             distance = (away - 1) / slope
             nx, ny = nx / slope, ny / slope
             row[0], row[1], row[2], row[3], row[4] = nx, ny, nx * p, nx * q + ny * p, ny * q
-            for m in range(5):
-                right[m] += row[m] * distance
-                for k in range(5):
-                    normal[m, k] += row[m] * row[k]
-        step = np.linalg.solve(normal, right)
-        ellipse += step
+            _add_equation(row, distance, normal, right)
+        ellipse += np.linalg.solve(normal, right)
+
+
+@njit(inline="always", error_model="numpy")
+def _add_equation(row, value, normal, right):
+    """Add one equation, `row @ unknowns = value`, to normal equations."""
+    for m in range(len(row)):
+        right[m] += row[m] * value
+        for k in range(len(row)):
+            normal[m, k] += row[m] * row[k]

@@ -1,52 +1,106 @@
-"""Sectors of a rim: where they lie, and which of them look like the rim of a ring, compiled."""
+"""Sectors of a rim: their geometry, their contrast and their weights in the fit; compiled."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.compiled import njit
+from recon.tracking.rim_fit.rim_parameters import LEAST_VARIANCE, Rim
+
+Array = NDArray[np.float64]
 
 SECTORS = 48
 LEAST_SECTORS = 16
+INNERMOST = 0.85  # of the ring's width inwards from the rim, where the summed pixels end at the latest
 OUTERMOST = 0.37  # radii beyond the rim: half way to the neighbour
-LEAST_VARIANCE = 0.06  # px^2: a pixel's own extent is 1/12
 SCATTER = 10.0  # standard deviations beyond which a pixel counts less
-KEPT = (1 - 6 / SCATTER**2) / (1 - 2 / SCATTER**2)  # of normal noise's variance, seen with pixels counting by their residuals
-STEEP = 0.6  # of the contrast (bright - dark) / (bright + dark) that a quarter of the sectors exceeds: with less it isn't a rim
+KEPT = (1 - 6 / SCATTER**2) / (1 - 2 / SCATTER**2)  # share of normal noise's variance that such weights leave
+STEEP = 0.6  # of the upper quartile of the sectors' contrasts (bright - dark) / (bright + dark): with less it isn't a rim
 STRANGE = 4.0  # times the usual mean square at which a sector has lost three quarters of its weight
 ROUNDING = 1 / 12  # DN^2
 
-# of a sector, by column
-UX, UY, NX, NY, WIDE, BOX, BLUR, PULL, INNER, OUTER, COS, SIN, X, Y = range(14)
-# a sector's own levels: by how much it is off the planes inside and outside (DN), how light grows outwards there (DN/px), and how
-# it leans along the rim (DN)
-DARK, BRIGHT, GROWTH, LEANING, OWN = range(5)
-# sums of a sector: the upper triangle of 5x5 for edge, dark, bright, variance, growth, then the right side, squares, count, and
-# five for the noise
-UNKNOWNS, RIGHT = 5, 15
-SQUARES, COUNT, DARK2, MIXED, BRIGHT2, DARK_SQUARES, BRIGHT_SQUARES, LOCAL = range(20, 28)
+# unknowns of a sector, by index
+EDGE, DARK, BRIGHT, VARIANCE, GROWTH = range(5)
+UNKNOWNS = 5
+
+
+SECTOR = np.dtype([(name, float) for name in (
+    "ux", "uy",  # direction on the unit circle that the shape maps to the rim
+    "nx", "ny",  # unit normal, outwards
+    "wide",  # px^2, variance of the profile across the edge
+    "box",  # px, the path of the motion across the edge
+    "blur",  # px, standard deviation of the lens's blur
+    "pull",  # px inwards, shift of the edge by motion along it
+    "inner", "outer",  # px, extent of the fitted band inwards and outwards
+    "cos", "sin",  # of twice the normal's angle
+    "x", "y",  # place on the rim from its centre, in mean radii
+)])  # fmt: skip
+"""Geometry and profile in the middle of a sector."""
+
+LEVELS = np.dtype([(name, float) for name in (
+    "dark", "bright",  # DN, offsets inside and outside
+    "growth",  # DN/px, gradient outwards
+    "leaning",  # DN a sector, gradient along the rim
+)])  # fmt: skip
+"""A sector's own light, in addition to the planes inside and outside."""
+
+SUMS = np.dtype([
+    ("normal", float, (UNKNOWNS, UNKNOWNS)),  # products of slopes
+    ("right", float, UNKNOWNS),  # slopes times residuals
+    ("squares", float),  # squared residuals over their expected variance
+    ("count", float),  # robust weights, as are those below
+    ("dark2", float), ("mixed", float), ("bright2", float),  # products of the shares of both sides
+    ("dark_squares", float), ("bright_squares", float),  # DN^2, squared residuals by the shares of both sides
+])  # fmt: skip
+"""Weighted sums over the pixels of a sector."""
+
+
+class SideNoise(NamedTuple):
+    """Variance of the noise, DN^2."""
+
+    dark: float
+    bright: float
+
+
+class Sums(NamedTuple):
+    """Weighted sums over the pixels of each sector."""
+
+    normal: Array  # (SECTORS, UNKNOWNS, UNKNOWNS) products of slopes
+    right: Array  # (SECTORS, UNKNOWNS) slopes times residuals
+    squares: Array  # (SECTORS,) squared residuals over their expected variance
+    count: Array  # (SECTORS,) robust weights, as are those below
+    dark2: Array  # (SECTORS,) squared shares of the dark side
+    mixed: Array  # (SECTORS,) products of the shares of both sides
+    bright2: Array  # (SECTORS,) squared shares of the bright side
+    dark_squares: Array  # (SECTORS,) DN^2, squared residuals by the share of the dark side
+    bright_squares: Array  # (SECTORS,) DN^2, and of the bright side
+
+
+class Free(NamedTuple):
+    """Steps of a sector's two levels by its own pixels alone, with the edge fixed. All (SECTORS,)."""
+
+    dark: Array  # DN
+    bright: Array  # DN
+    dark_variance: Array  # DN^2, 0 of a sector without pixels on both sides
+    bright_variance: Array  # DN^2
 
 
 @njit(error_model="numpy")
-def geometry(ellipse, variance, reach, hole):
-    """Of each sector's middle : (SECTORS, 14): its place, the normal, the profile there, and how far to look."""
-    sectors = np.empty((SECTORS, 14))
-    a, b, c = ellipse[2], ellipse[3], ellipse[4]
+def geometry(rim: Rim, reach, hole):
+    """Geometry of the sectors : (SECTORS,) SECTOR, for a rim that may be off by `reach` px, and the ratio `hole` of diameters."""
+    sectors = np.empty(SECTORS, SECTOR)
+    a, b, c = rim.a, rim.b, rim.c
     determinant = a * c - b * b
     radius = (a + c) / 2
-    strength = math.hypot(variance[1], variance[2])
-    blur = math.sqrt(max(variance[0] - strength, LEAST_VARIANCE))
+    strength = math.hypot(rim.variance_cos, rim.variance_sin)
+    blur = math.sqrt(max(rim.variance - strength, LEAST_VARIANCE))
     path = math.sqrt(24 * strength)
-    psi = 0.5 * math.atan2(variance[2], variance[1])
+    psi = 0.5 * math.atan2(rim.variance_sin, rim.variance_cos)
     for j in range(SECTORS):
-        at = (j + 0.5) * 4 / SECTORS
-        quadrant = int(at)
-        y = at - quadrant
-        x = 1 - y
-        length = math.hypot(x, y)
-        x, y = x / length, y / length
-        for _ in range(quadrant):
-            x, y = -y, x
+        sector = sectors[j]
+        x, y = _direction(j)
         nx, ny = (c * x - b * y) / determinant, (a * y - b * x) / determinant
         slope = math.hypot(nx, ny)
         nx, ny = nx / slope, ny / slope
@@ -54,20 +108,34 @@ def geometry(ellipse, variance, reach, hole):
         along = path * (ny * math.cos(psi) - nx * math.sin(psi))
         curvature = determinant / math.hypot(b * x - a * y, c * x - b * y) ** 3
         far = max(across / 2 + 3 * blur + 1.5, 1.3 * reach + 1)
-        sectors[j, UX], sectors[j, UY], sectors[j, NX], sectors[j, NY] = x, y, nx, ny
-        sectors[j, BOX], sectors[j, BLUR] = across, blur
-        sectors[j, WIDE] = blur * blur + across * across / 12
-        sectors[j, PULL] = curvature * along * along / 24
-        sectors[j, INNER] = min(far, 0.75 * (1 - hole) / slope)
-        sectors[j, OUTER] = min(far, OUTERMOST / slope)
-        sectors[j, COS], sectors[j, SIN] = nx * nx - ny * ny, 2 * nx * ny
-        sectors[j, X], sectors[j, Y] = (a * x + b * y) / radius, (b * x + c * y) / radius
+        sector.ux, sector.uy, sector.nx, sector.ny = x, y, nx, ny
+        sector.box, sector.blur = across, blur
+        sector.wide = blur * blur + across * across / 12
+        sector.pull = curvature * along * along / 24
+        sector.inner = min(far, 0.75 * (1 - hole) / slope)
+        sector.outer = min(far, OUTERMOST / slope)
+        sector.cos, sector.sin = nx * nx - ny * ny, 2 * nx * ny
+        sector.x, sector.y = (a * x + b * y) / radius, (b * x + c * y) / radius
     return sectors
 
 
 @njit(inline="always", error_model="numpy")
+def _direction(j):
+    """Unit vector to the middle of a sector; the inverse of `sector`."""
+    at = (j + 0.5) * 4 / SECTORS
+    quadrant = int(at)
+    y = at - quadrant
+    x = 1 - y
+    length = math.hypot(x, y)
+    x, y = x / length, y / length
+    for _ in range(quadrant):
+        x, y = -y, x
+    return x, y
+
+
+@njit(inline="always", error_model="numpy")
 def sector(x, y):
-    """Number of the sector of a direction, and how far into it, as one number."""
+    """Number of the sector of a direction, plus the share of it that lies before the direction."""
     total = abs(x) + abs(y)
     if x >= 0:
         at = y / total if y >= 0 else 3 + x / total
@@ -78,55 +146,68 @@ def sector(x, y):
 
 @njit(error_model="numpy")
 def steep(dark, bright, seen):
-    """Sectors : (SECTORS,) bool whose levels are ink's beside paper's, in whatever light: as deep as others."""
+    """Sectors with ring-like Michelson contrast : (SECTORS,) bool, of those with pixels, by their levels in any light."""
     depth = (bright - dark) / np.maximum(np.abs(bright) + np.abs(dark), 1e-9)
     return seen & (depth > STEEP * np.quantile(depth[seen], 0.75))
 
 
 @njit(error_model="numpy")
-def alone(sums):
-    """What each sector's pixels alone say, where its edge stays: steps of its dark and its bright level, DN, and their variances.
-
-    Two of (SECTORS, 2); 0 of one without pixels on both sides.
-    """
-    free, variance = np.zeros((SECTORS, 2)), np.zeros((SECTORS, 2))
+def free_levels(sums):
+    """Solve each sector's normal equations for its two levels alone."""
+    dark, bright, dark_variance, bright_variance = np.zeros(SECTORS), np.zeros(SECTORS), np.zeros(SECTORS), np.zeros(SECTORS)
     for j in range(SECTORS):
-        a, b, c, p, q = sums[j, 5] * 1.001, sums[j, 6], sums[j, 9] * 1.001, sums[j, RIGHT + 1], sums[j, RIGHT + 2]
+        normal, right = sums[j].normal, sums[j].right
+        a, b, c = normal[DARK, DARK] * 1.001, normal[DARK, BRIGHT], normal[BRIGHT, BRIGHT] * 1.001
+        p, q = right[DARK], right[BRIGHT]
         determinant = a * c - b * b
         if determinant > 0:
-            free[j, DARK], free[j, BRIGHT] = (c * p - b * q) / determinant, (a * q - b * p) / determinant
-            variance[j, DARK], variance[j, BRIGHT] = c / determinant, a / determinant
-    return free, variance
+            dark[j], bright[j] = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+            dark_variance[j], bright_variance[j] = c / determinant, a / determinant
+    return Free(dark, bright, dark_variance, bright_variance)
 
 
 @njit(error_model="numpy")
-def judge(sums, sectors, planes, own, weights, noise, capture, fewest):
-    """Weigh the sectors by how well they fit and follow the noise; False if too little of the rim is in the image."""
-    seen = sums[:, COUNT] >= fewest
+def weigh(sums, sectors, rim: Rim, own, fewest, weights):
+    """Weigh the sectors by contrast and fit, in place; returns the usual mean square, 0 if too few sectors have such contrast.
+
+    Sectors with less than `fewest` pixels don't count.
+    """
+    seen = sums.count >= fewest
     if seen.sum() < LEAST_SECTORS:
-        return False
-    mean = sums[:, SQUARES] / np.maximum(sums[:, COUNT], 1e-9)
-    free, _ = alone(sums)
-    dark = planes[0] + planes[1] * sectors[:, X] + planes[2] * sectors[:, Y] + own[:, DARK] + free[:, DARK]
-    bright = planes[3] + planes[4] * sectors[:, X] + planes[5] * sectors[:, Y] + own[:, BRIGHT] + free[:, BRIGHT]
+        return 0.0
+    mean = sums.squares / np.maximum(sums.count, 1e-9)
+    free = free_levels(sums)
+    dark = rim.dark + rim.dark_x * sectors.x + rim.dark_y * sectors.y + own.dark + free.dark
+    bright = rim.bright + rim.bright_x * sectors.x + rim.bright_y * sectors.y + own.bright + free.bright
     likely = steep(dark, bright, seen)
     if likely.sum() < LEAST_SECTORS:
-        return False
+        return 0.0
     usual = np.median(mean[likely])
     if not usual > 0:
         usual = 1.0
     for j in range(SECTORS):
         weights[j] = 1 / (1 + (mean[j] / (STRANGE * usual)) ** 2) ** 2 if likely[j] else 0.0
-    if capture:
-        noise[:] = np.maximum(noise.mean() * usual, ROUNDING)
-        return True
-    a, b, c = (weights * sums[:, DARK2]).sum(), (weights * sums[:, MIXED]).sum(), (weights * sums[:, BRIGHT2]).sum()
-    p, q = (weights * sums[:, DARK_SQUARES]).sum() / KEPT, (weights * sums[:, BRIGHT_SQUARES]).sum() / KEPT
+    return usual
+
+
+@njit(error_model="numpy")
+def even_noise(noise: SideNoise, usual):
+    """The same noise on both sides, by the usual mean square of residuals over the noise before."""
+    level = max((noise.dark + noise.bright) / 2 * usual, ROUNDING)
+    return SideNoise(level, level)
+
+
+@njit(error_model="numpy")
+def side_noise(sums, weights, noise: SideNoise):
+    """Noise of the dark and of the bright side, by least squares from the weighted residuals; the one before if undetermined."""
+    a, b, c = (weights * sums.dark2).sum(), (weights * sums.mixed).sum(), (weights * sums.bright2).sum()
+    p, q = (weights * sums.dark_squares).sum() / KEPT, (weights * sums.bright_squares).sum() / KEPT
+    dark, bright = noise.dark, noise.bright
     determinant = a * c - b * b
     if determinant > 1e-6 * a * c:
-        noise[0], noise[1] = (c * p - b * q) / determinant, (a * q - b * p) / determinant
-    if noise[0] < ROUNDING:
-        noise[0], noise[1] = ROUNDING, (q - b * ROUNDING) / c
-    if noise[1] < ROUNDING:
-        noise[1], noise[0] = ROUNDING, max((p - b * ROUNDING) / a, ROUNDING)
-    return True
+        dark, bright = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+    if dark < ROUNDING:
+        dark, bright = ROUNDING, (q - b * ROUNDING) / c
+    if bright < ROUNDING:
+        bright, dark = ROUNDING, max((p - b * ROUNDING) / a, ROUNDING)
+    return SideNoise(dark, bright)
