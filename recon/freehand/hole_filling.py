@@ -25,7 +25,7 @@ def fill_holes(reconstruction: Reconstruction, most_voxels: int = MOST_VOXELS, s
 
     A stick is a straight line through the empty voxel, in one of 13 directions, from one filled voxel to another. The value is
     the mean, weighted by 1/length, over the `sticks` shortest ones and all as short as these. Voxels without a stick of at most
-    `most_voxels` stay empty, so the volume does not grow past what was scanned. Filled voxels keep their values.
+    `most_voxels` stay empty, so the volume does not grow past the scan. Filled voxels keep their values.
 
     Source: sticks and their limit are those of the PLUS toolkit's hole filling, which weights the two ends slightly otherwise.
     """
@@ -34,6 +34,40 @@ def fill_holes(reconstruction: Reconstruction, most_voxels: int = MOST_VOXELS, s
     lengths = np.linalg.norm(STICKS * volume.spacing, axis=1)
     _fill(volume.voxels, reconstruction.filled, lengths, most_voxels, sticks, voxels, filled)
     return Reconstruction(Volume(voxels, volume.origin, volume.spacing, volume.directions), filled)
+
+
+@njit
+def _fill(before, known, step_mm, most_voxels, sticks, voxels, filled):
+    nz, ny, nx = before.shape
+    length, grey = np.empty(len(step_mm)), np.empty(len(step_mm))
+    for k in range(nz):
+        for j in range(ny):
+            for i in range(nx):
+                if known[k, j, i]:
+                    continue
+                _measure(before, known, (k, j, i), step_mm, most_voxels, length, grey)
+                mean = _mean_of_shortest(length, grey, sticks)
+                if mean >= 0:
+                    voxels[k, j, i] = np.uint8(mean + 0.5)
+                    filled[k, j, i] = True
+
+
+@njit(inline="always")
+def _measure(before, known, voxel, step_mm, most_voxels, length, grey):
+    """Lengths in mm of all sticks through an empty voxel, inf where there is none, and its grey level by each."""
+    k, j, i = voxel
+    for s in range(len(step_mm)):
+        di, dj, dk = STICKS[s]
+        length[s] = np.inf
+        forth = _reach(known, k, j, i, dk, dj, di, most_voxels - 2)
+        if forth == 0:
+            continue
+        back = _reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth)
+        if back > 0:
+            ahead = before[k + forth * dk, j + forth * dj, i + forth * di]
+            behind = before[k - back * dk, j - back * dj, i - back * di]
+            length[s] = (forth + back) * step_mm[s]
+            grey[s] = (back * ahead + forth * behind) / (forth + back)
 
 
 @njit
@@ -49,36 +83,19 @@ def _reach(filled: NDArray, k: int, j: int, i: int, dk: int, dj: int, di: int, m
     return 0
 
 
-@njit
-def _fill(before, known, lengths, most_voxels, sticks, voxels, filled):
-    nz, ny, nx = before.shape
-    length, found = np.empty(len(lengths)), np.empty(len(lengths))
-    for k in range(nz):
-        for j in range(ny):
-            for i in range(nx):
-                if known[k, j, i]:
-                    continue
-                for s in range(len(lengths)):
-                    di, dj, dk = STICKS[s]
-                    length[s] = np.inf
-                    forth = _reach(known, k, j, i, dk, dj, di, most_voxels - 2)
-                    if forth == 0:
-                        continue
-                    back = _reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth)
-                    if back > 0:
-                        ahead = before[k + forth * dk, j + forth * dj, i + forth * di]
-                        behind = before[k - back * dk, j - back * dj, i - back * di]
-                        length[s] = (forth + back) * lengths[s]
-                        found[s] = (back * ahead + forth * behind) / (forth + back)
-                total, weights, used = 0.0, 0.0, 0
-                while used < sticks and length.min() < np.inf:
-                    shortest = length.min()
-                    for s in range(len(lengths)):
-                        if length[s] <= shortest * (1 + 1e-9):
-                            total += found[s] / length[s]
-                            weights += 1 / length[s]
-                            length[s] = np.inf
-                            used += 1
-                if used > 0:
-                    voxels[k, j, i] = np.uint8(total / weights + 0.5)
-                    filled[k, j, i] = True
+@njit(inline="always")
+def _mean_of_shortest(length, grey, sticks):
+    """Mean grey level, weighted by 1/length, of the `sticks` shortest and all as short as these; -1 without any.
+
+    Lengths of used sticks become inf.
+    """
+    total, weights, used = 0.0, 0.0, 0
+    while used < sticks and length.min() < np.inf:
+        shortest = length.min()
+        for s in range(len(length)):
+            if length[s] <= shortest * (1 + 1e-9):
+                total += grey[s] / length[s]
+                weights += 1 / length[s]
+                length[s] = np.inf
+                used += 1
+    return total / weights if used > 0 else -1.0

@@ -1,4 +1,4 @@
-"""Freehand 3-D ultrasound: B-scans with poses become points, and a volume that is as large as where they have been.
+"""Freehand 3-D ultrasound: B-scans with poses become points, and a volume around all of them.
 
 Frames pass one by one; in memory are the volume and one image. `world_from_pixel` is a matrix (4, 4) that takes the pixel
 [u, v, 0, 1] to mm, the poses times the probe's calibration (`recon.freehand.sequences.target_from_pixel`).
@@ -7,7 +7,7 @@ Frames pass one by one; in memory are the volume and one image. `world_from_pixe
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import repeat
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,7 +48,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Grid:
-    """Where the voxels of a volume lie; see `Volume`."""
+    """The voxels of a volume in space; see `Volume`."""
 
     size: tuple[int, int, int]  # nx, ny, nz
     origin: Array  # (3,) mm
@@ -58,7 +58,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A volume, and which of its voxels a pixel fell into."""
+    """A volume, and those of its voxels that pixels fell into."""
 
     volume: Volume
     filled: Mask  # (nz, ny, nx)
@@ -67,7 +67,7 @@ class Reconstruction:
 def points(
     world_from_pixel: Array, shape: tuple[int, int], mask: Mask | None = None, clip: Clip | None = None
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Where the pixels of a B-scan lie.
+    """Points of a B-scan's pixels.
 
     Parameters
     ----------
@@ -101,9 +101,9 @@ def corners(world_from_pixel: Array, shape: tuple[int, int], clip: Clip | None =
 
 
 def aligned_grid(around: Array, spacing_mm: ArrayLike) -> Grid:
-    """The grid along the world's axes that takes in points (n, 3), from the least coordinates on.
+    """The grid along the world's axes that holds points (n, 3), from the least coordinates on.
 
-    It ends with the voxel that the greatest coordinates fall into, which is also how the PLUS toolkit sizes its volumes.
+    It ends with the voxel of the greatest coordinates, as the volumes of the PLUS toolkit do.
     """
     return _grid(around, spacing_mm, np.eye(3))
 
@@ -140,14 +140,14 @@ def reconstruct(
     grid : Grid
         Pixels outside are left out.
     compounding
-        What a voxel gets of the pixels in it: their mean, the greatest, or the latest. `integer_mean` is the running mean in
-        whole grey levels, rounded down at each pixel, of the PLUS toolkit: it is too dark, by levels, and there to compare.
+        Rule for the pixels in a voxel: their mean, the greatest, or the latest. `integer_mean` is the running mean in whole
+        grey levels, rounded down at each pixel, of the PLUS toolkit: too dark by several levels, and there for comparison.
     interpolation
-        Whether a pixel counts for the nearest voxel or, by its distance, for the eight around it.
+        A pixel counts for the nearest voxel or, by its distance, for the eight around it.
     masks : n times (h, w) bool, optional
         Pixels to take.
     most_bytes : int
-        What the volume may take in memory, 10 bytes a voxel.
+        Largest memory of the volume, 10 bytes a voxel.
 
     Raises
     ------
@@ -163,8 +163,8 @@ def reconstruct(
         needed = np.prod(grid.size, dtype=float) * BYTES_PER_VOXEL / 2**30
         found = f"{needed:.1f} GiB for {' x '.join(map(str, grid.size))} voxels; take a larger spacing or clip"
         raise InputError(f"volume: expected at most {most_bytes / 2**30:.1f} GiB, found {found}")
-    value, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    voxel_from_world = np.linalg.inv(Volume(value, grid.origin, grid.spacing, grid.directions).world_from_voxel)
+    sums = Sums(np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+    voxel_from_world = np.linalg.inv(Volume(sums.value, grid.origin, grid.spacing, grid.directions).world_from_voxel)
     paste = _paste_nearest if interpolation == "nearest" else _paste_linear
     count = 0
     for image, mask in zip(images, masks if masks is not None else repeat(None), strict=False):
@@ -178,12 +178,12 @@ def reconstruct(
                 found = f"{image.shape} of {image.dtype}, mask {taken.shape}"
                 raise InputError(f"image {count - 1}: expected height x width of uint8 and a mask like it, found {found}")
             bounds = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
-            paste(np.ascontiguousarray(image), taken, bounds, matrix, value, weight, RULES[compounding])
+            paste(np.ascontiguousarray(image), taken, bounds, matrix, sums, RULES[compounding])
     if count < len(world_from_pixel):
         raise InputError(f"images: expected as many as poses, {len(world_from_pixel)}, found {count}")
     voxels = np.empty(shape, np.uint8)
-    _finish(value, weight, compounding == "mean", voxels)
-    return Reconstruction(Volume(voxels, grid.origin, grid.spacing, grid.directions), weight > 0)
+    _finish(sums, compounding == "mean", voxels)
+    return Reconstruction(Volume(voxels, grid.origin, grid.spacing, grid.directions), sums.weight > 0)
 
 
 def _grid(around: Array, spacing_mm: ArrayLike, directions: Array) -> Grid:
@@ -196,11 +196,18 @@ def _grid(around: Array, spacing_mm: ArrayLike, directions: Array) -> Grid:
     return Grid((int(nx), int(ny), int(nz)), directions @ low, spacing, directions)
 
 
+class Sums(NamedTuple):
+    """Grey levels of the voxels before `_finish`, (nz, ny, nx) float32."""
+
+    value: NDArray[np.float32]  # their sum, or the greatest, latest or running mean
+    weight: NDArray[np.float32]  # of all pixels so far, 0 where there is none
+
+
 @njit
-def _paste_nearest(image, mask, bounds, voxel_from_pixel, value, weight, rule):
+def _paste_nearest(image, mask, bounds, voxel_from_pixel, sums: Sums, rule):
     m = voxel_from_pixel
     left, right, top, bottom = bounds
-    nz, ny, nx = value.shape
+    nz, ny, nx = sums.value.shape
     for v in range(top, bottom + 1):
         for u in range(left, right + 1):
             if not mask[v, u]:
@@ -209,14 +216,13 @@ def _paste_nearest(image, mask, bounds, voxel_from_pixel, value, weight, rule):
             j = int(np.floor(m[1, 0] * u + m[1, 1] * v + m[1, 3] + 0.5))
             k = int(np.floor(m[2, 0] * u + m[2, 1] * v + m[2, 3] + 0.5))
             if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
-                _compound(value, weight, k, j, i, image[v, u], np.float32(1.0), rule)
+                _compound(sums, k, j, i, image[v, u], np.float32(1.0), rule)
 
 
 @njit
-def _paste_linear(image, mask, bounds, voxel_from_pixel, value, weight, rule):
+def _paste_linear(image, mask, bounds, voxel_from_pixel, sums: Sums, rule):
     m = voxel_from_pixel
     left, right, top, bottom = bounds
-    nz, ny, nx = value.shape
     for v in range(top, bottom + 1):
         for u in range(left, right + 1):
             if not mask[v, u]:
@@ -224,17 +230,25 @@ def _paste_linear(image, mask, bounds, voxel_from_pixel, value, weight, rule):
             x = m[0, 0] * u + m[0, 1] * v + m[0, 3]
             y = m[1, 0] * u + m[1, 1] * v + m[1, 3]
             z = m[2, 0] * u + m[2, 1] * v + m[2, 3]
-            i0, j0, k0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-            for k in range(max(k0, 0), min(k0 + 2, nz)):
-                for j in range(max(j0, 0), min(j0 + 2, ny)):
-                    for i in range(max(i0, 0), min(i0 + 2, nx)):
-                        share = np.float32((1 - abs(x - i)) * (1 - abs(y - j)) * (1 - abs(z - k)))
-                        if share >= LEAST_WEIGHT or (rule == 0 and share > 0):
-                            _compound(value, weight, k, j, i, image[v, u], share, rule)
+            _share_out(sums, x, y, z, image[v, u], rule)
 
 
 @njit(inline="always")
-def _compound(value, weight, k, j, i, grey, share, rule):
+def _share_out(sums: Sums, x, y, z, grey, rule):
+    """Share a pixel out to the eight voxels around it, by its distance from each."""
+    nz, ny, nx = sums.value.shape
+    i0, j0, k0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    for k in range(max(k0, 0), min(k0 + 2, nz)):
+        for j in range(max(j0, 0), min(j0 + 2, ny)):
+            for i in range(max(i0, 0), min(i0 + 2, nx)):
+                share = np.float32((1 - abs(x - i)) * (1 - abs(y - j)) * (1 - abs(z - k)))
+                if share >= LEAST_WEIGHT or (rule == 0 and share > 0):
+                    _compound(sums, k, j, i, grey, share, rule)
+
+
+@njit(inline="always")
+def _compound(sums: Sums, k, j, i, grey, share, rule):
+    value, weight = sums.value, sums.weight
     if rule == 0:
         value[k, j, i] += share * grey
         weight[k, j, i] += share
@@ -251,7 +265,8 @@ def _compound(value, weight, k, j, i, grey, share, rule):
 
 
 @njit
-def _finish(value, weight, divide, voxels):
+def _finish(sums: Sums, divide, voxels):
+    value, weight = sums.value, sums.weight
     for k in range(value.shape[0]):
         for j in range(value.shape[1]):
             for i in range(value.shape[2]):
