@@ -1,9 +1,9 @@
 """From the images of a pattern sequence to projector coordinates, with their predicted noise."""
 
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -24,18 +24,18 @@ Measured = tuple[Fringes, Fringe]
 Guide = tuple[GrayCode | CentreLine, NDArray, int]  # the part, its images, the first one's place in the sequence
 
 DARKEST = 4.0  # DN of 255: default of the least modulation
-SMALLEST = 8  # px, an image's shorter side: what continuity is told from
+SMALLEST = 8  # px, an image's shorter side: the extent of the stencil of continuity
 WORST_SIGMA = 0.3  # rad of predicted phase noise: beyond, orders can't be decided
 
 
 class Status(IntEnum):
-    """What became of a pixel."""
+    """The outcome of decoding a pixel."""
 
     OK = 0
     DARK = 1  # too little modulation
     SATURATED = 2  # at full scale in a fringe image
-    UNREACHABLE = 3  # a surface that the centre line doesn't reach
-    UNCERTAIN = 4  # the order can't be told: a tear, a border, contradicting bits or pitches
+    UNREACHABLE = 3  # a surface without the centre line
+    UNCERTAIN = 4  # an ambiguous order: a tear, a border, contradicting bits or pitches
     OUTSIDE = 5  # decoded to a coordinate beyond the projector's image
 
 
@@ -43,9 +43,17 @@ class Status(IntEnum):
 OK, UNREACHABLE, UNCERTAIN, OUTSIDE = map(int, (Status.OK, Status.UNREACHABLE, Status.UNCERTAIN, Status.OUTSIDE))
 
 
+class Scale(NamedTuple):
+    """Projector px of an axis: `x = origin + pitch * cycles`, in [-0.5, length - 0.5]."""
+
+    origin: float
+    pitch: float
+    length: int
+
+
 @dataclass(frozen=True)
 class ProjectorMap:
-    """Projector coordinates seen by a camera. All images (h, w)."""
+    """Projector coordinates of a camera's pixels. All images (h, w)."""
 
     columns: Image | None  # projector px, NaN where unknown; None if not encoded
     rows: Image | None
@@ -85,7 +93,7 @@ def decode(
         Of one image. If not given it is measured from fringes of eight or more steps; with fewer steps a default stands in;
         the map's `noise_source` says which.
     min_modulation_dn : float, optional
-        Fringes weaker than this are dark; 4 DN of 255 if not given.
+        Least modulation, below which a pixel is dark; 4 DN of 255 if not given.
     name : str
         Of the images, for messages, such as `surface/cam1`.
 
@@ -123,9 +131,10 @@ def decode(
         ]
         orders, unreachable, found = _orders(patterns, axis, sets, guides, stage == Status.OK, noise, name)
         counts.update(found)
-        x, sigma = _coordinates(fringe.phase, fringe.sigma, orders.order, orders.trusted, unreachable, stage,
-                                part.zero(patterns.length(axis)), part.pitch, patterns.length(axis))  # fmt: skip
-        axes[axis], fringes[axis] = (x, sigma), fringe
+        length = patterns.length(axis)
+        scale = Scale(float(part.zero(length)), part.pitch, length)
+        axes[axis] = _coordinates(fringe.phase, fringe.sigma, orders, unreachable, stage, scale)
+        fringes[axis] = fringe
         status = np.where(status == Status.OK, stage, status)
     first = fringes[patterns.axes[0]]
     columns, rows = axes.get("columns", (None, None)), axes.get("rows", (None, None))
@@ -159,7 +168,7 @@ def _quality(fringes: list[Fringe], least: float) -> NDArray[np.uint8]:
 def _orders(
     patterns: Patterns, axis: Axis, sets: list[Measured], guides: list[Guide], valid: Mask, noise: Noise, name: str
 ) -> tuple[Orders, Mask, dict[str, int]]:
-    """Fringe orders by the sequence's way of unwrapping, where no line reaches, and what there is to count."""
+    """Fringe orders by the sequence's unwrapping, pixels out of the line's reach : (h, w) bool, and counts for the summary."""
     length = patterns.length(axis)
     nowhere = np.zeros(valid.shape, bool)
     part, fringe = min(sets, key=lambda pair: pair[0].pitch)
@@ -184,11 +193,11 @@ def _orders(
 def _from_line(
     line: CentreLine, image: NDArray, part: Fringes, fringe: Fringe, valid: Mask, length: int, axis: Axis, place: str
 ) -> tuple[Orders, Mask, dict[str, int]]:
-    """Orders by the centre line; for rows everything is turned, so that the line stands upright."""
+    """Orders by the centre line; for rows all images are transposed, so that the line stands upright."""
     plausibility.check_light(image, fringe, valid, place)
     turned = axis == "rows"
     if turned:
-        fringe = Fringe(*(np.ascontiguousarray(getattr(fringe, f.name).T) for f in fields(fringe)))
+        fringe = Fringe(*(np.ascontiguousarray(m.T) for m in fringe))
         image, valid = np.ascontiguousarray(image.T), np.ascontiguousarray(valid.T)
     turns = (line.middle(length) - part.zero(length)) / part.pitch
     found = spatial.unwrap(fringe, valid, image, turns, line.width / part.pitch)
@@ -198,8 +207,9 @@ def _from_line(
 
 
 @njit(parallel=True)
-def _coordinates(phase, sigma, order, trusted, unreachable, status, origin, pitch, length):
+def _coordinates(phase, sigma, orders: Orders, unreachable, status, scale: Scale):
     """Projector coordinates and their noise, NaN where unknown; writes the reasons into `status`."""
+    order, trusted, pitch = orders.order, orders.trusted, scale.pitch
     height, width = phase.shape
     x, sx = np.full((height, width), np.nan, np.float32), np.full((height, width), np.nan, np.float32)
     for v in prange(height):
@@ -209,8 +219,8 @@ def _coordinates(phase, sigma, order, trusted, unreachable, status, origin, pitc
             if not trusted[v, u]:
                 status[v, u] = UNREACHABLE if unreachable[v, u] else UNCERTAIN
                 continue
-            value = origin + pitch * (phase[v, u] / (2 * np.pi) + order[v, u])
-            if value < -0.5 or value > length - 0.5:
+            value = scale.origin + pitch * (phase[v, u] / (2 * np.pi) + order[v, u])
+            if value < -0.5 or value > scale.length - 0.5:
                 status[v, u] = OUTSIDE
                 continue
             x[v, u], sx[v, u] = value, pitch / (2 * np.pi) * sigma[v, u]

@@ -1,7 +1,7 @@
 """Fringe order from Gray code, safe at the borders of the periods."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
@@ -15,12 +15,19 @@ SURE = 3.0  # sigmas between a bit's intensity and its threshold, to call the bi
 MARGIN = 0.1  # cycle that must lie between a decision on the order and its tipping point
 
 
-@dataclass(frozen=True)
-class Orders:
-    """Fringe orders : (h, w) int32, and where they can be trusted : (h, w) bool."""
+class Orders(NamedTuple):
+    """Fringe orders and their trusted pixels. Both (h, w)."""
 
     order: NDArray[np.int32]
     trusted: NDArray[np.bool_]
+
+
+class Cells(NamedTuple):
+    """The cells of a Gray code on the projector's axis."""
+
+    first: float  # cycles, from the fringes' origin to the middle of the first cell
+    width: float  # cycles
+    inverted: bool  # each bit's image is followed by its inverse
 
 
 def fringe_order(
@@ -62,7 +69,7 @@ def fringe_order(
     -------
     orders : Orders
     residual : (h, w) float32, cycles
-        How far cell and phase are from a whole order, in +-0.5. With the complementary bit the right images spread it evenly
+        Remainder of cell and phase from a whole order, in +-0.5. With the complementary bit the right images spread it evenly
         over +-0.25, whatever the origins.
     """
     half = 2 if code.complementary else 1
@@ -70,43 +77,56 @@ def fringe_order(
     borders = code.origin(length) + cell * np.arange(half * 2**code.bits)
     drawn = np.mean(np.ceil(borders - 1e-9) - 0.5 - borders)  # projector pixels are lit whole
     first = (code.origin(length) + drawn + 0.5 * cell - fringes.zero(length)) / code.pitch
-    order, trusted, residual = _order(np.ascontiguousarray(images), code.inverted, fringe.phase, fringe.offset, fringe.modulation,
-                                      first, 1 / half, noise.read_variance, noise.gain)  # fmt: skip
-    return Orders(order, trusted), residual
+    return _order(np.ascontiguousarray(images), Cells(float(first), 1 / half, code.inverted), fringe, noise)
 
 
 @njit(parallel=True)
-def _order(images, inverted, phase, offset, modulation, first, cell, read, gain):
+def _order(images, cells: Cells, fringe: Fringe, noise: Noise):
+    phase = fringe.phase
     height, width = phase.shape
-    bits = images.shape[0] // 2 if inverted else images.shape[0]
     order = np.zeros((height, width), np.int32)
     trusted = np.zeros((height, width), np.bool_)
     residual = np.zeros((height, width), np.float32)
     for v in prange(height):
         for u in range(width):
-            uncertain, doubt, gray, number = 0, 0, 0, 0
-            low, high = 0.0, 0.0
-            if not inverted:
-                low = max(offset[v, u] - modulation[v, u], np.float32(0))  # gamma's harmonics pull the fit below black
-                high = offset[v, u] + modulation[v, u]
-                for i in range(bits):
-                    low, high = min(low, float(images[i, v, u])), max(high, float(images[i, v, u]))
-            for i in range(bits):
-                if inverted:
-                    value, other = float(images[2 * i, v, u]), float(images[2 * i + 1, v, u])
-                    variance = 2 * read + gain * (value + other)
-                else:
-                    value, other = float(images[i, v, u]), (low + high) / 2
-                    variance = read + gain * value + (2 * read + gain * (low + high)) / 4
-                gray ^= 1 if value > other else 0  # running parity turns Gray into binary
-                number = 2 * number + gray
-                if (value - other) ** 2 < SURE * SURE * variance:
-                    uncertain += 1
-                    doubt = (1 << (bits - i)) - 1  # a Gray bit flips its binary digit and all after it
-            cycles = first + number * cell - phase[v, u] / (2 * math.pi)
+            number, doubt, uncertain = _cell_number(images, cells.inverted, fringe, noise, v, u)
+            cycles = cells.first + number * cells.width - phase[v, u] / (2 * math.pi)
             nearest = math.floor(cycles + 0.5)
             order[v, u] = nearest
             residual[v, u] = cycles - nearest
-            other_way = math.floor(first + (number ^ doubt) * cell - phase[v, u] / (2 * math.pi) + 0.5)
+            other_way = math.floor(cells.first + (number ^ doubt) * cells.width - phase[v, u] / (2 * math.pi) + 0.5)
             trusted[v, u] = uncertain <= 1 and other_way == nearest and abs(cycles - nearest) < 0.5 - MARGIN
-    return order, trusted, residual
+    return Orders(order, trusted), residual
+
+
+@njit(inline="always")
+def _cell_number(images, inverted, fringe: Fringe, noise: Noise, v, u):
+    """The cell of a pixel, the digits that its last uncertain bit flips, and the number of uncertain bits."""
+    bits = images.shape[0] // 2 if inverted else images.shape[0]
+    uncertain, doubt, gray, number = 0, 0, 0, 0
+    low, high = 0.0, 0.0
+    if not inverted:
+        low, high = _black_and_white(images, fringe, v, u)
+    for i in range(bits):
+        if inverted:
+            value, other = float(images[2 * i, v, u]), float(images[2 * i + 1, v, u])
+            variance = 2 * noise.read_variance + noise.gain * (value + other)
+        else:
+            value, other = float(images[i, v, u]), (low + high) / 2
+            variance = noise.read_variance + noise.gain * value + (2 * noise.read_variance + noise.gain * (low + high)) / 4
+        gray ^= 1 if value > other else 0  # running parity turns Gray into binary
+        number = 2 * number + gray
+        if (value - other) ** 2 < SURE * SURE * variance:
+            uncertain += 1
+            doubt = (1 << (bits - i)) - 1  # a Gray bit flips its binary digit and all after it
+    return number, doubt, uncertain
+
+
+@njit(inline="always")
+def _black_and_white(images, fringe: Fringe, v, u):
+    """The darkest and the brightest that a pixel shows, over the code's images and the fringes' trough and crest."""
+    low = max(fringe.offset[v, u] - fringe.modulation[v, u], np.float32(0))  # gamma's harmonics pull the fit below black
+    high = fringe.offset[v, u] + fringe.modulation[v, u]
+    for i in range(images.shape[0]):
+        low, high = min(low, float(images[i, v, u])), max(high, float(images[i, v, u]))
+    return low, high

@@ -5,6 +5,7 @@ The coarsest wave may be just as long as the axis: at its ends both ways are tri
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
@@ -17,11 +18,9 @@ from recon.structured_light.gray_code import Orders
 from recon.structured_light.phase import Fringe
 
 SLACK = 0.1  # cycle from the nearest whole order, besides noise: beyond, the phases contradict each other
-SIGMAS = 5.0  # of noise that the decision on a pixel must stand
-MARGIN = 4.0  # sigmas to the tipping point that a typical pixel must have: with 4, the decision fails for 3 % of them
-PLANNED_SIGMA = (
-    0.02  # rad of phase noise that a sequence must stand, if its own isn't known: three steps, noise 1/40 of modulation
-)
+SIGMAS = 5.0  # of noise, margin of the decision on a pixel
+MARGIN = 4.0  # sigmas to the tipping point, least margin of a typical pixel: with 4, the decision fails for 3 % of them
+PLANNED_SIGMA = 0.02  # rad of phase noise, if the sequence's own isn't known: three steps, noise 1/40 of modulation
 FRINGES = 0.3  # rad: pixels of more phase noise show none
 
 Image = NDArray[np.float32]
@@ -35,11 +34,19 @@ class Step:
     weights: tuple[int, ...]  # of the phases of the sets, finest first
 
 
+class Rungs(NamedTuple):
+    """All rungs for compiled code, from the coarsest to the finest."""
+
+    pitch: NDArray[np.float64]  # (rungs,) projector px
+    weights: NDArray[np.float64]  # (rungs, sets)
+    lead: NDArray[np.float64]  # (sets,) rad, phase of each set in the middle of the axis
+
+
 def ladder(pitches: Sequence[float], length: float, sigmas: Sequence[float] | None = None) -> list[Step]:
     """Rungs from a wave that covers the axis down to the finest pitch.
 
     The candidates are the pitches themselves, the beats of two, `1 / (1/p - 1/q)` (heterodyne), and the beats of two beats. The
-    way taken is the one whose worst decision has the widest margin: going from pitch P to pitch Q, noise is magnified by P / Q.
+    path is the one with the widest margin of its worst decision: from pitch P to pitch Q, noise is magnified by P / Q.
 
     Parameters
     ----------
@@ -112,8 +119,7 @@ def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> Orders:
     """Fringe order k of the finest pitch, so that `x = origin + pitch * (phase / 2 pi + k)`.
 
     Each rung of the ladder gives a coordinate that the next one refines. A pixel is not trusted where a phase ends further
-    than 0.1 cycle and five predicted sigmas from a whole order, or so far that an error of as much, starting from the next
-    order, would have ended there.
+    than 0.1 cycle and five predicted sigmas from a whole order, or within reach of an equal error from the next order.
 
     Parameters
     ----------
@@ -132,12 +138,11 @@ def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> Orders:
     phases = np.stack([fringe.phase for _, fringe in sets])
     sigmas = np.stack([fringe.sigma for _, fringe in sets])
     path = ladder(pitches, length, _typical(sigmas))
-    pitch = np.array([step.pitch for step in path])
-    weights = np.array([step.weights for step in path], float)
     # A combined phase is zero where its own sum is; shift every set so that all are zero at the middle of the axis.
     middle = (length - 1) / 2
     lead = np.array([2 * np.pi * (middle - fringes.zero(length)) / fringes.pitch for fringes, _ in sets])
-    return Orders(*_climb(phases, sigmas, lead, pitch, weights, middle, sets[0][0].zero(length), length / 2))
+    rungs = Rungs(np.array([step.pitch for step in path]), np.array([step.weights for step in path], float), lead)
+    return _climb(phases, sigmas, rungs, middle, float(sets[0][0].zero(length)), length / 2)
 
 
 def _typical(sigmas: Image) -> NDArray[np.float64] | None:
@@ -148,52 +153,55 @@ def _typical(sigmas: Image) -> NDArray[np.float64] | None:
 
 
 @njit(parallel=True)
-def _climb(phases, sigmas, lead, pitch, weights, middle, origin, half):
+def _climb(phases, sigmas, rungs: Rungs, middle, origin, half):
+    """Orders of all pixels; at the ends of the axis, `half` px from its middle, by both ways of unwrapping the coarsest wave."""
+    pitch, weights = rungs.pitch, rungs.weights
     n, height, width = phases.shape
     order = np.zeros((height, width), np.int32)
     trusted = np.zeros((height, width), np.bool_)
     for v in prange(height):
         for u in range(width):
-            start = _cycles(phases, lead, weights, 0, v, u)
+            start = _cycles(phases, rungs, 0, v, u)
             start -= np.floor(start + 0.5)
-            x, sure = _ascend(phases, sigmas, lead, pitch, weights, v, u, start)
+            x, sure = _ascend(phases, sigmas, rungs, v, u, start)
             variance = 0.0
             for i in range(n):
                 variance += (weights[0, i] * sigmas[i, v, u]) ** 2
             if 0.5 - abs(start) < SIGMAS * np.sqrt(variance) / (2 * np.pi):
                 # The ends of the coarsest wave are one phase: of both only that which leads onto the axis can be right.
-                other, too = _ascend(phases, sigmas, lead, pitch, weights, v, u, start - np.sign(start))
+                other, too = _ascend(phases, sigmas, rungs, v, u, start - np.sign(start))
                 end = half + SIGMAS * pitch[-1] / (2 * np.pi) * sigmas[0, v, u]
                 inside, as_well = sure and abs(x) <= end, too and abs(other) <= end
                 sure = inside != as_well
                 x = other if as_well and not inside else x
             order[v, u] = np.floor((middle + x - origin) / pitch[-1] - phases[0, v, u] / (2 * np.pi) + 0.5)
             trusted[v, u] = sure
-    return order, trusted
+    return Orders(order, trusted)
 
 
 @njit(inline="always")
-def _cycles(phases, lead, weights, r, v, u):
+def _cycles(phases, rungs: Rungs, r, v, u):
     """Phase of a rung, in cycles from the middle of the axis."""
     cycles = 0.0
     for i in range(phases.shape[0]):
-        cycles += weights[r, i] * (phases[i, v, u] - lead[i])
+        cycles += rungs.weights[r, i] * (phases[i, v, u] - rungs.lead[i])
     return cycles / (2 * np.pi)
 
 
 @njit(inline="always")
-def _ascend(phases, sigmas, lead, pitch, weights, v, u, start):
+def _ascend(phases, sigmas, rungs: Rungs, v, u, start):
     """Projector px from the middle by the finest rung, and whether every rung could be decided."""
+    pitch, weights = rungs.pitch, rungs.weights
     x, sure = pitch[0] * start, True
     for r in range(1, pitch.size):
-        cycles = _cycles(phases, lead, weights, r, v, u)
+        cycles = _cycles(phases, rungs, r, v, u)
         whole = x / pitch[r] - cycles
         nearest = np.floor(whole + 0.5)
         variance = 0.0
         for i in range(phases.shape[0]):
             variance += ((pitch[r - 1] / pitch[r] * weights[r - 1, i] - weights[r, i]) * sigmas[i, v, u]) ** 2
         residual, doubt = abs(whole - nearest), SIGMAS * np.sqrt(variance) / (2 * np.pi)
-        # A wrong order comes from an error of over half a cycle, and leaves what it lacks to a whole one.
+        # A wrong order comes from an error of over half a cycle, and leaves the rest to a whole one.
         if residual > min(SLACK + doubt, 1 - SLACK - doubt):
             sure = False
         x = pitch[r] * (cycles + nearest)

@@ -1,7 +1,7 @@
 """Phase of N-step fringes by least squares, and the noise that comes with it."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
@@ -13,8 +13,7 @@ Image = NDArray[np.float32]
 
 QUANTISATION = 1 / 12  # DN^2, variance of rounding to whole digital numbers
 MIN_STEPS_FOR_NOISE = 8  # below eight steps no temporal harmonic is free of the projector's second and third
-NOISE_SAMPLES = 40_000  # pixels looked at; enough for 1 % in the variance
-
+NOISE_SAMPLES = 40_000  # pixels of the estimate; enough for 1 % in the variance
 
 PI, HALF_PI = np.float32(np.pi), np.float32(np.pi / 2)
 # atan(t) / t as a polynomial in t^2: least squares at Chebyshev nodes of [0, 1].
@@ -22,8 +21,7 @@ ATAN = tuple(np.float32(c) for c in (1.0, -0.33333284, 0.1999823, -0.14261574, 0
                                      0.01068072, -0.0017437012))  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Noise:
+class Noise(NamedTuple):
     """Photon-transfer noise of a camera: `variance = read_variance + gain * intensity`, in DN^2 and DN."""
 
     read_variance: float  # DN^2, rounding included
@@ -37,9 +35,8 @@ class Noise:
 DEFAULT_NOISE = Noise(0.5, 0.033)  # 8-bit; an 1/1.8" sensor of some 7700 electrons full well: 255 / 7700 DN an electron
 
 
-@dataclass(frozen=True)
-class Fringe:
-    """What a fringe sequence says about each pixel. All (h, w)."""
+class Fringe(NamedTuple):
+    """A decoded fringe sequence. All (h, w)."""
 
     phase: Image  # rad, in (-pi, pi]
     modulation: Image  # B, DN
@@ -151,8 +148,8 @@ def estimate_noise(images: NDArray, shifts: ArrayLike, *, saturation: float = 25
     """Measure the camera's noise from the fringes themselves.
 
     A sinusoid fills the mean and the first temporal harmonic of an evenly shifted sequence. The others hold noise, the same in
-    each, and what the projector and the lamp add: harmonics 2 and 3 its non-linearity (gamma; the fourth is 0.14 % of the
-    modulation for gamma 2.2), odd ones the edges of binary fringes, any of them its flicker. Since all that can only add, the
+    each, and additions of the projector and the lamp: harmonics 2 and 3 its non-linearity (gamma; the fourth is 0.14 % of the
+    modulation for gamma 2.2), odd ones the edges of binary fringes, any of them its flicker. Since these only add, the
     quietest harmonic is the noise; its power against the mean intensity is the photon-transfer line.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Do the images follow the sequence? What only a wrong order, exposure or file would show is refused, in one line."""
+"""Checks that images follow their pattern sequence: errors of order, exposure or file are refused, in one line."""
 
 import itertools
 
@@ -12,19 +12,19 @@ from recon.structured_light.phase import Fringe, sample_pixels
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-CHECK_SAMPLES = 10_000  # pixels looked at to judge a sequence
+CHECK_SAMPLES = 10_000  # pixels of a check
 LIT_SHARE = 0.002  # share of the image that must carry fringes
 SATURATED_SHARE = 0.5  # share of the lit image that may be saturated
-HARMONIC_SHARE = 0.08  # of the modulation, found in the high harmonics: more is not an N-step sequence
+HARMONIC_SHARE = 0.08  # of the modulation, in the high harmonics: beyond, it is no N-step sequence
 LINE_SHARE = 0.3  # share of the fringes' area that may be lit in the image of a line
-MIN_SIGHTINGS = 10  # rows in which the line must be seen
-LINE_OFF = 0.06  # cycle that the line may lie off the fringes; a fringe image out of its place is a step, 1/8 or so
-LOPSIDED = 0.05  # share of the pixels by which residuals of the Gray code may lie to one side, beyond what cells allow
+MIN_SIGHTINGS = 10  # least rows with the line
+LINE_OFF = 0.06  # cycle, largest offset of the line from the fringes; a fringe image out of its place is a step, 1/8 or so
+LOPSIDED = 0.05  # share of the pixels: largest excess of residuals of the Gray code on one side, beyond the cells' own
 ASTRAY = 0.3  # share that may lie beyond on both sides; of fringes that run backwards it is 0.75
 JUMPS = 0.025  # share of the code's borders at which the order may jump; the coarsest bits change at 3 % of them
 CROWDED = 4.0  # times as often as elsewhere: steps of the surface lie anywhere, wrong bits at the borders
 CONTINUES = 0.6 / (2 * np.pi)  # cycle between two pixels: less is taken for one surface
-FEW = 20  # pixels that prove nothing
+FEW = 20  # pixels, too few for a decision
 CONTRADICTED = 0.7  # share of the pixels whose pitches contradict each other; of unrelated phases it is 0.8 or more
 
 
@@ -49,7 +49,7 @@ def check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, 
 def _check_order(samples: Image, beside: Image, part: Fringes, place: str, start: int) -> None:
     """Refuse images that don't follow the N-step sequence: swapped images put power into the high temporal harmonics.
 
-    A projector's gamma fills harmonic 2, binary fringes the odd ones; those are not looked at. Noise differs between the
+    A projector's gamma fills harmonic 2, binary fringes the odd ones; those are left out. Noise differs between the
     samples and the pixels beside them, swapped images do not: their product is free of noise.
     """
     n = part.steps
@@ -84,10 +84,9 @@ def check_light(image: NDArray, fringe: Fringe, valid: Mask, place: str) -> None
 
 
 def check_line(sightings: int, votes: int, residual: float, place: str) -> None:
-    """Refuse a line that isn't seen, or whose middle doesn't have the phase that it must have: fringes in a wrong order.
+    """Refuse a line that is missing, or whose middle has a wrong phase: fringes in a wrong order.
 
-    Images shifted round by one turn every phase by one step, reversed ones count from the other end; either is a perfect N-step
-    sequence.
+    Images shifted round by one change every phase by one step, reversed ones its sign; either is a perfect N-step sequence.
     """
     if sightings >= MIN_SIGHTINGS and abs(residual) > LINE_OFF:
         raise InputError(
@@ -112,7 +111,7 @@ def check_code(
     Parameters
     ----------
     order, residual : (h, w)
-        Of `graycode.fringe_order`, trusted or not.
+        Of `gray_code.fringe_order`, trusted or not.
     code, fringes : GrayCode, Fringes
     phase : (h, w), rad
     valid : (h, w) bool

@@ -23,16 +23,18 @@ Mask = NDArray[np.bool_]
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
-NOISE = 6.0  # a difference of two points is noise up to so many of its standard deviations
+NOISE = 6.0  # standard deviations that the difference of two points has at most by noise
+# rows and columns from a point to one of two on opposite sides, within two pixels
+PAIRS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (2, 2), (2, -2))
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What counts as surface. A *sampling step* is the width of a pixel at the point: distance / focal length."""
+    """Limits of the surface. A *sampling step* is the width of a pixel at the point: distance / focal length."""
 
     max_slope: Positive = 12.0  # sampling steps along the ray a pixel; 12 is a surface seen at 85 deg from its normal
-    max_bend: Positive = 3.0  # a step is torn if it is so many times its neighbours'
-    min_tear: Positive = 3.0  # and so many sampling steps longer
+    max_bend: Positive = 3.0  # of a step, over its neighbours': beyond, and longer than the next, it is torn
+    min_tear: Positive = 3.0  # sampling steps, in addition
     max_sigma: Positive = 3.0  # predicted standard deviation along the ray, in sampling steps
     outlier_steps: Positive = 1.0  # distance from the local plane, in sampling steps, beyond the noise
     min_modulation: Fraction = 0.5  # at an edge: fringe modulation, as a fraction of the strongest within two pixels
@@ -49,13 +51,13 @@ def clean(point_map: PointMap, camera: Camera, modulation: ArrayLike | None = No
     camera : Camera
         The camera whose pixels the map is organised by.
     modulation : (h, w), digital numbers
-        Fringe modulation. A pixel that sees two surfaces at once has less than both: if given, pixels at an edge are dropped
-        on that ground too.
+        Fringe modulation. A pixel across two surfaces has less than both: if given, pixels at an edge are dropped by it,
+        too.
 
     Returns
     -------
     PointMap
-        The same, with NaN in place of what was removed.
+        The same, with NaN in place of removed points.
     """
     limits = limits or Limits()
     distance, step = _distances(point_map.points, camera)
@@ -108,7 +110,7 @@ def _distances(points: Float32, camera: Camera) -> tuple[Float32, Float32]:
 
 
 def _difference(sigma: Float32) -> Float32:
-    """How far the distances of two points of sigma : (h, w) mm may differ by noise alone : (h, w) mm; 0 where it is NaN."""
+    """Largest difference by noise alone : (h, w) mm, of the distances of two points of sigma : (h, w) mm; 0 where it is NaN."""
     return np.nan_to_num(NOISE * np.sqrt(np.float32(2)) * sigma)
 
 
@@ -125,7 +127,7 @@ def _norms(points, centre):
 
 @njit(parallel=True)
 def _bump(distance):
-    """How far each point stands out of its surroundings : (h, w) mm.
+    """Distance of each point from the local plane : (h, w) mm.
 
     Two pixels on opposite sides of a point predict its distance, exactly so on a plane and near enough on skin. Of the eight
     such pairs within two pixels the second best counts: beside a depth step the pairs along it still agree, and a lone
@@ -135,23 +137,29 @@ def _bump(distance):
     result = np.zeros((height, width), np.float32)
     for j in prange(height):
         for i in range(width):
-            here = distance[j, i]
-            if not np.isfinite(here):
+            if not np.isfinite(distance[j, i]):
                 continue
-            best = second = np.float32(np.inf)
-            for reach in (1, 2):
-                for dj, di in ((0, 1), (1, 0), (1, 1), (1, -1)):
-                    j0, j1, i0, i1 = j - reach * dj, j + reach * dj, i - reach * di, i + reach * di
-                    if j0 < 0 or j1 >= height or min(i0, i1) < 0 or max(i0, i1) >= width:
-                        continue
-                    residual = abs(here - (distance[j0, i0] + distance[j1, i1]) / 2)
-                    if residual < best:
-                        best, second = residual, best
-                    elif residual < second:
-                        second = residual
+            second = _second_best(distance, j, i)
             if np.isfinite(second):
                 result[j, i] = second
     return result
+
+
+@njit(inline="always")
+def _second_best(distance, j, i):
+    """The second smallest difference of a point from the mean of two on opposite sides, mm; inf of fewer than two pairs."""
+    height, width = distance.shape
+    best = second = np.float32(np.inf)
+    for dj, di in PAIRS:
+        j0, j1, i0, i1 = j - dj, j + dj, i - di, i + di
+        if j0 < 0 or j1 >= height or min(i0, i1) < 0 or max(i0, i1) >= width:
+            continue
+        residual = abs(distance[j, i] - (distance[j0, i0] + distance[j1, i1]) / 2)
+        if residual < best:
+            best, second = residual, best
+        elif residual < second:
+            second = residual
+    return second
 
 
 @njit(parallel=True)
@@ -214,20 +222,19 @@ def _triangles(distance, longest):
             ab, ac, bd, cd = abs(a - b) <= limit, abs(a - c) <= limit, abs(b - d) <= limit, abs(c - d) <= limit
             ad, bc = abs(a - d) <= 1.5 * limit, abs(b - c) <= 1.5 * limit
             along_ad = ad and (not bc or abs(a - d) <= abs(b - c))
-            if along_ad:
-                if ac and cd:
-                    faces[n] = ia, ic, id_
-                    n += 1
-                if ab and bd:
-                    faces[n] = ia, id_, ib
-                    n += 1
-            elif bc:
-                if ab and ac:
-                    faces[n] = ia, ic, ib
-                    n += 1
-                if bd and cd:
-                    faces[n] = ib, ic, id_
-                    n += 1
+            along_bc = bc and not along_ad
+            if along_ad and ac and cd:
+                faces[n] = ia, ic, id_
+                n += 1
+            if along_ad and ab and bd:
+                faces[n] = ia, id_, ib
+                n += 1
+            if along_bc and ab and ac:
+                faces[n] = ia, ic, ib
+                n += 1
+            if along_bc and bd and cd:
+                faces[n] = ib, ic, id_
+                n += 1
     return faces[:n]
 
 

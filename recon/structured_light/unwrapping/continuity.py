@@ -1,9 +1,9 @@
-"""Where a wrapped phase continues from pixel to pixel, and how far an order may be carried along it.
+"""Continuity of a wrapped phase from pixel to pixel, and the carrying of orders along it.
 
 A step of the surface is a jump of the phase. It is looked for with an antisymmetric stencil along rows and columns: the phase
-difference over three pixels less what the slopes two pixels further out predict. Curvature and a crease in the middle drop out
-of it; what is left is the jump (less whole periods), third derivatives and noise of 2.7 sigma. The mean over three neighbours
-beside each other, for which any border is straight enough, sees smaller jumps still.
+difference over three pixels less the prediction by the slopes two pixels further out. Curvature and a crease in the middle cancel
+in it; the rest is the jump (less whole periods), third derivatives and noise of 2.7 sigma. The mean over three neighbours
+beside each other, for which any border is straight enough, shows smaller jumps still.
 """
 
 import math
@@ -17,7 +17,7 @@ from recon.compiled import njit
 Image = NDArray[np.float32]
 Flags = NDArray[np.uint8]
 
-VOID, TORN, INCOMPLETE, CLEAN = 0, 1, 2, 3  # not measured; next to a jump; too near a gap to tell; continuous both ways
+VOID, TORN, INCOMPLETE, CLEAN = 0, 1, 2, 3  # not measured; next to a jump; too near a gap to decide; continuous both ways
 
 SLACK = 0.008  # cycle (0.05 rad) of mismatch that third derivatives and texture may cause
 SIGMAS = 4.5  # of the stencil's noise; one in 150 000 comparisons fails by chance
@@ -143,33 +143,44 @@ def carry(order, known, phase, sigma, flags, wanted, reach):
             if known[v, u] or flags[v, u] < wanted:
                 continue
             candidate, ways, clash = 0, 0, False
-            for way in range(4):
-                dv, du = (0, 0, 1, -1)[way], (1, -1, 0, 0)[way]
-                distance = 0
-                for step in range(1, reach + 1):
-                    y, x = v + step * dv, u + step * du
-                    if not (0 <= y < height and 0 <= x < width) or flags[y, x] < wanted:
-                        break
-                    if known[y, x]:
-                        distance = step
-                        break
-                y, x = v + distance * dv, u + distance * du
-                yy, xx = y + 2 * dv, x + 2 * du
-                if distance == 0 or not (0 <= yy < height and 0 <= xx < width) or not known[yy, xx]:
+            tolerance = SLACK + SIGMAS * 2.5 * sigma[v, u] / (2 * math.pi)
+            for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+                distance = _nearest_known(known, flags, wanted, reach, v, u, dv, du)
+                if distance == 0:
                     continue
-                start = order[y, x] + phase[y, x]
-                slope = (start - order[yy, xx] - phase[yy, xx]) / 2
-                total, smooth = start, True
-                tolerance = SLACK + SIGMAS * 2.5 * sigma[v, u] / (2 * math.pi)
-                for step in range(distance - 1, -1, -1):
-                    change = wrap(phase[v + step * dv, u + step * du] - phase[v + (step + 1) * dv, u + (step + 1) * du] - slope)
-                    smooth = smooth and abs(change) < tolerance
-                    total += slope + change
-                if not smooth or abs(total - start - distance * slope) > 2 * tolerance:
-                    continue
-                here = math.floor(total - phase[v, u] + 0.5)
-                clash = clash or (ways > 0 and here != candidate)
-                candidate, ways = here, ways + 1
+                total, smooth = _along_slope(order, phase, v, u, dv, du, distance, tolerance)
+                if smooth:
+                    here = math.floor(total - phase[v, u] + 0.5)
+                    clash = clash or (ways > 0 and here != candidate)
+                    candidate, ways = here, ways + 1
             if ways > 0 and not clash:
                 filled[v, u], found[v, u] = candidate, True
     return filled, found
+
+
+@njit(inline="always")
+def _nearest_known(known, flags, wanted, reach, v, u, dv, du):
+    """Steps to the nearest known pixel that another follows two steps behind, over continuous ones; 0 without."""
+    height, width = known.shape
+    for step in range(1, reach + 1):
+        y, x = v + step * dv, u + step * du
+        if not (0 <= y < height and 0 <= x < width) or flags[y, x] < wanted:
+            return 0
+        if known[y, x]:
+            y, x = y + 2 * dv, x + 2 * du
+            return step if 0 <= y < height and 0 <= x < width and known[y, x] else 0
+    return 0
+
+
+@njit(inline="always")
+def _along_slope(order, phase, v, u, dv, du, distance, tolerance):
+    """Absolute phase of a pixel in cycles, followed from a known one; and whether it keeps the slope between known ones."""
+    y, x = v + distance * dv, u + distance * du
+    start = order[y, x] + phase[y, x]
+    slope = (start - order[y + 2 * dv, x + 2 * du] - phase[y + 2 * dv, x + 2 * du]) / 2
+    total, smooth = start, True
+    for step in range(distance - 1, -1, -1):
+        change = wrap(phase[v + step * dv, u + step * du] - phase[v + (step + 1) * dv, u + (step + 1) * du] - slope)
+        smooth = smooth and abs(change) < tolerance
+        total += slope + change
+    return total, smooth and abs(total - start - distance * slope) <= 2 * tolerance

@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 CONTINUOUS = 0.85  # share of the common border of two basins that must be continuous for them to be one region
-VOTES = 5  # rows in which the line must be seen on a region
-AGREEMENT = 0.85  # share of the votes that must name one order
+VOTES = 5  # least rows with the line on a region
+AGREEMENT = 0.85  # least share of the votes for one order
 
 Integers = NDArray[np.int32]
 
 
 @dataclass(frozen=True)
 class Borders:
-    """How basins touch: the number of continuous contacts by order offset (q less p), and of torn ones."""
+    """Contacts between basins: numbers of continuous ones by order offset (q less p), and of torn ones."""
 
     continuous: dict[tuple[int, int], Counter]  # (p, q), p < q
     torn: Counter  # of (p, q), p < q
@@ -24,7 +24,7 @@ class Borders:
 
 @dataclass(frozen=True)
 class Regions:
-    """Which basins belong together, and at which order."""
+    """Basins joined to regions, and their orders."""
 
     region: Integers  # (count,) the region of each basin, named by one of its basins
     lift: Integers  # (count,) the order of each basin's root less that of its region's
@@ -35,13 +35,13 @@ class Regions:
 def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[int]) -> Regions:
     """Join basins into regions over continuous borders, the longest first, and anchor them by the line's votes.
 
-    Basins that both have the line need no border to agree, only one contact that doesn't contradict their votes.
+    Two basins with the line need no continuous border, only one contact that doesn't contradict their votes.
 
     Parameters
     ----------
     count : int, of basins
     borders : Borders
-    votes : basin -> how often the line named each absolute order of the basin's root
+    votes : basin -> votes of the line for each absolute order of the basin's root
     broken : basins that contradict themselves; they join nothing
 
     Returns
@@ -62,7 +62,7 @@ def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[in
         torn[q][p] += n
 
     def proposal(p: int, q: int) -> tuple[float, int] | None:
-        """How strongly p and q are one surface, and the order of q's root less p's; None if they can't be."""
+        """Strength of p and q as one surface, and the order of q's root less p's; None if they can't be."""
         offsets = links[p][q]
         if p in anchored and q in anchored:
             k = anchored[q] - anchored[p]
@@ -121,7 +121,7 @@ def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[in
 
 
 def _verdict(tally: Counter) -> int | None:
-    """The order that nearly all votes name, None if too few vote or they disagree."""
+    """The order of nearly all votes, None of too few or of votes that disagree."""
     if tally.total() < VOTES:
         return None
     order, n = tally.most_common(1)[0]

@@ -7,12 +7,13 @@ of periods: that opening in an otherwise torn border is a bottleneck, and is ref
 absolute order, by vote. A region without the line is reported as unreachable, one whose votes disagree as disputed.
 
 Only a jump that is a whole number of periods (within the noise, some 0.2 to 0.4 rad) along most of the border between two
-surfaces, or along an opening as wide as the smaller of them, can fool this, as it fools anything that sees the phase alone: Gray
+surfaces, or along an opening as wide as the smaller of them, can fool this, as it fools any use of the phase alone: Gray
 code or a second pitch is needed there. Gaps (shadow, dark spots) every few pixels leave no continuous cell and cost coverage.
 """
 
 from collections import Counter, defaultdict
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -35,19 +36,37 @@ Integers = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 
+class Line(NamedTuple):
+    """The image of the centre line, and the line itself."""
+
+    image: NDArray  # (h, w) DN
+    valid: Mask  # (h, w) pixels with enough modulation
+    turns: float  # cycles, the absolute phase of its middle
+    width: float  # cycles
+
+
+class Ground(NamedTuple):
+    """Continuous ground: cells of 4x4 px, and the basins that they are gathered in."""
+
+    phase: NDArray[np.float32]  # (h, w) cycles
+    relative: NDArray[np.int8]  # (h, w) order of each pixel less its cell's
+    basin: Integers  # (rows, columns) the basin of each cell, -1 of none
+    offset: Integers  # (rows, columns) order of each cell less its basin's
+
+
 @dataclass(frozen=True)
 class Unwrapped:
     """Absolute fringe orders from the centre line."""
 
     order: Integers  # (h, w)
     known: Mask  # (h, w) where the order holds
-    unreachable: Mask  # (h, w) continuous surface that no line reaches
+    unreachable: Mask  # (h, w) continuous surface without the line
     regions: int  # with the line
     islands: int  # without
     disputed: int  # in which the line's votes disagree
     votes: int  # sightings of the line on continuous surface that name an order
     sightings: int  # all of them
-    residual: float  # cycle, in +-0.5, by which the line lies off the fringes, in the median over the sightings
+    residual: float  # cycle, in +-0.5, offset of the line from the fringes, the median over the sightings
 
 
 def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: float) -> Unwrapped:
@@ -69,8 +88,8 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     Returns
     -------
     Unwrapped
-        With `sightings` zero if the line is nowhere to be seen, `residual` far from zero if the fringes are not what they are
-        taken for; both are for the caller to judge.
+        `sightings` is zero without a line in the image, `residual` far from zero with fringes of another sequence; the caller
+        judges both.
     """
     phase = fringe.phase * np.float32(1 / (2 * np.pi))
     flags = continuity.continuity(phase, fringe.sigma, valid)
@@ -78,13 +97,12 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     distance = watershed.depth(state)
     basin, offset, broken = watershed.flood(distance, right, down)
     basin, broken, count = watershed.number(basin, broken)
-    light = (line, fringe.offset, fringe.modulation, fringe.sigma)
-    places, values, residuals = _sight(*light, valid, phase, relative, basin, offset, turns, width)
+    places, values, residuals = _sightings(Line(line, valid, float(turns), width), fringe, Ground(phase, relative, basin, offset))
     near = np.abs(residuals) < RESIDUAL
     votes: dict[int, Counter] = defaultdict(Counter)
     for place, value in zip(places[near].tolist(), values[near].tolist(), strict=True):
         votes[place][value] += 1
-    ground = _grow(state, basin)
+    ground = _grown(state, basin)
     found = join(count, _borders(state, ground, offset, right, down), votes, broken)
     base = np.array([found.absolute.get(r, 0) for r in found.region.tolist()], np.int32)
     resolved = np.array([r in found.absolute for r in found.region.tolist()], bool)
@@ -105,36 +123,50 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
 
 
 @njit
-def _sight(line, offset, modulation, sigma, valid, phase, relative, basin, cell_order, turns, width):
+def _sightings(line: Line, fringe: Fringe, ground: Ground):
     """Sightings of the line on continuous ground: the basin, the absolute order of the basin's root cell, cycles off a whole."""
-    rows, columns = basin.shape
+    rows, columns = ground.basin.shape
     places, values, residuals = [np.int32(0) for _ in range(0)], [np.int32(0) for _ in range(0)], [0.0 for _ in range(0)]
     for v in range(rows * CELL):
         u = 0
         while u < columns * CELL:
-            start, weight, moment, extent = u, 0.0, 0.0, 0.0
-            while u < columns * CELL and valid[v, u]:
-                level = (line[v, u] - max(offset[v, u] - modulation[v, u], np.float32(0))) / (2 * modulation[v, u])
-                if level < LINE_LEVEL + 4 * sigma[v, u]:
-                    break
-                if u > start:
-                    extent += abs(wrap(phase[v, u] - phase[v, u - 1]))
-                weight += level
-                moment += level * u
-                u += 1
-            if u - start >= 2 and extent < 1.5 * width + 0.3:
-                middle = moment / weight
+            start = u
+            u, middle, extent = _lit_run(line, fringe, ground.phase, v, start, columns * CELL)
+            if u - start >= 2 and extent < 1.5 * line.width + 0.3:
                 near = int(np.floor(middle + 0.5))
-                place = basin[v // CELL, near // CELL]
+                place = ground.basin[v // CELL, near // CELL]
                 if place >= 0:
-                    other = near + 1 if middle > near else near - 1
-                    here = phase[v, near] + abs(middle - near) * wrap(phase[v, other] - phase[v, near])
-                    whole = np.floor(turns - here + 0.5)
+                    here = _phase_between(ground.phase, v, near, middle)
+                    whole = np.floor(line.turns - here + 0.5)
                     places.append(place)
-                    values.append(np.int32(whole) - relative[v, near] - cell_order[v // CELL, near // CELL])
-                    residuals.append(turns - here - whole)
+                    values.append(np.int32(whole) - ground.relative[v, near] - ground.offset[v // CELL, near // CELL])
+                    residuals.append(line.turns - here - whole)
             u = max(u, start + 1)
     return np.array(places), np.array(values), np.array(residuals)
+
+
+@njit(inline="always")
+def _lit_run(line: Line, fringe: Fringe, phase, v, start, end):
+    """Lit pixels of a row from `start` on: their end, the middle of their light, and their extent in cycles."""
+    u, weight, moment, extent = start, 0.0, 0.0, 0.0
+    while u < end and line.valid[v, u]:
+        offset, modulation = fringe.offset[v, u], fringe.modulation[v, u]
+        level = (line.image[v, u] - max(offset - modulation, np.float32(0))) / (2 * modulation)
+        if level < LINE_LEVEL + 4 * fringe.sigma[v, u]:
+            break
+        if u > start:
+            extent += abs(wrap(phase[v, u] - phase[v, u - 1]))
+        weight += level
+        moment += level * u
+        u += 1
+    return u, moment / weight if weight > 0 else 0.0, extent
+
+
+@njit(inline="always")
+def _phase_between(phase, v, near, u):
+    """Phase at column u of a row, between the nearest pixel and the one on its other side."""
+    other = near + 1 if u > near else near - 1
+    return phase[v, near] + abs(u - near) * wrap(phase[v, other] - phase[v, near])
 
 
 def _circular_median(cycles: NDArray[np.float64]) -> float:
@@ -152,7 +184,7 @@ def _borders(state: Flags, ground: Integers, offset: Integers, right: NDArray[np
     for steps, here, there in ((right, np.s_[:, :-1], np.s_[:, 1:]), (down, np.s_[:-1], np.s_[1:])):
         p, q, step = ground[here], ground[there], steps[here]
         meet = (p != q) & (p >= 0) & (q >= 0)
-        jump = step + offset[here] - offset[there]  # order of q's root less that of p's, as the two cells see it
+        jump = step + offset[here] - offset[there]  # order of q's root less that of p's, at this contact
         ripped = (state[here] == TORN) | (state[there] == TORN) | ((state[here] == CLEAN) & (state[there] == CLEAN))
         whole, rip = meet & (step != NONE), meet & (step == NONE) & ripped
         for a, b, k in zip(p[whole].tolist(), q[whole].tolist(), jump[whole].tolist(), strict=True):
@@ -162,21 +194,27 @@ def _borders(state: Flags, ground: Integers, offset: Integers, right: NDArray[np
 
 
 @njit
-def _grow(state, basin):
-    """Let the basins grow into torn cells, one ring a pass; a cell in reach of several takes the first it meets."""
+def _grown(state, basin):
+    """The basins, grown into torn cells by one ring a pass; a cell next to several takes its first neighbour's."""
     rows, columns = basin.shape
     ground = basin.copy()
     for _ in range(MARGIN_CELLS):
         before = ground.copy()
         for i in range(rows):
             for j in range(columns):
-                if before[i, j] >= 0 or state[i, j] == VOID:
-                    continue
-                for di, dj in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-                    if 0 <= i + di < rows and 0 <= j + dj < columns and before[i + di, j + dj] >= 0:
-                        ground[i, j] = before[i + di, j + dj]
-                        break
+                if before[i, j] < 0 and state[i, j] != VOID:
+                    ground[i, j] = _neighbour(before, i, j)
     return ground
+
+
+@njit(inline="always")
+def _neighbour(basin, i, j):
+    """The basin of a cell's first neighbour that has one, -1 without."""
+    rows, columns = basin.shape
+    for di, dj in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        if 0 <= i + di < rows and 0 <= j + dj < columns and basin[i + di, j + dj] >= 0:
+            return basin[i + di, j + dj]
+    return np.int32(-1)
 
 
 @njit
@@ -189,17 +227,11 @@ def _leaks(distance, home, cells, right, down):
     leaking = np.zeros((rows, columns), np.bool_)
     for i in range(rows):
         for j in range(columns):
-            for way in range(2):
-                step = down[i, j] if way else right[i, j]
-                if step == NONE:
-                    continue
-                y, x = (i + 1, j) if way else (i, j + 1)
-                if home[i, j] == home[y, x] and cells[y, x] - cells[i, j] == step:
+            for y, x, step in ((i, j + 1, right[i, j]), (i + 1, j, down[i, j])):
+                if step == NONE or (home[i, j] == home[y, x] and cells[y, x] - cells[i, j] == step):
                     continue
                 reach = min(distance[i, j], distance[y, x]) + 2
-                for a in range(max(i - reach, 0), min(y + reach + 1, rows)):
-                    for b in range(max(j - reach, 0), min(x + reach + 1, columns)):
-                        leaking[a, b] = True
+                leaking[max(i - reach, 0) : y + reach + 1, max(j - reach, 0) : x + reach + 1] = True
     return leaking
 
 
@@ -221,7 +253,7 @@ def _dilated(mask: Mask, cells: int) -> Mask:
 
 @njit(parallel=True)
 def _to_pixels(relative, flags, basin, cells, reached, island, closed):
-    """Orders of the cells to their pixels.
+    """Orders of the cells, given to their pixels.
 
     Islands, leaks and frontiers are marked in the flags, so that no order is carried into them.
     """
@@ -234,9 +266,11 @@ def _to_pixels(relative, flags, basin, cells, reached, island, closed):
             i, j = v // CELL, u // CELL
             if reached[i, j]:
                 order[v, u], known[v, u] = cells[i, j] + relative[v, u], True
-            elif closed[i, j]:
+                continue
+            if closed[i, j]:
                 flags[v, u] = min(flags[v, u], np.uint8(TORN))
-            elif basin[i, j] >= 0:
+                continue
+            if basin[i, j] >= 0:
                 unreachable[v, u] = island[i, j]
                 flags[v, u] = VOID
     return order, known, unreachable

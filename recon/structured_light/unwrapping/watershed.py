@@ -28,22 +28,9 @@ def gather(phase, flags):
     right, down = np.full((rows, columns), NONE, np.int8), np.full((rows, columns), NONE, np.int8)
     for i in prange(rows):
         for j in range(columns):
-            clean, torn, void = 0, 0, 0
-            for v in range(i * CELL, i * CELL + CELL):
-                for u in range(j * CELL, j * CELL + CELL):
-                    clean += flags[v, u] == CLEAN
-                    torn += flags[v, u] == TORN
-                    void += flags[v, u] == VOID
-            if clean < CELL * CELL:
-                state[i, j] = TORN if torn > 0 else (VOID if 2 * void > CELL * CELL else INCOMPLETE)
-                continue
-            state[i, j] = CLEAN
-            for v in range(i * CELL, i * CELL + CELL):
-                u = j * CELL
-                if v > i * CELL:
-                    relative[v, u] = relative[v - 1, u] - np.floor(phase[v, u] - phase[v - 1, u] + np.float32(0.5))
-                for u in range(j * CELL + 1, j * CELL + CELL):
-                    relative[v, u] = relative[v, u - 1] - np.floor(phase[v, u] - phase[v, u - 1] + np.float32(0.5))
+            state[i, j] = _state(flags, i * CELL, j * CELL)
+            if state[i, j] == CLEAN:
+                _follow(phase, relative, i * CELL, j * CELL)
     for i in prange(rows):
         for j in range(columns):
             if state[i, j] != CLEAN:
@@ -56,8 +43,32 @@ def gather(phase, flags):
 
 
 @njit(inline="always")
+def _state(flags, top, left):
+    """State of a cell from the flags of its pixels."""
+    clean, torn, void = 0, 0, 0
+    for v in range(top, top + CELL):
+        for u in range(left, left + CELL):
+            clean += flags[v, u] == CLEAN
+            torn += flags[v, u] == TORN
+            void += flags[v, u] == VOID
+    if clean == CELL * CELL:
+        return CLEAN
+    return TORN if torn > 0 else (VOID if 2 * void > CELL * CELL else INCOMPLETE)
+
+
+@njit(inline="always")
+def _follow(phase, relative, top, left):
+    """Orders of a cell's pixels relative to its first: down its left column, then along its rows."""
+    for v in range(top, top + CELL):
+        if v > top:
+            relative[v, left] = relative[v - 1, left] - np.floor(phase[v, left] - phase[v - 1, left] + np.float32(0.5))
+        for u in range(left + 1, left + CELL):
+            relative[v, u] = relative[v, u - 1] - np.floor(phase[v, u] - phase[v, u - 1] + np.float32(0.5))
+
+
+@njit(inline="always")
 def _offset(phase, relative, v, u, du, dv):
-    """The offset on which all pixel pairs between two cells agree, NONE if they don't; (v, u) is the first cell's first pair."""
+    """The common offset of all pixel pairs between two cells, NONE if they differ; (v, u) is the first cell's first pair."""
     result = NONE
     for k in range(CELL):
         y, x = v + k * du, u + k * dv
@@ -120,6 +131,23 @@ def _descending(distance):
     return order
 
 
+@njit(inline="always")
+def _contact(right, down, cell, way):
+    """The neighbour of a cell to the right, to the left, below or above, and its offset from the cell; NONE without contact."""
+    rows, columns = right.shape
+    i, j = cell // columns, cell % columns
+    near, step = cell, NONE
+    if way == 0 and j + 1 < columns:
+        near, step = cell + 1, int(right[i, j])
+    if way == 1 and j > 0:
+        near, step = cell - 1, int(right[i, j - 1])
+    if way == 2 and i + 1 < rows:
+        near, step = cell + columns, int(down[i, j])
+    if way == 3 and i > 0:
+        near, step = cell - columns, int(down[i - 1, j])
+    return near, -step if way % 2 and step != NONE else step
+
+
 @njit
 def flood(distance, right, down):
     """Gather cells into basins, from the widest places to the narrow ones: a watershed of the distance to the nearest gap.
@@ -136,34 +164,25 @@ def flood(distance, right, down):
     count = rows * columns
     parent, shift = np.arange(count).astype(np.int32), np.zeros(count, np.int32)
     peak = distance.copy().ravel()
-    seen = np.zeros(count, np.bool_)
+    flooded = np.zeros(count, np.bool_)
     flat = distance.ravel()
     for cell in _descending(flat):
         level = flat[cell]
         if level == 0:
             break
-        seen[cell] = True
-        i, j = cell // columns, cell % columns
+        flooded[cell] = True
         for way in range(4):
-            if way == 0:
-                near, step = (cell + 1, right[i, j]) if j + 1 < columns else (-1, NONE)
-            elif way == 1:
-                near, step = (cell - 1, right[i, j - 1]) if j > 0 else (-1, NONE)
-            elif way == 2:
-                near, step = (cell + columns, down[i, j]) if i + 1 < rows else (-1, NONE)
-            else:
-                near, step = (cell - columns, down[i - 1, j]) if i > 0 else (-1, NONE)
-            if step == NONE or not seen[near]:
+            near, step = _contact(right, down, cell, way)  # order of `near` less that of `cell`
+            if step == NONE or not flooded[near]:
                 continue
             a, shift_a = _find(parent, shift, cell)
             b, shift_b = _find(parent, shift, near)
             if a == b or min(peak[a], peak[b]) > level + BOTTLENECK:
                 continue
-            difference = int(step) if way % 2 == 0 else -int(step)  # of `near` less that of `cell`
             if peak[a] >= peak[b]:
-                parent[b], shift[b] = a, shift_a + difference - shift_b
+                parent[b], shift[b] = a, shift_a + step - shift_b
             else:
-                parent[a], shift[a] = b, shift_b - difference - shift_a
+                parent[a], shift[a] = b, shift_b - step - shift_a
     basin, offset = np.full((rows, columns), -1, np.int32), np.zeros((rows, columns), np.int32)
     broken = np.zeros((rows, columns), np.bool_)
     for cell in range(count):
@@ -180,7 +199,7 @@ def flood(distance, right, down):
 
 
 def number(basin: Integers, broken: Mask) -> tuple[Integers, set[int], int]:
-    """Number the basins from 0; returns the new map, the broken basins and how many there are."""
+    """Number the basins from 0; returns the new map, the broken basins and the number of basins."""
     inside = basin >= 0
     roots, numbers = np.unique(basin[inside], return_inverse=True)
     numbered = np.full(basin.shape, -1, np.int32)
