@@ -24,8 +24,6 @@ Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 NOISE = 6.0  # standard deviations that the difference of two points has at most by noise
-# rows and columns from a point to one of two on opposite sides, within two pixels
-PAIRS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (2, 2), (2, -2))
 
 
 @dataclass(frozen=True)
@@ -149,16 +147,18 @@ def _bump(distance):
 def _second_best(distance, j, i):
     """The second smallest difference of a point from the mean of two on opposite sides, mm; inf of fewer than two pairs."""
     height, width = distance.shape
+    here = distance[j, i]
     best = second = np.float32(np.inf)
-    for dj, di in PAIRS:
-        j0, j1, i0, i1 = j - dj, j + dj, i - di, i + di
-        if j0 < 0 or j1 >= height or min(i0, i1) < 0 or max(i0, i1) >= width:
-            continue
-        residual = abs(distance[j, i] - (distance[j0, i0] + distance[j1, i1]) / 2)
-        if residual < best:
-            best, second = residual, best
-        elif residual < second:
-            second = residual
+    for reach in (1, 2):
+        for dj, di in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            j0, j1, i0, i1 = j - reach * dj, j + reach * dj, i - reach * di, i + reach * di
+            if j0 < 0 or j1 >= height or min(i0, i1) < 0 or max(i0, i1) >= width:
+                continue
+            residual = abs(here - (distance[j0, i0] + distance[j1, i1]) / 2)
+            if residual < best:
+                best, second = residual, best
+            elif residual < second:
+                second = residual
     return second
 
 

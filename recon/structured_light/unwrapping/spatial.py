@@ -128,15 +128,17 @@ def _sightings(line: Line, fringe: Fringe, ground: Ground):
     rows, columns = ground.basin.shape
     places, values, residuals = [np.int32(0) for _ in range(0)], [np.int32(0) for _ in range(0)], [0.0 for _ in range(0)]
     for v in range(rows * CELL):
+        image, valid, phase = line.image[v], line.valid[v], ground.phase[v]
+        offset, modulation, sigma = fringe.offset[v], fringe.modulation[v], fringe.sigma[v]
         u = 0
         while u < columns * CELL:
             start = u
-            u, middle, extent = _lit_run(line, fringe, ground.phase, v, start, columns * CELL)
+            u, middle, extent = _lit_run(image, valid, offset, modulation, sigma, phase, start, columns * CELL)
             if u - start >= 2 and extent < 1.5 * line.width + 0.3:
                 near = int(np.floor(middle + 0.5))
                 place = ground.basin[v // CELL, near // CELL]
                 if place >= 0:
-                    here = _phase_between(ground.phase, v, near, middle)
+                    here = _phase_between(phase, near, middle)
                     whole = np.floor(line.turns - here + 0.5)
                     places.append(place)
                     values.append(np.int32(whole) - ground.relative[v, near] - ground.offset[v // CELL, near // CELL])
@@ -146,16 +148,15 @@ def _sightings(line: Line, fringe: Fringe, ground: Ground):
 
 
 @njit(inline="always")
-def _lit_run(line: Line, fringe: Fringe, phase, v, start, end):
+def _lit_run(image, valid, offset, modulation, sigma, phase, start, end):
     """Lit pixels of a row from `start` on: their end, the middle of their light, and their extent in cycles."""
     u, weight, moment, extent = start, 0.0, 0.0, 0.0
-    while u < end and line.valid[v, u]:
-        offset, modulation = fringe.offset[v, u], fringe.modulation[v, u]
-        level = (line.image[v, u] - max(offset - modulation, np.float32(0))) / (2 * modulation)
-        if level < LINE_LEVEL + 4 * fringe.sigma[v, u]:
+    while u < end and valid[u]:
+        level = (image[u] - max(offset[u] - modulation[u], np.float32(0))) / (2 * modulation[u])
+        if level < LINE_LEVEL + 4 * sigma[u]:
             break
         if u > start:
-            extent += abs(wrap(phase[v, u] - phase[v, u - 1]))
+            extent += abs(wrap(phase[u] - phase[u - 1]))
         weight += level
         moment += level * u
         u += 1
@@ -163,10 +164,10 @@ def _lit_run(line: Line, fringe: Fringe, phase, v, start, end):
 
 
 @njit(inline="always")
-def _phase_between(phase, v, near, u):
+def _phase_between(phase, near, u):
     """Phase at column u of a row, between the nearest pixel and the one on its other side."""
     other = near + 1 if u > near else near - 1
-    return phase[v, near] + abs(u - near) * wrap(phase[v, other] - phase[v, near])
+    return phase[near] + abs(u - near) * wrap(phase[other] - phase[near])
 
 
 def _circular_median(cycles: NDArray[np.float64]) -> float:
