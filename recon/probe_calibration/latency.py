@@ -1,49 +1,53 @@
-"""Time calibration: by how much the scanner's images lag behind the poses, from an up-and-down motion over a flat bottom.
+"""Time calibration: the lag of the scanner's images behind the poses, from an up-and-down motion over a flat bottom.
 
 The bottom's depth in the image follows the probe: `depth(t) = a + b . x(t - lag)` with six coordinates x of its pose. Above all
 it follows the height; but the target stands off from the array, so that a hand that tilts by half a degree moves the one by a
 millimetre and not the other. For tilts of some degrees depth is linear in the coordinates, and needs no calibrated probe. Both
-streams have time stamps of their own, so neither jitter nor dropped frames matter beyond the errors that they are: the pose is
-interpolated at the moment that each image was taken. Wanted is an offset of the clocks and delays together; where the clocks
-drift against each other by 50 ppm it changes by 3 ms a minute, so calibrate anew for long sessions.
+streams have time stamps of their own, so jitter and dropped frames add errors of their own size only: the pose is interpolated at
+the moment of each image. The lag is the offset of the clocks and the delays together; where the clocks drift against each other
+by 50 ppm it changes by 3 ms a minute, so calibrate anew for long sessions.
 
-Move the probe by 10 mm or more, three times or more, at an uneven pace: a motion that repeats itself fits at more than one lag.
+Move the probe by 10 mm or more, three times or more, at an uneven pace: a periodic motion fits at more than one lag.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy import stats
 from scipy.interpolate import BSpline, make_lsq_spline
 from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
+from recon.files.metrics import Metrics
 from recon.model import tracks
 from recon.model.tracks import Track
 
 Array = NDArray[np.float64]
+LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s; of a setting
 
 SEARCH_S = (-0.5, 0.5)
 STEP_S = 0.01  # of the search
 MIN_FRAMES = 20
 MIN_RANGE_MM = 4.0  # of the motion, between its 5th and 95th percentile
 KNOT_S = 0.1  # of the spline through the motion: hands move below 3 Hz
-STILL = 1e-9  # mm or rad: a coordinate that changes by less tells nothing
+STILL = 1e-9  # mm or rad: a coordinate that changes by less is left out
 MIN_OVERLAP = 0.6  # of the images with a pose
 MIN_CORRELATION = 0.6  # of depth and height, by ranks, outliers among them
 MIN_AGREEMENT = 0.95  # their correlation without outliers
 MAX_OUTLIERS = 0.4  # of the images
 RIVAL = 0.98  # correlation of another lag, over the best, that makes the motion ambiguous
-VALLEY = 0.8  # correlation between two such lags, over the best, that tells them apart
+VALLEY = 0.8  # correlation between two such lags, over the best, that separates them
 GATE = 4.0  # normalised residual of an outlier
 COVERAGE = 0.95  # of the interval
 BLOCK_PX = 8  # columns taken together
 BOTTOM_SIGMA_PX = 1.5  # smoothing in depth
 BOTTOM_CONTRAST = 30.0  # grey levels above the median of its columns
 BOTTOM_NEAR_PX = 3.0  # of the line
-BOTTOM_SHARE = 0.5  # of the columns that show it
+BOTTOM_SHARE = 0.5  # of the columns, at least, on the line
 
 
 @dataclass(frozen=True)
@@ -53,8 +57,8 @@ class Lag:
     seconds: float
     sigma_s: float
     interval_s: tuple[float, float]  # of 95 %
-    jitter_s: float  # of the time stamps: what of the residuals grows with speed
-    depth_sigma: float  # what doesn't, in units of the depths
+    jitter_s: float  # of the time stamps: the part of the residuals that grows with speed
+    depth_sigma: float  # the constant part, in units of the depths
     used: NDArray[np.bool_]  # (n,) images: with a pose and a depth, and no outlier
     residuals: Array  # (n,) in units of the depths; NaN without a pose or a depth
 
@@ -67,15 +71,14 @@ def estimate(times: NDArray[np.int64], depths: Array, track: Track, search_s: tu
     times : (n,) int64, ns
         Of the images, of their own clock.
     depths : (n,) float
-        Of the bottom in each image, in any unit, as of `bottom_depth`; NaN where it isn't seen.
+        Of the bottom in each image, in any unit, as of `bottom_depth`; NaN where there is none.
     search_s : (first, last) s
-        Lags looked at. Where the clocks have nothing to do with each other, give the difference of their starts, and around it as
-        much as is unsure.
+        Range of lags. For unrelated clocks give the difference of their starts, plus and minus its uncertainty.
 
     Raises
     ------
     InputError
-        If there are too few images or poses, the motion is too small or repeats itself, the depths don't follow it at any lag, or
+        If there are too few images or poses, the motion is too small or periodic, the depths don't follow it at any lag, or
         the best lag lies at the end of the search.
     """
     times, depths = np.asarray(times), np.asarray(depths, float)
@@ -92,11 +95,26 @@ def estimate(times: NDArray[np.int64], depths: Array, track: Track, search_s: tu
     return _refined(seconds, depths, moments, _smooth(moments, coordinates), start)
 
 
+def measure(depths: Array, found: Lag) -> Metrics:
+    """Figures of a lag, each named with its unit; depths : (n,) NaN where no bottom was found."""
+    return {
+        "frames": len(depths),
+        "frames_with_bottom": int(np.isfinite(depths).sum()),
+        "frames_used": int(found.used.sum()),
+        "lag_ms": 1e3 * found.seconds,
+        "lag_sigma_ms": 1e3 * found.sigma_s,
+        "lag_low_ms": 1e3 * found.interval_s[0],
+        "lag_high_ms": 1e3 * found.interval_s[1],
+        "jitter_ms": 1e3 * found.jitter_s,
+        "depth_sigma_px": found.depth_sigma,
+    }
+
+
 def bottom_depth(image: NDArray, top_px: int = 40) -> float:
     """Depth in px of a flat bottom at the middle column of a B-scan : (h, w), 8-bit; NaN if there is none.
 
-    Every few columns the brightest echo below `top_px` counts, where reverberation at the probe's face ends; the line is the one
-    that most columns agree on.
+    Columns are averaged in blocks, and the brightest echo of each below `top_px`, where reverberation at the probe's face ends,
+    is taken; the line is that through most of these echoes.
     """
     level = np.asarray(image, np.float32)
     blocks = level.shape[1] // BLOCK_PX
@@ -118,7 +136,7 @@ def bottom_depth(image: NDArray, top_px: int = 40) -> float:
 
 
 def _line_at_zero(u: Array, v: Array, blocks: int) -> float:
-    """Where the line that most points are near passes u = 0; NaN if too few are."""
+    """Height at u = 0 of the line near most of the points; NaN if these are too few."""
     first, second = np.triu_indices(len(u), 1)
     slopes = (v[second] - v[first]) / (u[second] - u[first])
     starts = v[first] - slopes * u[first]
@@ -130,9 +148,9 @@ def _line_at_zero(u: Array, v: Array, blocks: int) -> float:
 
 
 def _coordinates(track: Track) -> Array:
-    """Of the poses that were found, about their mean : (n, 3 to 6).
+    """Coordinates of the valid poses, about their mean : (n, 3 to 6).
 
-    The height along the main direction of the motion, mm; the place across it; the turn, rad. What doesn't change is left out.
+    The height along the main direction of the motion, mm; the place across it; the turn, rad. Constant ones are left out.
     """
     poses = track.poses[track.found]
     places = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
@@ -148,8 +166,8 @@ def _coordinates(track: Track) -> Array:
 def _smooth(moments: Array, coordinates: Array) -> BSpline:
     """Motion by a cubic spline with a knot every KNOT_S, or at every other pose where there are fewer; least squares.
 
-    Through the poses themselves it would carry their noise, and less of it between poses than at them: lags at which images fall
-    between poses would seem to fit better.
+    An interpolating spline would carry the poses' noise, and less of it between poses than at them: lags at which images fall
+    between poses would fit better than others.
     """
     step = max(2, round(KNOT_S / float(np.median(np.diff(moments)))))
     knots = moments[step:-step:step]
@@ -157,14 +175,14 @@ def _smooth(moments: Array, coordinates: Array) -> BSpline:
 
 
 def _within(moments: Array, wanted: Array) -> NDArray[np.bool_]:
-    """Whether there are poses on both sides of a moment, near enough."""
+    """Whether moments lie between two poses no more than `MAX_GAP_S` apart."""
     after = np.clip(np.searchsorted(moments, wanted), 1, len(moments) - 1)
     near = moments[after] - moments[after - 1] <= tracks.MAX_GAP_S
     return near & (wanted >= moments[0]) & (wanted <= moments[-1])
 
 
 def _search(seconds: Array, depths: Array, moments: Array, heights: Array, search_s: tuple[float, float]) -> float:
-    """The lag at which ranks of depth and height agree best."""
+    """The lag of the greatest rank correlation of depth and height."""
     lags = np.arange(search_s[0], search_s[1] + STEP_S / 2, STEP_S)
     agreement = np.zeros(len(lags))
     overlap = np.zeros(len(lags))
@@ -193,7 +211,7 @@ def _search(seconds: Array, depths: Array, moments: Array, heights: Array, searc
 
 
 def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, start: float) -> Lag:
-    """Weighted least squares over a, b and the lag, with variances of depth and of time that the residuals tell."""
+    """Weighted least squares over a, b and the lag, with variances of depth and of time estimated from the residuals."""
     lag, speed = start, spline.derivative()
     seen = np.isfinite(depths)
     used = seen & _within(moments, seconds - lag)
@@ -227,7 +245,7 @@ def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, sta
 
 
 def _agree(predicted: Array, depths: Array, inside: NDArray[np.bool_], used: NDArray[np.bool_]) -> None:
-    """Refuse depths that don't follow the height, or of which too many don't."""
+    """Refuse depths that don't follow the height, or with too many outliers."""
     outliers = 1 - used.sum() / inside.sum()
     agreement = abs(np.corrcoef(predicted[used], depths[used])[0, 1])
     if agreement < MIN_AGREEMENT or outliers > MAX_OUTLIERS:
@@ -236,7 +254,7 @@ def _agree(predicted: Array, depths: Array, inside: NDArray[np.bool_], used: NDA
 
 
 def _two_variances(residuals: Array, rates: Array, spread: float) -> tuple[float, float]:
-    """Variance of the depth, and standard deviation of the time, by least squares on the squared residuals; neither negative."""
+    """Variance of the depth and standard deviation of the time, not negative, by least squares on the squared residuals."""
     floor = (0.1 * spread) ** 2 + 1e-12
     design = np.column_stack([np.ones_like(rates), rates])
     depth, time = np.linalg.lstsq(design, residuals**2, rcond=None)[0]
@@ -248,7 +266,7 @@ def _two_variances(residuals: Array, rates: Array, spread: float) -> tuple[float
 
 
 def _sigma(design: Array, residuals: Array, weights: Array) -> float:
-    """Of the lag, from the residuals as they are (a sandwich, each enlarged by its leverage), whatever the variances are."""
+    """Standard deviation of the lag by a sandwich estimate: from the residuals, each enlarged by its leverage."""
     inverse = np.linalg.pinv(design.T @ (design * weights[:, None]))
     leverage = np.einsum("ni,ij,nj->n", design, inverse, design) * weights
     pulls = design * (weights * residuals / (1 - np.minimum(leverage, 0.9)))[:, None]

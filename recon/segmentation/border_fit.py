@@ -1,21 +1,24 @@
 """The surface of a dark mass in averaged echo power, from profiles across a rough one.
 
-A border of two tissues, blurred by pulse, beam and slice, is a step with half of its height on the border; a border that is
-square to the beam also reflects, which adds a bright line in the same place. Both are fitted to profiles along the surface's
-normals, each with levels of its own, so that it doesn't matter how bright the tissue beside is. Profiles are averaged over their
-neighbours at the same distance from the rough surface: unlike a blur of the image, this doesn't shrink what is round.
+A border of two tissues, blurred by pulse, beam and slice, is a step with half of its height on the border; a border square to the
+beam also reflects, which adds a bright line in the same place. Both are fitted to profiles along the surface's normals, each with
+levels of its own, so that the brightness of the tissue beside is free. Profiles are averaged over their neighbours at the same
+distance from the rough surface: unlike a blur of the image, this doesn't shrink what is round.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
+from numba import prange
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import KDTree
 from scipy.special import ndtr
 
+from recon.compiled import njit
 from recon.geometry import rigid
 from recon.segmentation.echo_power import EchoPower
 
@@ -23,59 +26,127 @@ Array = NDArray[np.float64]
 
 REACH_MM = 2.4  # of a profile, on either side of the surface
 BIN_MM = 0.2
-MOST_MM = 1.0  # that a vertex moves in one round
-STEP_MM = 0.1  # of the places that are tried
-BLURS_MM = (0.25, 0.4, 0.6)  # standard deviations that are tried
+MOST_MM = 1.0  # by which a vertex is moved in one round
+STEP_MM = 0.1  # between trial places
+BLURS_MM = (0.25, 0.4, 0.6)  # trial standard deviations
 PATCH_MM = 1.0  # standard deviation of the weights by which neighbours are averaged
-STAY = 0.1  # of the median certainty: how strongly a vertex stays where it is
+FARTHEST = 2.5  # patches: neighbours beyond count nothing
+STAY = 0.1  # of the median certainty: weight of the place before
 UNLIKE = 0.05  # of tissue's power, by which blurs differ from those tried
 EVENINGS = 10  # rounds of smoothing over neighbouring vertices
 LINE_GAIN = 1.5  # by which the misfit must be less with a line on the border
-NEVER = 1e9  # of a misfit
+NEVER = 1e9  # misfit of no step up, or of a dark line
 FLOOR = 0.05  # of tissue's power: no level counts as more certain than that of this
+RIDGE = 1e-9  # on the diagonal of the normal equations, for profiles without data
+OUTSIDE, INSIDE, LINE = 0, 1, 2  # rows of a trial: shares of both levels, and the bright line
 
 
 @dataclass(frozen=True)
 class Refined:
-    """A surface moved to where the profiles have their step."""
+    """A surface moved to the steps of its profiles."""
 
     mesh: trimesh.Trimesh
     moved: Array  # (n,) mm outwards, of the vertices
 
 
+class Cells(NamedTuple):
+    """Places sorted into cubes; a row of cubes along z lies in one piece."""
+
+    places: Array  # (n, 3) mm, sorted
+    normals: Array  # (n, 3), likewise
+    cube: NDArray[np.int64]  # (n, 3) of each place
+    start: NDArray[np.int64]  # (nx, ny, nz + 1) number of the first place in a cube; the last ends the row
+
+
 def refine(rough: trimesh.Trimesh, power: EchoPower, patch_mm: float = PATCH_MM) -> Refined:
-    """Move the vertices of a closed mesh along their normals to the border that the power shows."""
+    """Move the vertices of a closed mesh along their normals to the border in the power."""
     number, distance, value, weight = _near(rough, power)
     bins = round(2 * REACH_MM / BIN_MM)
     index = number * bins + np.clip(((distance + REACH_MM) / BIN_MM).astype(int), 0, bins - 1)
     count = len(rough.vertices) * bins
     total = np.bincount(index, weight * value, count).reshape(-1, bins)
     mass = np.bincount(index, weight, count).reshape(-1, bins)
-    tree = KDTree(rough.vertices)
-    gaps = tree.sparse_distance_matrix(tree, 2.5 * patch_mm, output_type="coo_matrix")
-    facing = (rough.vertex_normals[gaps.row] * rough.vertex_normals[gaps.col]).sum(axis=1)
-    share = np.exp(-(gaps.data**2) / (2 * patch_mm**2)) * np.clip(facing, 0, None)
-    mixing = sparse.csr_matrix((share, (gaps.row, gaps.col)), shape=gaps.shape)
-    mass, total = mixing @ mass, mixing @ total
+    vertices, normals = np.asarray(rough.vertices), np.asarray(rough.vertex_normals)
+    mixed = mix(vertices, normals, np.hstack([mass, total]), patch_mm)
+    mass, total = mixed[:, :bins], mixed[:, bins:]
     step, doubt = _steps(np.divide(total, mass, out=np.zeros_like(total), where=mass > 0), mass)
-    sure = mixing @ (1 / doubt)
-    moved = (mixing @ (step / doubt)) / (sure + STAY * np.median(sure))  # where little is known it stays
-    mesh = trimesh.Trimesh(rough.vertices + moved[:, None] * rough.vertex_normals, rough.faces, process=False)
-    return Refined(trimesh.smoothing.filter_taubin(mesh, iterations=EVENINGS), moved)  # takes spikes, keeps the volume
+    sure, pull = mix(vertices, normals, np.column_stack([1 / doubt, step / doubt]), patch_mm).T
+    moved = pull / (sure + STAY * np.median(sure))  # uncertain vertices stay
+    return Refined(evened(rough, vertices + moved[:, None] * normals), moved)
+
+
+def mix(places: Array, normals: Array, values: Array, patch_mm: float) -> Array:
+    """Weighted sums : (n, k) of values : (n, k) over neighbouring vertices.
+
+    The weight is a Gaussian of the distance times the cosine between the normals : (n, 3), 0 for opposite ones.
+    """
+    reach = FARTHEST * patch_mm
+    cube = ((places - places.min(axis=0)) / reach).astype(np.int64)
+    size = cube.max(axis=0) + 1
+    flat = np.ravel_multi_index(cube.T, size)
+    order = np.argsort(flat, kind="stable")
+    start = np.searchsorted(flat[order], np.arange(size.prod() + 1))
+    rows = np.append(start[:-1].reshape(size), start[size[2] :: size[2]].reshape(*size[:2], 1), axis=2)
+    result = np.empty_like(values)
+    result[order] = _mix(Cells(places[order], normals[order], cube[order], rows), values[order], patch_mm, reach)
+    return result
+
+
+@njit(parallel=True)
+def _mix(cells, values, patch, reach):
+    sums = np.zeros_like(values)
+    nx, ny, nz = cells.start.shape
+    for n in prange(len(values)):
+        x, y, z = cells.cube[n, 0], cells.cube[n, 1], cells.cube[n, 2]
+        low, high = max(z - 1, 0), min(z + 2, nz - 1)
+        for i in range(max(x - 1, 0), min(x + 2, nx)):
+            for j in range(max(y - 1, 0), min(y + 2, ny)):
+                _add_row(sums, cells, values, n, (cells.start[i, j, low], cells.start[i, j, high]), (patch, reach))
+    return sums
+
+
+@njit(inline="always")
+def _add_row(sums, cells, values, n, row, lengths):
+    patch, reach = lengths
+    place, normal = cells.places[n], cells.normals[n]
+    for other in range(row[0], row[1]):
+        gap, cosine = 0.0, 0.0
+        for axis in range(3):
+            gap += (place[axis] - cells.places[other, axis]) ** 2
+            cosine += normal[axis] * cells.normals[other, axis]
+        if gap <= reach * reach and cosine > 0:
+            share = np.exp(-gap / (2 * patch * patch)) * cosine
+            for column in range(values.shape[1]):
+                sums[n, column] += share * values[other, column]
+
+
+def evened(mesh: trimesh.Trimesh, vertices: Array) -> trimesh.Trimesh:
+    """A mesh with other vertices, spikes taken off by Taubin's smoothing, which keeps the volume."""
+    ends = mesh.faces[:, [0, 1, 2, 1, 2, 0]].T.reshape(2, -1)
+    joined = sparse.csr_matrix((np.ones(ends.shape[1]), ends), shape=2 * (len(vertices),))
+    joined = joined + joined.T
+    joined.data[:] = 1
+    share = sparse.diags(1 / np.maximum(np.diff(joined.indptr), 1))
+    moved = trimesh.Trimesh(vertices, mesh.faces, process=False)
+    return trimesh.smoothing.filter_taubin(moved, iterations=EVENINGS, laplacian_operator=share @ joined)
 
 
 def _near(rough: trimesh.Trimesh, power: EchoPower) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Voxels that were seen near a surface: the nearest vertex, distance (positive outside), power and weight."""
-    volume = power.volume
+    """Voxels with data near a surface: the nearest vertex, distance (positive outside), power and weight."""
+    volume, farthest = power.volume, 1.5 * REACH_MM
     voxel = rigid.apply(np.linalg.inv(volume.world_from_voxel), rough.vertices)
     margin = 2 * REACH_MM / volume.spacing
     low = np.maximum(np.floor(voxel.min(axis=0) - margin), 0).astype(int)
     high = np.minimum(np.ceil(voxel.max(axis=0) + margin).astype(int) + 1, volume.voxels.shape[::-1])
     part = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
-    k, j, i = np.nonzero(power.weight[part] > 0.01)
+    apart = np.ones(tuple(high - low)[::-1], bool)
+    apart[tuple(np.clip(np.rint(voxel).astype(int) - low, 0, high - low - 1).T[::-1])] = False
+    spared = np.linalg.norm(volume.spacing) / 2  # a vertex lies up to this far from its voxel's centre
+    within = np.asarray(ndimage.distance_transform_edt(apart, volume.spacing[::-1])) < farthest + spared
+    k, j, i = np.nonzero((power.weight[part] > 0.01) & within)
     index = np.column_stack([i, j, k]) + low
     places = rigid.apply(volume.world_from_voxel, index)
-    away, nearest = KDTree(rough.vertices).query(places, distance_upper_bound=1.5 * REACH_MM, workers=-1)
+    away, nearest = KDTree(rough.vertices).query(places, distance_upper_bound=farthest, workers=-1)
     kept = np.isfinite(away)
     places, nearest, index = places[kept], nearest[kept], index[kept]
     distance = ((places - rough.vertices[nearest]) * rough.vertex_normals[nearest]).sum(axis=1)
@@ -90,22 +161,18 @@ def _near(rough: trimesh.Trimesh, power: EchoPower) -> tuple[NDArray[np.int64], 
 
 
 def _steps(profiles: Array, weight: Array) -> tuple[Array, Array]:
-    """Where profiles : (n, bins) step up : (n,) mm, and a variance in some unit.
+    """Places : (n,) mm at which profiles : (n, bins) step up, and a variance in some unit.
 
-    Each place and blur is tried with the levels within, without and of a line on the border that fit best; the least sum of
-    squares, weighed as speckle scatters, counts. A weak line can't be told from a step that lies elsewhere, so there is one only
-    where the fit is much better with it.
+    Each trial place and blur is fitted with the levels within, without and of a line on the border; the least sum of squares,
+    weighed as speckle scatters, counts. A weak line looks like a step elsewhere, so a line counts only where the fit is much
+    better with it.
     """
     s = -REACH_MM + BIN_MM * (np.arange(profiles.shape[1]) + 0.5)
     candidates = np.arange(-MOST_MM, MOST_MM + STEP_MM / 2, STEP_MM)
     weight = weight / np.maximum(uniform_filter1d(profiles, 5, axis=1, mode="nearest"), FLOOR)
-    plain, lined = np.full((2, len(candidates), len(profiles)), NEVER)
-    for blur in BLURS_MM:
-        for c, place in enumerate(candidates):
-            z = (s - place) / blur
-            basis = np.stack([ndtr(z), ndtr(-z), np.exp(-z * z / 2)])
-            plain[c] = np.minimum(plain[c], _misfit(basis[:2], profiles, weight))
-            lined[c] = np.minimum(lined[c], _misfit(basis, profiles, weight))
+    z = (s - candidates[:, None, None]) / np.array(BLURS_MM)[:, None]
+    trials = np.stack([ndtr(z), ndtr(-z), np.exp(-z * z / 2)], axis=2)  # (places, blurs, 3, bins)
+    plain, lined = misfits(profiles, weight, trials)
     least = UNLIKE**2 * weight.sum(axis=1)
     costs = np.where(plain.min(axis=0) + least > LINE_GAIN * (lined.min(axis=0) + least), lined, plain)
     c = np.clip(costs.argmin(axis=0), 1, len(candidates) - 2)
@@ -113,23 +180,74 @@ def _steps(profiles: Array, weight: Array) -> tuple[Array, Array]:
     before, here, after = costs[c - 1, rows], costs[c, rows], costs[c + 1, rows]
     bend = np.maximum(before + after - 2 * here, 1e-9)
     shift = np.clip((before - after) / (2 * bend), -0.5, 0.5)
-    found = (here < NEVER) & (costs.argmin(axis=0) == c)  # not at an end of what was tried
+    found = (here < NEVER) & (costs.argmin(axis=0) == c)  # not at an end of the trials
     return np.where(found, candidates[c] + shift * STEP_MM, 0.0), np.where(found, here / bend + 1e-3, NEVER)
 
 
-def _misfit(basis: Array, profiles: Array, weight: Array) -> Array:
-    """Weighted sum of squares : (n,) that the best mixture of basis : (2 or 3, bins) leaves.
+@njit(parallel=True, error_model="numpy")
+def misfits(profiles, weight, trials):
+    """Least weighted sums of squares : (places, n) over the blurs, of steps alone and of steps with a bright line.
 
-    `NEVER` where it is no step up, or the line isn't bright.
+    `NEVER` where the levels don't step up, or the line isn't bright.
     """
-    sums, levels = _residual(basis, profiles, weight)
-    return np.where((levels[:, 0] > levels[:, 1]) & (levels[:, 2:] > 0).all(axis=1), sums, NEVER)
+    places, blurs = trials.shape[:2]
+    plain = np.full((places, len(profiles)), NEVER)
+    lined = np.full((places, len(profiles)), NEVER)
+    for n in prange(len(profiles)):
+        for place in range(places):
+            for blur in range(blurs):
+                sums = _weighted_sums(trials[place, blur], profiles[n], weight[n])
+                plain[place, n] = min(plain[place, n], _misfit_of_step(sums))
+                lined[place, n] = min(lined[place, n], _misfit_with_line(sums))
+    return plain, lined
 
 
-def _residual(basis: Array, profiles: Array, weight: Array) -> tuple[Array, Array]:
-    count = len(basis)
-    products = (basis[:, None] * basis[None]).reshape(count * count, -1)
-    normal = (weight @ products.T).reshape(-1, count, count) + 1e-9 * np.eye(count)
-    right = (weight * profiles) @ basis.T
-    levels = np.linalg.solve(normal, right[..., None])[..., 0]
-    return (weight * profiles**2).sum(axis=1) - (levels * right).sum(axis=1), levels
+class Sums(NamedTuple):
+    """Weighted sums over a profile y and the rows a, b, c of a trial."""
+
+    yy: float
+    ay: float
+    by: float
+    cy: float
+    aa: float
+    ab: float
+    ac: float
+    bb: float
+    bc: float
+    cc: float
+
+
+@njit(inline="always")
+def _weighted_sums(trial, profile, weight):
+    yy, ay, by, cy = 0.0, 0.0, 0.0, 0.0
+    aa, ab, ac, bb, bc, cc = RIDGE, 0.0, 0.0, RIDGE, 0.0, RIDGE
+    for s in range(len(profile)):
+        y, a, b, c = profile[s], trial[OUTSIDE, s], trial[INSIDE, s], trial[LINE, s]
+        wy, wa, wb, wc = weight[s] * y, weight[s] * a, weight[s] * b, weight[s] * c
+        yy, ay, by, cy = yy + wy * y, ay + wa * y, by + wb * y, cy + wc * y
+        aa, ab, ac, bb, bc, cc = aa + wa * a, ab + wa * b, ac + wa * c, bb + wb * b, bc + wb * c, cc + wc * c
+    return Sums(yy, ay, by, cy, aa, ab, ac, bb, bc, cc)
+
+
+@njit(inline="always")
+def _misfit_of_step(m):
+    """Sum of squares left by the best levels on both sides, by Cramer's rule."""
+    det = m.aa * m.bb - m.ab * m.ab
+    outside, inside = (m.ay * m.bb - m.by * m.ab) / det, (m.by * m.aa - m.ay * m.ab) / det
+    if outside > inside:
+        return m.yy - outside * m.ay - inside * m.by
+    return NEVER
+
+
+@njit(inline="always")
+def _misfit_with_line(m):
+    """Sum of squares left by the best levels on both sides and of the line, by elimination of the line."""
+    ac, bc = m.ac / m.cc, m.bc / m.cc
+    aa, ab, bb = m.aa - ac * m.ac, m.ab - ac * m.bc, m.bb - bc * m.bc
+    ay, by = m.ay - ac * m.cy, m.by - bc * m.cy
+    det = aa * bb - ab * ab
+    outside, inside = (ay * bb - by * ab) / det, (by * aa - ay * ab) / det
+    line = m.cy / m.cc - ac * outside - bc * inside
+    if outside > inside and line > 0:
+        return m.yy - outside * m.ay - inside * m.by - line * m.cy
+    return NEVER

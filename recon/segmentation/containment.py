@@ -1,11 +1,13 @@
-"""Whether what ultrasound found lies inside the outer surface that the cameras measured."""
+"""Containment of masses, found by ultrasound, in the outer surface that the cameras measured."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import KDTree
+
+from recon.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -14,7 +16,7 @@ LEAST_COVERED = 0.5  # of a mesh's vertices, to call it inside
 
 @dataclass(frozen=True)
 class Containment:
-    """How a closed mesh lies under an open surface."""
+    """Depths of a closed mesh under an open surface."""
 
     depths: Array  # (n,) mm of the mesh's vertices, as of `depths`
 
@@ -36,31 +38,51 @@ class Containment:
         return True if self.covered > LEAST_COVERED else None
 
 
+def read_skin(path: Path) -> trimesh.Trimesh:
+    """Read a surface of triangles, PLY.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, of another kind, or holds no triangles.
+    """
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path}: expected a surface as PLY, found {path.suffix or 'no suffix'}")
+    if not path.is_file():
+        raise InputError(f"{path}: expected a surface as PLY, found none")
+    try:
+        mesh = trimesh.load(path, file_type="ply", process=False)
+    except (ValueError, IndexError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: expected a surface as PLY, found a damaged one: {error}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{path}: expected a surface of triangles, found none in it")
+    return mesh
+
+
 def contain(mesh: trimesh.Trimesh, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)) -> Containment:
-    """How a mesh lies under a surface as of `recon.structured_light.surface_mesh`, in the same world."""
+    """Containment of a mesh in a surface as of `recon.structured_light.surface_mesh`, in the same world."""
     return Containment(depths(mesh.vertices, surface, camera))
 
 
 def depths(points: Array, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Distance : (n,) mm of points : (n, 3) to an open surface, positive behind it, as the camera that measured it sees it.
+    """Distance : (n,) mm of points : (n, 3) to an open surface, positive behind it, as seen from the camera that measured it.
 
-    NaN where the nearest part of the surface is its rim, beyond which nothing is known.
+    NaN where the nearest part of the surface is its rim. The surface's search tree is kept with it, for further points.
     """
-    vertices = np.asarray(surface.vertices)
+    points = np.asarray(points, float)
+    _, nearest = surface.kdtree.query(points, workers=-1)
+    vertices, normals = np.asarray(surface.vertices[nearest]), np.asarray(surface.vertex_normals[nearest])
     away = vertices - np.asarray(camera, float)
-    normals = np.asarray(surface.vertex_normals)
     normals = normals * np.where((normals * away).sum(axis=1) > 0, -1, 1)[:, None]  # towards the camera
-    _, nearest = KDTree(vertices).query(np.asarray(points, float), workers=-1)
-    offset = points - vertices[nearest]
-    behind = -(offset * normals[nearest]).sum(axis=1)  # of the tangent plane there: a vertex's distance would add the way to it
+    behind = -((points - vertices) * normals).sum(axis=1)  # from the tangent plane there
     return np.where(_on_rim(surface, nearest), np.nan, behind)
 
 
 def _on_rim(surface: trimesh.Trimesh, chosen: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether chosen vertices : (n,) end edges that only one triangle has : (n,)."""
+    """Whether chosen vertices : (n,) end edges of one triangle only : (n,)."""
     near = np.zeros(len(surface.vertices), bool)
     near[chosen] = True
-    about = surface.faces[near[surface.faces].any(axis=1)]  # all that the edges of the chosen can have
+    about = surface.faces[near[surface.faces].any(axis=1)]  # all triangles at edges of the chosen
     edges = np.sort(about[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     rim = np.zeros(len(surface.vertices), bool)
     rim[edges[trimesh.grouping.group_rows(edges, require_count=1)]] = True

@@ -1,7 +1,7 @@
 """Mean echo power of tissue on a grid along the beams, from tracked B-scans.
 
-Speckle's power averages to the tissue's backscatter, its grey levels don't: they are logarithms, in which a dark mass seems
-smaller than it is by what pulse and beam spill into it. So grey levels are turned back into power before they are averaged.
+Speckle's power averages to the tissue's backscatter, its grey levels don't: they are logarithms, in which a dark mass looks too
+small, by the width of pulse and beam spilling into it. So grey levels are turned back into power before they are averaged.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,30 +19,30 @@ from recon.freehand.volume_compounding import Clip, Grid
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-BRIGHTEST = 10**0.8  # times tissue: what is brighter counts as 8 dB above it, such as walls square to the beam
+BRIGHTEST = 10**0.8  # times tissue: brighter echoes count as 8 dB above it, such as those of walls square to the beam
 MEDIAN_OF_MEAN = np.log(2)  # of the power of speckle, which is exponentially distributed
 
 
 @dataclass(frozen=True)
 class EchoPower:
-    """Mean power, relative to the tissue's typical one, and where a pixel fell."""
+    """Mean power, relative to the tissue's typical one, and the number of pixels in it."""
 
     volume: Volume  # voxels (nz, ny, nx) float32; x along the array, y into the depth, z across the images
     weight: Map  # (nz, ny, nx) pixels that a voxel is the mean of
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """Voxels that a pixel fell into : (nz, ny, nx)."""
+        """Voxels with a pixel in them : (nz, ny, nx)."""
         return self.weight > 0
 
 
 def typical_grey(images: NDArray, rows: slice) -> float:
-    """Median grey level of some rows of images : (n, h, w): that of tissue, where most of what they show is tissue."""
+    """Median grey level of some rows of images : (n, h, w): that of tissue, where they show mostly tissue."""
     return float(np.median(images[:, rows]))
 
 
 def beam_grid(world_from_pixel: Array, shape: tuple[int, int], spacing_mm: float, clip: Clip | None = None) -> Grid:
-    """The grid along the mean array (x) and beam (y) of images (h, w) with poses : (n, 4, 4), that takes in all of them."""
+    """The grid along the mean array (x) and beam (y) around all images (h, w) with poses : (n, 4, 4)."""
     around = volume_compounding.corners(world_from_pixel, shape, clip)
     found = world_from_pixel[np.isfinite(world_from_pixel).all(axis=(1, 2))]
     axes = found[:, :3, :2] / np.linalg.norm(found[:, :3, :2], axis=1, keepdims=True)
@@ -95,7 +95,7 @@ def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, 
     Parameters
     ----------
     parts : n times (power, u, v), of one shape
-        Power, NaN where it isn't to count, and the places in the image.
+        Power, NaN where it is left out, and the places in the image.
     world_from_pixel : (n, 4, 4)
         Images with a NaN are left out.
 
@@ -125,19 +125,35 @@ def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, 
     return EchoPower(Volume(value, grid.origin, grid.spacing, grid.directions), weight)
 
 
-@njit
-def _add(power, u, v, m, value, weight):
-    nz, ny, nx = value.shape
+@njit(nogil=True)
+def _add(power, u, v, voxel_from_pixel, value, weight):
+    """Add the powers of pixels to the eight voxels around each; those that aren't finite are left out."""
+    m = voxel_from_pixel
     for n in range(power.size):
-        if not np.isfinite(power[n]):
-            continue
-        x = m[0, 0] * u[n] + m[0, 1] * v[n] + m[0, 3]
-        y = m[1, 0] * u[n] + m[1, 1] * v[n] + m[1, 3]
-        z = m[2, 0] * u[n] + m[2, 1] * v[n] + m[2, 3]
-        i0, j0, k0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-        for k in range(max(k0, 0), min(k0 + 2, nz)):
-            for j in range(max(j0, 0), min(j0 + 2, ny)):
-                for i in range(max(i0, 0), min(i0 + 2, nx)):
-                    share = np.float32((1 - abs(x - i)) * (1 - abs(y - j)) * (1 - abs(z - k)))
-                    value[k, j, i] += share * power[n]
-                    weight[k, j, i] += share
+        if np.isfinite(power[n]):
+            x = m[0, 0] * u[n] + m[0, 1] * v[n] + m[0, 3]
+            y = m[1, 0] * u[n] + m[1, 1] * v[n] + m[1, 3]
+            z = m[2, 0] * u[n] + m[2, 1] * v[n] + m[2, 3]
+            _share_out(power[n], x, y, z, value, weight)
+
+
+@njit(inline="always")
+def _share_out(power, x, y, z, value, weight):
+    """Add a power to the voxels around a place, in voxels, each weighed by its trilinear share."""
+    nz, ny, nx = value.shape
+    i0, j0, k0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    for k in range(max(k0, 0), min(k0 + 2, nz)):
+        for j in range(max(j0, 0), min(j0 + 2, ny)):
+            for i in range(max(i0, 0), min(i0 + 2, nx)):
+                share = np.float32((1 - abs(x - i)) * (1 - abs(y - j)) * (1 - abs(z - k)))
+                value[k, j, i] += share * power
+                weight[k, j, i] += share
+
+
+def pixel_mm(world_from_pixel: Array) -> tuple[float, float]:
+    """Size of a pixel along the array and into the depth."""
+    found = world_from_pixel[np.isfinite(world_from_pixel).all(axis=(1, 2))]
+    if not len(found):
+        raise InputError(f"poses: expected at least one that is valid, found none in {len(world_from_pixel)}")
+    across, down = np.linalg.norm(found[0, :3, :2], axis=0)
+    return float(across), float(down)

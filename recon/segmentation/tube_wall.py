@@ -1,10 +1,10 @@
 """The wall of a round tube or rod in a B-scan through water, to a fraction of a pixel, and the cylinder through many of them.
 
-What is seen is the front half of the wall: it is bright where it is square to the beam, weaker towards the sides, and nothing
-behind it is where it seems, for sound has another speed inside. A wall's echo has its middle on the wall, since pulse and beam
-are symmetric; so the edge is the middle of the echo across the wall, between two equal levels, which stands clipped pixels.
-Two things move it. The bend of the wall: of a circle of radius R blurred by sigma along the wall, the ridge lies at
-`R - sigma²/(2 R)`. And its fading towards the sides: the beam is wider than the pulse is deep, so a bright crest smears beyond
+Only the front half of the wall is measured: it is bright where it is square to the beam, weaker towards the sides, and echoes
+from behind it are shown at wrong depths, for sound has another speed inside. A wall's echo has its middle on the wall, since
+pulse and beam are symmetric; so the edge is the middle of the echo across the wall, between two equal levels, which stands
+clipped pixels. Two things move it. The bend of the wall: of a circle of radius R blurred by sigma along the wall, the ridge lies
+at `R - sigma²/(2 R)`. And its fading towards the sides: the beam is wider than the pulse is deep, so a bright crest smears beyond
 the wall beside it. A wall whose power grows as `exp(g s)` along its tangent t, blurred by a Gaussian of covariance S, has its
 ridge `-g t.S n` off along its normal n.
 """
@@ -21,12 +21,13 @@ from scipy.optimize import least_squares
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.primitives import Cylinder, fit_cylinder
+from recon.model.probe import ProbeCalibration
 
 Array = NDArray[np.float64]
 
 SMOOTH_PX = 1.0  # before the first echo of each column is looked for
 TRIALS = 400  # circles through three first echoes
-NEAR_MM = 0.5  # of a first echo to a circle that it counts for
+NEAR_MM = 0.5  # from a circle, of the first echoes that count for it
 LEAST_ARC_DEG = 70.0  # of first echoes; less leaves the radius to chance
 CENTRINGS = 3
 STEP_DEG = 1.0  # between rays
@@ -45,7 +46,7 @@ SEED = 0  # of the trials: the same image gives the same ring
 
 @dataclass(frozen=True)
 class Appearance:
-    """What a tube looks like on a scanner."""
+    """Appearance of a tube on a scanner."""
 
     diameter_mm: tuple[float, float] = (5.0, 36.0)  # least and most
     spread_mm: tuple[float, float] = (0.25, 0.08)  # sigma of an echo's power, along the array and in depth
@@ -56,7 +57,7 @@ class Appearance:
 
 @dataclass(frozen=True)
 class Ring:
-    """Edge points of a tube's wall in an image, or why there are none."""
+    """Edge points of a tube's wall in an image, or the reason of their absence."""
 
     pixels: Array  # (n, 2) u, v
     covariance: Array  # (n, 2, 2) px^2
@@ -143,6 +144,22 @@ def fit_tube(rings: Sequence[Ring], world_from_pixel: Array) -> Tube:
     return _weighted(points, covariance, frames)
 
 
+def scale_sigma(rings: Sequence[Ring], world_from_pixel: Array, tube: Tube, probe: ProbeCalibration) -> float:
+    """Standard deviation of a tube's radius, mm, due to those of sx and sy, common to all images; 0 if none is known."""
+    known = probe.uncertainty
+    if known is None:
+        return 0.0
+    names = [name for name in ("sx", "sy") if known.sigma(name) > 0]
+    slopes = []
+    for name in names:
+        k, sigma = ("sx", "sy").index(name), known.sigma(name)
+        changed = np.ones(4)
+        changed[k] += sigma / probe.scale[k]
+        slopes.append((fit_tube(rings, world_from_pixel * changed).shape.radius - tube.shape.radius) / sigma)
+    order = [known.names.index(name) for name in names]
+    return float(np.sqrt(np.array(slopes) @ known.covariance[np.ix_(order, order)] @ np.array(slopes))) if names else 0.0
+
+
 def in_world(pixels: Array, world_from_pixel: Array) -> Array:
     """Pixels : (n, 2) u, v of an image, to points : (n, 3) mm."""
     return rigid.apply(world_from_pixel, np.column_stack([pixels, np.zeros(len(pixels))]))
@@ -154,7 +171,7 @@ def first_echoes(level: NDArray[np.float32], top: int, contrast: float) -> Array
     `contrast` is in grey levels, above the column's background; rows above `top` are left out.
     """
     smooth = cv2.GaussianBlur(level, (0, 0), SMOOTH_PX, borderType=cv2.BORDER_REPLICATE)[top:]
-    background = np.median(smooth, axis=1, keepdims=True)  # what is bright along the whole array is no wall
+    background = np.median(smooth, axis=1, keepdims=True)  # rows bright along the whole array are no wall
     bright = smooth - background > contrast
     peak = bright & (smooth >= np.roll(smooth, -1, axis=0)) & (smooth >= np.roll(smooth, 1, axis=0))
     peak[[0, -1]] = False
@@ -163,7 +180,7 @@ def first_echoes(level: NDArray[np.float32], top: int, contrast: float) -> Array
 
 
 def _rough_circle(points: Array, diameter: tuple[float, float]) -> tuple[Array, NDArray[np.bool_] | None]:
-    """Circle x, y, radius that most of the points lie on with their front side, and which; None if none has the size."""
+    """Circle x, y, radius with most of the points on its front side, and these points; None without one of the size."""
     rng = np.random.default_rng(SEED)
     best, chosen, count = np.zeros(3), None, 9
     for _ in range(TRIALS):

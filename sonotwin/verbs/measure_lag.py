@@ -1,4 +1,4 @@
-"""Measure by how much the scanner's images lag behind the poses of the tracker.
+"""Measure the lag of the scanner's images behind the poses of the tracker.
 
 Reads the sweep part of a capture folder: the probe moved up and down over a flat bottom in water, by 10 mm or more, three times
 or more, at an uneven pace. Writes into the folder `out`: lag.json, with lag_s for the other commands; depths.csv, the bottom's
@@ -33,7 +33,6 @@ DEPTHS = "depths.csv"
 HEADER = ("frame", "time_ns", "depth_px", "residual_px", "used")
 
 Array = NDArray[np.float64]
-LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s; of the settings lag_s of other commands
 
 
 class Config(BaseModel):
@@ -62,7 +61,7 @@ def run(config: Config) -> None:
     Raises
     ------
     InputError
-        If the capture is incomplete or damaged, the motion doesn't tell the lag, or `out` can't be written to.
+        If the capture is incomplete or damaged, the motion doesn't determine the lag, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
     atomic.check_folder(config.out, LAG, inputs=[config.capture])
@@ -77,30 +76,15 @@ def run(config: Config) -> None:
         found = latency.estimate(sweep.times, depths, sweep.track, config.search_s)
     except InputError as error:
         raise InputError(f"{sweep.name}: {error}") from None
-    figures = measure(depths, found) | {"seconds_find": round(seconds, 3)}
+    figures = latency.measure(depths, found) | {"seconds_find": round(seconds, 3)}
     for line in describe(figures):
         console.print(line, markup=False)
     written = write(config.out, sweep, depths, found, figures)
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
 
 
-def measure(depths: Array, found: Lag) -> Metrics:
-    """Figures of a lag, each named with its unit."""
-    return {
-        "frames": len(depths),
-        "frames_with_bottom": int(np.isfinite(depths).sum()),
-        "frames_used": int(found.used.sum()),
-        "lag_ms": 1e3 * found.seconds,
-        "lag_sigma_ms": 1e3 * found.sigma_s,
-        "lag_low_ms": 1e3 * found.interval_s[0],
-        "lag_high_ms": 1e3 * found.interval_s[1],
-        "jitter_ms": 1e3 * found.jitter_s,
-        "depth_sigma_px": found.depth_sigma,
-    }
-
-
 def describe(figures: Metrics) -> Iterator[str]:
-    """Lines that say the lag with its interval, and what scatters."""
+    """Lines: the lag with its interval, and the scatter about it."""
     interval = f"{figures['lag_low_ms']:.1f} to {figures['lag_high_ms']:.1f} ms"
     yield f"lag         {figures['lag_ms']:.1f} ms, {interval} ({100 * latency.COVERAGE:.0f} %), the images after the poses"
     scatter = f"{figures['depth_sigma_px']:.2f} px of depth, {figures['jitter_ms']:.1f} ms of the time stamps"
@@ -123,7 +107,7 @@ def write(out: Path, sweep: SweepCapture, depths: Array, found: Lag, figures: Me
 
 
 def rows(sweep: SweepCapture, depths: Array, found: Lag) -> Iterator[Sequence[object]]:
-    """What was found in each B-scan, in the order of HEADER; empty where there is nothing."""
+    """A row a B-scan, in the order of HEADER; empty where there is no depth."""
     for frame, time, depth, residual, used in zip(sweep.frames, sweep.times, depths, found.residuals, found.used, strict=True):
         shown = ["" if np.isnan(value) else f"{value:.3f}" for value in (depth, residual)]
         yield frame, time, *shown, int(used)

@@ -9,15 +9,9 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 
 from recon.geometry import rigid
-from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
-from recon.segmentation import tube_wall
-from recon.segmentation.containment import Containment
-from recon.segmentation.masses import Mass
-from recon.segmentation.tube_wall import Ring
 from sonotwin.cli import main
-from sonotwin.verbs import segment
 from tests.recon import captures, probe_motions, sweep_sets
 
 LAG_S = 0.1
@@ -107,32 +101,3 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, tmp_p
     assert complaint(f"capture={capture}", "diameter_mm=[9,5]").startswith("segment: diameter_mm: expected the least before")
     assert complaint(f"capture={capture}", "kind=tube").startswith(f"{capture}: rings: expected at least three images")
     assert not out.exists()
-
-
-def test_whether_a_mass_is_inside_may_be_unknown():
-    """Covered by less than half, with nothing above the surface."""
-    mass = Mass(trimesh.creation.icosphere(radius=3))
-    depths = np.full(len(mass.mesh.vertices), np.nan)
-    depths[: round(0.48 * len(depths))] = 2.0
-    under = Containment(depths)
-    assert segment.describe(mass, under).endswith("unknown: only 48 % lies under the surface")
-    figures = segment.measure("mass0", mass, under)
-    assert np.isnan(figures["mass0_inside"]) and figures["mass0_covered"] == pytest.approx(0.48, abs=0.01)
-
-
-def test_an_uncertain_scale_is_an_uncertain_diameter(rig):
-    """Circles in the image: 1 % of sx and sy together are 1 % of the radius; of sx alone, near half of it."""
-    scale, turned = np.array([0.2, 0.1]), np.radians(np.arange(0, 360, 2.0))
-    pixels = (np.array([16.0, 15.0]) + 6.0 * np.column_stack([np.cos(turned), np.sin(turned)])) / scale
-    one = Ring(pixels, np.tile(0.01 * np.eye(2), (len(pixels), 1, 1)))
-    matrices = np.stack([rigid.transform(np.eye(3), [0, 0, k]) @ np.diag([*scale, 1, 1]) for k in range(8)])
-    tube = tube_wall.fit_tube([one] * 8, matrices)
-
-    def sigma(covariance: np.ndarray) -> float:
-        known = Uncertainty(("sx", "sy"), covariance)
-        return segment.scale_sigma([one] * 8, matrices, tube, ProbeCalibration(np.eye(4), scale, known))
-
-    together = np.outer(0.01 * scale, 0.01 * scale)
-    assert sigma(together) == pytest.approx(0.06, rel=0.02)
-    assert sigma(np.diag(np.diag(together))) == pytest.approx(0.06 / np.sqrt(2), rel=0.1)
-    assert segment.scale_sigma([one] * 8, matrices, tube, ProbeCalibration(np.eye(4), scale)) == 0

@@ -72,3 +72,21 @@ def test_arrays_all_round_have_no_grid():
     turns = np.stack([rigid.from_rotation_vector([0, a, 0], [0, 0, 0]) for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)])
     with pytest.raises(InputError, match="about one way"):
         echo_power.beam_grid(turns, (20, 20), 0.5)
+
+
+def test_pixels_are_shared_out_by_their_distance(rng):
+    """Pixel by pixel, to all voxels at once; those beside the grid and those that aren't to count left out."""
+    grid = echo_power.Grid((7, 6, 5), np.zeros(3), np.full(3, 1.0), np.eye(3))
+    power = rng.uniform(0, 2, (9, 8)).astype(np.float32)
+    power[3, 4] = np.nan
+    v, u = np.mgrid[:9, :8].astype(np.float32)
+    pose = rigid.from_rotation_vector([0.3, 0.2, -0.1], [-0.8, 0.3, 1.2])
+    voxels = np.stack(np.mgrid[:5, :6, :7], axis=-1)[..., ::-1]
+    total, weight = np.zeros((2, 5, 6, 7))
+    for place, value in zip(rigid.apply(pose, np.stack([u, v, 0 * u], axis=-1)).reshape(-1, 3), power.ravel(), strict=True):
+        share = np.clip(1 - np.abs(voxels - place), 0, None).prod(axis=-1)
+        total += np.nan_to_num(share * value)
+        weight += share * np.isfinite(value)
+    found = echo_power.accumulated([(power, u, v)], pose[None], grid)
+    np.testing.assert_allclose(found.weight, weight, atol=1e-5)
+    np.testing.assert_allclose(found.volume.voxels[weight > 0.01], (total / np.maximum(weight, 1e-6))[weight > 0.01], rtol=1e-3)

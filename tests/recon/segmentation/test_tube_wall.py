@@ -8,7 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.model.calibration import Uncertainty
+from recon.model.probe import ProbeCalibration
 from recon.segmentation import tube_wall
+from recon.segmentation.tube_wall import Ring
 
 SCALE = np.array([0.12, 0.118])
 SIZE = (320, 260)  # w, h
@@ -174,3 +177,21 @@ def test_images_without_a_pose_are_left_out_and_three_are_needed(rng):
         tube_wall.fit_tube(rings[:2], matrices[:2])
     with pytest.raises(InputError, match="as many as poses"):
         tube_wall.fit_tube(rings, matrices[:4])
+
+
+def test_an_uncertain_scale_is_an_uncertain_diameter():
+    """Circles in the image: 1 % of sx and sy together are 1 % of the radius; of sx alone, near half of it."""
+    scale, turned = np.array([0.2, 0.1]), np.radians(np.arange(0, 360, 2.0))
+    pixels = (np.array([16.0, 15.0]) + 6.0 * np.column_stack([np.cos(turned), np.sin(turned)])) / scale
+    one = Ring(pixels, np.tile(0.01 * np.eye(2), (len(pixels), 1, 1)))
+    matrices = np.stack([rigid.transform(np.eye(3), [0, 0, k]) @ np.diag([*scale, 1, 1]) for k in range(8)])
+    tube = tube_wall.fit_tube([one] * 8, matrices)
+
+    def sigma(covariance: np.ndarray) -> float:
+        known = Uncertainty(("sx", "sy"), covariance)
+        return tube_wall.scale_sigma([one] * 8, matrices, tube, ProbeCalibration(np.eye(4), scale, known))
+
+    together = np.outer(0.01 * scale, 0.01 * scale)
+    assert sigma(together) == pytest.approx(0.06, rel=0.02)
+    assert sigma(np.diag(np.diag(together))) == pytest.approx(0.06 / np.sqrt(2), rel=0.1)
+    assert tube_wall.scale_sigma([one] * 8, matrices, tube, ProbeCalibration(np.eye(4), scale)) == 0

@@ -1,0 +1,126 @@
+"""Closed surfaces of masses: signed distances to them, and surfaces without folds from these."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+from scipy.spatial import KDTree
+from skimage.measure import marching_cubes
+
+from recon.files.volumes import Volume
+from recon.freehand.volume_compounding import Grid
+from recon.geometry import rigid
+from recon.segmentation import prefetch
+
+Array = NDArray[np.float64]
+
+EVEN_MM = 0.5  # standard deviation; a voxel
+LEVELLINGS = 4  # Newton's steps to the level that holds the volume
+NEAR_MM = 1.5  # of a vertex, within which distances come from the surface itself
+NEIGHBOURS = 6  # vertices that the distance to a surface is taken from
+FAR_MM = 5.0  # around a mass, to which distances reach
+
+
+@dataclass(frozen=True)
+class Mass:
+    """A mass in the world."""
+
+    mesh: trimesh.Trimesh  # closed, mm
+
+    @property
+    def volume(self) -> float:
+        """mm^3."""
+        return float(self.mesh.volume)
+
+    @property
+    def centre(self) -> Array:
+        """Centre of gravity : (3,) mm."""
+        return np.asarray(self.mesh.center_mass)
+
+
+def evened(mass: Mass, lattice: Volume) -> Mass:
+    """The same mass without folds and spikes finer than a voxel, of the same volume.
+
+    Moved vertices can cross each other; the smoothed distance to them has a clean surface, taken at the level of the same volume.
+    """
+    low, high = around(mass, lattice, NEAR_MM + 3 * EVEN_MM)
+    origin = rigid.apply(lattice.world_from_voxel, low)
+    near = distances([mass], Grid(tuple(high - low), origin, lattice.spacing, lattice.directions))
+    field, whole = ndimage.gaussian_filter(near.voxels, EVEN_MM / lattice.spacing[::-1]), 3 * (slice(0, None),)
+    level, volume = 0.0, enclosed(np.asarray(mass.mesh.vertices), mass.mesh.faces).sum()
+    for _ in range(LEVELLINGS):
+        mesh = meshed(field, level, whole, near, outside=FAR_MM)
+        level += (volume - enclosed(np.asarray(mesh.vertices), mesh.faces).sum()) / mesh.area
+    return Mass(meshed(field, level, whole, near, outside=FAR_MM))
+
+
+def around(mass: Mass, lattice: Volume, margin_mm: float = FAR_MM) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First voxel and the one after the last : (3,) x, y, z, of the box around a mass, maybe beyond the lattice."""
+    voxel = rigid.apply(np.linalg.inv(lattice.world_from_voxel), mass.mesh.vertices)
+    margin = margin_mm / lattice.spacing
+    return np.floor(voxel.min(axis=0) - margin).astype(int), np.ceil(voxel.max(axis=0) + margin).astype(int) + 1
+
+
+def distances(masses: Sequence[Mass], grid: Grid) -> Volume:
+    """Signed distance to the masses : mm, negative inside, on a grid; `FAR_MM` at most, and exact near them only."""
+    field = np.full(grid.size[::-1], FAR_MM, np.float32)
+    volume = Volume(field, grid.origin, grid.spacing, grid.directions)
+    for mass in masses:
+        low, high = around(mass, volume)
+        part = tuple(slice(max(a, 0), min(b, n)) for a, b, n in zip(low[::-1], high[::-1], field.shape, strict=True))
+        near = _near_distance(mass.mesh, volume, part)
+        apart, _ = ndimage.label(np.isnan(near))
+        bodies, count = ndimage.label((apart != apart[0, 0, 0]) & ~(near >= 0))
+        inside = bodies == np.bincount(bodies.ravel())[1:].argmax() + 1 if count else bodies > 0  # narrow hollows are unsure
+        out, into = prefetch.mapped(lambda one: ndimage.distance_transform_edt(one, grid.spacing[::-1]), (~inside, inside))
+        whole = np.asarray(out) - np.asarray(into) - np.where(inside, -0.5, 0.5) * grid.spacing[0]
+        signed = np.where(np.isfinite(near) & ((near < 0) == inside), near, whole)
+        field[part] = np.minimum(field[part], np.clip(signed, -FAR_MM, FAR_MM))
+    return volume
+
+
+def _near_distance(mesh: trimesh.Trimesh, volume: Volume, part: tuple[slice, ...]) -> NDArray:
+    """Signed distance of a part's voxels to a mesh, by the tangent planes of its nearest vertices; NaN beyond `NEAR_MM`."""
+    shape, low = tuple(s.stop - s.start for s in part), [s.start for s in part[::-1]]
+    voxel = np.rint(rigid.apply(np.linalg.inv(volume.world_from_voxel), mesh.vertices)).astype(int) - low
+    apart = np.ones(shape, bool)
+    apart[tuple(np.clip(voxel, 0, np.array(shape[::-1]) - 1).T[::-1])] = False
+    k, j, i = np.nonzero(np.asarray(ndimage.distance_transform_edt(apart, volume.spacing[::-1])) < NEAR_MM)
+    places = rigid.apply(volume.world_from_voxel, np.column_stack([i, j, k]) + low)
+    _, nearest = KDTree(mesh.vertices).query(places, k=NEIGHBOURS, workers=-1)
+    across = ((places[:, None] - mesh.vertices[nearest]) * mesh.vertex_normals[nearest]).sum(axis=2)
+    result = np.full(shape, np.nan)
+    result[k, j, i] = across.mean(axis=1)
+    return result
+
+
+def meshed(field: NDArray, level: float, part: tuple[slice, ...], volume: Volume, outside: float = 1.0) -> trimesh.Trimesh:
+    """The largest closed surface at a level of a field, given in a part of a volume and constant outside of it."""
+    vertices, faces, _, _ = marching_cubes(np.pad(field, 1, constant_values=outside), level)
+    index = vertices[:, ::-1] - 1 + [s.start for s in part[::-1]]
+    places, faces = _largest(rigid.apply(volume.world_from_voxel, index), faces)
+    outwards = faces if enclosed(places, faces).sum() > 0 else faces[:, ::-1]
+    return trimesh.Trimesh(places, outwards, process=False)
+
+
+def enclosed(vertices: Array, faces: NDArray[np.int32]) -> Array:
+    """Signed volumes : (m,) mm^3 of the tetrahedra of triangles and the vertices' mean; they add up to a closed surface's."""
+    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
+    return (a * np.cross(b, c)).sum(axis=1) / 6
+
+
+def _largest(vertices: Array, faces: NDArray[np.int32]) -> tuple[Array, NDArray[np.int32]]:
+    """Vertices and faces of the connected surface with the greatest volume."""
+    ends = np.hstack([faces[:, :2].T, faces[:, 1:].T])
+    joined = sparse.coo_matrix((np.ones(ends.shape[1], bool), ends), shape=2 * (len(vertices),))
+    count, label = csgraph.connected_components(joined, directed=False)
+    if count == 1:
+        return vertices, faces
+    volumes = np.bincount(label[faces[:, 0]], enclosed(vertices, faces), count)
+    chosen = label == np.abs(volumes).argmax()
+    number = np.cumsum(chosen) - 1
+    return vertices[chosen], number[faces[chosen[faces[:, 0]]]]

@@ -1,0 +1,131 @@
+"""Masses, or a tube, in the B-scans of a sweep: closed surfaces, their figures, and B-scans with the outlines drawn over."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.files.metrics import Metrics, shown
+from recon.freehand import scans as freehand_scans
+from recon.freehand.scans import Scans
+from recon.model.probe import SCANNER_SPEED
+from recon.segmentation import masses, scan_overlays, tube_wall
+from recon.segmentation.containment import Containment, contain
+from recon.segmentation.masses import Mass
+from recon.segmentation.refraction import Sound
+from recon.segmentation.scan_overlays import Overlay
+from recon.segmentation.tube_wall import Appearance, Ring, Tube
+
+Array = NDArray[np.float64]
+
+OVERLAYS = 4
+NONE_FOUND = "none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"
+
+
+@dataclass(frozen=True)
+class Segmented:
+    """Surfaces of a sweep, with what is reported of them."""
+
+    meshes: dict[str, trimesh.Trimesh]  # by the files' names
+    figures: Metrics
+    lines: list[str]  # for the console
+    overlays: list[Overlay]
+
+
+def find_masses(
+    scans: Scans,
+    skin: trimesh.Trimesh | None = None,
+    mass_m_s: float = SCANNER_SPEED,
+    dynamic_range_db: float = 60.0,
+    overlays: int = OVERLAYS,
+) -> Segmented:
+    """Find masses; with a skin, whether they lie under it.
+
+    Raises
+    ------
+    InputError
+        As `recon.segmentation.masses.from_scans`.
+    """
+    scans = freehand_scans.in_memory(scans)  # they are read five times and more
+    sound, placed = Sound(scans.speed_m_s, mass_m_s), scans.world_from_pixel
+    grey = masses.tissue_grey(scans.stream(), scans.shape, placed)
+    found = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey)
+    figures: Metrics = {"tissue_grey": grey, "masses": len(found)}
+    lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {NONE_FOUND}"])]
+    for number, mass in enumerate(found):
+        under = None if skin is None else contain(mass.mesh, skin)
+        figures |= measure(f"mass{number}", mass, under)
+        lines.append(f"mass{number}       {describe(mass, under)}")
+    drawn = scan_overlays.of_masks(scans.stream(), masses.shown(found, placed, scans.shape, sound), overlays)
+    return Segmented({f"mass{k}": mass.mesh for k, mass in enumerate(found)}, figures, lines, drawn)
+
+
+def measure(name: str, mass: Mass, under: Containment | None) -> Metrics:
+    """Figures of a mass, each named with its unit."""
+    figures: Metrics = {f"{name}_volume_mm3": mass.volume}
+    figures |= {f"{name}_centre_{axis}_mm": float(value) for axis, value in zip("xyz", mass.centre, strict=True)}
+    figures |= {f"{name}_extent_{axis}_mm": float(value) for axis, value in zip("xyz", mass.mesh.extents, strict=True)}
+    if under is not None:
+        inside = np.nan if under.inside is None else int(under.inside)
+        figures |= {f"{name}_inside": inside, f"{name}_covered": under.covered, f"{name}_depth_mm": under.least_mm}
+    return figures
+
+
+def describe(mass: Mass, under: Containment | None) -> str:
+    """One line: volume, centre and extent of a mass, and its depth below the skin."""
+    centre = ", ".join(f"{value:.1f}" for value in mass.centre)
+    text = f"{mass.volume:.0f} mm3, centre {centre} mm, {' x '.join(f'{value:.1f}' for value in mass.mesh.extents)} mm"
+    if under is None:
+        return text
+    if under.inside is None:
+        return f"{text}, inside unknown: only {100 * under.covered:.0f} % lies under the surface"
+    return f"{text}, {'inside' if under.inside else 'not inside'}, {shown(under.least_mm, '.1f')} mm below the skin"
+
+
+def find_tube(scans: Scans, look: Appearance | None = None, overlays: int = OVERLAYS) -> Segmented:
+    """Find a tube, and its wall in the B-scans.
+
+    Raises
+    ------
+    InputError
+        If fewer than three B-scans show its wall.
+    """
+    matrices = scans.world_from_pixel
+    scale = np.array(masses.pixel_mm(matrices))
+    rings = [tube_wall.find(image, scale, look) for image in scans.stream()]
+    try:
+        tube = tube_wall.fit_tube(rings, matrices)
+    except InputError as error:
+        reasons = [one.reason for one in rings if one.reason]
+        most = f"; most others: {max(set(reasons), key=reasons.count)}" if reasons else ""
+        raise InputError(f"{error}{most}") from None
+    of_scale = 0.0 if scans.probe is None else tube_wall.scale_sigma(rings, matrices, tube, scans.probe)
+    figures = measure_tube(tube, of_scale)
+    diameter, sigma, used = (figures[f"tube_{name}"] for name in ("diameter_mm", "diameter_sigma_mm", "frames"))
+    line = f"tube        {diameter:.3f} mm in diameter, sigma {sigma:.3f} mm, {used} B-scans, RMS {tube.rms:.3f} mm"
+    outlines = {int(k): rings[k].pixels for k in np.unique(tube.frames)}
+    drawn = scan_overlays.of_outlines(scans.stream(), outlines, overlays)
+    return Segmented({"tube": tube_mesh(tube, rings, matrices)}, figures, [line], drawn)
+
+
+def measure_tube(tube: Tube, of_scale_mm: float) -> Metrics:
+    """Figures of a tube, each named with its unit, with the part of the radius' standard deviation due to the probe's scale."""
+    return {
+        "tube_diameter_mm": 2 * tube.shape.radius,
+        "tube_diameter_sigma_mm": 2 * float(np.hypot(tube.sigma_mm, of_scale_mm)),
+        "tube_rms_mm": tube.rms,
+        "tube_frames": len(np.unique(tube.frames)),
+        **{f"tube_axis_{axis}": float(value) for axis, value in zip("xyz", tube.shape.axis, strict=True)},
+        **{f"tube_point_{axis}_mm": float(value) for axis, value in zip("xyz", tube.shape.point, strict=True)},
+    }
+
+
+def tube_mesh(tube: Tube, rings: Sequence[Ring], matrices: Array) -> trimesh.Trimesh:
+    """The cylinder, between the farthest points of the wall along its axis."""
+    points = np.concatenate([tube_wall.in_world(rings[k].pixels, matrices[k]) for k in np.unique(tube.frames)])
+    along = (points - tube.shape.point) @ tube.shape.axis
+    ends = tube.shape.point + np.outer([along.min(), along.max()], tube.shape.axis)
+    return trimesh.creation.cylinder(tube.shape.radius, segment=ends, sections=96)

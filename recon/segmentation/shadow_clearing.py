@@ -1,0 +1,106 @@
+"""Echo power without the masses' shadows: pixels put back to their true places, and as bright as without the masses.
+
+Tissue some mm around the masses has one backscatter, so the mean brightness there, by depth and by length of the way through
+masses, gives the loss of both.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from recon.files.volumes import Volume
+from recon.freehand.volume_compounding import Clip, Grid
+from recon.geometry import rigid
+from recon.segmentation import echo_power, prefetch
+from recon.segmentation.echo_power import EchoPower, pixel_mm
+from recon.segmentation.mass_surface import FAR_MM, Mass, distances
+from recon.segmentation.refraction import Sound, follow
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+
+CLEAR_MM = 2.0  # from a border, where pixels show one tissue only
+MOST_BY_PATH = 0.25  # nepers a mm: 11 dB/cm more than tissue, there and back
+MOST_LOSS = 0.05  # of power left: darker pixels are left out rather than made as bright as they were
+THINNED = 4  # pixels, columns and rows, of which one counts for the losses
+DEPTH_BINS, PATH_BINS = 60, 40  # of 1 mm
+
+
+@dataclass(frozen=True)
+class Recording:
+    """B-scans in space, with the power of their grey levels."""
+
+    images: Callable[[], Iterator[NDArray[np.uint8]]]  # n of (h, w), one by one, from the first at each call
+    world_from_pixel: Array  # (n, 4, 4), NaN where there is no pose
+    table: Map  # (256,) power of each grey level
+    clip: Clip
+
+
+def cleared(recording: Recording, grid: Grid, masses: Sequence[Mass], sound: Sound) -> EchoPower:
+    """Average power anew, with each pixel at the place of its echo, and as bright as without the masses' shadows."""
+    inside, scale = distances(masses, grid), pixel_mm(recording.world_from_pixel)
+    by_depth, by_path = losses(recording, inside, sound)
+    table, top = recording.table, recording.clip.v
+
+    def place(scan: tuple[NDArray[np.uint8], Array]) -> tuple[Map, Map, Map]:
+        image, matrix = scan
+        if not np.isfinite(matrix).all():
+            return table[image], table[image], table[image]
+        lines = follow(inside, scale, matrix, image.shape, sound)
+        rows = np.arange(image.shape[0], dtype=np.float32)[:, None] * scale[1]
+        left = lines.passed * np.exp(-by_path * lines.within)
+        power = np.where(left > MOST_LOSS, table[image] / np.maximum(left, MOST_LOSS), np.nan) * np.exp(by_depth * rows)
+        return power[top:].astype(np.float32), lines.u[top:], lines.v[top:]
+
+    scans = zip(recording.images(), recording.world_from_pixel, strict=True)
+    return echo_power.accumulated(prefetch.mapped(place, scans), recording.world_from_pixel, grid)
+
+
+def losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, float]:
+    """Loss of power, nepers a mm: of tissue with depth, beyond the scanner's gain; and of masses, beyond that of tissue.
+
+    Fitted to the mean power of tissue some mm around the masses, by depth and length of the way through masses.
+    """
+    scale, table = pixel_mm(recording.world_from_pixel), recording.table
+    rows = slice(recording.clip.v, None, THINNED)
+
+    def binned(scan: tuple[NDArray[np.uint8], Array]) -> tuple[NDArray[np.int64], Array]:
+        image, matrix = scan
+        lines = follow(inside, scale, matrix, image.shape, sound, THINNED)
+        u, v, within, passed = (a[rows] for a in (lines.u, lines.v, lines.within, lines.passed))
+        power = table[image[rows, ::THINNED]]
+        away = _sampled(inside, matrix, u, v)
+        used = (away > CLEAR_MM) & (away < FAR_MM - 0.2) & (passed > 0.5)
+        bins = np.minimum(v[used] * scale[1], DEPTH_BINS - 1).astype(int) * PATH_BINS
+        return bins + np.minimum(within[used], PATH_BINS - 1).astype(int), power[used] / passed[used]
+
+    total, count = np.zeros((2, DEPTH_BINS * PATH_BINS))
+    scans = zip(recording.images(), recording.world_from_pixel, strict=True)
+    placed = (scan for scan in scans if np.isfinite(scan[1]).all())
+    for bins, power in prefetch.mapped(binned, placed):
+        total += np.bincount(bins, power, len(total))
+        count += np.bincount(bins, minlength=len(count))
+    return _fitted_losses(total, count)
+
+
+def _fitted_losses(total: Array, count: Array) -> tuple[float, float]:
+    """Slopes of the log mean power by depth and by path, each bin weighed by its number of pixels; 0 if bins are too few."""
+    enough = (count > 20) & (total > 0)
+    if enough.sum() < 4:
+        return 0.0, 0.0
+    depth, path = np.divmod(np.flatnonzero(enough), PATH_BINS)
+    path = np.where(path > 0, path + 0.5, 0.0)
+    design = np.column_stack([np.ones(enough.sum()), -(depth + 0.5), -path]) * np.sqrt(count[enough])[:, None]
+    level = np.log(total[enough] / count[enough]) * np.sqrt(count[enough])
+    _, by_depth, by_path = np.linalg.lstsq(design, level)[0]
+    return float(max(by_depth, 0.0)), float(np.clip(by_path, 0.0, MOST_BY_PATH))
+
+
+def _sampled(inside: Volume, world_from_pixel: Array, u: NDArray, v: NDArray) -> Array:
+    """Signed distance at pixels, mm."""
+    voxel_from_pixel = np.linalg.inv(inside.world_from_voxel) @ world_from_pixel
+    i, j, k = np.moveaxis(rigid.apply(voxel_from_pixel, np.stack([u, v, 0 * u], axis=-1)), -1, 0)
+    return ndimage.map_coordinates(inside.voxels, [k, j, i], order=1, mode="nearest")

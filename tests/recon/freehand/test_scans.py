@@ -1,0 +1,39 @@
+"""B-scans in space: are they read no more often than need be, and no more kept than there is room for?"""
+
+import numpy as np
+
+from recon.freehand import scans
+from recon.freehand.scans import Scans
+
+
+def recorded(reads: list[int]) -> Scans:
+    def stream():
+        for k in range(3):
+            reads.append(k)
+            yield np.full((4, 5), k, np.uint8)
+
+    matrices = np.tile(np.eye(4), (3, 1, 1))
+    matrices[1] = np.nan
+    return Scans((4, 5), matrices, stream, 1540.0, 1488.0)
+
+
+def test_images_are_read_once_where_there_is_room():
+    reads = []
+    kept = scans.in_memory(recorded(reads), 60)
+    for _ in range(3):
+        np.testing.assert_array_equal([image[0, 0] for image in kept.stream()], [0, 1, 2])
+    assert reads == [0, 1, 2]
+
+
+def test_images_are_read_anew_where_there_is_none():
+    reads = []
+    streamed = scans.in_memory(recorded(reads), 59)
+    assert not reads
+    assert [image[0, 0] for image in streamed.stream()] == [image[0, 0] for image in streamed.stream()]
+    assert reads == 2 * [0, 1, 2]
+
+
+def test_what_is_said_of_them():
+    few = recorded([])
+    assert scans.summary(few) == "3 B-scans, 5x4, 2 with a pose"
+    assert scans.depths(few) == "right where sound makes 1540 m/s, converted from 1488 m/s, for which the probe is calibrated"

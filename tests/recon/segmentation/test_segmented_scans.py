@@ -1,0 +1,20 @@
+"""What is said and counted of masses found in a sweep."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from recon.segmentation import segmented_scans
+from recon.segmentation.containment import Containment
+from recon.segmentation.masses import Mass
+
+
+def test_whether_a_mass_is_inside_may_be_unknown():
+    """Covered by less than half, with nothing above the surface."""
+    mass = Mass(trimesh.creation.icosphere(radius=3))
+    depths = np.full(len(mass.mesh.vertices), np.nan)
+    depths[: round(0.48 * len(depths))] = 2.0
+    under = Containment(depths)
+    assert segmented_scans.describe(mass, under).endswith("unknown: only 48 % lies under the surface")
+    figures = segmented_scans.measure("mass0", mass, under)
+    assert np.isnan(figures["mass0_inside"]) and figures["mass0_covered"] == pytest.approx(0.48, abs=0.01)
