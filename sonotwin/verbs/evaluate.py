@@ -31,7 +31,7 @@ class Config(BaseModel):
 
 
 def run(config: Config) -> None:
-    """Compare, say how far off the surface is, and write.
+    """Compare a surface with its truth, report its errors, and write.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Reconstruct the surface that a camera and the projector saw.
+"""Reconstruct the surface in the common view of a camera and the projector.
 
 Reads a capture folder, whether devices or the twin wrote it, or a bare folder of images with its patterns and calibration.
 Writes surface.ply (mm), surface.glb (metres, y up), points.npz (the point of every pixel, with its predicted sigma) and
@@ -16,25 +16,22 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from pydantic import BaseModel, ConfigDict
 
 from recon.capture import surface_part
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
-from recon.files.metrics import Metrics, shown
-from recon.geometry.camera import Camera
-from recon.structured_light import decode, surface_mesh
-from recon.structured_light.decode import ProjectorMap, Status
-from recon.structured_light.triangulate import PointMap, Triangulator
+from recon.files.metrics import shown
+from recon.structured_light import decode, surface_figures, surface_mesh
+from recon.structured_light.triangulate import Triangulator
 from sonotwin import config as configuration
 
 POINTS = "points.npz"  # by which the folder of a surface is known
 
 
 class Config(BaseModel):
-    """Where the capture is, where the surface goes, and what counts as surface."""
+    """Fields of `conf/surface.yaml`: sources, target, and limits of the surface."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -67,7 +64,7 @@ def run(config: Config) -> None:
     Raises
     ------
     InputError
-        If the input is incomplete or damaged, `out` can't be written to, or nothing is seen by both devices.
+        If the input is incomplete or damaged, `out` can't be written to, or the devices have no view in common.
     """
     atomic.check_folder(config.out, POINTS, inputs=sources(config))
     watch = Stopwatch()
@@ -77,7 +74,7 @@ def run(config: Config) -> None:
 
     with watch.stage("decode"):
         found = decode.decode(shots.images, shots.patterns, bits=shots.bits, name=shots.name)
-    for line in report(shots, found):
+    for line in surface_figures.describe_decoding(shots.patterns, found):
         print(line)
 
     with watch.stage("rays"):
@@ -90,7 +87,8 @@ def run(config: Config) -> None:
         raise InputError(f"{shots.name}: expected a surface that camera and projector both see, found no point of it")
     with watch.stage("mesh"):
         mesh = surface_mesh.mesh(cleaned, camera, config.limits.max_slope)
-    figures = measure(found, raw, cleaned) | {"predicted_rms_mm": predicted_rms(mesh, camera), "triangles": len(mesh.faces)}
+    predicted = {"predicted_rms_mm": surface_figures.predicted_rms(mesh, camera), "triangles": len(mesh.faces)}
+    figures = surface_figures.measure(found, raw, cleaned) | predicted
     points, sigma = f"{figures['points']:,}".replace(",", " "), shown(figures["predicted_rms_mm"], ".3f", " mm")
     print(f"triangulate {points} points, predicted sigma {sigma}, {figures['removed_px']} px removed as unsure")
 
@@ -105,12 +103,12 @@ def run(config: Config) -> None:
 
 
 def read(config: Config) -> SurfaceCapture:
-    """Read the capture from wherever the fields say.
+    """Read the capture, or the bare folder of images.
 
     Raises
     ------
     InputError
-        If the fields name no source or two, or what they name is damaged.
+        If the fields name no source or two, or a source is damaged.
     """
     bare = {"images": config.images, "patterns": config.patterns, "calibration": config.calibration}
     given = [name for name, value in bare.items() if value is not None]
@@ -125,7 +123,7 @@ def read(config: Config) -> SurfaceCapture:
 
 
 def sources(config: Config) -> list[Path]:
-    """What the fields name to be read."""
+    """Files and folders to be read."""
     patterns = None if config.patterns is None else patterns_file(config.patterns)
     return [path for path in (config.capture, config.images, patterns, config.calibration) if path is not None]
 
@@ -134,48 +132,3 @@ def patterns_file(name: str) -> Path:
     """The file of a pattern sequence, given as a path or as a name from `conf/patterns`."""
     known = configuration.folder() / "patterns" / f"{name}.yaml"
     return known if known.is_file() and not Path(name).is_file() else Path(name)
-
-
-def report(shots: SurfaceCapture, found: ProjectorMap) -> Iterator[str]:
-    """Lines that say how decoding and unwrapping went."""
-    count, height, width = shots.images.shape
-    lit = found.modulation[found.status != Status.DARK]
-    strength = np.median(lit) if lit.size else 0.0
-    saturated = 100 * found.summary["saturated"] / found.status.size
-    yield f"decode      {count} images, {width}x{height}, modulation {strength:.0f} DN, {saturated:.1f} % saturated"
-    notes = [str(shots.patterns.unwrap).replace("_", " ")]
-    if "regions" in found.summary:
-        regions, islands = _counted(found.summary["regions"], "region"), _counted(found.summary["islands"], "island")
-        notes.append(f"{regions}, {islands} left out ({found.summary['unreachable']} px)")
-    notes.append(f"{found.summary['uncertain']} px uncertain")
-    yield f"unwrap      {', '.join(notes)}"
-
-
-def _counted(number: int, thing: str) -> str:
-    return f"{number} {thing}{'' if number == 1 else 's'}"
-
-
-def measure(found: ProjectorMap, raw: PointMap, cleaned: PointMap) -> Metrics:
-    """Figures of a reconstruction, each named with its unit."""
-    before, after = np.isfinite(raw.points[..., 0]), np.isfinite(cleaned.points[..., 0])
-    points = int(after.sum())
-    return {
-        "points": points,
-        "removed_px": int(before.sum()) - points,
-        "unreachable_px": found.summary["unreachable"],
-        "uncertain_px": found.summary["uncertain"],
-        "saturated_fraction": found.summary["saturated"] / found.status.size,
-        "modulation_median_dn": float(np.median(found.modulation[after])),
-    }
-
-
-def predicted_rms(mesh: trimesh.Trimesh, camera: Camera) -> float:
-    """Root mean square of the predicted standard deviations across the surface, mm; NaN if there are none.
-
-    Sigma lies along the camera's ray; its part along the vertex normal moves the surface.
-    """
-    offset = mesh.vertices - camera.centre
-    cosine = (offset * mesh.vertex_normals).sum(axis=1) / np.linalg.norm(offset, axis=1)
-    across = mesh.vertex_attributes["sigma_mm"].astype(float) * cosine
-    known = across[np.isfinite(across)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else np.nan

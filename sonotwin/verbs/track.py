@@ -1,10 +1,10 @@
 """Track the probe's target through the frames of two cameras.
 
 Reads a capture folder with frames of both cameras (sweep/cam1, sweep/cam2) and their calibration; frames are paired by their time
-stamps. Writes into the folder `out`: poses.csv, poses with their covariance in the layout that all verbs read; frames.csv, how
-each pose was found or why not; overlays/, both views side by side with what was seen in them; and metrics.json. Frames are read
-one after the other, so a film may be of any length. Results that are there already are replaced. Takes some seconds, the first
-time a minute to compile, and 20 to 60 frames a second from then on.
+stamps. Writes into the folder `out`: poses.csv, poses with their covariance in the layout that all verbs read; frames.csv, the
+way in which each pose was found, or the reason why not; overlays/, both views side by side with the rims found; and metrics.json.
+Frames are read one after the other, so a film may be of any length. Results that are there already are replaced. Takes some
+seconds, the first time a minute to compile, and 20 to 60 frames a second from then on.
 
 If the capture has B-scans too (sweep/us), `out` becomes a capture itself, those images with these poses, and the verbs that need
 poses are given it instead:
@@ -15,9 +15,6 @@ poses are given it instead:
     sonotwin freehand capture=tracked probe=probe.yaml lag_s=0.05 out=volume
 """
 
-import re
-from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated
@@ -30,14 +27,10 @@ from rich.progress import Progress
 from recon.capture import stereo_frames
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
-from recon.files.metrics import Metrics, shown
 from recon.model.rig import Rig
-from recon.tracking import networks, results
+from recon.tracking import networks, results, track_figures
 from recon.tracking.results import Step
 from recon.tracking.tracker import Tracker
-
-WAYS = ("predicted", "segmented", "detected")
-KINDS = 4  # of reasons that are told apart
 
 
 class Config(BaseModel):
@@ -75,8 +68,8 @@ def run(config: Config) -> None:
     with atomic.new_folder(config.out, results.POSES) as folder:
         start = perf_counter()
         steps = follow(film, tracker, folder if config.overlays else None, console)
-        figures = measure(steps)
-        for line in describe(steps, figures):
+        figures = track_figures.measure(steps)
+        for line in track_figures.describe(steps, figures):
             console.print(line, markup=False)
         results.write_poses(folder, film, steps)
         metrics.write(folder / metrics.FILE, figures | {"seconds_track": round(perf_counter() - start, 3)})
@@ -96,46 +89,3 @@ def follow(film: Film, tracker: Tracker, pictures: Path | None, console: Console
             if pictures is not None:
                 results.write_overlay(pictures, number, results.overlay(pair, found, film.cameras))
     return steps
-
-
-def measure(steps: Sequence[Step]) -> Metrics:
-    """Figures of what was tracked; frames a second are of the tracker alone, in its median frame."""
-    found = [step for step in steps if step.found]
-    sigma = np.array([step.sigmas for step in found]).reshape(-1, 2)
-    typical = np.median(sigma, axis=0) if found else np.full(2, np.nan)
-    return {
-        "frames": len(steps),
-        "frames_found": len(found),
-        **{f"frames_{way}": sum(step.how == way for step in found) for way in WAYS},
-        "sigma_median_mm": float(typical[0]),
-        "sigma_median_deg": float(typical[1]),
-        "frames_per_s": 1 / max(float(np.median([step.seconds for step in steps])), 1e-9),
-    }
-
-
-def describe(steps: Sequence[Step], figures: Metrics) -> list[str]:
-    """How many were found and why not the others, how, how fast and how well."""
-    found, count = figures["frames_found"], figures["frames"]
-    missed = ", ".join(f"{kind} ({number})" for kind, number in kinds([step.reason for step in steps]))
-    left = f", {count - found} not: {missed}" if found < count else ""
-    ways = ", ".join(f"{figures[f'frames_{way}']} {way}" for way in WAYS if figures[f"frames_{way}"])
-    return [
-        f"found       {found} of {count} frames{left}",
-        f"speed       {figures['frames_per_s']:.1f} frames a second, in the median{f'; {ways}' if ways else ''}",
-        f"sigma       {shown(figures['sigma_median_mm'], '.3f', ' mm')}, {shown(figures['sigma_median_deg'], '.3f', ' deg')}, "
-        "predicted, median",
-    ]
-
-
-def kinds(reasons: Sequence[str | None]) -> list[tuple[str, int]]:
-    """Reasons without their details, the commonest first, each with how often; the rarest are put together."""
-    counted = Counter(kind(reason) for reason in reasons if reason is not None).most_common()
-    rest = sum(number for _, number in counted[KINDS:])
-    return counted[:KINDS] + ([("others", rest)] if rest else [])
-
-
-def kind(reason: str) -> str:
-    """A reason without its details."""
-    if reason.startswith("camera 1:"):
-        return "no camera sees all three circles"
-    return re.sub(r"(?<!\w)(?<!camera )\d[\d.]*", "…", re.split(r"[;:]", reason)[0])

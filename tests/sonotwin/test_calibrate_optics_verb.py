@@ -18,9 +18,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.boards import Chessboard
 from recon.model.calibration import Calibration
-from recon.optical_calibration.sightings import Sighting
 from sonotwin.cli import main
-from sonotwin.verbs.calibrate_optics import found_by
 from tests.recon import board_views
 
 SIZE = (320, 256)
@@ -179,12 +177,6 @@ def test_a_third_camera_is_warned_of(copied, tmp_path, capsys):
         "warning     cam3: not calibrated, as only cam1, cam2, projector can be"
     ]
     assert list(calibration_files.read(tmp_path / "out" / "optics.yaml").cameras) == ["cam1", "cam2"]
-
-
-def test_a_device_counts_where_it_sees_points():
-    nowhere, somewhere = np.full((4, 2), np.nan), np.arange(8.0).reshape(4, 2)
-    sightings = [Sighting(name, {"cam1": somewhere, "cam2": at}, {}, nowhere) for name, at in (("a", nowhere), ("b", somewhere))]
-    assert found_by(sightings, {"cam1": SIZE, "cam2": SIZE}) == "2 poses: cam1 2, cam2 1"
 
 
 def test_other_folders_are_not_replaced(session, tmp_path, capsys):

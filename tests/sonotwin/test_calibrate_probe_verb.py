@@ -140,7 +140,7 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, rig, 
     silent = [f"noise.{name}=0" for name in ("angle_deg", "position_mm", "pixel_px", "slice_mm")]
     assert complaint(capsys, *fields, *silent).startswith("calibrate-probe: noise: expected one standard deviation above zero")
     scanner = [f"lag_s={LAG_S}", "rig.probe.scale_mm_per_px=[0.1229,0.0122]"]
-    assert "calibration: sy: expected to tell a speed of sound" in complaint(capsys, *fields, *scanner)
+    assert "calibration: sy: expected to imply a speed of sound" in complaint(capsys, *fields, *scanner)
     assert "are the clocks others?" in complaint(capsys, *fields, "lag_s=100")
     assert complaint(capsys, f"pairs={tmp_path / 'a.csv'}", f"out={out}").endswith("a.csv: expected a file, found none")
     darker = "appearance.min_contrast_db=55"

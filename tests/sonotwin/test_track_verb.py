@@ -9,7 +9,6 @@ import pytest
 from recon.capture import sweep_tables
 from recon.tracking import networks
 from sonotwin.cli import main
-from sonotwin.verbs.track import kind, kinds
 from tests.recon.tracking import films
 from tests.recon.tracking.stand_ins import Told
 
@@ -69,21 +68,3 @@ def test_a_damaged_frame_leaves_nothing_behind(rig, told, tmp_path, capsys):
     assert main(["track", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 2
     assert capsys.readouterr().err.startswith(f"sonotwin: {path}: expected a whole PNG image")
     assert [entry.name for entry in tmp_path.iterdir()] == ["capture"]
-
-
-def test_reasons_are_put_together():
-    reasons = [
-        None,
-        "only camera 1 sees the target; camera 2: c0: 23 % of its rim seen",
-        "only camera 1 sees the target; camera 2: c0: 12 % of its rim seen",
-        "a misfit of 12 times the centres' uncertainty: other circles, or cameras swapped or moved",
-        "camera 1: 0 of 3 circles; camera 2: 1 of 3 circles",
-        "rays of c1 miss each other by 7.5 mm: other circles, or cameras swapped",
-    ]
-    assert kinds(reasons)[0] == ("only camera 1 sees the target", 2)
-    assert [kind(str(reason)) for reason in reasons[3:]] == [
-        "a misfit of … times the centres' uncertainty",
-        "no camera sees all three circles",
-        "rays of c1 miss each other by … mm",
-    ]
-    assert kinds([f"reason {letter}" for letter in "aabcdef"])[-1] == ("others", 2)

@@ -1,0 +1,77 @@
+"""From the board part of a capture to sightings: the devices that take part, and the poses in which each found the board."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from recon.capture.board_part import BoardCapture
+from recon.errors import InputError
+from recon.optical_calibration.joint_calibration import Result
+from recon.optical_calibration.observations import Size
+from recon.optical_calibration.sightings import Sighting, sight
+
+DEVICES = ("cam1", "cam2", "projector")  # in the order in which they are adjusted; the first is the world
+
+
+def sizes_of(captured: BoardCapture) -> dict[str, Size]:
+    """Image sizes of the devices that take part, in the order in which they stand in the calibration.
+
+    Raises
+    ------
+    InputError
+        If camera 1, whose frame is the world, is not among them.
+    """
+    sizes = {name: captured.devices[name].size for name in captured.cameras}
+    if captured.patterns is not None:
+        sizes["projector"] = captured.patterns.projector_size
+    if DEVICES[0] not in sizes:
+        raise InputError(f"{captured.name}: expected images of {DEVICES[0]}, the world's frame, found {', '.join(sizes)}")
+    return {name: sizes[name] for name in DEVICES if name in sizes}
+
+
+def look(captured: BoardCapture, number: int) -> Sighting:
+    """Read the images of one pose and find the board in those of the cameras that can be calibrated."""
+    pose = captured.pose(number)
+    lit = {camera: image for camera, image in pose.lit.items() if camera in DEVICES}
+    bits = {name: device.bits for name, device in captured.devices.items()}
+    return sight(pose.name, captured.board, lit, pose.fringes, captured.patterns, bits)
+
+
+def found_by(sightings: Sequence[Sighting], devices: Mapping[str, Size]) -> str:
+    """Numbers of poses in which each device found the board, in words."""
+    counts = (f"{device} {sum(_has_points(sighting, device) for sighting in sightings)}" for device in devices)
+    return f"{len(sightings)} poses: {', '.join(counts)}"
+
+
+def not_found(sightings: Sequence[Sighting]) -> dict[str, str]:
+    """Reasons by pose and device without any point of the board."""
+    return {f"{sighting.name} {device}": reason for sighting in sightings for device, reason in sighting.failures.items()}
+
+
+def refuse_lonely(sightings: Sequence[Sighting], name: str) -> None:
+    """Refuse a capture in which fewer than two devices found the board: nothing can be measured with one.
+
+    Raises
+    ------
+    InputError
+        With the commonest reason.
+    """
+    seeing = {device for sighting in sightings for device in sighting.pixels if _has_points(sighting, device)}
+    if len(seeing) >= 2:
+        return
+    reasons = [f"{device}: {reason}" for sighting in sightings for device, reason in sighting.failures.items()]
+    why = f" ({max(set(reasons), key=reasons.count)})" if reasons else ""
+    raise InputError(f"{name}: expected two devices or more that see the board, found {', '.join(seeing) or 'none'}{why}")
+
+
+def with_absent(result: Result, devices: Mapping[str, Size], cameras: Sequence[str]) -> Result:
+    """Add a warning for each device of the capture that is not in the result, and for each camera without a place in it."""
+    absent = [device for device in devices if device not in result.observations.devices]
+    lines = [f"{device}: not calibrated, as it saw the board in no pose" for device in absent]
+    lines += [f"{name}: not calibrated, as only {', '.join(DEVICES)} can be" for name in cameras if name not in DEVICES]
+    return replace(result, warnings=(*lines, *result.warnings))
+
+
+def _has_points(sighting: Sighting, device: str) -> bool:
+    return device in sighting.pixels and bool(np.isfinite(sighting.pixels[device]).all(axis=-1).any())

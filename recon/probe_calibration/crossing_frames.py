@@ -1,0 +1,77 @@
+"""Frames of a probe's calibration: in which of them the crossing of the wires was found, and the reasons in the others."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.probe_calibration import point_calibration
+from recon.probe_calibration.cross_wire import Appearance, Crossing
+from recon.probe_calibration.point_calibration import MIN_FRAMES, Sightings
+
+Array = NDArray[np.float64]
+Size = tuple[int, int]  # width, height, px
+
+
+@dataclass(frozen=True)
+class CrossingFrames:
+    """The crossing in n frames."""
+
+    name: str  # of the capture or file, for messages
+    size: Size
+    sightings: Sightings  # of the m usable frames
+    numbers: NDArray[np.int64]  # (n,) of the frames
+    crossings: tuple[Crossing, ...]  # (n,)
+
+    @property
+    def usable(self) -> NDArray[np.int64]:
+        """Indices of the frames with a sighting : (m,)."""
+        return np.flatnonzero([crossing.found for crossing in self.crossings])
+
+
+def look(
+    name: str,
+    images: Iterable[NDArray[np.uint8]],
+    size: Size,
+    numbers: NDArray[np.int64],
+    poses: Array,
+    pose_covariance: Array | None = None,
+    appearance: Appearance | None = None,
+) -> CrossingFrames:
+    """Find the crossing in n B-scans, taken one by one, at poses : (n, 4, 4) with a covariance : (n, 6, 6)."""
+    sightings, crossings = point_calibration.from_images(images, poses, appearance)
+    frames = CrossingFrames(name, size, sightings, numbers, tuple(crossings))
+    if pose_covariance is None:
+        return frames
+    return replace(frames, sightings=replace(sightings, pose_covariance=pose_covariance[frames.usable]))
+
+
+def of_pairs(name: str, size: Size, poses: Array, pixels: Array) -> CrossingFrames:
+    """Frames of n pairs of a pose and the crossing's pixel, found elsewhere."""
+    crossings = tuple(Crossing(pixel, np.full((2, 2), np.nan), np.nan) for pixel in pixels)
+    return CrossingFrames(name, size, Sightings(poses, pixels), np.arange(len(pixels)), crossings)
+
+
+def rejected(frames: CrossingFrames) -> dict[str, list[int]]:
+    """Numbers of the frames without a crossing, by kind of reason, the commonest first."""
+    kinds: dict[str, list[int]] = {}
+    for number, crossing in zip(frames.numbers.tolist(), frames.crossings, strict=True):
+        if crossing.reason is not None:
+            kinds.setdefault(crossing.reason.partition(":")[0], []).append(number)
+    return dict(sorted(kinds.items(), key=lambda item: -len(item[1])))
+
+
+def refuse_few(frames: CrossingFrames) -> None:
+    """Refuse a capture with too few usable frames, naming the commonest reason.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than six.
+    """
+    if len(frames.usable) < MIN_FRAMES:
+        reason = next(iter(rejected(frames)), "no more were given")
+        expected = f"{MIN_FRAMES} frames or more with a pose and the crossing"
+        raise InputError(f"{frames.name}: expected {expected}, found {len(frames.usable)} (most often: {reason})")

@@ -1,0 +1,116 @@
+"""Figures of a probe's calibration, the lines that report them, and the table of its frames."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from recon.files.metrics import Metrics
+from recon.model.probe import ProbeCalibration
+from recon.model.rig import Probe
+from recon.probe_calibration import crossing_frames, point_calibration, repeatability, sound_in_water
+from recon.probe_calibration.crossing_frames import CrossingFrames
+from recon.probe_calibration.point_calibration import Adjustment
+from recon.probe_calibration.tank_calibration import Result, Settings
+
+COLUMNS = ("frame", "status", "u", "v", "contrast_db", "residual_mm", "normalised", "reason")  # of the table of frames
+FIVE_POINTS = ("centre", "top_left", "top_right", "bottom_left", "bottom_right")
+SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reported
+
+
+def measure(frames: CrossingFrames, result: Result, design: Probe, settings: Settings) -> Metrics:
+    """Figures of a calibration, each named with its unit."""
+    found, calibration, uncertainty = result.adjustment, result.calibration, result.calibration.uncertainty
+    assert uncertainty is not None
+    expected = design.target_from_image.matrix()
+    pixels = repeatability.five_points(frames.size)
+    sigma = np.sqrt(np.trace(point_calibration.point_covariance(calibration, pixels), axis1=1, axis2=2))
+    turn = Rotation.from_matrix(expected[:3, :3].T @ calibration.target_from_image[:3, :3]).magnitude()
+    away = calibration.to_target(pixels[0]) - ProbeCalibration(expected, np.array(design.scale_mm_per_px)).to_target(pixels[0])
+    return {
+        "frames": len(frames.numbers),
+        "frames_rejected": len(frames.numbers) - len(frames.usable),
+        "frames_outliers": int(found.outliers.sum()),
+        "frames_used": int((~found.outliers).sum()),
+        "rms_mm": found.rms_mm,
+        "noise_factor": found.noise_factor,
+        "wires_apart_mm": found.apart_mm,
+        "echo_ahead_mm": settings.echo_ahead_mm,
+        "sx_mm_per_px": float(calibration.scale[0]),
+        "sy_mm_per_px": float(calibration.scale[1]),
+        "sx_sigma_mm_per_px": uncertainty.sigma("sx"),
+        "sy_sigma_mm_per_px": uncertainty.sigma("sy"),
+        "sy_measured_mm_per_px": float(found.calibration.scale[1]),
+        **{f"sigma_{name}_mm": float(value) for name, value in zip(FIVE_POINTS, sigma, strict=True)},
+        "implied_speed_m_per_s": result.implied_speed[0],
+        "implied_speed_sigma_m_per_s": result.implied_speed[1],
+        "water_speed_m_per_s": settings.water_speed,
+        "speed_m_per_s": calibration.speed_m_s,
+        "design_turn_deg": float(np.degrees(turn)),
+        "design_centre_mm": float(np.linalg.norm(away)),
+    }
+
+
+def describe_frames(frames: CrossingFrames, seconds: float) -> Iterator[str]:
+    """Lines: number of frames with the crossing, and reasons of the others."""
+    width, height = frames.size
+    found, count = len(frames.usable), len(frames.numbers)
+    yield f"find        {count} frames, {width}x{height}: crossing in {found}, {count - found} rejected, {seconds:.0f} s"
+    for reason, numbers in crossing_frames.rejected(frames).items():
+        yield f"rejected    {len(numbers)} {reason}: frame{'s' if len(numbers) > 1 else ''} {_listed(numbers)}"
+
+
+def describe(frames: CrossingFrames, found: Adjustment, figures: Metrics, design: Probe, settings: Settings) -> Iterator[str]:
+    """Lines: agreement of the frames, the probe with its uncertainty, and the speed of sound with its effect on depths."""
+    numbers = frames.numbers[frames.usable][found.outliers].tolist()
+    left_out = f", {len(numbers)} outlier{'s' if len(numbers) > 1 else ''} left out ({_listed(numbers)})" if numbers else ""
+    rms, factor = figures["rms_mm"], figures["noise_factor"]
+    yield f"calibrate   {figures['frames_used']} frames{left_out}; RMS {rms:.3f} mm, noise {factor:.2f} times the assumed"
+    if found.apart_mm:
+        ahead = f"their echo taken {figures['echo_ahead_mm']:.2f} mm before their axes"
+        yield f"wires       seen as lines, the axes {found.apart_mm:.2f} mm apart; {ahead}"
+    scales = ", ".join(
+        f"{name} {figures[f'{name}_mm_per_px']:.5f} ± {figures[f'{name}_sigma_mm_per_px']:.5f}" for name in ("sx", "sy")
+    )
+    turn, away = figures["design_turn_deg"], figures["design_centre_mm"]
+    yield f"probe       {scales} mm/px; {turn:.1f} deg and {away:.1f} mm from its design"
+    corners = [figures[f"sigma_{name}_mm"] for name in FIVE_POINTS[1:]]
+    centre, edge = f"{figures['sigma_centre_mm']:.3f} mm", f"{min(corners):.3f} to {max(corners):.3f} mm"
+    yield f"uncertain   image centre {centre}, corners {edge} (1 sigma, of the place in space)"
+    yield from _describe_sound(figures, design, settings)
+
+
+def _describe_sound(figures: Metrics, design: Probe, settings: Settings) -> Iterator[str]:
+    speed, sigma = figures["implied_speed_m_per_s"], figures["implied_speed_sigma_m_per_s"]
+    implied = f"{speed:.0f} ± {sigma:.0f} m/s by sy, if the scanner's is {design.scale_mm_per_px[1]:g} mm/px"
+    yield f"sound       {implied} for {settings.assumed_speed:g} m/s"
+    if settings.temperature_c is None:
+        same = f"as in the medium of the calibration, {figures['speed_m_per_s']:.0f} m/s, right for sweeps through the same"
+        yield f"depth       {same}; temperature_c=... converts it"
+        return
+    in_water, assumed = figures["water_speed_m_per_s"], settings.assumed_speed
+    deep = float(sound_in_water.shown_too_deep(SHOWN_DEPTH_MM, in_water, assumed))
+    shown = f"{abs(deep):.2f} mm too {'deep' if deep > 0 else 'shallow'} at {SHOWN_DEPTH_MM:g} mm"
+    yield f"water       {settings.temperature_c:g} °C, {in_water:.1f} m/s: assuming {assumed:g}, the scanner shows echoes {shown}"
+    scales = f"sy {figures['sy_measured_mm_per_px']:.5f} to {figures['sy_mm_per_px']:.5f} mm/px"
+    yield f"depth       converted from this water to {settings.wanted_speed:g} m/s: {scales}"
+
+
+def rows(frames: CrossingFrames, found: Adjustment) -> Iterator[Sequence[object]]:
+    """A row a frame, in the order of COLUMNS; empty where a frame has no such value."""
+    place = {int(k): m for m, k in enumerate(frames.usable)}
+    distances = np.linalg.norm(found.residuals, axis=1)
+    for k, (number, crossing) in enumerate(zip(frames.numbers.tolist(), frames.crossings, strict=True)):
+        contrast = f"{crossing.contrast_db:.1f}" if np.isfinite(crossing.contrast_db) else ""
+        if k not in place:
+            yield number, "rejected", "", "", contrast, "", "", crossing.reason
+            continue
+        m = place[k]
+        status = "outlier" if found.outliers[m] else "used"
+        pixel = [f"{value:.3f}" for value in crossing.pixel]
+        yield number, status, *pixel, contrast, f"{distances[m]:.4f}", f"{found.normalised[m]:.3f}", ""
+
+
+def _listed(numbers: Sequence[int], most: int = 10) -> str:
+    more = f" and {len(numbers) - most} more" if len(numbers) > most else ""
+    return ", ".join(map(str, numbers[:most])) + more

@@ -1,0 +1,28 @@
+"""Is every frame without the crossing counted with its reason?"""
+
+import numpy as np
+import pytest
+
+from recon.errors import InputError
+from recon.probe_calibration import crossing_frames
+from recon.probe_calibration.cross_wire import Crossing
+from recon.probe_calibration.crossing_frames import CrossingFrames
+from recon.probe_calibration.point_calibration import Sightings
+
+NOWHERE = (np.full(2, np.nan), np.full((2, 2), np.nan), np.nan)
+
+
+def test_reasons_are_put_together_by_kind():
+    reasons = ["blurred: 9x3 px", None, "no echo stands out", "blurred: 8x4 px"]
+    crossings = tuple(Crossing(*NOWHERE, reason) for reason in reasons)
+    frames = CrossingFrames("wires", (321, 408), Sightings(np.eye(4)[None], np.ones((1, 2))), np.array([2, 3, 5, 8]), crossings)
+    assert frames.usable.tolist() == [1]
+    assert crossing_frames.rejected(frames) == {"blurred": [2, 8], "no echo stands out": [5]}
+    with pytest.raises(InputError, match=r"wires: expected 6 frames or more .* found 1 \(most often: blurred\)"):
+        crossing_frames.refuse_few(frames)
+
+
+def test_pairs_are_frames_that_are_all_usable():
+    frames = crossing_frames.of_pairs("pairs.csv", (321, 408), np.tile(np.eye(4), (7, 1, 1)), np.arange(14.0).reshape(7, 2))
+    assert frames.usable.tolist() == frames.numbers.tolist() == list(range(7))
+    crossing_frames.refuse_few(frames)
