@@ -1,4 +1,4 @@
-"""The PLUS toolkit's configuration files: the calibration of the probe, and how a sequence is to be reconstructed."""
+"""The PLUS toolkit's configuration files: the calibration of the probe, and the settings of a sequence's reconstruction."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ SWITCH = {"ON": True, "TRUE": True, "OFF": False, "FALSE": False}
 
 @dataclass(frozen=True)
 class Sticks:
-    """How holes are filled; see `recon.freehand.hole_filling.fill_holes`."""
+    """Filling of holes; see `recon.freehand.hole_filling.fill_holes`."""
 
     most_voxels: int
     sticks: int
@@ -31,7 +31,7 @@ class Sticks:
 
 @dataclass(frozen=True)
 class PlusConfig:
-    """What a configuration says of coordinates and of the reconstruction."""
+    """The parts of a configuration on coordinates and on the reconstruction."""
 
     transforms: dict[str, Array]  # "ImageToProbe": (4, 4), mm and px
     spacing: Array  # (3,) mm
@@ -49,7 +49,7 @@ def read_config(path: Path) -> PlusConfig:
     Raises
     ------
     InputError
-        If the file is missing or no such configuration, or asks for what is not known here: a fan-shaped clip, another way of
+        If the file is missing or no such configuration, or has settings unknown here: a fan-shaped clip, another way of
         compounding or of filling holes.
     """
     path = Path(path)
@@ -85,12 +85,12 @@ def read_config(path: Path) -> PlusConfig:
 
 
 def reconstruct_sequence(path: Path, config: PlusConfig) -> tuple[Reconstruction, Reconstruction]:
-    """Reconstruct a sequence file as its configuration says, reading the images one by one.
+    """Reconstruct a sequence file by its configuration, reading the images one by one.
 
     Returns
     -------
     Reconstruction, Reconstruction
-        Before its holes are filled, and after; the same if they are not to be.
+        Before its holes are filled, and after; the same without filling.
     """
     frames = sequences.read_tracking(path)
     shape = sequences.image_shape(path)

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 TRANSFORM = re.compile(r"([A-Z]\w*?)To([A-Z]\w*)")
 ORIENTATIONS = {"MF": (1, 1), "UF": (1, -1), "MN": (-1, 1), "UN": (-1, -1)}  # steps along v and u that turn one into MF
-STRUCTURE = {  # what follows from the images and from the format, in either of the two
+STRUCTURE = {  # fields given by the images and the format, in either of the two
     *("ObjectType", "NDims", "DimSize", "Kinds", "ElementType", "ElementNumberOfChannels", "ElementSpacing", "Offset"),
     *("TransformMatrix", "CenterOfRotation", "AnatomicalOrientation", "BinaryData", "BinaryDataByteOrderMSB", "CompressedData"),
     *("CompressedDataSize", "ElementDataFile", "ElementByteOrderMSB", "UltrasoundImageOrientation", "UltrasoundImageType"),
@@ -49,7 +49,7 @@ class Frames:
 
     times_s: Array  # (n,), NaN if the file has none
     transforms: dict[str, Array]  # "ProbeToTracker": tracker_from_probe (n, 4, 4), mm; the identity in frames that have none
-    valid: dict[str, NDArray[np.bool_]]  # (n,) by the transforms' names, whether to use it; and by "Image", if there are images
+    valid: dict[str, NDArray[np.bool_]]  # (n,) by the transforms' names; and by "Image", if there are images
     images: NDArray[np.uint8] | None = None  # (n, h, w), the array's marked side left and depth down; None if tracking only
     frame_fields: dict[str, tuple[str, ...]] = field(default_factory=dict)  # n texts; empty where a frame has none
     fields: dict[str, str] = field(default_factory=dict)  # of the whole file
@@ -91,12 +91,12 @@ def sequence_of(images: ArrayLike, world_from_target: Array, probe: ProbeCalibra
 
 
 def target_from_pixel(probe: ProbeCalibration) -> Array:
-    """The matrix (4, 4) that takes pixels [u, v, 0, 1] to the target's frame in mm; what PLUS calls ImageToProbe."""
+    """The matrix (4, 4) that takes pixels [u, v, 0, 1] to the target's frame in mm; ImageToProbe in PLUS."""
     return probe.target_from_image @ np.diag([*probe.scale, np.mean(probe.scale), 1.0])
 
 
 def poses(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = None) -> Array:
-    """Transforms (n, 4, 4) that take points of frame `of` to frame `to`, along whatever transforms lead there; NaN where invalid.
+    """Transforms (n, 4, 4) that take points of frame `of` to frame `to`, along a chain of transforms; NaN where invalid.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def read_sequence(path: Path) -> Frames:
     Raises
     ------
     InputError
-        If the file is damaged or cut short, of another kind, or a field is not what it should be; the message names it.
+        If the file is damaged or cut short, of another kind, or a field is wrong; the message names it.
     """
     file = medical_images.read_header(path)
     frames = _without_images(file)
@@ -213,7 +213,7 @@ def _without_images(file: ImageFile) -> Frames:
 
 
 def _layout(file: ImageFile) -> tuple[int, tuple[int, int]]:
-    """Number of frames, and height and width of an image; the last axis is time where the kinds don't say."""
+    """Number of frames, and height and width of an image; without kinds the last axis is time."""
     kinds = file.fields.get("Kinds", file.fields.get("kinds", "")).split()
     kinds = kinds or ["domain"] * (len(file.size) - 1) + ["list"]
     if len(kinds) != len(file.size):
@@ -283,7 +283,7 @@ def _usable(frames: Frames, name: str) -> Array:
 
 
 def _check(path: Path, frames: Frames) -> None:
-    """Refuse what would not be read back, or not as it was."""
+    """Refuse frames that would not be read back the same."""
     count = len(frames.times_s)
     known = np.isfinite(frames.times_s)
     if count == 0:

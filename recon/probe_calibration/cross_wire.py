@@ -1,15 +1,15 @@
-"""The crossing of two wires in a B-scan: one spot in water, found to a fraction of a pixel, or the reason why not.
+"""The crossing of two wires in a B-scan: one spot in water, found to a fraction of a pixel, or the reason of its rejection.
 
 In a log-compressed image a Gaussian spot is a paraboloid, so its top comes from a linear fit, which needs no start and stands
-clipped pixels. What a spot has to be told from: reverberation at the probe's face (rows bright along the whole array), the
-tank's bottom (drawn out), the wire's own comet tail and side lobes (below and beside, weaker), and the other wire's echo where
-the crossing isn't in the image plane (a second spot, or a spot too wide).
+clipped pixels. Other echoes are rejected: reverberation at the probe's face (rows bright along the whole array), the tank's
+bottom (drawn out), the wire's own comet tail and side lobes (below and beside, weaker), and the other wire's echo where the
+crossing isn't in the image plane (a second spot, or a spot too wide).
 
 The slice is thick, so an oblique wire is drawn out into a line: its parts beside the image plane lie at other depths. The
-crossing is then an X, and its brightest point means nothing, for the wires' echoes interfere. But the lines still meet where
-the crossing is, seen along the image's normal, however their brightness goes; so two lines are fitted to the bright pixels.
-Of all pairs of lines the one is taken that leaves fewest pixels unexplained, where a pixel on both lines counts once: else two
-lines along one wire would be the likeliest pair.
+crossing is then an X, and its brightest point means nothing, for the wires' echoes interfere. But the lines still meet at the
+crossing, seen along the image's normal, independent of their brightness; so two lines are fitted to the bright pixels. Of all
+pairs of lines the one with fewest unexplained pixels is taken, where a pixel on both lines counts once: else two lines along one
+wire would be the likeliest pair.
 """
 
 from dataclasses import dataclass
@@ -25,16 +25,16 @@ MATCHED_PX = (3.0, 1.5)  # along the array, in depth: smoothing before the searc
 APART_PX = (25, 13)  # no second candidate within half of this
 CANDIDATES = 12  # the brightest looked at
 CORE_DB = 8.0  # the spot's part that is fitted
-OUTLINE_DB = 10.0  # the part whose extent is measured
-NOISE = 6.0  # times the noise that an echo has to stand out
+OUTLINE_DB = 10.0  # the part of measured extent
+NOISE = 6.0  # least height of an echo, in units of the noise
 COLUMN_PX = 15.0  # reverberations of an echo lie below it within this
 CLIPPED = 0.35  # share of the core that may be clipped
 MIN_CORE = 12  # pixels, twice the unknowns
 FLOOR_PX = 0.1  # no sighting counts as more exact than this
 MAX_RIPPLE_DB = 1.0  # rms, of a spot about its paraboloid
-MAX_OBLIQUE = 0.3  # correlation of a spot's width and height; what lies aslant is a wire drawn out
+MAX_OBLIQUE = 0.3  # correlation of a spot's width and height; oblique echoes are wires drawn out
 FACE_PERCENT = 10  # of a row: its level there is the face's, even if a wire covers most of the row
-ARMS_DB = 22.0  # below the brightest, which lines are fitted to
+ARMS_DB = 22.0  # below the brightest: range of the pixels that lines are fitted to
 ARMS_PX = (70, 45)  # from the brightest, along the array and in depth
 POINT_PX = np.array([2.6, 1.1])  # 1 sigma of a line's width along the array and in depth
 DIRECTIONS = 12  # of the first look
@@ -44,29 +44,29 @@ MAX_SMOOTH = 0.45  # share of an echo's relief that a paraboloid explains: a bar
 BORDER_PX = 4  # of the image, where lines may not meet
 MIN_SINE = 0.15  # of the angle between the lines, in units of POINT_PX
 SHARED_PX = 3.0  # pixels with one independent error of their place across the line, measured on simulated wires
-MAX_ERROR_PX = (1.6, 1.2)  # 1 sigma of where lines meet; what is worse adds little to poses, and is often a wrong line
+MAX_ERROR_PX = (1.6, 1.2)  # 1 sigma of the meeting point; worse ones add little, and are often of a wrong line
 DECIBEL = 20 / np.log(10)  # dB a neper of amplitude
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """What a crossing looks like on a scanner."""
+    """Appearance of a crossing on a scanner."""
 
     dynamic_range_db: float = 60.0  # from black to white
     min_contrast_db: float = 9.0  # above the background
     rival_db: float = 6.0  # a second spot this much weaker, or less, makes the image ambiguous
     max_sigma_px: tuple[float, float] = (14.0, 7.0)  # of a spot, along the array and in depth (1.7 and 0.9 mm at 0.12 mm/px)
-    max_extent_px: tuple[float, float] = (70.0, 40.0)  # of its outline; what is larger is a line or a surface
+    max_extent_px: tuple[float, float] = (70.0, 40.0)  # of its outline; larger echoes are lines or surfaces
     top_px: int = 16  # rows at the probe's face that are left out
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """A crossing in an image, or why there is none."""
+    """A crossing in an image, or the reason of its rejection."""
 
     pixel: Array  # (2,) u, v; NaN if there is none
     covariance: Array  # (2, 2) px^2
-    contrast_db: float  # of the strongest echo above the background; NaN if nothing stands out
+    contrast_db: float  # of the strongest echo above the background; NaN without any
     reason: str | None = None  # of the rejection
     directions: Array | None = None  # (2, 2) px, along the two lines; None of a spot
 
@@ -177,7 +177,7 @@ def _fitted(level: Array, smooth: Array, peak: NDArray[np.int64], contrast: floa
 
 
 def _lines(level: NDArray[np.float32], look: Appearance, contrast: float) -> Crossing:
-    """Where the two lines through the brightest echo meet."""
+    """The meeting point of the two lines through the brightest echo."""
     points, weights, brightest = _arms(level, look)
     if len(points) < 4 * MIN_CORE:
         return _none("no arms", contrast)
@@ -269,7 +269,7 @@ def _refined(points: Array, weights: Array, middles: Array, angles: Array) -> tu
 
 
 def _meeting_covariance(offsets: Array, shares: Array, angles: Array) -> Array:
-    """Of the point where two lines meet : (2, 2), from pixels at offsets : (n, 2) from it, shared out as (2, n)."""
+    """Covariance : (2, 2) of the meeting point of two lines, from pixels at offsets : (n, 2) from it, shared out as (2, n)."""
     information, squares = 1e-9 * np.eye(4), 0.0
     for line, angle in enumerate(angles):
         across = np.array([-np.sin(angle), np.cos(angle)])
@@ -281,7 +281,7 @@ def _meeting_covariance(offsets: Array, shares: Array, angles: Array) -> Array:
 
 
 def _correlation(residual: Array) -> float:
-    """How many pixels share one independent error, from the correlation of neighbours along both axes."""
+    """Number of pixels with one independent error in common, from the correlation of neighbours along both axes."""
     power = (residual**2).sum() + 1e-12
     along = (residual[:, 1:] * residual[:, :-1]).sum() / power, (residual[1:] * residual[:-1]).sum() / power
     return float(np.prod([(1 + rho) / (1 - rho) for rho in np.clip(along, 0, 0.9)]))

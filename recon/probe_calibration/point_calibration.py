@@ -1,13 +1,13 @@
 """Calibration of a tracked ultrasound probe by one point: the crossing of two wires, seen in many B-scans.
 
-Where pixel i lies in the world is the same for all frames (equation 1 of Meza et al. 2021):
+The crossing's place in the world is the same in all frames (equation 1 of Meza et al. 2021):
 `world_from_target_i @ target_from_image @ [sx u_i, sy v_i, 0, 1] = wire`, the crossing, unknown and at rest. Unknown are the six
 of `target_from_image`, sx, sy and the wire's three. Written with the columns `sx x`, `sy y` and the image's origin it is linear,
 which gives a start in closed form; Levenberg and Marquardt do the rest.
 
 **Which motion is best.** An error of the tracked angle moves the wire by the lever, here 140 mm, so 0.08 degrees are 0.2 mm: far
 more than the errors of position or pixel. Frames are therefore weighted by their covariance, which has this lever in it. Turns
-decide how well the image's place is told from the wire's: roll the probe about its depth axis as far as the tracking allows, tilt
+separate the image's place from the wire's: roll the probe about its depth axis as far as the tracking allows, tilt
 it 35 degrees to all sides, mostly forward and backward, and bring the crossing near all corners of the image in turn. `motion`
 lists such frames. Predicted errors (1 sigma, of the place in space) of 30 frames with 0.08 degrees and 0.05 mm of noise per axis,
 for the rig of the paper:
@@ -42,20 +42,20 @@ NAMES = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")  # of the uncertainty; 
 NO_POSE = "the target was not tracked"
 MIN_FRAMES = 6
 DRAWS = 500  # random sixes of frames; at 30 % outliers 0.7**6 = 12 % of them are clean
-GATE = 16.27  # squared normalised residual of a frame beyond which it is an outlier; 1 of 1000 good ones (chi-square, 3)
+GATE = 16.27  # squared normalised residual of an outlier; exceeded by 1 of 1000 good frames (chi-square, 3)
 MEDIAN = 2.366  # of chi-square with 3 degrees of freedom
-MAX_FACTOR = 8.0  # measured over assumed noise beyond which frames don't show one point at rest
-MAX_RMS_MM = 3.0  # of residuals beyond which they don't either, however long the lever; Meza et al. 2021 have 0.423
+MAX_FACTOR = 8.0  # measured over assumed noise, of frames of one point at rest
+MAX_RMS_MM = 3.0  # of their residuals, for any lever; Meza et al. 2021 have 0.423
 MIN_INLIERS = 0.5  # of the frames
 REACH = (0.43, 0.40)  # of the crossing from the middle, of the image's width and height: spots stay whole and clear of the face
-ROCK = 0.6  # most of a tilt that is about the image's normal, where wires are seen edge-on
+ROCK = 0.6  # greatest part of a tilt about the image's normal, by which wires are seen edge-on
 FLOOR_MM = 1e-3  # no sighting counts as more exact than this
 APART_MM = 1.0  # 1 sigma of the distance of wires that cross, before it is measured
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations, per axis, of what has no covariance of its own."""
+    """Standard deviations, per axis, for sightings without a covariance of their own."""
 
     angle_deg: float = 0.08  # of the target's pose
     position_mm: float = 0.05  # of the target's pose
@@ -65,15 +65,15 @@ class Noise:
 
 @dataclass(frozen=True)
 class Sightings:
-    """The crossing, as seen in n frames."""
+    """The crossing in n frames."""
 
     poses: Array  # (n, 4, 4) world_from_target, mm
     pixels: Array  # (n, 2) px
     pose_covariance: Array | None = None  # (n, 6, 6) as in recon.model.tracks: a turn (rad) after the pose's own, a shift (mm)
     pixel_covariance: Array | None = None  # (n, 2, 2) px^2
     slice_mm: Array | None = None  # (n,) standard deviation across the image plane
-    directions: Array | None = None  # (n, 2, 2) px, along the wires' lines; NaN where they were seen as a spot
-    beside: Array | None = None  # (n, 2) px a mm: where lines meet, by the distance of the wires; `calibrate` finds it
+    directions: Array | None = None  # (n, 2, 2) px, along the wires' lines; NaN for a spot
+    beside: Array | None = None  # (n, 2) px a mm: shift of the lines' meeting point by the wires' distance; set by `calibrate`
 
     def of(self, chosen: ArrayLike) -> "Sightings":
         """Those of some frames, by number or mask."""
@@ -83,11 +83,11 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """The outcome: values, what is left, and how sure they are."""
+    """Adjusted values, their uncertainty, and the residuals."""
 
     calibration: ProbeCalibration
     wire: Array  # (3,) mm, in the world
-    residuals: Array  # (n, 3) mm, in the world: where the pixel is put, less the wire
+    residuals: Array  # (n, 3) mm, in the world: the pixel's place less the wire
     normalised: Array  # (n,) length of the residual over its standard deviation; sqrt(3) for a typical frame
     outliers: Mask  # (n,)
     noise_factor: float  # measured noise over the assumed; the covariance is scaled by its square
@@ -113,7 +113,7 @@ class _Estimate:
         )
 
     def pixels(self, sightings: Sightings) -> Array:
-        """Where the midpoint between the wires is : (n, 2) px."""
+        """Pixels : (n, 2) of the midpoint between the wires."""
         return sightings.pixels if sightings.beside is None else sightings.pixels - self.apart * sightings.beside
 
 
@@ -127,28 +127,28 @@ def calibrate(
 ) -> Adjustment:
     """Calibrate a probe from poses and pixels of one point at rest: of two wires, the midpoint between their axes.
 
-    Seen as two lines, the wires meet beside that point, one being above the other. Where six frames or more show lines, it is
-    found which is whose, and the distance of the axes is adjusted with the rest.
+    Seen as two lines, the wires meet beside that point, one being above the other. With lines in six frames or more, these are
+    assigned to the wires, and the distance of the axes is adjusted with the rest.
 
     Parameters
     ----------
     size : (width, height) px
         Of the B-scans.
     noise : Noise
-        Of what the sightings give no covariance for. Only its proportions matter: the level is measured.
+        For sightings without a covariance. Only its proportions matter: the level is measured.
     expected : (4, 4)
         `target_from_image` as the bracket was designed, to within some 30 degrees and 30 mm. A mirrored image, or swapped axes of
-        image or target, fit the equations as well as the truth does; they are known by this alone.
+        image or target, fit the equations as well as the truth does; only the design excludes them.
     seed : int
         Of the random draws of frames for the robust start.
     ahead_mm : float
-        By how much the echo lies before the wires' axes: see `recon.probe_calibration.wires.echo_ahead`.
+        Distance of the echo before the wires' axes: see `recon.probe_calibration.wires.echo_ahead`.
 
     Raises
     ------
     InputError
         If there are too few frames, the poses or pixels are none, the motion leaves something undetermined, most frames
-        contradict each other, or the outcome is none of a probe; it says which.
+        contradict each other, or the outcome is impossible for a probe.
     """
     noise = noise or Noise()
     sightings = _checked(sightings, size)
@@ -197,7 +197,7 @@ def from_images(
 
 
 def point_covariance(calibration: ProbeCalibration, pixels: ArrayLike) -> Array:
-    """Covariance : (k, 3, 3) mm^2, in the target's frame, of where pixels : (k, 2) are put; zero if the calibration has none."""
+    """Covariance : (k, 3, 3) mm^2, in the target's frame, of the places of pixels : (k, 2); zero if the calibration has none."""
     pixels = np.asarray(pixels, float)
     if calibration.uncertainty is None:
         return np.zeros((len(pixels), 3, 3))
@@ -207,14 +207,14 @@ def point_covariance(calibration: ProbeCalibration, pixels: ArrayLike) -> Array:
 
 
 def motion(size: Size, count: int = 30, tilt_deg: float = 35.0, roll_deg: float = 180.0) -> tuple[Array, Array]:
-    """Frames of a good calibration: which way to hold the probe, and where to have the crossing in the image.
+    """Frames of a good calibration: attitudes of the probe, and places of the crossing in the image.
 
     Returns
     -------
     turns : (count, 3) deg
         Tilt about the array's axis x, roll about the depth axis y and tilt about the normal z, done in the order y, x, z in
         axes that go with the image. Tilts are `tilt_deg` to all sides, but mostly forward and backward: rocked in its own plane
-        only, the probe sees both wires on one line. Rolls are up to `roll_deg` both ways.
+        only, the probe shows both wires on one line. Rolls are up to `roll_deg` both ways.
     pixels : (count, 2) px
         Near the four corners, each round in another order: they tell the scales and the image's attitude best.
     """
@@ -240,7 +240,7 @@ def _checked(sightings: Sightings, size: Size) -> Sightings:
 
 
 def _with_wires(estimate: _Estimate, sightings: Sightings, inliers: Mask) -> Sightings:
-    """With the places where lines meet by the wires' distance, if both wires can be told."""
+    """Add the shifts of the lines' meeting points by the wires' distance, if both wires can be separated."""
     if sightings.directions is None:
         return sightings
     lines = np.isfinite(sightings.directions).all(axis=(1, 2))

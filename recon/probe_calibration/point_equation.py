@@ -1,4 +1,4 @@
-"""The equation of a probe's calibration by one point: its solution in closed form, and how points move with the parameters."""
+"""The equation of a probe's calibration by one point: its solution in closed form, and the Jacobian of points."""
 
 import numpy as np
 from numpy.typing import NDArray

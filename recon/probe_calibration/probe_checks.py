@@ -1,4 +1,4 @@
-"""What can be wrong with a probe's calibration, and its name: poses, pixels, a motion that leaves something open, the outcome."""
+"""Sanity checks of a probe's calibration: its poses, pixels, motion and outcome; each fault is named."""
 
 from itertools import permutations, product
 from typing import Protocol
@@ -37,7 +37,7 @@ def poses(world_from_target: Array) -> None:
 
 
 def pixels(of_crossing: Array, size: Size) -> None:
-    """Refuse pixels outside the image, and say if they were inside with u and v swapped."""
+    """Refuse pixels outside the image, with a hint if they were inside with u and v swapped."""
     limit = np.array(size, float) - 0.5
     outside = ~((of_crossing >= -0.5) & (of_crossing <= limit)).all(axis=1)
     if not outside.any():
@@ -50,7 +50,7 @@ def pixels(of_crossing: Array, size: Size) -> None:
 
 
 def motion(world_from_target: Array, of_crossing: Array, size: Size) -> None:
-    """Refuse a motion that leaves unknowns open whatever the noise, and name the rotation, depth or width that is missing."""
+    """Refuse a motion that leaves unknowns undetermined at any noise, and name the missing rotation, depth or width."""
     axes, rms = turns(world_from_target)
     if rms[0] < MIN_TURN_DEG:
         raise InputError(f"motion: expected turns of the probe about two axes, found none: at most {rms[0]:.1f} deg (rms)")
@@ -77,7 +77,7 @@ def turns(world_from_target: Array) -> tuple[Array, Array]:
 
 
 def information(target_from_image: Array, scale: Array, matrix: Array, frames: _Frames, size: Size) -> None:
-    """Refuse a motion by which some pixel's place stays open by more than MAX_SIGMA_MM, and name what is weakest.
+    """Refuse a motion that leaves some pixel's place uncertain by more than MAX_SIGMA_MM, and name its weakest part.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def information(target_from_image: Array, scale: Array, matrix: Array, frames: _
 
 
 def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -> None:
-    """Refuse what is no probe's calibration: scales of other units, a target under the probe's face, axes swapped."""
+    """Refuse impossible calibrations: scales of other units, a target under the probe's face, axes swapped."""
     for name, value in zip(("sx", "sy"), calibration.scale, strict=True):
         if not SCALES[0] <= value <= SCALES[1]:
             found = f"{value:.3g}: are the poses in mm?"
@@ -125,9 +125,9 @@ def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -
 
 
 def speed(implied: float) -> None:
-    """Refuse a calibration whose sy, beside the scanner's, tells a speed of sound (m/s) that nothing has."""
+    """Refuse a calibration whose sy, beside the scanner's, implies a speed of sound (m/s) of no medium."""
     if not SPEEDS[0] <= implied <= SPEEDS[1]:
-        expected = f"calibration: sy: expected to tell a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s"
+        expected = f"calibration: sy: expected to imply a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s"
         raise InputError(f"{expected}, found {implied:.0f}: are the poses in mm, and rig.probe.scale_mm_per_px the scanner's?")
 
 
@@ -151,7 +151,7 @@ def _as_designed(calibration: ProbeCalibration, size: Size, expected: Array) -> 
 
 
 def readings(world_from_target: Array) -> dict[str, Array]:
-    """Common other meanings of 4x4 poses, which a fit may tell."""
+    """Common other meanings of 4x4 poses, each with the poses in ours."""
     inverse = np.linalg.inv(world_from_target)
     transposed = world_from_target.copy()
     transposed[:, :3, :3] = np.swapaxes(world_from_target[:, :3, :3], 1, 2)

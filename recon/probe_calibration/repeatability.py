@@ -1,4 +1,4 @@
-"""How well several calibrations of one probe agree: CR1, CR2 and their mean.
+"""Agreement of several calibrations of one probe: CR1, CR2 and their mean.
 
 CR1 and CR2 are those of Meza et al. 2021: of a pixel's place in the target's frame, `target_from_image @ [sx u, sy v, 0, 1]`.
 """
@@ -24,14 +24,14 @@ def five_points(size: Size) -> Array:
 
 
 def cr1(calibrations: Sequence[ProbeCalibration], pixels: ArrayLike) -> Array:
-    """Repeatability CR1 : (k,) mm: mean distance, over all pairs of calibrations, of where pixels : (k, 2) are put."""
+    """Repeatability CR1 : (k,) mm: mean distance, over all pairs of calibrations, of the places of pixels : (k, 2)."""
     points = np.stack([calibration.to_target(pixels) for calibration in calibrations])
     first, second = np.triu_indices(len(points), 1)
     return np.linalg.norm(points[first] - points[second], axis=-1).mean(axis=0)
 
 
 def cr2(calibrations: Sequence[ProbeCalibration], pixels: ArrayLike) -> Array:
-    """Repeatability CR2 : (k,) mm: mean distance of where pixels : (k, 2) are put by each calibration from the mean point."""
+    """Repeatability CR2 : (k,) mm: mean distance of the places of pixels : (k, 2) by each calibration from the mean place."""
     points = np.stack([calibration.to_target(pixels) for calibration in calibrations])
     return np.linalg.norm(points - points.mean(axis=0), axis=-1).mean(axis=0)
 

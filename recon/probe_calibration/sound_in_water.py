@@ -1,4 +1,4 @@
-"""Speed of sound in water, and what a speed other than the scanner's does to depths.
+"""Speed of sound in water, and the depths shown at a speed other than the scanner's.
 
 A scanner shows an echo of delay tau at the depth `c0 tau / 2`, with the speed c0 that it assumes, mostly 1540 m/s; it lies at
 `c tau / 2`. In water of 22 degrees (1488 m/s) everything is 3.4 % nearer than shown: 1.7 mm at 50 mm. Along the array nothing
@@ -6,7 +6,7 @@ changes: the lines of a linear array stand where its elements do.
 
 A calibration in water finds mm of water a pixel, with no need of the temperature: `sy = sy_scanner c_water / c0`. It is right for
 sweeps through the same water. For tissue, or water of another temperature, it is converted by the ratio of the speeds; depths
-scale about the probe's face, where the delay is zero. Which speed a calibration holds for is kept in it.
+scale about the probe's face, where the delay is zero. A calibration holds the speed that it is right for.
 """
 
 import numpy as np
@@ -53,21 +53,21 @@ def true_over_shown(speed: ArrayLike, assumed: float = SCANNER_SPEED) -> Array:
 
 
 def shown_too_deep(depth_mm: ArrayLike, speed: ArrayLike, assumed: float = SCANNER_SPEED) -> Array:
-    """By how much an echo at a shown depth : (...) mm below the face lies less deep : (...) mm."""
+    """Shown less true depth : (...) mm of an echo at a shown depth : (...) mm below the face."""
     return np.asarray(depth_mm, float) * (1 - true_over_shown(speed, assumed))
 
 
 def implied_speed(calibration: ProbeCalibration, scanner_sy: float, assumed: float = SCANNER_SPEED) -> tuple[float, float]:
-    """Speed of sound, and its standard deviation, m/s, that a calibrated sy tells, where the scanner's own in mm/px is known.
+    """Speed of sound and its standard deviation, m/s, implied by a calibrated sy beside the scanner's own in mm/px.
 
-    Beside the speed that the temperature gives it shows a wrong depth setting, or a thermometer that is off.
+    A difference from the speed at the water's temperature shows a wrong depth setting, or a wrong thermometer.
     """
     sigma = calibration.uncertainty.sigma("sy") if calibration.uncertainty is not None else 0.0
     return float(assumed * calibration.scale[1] / scanner_sy), float(assumed * sigma / scanner_sy)
 
 
 def in_tissue(world_from_pixel: Array, calibrated: float, speed: float) -> Array:
-    """Matrices : (..., 4, 4) px to mm, whose depths hold for a calibrated speed, for a medium of another; row 0 is the face."""
+    """Convert matrices : (..., 4, 4) px to mm from a calibrated speed to that of another medium; row 0 is the face."""
     _check(calibrated=calibrated, speed=speed)
     return world_from_pixel @ np.diag([1, speed / calibrated, 1, 1])
 
@@ -101,7 +101,7 @@ def in_medium(
 
 
 def for_tissue(calibration: ProbeCalibration, speed: float | None) -> ProbeCalibration:
-    """A calibration converted from the speed that it holds for to that of the images' medium; as it is if that isn't known."""
+    """A calibration converted from its speed to that of the images' medium; unchanged without the latter."""
     return calibration if speed is None else in_medium(calibration, calibration.speed_m_s, speed)
 
 

@@ -1,10 +1,10 @@
-"""Wires aren't lines: crossed, one lies above the other, and their echo comes from before their axes.
+"""Wires of finite thickness: crossed, one lies above the other, and their echo comes from before their axes.
 
-Of wires that touch, the axes are a diameter apart. Seen along the image's normal, the two lines still meet, but not where the
-midpoint between the axes is: with the lines' normals m, m' and the wires' distance g, seen in the image, the place d where they
-meet obeys `m d = m g / 2`, `m' d = -m' g / 2`. For wires of 0.2 mm that is 1 to 2 px, and more where the lines are alike: ten
-times the error of the fitted lines. It changes its sign with the probe's tilt, so it can be told from the crossing's place,
-once it is known which line in each image is of which wire.
+Of wires that touch, the axes are a diameter apart. Seen along the image's normal, the two lines still meet, but beside the
+midpoint between the axes: with the lines' normals m, m' and the wires' distance g, seen in the image, the meeting point d from
+the midpoint obeys `m d = m g / 2`, `m' d = -m' g / 2`. For wires of 0.2 mm that is 1 to 2 px, and more where the lines are alike:
+ten times the error of the fitted lines. It changes its sign with the probe's tilt, so it can be separated from the crossing's
+place, once each line is assigned to its wire.
 """
 
 import numpy as np
@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-MIN_FRAMES = 6  # with two lines, to tell the wires
-MOST_PLANES = 80  # of which candidates are made
+MIN_FRAMES = 6  # with two lines, to separate the wires
+MOST_PLANES = 80  # for candidates
 SPREAD = 0.1  # sine of the angle between a wire and the plane in which it was seen; of short arms
 ALIKE = 0.97  # cosine of the angle between wires that are one and the same
-MIN_SINE = 0.05  # of the angle between the lines, below which nothing is said of where they meet
+MIN_SINE = 0.05  # of the angle between the lines, below which their meeting point is unknown
 
 
 def echo_ahead(radius_mm: float, wire_speed: float, speed: float) -> float:
-    """By how much the echo of a thin wire lies before its axis, mm of the medium.
+    """Distance of the echo of a thin wire before its axis, mm of the medium.
 
     The echoes of its front and back, about alike, are nearer to each other than the pulse is long, so that the middle between
     both is seen; the back one comes later by the way through the wire. For nylon of 0.2 mm in water that is 0.04 mm.
@@ -51,7 +51,7 @@ def planes(world_from_image: Array, scale: Array, directions: Array) -> Array:
 
 
 def directions_of(seen: Array) -> Array | None:
-    """Directions : (2, 3) of the two wires in the world, that lie in most of the planes : (n, 2, 3); None if they can't be told.
+    """Directions : (2, 3) of the two wires in the world, that lie in most of the planes : (n, 2, 3); None if undetermined.
 
     Every two planes have one direction in common. The one that lies near most planes is the first wire's, and the one that lies
     near most of the others the second's; then each frame's lines are shared out and each wire is fitted to its planes.
@@ -78,7 +78,7 @@ def directions_of(seen: Array) -> Array | None:
 
 
 def _fitted(wires: Array, seen: Array) -> Array:
-    """Each wire fitted to the planes that are rather its own, those far off left out."""
+    """Fit each wire to the nearer planes of each pair, far ones left out."""
     near = np.exp(-((np.einsum("wj,nkj->nwk", wires, seen) / SPREAD) ** 2) / 2)
     straight = near[:, 0, 0] + near[:, 1, 1] >= near[:, 0, 1] + near[:, 1, 0]
     own = np.where(straight[:, None, None], seen, seen[:, ::-1])
@@ -88,7 +88,7 @@ def _fitted(wires: Array, seen: Array) -> Array:
 
 
 def beside(world_from_image: Array, scale: Array, wires: Array) -> Array:
-    """Where the lines of two wires meet : (n, 2) px from the midpoint between their axes, a mm between these.
+    """Meeting points : (n, 2) of the lines of two wires, from the midpoint between their axes; px a mm between these.
 
     The second wire lies ahead of the first, along the cross product of their directions. Zero where the lines are too alike to
     meet in the image.
