@@ -5,8 +5,8 @@ import sys
 
 PARTS = {  # the modules' beginnings, what the console calls them, and the seconds that a core takes for all of their functions
     "recon.structured_light": ("decoder and mesh", 60),
-    "recon.tracking": ("fit of the target's rims", 40),
-    "recon.optical_calibration": ("images of the board in the projector", 10),
+    "recon.tracking": ("fit of the target's rims", 80),
+    "recon.optical_calibration": ("images of the board in the projector", 30),
     "recon.board_detection": ("edges of the board's circles", 5),
     "recon.freehand": ("volume from B-scans", 10),
     "recon.segmentation": ("search for masses", 10),
