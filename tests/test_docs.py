@@ -14,7 +14,8 @@ from sonotwin.cli import VERBS, main
 from sonotwin.config import load
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+PAGES += sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "users").glob("*.md")])
 MADE = {  # what a verb writes into its folder `out`, for those that read it; "" is the folder itself
     "render": {"capture", "truth"},
     "film": {"capture", "truth"},
