@@ -11,12 +11,14 @@ the limit of a disc's centre, `(n/C) sqrt(2 sqrt(pi) s / (pi R))`.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
 
 from recon.compiled import njit
-from recon.geometry.ellipses import Ellipses, on_ellipse, signed_distance
+from recon.geometry.ellipses import Ellipses, on_ellipse
 
 Array = NDArray[np.float64]
 
@@ -27,6 +29,7 @@ LEAST_BLUR = 0.25  # px: below it a step between two pixels can't be told from a
 FLAT = 2.5  # blurs away from the edge the step is over
 ROUNDING = 1 / 12  # DN^2, the variance of whole numbers
 SCATTER = 10.0  # standard deviations beyond which a pixel counts less
+BANDWIDTH = 1.5  # reaches, measured along the shorter axis: no pixel of the band is farther
 KEPT = (1 - 6 / SCATTER**2) / (1 - 2 / SCATTER**2)  # of normal noise's variance, seen with pixels counting by their residuals
 LOOSENESS = 1e-4  # of the mean information of a sector: keeps sectors without an edge in place
 
@@ -46,8 +49,27 @@ class Edges:
     clipped: Array  # (n,) share of the band's pixels that are as bright as the image can be
 
 
-@dataclass(frozen=True)
-class _Band:
+class _Rims(NamedTuple):
+    """Rough outlines and the boxes that hold their bands."""
+
+    centre: Array  # (n, 2) px
+    inverse: Array  # (n, 2, 2) 1/px, of the shapes
+    axes: Array  # (n, 2) px, the shorter and the longer semi-axis
+    reach: Array  # (n,) px
+    low: NDArray[np.int64]  # (n, 2) first column and row
+    high: NDArray[np.int64]  # (n, 2) behind the last
+
+    @staticmethod
+    def of(outlines: Ellipses, reach: Array, shape: tuple[int, ...]) -> "_Rims":
+        """Of ellipses, for an image of a shape."""
+        extent = np.sqrt(np.einsum("nij,nij->ni", outlines.shape, outlines.shape)) + reach[:, None]
+        low = np.clip(np.floor(outlines.centre - extent), 0, shape[::-1]).astype(np.int64)
+        high = np.clip(np.ceil(outlines.centre + extent) + 1, 0, shape[::-1]).astype(np.int64)
+        axes = np.linalg.eigvalsh(outlines.shape)
+        return _Rims(np.array(outlines.centre), np.linalg.inv(outlines.shape), axes, np.array(reach, float), low, high)
+
+
+class _Band(NamedTuple):
     """The pixels near all outlines, one after the other."""
 
     values: Array  # (p,) DN
@@ -57,10 +79,25 @@ class _Band:
     angle: Array  # (p,) rad
     starts: NDArray[np.int64]  # (n + 1,) where an outline's pixels begin
 
+    @staticmethod
+    def of(image: Array, outlines: Ellipses, reach: Array) -> "_Band":
+        """All pixels of an image : (h, w) within reach of the outlines."""
+        rims = _Rims.of(outlines, reach, image.shape)
+        return _gather(np.ascontiguousarray(image), rims, np.concatenate([[0], np.cumsum(_sizes(rims))]).astype(np.int64))
+
     @property
     def owner(self) -> NDArray[np.int64]:
         """Number of the outline : (p,)."""
         return np.repeat(np.arange(self.starts.size - 1), np.diff(self.starts))
+
+
+class _Step(NamedTuple):
+    """The blurred steps that the bands are compared with."""
+
+    levels: Array  # (n, 6) DN, planes of the inside and the outside
+    width: Array  # (n,) px, of the blur
+    offset: Array  # (n, m) px, of the sectors' edges from the rough outline
+    limit: Array  # (n,) DN, residual from which on a pixel counts less
 
 
 def find_edges(
@@ -84,8 +121,8 @@ def find_edges(
         Largest value that the image can have.
     """
     count = len(outlines.centre)
-    band = _band(image, outlines, reach)
-    levels = _first_levels(band, count)
+    band = _Band.of(image, outlines, reach)
+    levels = _first_levels(band)
     width = np.full(count, 1.0) if blur is None else np.array(blur, float)
     noise = np.full(count, np.inf)
     offset = np.zeros((count, sectors))
@@ -113,8 +150,7 @@ def find_edges(
     )
 
 
-@dataclass(frozen=True)
-class _Sums:
+class _Sums(NamedTuple):
     """Normal equations of the step model: the offsets of the sectors, and the planes and the blur of their outline."""
 
     offset: Array  # (n, m) information on the offsets
@@ -129,17 +165,8 @@ class _Sums:
     @staticmethod
     def of(band: _Band, levels: Array, width: Array, offset: Array, noise: Array) -> "_Sums":
         """Sum over the pixels. Pixels that stand out by many times the noise count less."""
-        n, m = offset.shape
         limit = SCATTER * np.maximum(noise, 0.02 * np.abs(levels[:, 3] - levels[:, 0]))
-        sums = _Sums(
-            np.zeros((n, m)), np.zeros((n, m, SHARED)), np.zeros((n, SHARED, SHARED)), np.zeros((n, m)), np.zeros((n, SHARED)),
-            np.zeros((n, m)), np.zeros((n, 2, 2)), np.zeros((n, 2)),
-        )  # fmt: skip
-        _add_up(
-            band.values, band.xy, band.normal, band.distance, band.angle, band.starts, levels, width, offset, limit,
-            sums.offset, sums.mixed, sums.rest, sums.toward_offset, sums.toward_rest, sums.turn, sums.flat, sums.near,
-        )  # fmt: skip
-        return sums
+        return _add_up(band, _Step(levels, width, offset, limit))
 
     @property
     def information(self) -> Array:
@@ -178,86 +205,135 @@ class _Sums:
         return (np.arange(sectors) + 0.5) / sectors * 2 * np.pi - np.pi + self.turn / np.maximum(self.offset, 1e-12)
 
 
+@njit(inline="always")
+def _nearest(x, y, inverse):
+    """Distance of a point from an ellipse about the origin, angle and outward normal of the point next to it.
+
+    As `recon.geometry.ellipses.signed_distance` and `on_ellipse`, for one point.
+    """
+    if x == 0 and y == 0:
+        x = 1e-9  # the centre itself is next to any point
+    a, b, c = inverse[0, 0], inverse[0, 1], inverse[1, 1]
+    p, q = a * x + b * y, b * x + c * y  # on the unit circle
+    radius = math.hypot(p, q)
+    p, q = p / radius, q / radius
+    slope_x, slope_y = a * p + b * q, b * p + c * q
+    slope = math.hypot(slope_x, slope_y)
+    bend = (p * (b * slope_x + c * slope_y) - q * (a * slope_x + b * slope_y)) ** 2 / (radius * slope**2)
+    first = (radius - 1) / slope
+    return first + bend * first**2 / (2 * slope), math.atan2(q, p), slope_x / slope, slope_y / slope
+
+
+@njit(inline="always")
+def _may_be_near(x, y, rims, i):
+    """Whether a point could lie within reach of an outline: a test without roots of roots, for most pixels fail it."""
+    inverse = rims.inverse[i]
+    q = math.hypot(inverse[0, 0] * x + inverse[0, 1] * y, inverse[1, 0] * x + inverse[1, 1] * y)
+    return abs(q - 1) * rims.axes[i, 0] < BANDWIDTH * rims.reach[i]
+
+
+@njit(parallel=True)
+def _sizes(rims):
+    """Number of pixels of each band : (n,)."""
+    sizes = np.zeros(len(rims.centre), np.int64)
+    for i in prange(len(sizes)):
+        for v in range(rims.low[i, 1], rims.high[i, 1]):
+            for u in range(rims.low[i, 0], rims.high[i, 0]):
+                x, y = u - rims.centre[i, 0], v - rims.centre[i, 1]
+                if _may_be_near(x, y, rims, i) and abs(_nearest(x, y, rims.inverse[i])[0]) <= rims.reach[i]:
+                    sizes[i] += 1
+    return sizes
+
+
+@njit(parallel=True)
+def _gather(image, rims, starts):
+    """The bands of all outlines, each where it begins."""
+    count = starts[-1]
+    values, distance, angle = np.empty(count), np.empty(count), np.empty(count)
+    xy, normal = np.empty((count, 2)), np.empty((count, 2))
+    for i in prange(len(rims.centre)):
+        p, radius = starts[i], rims.axes[i, 1]
+        for v in range(rims.low[i, 1], rims.high[i, 1]):
+            for u in range(rims.low[i, 0], rims.high[i, 0]):
+                x, y = u - rims.centre[i, 0], v - rims.centre[i, 1]
+                if not _may_be_near(x, y, rims, i):
+                    continue
+                away, at, across, down = _nearest(x, y, rims.inverse[i])
+                if abs(away) <= rims.reach[i]:
+                    values[p], distance[p], angle[p] = image[v, u], away, at
+                    xy[p, 0], xy[p, 1] = x / radius, y / radius
+                    normal[p, 0], normal[p, 1] = across / radius, down / radius
+                    p += 1
+    return _Band(values, xy, normal, distance, angle, starts)
+
+
+@njit(parallel=True)
+def _add_up(band, step):
+    """The sums of `_Sums`, outline by outline."""
+    n, sectors = step.offset.shape
+    sums = _Sums(
+        np.zeros((n, sectors)), np.zeros((n, sectors, SHARED)), np.zeros((n, SHARED, SHARED)), np.zeros((n, sectors)),
+        np.zeros((n, SHARED)), np.zeros((n, sectors)), np.zeros((n, 2, 2)), np.zeros((n, 2)),
+    )  # fmt: skip
+    for i in prange(n):
+        _add_outline(i, band, step, sums)
+    return sums
+
+
 @njit
-def _add_up(
-    values, xy, normal, distance, angle, starts, levels, width, offset, limit,
-    information, mixed, rest, toward_offset, toward_rest, turn, flat, near,
-):  # fmt: skip
-    """Fill the sums of `_Sums`: for each pixel measured less modelled, and the model's slopes.
+def _add_outline(i, band, step, sums):
+    """Add one outline's pixels: measured less modelled, and the model's slopes.
 
     A plane `a + g t` that begins at t = 0, blurred by s, is `(a + g t) Phi(t/s) + g s phi(t/s)`.
     """
-    sectors = offset.shape[1]
+    sectors = step.offset.shape[1]
     columns = np.empty(SHARED)
-    for i in range(len(starts) - 1):
-        inner, outer, s = levels[i, :3], levels[i, 3:], width[i]
-        for p in range(starts[i], starts[i + 1]):
-            at = (angle[p] / (2 * np.pi) + 0.5) * sectors
-            j = int(at) % sectors
-            x, y = xy[p, 0], xy[p, 1]
-            z = (distance[p] - offset[i, j]) / s
-            share = 0.5 * math.erfc(-z / math.sqrt(2.0))
-            peak = math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
-            inside, outside = inner[0] + inner[1] * x + inner[2] * y, outer[0] + outer[1] * x + outer[2] * y
-            bent_x, bent_y = s * peak * normal[p, 0], s * peak * normal[p, 1]
-            bent = (outer[1] - inner[1]) * bent_x + (outer[2] - inner[2]) * bent_y
-            residual = values[p] - inside - (outside - inside) * share - bent
-            slope = -(outside - inside) * peak / s
-            columns[0], columns[3] = 1 - share, share
-            columns[1], columns[2] = x * (1 - share) - bent_x, y * (1 - share) - bent_y
-            columns[4], columns[5] = x * share + bent_x, y * share + bent_y
-            columns[6] = slope * z
-            w = 1 / (1 + (residual / limit[i]) ** 2) ** 2
-            information[i, j] += w * slope * slope
-            toward_offset[i, j] += w * slope * residual
-            turn[i, j] += w * slope * slope * (at - int(at) - 0.5) * 2 * np.pi / sectors
-            for a in range(SHARED):
-                mixed[i, j, a] += w * slope * columns[a]
-                toward_rest[i, a] += w * columns[a] * residual
-                for b in range(a + 1):
-                    rest[i, a, b] += w * columns[a] * columns[b]
-            near[i, 0] += w
-            near[i, 1] += w * residual * residual
-            if abs(z) > FLAT:
-                flat[i, int(z > 0), 0] += w
-                flat[i, int(z > 0), 1] += w * residual * residual
+    inner, outer, s, limit = step.levels[i, :3], step.levels[i, 3:], step.width[i], step.limit[i]
+    for p in range(band.starts[i], band.starts[i + 1]):
+        at = (band.angle[p] / (2 * np.pi) + 0.5) * sectors
+        j = int(at) % sectors
+        x, y = band.xy[p, 0], band.xy[p, 1]
+        z = (band.distance[p] - step.offset[i, j]) / s
+        share = 0.5 * math.erfc(-z / math.sqrt(2.0))
+        peak = math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
+        inside, outside = inner[0] + inner[1] * x + inner[2] * y, outer[0] + outer[1] * x + outer[2] * y
+        bent_x, bent_y = s * peak * band.normal[p, 0], s * peak * band.normal[p, 1]
+        bent = (outer[1] - inner[1]) * bent_x + (outer[2] - inner[2]) * bent_y
+        residual = band.values[p] - inside - (outside - inside) * share - bent
+        slope = -(outside - inside) * peak / s
+        columns[0], columns[3] = 1 - share, share
+        columns[1], columns[2] = x * (1 - share) - bent_x, y * (1 - share) - bent_y
+        columns[4], columns[5] = x * share + bent_x, y * share + bent_y
+        columns[6] = slope * z
+        w = 1 / (1 + (residual / limit) ** 2) ** 2
+        sums.offset[i, j] += w * slope * slope
+        sums.toward_offset[i, j] += w * slope * residual
+        sums.turn[i, j] += w * slope * slope * (at - int(at) - 0.5) * 2 * np.pi / sectors
         for a in range(SHARED):
-            for b in range(a):
-                rest[i, b, a] = rest[i, a, b]
+            sums.mixed[i, j, a] += w * slope * columns[a]
+            sums.toward_rest[i, a] += w * columns[a] * residual
+            for b in range(a + 1):
+                sums.rest[i, a, b] += w * columns[a] * columns[b]
+        sums.near[i, 0] += w
+        sums.near[i, 1] += w * residual * residual
+        if abs(z) > FLAT:
+            sums.flat[i, int(z > 0), 0] += w
+            sums.flat[i, int(z > 0), 1] += w * residual * residual
+    for a in range(SHARED):
+        for b in range(a):
+            sums.rest[i, b, a] = sums.rest[i, a, b]
 
 
-def _band(image: Array, outlines: Ellipses, reach: Array) -> _Band:
-    height, width = image.shape
-    extent = np.sqrt(np.einsum("nij,nij->ni", outlines.shape, outlines.shape)) + reach[:, None]
-    low = np.clip(np.floor(outlines.centre - extent), 0, [width, height]).astype(int)
-    high = np.clip(np.ceil(outlines.centre + extent) + 1, 0, [width, height]).astype(int)
-    parts = []
-    for i, (centre, shape) in enumerate(zip(outlines.centre, outlines.shape, strict=True)):
-        (left, top), (right, bottom) = low[i], high[i]
-        v, u = np.mgrid[top:bottom, left:right]
-        inverse = np.linalg.inv(shape)
-        x, y = u - centre[0], v - centre[1]
-        q = np.hypot(inverse[0, 0] * x + inverse[0, 1] * y, inverse[1, 0] * x + inverse[1, 1] * y)
-        axes = np.linalg.eigvalsh(shape)
-        near = np.abs(q - 1) * axes[0] < 1.5 * reach[i]  # the distance is at least that along the shorter axis
-        pixels = np.column_stack([u[near], v[near]]).astype(float)
-        distance, angle = signed_distance(pixels, centre, shape)
-        keep = np.abs(distance) <= reach[i]
-        values = image[top:bottom, left:right][near][keep]
-        normal = on_ellipse(outlines[i : i + 1], angle[keep][None])[1][0]
-        parts.append((values, (pixels[keep] - centre) / axes[1], normal / axes[1], distance[keep], angle[keep]))
-    starts = np.concatenate([[0], np.cumsum([part[0].size for part in parts])]).astype(np.int64)
-    values, xy, normal, distance, angle = (np.concatenate([part[k] for part in parts]) for k in range(5))
-    return _Band(values.astype(float), xy, normal, distance, angle, starts)
-
-
-def _first_levels(band: _Band, count: int) -> Array:
+@njit(parallel=True)
+def _first_levels(band):
     """Planes of the inside and the outside : (n, 6), flat at first: the medians of the halves away from the edge."""
-    levels = np.zeros((count, 6))
-    for i in range(count):
-        part = slice(band.starts[i], band.starts[i + 1])
-        far = np.abs(band.distance[part]) > 0.4 * np.abs(band.distance[part]).max(initial=0)
-        for column, side in ((0, band.distance[part] < 0), (3, band.distance[part] > 0)):
-            if (far & side).any():
-                levels[i, column] = np.median(band.values[part][far & side])
+    levels = np.zeros((len(band.starts) - 1, 6))
+    for i in prange(len(levels)):
+        distance = band.distance[band.starts[i] : band.starts[i + 1]]
+        values = band.values[band.starts[i] : band.starts[i + 1]]
+        if len(distance):
+            far = 0.4 * np.abs(distance).max()
+            inside, outside = values[distance < -far], values[distance > far]
+            levels[i, 0] = np.median(inside) if len(inside) else 0.0
+            levels[i, 3] = np.median(outside) if len(outside) else 0.0
     return levels
