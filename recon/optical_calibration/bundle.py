@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +72,13 @@ class Problem:
         """The devices' parameters : (g,), as in `calibration.Uncertainty`."""
         return tuple(f"{device}.{name}" for device in self.observations.devices for name in self.free.get(device, ()))
 
+    @cached_property
+    def whitening(self) -> Array:
+        """Matrices that turn residuals into standard normal numbers : (p, n, d, 2, 2); zero where nothing was seen."""
+        seen, covariance = self.observations.seen[..., None, None], self.observations.covariance
+        inverse = np.linalg.inv(np.linalg.cholesky(np.where(seen, covariance, np.eye(2)) + FLOOR_PX**2 * np.eye(2)))
+        return np.where(self.observations.used[..., None, None], inverse, 0.0)
+
 
 @dataclass(frozen=True)
 class System:
@@ -111,7 +119,7 @@ def linearised(problem: Problem, estimate: Estimate, noise: Array, shaped: bool)
         residual[:, :, d] -= np.einsum("pnij,pnj->pni", observations.gradient, residual[:, :, 0])
         shared[:, :, d] -= observations.gradient @ shared[:, :, 0]
         by_pose[:, :, d] -= observations.gradient @ by_pose[:, :, 0]
-    return _weighted(plain, residual, shared, by_pose, _whitening(observations, noise))
+    return _weighted(plain, residual, shared, by_pose, problem.whitening / noise[:, None, None])
 
 
 def _put_own_columns(columns: Array, by_shape: Array) -> None:
@@ -138,13 +146,6 @@ def _weighted(plain: Array, residual: Array, shared: Array, by_pose: Array, whit
         plain,
         lengths,
     )
-
-
-def _whitening(observations: Observations, noise: Array) -> Array:
-    """What turns residuals into standard normal numbers : (p, n, d, 2, 2); zero where nothing was seen."""
-    covariance = np.where(observations.seen[..., None, None], observations.covariance, np.eye(2)) + FLOOR_PX**2 * np.eye(2)
-    inverse = np.linalg.inv(np.linalg.cholesky(covariance)) / noise[:, None, None]
-    return np.where(observations.used[..., None, None], inverse, 0.0)
 
 
 def stepped(problem: Problem, estimate: Estimate, shared: Array, poses: Array) -> Estimate:
