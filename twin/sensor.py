@@ -4,9 +4,10 @@ Photons arrive as a Poisson process and free electrons with the quantum efficien
 own response (PRNU) and dark signal (DSNU); reading adds dark noise; gain, black level, clipping and the ADC make a number.
 """
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,13 +57,36 @@ def auto_exposure(
     return max(round(seconds, 6), 1e-6)
 
 
-def expose(radiance: Images, device: CameraDevice, wavelength_nm: float, exposure: Exposure, seed: int) -> Numbers:
+class Stack(Protocol):
+    """Images : (n, h, w) float32, an array or made one by one."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Their number, height and width."""
+        ...
+
+    def __getitem__(self, k: int) -> Images: ...
+
+
+class Readout(NamedTuple):
+    """From radiance to digital numbers, for one sensor and exposure."""
+
+    scale: np.float32  # electrons a radiance
+    dark_e: np.float32  # electrons of the dark current
+    dark_variance: np.float32  # electrons^2, of the dark noise
+    gain: np.float32  # numbers of the ADC an electron
+    black: np.float32  # numbers of the ADC
+    brightest: np.float32  # number of the ADC
+    dropped: int  # least significant bits that the image leaves out
+
+
+def expose(radiance: Stack, device: CameraDevice, wavelength_nm: float, exposure: Exposure, seed: int) -> Numbers:
     """Take images.
 
     Parameters
     ----------
     radiance : (n, h, w) float32, W/mm^2/sr
-        Radiance at each pixel, from the renderer.
+        What the renderer says arrives at each pixel.
     seed : int
         Of the temporal noise; image k has its own stream, whatever the number of threads. PRNU and DSNU come from the camera's
         serial number: they are the same in every image and every capture.
@@ -71,17 +95,48 @@ def expose(radiance: Images, device: CameraDevice, wavelength_nm: float, exposur
     -------
     (n, h, w) uint8, or uint16 for more than 8 bits
     """
-    sensor = device.sensor
-    response, offset = fixed_pattern(sensor, radiance.shape[1:], device.serial)
-    scale = np.float32(electrons_per_radiance(device, wavelength_nm) * exposure.time_s)
-    dark = np.float32(sensor.dark_current_e_per_s * exposure.time_s)
+    sensor, (count, *shape) = device.sensor, radiance.shape
+    response, offset = fixed_pattern(sensor, tuple(shape), device.serial)
+    readout = readout_of(device, wavelength_nm, exposure)
+    numbers = np.empty((count, *shape), np.uint8 if exposure.bits == 8 else np.uint16)
 
-    def take(image: Images, stream: np.random.SeedSequence) -> Numbers:
-        mean = np.maximum(image * scale * response, 0) + dark
-        return digitise(read_out(mean, sensor.dark_noise_e, np.random.default_rng(stream)) + offset, sensor, exposure)
+    def take(k: int, stream: np.random.SeedSequence) -> None:
+        generator = np.random.default_rng(stream)
+        if sensor.dark_noise_e >= SMOOTHING_E:
+            normal = generator.standard_normal(tuple(shape), np.float32)
+            _take(radiance[k], normal, response, offset, readout, numbers[k])
+            return
+        mean = np.maximum(radiance[k] * readout.scale * response, 0) + readout.dark_e
+        numbers[k] = digitise(read_out(mean, sensor.dark_noise_e, generator) + offset, sensor, exposure)
 
-    with ThreadPoolExecutor() as pool:
-        return np.stack(list(pool.map(take, radiance, np.random.SeedSequence(seed).spawn(len(radiance)))))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(take, range(count), np.random.SeedSequence(seed).spawn(count)))
+    return numbers
+
+
+def readout_of(device: CameraDevice, wavelength_nm: float, exposure: Exposure) -> Readout:
+    """Of a camera."""
+    sensor, dropped = device.sensor, device.sensor.adc_bits - exposure.bits
+    return Readout(
+        np.float32(electrons_per_radiance(device, wavelength_nm) * exposure.time_s),
+        np.float32(sensor.dark_current_e_per_s * exposure.time_s),
+        np.float32(sensor.dark_noise_e**2),
+        np.float32(number_per_electron(sensor, exposure) * 2**dropped),
+        np.float32(sensor.black_level_dn * 2 ** (sensor.adc_bits - 8)),
+        np.float32(2**sensor.adc_bits - 1),
+        dropped,
+    )
+
+
+@njit(nogil=True)
+def _take(radiance, normal, response, offset, readout, numbers):
+    """One image by `read_out` and `digitise` in one pass, with the noise from standard normal numbers."""
+    for i in range(radiance.shape[0]):
+        for j in range(radiance.shape[1]):
+            mean = max(radiance[i, j] * readout.scale * response[i, j], np.float32(0)) + readout.dark_e
+            electrons = np.float32(_drawn(mean, normal[i, j], readout.dark_variance)) + offset[i, j]
+            count = np.rint(readout.black + electrons * readout.gain)
+            numbers[i, j] = np.uint16(min(max(count, np.float32(0)), readout.brightest)) >> readout.dropped
 
 
 def read_out(mean: Images, dark_noise_e: float, generator: np.random.Generator) -> Images:
@@ -97,18 +152,24 @@ def read_out(mean: Images, dark_noise_e: float, generator: np.random.Generator) 
     return electrons + np.float32(dark_noise_e) * generator.standard_normal(mean.shape, np.float32)
 
 
+@njit(inline="always")
+def _drawn(mean, z, dark_variance):
+    """Poisson of a mean plus normal noise, from a standard normal number, by the expansion of Cornish and Fisher (1938)."""
+    variance = mean + dark_variance
+    sigma = np.sqrt(variance)
+    skewness, kurtosis = mean / (variance * sigma), mean / (variance * variance)
+    bend = skewness / 6 * (z * z - 1)
+    bend += z * (kurtosis / 24 * (z * z - 3) - skewness * skewness / 36 * (2 * z * z - 5))
+    return mean + sigma * (z + bend)
+
+
 @njit(nogil=True)
 def _bent(mean, normal, dark_variance):
-    """Poisson of a mean plus normal noise, from standard normal numbers, by the expansion of Cornish and Fisher (1938)."""
+    """`_drawn` for each pixel : (h, w)."""
     result = np.empty_like(normal)
     for i in range(mean.shape[0]):
         for j in range(mean.shape[1]):
-            z, variance = normal[i, j], mean[i, j] + dark_variance
-            sigma = np.sqrt(variance)
-            skewness, kurtosis = mean[i, j] / (variance * sigma), mean[i, j] / (variance * variance)
-            bend = skewness / 6 * (z * z - 1)
-            bend += z * (kurtosis / 24 * (z * z - 3) - skewness * skewness / 36 * (2 * z * z - 5))
-            result[i, j] = mean[i, j] + sigma * (z + bend)
+            result[i, j] = _drawn(mean[i, j], normal[i, j], dark_variance)
     return result
 
 

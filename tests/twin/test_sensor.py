@@ -115,6 +115,21 @@ def test_noise_drawn_in_one_is_shot_and_dark_noise(rng, electrons, dark_noise):
     assert stats.ks_2samp(drawn, apart).pvalue > 1e-4
 
 
+@pytest.mark.parametrize("bits", [8, 10])
+def test_one_pass_is_the_chain_of_its_steps(rig, rng, bits):
+    """Exposure, shot and dark noise, fixed pattern and ADC in one compiled pass give the numbers of one step after the other."""
+    device, sensor, exposure = rig.cam1, rig.cam1.sensor, Exposure(0.01, 1.0, bits)
+    radiance = np.float32(rng.uniform(-1e-8, 7e-7, (2, 40, 50)))
+    assert sensor.dark_noise_e >= SMOOTHING_E
+    response, offset = fixed_pattern(sensor, (40, 50), device.serial)
+    scale = np.float32(electrons_per_radiance(device, WAVELENGTH) * exposure.time_s)
+    dark = np.float32(sensor.dark_current_e_per_s * exposure.time_s)
+    images = expose(radiance, device, WAVELENGTH, exposure, seed=4)
+    for image, light, stream in zip(images, radiance, np.random.SeedSequence(4).spawn(2), strict=True):
+        electrons = read_out(np.maximum(light * scale * response, 0) + dark, sensor.dark_noise_e, np.random.default_rng(stream))
+        np.testing.assert_array_equal(image, digitise(electrons + offset, sensor, exposure))
+
+
 def test_single_electrons_are_counted_where_dark_noise_is_low(rng):
     """A sensor without dark noise reads whole electrons, and none in the dark."""
     drawn = read_out(np.full((100, 100), 2.0, np.float32), 0.0, rng)
