@@ -7,12 +7,13 @@ finished set then takes its place as `OUT/capture/` and `OUT/truth/`.
 import json
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.capture import writer
 from recon.capture.manifest import MANIFEST, BoardPart, Device
@@ -26,7 +27,7 @@ from scenes.scene_types import Scene, Thing
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, Images, meets_something, render_pixels
 from twin.optics.raster import Light
-from twin.optics.ray_world import build_world, move_things
+from twin.optics.ray_world import build_world, is_convex, move_things
 from twin.optics.surface_session import CameraName, Shooting, calibration_of, camera_optics, describe_visible, device_of
 from twin.sensor import Exposure, Numbers, auto_exposure, expose
 from twin.session import SETTINGS, Session, write_json
@@ -51,6 +52,7 @@ class Stage:
     patterns: Light
     things: tuple[Thing, ...]  # in the board's frame
     world: mi.Scene  # the same things; moved from pose to pose
+    convex: bool  # whether they are one convex body, as a flat board is
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ def set_up(settings: Settings) -> Stage:
         Light.of(settings.patterns, settings.rig.projector),
         things,
         build_world(Scene("board", things)),
+        is_convex(things),
     )
 
 
@@ -98,7 +101,7 @@ def set_exposures(stage: Stage, settings: Settings) -> dict[CameraName, Exposure
         time_s = shooting.exposure_s
         if time_s is None:
             move_things(stage.world, stage.things, closest_pose(settings))
-            radiance = render_near(stage, optics, fully_on(stage.patterns), settings.engine, 0)
+            radiance = trace_near(stage, optics, fully_on(stage.patterns), settings.engine, 0)
             time_s = auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
         exposures[camera] = Exposure(time_s, shooting.gain, shooting.bits)
     return exposures
@@ -134,8 +137,10 @@ def shoot_pose(
         light, engine = with_fully_on(stage.patterns), settings.engine
         if camera != FRINGE_CAMERA:
             light, engine = fully_on(stage.patterns), engine.model_copy(update={"samples": EVEN_SAMPLES})
-        radiance = render_near(stage, optics, light, engine, light_seed)
-        refine_edges(radiance[-1], stage, optics, settings.engine, edge_seed)
+        radiance = trace_near(stage, optics, light, engine, light_seed)
+        on = radiance[-1]
+        refine_edges(on, stage, optics, settings.engine, edge_seed)
+        radiance.near[-1] = on.ravel()[radiance.pixels]
         device, wavelength = getattr(settings.rig, camera), settings.rig.projector.wavelength_nm
         images = expose(radiance, device, wavelength, exposures[camera], sensor_seed)
         lit[camera] = images[-1]
@@ -144,8 +149,30 @@ def shoot_pose(
     return lit, fringes
 
 
-def render_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine, seed: int) -> Images:
-    """As `transport.render` : (n, h, w), but only the board and what is near are traced; the rest of an image shows the room."""
+@dataclass(frozen=True)
+class NearBoard:
+    """Images : n of (h, w), W/mm^2/sr, that differ in some pixels only; the rest shows the room."""
+
+    room: Images  # (h, w)
+    pixels: NDArray[np.uint32]  # (m,) numbers `v * width + u`
+    near: Images  # (n, m)
+
+    def __getitem__(self, k: int) -> Images:
+        image = self.room.copy()
+        image.ravel()[self.pixels] = self.near[k]
+        return image
+
+    def __iter__(self) -> Iterator[Images]:
+        return (self[k] for k in range(len(self.near)))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of all images together : (n, h, w)."""
+        return len(self.near), *self.room.shape
+
+
+def trace_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine, seed: int) -> NearBoard:
+    """As `light_transport.render`, but only the board and what is near are traced; the rest of an image shows the room."""
     box = stage.world.bbox()
     corners = np.array([box.corner(k) for k in range(8)]).reshape(8, 3)
     depths = rigid.apply(optics.camera.camera_from_world, corners)[:, 2]
@@ -153,13 +180,15 @@ def render_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine
     window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     seen = cv2.dilate(np.uint8(meets_something(stage.world, optics)), window)
     pixels = np.flatnonzero(seen).astype(np.uint32)
-    width, height = optics.camera.size
-    radiance = np.empty((len(light.profiles), height, width), np.float32)
-    radiance[:] = optics.transmission * np.float32(engine.room_radiance)
+    near = np.empty((len(light.profiles), 0), np.float32)
     if len(pixels):
-        near = render_pixels(stage.world, optics, stage.projector, light, engine, seed, pixels)
-        radiance.reshape(len(radiance), -1)[:, pixels] = near
-    return radiance
+        near = render_pixels(stage.world, optics, stage.projector, light, engine, seed, pixels, convex=stage.convex)
+    return NearBoard(optics.transmission * np.float32(engine.room_radiance), pixels, near)
+
+
+def render_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine, seed: int) -> Images:
+    """The images of `trace_near`, whole : (n, h, w)."""
+    return np.stack([*trace_near(stage, optics, light, engine, seed)])
 
 
 def refine_edges(radiance: Images, stage: Stage, optics: CameraOptics, engine: Engine, seed: int) -> None:
@@ -172,7 +201,8 @@ def refine_edges(radiance: Images, stage: Stage, optics: CameraOptics, engine: E
     pixels = np.flatnonzero(contrast > EDGE_RANGE * radiance.max()).astype(np.uint32)
     finer = engine.model_copy(update={"samples": max(engine.samples, EDGE_SAMPLES)})
     light = fully_on(stage.patterns)
-    radiance.ravel()[pixels] = render_pixels(stage.world, optics, stage.projector, light, finer, seed, pixels)[0]
+    found = render_pixels(stage.world, optics, stage.projector, light, finer, seed, pixels, convex=stage.convex)
+    radiance.ravel()[pixels] = found[0]
 
 
 def fully_on(light: Light) -> Light:

@@ -5,6 +5,7 @@ own response (PRNU) and dark signal (DSNU); reading adds dark noise; gain, black
 """
 
 import os
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
@@ -44,7 +45,7 @@ def electrons_per_radiance(device: CameraDevice, wavelength_nm: float) -> float:
 
 
 def auto_exposure(
-    radiance: Images, device: CameraDevice, wavelength_nm: float, *, level: float = 0.9, percentile: float = 99.9
+    radiance: Iterable[Images], device: CameraDevice, wavelength_nm: float, *, level: float = 0.9, percentile: float = 99.9
 ) -> float:
     """Exposure time in s, to the microsecond, that brings the brightest image's percentile to a level of full scale at gain 1.
 

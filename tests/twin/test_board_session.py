@@ -19,6 +19,7 @@ from scenes.kinds import board
 from twin import board_session
 from twin.board_session import Settings
 from twin.optics.light_transport import Engine, render
+from twin.optics.ray_world import is_convex
 from twin.optics.surface_session import Shooting, calibration_of
 from twin.sensor import electrons_per_radiance
 from twin.session import Session
@@ -150,6 +151,20 @@ def test_what_is_far_from_the_board_is_the_room(settings, aperture_mm):
     whole = render(stage.world, optics, stage.projector, light, settings.engine, 5)
     assert near.shape == whole.shape and (whole[-1] < whole[-1].max() / 50).mean() > 0.3
     np.testing.assert_allclose(near, whole, rtol=1e-5)
+
+
+def test_a_flat_board_throws_no_shadow(settings):
+    """Looking for shadows on a convex board changes no bit of an image; a warped board isn't convex."""
+    stage = board_session.set_up(settings)
+    assert stage.convex
+    assert not is_convex(board.things(board.Config(warp_mm=0.1)))
+    board_session.move_things(stage.world, stage.things, board_session.place_all(settings)[0])
+    light = board_session.fully_on(stage.patterns)
+    images = [
+        board_session.render_near(replace(stage, convex=convex), stage.cameras["cam1"], light, settings.engine, 5)
+        for convex in (True, False)
+    ]
+    np.testing.assert_array_equal(*images)
 
 
 def test_a_board_out_of_sight_leaves_the_room(settings):

@@ -73,8 +73,13 @@ def render_pixels(
     engine: Engine,
     seed: int,
     pixels: NDArray[np.uint32],
+    *,
+    convex: bool = False,
 ) -> Images:
-    """Render some pixels : (m,) numbers `v * width + u`, as `render` does all : (n, m) float32, W/mm^2/sr."""
+    """Render some pixels : (m,) numbers `v * width + u`, as `render` does all : (n, m) float32, W/mm^2/sr.
+
+    Light that leaves a convex body meets nothing again: for a scene that is one, shadows needn't be looked for.
+    """
     table = LightTable.of(light)
     pixel = mi.UInt32(pixels)
     centre, across, down = camera.tables
@@ -85,14 +90,18 @@ def render_pixels(
     def body(index: mi.UInt32, sums: list[mi.Float], room: mi.Float) -> tuple:
         points = PairedPoints(pixel, index, engine.samples, seed_word)
         ray = sample_rays(camera, tables, pixel_offset(camera, points), points.mirrored_disc())
-        values, from_room = trace(scene, projector, table, engine, points, ray)
+        values, from_room = trace(scene, projector, table, engine, points, ray, convex)
         return index + 1, [total + value for total, value in zip(sums, values, strict=True)], room + from_room
 
     state = (mi.UInt32(0), [dr.zeros(mi.Float, len(pixels)) for _ in range(table.count)], dr.zeros(mi.Float, len(pixels)))
     _, sums, room = dr.while_loop(state, lambda index, sums, room: index < samples, body, label="samples")
     dr.eval(sums, room)
     scale = camera.transmission.ravel()[pixels] / np.float32(engine.samples)
-    return np.stack([(np.asarray(total) + np.asarray(room)) * scale for total in sums])
+    radiance = np.empty((table.count, len(pixels)), np.float32)
+    for total, values in zip(sums, radiance, strict=True):
+        np.add(np.asarray(total), np.asarray(room), out=values)
+        values *= scale
+    return radiance
 
 
 def meets_something(scene: mi.Scene, camera: CameraOptics) -> NDArray[np.bool_]:
@@ -108,7 +117,13 @@ def pixel_offset(camera: CameraOptics, points: PairedPoints) -> mi.Point2f:
 
 
 def trace(
-    scene: mi.Scene, projector: ProjectorOptics, table: LightTable, engine: Engine, points: PairedPoints, ray: mi.Ray3f
+    scene: mi.Scene,
+    projector: ProjectorOptics,
+    table: LightTable,
+    engine: Engine,
+    points: PairedPoints,
+    ray: mi.Ray3f,
+    convex: bool,
 ) -> tuple[list[mi.Float], mi.Float]:
     """Follow camera rays: radiance of each pattern, and of the room, W/mm^2/sr."""
     context = mi.BSDFContext()
@@ -124,12 +139,13 @@ def trace(
         source, projector_pixel, irradiance = light_point(projector, hit.p, points.mirrored_disc())
         shadow_ray = hit.spawn_ray_to(source)
         lit = active & (irradiance > 0) & (dr.dot(shadow_ray.d, hit.n) > 0)
-        lit &= ~scene.ray_test(shadow_ray, lit)
+        if not convex:
+            lit &= ~scene.ray_test(shadow_ray, lit)
         reflected = bsdf.eval(context, hit, hit.to_local(shadow_ray.d), lit)[0]  # BRDF times cosine
         weight = dr.select(lit, throughput * reflected * irradiance, 0)
         sums = [total + weight * value for total, value in zip(sums, table.lookup(projector_pixel, lit), strict=True)]
 
-        last = bounce + 1 == engine.bounces
+        last = convex or bounce + 1 == engine.bounces
         if last and engine.room_radiance == 0:
             break
         sample, factor = bsdf.sample(context, hit, points.square().x, points.square(), active)
@@ -137,5 +153,7 @@ def trace(
         ray = hit.spawn_ray(hit.to_world(sample.wo))
         active &= throughput > 0
         if last:
-            room += dr.select(active & ~scene.ray_test(ray, active), throughput * engine.room_radiance, 0)
+            free = active if convex else active & ~scene.ray_test(ray, active)
+            room += dr.select(free, throughput * engine.room_radiance, 0)
+            break
     return sums, room

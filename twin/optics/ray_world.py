@@ -4,17 +4,25 @@ from collections.abc import Sequence
 
 import mitsuba as mi
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from recon.geometry import rigid
 from recon.geometry.primitives import Sphere
 from scenes.scene_types import Material, Scene, Thing
 
+FILLED = 1e-6  # of a convex hull's volume may be missing by rounding: over a board's area 0.000003 mm
 RAMP = 1024  # texels of the texture that turns a texture coordinate into a reflectance
 
 
 def build_world(scene: Scene) -> mi.Scene:
     """Build the ray tracer's scene from the things that light can reach; shape k is visible thing k."""
     return mi.load_dict({"type": "scene", **named_shapes(scene)})
+
+
+def is_convex(things: Sequence[Thing]) -> bool:
+    """Whether closed things that don't overlap make up one convex body: they then fill their convex hull."""
+    hull = ConvexHull(np.concatenate([thing.mesh.vertices for thing in things]))
+    return sum(thing.mesh.volume for thing in things) > (1 - FILLED) * hull.volume
 
 
 def move_things(world: mi.Scene, things: Sequence[Thing], to_from: rigid.Array) -> None:
