@@ -12,8 +12,8 @@ the element send waves of their own; near the face their ripples differ from fre
 Source: Goodman, Introduction to Fourier Optics, chapter 4; reciprocity for the receiver.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +35,7 @@ BAND = np.linspace(-1.1, 1.1, 23)  # frequencies of an echo, in its full widths 
 DEEPER = 1.2  # true depth that the tables reach, over the shown one
 
 
-@dataclass(frozen=True, eq=False)
-class Beam:
+class Beam(NamedTuple):
     """Tables of the point spread of one transducer. Depths in rows of the image as shown."""
 
     lateral: Complex  # (h, taps) along the array, per row; taps odd, centred

@@ -4,6 +4,8 @@ Most of a ray's way lies in one tissue. The distance to the nearest solid, from 
 are sure to meet no border, so that only the rest has to be walked ray by ray.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
@@ -18,11 +20,28 @@ CLEAR = 1.15  # over a bundle's reach: distances of bent surfaces are true to se
 MOST = 32  # spans of a bundle
 GROWTH_MM = 0.3  # by which a span grows
 LEAP_MM = 2.5  # at most, less than the margin of the solids' grids
+START, STOP = range(2)  # columns of a span
 
 
-def spans(
-    body: Body, world_from_image: Array, x: Array, z: Array, first_mm: Array, deepest: float
-) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
+class Spans(NamedTuple):
+    """Spans of depth, by bundles of rays along the array and across the plane."""
+
+    depths: Array  # (n / 8, m / 5, MOST, 2) mm, START and STOP
+    counts: NDArray[np.int64]  # (n / 8, m / 5)
+    close: NDArray[np.bool_]  # (n / 8, m / 5, k) which solids have borders there
+
+
+class Bundles(NamedTuple):
+    """Middles of the bundles on the probe's face, and what their rays have in common."""
+
+    along: Array  # (n / 8,) mm
+    across: Array  # (m / 5,) mm
+    first_mm: Array  # (m / 5,) depth from which they count
+    deepest_mm: float
+    radius_mm: float  # around the middle, within which a bundle's rays run
+
+
+def spans(body: Body, world_from_image: Array, x: Array, z: Array, first_mm: Array, deepest_mm: float) -> Spans:
     """Spans of depth outside of which no ray of a bundle meets a border.
 
     Parameters
@@ -31,52 +50,56 @@ def spans(
         Places of the rays on the probe's face, evenly spaced; bundle (i, j) has those of [8 i, 8 i + 8) and [5 j, 5 j + 5).
     first_mm : (m,) mm
         Depth from which a ray counts, by its place across the plane.
-    deepest : mm, to which rays go.
-
-    Returns
-    -------
-    spans (n / 8, m / 5, MOST, 2) mm, first and last depth; how many there are (n / 8, m / 5); and which of the k solids have
-    borders there (n / 8, m / 5, k).
+    deepest_mm : to which rays go.
     """
     groups = [np.split(places, range(size, len(places), size)) for places, size in zip((x, z), BUNDLE, strict=True)]
     middles = [np.array([(part[0] + part[-1]) / 2 for part in group]) for group in groups]
     reach = [max(np.ptp(part) for part in group) / 2 for group in groups]
     starts = np.array([part.min() for part in np.split(first_mm, range(BUNDLE[1], len(z), BUNDLE[1]))])
     radius = CLEAR * float(np.hypot(reach[0], reach[1]))
-    return _spans(*body.packed(), world_from_image, middles[0], middles[1], radius, starts, deepest)
+    bundles = Bundles(middles[0], middles[1], starts, deepest_mm, radius)
+    return Spans(*_spans(body.packed(), np.ascontiguousarray(world_from_image, float), bundles))
 
 
 @njit(parallel=True)
-def _spans(flat, where, frame, pose, xs, zs, radius, starts, deepest):
-    found = np.zeros((len(xs), len(zs), MOST, 2))
-    counts = np.zeros((len(xs), len(zs)), np.int64)
-    close = np.zeros((len(xs), len(zs), len(where)), np.bool_)
-    for i in prange(len(xs)):
-        clear = np.zeros(len(where))  # depth up to which a solid is sure to have no border in the bundle
-        for j in range(len(zs)):
-            x = pose[0, 0] * xs[i] + pose[0, 2] * zs[j] + pose[0, 3]
-            y = pose[1, 0] * xs[i] + pose[1, 2] * zs[j] + pose[1, 3]
-            z = pose[2, 0] * xs[i] + pose[2, 2] * zs[j] + pose[2, 3]
-            t, count, end = starts[j], 0, -1.0
+def _spans(solids, pose, bundles):
+    n, m = len(bundles.along), len(bundles.across)
+    depths, counts = np.zeros((n, m, MOST, 2)), np.zeros((n, m), np.int64)
+    close = np.zeros((n, m, len(solids.grid)), np.bool_)
+    for i in prange(n):
+        clear = np.zeros(len(solids.grid))
+        for j in range(m):
+            along, across = bundles.along[i], bundles.across[j]
+            x = pose[0, 0] * along + pose[0, 2] * across + pose[0, 3]
+            y = pose[1, 0] * along + pose[1, 2] * across + pose[1, 3]
+            z = pose[2, 0] * along + pose[2, 2] * across + pose[2, 3]
+            t, count, end = bundles.first_mm[j], 0, -1.0
             clear[:] = t
-            while t < deepest:
-                met, onwards = False, deepest
-                for s in range(len(where)):
-                    if t >= clear[s]:
-                        d = distance_at(flat, where[s], frame[s], x + pose[0, 1] * t, y + pose[1, 1] * t, z + pose[2, 1] * t)
-                        here = abs(d) <= radius + GROWTH_MM
-                        clear[s] = t + (GROWTH_MM if here else min(abs(d) - radius, LEAP_MM))
-                        close[i, j, s] |= here
-                        met |= here
-                    onwards = min(onwards, clear[s])
-                if met:
-                    if t > end and count < MOST:
-                        found[i, j, count, 0] = t
-                        count += 1
-                    end = min(t + GROWTH_MM, deepest)
-                    found[i, j, count - 1, 1] = end
-                    t += GROWTH_MM
-                else:
-                    t = onwards
+            while t < bundles.deepest_mm:
+                point = x + pose[0, 1] * t, y + pose[1, 1] * t, z + pose[2, 1] * t
+                met = _borders_near(clear, close[i, j], solids, point, t, bundles.radius_mm)
+                if not met:
+                    t = min(clear.min(), bundles.deepest_mm) if len(clear) else bundles.deepest_mm
+                    continue
+                if t > end and count < MOST:
+                    depths[i, j, count, START] = t
+                    count += 1
+                end = min(t + GROWTH_MM, bundles.deepest_mm)
+                depths[i, j, count - 1, STOP] = end
+                t += GROWTH_MM
             counts[i, j] = count
-    return found, counts, close
+    return depths, counts, close
+
+
+@njit(inline="always")
+def _borders_near(clear, close, solids, point, t, radius_mm):
+    """Whether a border may lie in a bundle at a depth; marks its solids, and the depths up to which each is sure to have none."""
+    met = False
+    for solid in range(len(clear)):
+        if t >= clear[solid]:
+            d = distance_at(solids, solid, point[0], point[1], point[2])
+            here = abs(d) <= radius_mm + GROWTH_MM
+            clear[solid] = t + (GROWTH_MM if here else min(abs(d) - radius_mm, LEAP_MM))
+            close[solid] |= here
+            met |= here
+    return met

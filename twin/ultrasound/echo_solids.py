@@ -7,6 +7,7 @@ smaller come later. A plane's distance is linear, and so exact on a grid of two 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -26,6 +27,26 @@ LARGE_MM = 60.0  # greatest extent of a small one
 MARGIN_MM = 3.0  # of the grids, around the solid
 BAND_MM = 3.0  # from a mesh, beyond which only the sign of its distance counts
 THIN_MM = 0.5  # radius, below which a rod is a wire
+
+FIRST, NX, NY, NZ = range(4)  # columns of `Solids.grid`
+X0, Y0, Z0, PER_X, PER_Y, PER_Z = range(6)  # columns of `Solids.frame`
+
+
+class Solids(NamedTuple):
+    """Signed distances of the n solids on their grids, for compiled code; a row a solid."""
+
+    distance: NDArray[np.float32]  # (m,) mm, of all grids, one after the other
+    grid: NDArray[np.int64]  # (n, 4) place of the first value in `distance`, and points along x, y, z
+    frame: Array  # (n, 6) first point, mm in the world, and points a mm
+
+
+class Tissues(NamedTuple):
+    """Acoustic figures by label : (n + 1,), 0 for the surroundings, for compiled code."""
+
+    impedance: Array  # MRayl
+    speed: Array  # m/s
+    loss: Array  # nepers a mm, both ways
+    roughness: Array  # mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +84,23 @@ class Body:
         """By label: 0 is what surrounds the solids."""
         return (self.medium, *(solid.tissue for solid in self.solids))
 
-    def packed(self) -> tuple[NDArray[np.float32], NDArray[np.int64], Array]:
-        """Distances : (m,) in a row, per solid start and size : (n, 4), and origin and 1/spacing : (n, 6)."""
+    def packed(self) -> Solids:
+        """The solids' distances, for compiled code."""
         return self._packed
 
     @cached_property
-    def _packed(self) -> tuple[NDArray[np.float32], NDArray[np.int64], Array]:
+    def _packed(self) -> Solids:
         sizes = [solid.distance.size for solid in self.solids]
         starts = np.concatenate([[0], np.cumsum(sizes)])[:-1] if sizes else []
-        where = [(int(start), *solid.distance.shape) for start, solid in zip(starts, self.solids, strict=True)]
+        grid = [(int(start), *solid.distance.shape) for start, solid in zip(starts, self.solids, strict=True)]
         frame = [(*solid.origin, *(1 / solid.spacing)) for solid in self.solids]
         flat = np.concatenate([solid.distance.ravel() for solid in self.solids]) if sizes else np.zeros(0, np.float32)
-        return flat, np.array(where, np.int64).reshape(-1, 4), np.array(frame, float).reshape(-1, 6)
+        return Solids(flat, np.array(grid, np.int64).reshape(-1, 4), np.array(frame, float).reshape(-1, 6))
+
+    def acoustics(self, frequency_mhz: float) -> Tissues:
+        """The tissues' figures at a frequency, for compiled code."""
+        loss = self.column("attenuation") * frequency_mhz * np.log(10) / 100  # from dB/cm/MHz
+        return Tissues(self.column("impedance"), self.column("speed"), loss, self.column("roughness"))
 
     def column(self, name: str) -> Array:
         """A figure of the tissues by label : (n + 1,)."""
@@ -178,25 +204,35 @@ def _from_mesh(mesh: trimesh.Trimesh, points: Array, step: float) -> NDArray[np.
 
 
 @njit(inline="always")
-def distance_at(flat, where, frame, x, y, z):
-    """Signed distance of one solid at a point of the world, trilinear; 1e3 and more outside its grid."""
-    gx, gy, gz = (x - frame[0]) * frame[3], (y - frame[1]) * frame[4], (z - frame[2]) * frame[5]
-    nx, ny, nz = where[1], where[2], where[3]
-    if gx < 0 or gy < 0 or gz < 0 or gx > nx - 1 or gy > ny - 1 or gz > nz - 1:
-        return np.float32(1e3)
-    i, j, k = min(int(gx), nx - 2), min(int(gy), ny - 2), min(int(gz), nz - 2)
-    a, b, c = np.float32(gx - i), np.float32(gy - j), np.float32(gz - k)
-    p = where[0] + (i * ny + j) * nz + k
-    q, r, s = p + nz, p + ny * nz, p + ny * nz + nz
-    low = (flat[p] * (1 - c) + flat[p + 1] * c) * (1 - b) + (flat[q] * (1 - c) + flat[q + 1] * c) * b
-    high = (flat[r] * (1 - c) + flat[r + 1] * c) * (1 - b) + (flat[s] * (1 - c) + flat[s + 1] * c) * b
-    return low * (1 - a) + high * a
+def between(low, high, share):
+    """The value a share of the way from one to another."""
+    return low + share * (high - low)
 
 
 @njit(inline="always")
-def label_at(flat, where, frame, x, y, z):
+def distance_at(solids, solid, x, y, z):
+    """Signed distance of one solid at a point of the world, trilinear; 1e3 outside its grid."""
+    grid, frame = solids.grid, solids.frame
+    gx = (x - frame[solid, X0]) * frame[solid, PER_X]
+    gy = (y - frame[solid, Y0]) * frame[solid, PER_Y]
+    gz = (z - frame[solid, Z0]) * frame[solid, PER_Z]
+    nx, ny, nz = grid[solid, NX], grid[solid, NY], grid[solid, NZ]
+    if gx < 0 or gy < 0 or gz < 0 or gx > nx - 1 or gy > ny - 1 or gz > nz - 1:
+        return 1e3
+    i, j, k = min(int(gx), nx - 2), min(int(gy), ny - 2), min(int(gz), nz - 2)
+    a, b, c = gx - i, gy - j, gz - k
+    value, row, sheet = solids.distance, np.uint64(nz), np.uint64(ny * nz)
+    p = np.uint64(grid[solid, FIRST] + (i * ny + j) * nz + k)  # unsigned, or each access would look for a negative index
+    q, r, s, one = p + row, p + sheet, p + sheet + row, np.uint64(1)
+    near = between(between(value[p], value[p + one], c), between(value[q], value[q + one], c), b)
+    far = between(between(value[r], value[r + one], c), between(value[s], value[s + one], c), b)
+    return between(near, far, a)
+
+
+@njit(inline="always")
+def label_at(solids, x, y, z):
     """Label of a point: 0 in the surroundings, k + 1 in solid k, the last that holds it."""
-    for k in range(len(where) - 1, -1, -1):
-        if distance_at(flat, where[k], frame[k], x, y, z) < 0:
+    for k in range(len(solids.grid) - 1, -1, -1):
+        if distance_at(solids, k, x, y, z) < 0:
             return k + 1
     return 0

@@ -5,97 +5,96 @@ same tissue from every pose, with nothing stored. Places are uniform in the cell
 has no echo of its own. A scatterer's length f follows from the backscatter coefficient: `density f² = eta`.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from recon.compiled import njit
-from twin.ultrasound.beam import OVERSAMPLING, STEP_MM, Beam
-from twin.ultrasound.echo_solids import Body, distance_at, label_at
+from recon.geometry import rigid
+from twin.ultrasound.beam import STEP_MM, Beam
+from twin.ultrasound.echo_field import (
+    BESIDE_MM,
+    END,
+    FIRST,
+    PARTS,
+    Field,
+    deposit,
+    field_like,
+    scanner_at,
+    slab,
+    summed,
+)
+from twin.ultrasound.echo_solids import Body, between, distance_at, label_at
 from twin.ultrasound.sound_paths import Paths
 from twin.ultrasound.transducer import Transducer
 
-Field = NDArray[np.complex64]
+Array = NDArray[np.float64]
 
-BESIDE_MM = 2.0  # beside the image, from where scatterers still count
 TURNS = 4096  # entries of the table of phases, a power of two
 MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)  # of a cell's coordinates
-PARTS = 16  # in which echoes are summed: not the number of threads, on which the rounding would then depend
-SPREAD = 7  # without a common factor with PARTS
+BITS = 21  # of a hash for each coordinate of the place in a cell
 RUN = 8  # cells in a row whose tissue is looked up at once, where no border is near
 CLEAR = 1.15  # over a run's reach: distances of bent surfaces are true to second order
+X, Y, Z = range(3)  # rows of `Lattice.image_from_world`, and of a column's places in the image's frame
+LABEL, P, Q, R = range(3, 7)  # rows of a column's places: tissue, and place in the cell in steps of 2^-BITS
+NEAR_BORDER = -1  # a label that has to be looked up at each place
 
 
-def field_like(transducer: Transducer, beam: Beam) -> Field:
-    """An empty field of echoes : (w + taps - 1, OVERSAMPLING h), lines by shown depth, with room for the beam's width."""
-    width, height = transducer.image_size
-    return np.zeros((width + beam.lateral.shape[1] - 1, OVERSAMPLING * height), np.complex64)
+class Lattice(NamedTuple):
+    """Cells around the slice, in columns along one of the lattice's axes, and what scatterers in them send back."""
+
+    edge_mm: float
+    axes: NDArray[np.int64]  # (3,) the one most along the image's x, the other, and the columns': most across the plane
+    low: NDArray[np.int64]  # (3,) first cell of the box around the slice
+    high: NDArray[np.int64]  # (3,) last cell
+    image_from_world: Array  # (3, 4) mm
+    half_mm: NDArray[np.float32]  # (m,) half thickness of the slice that a column may meet which crosses the plane at a depth
+    strength: NDArray[np.float32]  # (n + 1,) of a scatterer's echo, by label
+    turns: Field  # (TURNS,) phases of an echo
 
 
-def scatter(body: Body, transducer: Transducer, beam: Beam, paths: Paths, world_from_image: NDArray, seed: int) -> Field:
+def scatter(body: Body, transducer: Transducer, beam: Beam, paths: Paths, world_from_image: Array, seed: int) -> Field:
     """Demodulated echoes of the tissue's scatterers, weighed across the plane, before the point spread in the plane."""
+    scanner = scanner_at(transducer, beam, paths, world_from_image, seed)
+    lattice = _lattice(body, transducer, beam, scanner.world_from_image)
+    fields = np.zeros((PARTS, *field_like(transducer, beam).shape), np.complex64)
+    return summed(fields, _scatter(fields, body.packed(), lattice, scanner, beam, paths))
+
+
+def _lattice(body: Body, transducer: Transducer, beam: Beam, pose: Array) -> Lattice:
     edge = transducer.scatterers_per_mm3 ** (-1 / 3)
     strength = np.sqrt(body.scattering() / transducer.scatterers_per_mm3) * transducer.wavelength_mm
     turns = np.exp(2j * np.pi * np.arange(TURNS) / TURNS).astype(np.complex64)
-    pose = np.asarray(world_from_image, float)
-    sx, sy = transducer.scale_mm_per_px
-    axes = _lattice_axes(pose)
-    fields = np.zeros((PARTS, *field_like(transducer, beam).shape), np.complex64)
-    touched = _scatter(
-        *body.packed(),
-        pose,
-        _lattice_box(transducer, beam, pose, edge),
-        axes,
-        edge,
-        np.uint64(seed),
-        strength.astype(np.float32),
-        sx,
-        sy / OVERSAMPLING,
-        paths.step_mm,
-        paths.shown_mm,
-        paths.amplitude,
-        paths.shift_mm,
-        beam.elevation,
-        beam.core_mm,
-        _thickness(beam, pose, axes, edge),
-        deepest_seen(transducer, beam, paths),
-        beam.depth_step_mm,
-        transducer.wavenumber,
-        turns,
-        fields,
-    )
-    return summed(fields, touched)
+    axes = _axes(pose)
+    low, high = _box(transducer, beam, pose, edge)
+    image_from_world = np.ascontiguousarray(rigid.invert(pose)[:3])
+    half = _half_thickness(beam, pose, axes[2], edge)
+    return Lattice(edge, axes, low, high, image_from_world, half, strength.astype(np.float32), turns)
 
 
-def _lattice_axes(pose: NDArray) -> tuple[int, int, int]:
-    """The lattice's axis most along the image's x, the other one, and the one most across the image."""
+def _axes(pose: Array) -> NDArray[np.int64]:
     across = int(np.abs(pose[:3, 2]).argmax())
     along, other = sorted({0, 1, 2} - {across}, key=lambda axis: -abs(pose[axis, 0]))
-    return along, other, across
+    return np.array([along, other, across])
 
 
-def _lattice_box(transducer: Transducer, beam: Beam, pose: NDArray, edge: float) -> NDArray[np.int64]:
-    """First and last cell : (2, 3) of the box around the slice."""
+def _box(transducer: Transducer, beam: Beam, pose: Array, edge: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and last cell of the box around the slice."""
     x = np.array([-BESIDE_MM, transducer.width_mm + BESIDE_MM])
     y = np.array([0.0, beam.depth_step_mm * (len(beam.core_mm) - 1)])
     z = np.array([-1.0, 1.0]) * float(beam.core_mm.max())
     corners = np.stack(np.meshgrid(x, y, z), axis=-1).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
-    return np.stack([np.floor(corners.min(axis=0) / edge), np.floor(corners.max(axis=0) / edge)]).astype(np.int64)
+    low, high = corners.min(axis=0) / edge, corners.max(axis=0) / edge
+    return np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
 
 
-def _thickness(beam: Beam, pose: NDArray, axes: tuple[int, int, int], edge: float) -> NDArray[np.float32]:
-    """Half thickness of the slice that a column of cells may meet which crosses the image's plane at a depth, as `core_mm`."""
-    tilt = abs(pose[axes[2], 1] / pose[axes[2], 2])
+def _half_thickness(beam: Beam, pose: Array, main: int, edge: float) -> NDArray[np.float32]:
+    tilt = abs(pose[main, 1] / pose[main, 2])
     rows = int(np.ceil(((float(beam.core_mm.max()) + 2 * edge) * tilt + 2 * edge) / beam.depth_step_mm))
     return maximum_filter1d(beam.core_mm, 2 * rows + 1)
-
-
-def deepest_seen(transducer: Transducer, beam: Beam, paths: Paths) -> float:
-    """Depth, mm, beyond which no line shows anything in the image."""
-    last = transducer.depth_mm + transducer.scale_mm_per_px[1] * beam.axial.shape[1] / 2 / OVERSAMPLING
-    levels = int(np.searchsorted(paths.shown_mm.min(axis=0), last))
-    return min(paths.step_mm * levels, beam.depth_step_mm * (len(beam.core_mm) - 1))
 
 
 @njit(inline="always")
@@ -106,151 +105,142 @@ def hashed(i, j, k, seed):
 
 @njit(inline="always")
 def mixed(x, seed):
-    """64 random bits of what the coordinates have been folded to."""
+    """64 random bits of folded coordinates."""
     x = x + seed * np.uint64(0xD6E8FEB86659FD93)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))
 
 
-@njit(inline="always")
-def deposit(field, px, py, value):
-    """Add an echo at a fractional place of the field, shared among the four samples around it."""
-    i, j = int(np.floor(px)), int(np.floor(py))
-    if i < 0 or j < 0 or i >= field.shape[0] - 1 or j >= field.shape[1] - 1:
-        return
-    a, b = np.float32(px - i), np.float32(py - j)
-    field[i, j] += value * ((1 - a) * (1 - b))
-    field[i, j + 1] += value * ((1 - a) * b)
-    field[i + 1, j] += value * (a * (1 - b))
-    field[i + 1, j + 1] += value * (a * b)
-
-
-@njit(inline="always")
-def uniform_label(flat, where, frame, x, y, z, radius):
-    """Label of all points within a distance of one, or -1 if a border may come as near."""
-    found = 0
-    for k in range(len(where)):
-        d = distance_at(flat, where[k], frame[k], x, y, z)
-        if abs(d) <= radius:
-            return -1
-        if d < 0:
-            found = k + 1
-    return found
-
-
 @njit(parallel=True, fastmath=True)
-def _scatter(
-    flat,
-    where,
-    frame,
-    pose,
-    box,
-    axes,
-    edge,
-    seed,
-    strength,
-    sx,
-    row,
-    step,
-    shown,
-    amplitude,
-    shift,
-    elevation,
-    half,
-    thickness,
-    deepest,
-    depth_step,
-    wavenumber,
-    turns,
-    fields,
-):
-    first, second, main = axes
-    lines, depths = shown.shape
-    parts = fields.shape[0]
-    pad = (fields.shape[1] - lines) // 2
-    mask = np.uint64(0x1FFFFF)
-    to_turn = 2 * wavenumber / (2 * np.pi) * len(turns)
-    turn = len(turns) - 1  # a mask, as their number is a power of two
-    columns = box[1, first] - box[0, first] + 1
-    normal = pose[main, 2]
-    radius = CLEAR * edge * np.sqrt((RUN / 2) ** 2 + 0.5)  # of a run of cells, around its middle
-    right = sx * (lines - 1) + BESIDE_MM
-    per_line, per_row, per_step, per_plane, per_place = 1 / sx, 1 / row, 1 / step, 1 / depth_step, 1 / STEP_MM
-    bit = edge / 2097152
-    ax, ay, az = bit * pose[0, 0], bit * pose[0, 1], bit * pose[0, 2]  # image's x, y, z of a step of 2^-21 in the cell
-    bx, by, bz = bit * pose[1, 0], bit * pose[1, 1], bit * pose[1, 2]
-    cx, cy, cz = bit * pose[2, 0], bit * pose[2, 1], bit * pose[2, 2]
-    mix_first, mix_second, mix_main = MIX[first], MIX[second], MIX[main]
-    touched = np.zeros((parts, 2), np.int64)
-    for part in prange(parts):
-        field = fields[part]
-        corner = np.zeros(3)  # of a cell, in the world
-        off = np.full(3, 0.5 * edge)  # of a run's middle from it
-        off[main] = 0.0
-        low_line, high_line = lines + 2 * pad, 0
-        slab = part * SPREAD % parts  # threads take parts in order: so each gets some from everywhere
-        for column in range(columns * slab // parts, columns * (slab + 1) // parts):
-            i = box[0, first] + column
-            for j in range(box[0, second], box[1, second] + 1):
-                u, v = i * edge - pose[first, 3], j * edge - pose[second, 3]
-                w = -(u * pose[first, 2] + v * pose[second, 2]) / normal  # where the column crosses the image's plane
-                x = u * pose[first, 0] + v * pose[second, 0] + w * pose[main, 0]
-                y = u * pose[first, 1] + v * pose[second, 1] + w * pose[main, 1]
-                level = min(max(int(y / depth_step + 0.5), 0), len(thickness) - 1)
-                most = (thickness[level] + 2 * edge) / abs(normal)
-                aside, deeper = most * abs(pose[main, 0]) + 2 * edge, most * abs(pose[main, 1]) + 2 * edge
-                if y < -deeper or y > deepest + deeper or x < -BESIDE_MM - aside or x > right + aside:
-                    continue
-                low = int(np.floor((w - most + pose[main, 3]) / edge))
-                high = int(np.floor((w + most + pose[main, 3]) / edge))
-                corner[first], corner[second] = i * edge, j * edge
-                folded = np.uint64(i) * mix_first ^ np.uint64(j) * mix_second
-                for start in range(low, high + 1, RUN):
-                    corner[main] = (start + RUN / 2) * edge
-                    known = uniform_label(flat, where, frame, corner[0] + off[0], corner[1] + off[1], corner[2] + off[2], radius)
-                    if known >= 0 and strength[known] == 0:
-                        continue
-                    for k in range(start, min(start + RUN, high + 1)):
-                        w = k * edge - pose[main, 3]
-                        bits = mixed(folded ^ np.uint64(k) * mix_main, seed)
-                        p, q, r = float(bits & mask), float((bits >> np.uint64(21)) & mask), float((bits >> np.uint64(42)) & mask)
-                        y = u * pose[first, 1] + v * pose[second, 1] + w * pose[main, 1] + p * ay + q * by + r * cy
-                        z = abs(u * pose[first, 2] + v * pose[second, 2] + w * pose[main, 2] + p * az + q * bz + r * cz)
-                        if y < 0 or y >= deepest:
-                            continue
-                        plane = int(y * per_plane + 0.5)
-                        if z >= half[plane]:
-                            continue
-                        x = u * pose[first, 0] + v * pose[second, 0] + w * pose[main, 0] + p * ax + q * bx + r * cx
-                        if x < -BESIDE_MM or x > right:
-                            continue
-                        label = known
-                        if known < 0:
-                            corner[main] = k * edge
-                            label = label_at(flat, where, frame, corner[0] + p * bit, corner[1] + q * bit, corner[2] + r * bit)
-                        f = strength[label]
-                        if f == 0:
-                            continue
-                        line = min(max(int(x * per_line + 0.5), 0), lines - 1)
-                        level = min(int(y * per_step), depths - 2)
-                        share = np.float32(y * per_step - level)
-                        seen = shown[line, level] * (1 - share) + shown[line, level + 1] * share
-                        phase = turns[int(seen * to_turn) & turn]
-                        value = f * amplitude[line, level] * elevation[plane, int(z * per_place + 0.5)] * phase
-                        across = (x - shift[line, level]) * per_line + pad
-                        deposit(field, across, seen * per_row, value)
-                        low_line, high_line = min(low_line, int(across)), max(high_line, int(across) + 2)
-        touched[part] = max(low_line, 0), min(high_line, lines + 2 * pad)
+def _scatter(fields, solids, lattice, scanner, beam, paths):
+    """Lay the echoes of all scatterers in the slice; lines that each part has touched : (PARTS, 2)."""
+    first, second = lattice.axes[0], lattice.axes[1]
+    columns = lattice.high[first] - lattice.low[first] + 1
+    most = 2 * RUN + int(4 * (lattice.half_mm.max() / lattice.edge_mm + 2))  # cells of a column; its cosine is 0.57 at least
+    touched = np.zeros((PARTS, 2), np.int64)
+    for part in prange(PARTS):
+        begin, end = slab(part, columns)
+        places, cell = np.empty((7, most)), np.zeros(3, np.int64)
+        low, high = fields.shape[1], 0
+        for i in range(begin, end):
+            cell[first] = lattice.low[first] + i
+            for j in range(lattice.low[second], lattice.high[second] + 1):
+                cell[second] = j
+                found = _places_in_slice(places, cell, solids, lattice, scanner, beam, paths)
+                left, right = _lay_echoes(fields[part], places, found, solids, lattice, scanner, beam, paths)
+                low, high = min(low, left), max(high, right)
+        touched[part, FIRST], touched[part, END] = max(low, 0), min(high, fields.shape[1])
     return touched
 
 
-@njit(fastmath=True)
-def summed(fields, touched):
-    """Sum over parts, always in the same order, of the lines that each has touched."""
-    total = np.zeros(fields.shape[1:], fields.dtype)
-    for part in range(len(fields)):
-        for line in range(touched[part, 0], touched[part, 1]):
-            for sample in range(total.shape[1]):
-                total[line, sample] += fields[part, line, sample]
-    return total
+@njit(inline="always")
+def _places_in_slice(places, cell, solids, lattice, scanner, beam, paths):
+    """Find a column's scatterers in the slice: fills the rows of `places`; their number."""
+    right = scanner.line_mm * (len(paths.labels) - 1) + BESIDE_MM
+    low, high = _cells_in_slice(cell, lattice, beam, scanner.deepest_mm, right)
+    found, per_step = 0, 1 / beam.depth_step_mm
+    for start in range(low, high + 1, RUN):
+        label = _label_of_run(cell, start, solids, lattice)
+        if label >= 0 and lattice.strength[label] == 0:
+            continue
+        _hash_places(places, found, cell, start, lattice, scanner.seed)
+        for n in range(found, found + min(RUN, high + 1 - start)):
+            x, y, z = places[X, n], places[Y, n], places[Z, n]
+            if 0 <= y < scanner.deepest_mm and -BESIDE_MM <= x <= right and abs(z) < beam.core_mm[int(y * per_step + 0.5)]:
+                places[X, found], places[Y, found], places[Z, found], places[LABEL, found] = x, y, z, label
+                found += 1
+    return found
+
+
+@njit(inline="always")
+def _cells_in_slice(cell, lattice, beam, deepest, right):
+    """First and last cell of a column that may hold scatterers in the slice; the last before the first if none may."""
+    first, second, main = lattice.axes[0], lattice.axes[1], lattice.axes[2]
+    to, edge = lattice.image_from_world, lattice.edge_mm
+    u, v, normal = cell[first] * edge, cell[second] * edge, to[Z, main]
+    w = -(u * to[Z, first] + v * to[Z, second] + to[Z, 3]) / normal  # where the column crosses the image's plane
+    x = u * to[X, first] + v * to[X, second] + w * to[X, main] + to[X, 3]
+    y = u * to[Y, first] + v * to[Y, second] + w * to[Y, main] + to[Y, 3]
+    half = lattice.half_mm[min(max(int(y / beam.depth_step_mm + 0.5), 0), len(lattice.half_mm) - 1)]
+    most = (half + 2 * edge) / abs(normal)
+    aside, deeper = most * abs(to[X, main]) + 2 * edge, most * abs(to[Y, main]) + 2 * edge
+    if y < -deeper or y > deepest + deeper or x < -BESIDE_MM - aside or x > right + aside:
+        return 0, -1
+    before = edge * (min(to[Z, 0], 0.0) + min(to[Z, 1], 0.0) + min(to[Z, 2], 0.0))  # how far a cell reaches beside its corner
+    beyond = edge * (max(to[Z, 0], 0.0) + max(to[Z, 1], 0.0) + max(to[Z, 2], 0.0))
+    ends = (-half - beyond) / normal, (half - before) / normal
+    return int(np.ceil((w + min(ends[0], ends[1])) / edge)), int(np.floor((w + max(ends[0], ends[1])) / edge))
+
+
+@njit(inline="always")
+def _label_of_run(cell, start, solids, lattice):
+    """Label of a run of cells along a column, or NEAR_BORDER if a border may lie in one."""
+    edge, main = lattice.edge_mm, lattice.axes[2]
+    x = edge * (start + RUN / 2 if main == X else cell[X] + 0.5)
+    y = edge * (start + RUN / 2 if main == Y else cell[Y] + 0.5)
+    z = edge * (start + RUN / 2 if main == Z else cell[Z] + 0.5)
+    radius = CLEAR * edge * np.sqrt((RUN / 2) ** 2 + 0.5)
+    label = 0
+    for solid in range(len(solids.grid)):
+        d = distance_at(solids, solid, x, y, z)
+        if abs(d) <= radius:
+            return NEAR_BORDER
+        if d < 0:
+            label = solid + 1
+    return label
+
+
+@njit(inline="always")
+def _hash_places(places, found, cell, start, lattice, seed):
+    """Places of the scatterers of a run of cells, after those that are found already."""
+    first, second, main = lattice.axes[0], lattice.axes[1], lattice.axes[2]
+    to, edge = lattice.image_from_world, lattice.edge_mm
+    folded = np.uint64(cell[first]) * MIX[first] ^ np.uint64(cell[second]) * MIX[second]
+    mix, mask, bit = MIX[main], np.uint64(2**BITS - 1), edge / 2**BITS
+    p, q, r = places[P, found : found + RUN], places[Q, found : found + RUN], places[R, found : found + RUN]
+    for n in range(RUN):
+        bits = mixed(folded ^ np.uint64(start + n) * mix, seed)
+        p[n], q[n], r[n] = bits & mask, (bits >> np.uint64(BITS)) & mask, (bits >> np.uint64(2 * BITS)) & mask
+    for axis in range(3):
+        corner = edge * (cell[first] * to[axis, first] + cell[second] * to[axis, second]) + to[axis, 3]
+        onwards, a, b, c = edge * to[axis, main], bit * to[axis, X], bit * to[axis, Y], bit * to[axis, Z]
+        place = places[axis, found : found + RUN]
+        for n in range(RUN):
+            place[n] = corner + (start + n) * onwards + p[n] * a + q[n] * b + r[n] * c
+
+
+@njit(inline="always")
+def _lay_echoes(field, places, found, solids, lattice, scanner, beam, paths):
+    """Lay the echoes of a column's scatterers; the first line they touch and the end."""
+    lines, depths = paths.labels.shape
+    pad = (len(field) - lines) // 2
+    to_turn = 2 * scanner.wavenumber / (2 * np.pi) * TURNS
+    per_line, per_sample, per_level = 1 / scanner.line_mm, 1 / scanner.sample_mm, 1 / paths.step_mm
+    per_row, per_column = 1 / beam.depth_step_mm, 1 / STEP_MM
+    first, end = len(field), 0
+    for n in range(found):
+        x, y, z, label = places[X, n], places[Y, n], places[Z, n], int(places[LABEL, n])
+        if label == NEAR_BORDER:
+            label = _label_in_image(solids, scanner.world_from_image, x, y, z)
+        if lattice.strength[label] == 0:
+            continue
+        line, level = min(max(int(x * per_line + 0.5), 0), lines - 1), min(int(y * per_level), depths - 2)
+        seen = between(paths.shown_mm[line, level], paths.shown_mm[line, level + 1], y * per_level - level)
+        weight = beam.elevation[int(y * per_row + 0.5), int(abs(z) * per_column + 0.5)]
+        value = lattice.strength[label] * paths.amplitude[line, level] * weight
+        across = (x - paths.shift_mm[line, level]) * per_line + pad
+        deposit(field, across, seen * per_sample, value * lattice.turns[int(seen * to_turn) & (TURNS - 1)])
+        first, end = min(first, int(across)), max(end, int(across) + 2)
+    return first, end
+
+
+@njit(inline="always")
+def _label_in_image(solids, pose, x, y, z):
+    """Label of a point of the image's frame."""
+    return label_at(
+        solids,
+        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
+        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
+        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3],
+    )

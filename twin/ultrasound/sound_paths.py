@@ -5,7 +5,7 @@ depth (delay at the assumed speed), the amplitude that is left both ways (attenu
 refraction has bent it sideways.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.compiled import njit
 from twin.ultrasound.beam import DEEPER
-from twin.ultrasound.echo_solids import Body, distance_at, label_at
+from twin.ultrasound.echo_solids import Body, between, distance_at, label_at
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -23,8 +23,7 @@ LEAP_MM = 2.5  # at most, without a look at the tissue; less than the margin of 
 GRADIENT_MM = 0.3  # over which a surface's normal is taken
 
 
-@dataclass(frozen=True, eq=False)
-class Paths:
+class Paths(NamedTuple):
     """Tables over lines (the image's columns) and true depth in steps of `step_mm`."""
 
     step_mm: float
@@ -37,21 +36,13 @@ class Paths:
 def follow(body: Body, transducer: Transducer, world_from_image: Array) -> Paths:
     """Follow the lines of one pose : world_from_image (4, 4) mm."""
     sx, sy = transducer.scale_mm_per_px
-    depths = int(np.ceil(DEEPER * transducer.depth_mm / sy)) + 1
-    labels, shown, amplitude, shift = _follow(
-        *body.packed(),
-        np.asarray(world_from_image, float),
-        transducer.image_size[0],
-        depths,
-        sx,
-        sy,
-        body.column("impedance"),
-        body.column("speed"),
-        body.column("attenuation") * transducer.frequency_mhz * np.log(10) / 100,  # dB/cm/MHz both ways to nepers a mm
-        transducer.assumed_speed,
-        transducer.refraction,
-    )
-    return Paths(sy, labels, shown, amplitude, shift)
+    size = transducer.image_size[0], int(np.ceil(DEEPER * transducer.depth_mm / sy)) + 1
+    tables = [np.full(size, start, np.float32) for start in (0, 1, 0)]
+    paths = Paths(sy, np.zeros(size, np.uint8), *tables)
+    pose = np.ascontiguousarray(world_from_image, float)
+    tissues = body.acoustics(transducer.frequency_mhz)
+    _follow(paths, body.packed(), tissues, pose, sx, transducer.assumed_speed, transducer.refraction)
+    return paths
 
 
 @njit(inline="always")
@@ -65,58 +56,87 @@ def reflection(z1, z2, c1, c2, cosine):
 
 
 @njit(inline="always")
-def normal_at(flat, where, frame, x, y, z):
+def normal_at(solids, solid, x, y, z):
     """Outward normal of a solid at a point of the world, from central differences."""
     h = GRADIENT_MM
-    a = distance_at(flat, where, frame, x + h, y, z) - distance_at(flat, where, frame, x - h, y, z)
-    b = distance_at(flat, where, frame, x, y + h, z) - distance_at(flat, where, frame, x, y - h, z)
-    c = distance_at(flat, where, frame, x, y, z + h) - distance_at(flat, where, frame, x, y, z - h)
+    a = distance_at(solids, solid, x + h, y, z) - distance_at(solids, solid, x - h, y, z)
+    b = distance_at(solids, solid, x, y + h, z) - distance_at(solids, solid, x, y - h, z)
+    c = distance_at(solids, solid, x, y, z + h) - distance_at(solids, solid, x, y, z - h)
     size = np.sqrt(a * a + b * b + c * c) + 1e-12
     return a / size, b / size, c / size
 
 
+@njit(inline="always")
+def table_at(table, line, depth, step_mm):
+    """The value of a table over lines and depths at a depth, linear between its steps."""
+    level = min(int(depth / step_mm), table.shape[1] - 2)
+    return between(table[line, level], table[line, level + 1], depth / step_mm - level)
+
+
+@njit(inline="always")
+def _nearest(solids, x, y, z):
+    """Distance to the nearest border, LEAP_MM at most."""
+    near = LEAP_MM
+    for solid in range(len(solids.grid)):
+        near = min(near, abs(distance_at(solids, solid, x, y, z)))
+    return near
+
+
+@njit
+def _share_before(solids, solid, pose, point, step_mm):
+    """Share of the last step down to a point that lies before a solid's border."""
+    x, y, z = point
+    ahead = distance_at(solids, solid, x, y, z)
+    back = distance_at(solids, solid, x - pose[0, 1] * step_mm, y - pose[1, 1] * step_mm, z - pose[2, 1] * step_mm)
+    return min(max(back / (back - ahead), 0.0), 1.0) if back != ahead else 0.5
+
+
+@njit
+def _through_border(solids, tissues, pose, point, here, there):
+    """Share of the amplitude that passes a border, there and back, and tangent by which the line turns along the array."""
+    nx, ny, nz = normal_at(solids, max(here, there) - 1, point[0], point[1], point[2])
+    cosine = nx * pose[0, 1] + ny * pose[1, 1] + nz * pose[2, 1]
+    square = max(abs(cosine), 0.02)
+    speed = tissues.speed[here], tissues.speed[there]
+    r = reflection(tissues.impedance[here], tissues.impedance[there], speed[0], speed[1], square)
+    along = (nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]) * (1.0 if cosine > 0 else -1.0)
+    turn = (speed[1] / speed[0] - 1) * -along / square
+    return max(1 - r * r, 0.0), min(max(turn, -0.3), 0.3)
+
+
 @njit(parallel=True)
-def _follow(flat, where, frame, pose, lines, depths, sx, step, impedance, speed, loss, assumed, refract):
-    labels = np.zeros((lines, depths), np.uint8)
-    shown = np.zeros((lines, depths), np.float32)
-    amplitude = np.ones((lines, depths), np.float32)
-    shift = np.zeros((lines, depths), np.float32)
-    dx, dy, dz = pose[0, 1], pose[1, 1], pose[2, 1]
+def _follow(paths, solids, tissues, pose, line_mm, assumed_speed, refract):
+    lines, depths = paths.labels.shape
+    step = paths.step_mm
+    delays, kept = step * assumed_speed * (1 / tissues.speed), np.exp(-step * tissues.loss)  # of whole steps, by label
     for line in prange(lines):
-        x0, y0, z0 = pose[0, 0] * sx * line + pose[0, 3], pose[1, 0] * sx * line + pose[1, 3], pose[2, 0] * sx * line + pose[2, 3]
-        here = label_at(flat, where, frame, x0, y0, z0)
-        labels[line, 0] = here
+        x0, y0, z0 = (
+            pose[0, 0] * line_mm * line + pose[0, 3],
+            pose[1, 0] * line_mm * line + pose[1, 3],
+            pose[2, 0] * line_mm * line + pose[2, 3],
+        )
+        here = label_at(solids, x0, y0, z0)
+        paths.labels[line, 0] = here
         delay, left, slope, aside, clear = 0.0, 1.0, 0.0, 0.0, 0.0
-        for k in range(1, depths):
-            t = step * k
-            x, y, z = x0 + dx * t, y0 + dy * t, z0 + dz * t
+        for level in range(1, depths):
+            t = step * level
+            x, y, z = x0 + pose[0, 1] * t, y0 + pose[1, 1] * t, z0 + pose[2, 1] * t
             there = here
             if t >= clear:  # a border may lie as near
-                there = label_at(flat, where, frame, x, y, z)
-                near = LEAP_MM
-                for s in range(len(where)):
-                    near = min(near, abs(distance_at(flat, where[s], frame[s], x, y, z)))
-                clear = t + 0.9 * near
-            part = 1.0  # of the step in the tissue that it started in
-            if there != here:
-                s = max(here, there) - 1
-                back = distance_at(flat, where[s], frame[s], x - dx * step, y - dy * step, z - dz * step)
-                ahead = distance_at(flat, where[s], frame[s], x, y, z)
-                part = min(max(back / (back - ahead), 0.0), 1.0) if back != ahead else 0.5
-                nx, ny, nz = normal_at(flat, where[s], frame[s], x, y, z)
-                cosine = nx * dx + ny * dy + nz * dz
-                size = max(abs(cosine), 0.02)
-                r = reflection(impedance[here], impedance[there], speed[here], speed[there], size)
-                left *= max(1 - r * r, 0.0)
-                if refract:
-                    along = (nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]) * (1.0 if cosine > 0 else -1.0)
-                    slope += min(max((speed[there] / speed[here] - 1) * -along / size, -0.3), 0.3)
-            delay += step * assumed * (part / speed[here] + (1 - part) / speed[there])
-            left *= np.exp(-step * (part * loss[here] + (1 - part) * loss[there]))
+                there = label_at(solids, x, y, z)
+                clear = t + 0.9 * _nearest(solids, x, y, z)
+            if there == here:
+                delay += delays[here]
+                left *= kept[here]
+            else:
+                part = _share_before(solids, max(here, there) - 1, pose, (x, y, z), step)
+                passed, turn = _through_border(solids, tissues, pose, (x, y, z), here, there)
+                delay += part * delays[here] + (1 - part) * delays[there]
+                left *= passed * np.exp(-step * (part * tissues.loss[here] + (1 - part) * tissues.loss[there]))
+                slope += turn if refract else 0.0
             aside += slope * step
             here = there
-            labels[line, k] = here
-            shown[line, k] = delay
-            amplitude[line, k] = left
-            shift[line, k] = aside
-    return labels, shown, amplitude, shift
+            paths.labels[line, level] = here
+            paths.shown_mm[line, level] = delay
+            paths.amplitude[line, level] = left
+            paths.shift_mm[line, level] = aside

@@ -5,78 +5,94 @@ a curved one is seen where it is square. What its roughness takes from the coher
 tilted that their phases alias reach no aperture, and are left out of the coherent sum.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
 from recon.compiled import njit
 from twin.ultrasound import borders
-from twin.ultrasound.beam import OVERSAMPLING, STEP_MM, Beam
-from twin.ultrasound.echo_solids import Body, distance_at
-from twin.ultrasound.medium import BESIDE_MM, PARTS, SPREAD, deepest_seen, deposit, field_like, hashed, summed
-from twin.ultrasound.sound_paths import Paths, normal_at, reflection
+from twin.ultrasound.beam import STEP_MM, Beam
+from twin.ultrasound.borders import BUNDLE, START, STOP
+from twin.ultrasound.echo_field import BESIDE_MM, END, FIRST, PARTS, Field, deposit, field_like, scanner_at, slab, summed
+from twin.ultrasound.echo_solids import Body, Wire, distance_at
+from twin.ultrasound.medium import hashed
+from twin.ultrasound.sound_paths import Paths, normal_at, reflection, table_at
 from twin.ultrasound.transducer import Transducer
 
-Field = NDArray[np.complex64]
+Array = NDArray[np.float64]
 
 SUBLINES = 2  # rays a line
 ACROSS_MM = 0.2  # between rays across the plane
 STEPS_MM = (0.15, 2.5)  # of the march, least and most; less than the margin of the solids' grids
+GLANCING = 0.05  # cosine, below which a facet sends nothing back
 PATCH_MM = 0.1  # over which roughness keeps its height, about half a wavelength
 ALONG_MM = 0.05  # between points of a wire
 RINGS = 3  # echoes from within a wire
 TAPER = (2.2, 4.4)  # rad of phase from line to line: coherent echoes fade; more than apertures accept, less than aliases in them
 
 
-def surface_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths, world_from_image: NDArray, seed: int) -> Field:
+FROM, TO, DEPTH = range(3)  # columns of a ray's crossings: labels before and behind the border, mm
+CROSSINGS = 256  # of a ray, at most
+BEFORE, AFTER = range(2)  # rows of the solids' distances, of a step of the march
+
+
+class Rays(NamedTuple):
+    """Places of rays on the probe's face, in the image's frame."""
+
+    along: Array  # (n,) mm
+    across: Array  # (m,) mm
+
+
+class Ray(NamedTuple):
+    """One of them, straight into the depth: its place on the face, and its start and direction in the world."""
+
+    along: float
+    across: float
+    x: float
+    y: float
+    z: float
+    dx: float
+    dy: float
+    dz: float
+
+
+class Strand(NamedTuple):
+    """Points of a wire, and the echoes of each."""
+
+    world: Array  # (n, 3) mm
+    image: Array  # (n, 3) mm, of its front
+    rise_mm: float  # from point to point, into the depth
+    roughness: float  # mm
+    echoes: Array  # (m, 2) mm behind the front, and strength
+
+
+def surface_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths, world_from_image: Array, seed: int) -> Field:
     """Demodulated echoes of all borders of tissues in the slice, before the point spread in the plane."""
-    half = float(beam.half_mm.max())
-    deepest = deepest_seen(transducer, beam, paths)
-    fields = np.zeros((PARTS, *field_like(transducer, beam).shape), np.complex64)
     if not body.solids:
-        return fields[0]
-    sx, sy = transducer.scale_mm_per_px
+        return field_like(transducer, beam)
+    scanner = scanner_at(transducer, beam, paths, world_from_image, seed)
+    half, sx = float(beam.half_mm.max()), scanner.line_mm
     across = ACROSS_MM * np.arange(-int(half / ACROSS_MM), int(half / ACROSS_MM) + 1)
     beside = int(SUBLINES * BESIDE_MM / sx)  # rays beside the image, or its edges would diffract
-    aside = (np.arange(-beside, SUBLINES * transducer.image_size[0] + beside) + 0.5) * sx / SUBLINES - sx / 2
-    pose = np.asarray(world_from_image, float)
-    touched = _surfaces(
-        *body.packed(),
-        pose,
-        aside,
-        across,
-        *borders.spans(body, pose, aside, across, _first_depths(transducer, beam, across), deepest),
-        body.column("impedance"),
-        body.column("speed"),
-        body.column("roughness"),
-        sx,
-        sy / OVERSAMPLING,
-        paths.step_mm,
-        paths.shown_mm,
-        paths.amplitude,
-        paths.shift_mm,
-        beam.elevation,
-        beam.half_mm,
-        beam.depth_step_mm,
-        deepest,
-        transducer.wavenumber,
-        transducer.assumed_speed,
-        transducer.reverberations,
-        transducer.face_reflection,
-        np.uint64(seed),
-        fields,
-    )
+    along = (np.arange(-beside, SUBLINES * transducer.image_size[0] + beside) + 0.5) * sx / SUBLINES - sx / 2
+    first = _first_depths(transducer, beam, across)
+    spans = borders.spans(body, scanner.world_from_image, along, across, first, scanner.deepest_mm)
+    fields = np.zeros((PARTS, *field_like(transducer, beam).shape), np.complex64)
+    tissues = body.acoustics(transducer.frequency_mhz)
+    touched = _border_echoes(fields, body.packed(), tissues, Rays(along, across), spans, scanner, beam, paths)
     return summed(fields, touched)
 
 
-def _first_depths(transducer: Transducer, beam: Beam, across: NDArray) -> NDArray:
+def _first_depths(transducer: Transducer, beam: Beam, across: Array) -> Array:
     """Depths, mm, from which rays across the plane, or the repeats of what they meet, are in the slice : as `across`."""
     thick = beam.half_mm > np.abs(across)[:, None]
     first = np.where(thick.any(axis=1), thick.argmax(axis=1), len(beam.half_mm))
     return np.maximum(first - 1, 0) * beam.depth_step_mm / (transducer.reverberations + 1)
 
 
-def wire_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths, world_from_image: NDArray, seed: int) -> Field:
+def wire_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths, world_from_image: Array, seed: int) -> Field:
     """Demodulated echoes of wires in the slice, before the point spread in the plane.
 
     A wire of radius a, met square, reflects as a strip of the mirror `sqrt(a lambda / 2)` wide: Kirchhoff's integral round its
@@ -85,45 +101,37 @@ def wire_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths, wo
     little back, and from half the depth that the scanner focuses on.
     """
     field = field_like(transducer, beam)
-    image_from_world = np.linalg.inv(world_from_image)
-    sx, sy = transducer.scale_mm_per_px
+    scanner = scanner_at(transducer, beam, paths, world_from_image, seed)
     for wire in body.wires:
-        length = float(np.linalg.norm(wire.ends[1] - wire.ends[0]))
-        count = max(int(length / ALONG_MM), 2)
-        share = (np.arange(count) + 0.5)[:, None] / count
-        points = wire.ends[0] * (1 - share) + wire.ends[1] * share
-        direction = (wire.ends[1] - wire.ends[0]) / length @ image_from_world[:3, :3].T
-        local = points @ image_from_world[:3, :3].T + image_from_world[:3, 3]
-        bounce = (wire.tissue.impedance - body.medium.impedance) / (wire.tissue.impedance + body.medium.impedance)
-        strength = np.sqrt(wire.radius * transducer.wavelength_mm / 2) * length / count
-        ring = 2 * wire.radius * transducer.assumed_speed / wire.tissue.speed
-        echoes = [(0.0, bounce)] + [(ring * n, -bounce * (1 - bounce**2) * bounce ** (2 * n - 2)) for n in range(1, RINGS + 1)]
-        _wire(
-            points,
-            local,
-            direction[1] * length / count,
-            wire.radius,
-            wire.tissue.roughness,
-            np.array(echoes) * [1, strength],
-            sx,
-            sy / OVERSAMPLING,
-            paths.step_mm,
-            paths.shown_mm,
-            paths.amplitude,
-            paths.shift_mm,
-            beam.elevation,
-            beam.half_mm,
-            beam.depth_step_mm,
-            transducer.wavenumber,
-            np.uint64(seed),
-            field,
-        )
+        _lay_wire(field, _strand(wire, body.medium.impedance, transducer, world_from_image), scanner, beam, paths)
     return field
+
+
+def _strand(wire: Wire, around: float, transducer: Transducer, world_from_image: Array) -> Strand:
+    """A wire's points, every ALONG_MM, in a medium of an impedance."""
+    image_from_world = np.linalg.inv(world_from_image)
+    length = float(np.linalg.norm(wire.ends[1] - wire.ends[0]))
+    count = max(int(length / ALONG_MM), 2)
+    share = (np.arange(count) + 0.5)[:, None] / count
+    points = wire.ends[0] * (1 - share) + wire.ends[1] * share
+    direction = (wire.ends[1] - wire.ends[0]) / length @ image_from_world[:3, :3].T
+    local = points @ image_from_world[:3, :3].T + image_from_world[:3, 3] - [0, wire.radius, 0]
+    bounce = (wire.tissue.impedance - around) / (wire.tissue.impedance + around)
+    ring = 2 * wire.radius * transducer.assumed_speed / wire.tissue.speed
+    echoes = [(0.0, bounce)] + [(ring * n, -bounce * (1 - bounce**2) * bounce ** (2 * n - 2)) for n in range(1, RINGS + 1)]
+    strength = np.sqrt(wire.radius * transducer.wavelength_mm / 2) * length / count
+    return Strand(points, local, float(direction[1] * length / count), wire.tissue.roughness, np.array(echoes) * [1, strength])
 
 
 @njit(inline="always")
 def _sinc(x):
     return np.sin(x) / x if abs(x) > 1e-4 else 1.0
+
+
+@njit(inline="always")
+def _turned(phase):
+    """A complex number of length 1."""
+    return complex(np.cos(phase), np.sin(phase))
 
 
 @njit(inline="always")
@@ -141,210 +149,178 @@ def _phase_of_patch(x, y, z, seed):
     return 2 * np.pi * (bits >> np.uint64(11)) / 9007199254740992.0
 
 
-@njit(inline="always")
-def _at(table, line, depth, step):
-    level = min(int(depth / step), table.shape[1] - 2)
-    part = depth / step - level
-    return table[line, level] * (1 - part) + table[line, level + 1] * part
+@njit(parallel=True, fastmath=True)
+def _border_echoes(fields, solids, tissues, rays, spans, scanner, beam, paths):
+    """Lay the echoes of all borders in the slice; lines that each part has touched : (PARTS, 2)."""
+    touched = np.zeros((PARTS, 2), np.int64)
+    left, right = paths.shift_mm.max(), paths.shift_mm.min()
+    pad = (fields.shape[1] - len(paths.labels)) // 2
+    for part in prange(PARTS):
+        begin, end = slab(part, len(rays.along))
+        touched[part, FIRST] = max(int(np.floor((rays.along[begin] - left) / scanner.line_mm)) + pad - 1, 0)
+        touched[part, END] = min(int(np.floor((rays.along[end - 1] - right) / scanner.line_mm)) + pad + 3, fields.shape[1])
+        distances, crossings = np.zeros((2, len(solids.grid))), np.empty((CROSSINGS, 3))
+        for i in range(begin, end):
+            for j in range(len(rays.across)):
+                ray = _ray(rays.along[i], rays.across[j], scanner.world_from_image)
+                bundle = i // BUNDLE[0], j // BUNDLE[1]
+                met = _crossings_of(ray, crossings, distances, solids, spans, bundle, beam, scanner.repeats)
+                _lay_facets(fields[part], ray, crossings[:met], solids, tissues, scanner, beam, paths)
+    return touched
 
 
 @njit(inline="always")
-def _echo(field, x, seen, depth, z, strength, line, pad, sx, row, step, shift, elevation, half, depth_step, wavenumber):
-    plane = min(int(depth / depth_step + 0.5), len(half) - 1)
-    if abs(z) >= half[plane]:
-        return
-    carrier = np.exp(2j * wavenumber * seen)
-    value = np.complex64(strength * carrier) * elevation[plane, int(abs(z) / STEP_MM + 0.5)]
-    level = min(int(depth / step), shift.shape[1] - 1)
-    deposit(field, (x - shift[line, level]) / sx + pad, seen / row, value)
+def _ray(along, across, pose):
+    return Ray(
+        along,
+        across,
+        pose[0, 0] * along + pose[0, 2] * across + pose[0, 3],
+        pose[1, 0] * along + pose[1, 2] * across + pose[1, 3],
+        pose[2, 0] * along + pose[2, 2] * across + pose[2, 3],
+        pose[0, 1],
+        pose[1, 1],
+        pose[2, 1],
+    )
 
 
 @njit(inline="always")
-def _in_slice(y, z, orders, half, depth_step):
+def _crossings_of(ray, crossings, distances, solids, spans, bundle, beam, repeats):
+    """March a ray through the spans of its bundle; the number of borders between tissues that it crosses in the slice."""
+    met, started = 0, False
+    for span in range(spans.counts[bundle]):
+        here, stride = -1, 0.0
+        t, stop = spans.depths[bundle[0], bundle[1], span, START], spans.depths[bundle[0], bundle[1], span, STOP]
+        while True:
+            there, near = _tissue_at(ray, t, solids, spans.close[bundle], distances, started)
+            started = True  # solids without borders near the bundle need no second look
+            if here >= 0 and there != here and met < CROSSINGS and _in_slice(t, ray.across, repeats, beam):
+                solid = max(here, there) - 1
+                before, after = distances[BEFORE, solid], distances[AFTER, solid]
+                part = before / (before - after) if before != after else 0.5
+                crossings[met, FROM], crossings[met, TO] = here, there
+                crossings[met, DEPTH] = t - stride + min(max(part, 0.0), 1.0) * stride
+                met += 1
+            here = there
+            if t >= stop:
+                break
+            stride = min(max(near, STEPS_MM[0]), stop - t + 1e-6)
+            t += stride
+    return met
+
+
+@njit(inline="always")
+def _tissue_at(ray, t, solids, close, distances, close_alone):
+    """Label at a depth of a ray, and a step that crosses no border; brings the distances of the solids up to date."""
+    label, near = 0, STEPS_MM[1]
+    for solid in range(distances.shape[1]):
+        distances[BEFORE, solid] = distances[AFTER, solid]
+        if close[solid] or not close_alone:
+            d = distance_at(solids, solid, ray.x + ray.dx * t, ray.y + ray.dy * t, ray.z + ray.dz * t)
+            distances[AFTER, solid] = d
+            near = min(near, 0.9 * abs(d))
+        if distances[AFTER, solid] < 0:
+            label = solid + 1
+    return label, near
+
+
+@njit(inline="always")
+def _in_slice(y, z, repeats, beam):
     """Whether a place across the image's plane lies in the slice, at its depth or at that of one of its repeats."""
-    for order in range(1, orders + 2):
-        plane = min(int(order * y / depth_step + 0.5), len(half) - 1)
-        if abs(z) < half[plane]:
+    for order in range(1, repeats + 2):
+        row = min(int(order * y / beam.depth_step_mm + 0.5), len(beam.half_mm) - 1)
+        if abs(z) < beam.half_mm[row]:
             return True
     return False
 
 
-@njit(parallel=True, fastmath=True)
-def _surfaces(
-    flat,
-    where,
-    frame,
-    pose,
-    aside,
-    across,
-    spans,
-    counts,
-    close,
-    impedance,
-    speed,
-    roughness,
-    sx,
-    row,
-    step,
-    shown,
-    amplitude,
-    shift,
-    elevation,
-    half,
-    depth_step,
-    deepest,
-    wavenumber,
-    assumed,
-    orders,
-    face,
-    seed,
-    fields,
-):
-    lines, depths = shown.shape
-    solids = len(where)
-    pad = (fields.shape[1] - lines) // 2
-    parts = fields.shape[0]
-    deepest = min(deepest, step * (depths - 2))
-    last = fields.shape[2] * row
-    area = sx / SUBLINES * ACROSS_MM
-    diffuse = 2 * np.pi / wavenumber / np.sqrt(np.pi * area)  # Lambert: cos / pi of the power a steradian
-    dx, dy, dz = pose[0, 1], pose[1, 1], pose[2, 1]
-    touched = np.zeros((parts, 2), np.int64)
-    for thread in prange(parts):
-        field = fields[thread]
-        slab = thread * SPREAD % parts
-        first, end = len(aside) * slab // parts, len(aside) * (slab + 1) // parts
-        touched[thread, 0] = max(int(np.floor((aside[first] - shift.max()) / sx)) + pad - 1, 0)
-        touched[thread, 1] = min(int(np.floor((aside[end - 1] - shift.min()) / sx)) + pad + 3, fields.shape[1])
-        before, after = np.zeros(solids), np.zeros(solids)
-        for ray in range(first, end):
-            x = aside[ray]
-            line = min(max(int(x / sx + 0.5), 0), lines - 1)
-            for k in range(len(across)):
-                z, bundle = across[k], (ray // borders.BUNDLE[0], k // borders.BUNDLE[1])
-                wx = pose[0, 0] * x + pose[0, 2] * z + pose[0, 3]
-                wy = pose[1, 0] * x + pose[1, 2] * z + pose[1, 3]
-                wz = pose[2, 0] * x + pose[2, 2] * z + pose[2, 3]
-                for span in range(counts[bundle]):
-                    here, t, stride, stop = -1, spans[bundle][span, 0], 0.0, spans[bundle][span, 1]
-                    while True:
-                        there, near = 0, STEPS_MM[1]
-                        for s in range(solids):
-                            if here < 0 or close[bundle][s]:
-                                after[s] = distance_at(flat, where[s], frame[s], wx + dx * t, wy + dy * t, wz + dz * t)
-                                near = min(near, 0.9 * abs(after[s]))
-                            if after[s] < 0:
-                                there = s + 1
-                        if here >= 0 and there != here and _in_slice(t, z, orders, half, depth_step):
-                            s = max(here, there) - 1
-                            part = before[s] / (before[s] - after[s]) if before[s] != after[s] else 0.5
-                            y = t - stride + min(max(part, 0.0), 1.0) * stride
-                            px, py, pz = wx + dx * y, wy + dy * y, wz + dz * y
-                            miss = distance_at(flat, where[s], frame[s], px, py, pz)
-                            nx, ny, nz = normal_at(flat, where[s], frame[s], px, py, pz)
-                            cosine = nx * dx + ny * dy + nz * dz
-                            if abs(cosine) > 0.05:
-                                if abs(miss) < 0.1:
-                                    y -= miss / cosine
-                                size = abs(cosine)
-                                slope_x = (nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]) / size
-                                slope_z = (nx * pose[0, 2] + ny * pose[1, 2] + nz * pose[2, 2]) / size
-                                level = max(int(y / step) - 1, 0)  # before the border, where delays have a kink
-                                seen = shown[line, level] + (y - level * step) * assumed / speed[here]
-                                left = amplitude[line, level]
-                                r = reflection(impedance[here], impedance[there], speed[here], speed[there], size)
-                                square = (impedance[there] - impedance[here]) / (impedance[there] + impedance[here])
-                                spread = 2 * wavenumber * roughness[s + 1] * size
-                                lost = np.sqrt(1 - np.exp(-spread * spread))
-                                rough = square * diffuse * lost * np.sqrt(size) * np.exp(1j * _phase_of_patch(px, py, pz, seed))
-                                strength = area * left
-                                for order in range(1, orders + 2):
-                                    if order * seen >= last or order * y >= deepest:
-                                        break
-                                    facet = _unaliased(2 * order * wavenumber * slope_x * sx)
-                                    facet *= _unaliased(2 * order * wavenumber * slope_z * ACROSS_MM)
-                                    value = r * facet * np.exp(-0.5 * (order * spread) ** 2) + (rough if order == 1 else 0j)
-                                    if value != 0:
-                                        _echo(
-                                            field,
-                                            x,
-                                            order * seen,
-                                            order * y,
-                                            z,
-                                            strength * value,
-                                            line,
-                                            pad,
-                                            sx,
-                                            row,
-                                            step,
-                                            shift,
-                                            elevation,
-                                            half,
-                                            depth_step,
-                                            wavenumber,
-                                        )
-                                    strength *= r * face * left
-                        here = there
-                        for s in range(solids):
-                            before[s] = after[s]
-                        if t >= stop:
-                            break
-                        stride = min(max(near, STEPS_MM[0]), stop - t + 1e-6)
-                        t += stride
-    return touched
+@njit(inline="always")
+def _lay_facets(field, ray, crossings, solids, tissues, scanner, beam, paths):
+    """Lay the echoes of all facets that a ray meets."""
+    for n in range(len(crossings)):
+        _lay_facet(field, ray, crossings[n], solids, tissues, scanner, beam, paths)
+
+
+@njit(inline="always")
+def _facet(ray, y, solids, solid, pose):
+    """Depth of a solid's border on a ray, cosine to its normal, and slopes along the array and across the plane."""
+    x0, y0, z0 = ray.x + ray.dx * y, ray.y + ray.dy * y, ray.z + ray.dz * y
+    nx, ny, nz = normal_at(solids, solid, x0, y0, z0)
+    cosine = nx * ray.dx + ny * ray.dy + nz * ray.dz
+    square = max(abs(cosine), 1e-6)
+    miss = distance_at(solids, solid, x0, y0, z0)
+    depth = y - miss / cosine if abs(miss) < 0.1 and abs(cosine) > GLANCING else y
+    slope_x = (nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]) / square
+    slope_z = (nx * pose[0, 2] + ny * pose[1, 2] + nz * pose[2, 2]) / square
+    return depth, square, slope_x, slope_z
+
+
+@njit(inline="always")
+def _lay_facet(field, ray, crossing, solids, tissues, scanner, beam, paths):
+    """Lay the echo of a border's facet, and its repeats between border and face."""
+    here, there, solid = int(crossing[FROM]), int(crossing[TO]), int(max(crossing[FROM], crossing[TO])) - 1
+    depth = crossing[DEPTH]
+    y, square, slope_x, slope_z = _facet(ray, depth, solids, solid, scanner.world_from_image)
+    if square <= GLANCING:
+        return
+    lines, depths = paths.labels.shape
+    line = min(max(int(ray.along / scanner.line_mm + 0.5), 0), lines - 1)
+    level = max(int(y / paths.step_mm) - 1, 0)  # before the border, where delays have a kink
+    speed, impedance = tissues.speed, tissues.impedance
+    seen = paths.shown_mm[line, level] + (y - level * paths.step_mm) * scanner.assumed_speed / speed[here]
+    left = paths.amplitude[line, level]
+    r = reflection(impedance[here], impedance[there], speed[here], speed[there], square)
+    mirror = np.exp(-0.5 * (2 * scanner.wavenumber * tissues.roughness[solid + 1] * square) ** 2)
+    area, carrier = scanner.line_mm / SUBLINES * ACROSS_MM, _turned(2 * scanner.wavenumber * seen)
+    strength, once = area * left * carrier, r * scanner.face_reflection * left * carrier
+    last, deepest = field.shape[1] * scanner.sample_mm, min(scanner.deepest_mm, paths.step_mm * (depths - 2))
+    for order in range(1, scanner.repeats + 2):
+        if order * seen >= last or order * y >= deepest:
+            break
+        row = min(int(order * y / beam.depth_step_mm + 0.5), len(beam.half_mm) - 1)
+        if abs(ray.across) < beam.half_mm[row]:
+            value = complex(r * mirror ** (order * order))
+            value *= _unaliased(2 * order * scanner.wavenumber * slope_x * scanner.line_mm)
+            value *= _unaliased(2 * order * scanner.wavenumber * slope_z * ACROSS_MM)
+            if order == 1 and mirror < 1:
+                phase = _phase_of_patch(ray.x + ray.dx * depth, ray.y + ray.dy * depth, ray.z + ray.dz * depth, scanner.seed)
+                value += _scattered(mirror, impedance[here], impedance[there], square, area, scanner) * _turned(phase)
+            if value != 0:
+                echo = np.complex64(strength * value) * beam.elevation[row, int(abs(ray.across) / STEP_MM + 0.5)]
+                beside = paths.shift_mm[line, min(int(order * y / paths.step_mm), depths - 1)]
+                across = (ray.along - beside) / scanner.line_mm + (len(field) - lines) // 2
+                deposit(field, across, order * seen / scanner.sample_mm, echo)
+        strength *= once
+
+
+@njit(inline="always")
+def _scattered(mirror, z1, z2, square, area, scanner):
+    """Amplitude that roughness sends to all sides, by Lambert's law: cos / pi of the power a steradian."""
+    diffuse = 2 * np.pi / scanner.wavenumber / np.sqrt(np.pi * area)
+    return (z2 - z1) / (z2 + z1) * diffuse * np.sqrt(1 - mirror * mirror) * np.sqrt(square)
 
 
 @njit
-def _wire(
-    points,
-    local,
-    rise,
-    radius,
-    roughness,
-    echoes,
-    sx,
-    row,
-    step,
-    shown,
-    amplitude,
-    shift,
-    elevation,
-    half,
-    depth_step,
-    wavenumber,
-    seed,
-    field,
-):
-    lines, depths = shown.shape
-    pad = (field.shape[0] - lines) // 2
-    deepest, last = step * (depths - 2), field.shape[1] * row
-    for k in range(len(points)):
-        x, y, z = local[k, 0], local[k, 1] - radius, local[k, 2]
-        if y < 0 or y >= deepest or abs(z) > half.max() or x < -pad * sx or x > (lines - 1 + pad) * sx:
+def _lay_wire(field, strand, scanner, beam, paths):
+    """Lay the echoes of a wire's points."""
+    lines, depths = paths.labels.shape
+    pad = (len(field) - lines) // 2
+    deepest, last = paths.step_mm * (depths - 2), field.shape[1] * scanner.sample_mm
+    smooth = np.exp(-0.5 * (2 * scanner.wavenumber * strand.roughness) ** 2)
+    coherent, rough = smooth * _sinc(scanner.wavenumber * strand.rise_mm), np.sqrt(1 - smooth * smooth)
+    for k in range(len(strand.image)):
+        x, y, z = strand.image[k]
+        if not (0 <= y < deepest and -pad <= x / scanner.line_mm <= lines - 1 + pad):
             continue
-        line = min(max(int(x / sx + 0.5), 0), lines - 1)
-        seen, left = _at(shown, line, y, step), _at(amplitude, line, y, step)
-        patch = _phase_of_patch(points[k, 0], points[k, 1], points[k, 2], seed)
-        for behind, strength in echoes:
-            if seen + behind >= last:
-                break
-            smooth = np.exp(-0.5 * (2 * wavenumber * roughness) ** 2)
-            rough = np.sqrt(1 - smooth * smooth) * np.exp(1j * patch)
-            _echo(
-                field,
-                x,
-                seen + behind,
-                y,
-                z,
-                strength * left * (smooth * _sinc(wavenumber * rise) + rough),
-                line,
-                pad,
-                sx,
-                row,
-                step,
-                shift,
-                elevation,
-                half,
-                depth_step,
-                wavenumber,
-            )
+        row = min(int(y / beam.depth_step_mm + 0.5), len(beam.half_mm) - 1)
+        if abs(z) >= beam.half_mm[row]:
+            continue
+        line = min(max(int(x / scanner.line_mm + 0.5), 0), lines - 1)
+        seen = table_at(paths.shown_mm, line, y, paths.step_mm)
+        patch = _phase_of_patch(strand.world[k, 0], strand.world[k, 1], strand.world[k, 2], scanner.seed)
+        part = coherent + rough * _turned(patch)
+        part *= table_at(paths.amplitude, line, y, paths.step_mm) * beam.elevation[row, int(abs(z) / STEP_MM + 0.5)]
+        across = (x - paths.shift_mm[line, min(int(y / paths.step_mm), depths - 1)]) / scanner.line_mm + pad
+        for behind, strength in strand.echoes:
+            if seen + behind < last:
+                value = strength * part * _turned(2 * scanner.wavenumber * (seen + behind))
+                deposit(field, across, (seen + behind) / scanner.sample_mm, np.complex64(value))

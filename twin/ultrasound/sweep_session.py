@@ -86,7 +86,7 @@ def refuse_inside(course: Track, body: Body, transducer: Transducer, allowed_mm:
     tables = body.packed()
     face = np.column_stack([np.linspace(0, transducer.width_mm, 5), np.full(5, -allowed_mm), np.zeros(5)])
     for time, pose in zip(course.times, course.poses, strict=True):
-        found = max(label_at(*tables, *point) for point in rigid.apply(pose, face))
+        found = max(label_at(tables, *point) for point in rigid.apply(pose, face))
         if found:
             name = body.solids[found - 1].name
             raise InputError(f"path: expected the probe in front of all things, found it in {name} after {time * 1e-9:.2f} s")

@@ -26,7 +26,7 @@ def test_no_border_lies_outside_the_spans(made, small, rng, turn):
         i, k = int(rng.integers(len(x))), int(rng.integers(len(z)))
         bundle = i // borders.BUNDLE[0], k // borders.BUNDLE[1]
         places = rigid.apply(pose, np.column_stack([np.full(len(depths), x[i]), depths, np.full(len(depths), z[k])]))
-        labels = np.array([label_at(*packed, *place) for place in places])
+        labels = np.array([label_at(packed, *place) for place in places])
         for n in np.flatnonzero(np.diff(labels)):
             found = spans[bundle][: counts[bundle]]
             assert ((found[:, 0] <= depths[n + 1]) & (found[:, 1] >= depths[n])).any()

@@ -8,13 +8,13 @@ from recon.errors import InputError
 from scenes.acoustics import TISSUES
 from scenes.catalogue import build_scene
 from scenes.scene_types import Material, Thing
-from twin.ultrasound.echo_solids import body, distance_at, label_at, solid
+from tests.twin.ultrasound import plain_sound
+from twin.ultrasound.echo_solids import Body, body, distance_at, label_at, solid
 
 
 def distances(one, points):
-    flat, where = one.distance.ravel(), np.array([0, *one.distance.shape])
-    frame = np.array([*one.origin, *(1 / one.spacing)])
-    return np.array([distance_at(flat, where, frame, *point) for point in points])
+    packed = Body(TISSUES["water"], (one,), ()).packed()
+    return np.array([distance_at(packed, 0, *point) for point in points])
 
 
 def test_a_meshs_distance_is_that_of_the_shape(rng):
@@ -36,10 +36,10 @@ def breast():
 
 def test_the_breast_is_full(breast):
     """Downwards from its skin to the table there is tissue and no gap, though its flat base has no vertices of its own."""
-    flat, where, frame = breast.packed()
+    packed = breast.packed()
     names = ["", *(one.name for one in breast.solids)]
     for x, y in ((4.0, -2.0), (26.0, 20.0), (-30.0, 10.0), (40.0, 2.0), (-25.0, 1.0)):
-        column = [names[label_at(flat, where, frame, x, y, z)] for z in np.arange(640.0, 705.0, 0.25)]
+        column = [names[label_at(packed, x, y, z)] for z in np.arange(640.0, 705.0, 0.25)]
         first, last = column.index("breast"), len(column) - 1 - column[::-1].index("breast")
         assert set(column[:first]) == {""}
         assert "" not in column[first:]
@@ -47,10 +47,23 @@ def test_the_breast_is_full(breast):
 
 
 def test_tumours_lie_within_the_breast(breast):
-    flat, where, frame = breast.packed()
+    packed = breast.packed()
     names = ["", *(one.name for one in breast.solids)]
     for name, (x, y, z) in (("tumour0", (-10, -8, 680)), ("tumour1", (28, -18, 676)), ("tumour2", (26, 20, 681))):
-        assert names[label_at(flat, where, frame, float(x), float(y), float(z))] == name
+        assert names[label_at(packed, float(x), float(y), float(z))] == name
+
+
+def test_distances_and_labels_are_those_of_plain_interpolation(breast, rng):
+    """At places in and around the breast, by SciPy."""
+    places = rng.uniform((-60, -60, 640), (60, 60, 720), (3000, 3))
+    packed = breast.packed()
+    expected = plain_sound.distances(breast, places)
+    assert len({*plain_sound.labels(breast, places)}) > 3
+    for k in range(len(breast.solids)):
+        assert np.array([distance_at(packed, k, *place) for place in places]) == pytest.approx(expected[k], abs=1e-5)
+    clear = np.abs(expected).min(axis=0) > 1e-4
+    found = np.array([label_at(packed, *place) for place in places])
+    assert (found == plain_sound.labels(breast, places))[clear].all()
 
 
 def test_a_scene_without_acoustics_is_refused():

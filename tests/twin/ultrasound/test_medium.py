@@ -1,7 +1,5 @@
 """Speckle: its statistics, and that it belongs to the tissue and not to the image."""
 
-from itertools import product
-
 import numba
 import numpy as np
 import pytest
@@ -11,12 +9,13 @@ from recon.geometry.primitives import Cylinder
 from scenes import solid_meshes as shapes
 from scenes.acoustics import Tissue
 from scenes.scene_types import Material, Thing
+from tests.twin.ultrasound import plain_sound
 from tests.twin.ultrasound.phantoms import down
 from twin.ultrasound import bmode_image
-from twin.ultrasound.beam import OVERSAMPLING, STEP_MM, beam
+from twin.ultrasound.beam import beam
 from twin.ultrasound.bscan import scan
-from twin.ultrasound.echo_solids import Body, label_at, solid
-from twin.ultrasound.medium import field_like, hashed, scatter
+from twin.ultrasound.echo_solids import Body, solid
+from twin.ultrasound.medium import scatter
 from twin.ultrasound.sound_paths import follow
 
 FACE = (3.0, -2.0, 650.0)
@@ -68,49 +67,14 @@ def test_decorrelation_across_the_plane_follows_diffraction(speckle, clean, move
     assert abs(correlation(first, second)) == pytest.approx(expected, abs=0.08)
 
 
-def plainly(body, transducer, pose, seed):
-    """Echoes of the scatterers, one rule after the other: the slow version of `scatter`."""
-    spread, paths = beam(transducer), follow(body, transducer, pose)
-    edge, (sx, sy) = transducer.scatterers_per_mm3 ** (-1 / 3), transducer.scale_mm_per_px
-    image_from_world = rigid.invert(pose)
-    span = np.array(list(product((-3, transducer.width_mm + 3), (-1, 61), (-5, 5))))
-    low, high = (np.floor(bound(rigid.apply(pose, span), axis=0) / edge).astype(int) for bound in (np.min, np.max))
-    cells = np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high, strict=True)), indexing="ij"), axis=-1).reshape(
-        -1, 3
-    )
-    near = rigid.apply(image_from_world, (cells + 0.5) * edge)
-    cells = cells[(np.abs(near[:, 2]) < 5) & (near[:, 1] > -1) & (near[:, 0] > -3) & (near[:, 0] < transducer.width_mm + 3)]
-    bits = np.array([hashed(i, j, k, np.uint64(seed)) for i, j, k in cells], np.uint64)
-    parts = np.column_stack([(bits >> np.uint64(21 * axis)) & np.uint64(2**21 - 1) for axis in range(3)]) / 2**21
-    places = (cells + parts) * edge
-    x, y, z = rigid.apply(image_from_world, places).T
-    plane = np.clip(np.rint(y / spread.depth_step_mm).astype(int), 0, len(spread.core_mm) - 1)
-    kept = (y >= 0) & (y < 58) & (np.abs(z) < spread.core_mm[plane]) & (x >= -2) & (x <= transducer.width_mm + 2)
-    x, y, z, plane, places = x[kept], y[kept], z[kept], plane[kept], places[kept]
-    labels = np.array([label_at(*body.packed(), *place) for place in places])
-    strength = np.sqrt(body.scattering() / transducer.scatterers_per_mm3)[labels] * transducer.wavelength_mm
-    line, level = np.clip(np.rint(x / sx).astype(int), 0, transducer.image_size[0] - 1), (y / sy).astype(int)
-    share = y / sy - level
-    seen = paths.shown_mm[line, level] * (1 - share) + paths.shown_mm[line, level + 1] * share
-    weight = spread.elevation[plane, np.rint(np.abs(z) / STEP_MM).astype(int)]
-    value = strength * paths.amplitude[line, level] * weight * np.exp(2j * transducer.wavenumber * seen)
-    field = field_like(transducer, spread)
-    across, down_ = (x - paths.shift_mm[line, level]) / sx + spread.lateral.shape[1] // 2, seen / sy * OVERSAMPLING
-    i, j = np.floor(across).astype(int), np.floor(down_).astype(int)
-    for right, lower in product((0, 1), (0, 1)):
-        part = np.abs(1 - right - (across - i)) * np.abs(1 - lower - (down_ - j))
-        inside = (i >= 0) & (j >= 0) & (i < field.shape[0] - 1) & (j < field.shape[1] - 1)
-        np.add.at(field, (i[inside] + right, j[inside] + lower), (value * part)[inside])
-    return field
-
-
 @pytest.mark.parametrize("turn", [(0, 0, 0), (0.4, 0.3, -0.2)])
 def test_scatterers_are_found_as_by_the_slow_way(clean, turn):
     """A dark rod and a void one in reference tissue, straight and turned: the same echoes but for the table of phases."""
     array = clean.model_copy(update={"image_size": (24, 408), "scatterers_per_mm3": 8.0})
     made = Body(Tissue(1.6, 1540.0, 0.5, 0.0), (rod(12.0, -6.0), rod(24.0, None)), ())
     pose = down(array, (0.0, 0.0, 0.0)) @ rigid.from_rotation_vector(turn, [0, 0, 0])
-    quick, slow = scatter(made, array, beam(array), follow(made, array, pose), pose, 3), plainly(made, array, pose, 3)
+    spread, paths = beam(array), follow(made, array, pose)
+    quick, slow = (way(made, array, spread, paths, pose, 3) for way in (scatter, plain_sound.scatter))
     assert np.abs(quick - slow)[:, :800].max() < 0.01 * np.abs(slow).max()
 
 

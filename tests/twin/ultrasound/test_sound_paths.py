@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from twin.ultrasound.sound_paths import reflection
+from recon.geometry import rigid
+from scenes.catalogue import build_scene
+from tests.twin.ultrasound import plain_sound
+from tests.twin.ultrasound.phantoms import down
+from twin.ultrasound.echo_solids import body
+from twin.ultrasound.sound_paths import follow, reflection
 
 
 def test_reflection_at_normal_incidence():
@@ -24,3 +29,19 @@ def test_two_fluids_swap_with_the_opposite_sign():
     cosine = 0.9
     onwards = np.sqrt(1 - (1450 / 1540) ** 2 * (1 - cosine**2))
     assert reflection(1.6, 1.4, 1540.0, 1450.0, cosine) == pytest.approx(-reflection(1.4, 1.6, 1450.0, 1540.0, onwards))
+
+
+@pytest.mark.parametrize("kind", ["inner_cylinder", "breast"])
+def test_lines_are_followed_as_by_the_slow_way(small, kind):
+    """Step by step, tissues by SciPy: the same delays, losses and bends, in float32."""
+    array = small.model_copy(update={"image_size": (12, 408), "scale_mm_per_px": (1.2, 0.1225)})
+    made = body(build_scene({"kind": kind}))
+    pose = down(array, (4.0, -2.0, 650.0)) @ rigid.from_rotation_vector([0.05, 0.1, -0.05], [0, 0, 0])
+    quick = follow(made, array, pose)
+    slow = plain_sound.follow(made, array, pose, quick.labels.shape[1])
+    assert len(np.unique(slow.labels)) > 1
+    assert np.abs(slow.shift_mm).max() > 0.1
+    assert (quick.labels == slow.labels).all()
+    assert quick.shown_mm == pytest.approx(slow.shown_mm, abs=1e-4)
+    assert quick.amplitude == pytest.approx(slow.amplitude, abs=1e-4)
+    assert quick.shift_mm == pytest.approx(slow.shift_mm, abs=1e-3)

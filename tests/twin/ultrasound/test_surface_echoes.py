@@ -11,9 +11,13 @@ from scenes import solid_meshes as shapes
 from scenes.acoustics import TISSUES, Tissue
 from scenes.catalogue import build_scene
 from scenes.scene_types import Material, Thing
+from tests.twin.ultrasound import plain_sound
 from tests.twin.ultrasound.phantoms import down, filament
+from twin.ultrasound.beam import beam
 from twin.ultrasound.bscan import scan
-from twin.ultrasound.echo_solids import Body, body, solid
+from twin.ultrasound.echo_solids import Body, Wire, body, solid
+from twin.ultrasound.sound_paths import follow
+from twin.ultrasound.surface_echoes import surface_echoes, wire_echoes
 
 WATER = TISSUES["water"]
 DEPTH_MM, RADIUS_MM = 25.0, 8.0
@@ -95,3 +99,35 @@ def test_a_wire_rings_but_does_not_come_again(small):
     repeating = small.model_copy(update={"reverberations": 2})
     envelope = scan(filament(15.0), repeating, down(small, (0, 0, 0)), 1).envelope
     assert envelope[200:].max() < 1e-3 * envelope.max()
+
+
+@pytest.mark.parametrize(("roughness", "most"), [(0.0, 0.03), (0.01, 0.15)])
+def test_borders_echo_as_by_the_slow_way(small, roughness, most):
+    """A rod within a larger one, turned a little: borders sought in small steps and by bisection send the same echoes.
+
+    The quick march finds borders by a secant, a little off: that turns phases, and puts some facets of rough walls on the next
+    patch, whose phase is another.
+    """
+    array = small.model_copy(update={"image_size": (24, 408), "reverberations": 2})
+    outer, inner = (replace(TISSUES[name], roughness=roughness) for name in ("gelatin", "polymer"))
+    parts = [rod(tissue).solids[0] for tissue in (outer, inner)]
+    made = Body(WATER, (parts[0], replace(parts[1], distance=parts[1].distance + np.float32(3))), ())
+    pose = down(array, (0.8, 0, 0)) @ rigid.from_rotation_vector([0.03, 0.05, -0.04], [0, 0, 0])
+    spread, paths = beam(array), follow(made, array, pose)
+    quick, slow = (way(made, array, spread, paths, pose, 5) for way in (surface_echoes, plain_sound.border_echoes))
+    assert np.count_nonzero(slow) > 1000
+    assert np.linalg.norm(quick - slow) < most * np.linalg.norm(slow)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.02])
+def test_wires_echo_as_by_the_slow_way(small, tilt):
+    """A rough wire, oblique in the slice, in water."""
+    array = small.model_copy(update={"image_size": (24, 408)})
+    ends = np.array([[1.0, -10.0, 20.0 - 10 * tilt], [-0.5, 10.0, 20.0 + 10 * tilt]])
+    wire = Wire("wire", replace(TISSUES["steel"], roughness=0.01), ends, 0.1)
+    pose = down(array, (0, 0, 0))
+    spread, paths = beam(array), follow(Body(WATER, (), (wire,)), array, pose)
+    quick = wire_echoes(Body(WATER, (), (wire,)), array, spread, paths, pose, 5)
+    slow = plain_sound.wire_echoes(wire, WATER, array, spread, paths, pose, 5)
+    assert np.count_nonzero(slow) > 10
+    assert np.abs(quick - slow).max() < 1e-4 * np.abs(slow).max()

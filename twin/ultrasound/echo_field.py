@@ -1,0 +1,97 @@
+"""The field of echoes before the point spread: its raster, how echoes are laid on it, and their sum.
+
+Echoes are laid by threads on as many fields as there are parts of the slice. Their number is fixed, and so is the order of the
+sum: the same bytes from any number of threads.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from recon.compiled import njit
+from twin.ultrasound.beam import OVERSAMPLING, Beam
+from twin.ultrasound.sound_paths import Paths
+from twin.ultrasound.transducer import Transducer
+
+Array = NDArray[np.float64]
+Field = NDArray[np.complex64]
+
+BESIDE_MM = 2.0  # beside the image, from where echoes still count
+PARTS = 16  # in which echoes are summed
+SPREAD = 7  # without a common factor with PARTS
+FIRST, END = range(2)  # columns of the lines that a part has touched
+
+
+class Scanner(NamedTuple):
+    """The image's plane in the world, and figures of the scanner, for compiled code."""
+
+    world_from_image: Array  # (4, 4) mm
+    line_mm: float  # between lines
+    sample_mm: float  # between samples of the field, as shown
+    deepest_mm: float  # beyond which no line shows anything
+    wavenumber: float  # rad/mm, one way
+    assumed_speed: float  # m/s
+    repeats: int  # of a border's echo, between it and the probe's face
+    face_reflection: float
+    seed: np.uint64  # of the tissue
+
+
+def scanner_at(transducer: Transducer, beam: Beam, paths: Paths, world_from_image: Array, seed: int) -> Scanner:
+    """The scanner's figures with the image's plane at a pose."""
+    sx, sy = transducer.scale_mm_per_px
+    return Scanner(
+        np.ascontiguousarray(world_from_image, float),
+        sx,
+        sy / OVERSAMPLING,
+        _deepest_seen(transducer, beam, paths),
+        transducer.wavenumber,
+        transducer.assumed_speed,
+        transducer.reverberations,
+        transducer.face_reflection,
+        np.uint64(seed),
+    )
+
+
+def field_like(transducer: Transducer, beam: Beam) -> Field:
+    """An empty field of echoes : (w + taps - 1, OVERSAMPLING h), lines by shown depth, with room for the beam's width."""
+    width, height = transducer.image_size
+    return np.zeros((width + beam.lateral.shape[1] - 1, OVERSAMPLING * height), np.complex64)
+
+
+def _deepest_seen(transducer: Transducer, beam: Beam, paths: Paths) -> float:
+    last = transducer.depth_mm + transducer.scale_mm_per_px[1] * beam.axial.shape[1] / 2 / OVERSAMPLING
+    levels = int(np.searchsorted(paths.shown_mm.min(axis=0), last))
+    return min(paths.step_mm * levels, beam.depth_step_mm * (len(beam.core_mm) - 1))
+
+
+@njit(inline="always")
+def slab(part, count):
+    """First and end of a part's share of a count. Threads take parts in order: so each gets some from everywhere."""
+    place = part * SPREAD % PARTS
+    return count * place // PARTS, count * (place + 1) // PARTS
+
+
+@njit(inline="always")
+def deposit(field, px, py, value):
+    """Add an echo at a fractional place of the field, shared among the four samples around it."""
+    i, j = int(np.floor(px)), int(np.floor(py))
+    if i < 0 or j < 0 or i >= field.shape[0] - 1 or j >= field.shape[1] - 1:
+        return
+    a, b = np.float32(px - i), np.float32(py - j)
+    field[i, j] += value * ((1 - a) * (1 - b))
+    field[i, j + 1] += value * ((1 - a) * b)
+    field[i + 1, j] += value * (a * (1 - b))
+    field[i + 1, j + 1] += value * (a * b)
+
+
+@njit(parallel=True)
+def summed(fields, touched):
+    """Sum over parts, always in the same order, of the lines that each has touched."""
+    total = np.zeros(fields.shape[1:], fields.dtype)
+    for line in prange(len(total)):
+        for part in range(PARTS):
+            if touched[part, FIRST] <= line < touched[part, END]:
+                total[line] += fields[part, line]
+    return total
