@@ -4,8 +4,10 @@ from collections import defaultdict
 
 import numpy as np
 import trimesh
+from numba import prange
 from numpy.typing import NDArray
 
+from recon.compiled import njit
 from recon.geometry import rigid
 from twin.ultrasound import bmode_image
 from twin.ultrasound.echo_solids import Body
@@ -19,13 +21,7 @@ SAME_MM = 1e-5  # between ends of neighbouring segments of a section
 
 def labels(paths: Paths, transducer: Transducer) -> NDArray[np.uint8]:
     """Label of what each pixel shows : (h, w), 0 the surroundings, k + 1 solid k; delays and refraction included."""
-    lines, depths = paths.shown_mm.shape
-    shown = np.empty((transducer.image_size[1], lines), np.uint8)
-    for line in range(lines):
-        level = np.clip(np.searchsorted(paths.shown_mm[line], transducer.rows_mm), 0, depths - 1)
-        aside = np.rint(line + paths.shift_mm[line, level] / transducer.scale_mm_per_px[0]).astype(int)
-        shown[:, line] = paths.labels[np.clip(aside, 0, lines - 1), level]
-    return shown
+    return _labels(paths, transducer.rows_mm, np.float32(transducer.scale_mm_per_px[0]))
 
 
 def masks(shown: NDArray[np.uint8], solids: int) -> NDArray[np.bool_]:
@@ -82,3 +78,17 @@ def _loops(edges: NDArray[np.int64]) -> list[list[int]]:
         if len(walk) > 3:
             loops.append(walk)
     return loops
+
+
+@njit(parallel=True)
+def _labels(paths, rows_mm, line_mm):
+    lines, depths = paths.labels.shape
+    shown = np.empty((len(rows_mm), lines), np.uint8)
+    for line in prange(lines):
+        level = 0  # the first that is shown at a row's depth or below
+        for row in range(len(rows_mm)):
+            while level < depths - 1 and paths.shown_mm[line, level] < rows_mm[row]:
+                level += 1
+            aside = int(np.rint(np.float32(line) + paths.shift_mm[line, level] / line_mm))
+            shown[row, line] = paths.labels[min(max(aside, 0), lines - 1), level]
+    return shown

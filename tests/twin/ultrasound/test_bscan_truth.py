@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from recon.geometry import rigid
 from scenes.catalogue import build_scene
+from tests.twin.ultrasound import plain_sound
 from tests.twin.ultrasound.phantoms import down
 from twin.ultrasound import bscan_truth
 from twin.ultrasound.echo_solids import body
@@ -41,6 +43,16 @@ def test_a_mask_is_as_wide_as_its_object_and_too_deep(cylinder, clean):
     top = (20 - 7.91) * 1540 / 1488.3
     assert rows[0] == pytest.approx(top, abs=0.25)
     assert rows[-1] == pytest.approx(top + 15.82 * 1540 / 2700, abs=0.3)
+
+
+def test_labels_are_shown_as_by_the_slow_way(cylinder, clean):
+    """Along the rod, turned a little, so that lines bend."""
+    pose = down(clean, (4.0, -2.0, 650.0)) @ rigid.from_rotation_vector([0.05, 0.2, 0.1], [0, 0, 0])
+    paths = follow(cylinder, clean, pose)
+    slow = plain_sound.shown_labels(paths, clean)
+    assert len(np.unique(slow)) > 1
+    assert np.abs(paths.shift_mm).max() > clean.scale_mm_per_px[0]
+    assert (bscan_truth.labels(paths, clean) == slow).all()
 
 
 def test_wires_are_points_where_they_cross_the_plane(small):
