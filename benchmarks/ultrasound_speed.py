@@ -1,9 +1,13 @@
-"""B-scans of the breast on the path of a hand, everything on, against PyMUST's time for one frame.
+"""B-scans of the breast on the path of a hand, everything on, against PyMUST's time for one frame; and crossed wires.
 
 The peer is measured apart, by `benchmarks/pymust_peer.py`, on one core: a plane wave on as many scatterers as the slice has.
 """
 
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
 
 import numba
@@ -25,7 +29,7 @@ FRAMES = 40
 
 def measurements() -> list[Measurement]:
     """The rows of the group."""
-    return [frames]
+    return [frames, wires]
 
 
 def frames() -> list[Row]:
@@ -54,9 +58,20 @@ def frames() -> list[Row]:
     theirs = peer()["plane_wave"]["seconds"] * count / peer()["plane_wave"]["scatterers"]
     what = f"breast, {array.image_size[0]}x{array.image_size[1]}, some {count / 1e3:.0f} 000 scatterers"
     return [
-        Row("b", f"{what}: frames a second, {threads} cores", 1 / seconds, 10, 1 / theirs, "1/s", at_least=True),
+        Row("b", f"{what}: frames a second, {threads} cores", 1 / seconds, 20, 1 / theirs, "1/s", at_least=True),
         Row("b", f"{what}: one frame, seconds of one core", alone, 0.2, theirs, "s"),
     ]
+
+
+def wires() -> list[Row]:
+    """Row w: the whole command that renders what a probe is calibrated from, with code that is compiled."""
+    with TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "sonotwin", "sweep", "scene=crosswire", "ultrasound=water", "path=wire"]
+        for name in ("compiled", "timed"):
+            start = perf_counter()
+            subprocess.run([*command, f"out={Path(folder) / name}"], check=True, stdout=subprocess.DEVNULL)
+            seconds = perf_counter() - start
+    return [Row("w", "30 B-scans of crossed wires, rendered and written, the whole command", seconds, 8, None, "s")]
 
 
 def scatterers(array: Transducer) -> float:
