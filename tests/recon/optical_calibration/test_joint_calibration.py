@@ -200,12 +200,13 @@ def test_one_camera_and_projector_are_enough(cameras):
 
 @pytest.mark.parametrize("hidden", [{"cam2": [1]}, {"cam2": [3, 8]}, {"cam2": [0, 2, 4, 6, 8, 10]}, {"projector": [3]}])
 def test_devices_may_miss_poses(sizes, good, hidden):
-    """The distortion's choice, the halves and the noise all live with what is there."""
+    """The distortion's choice, which takes long, so of eight poses, the halves and the noise all live with what is there."""
+    quick = len(hidden.get("cam2", [])) > 1
     partly = []
-    for number, one in enumerate(good):
+    for number, one in enumerate(good if quick else good[:8]):
         gone = [device for device, poses in hidden.items() if number in poses]
         partly.append(replace(one, pixels={device: at for device, at in one.pixels.items() if device not in gone}))
-    found = joint_calibration.calibrate(partly, BOARD, sizes, QUICK if len(hidden.get("cam2", [])) > 1 else None)
+    found = joint_calibration.calibrate(partly, BOARD, sizes, QUICK if quick else None)
     assert max(found.rms.values()) < 0.02
     np.testing.assert_allclose(list(found.adjustment.noise.values()), 1, atol=0.2)
 
