@@ -106,7 +106,9 @@ def _through_border(solids, tissues, pose, point, here, there):
 
 @njit(parallel=True)
 def _follow(paths, solids, tissues, pose, line_mm, assumed_speed, refract):
-    lines, depths = paths.labels.shape
+    # taken from the tuple here: writes into a tuple's arrays within `prange` are lost
+    labels, shown_mm, amplitude, shift_mm = paths.labels, paths.shown_mm, paths.amplitude, paths.shift_mm
+    lines, depths = labels.shape
     step = paths.step_mm
     delays, kept = step * assumed_speed * (1 / tissues.speed), np.exp(-step * tissues.loss)  # of whole steps, by label
     for line in prange(lines):
@@ -116,7 +118,7 @@ def _follow(paths, solids, tissues, pose, line_mm, assumed_speed, refract):
             pose[2, 0] * line_mm * line + pose[2, 3],
         )
         here = label_at(solids, x0, y0, z0)
-        paths.labels[line, 0] = here
+        labels[line, 0] = here
         delay, left, slope, aside, clear = 0.0, 1.0, 0.0, 0.0, 0.0
         for level in range(1, depths):
             t = step * level
@@ -136,7 +138,7 @@ def _follow(paths, solids, tissues, pose, line_mm, assumed_speed, refract):
                 slope += turn if refract else 0.0
             aside += slope * step
             here = there
-            paths.labels[line, level] = here
-            paths.shown_mm[line, level] = delay
-            paths.amplitude[line, level] = left
-            paths.shift_mm[line, level] = aside
+            labels[line, level] = here
+            shown_mm[line, level] = delay
+            amplitude[line, level] = left
+            shift_mm[line, level] = aside
