@@ -12,7 +12,7 @@ from twin.tracking.parameter_table import Rows
 from twin.tracking.samples import SCRATCHES, SPOTS
 
 POSTER_KINDS = 6
-STRIDE_MM = 2000.0  # between the print coordinates of one poster and the next; see bank.py
+STRIDE_MM = 2000.0  # between the print coordinates of one poster and the next; see mesh_bank.py
 
 
 @dataclass(frozen=True)
