@@ -26,6 +26,7 @@ from platformdirs import user_cache_path
 
 log = logging.getLogger(__name__)
 
+OURS = ("recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks")  # packages; others keep Numba's own cache
 UNUSED_DAYS = 30  # after which code compiled from other sources is deleted
 
 
@@ -122,9 +123,9 @@ class SourceHashLocator(caching._CacheLocator):
 
     @classmethod
     def from_function(cls, py_func: Callable, py_file: str) -> "SourceHashLocator | None":
-        """For a function of a package beside this one; None for any other, or where nothing can be written."""
+        """For a function of our packages; None for any other, or where nothing can be written."""
         root, path = Path(__file__).resolve().parent.parent, Path(py_file).resolve()
-        if not path.is_relative_to(root) or not path.is_file() or py_func.__module__ != _module_name(path, root):
+        if py_func.__module__.partition(".")[0] not in OURS or not path.is_relative_to(root) or not path.is_file():
             return None
         locator = cls(_folder(path, root, path.stat().st_mtime_ns), py_func.__code__.co_firstlineno)
         try:

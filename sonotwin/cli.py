@@ -40,7 +40,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("film", "render a film of the moving target with its ground truth"),
     Verb("calibrate-optics", "calibrate cameras and projector from images of a board, rendered or real"),
     Verb("calibrate-probe", "calibrate the ultrasound probe from B-scans of crossed wires"),
-    Verb("measure-lag", "measure by how much the scanner's images lag behind the tracked poses"),
+    Verb("measure-lag", "measure the lag of the scanner's images behind the tracked poses"),
     Verb("surface", "reconstruct the surface from a capture, rendered or real"),
     Verb("track", "track the probe's target through the frames of two cameras"),
     Verb("freehand", "put tracked B-scans into a volume, for 3D Slicer too"),

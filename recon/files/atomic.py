@@ -48,6 +48,7 @@ def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
         check_folder(path, marker)
     restore(paths)
     temporaries, asides = [_beside(path, "new") for path in paths], [_beside(path, "old") for path in paths]
+    placed: list[Path] = []
     try:
         for temporary in temporaries:
             temporary.mkdir(parents=True)
@@ -57,10 +58,11 @@ def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
                 path.rename(aside)
         for path, temporary in zip(paths, temporaries, strict=True):
             temporary.rename(path)
+            placed.append(path)
     finally:
-        if temporaries[-1].exists():  # not all are in their places
+        if len(placed) < len(paths):
             for path, temporary, aside in zip(paths, temporaries, asides, strict=True):
-                if not temporary.exists():
+                if path in placed:
                     path.rename(temporary)
                 if aside.exists():
                     aside.rename(path)

@@ -1,4 +1,4 @@
-"""The centre of a projected circle is not the centre of its ellipse: by how much, for a given camera and pose.
+"""Offset between the projected centre of a circle and the centre of its ellipse, for a given camera and pose.
 
 Perspective shows the near half of a tilted disc larger than the far half, so the ellipse's centre lies on the near side of the
 projected centre, by about `f r^2 sin(w) cos(w) / Z^2` for a tilt of w; the lens bends the outline on top of that. A detector

@@ -164,7 +164,7 @@ def compare_halves(
 
 
 def deviation(first: Calibration, second: Calibration) -> Array:
-    """By how much the second calibration's parameters differ from the first's : (g,), in the order of the first's uncertainty."""
+    """Differences of the second calibration's parameters from the first's : (g,), in the order of the first's uncertainty."""
     assert first.uncertainty is not None
     steps = []
     for device, name in (full.split(".") for full in first.uncertainty.names):

@@ -1,4 +1,4 @@
-"""What can be wrong with a calibration's captures, told before it is believed: refusals, and warnings that name a cause."""
+"""Sanity checks of the optics calibration: refusals, and warnings that name a cause."""
 
 from collections.abc import Mapping, Sequence
 

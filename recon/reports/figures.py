@@ -331,7 +331,7 @@ def _space(camera: dict[str, dict[str, float]]) -> dict[str, object]:
 
 
 def _thinned(shown: Mask, most: int) -> tuple[slice, slice]:
-    """Every how manyth pixel of each axis is taken, so that about so many of those shown are left."""
+    """Subsampling stride of each axis that leaves about the wanted number of pixels."""
     stride = max(1, int(np.ceil(np.sqrt(np.count_nonzero(shown) / most))))
     return (slice(stride // 2, None, stride),) * 2
 

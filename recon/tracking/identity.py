@@ -81,7 +81,7 @@ def affinity(points: Array, target: Target) -> Array:
 
 
 def disagreement(ellipses: Ellipses, target: Target) -> float:
-    """By how much, as a share of their size, three ellipses differ from those that their distances ask for; inf if mirrored."""
+    """Misfit of three ellipses' shapes to the target's distances, as a share of their size; inf if mirrored."""
     affine = affinity(ellipses.centre, target)
     if not np.isfinite(affine).all() or np.linalg.det(affine) >= 0:
         return np.inf

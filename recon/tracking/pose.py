@@ -38,7 +38,7 @@ SIZES = 0.12  # of a disc's size, by which shapes may differ from the pose's
 SIZES_ALONE = 0.05  # the same of one view by itself: three rings of a sheet were 14 % off, targets 0.5 % in the median
 SHAPES = 0.005  # the same: what blur and gradients leave of a shape, one standard deviation
 SIGMAS = 3.0  # standard deviations that are added to what sizes may differ by
-TOLD = 16.0  # by how much another pose's misfit, with shapes, must be larger
+DISTINCT = 16.0  # least excess of another pose's misfit, with shapes
 SAME = 16.0  # squared standard deviations within which two poses are one
 
 
@@ -152,7 +152,7 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
     off, sigma = shapes[best]
     if not _like(off, sigma, SIZES):
         return lost(f"circles whose sizes are {100 * np.abs(off).max():.0f} % from what their distance asks for")
-    rivals = [fit for k, fit in enumerate(good) if k != best and total[k] < total[best] + TOLD]
+    rivals = [fit for k, fit in enumerate(good) if k != best and total[k] < total[best] + DISTINCT]
     if any(_distance2(good[best], rival) > SAME for rival in rivals):
         return lost("two poses that the circles seen do not tell apart")
     return good[best]
@@ -164,7 +164,7 @@ def _like(off: Array, sigma: Array, share: float) -> bool:
 
 
 def _off_shapes(pose: Array, views: Sequence[Sighting], used: Iterable[NDArray[np.bool_]], target: Target) -> tuple[Array, Array]:
-    """By how much ellipses differ from a pose's : (m, 3), and what that is known to : (m, 1), as shares of their size."""
+    """Relative shape residuals of ellipses against a pose : (m, 3), and their standard deviations : (m, 1)."""
     off, sigma = [np.zeros((0, 3))], [np.zeros((0, 1))]
     for view, circles in zip(views, used, strict=True):
         if view.shapes is not None:

@@ -37,7 +37,7 @@ OUTPUTS = (
     ("volume/volume.nrrd", "the B-scans of the sweep as a volume in the frame of the surface, in mm"),
     ("tumours/", "what was found inside: a closed surface each, in mm"),
     ("probe/probe.yaml", "the calibration of the probe, with its covariance"),
-    ("lag/lag.json", "by how much the scanner lags behind the cameras"),
+    ("lag/lag.json", "the lag of the scanner behind the cameras"),
     ("track/", "the target's poses in the film with their covariance, why some weren't found, and pictures of all frames"),
     ("capture/", "the images, their manifest and the calibration, as a camera would have left them"),
     ("truth/", "what the images were rendered from: points, normals, projector coordinates, true calibration"),

@@ -251,10 +251,10 @@ def pictures(story: Inside) -> Iterator[tuple[Colours, str, str]]:
 
 
 def probe_and_clock(story: Inside, metrics: Metrics) -> Section:
-    """How the probe was calibrated, by how much its images are late, and what that leaves of the place of a pixel."""
+    """The probe's calibration, the lag of its images, and the error that both leave in a pixel's place."""
     text = (
         "Where a B-scan’s pixels lie in the frame of the probe’s target was found from the crossing of two wires in water, seen "
-        "from all sides; by how much the scanner’s images lag behind the cameras, from strokes up and down over a flat bottom."
+        "from all sides; the lag of the scanner’s images behind the cameras, from strokes up and down over a flat bottom."
     )
     names = ("speed of the probe, mm/s", "bottom late by, mm"), ("B-scans", f"{metrics['lag_ms']:.1f} ms")
     drawings = [
@@ -289,7 +289,7 @@ def uncertainty(story: Inside, metrics: Metrics) -> Iterator[tuple[Colours, str,
 
 
 def against_speed(story: Inside, sy: float) -> tuple[Array, Array]:
-    """Speed : (k,) mm/s of the probe in its main direction; by how much the bottom's depth is behind its pose : (k,) mm."""
+    """Speed : (k,) mm/s of the probe in its main direction; lag of the bottom's depth behind its pose : (k,) mm."""
     times, track = story.bob.times, story.bob.track
     depth, residual = story.depth_residuals.T * sy
     late, now = (tracks.poses_at(track, times, lag_s)[:, :3, 3] for lag_s in (story.lag_s, 0.0))

@@ -24,7 +24,6 @@ class Ranges(BaseModel):
 
 
 Lengths = tuple[Positive, Positive]
-Amounts = tuple[NotNegative, NotNegative]
 
 
 class CameraRanges(Ranges):

@@ -94,7 +94,7 @@ def rings(image: Grey, target: Target) -> Ellipses:
 
 
 def choose(rough: Ellipses, target: Target) -> tuple[tuple[int, int, int], float]:
-    """The three rings, as c0, c1, c2, that are most like the target's, and by how much they aren't (see `_misfit`)."""
+    """The three rings, as c0, c1, c2, closest to the target's, and their misfit (see `_misfit`)."""
     order = np.array(list(permutations(range(len(rough.centre)), 3)))
     misfit = _misfit(rough.centre[order], rough.shape[order], target)
     best = int(misfit.argmin())

@@ -183,7 +183,7 @@ def _lines(image: Grey, board: Board) -> tuple[NDArray[np.int64], Array]:
 
 @cache
 def _line_offset() -> Array:
-    """By how much this OpenCV's fitted lines lie off : (2,) px, seen on a drawn marker: half a pixel, if it isn't mended."""
+    """Offset of this OpenCV's fitted lines : (2,) px, measured on a drawn marker: half a pixel in versions with the fault."""
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     fine = np.full((144 * 4, 144 * 4), 170, np.uint8)
     fine[96:480, 96:480] = 20 + np.asarray(cv2.aruco.generateImageMarker(family, 0, 384)) // 255 * 150
