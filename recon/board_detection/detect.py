@@ -1,6 +1,6 @@
-"""Calibration boards in images: where each point stands, to a hundredth of a pixel, how well that is known, or why it's missing.
+"""Calibration boards in images: each point's place to a hundredth of a pixel, its covariance, or the reason why it's missing.
 
-Discs are dark on a bright board. What is measured of a disc is the centre of its ellipse, which is not yet where the disc's
+Discs are dark on a bright board. Measured is the centre of a disc's ellipse, which is not yet where the disc's
 centre is projected to: see `recon.geometry.circle_projection`.
 
 Which way round a board lies follows from its points where it can; an image is never taken for a mirrored one. A grid may look the

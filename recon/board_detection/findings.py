@@ -1,4 +1,4 @@
-"""What a detector of boards hands back: where each point stands and how well that is known, or why the board isn't there."""
+"""A detector's result: each point's place and covariance, or the reason why the board isn't found."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -19,7 +19,7 @@ MIRROR = np.array([[-1, 0], [0, 1]])
 
 
 def assign(points: Array, cells: Integers, steps: Integers) -> Integers:
-    """Tell the points of a grid.
+    """Assign points to the nodes of a grid.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from recon.model.patterns import Patterns
 
 @dataclass(frozen=True)
 class Pose:
-    """What was seen of the board in one pose."""
+    """Images of the board in one pose."""
 
     name: str
     lit: dict[str, Images]  # camera: (h, w) digital numbers, the projector fully on

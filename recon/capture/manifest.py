@@ -54,7 +54,7 @@ class Part(Record):
 
 
 class SurfacePart(Part):
-    """The fringe sequence: what was projected and what each camera saw, in the same order."""
+    """The fringe sequence: the patterns, and each camera's images in the same order."""
 
     patterns: Patterns
     images: dict[str, tuple[str, ...]]  # camera: paths relative to the manifest's root
@@ -68,7 +68,7 @@ class SurfacePart(Part):
 
 
 class BoardPose(Record):
-    """What was seen of the calibration board in one pose."""
+    """Images of the calibration board in one pose."""
 
     name: Annotated[str, Field(min_length=1)]
     lit: Annotated[dict[str, str], Field(min_length=1)]  # camera: path of the image with the projector fully on

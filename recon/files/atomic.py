@@ -117,7 +117,7 @@ def check_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
     marker : str
         A file that folders of this kind have and no others, by which one that may be replaced is known.
     inputs : iterable of paths
-        What the folder is going to be made from.
+        Sources of the folder's content.
 
     Raises
     ------

@@ -35,7 +35,7 @@ MOST_UNPACKED = 1100  # times the packed size: deflate reaches 1032
 
 @dataclass(frozen=True)
 class ImageFile:
-    """An image file whose header was read: what it says, and where the pixels are."""
+    """An image file whose header was read: its fields, and the place of its pixels."""
 
     path: Path  # of the header
     fields: dict[str, str]  # as they stand in the header, in its order

@@ -21,7 +21,7 @@ DAMAGE = (  # what numpy raises on files damaged at random, in the archive or in
 
 @dataclass(frozen=True)
 class Form:
-    """What an array has to look like."""
+    """Expected form of an array."""
 
     numbers: str  # a key of NUMBERS
     shape: tuple[int | None, ...] | None = None  # None for a length that is free, or for any shape

@@ -67,7 +67,7 @@ def write_covariance(storage: cv2.FileStorage, names: Sequence[str], covariance:
 
 
 def save(path: Path, storage: cv2.FileStorage) -> None:
-    """Write what was gathered in memory to a file, whole or not at all."""
+    """Write a storage in memory to a file, whole or not at all."""
     text = storage.releaseAndGetString()
     with atomic.new_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -44,7 +44,7 @@ def joined(parts: Sequence[Ellipses]) -> Ellipses:
 
 @dataclass(frozen=True)
 class EllipseFit:
-    """What the edge points say."""
+    """Fitted ellipses with their covariance."""
 
     ellipses: Ellipses
     covariance: Array  # (n, 5, 5) px^2, of the centre (x, y) and of the shape (xx, xy, yy)

@@ -65,7 +65,7 @@ Kind = TypeVar("Kind", Plane, Sphere, Cylinder)
 
 @dataclass(frozen=True)
 class Fit(Generic[Kind]):
-    """A fitted shape without a name, and how well it fits."""
+    """Parameters of a fitted shape, and its residuals."""
 
     shape: Kind
     residuals: Array  # (n,), mm; positive outside the sphere or cylinder, or on the side of the plane's normal

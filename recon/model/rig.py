@@ -21,7 +21,7 @@ FOCAL_TOLERANCE = 0.05  # a lens's nominal focal length against the calibrated o
 
 
 class Part(BaseModel):
-    """Base of what is read from files and settings: immutable, refuses unknown keys and numbers that are not finite."""
+    """Base of settings and files' records: immutable, refuses unknown keys and numbers that are not finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

@@ -1,4 +1,4 @@
-"""Poses over time: what a tracker says of a moving body, and its pose at any moment between."""
+"""Poses over time: a tracker's poses of a moving body, and its pose at any moment between."""
 
 from dataclasses import dataclass
 

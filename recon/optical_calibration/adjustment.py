@@ -29,7 +29,7 @@ MAX_ROUNDS = 4  # of measuring the noise
 
 @dataclass(frozen=True)
 class Adjustment:
-    """The outcome: values, what is left, and how sure they are."""
+    """The outcome: values, residuals and covariance."""
 
     calibration: Calibration  # with the uncertainty that follows from the measured noise, and from the board's if not released
     poses: Array  # (p, 4, 4) world_from_board
@@ -52,7 +52,7 @@ def adjust(
     offsets: Array | None = None,
     shape: Shape | None = None,
 ) -> Adjustment:
-    """Adjust devices, poses and shape to what was seen.
+    """Adjust devices, poses and shape to the observations.
 
     Parameters
     ----------

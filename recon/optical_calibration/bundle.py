@@ -1,4 +1,4 @@
-"""The bundle adjustment's problem: its unknowns, what is seen, and both linearised at an estimate."""
+"""The bundle adjustment's problem: its unknowns and observations, both linearised at an estimate."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ FLOOR_PX = 1e-4  # no sighting counts as more exact than this
 
 
 class Shape(Part):
-    """What is known of the board's shape: how far its points stand from their design, as standard deviations.
+    """Prior of the board's shape: standard deviations of its points' distances from their design.
 
     Print errors are each point's own. A board that isn't flat is bent: nine tenths of the variance out of the plane belong to the
     three ways of bending it (along x, along y, as a saddle), one tenth is each point's own.
@@ -60,7 +60,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is to be adjusted to what."""
+    """Observations, estimate and prior of one adjustment."""
 
     observations: Observations
     offsets: Array  # (p, n, d, 2) px, from where a device would see a point to where the detection puts it

@@ -1,4 +1,4 @@
-"""`calibration.html`: a calibration told as a page, for whoever has to decide whether to measure with it."""
+"""`calibration.html`: the report of a calibration, for the decision whether to measure with it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -109,12 +109,12 @@ def opening(result: Result, metrics: Metrics) -> Opening:
 
 
 def warnings(result: Result) -> list[Section]:
-    """What a person should look at before using the calibration; nothing if there is nothing."""
+    """Warnings before the calibration is used; none if there are none."""
     return [Section("Warnings", [page.notices(result.warnings)])] if result.warnings else []
 
 
 def residuals(result: Result, metrics: Metrics) -> Section:
-    """What is left of the observations when the prediction is taken away, over each image."""
+    """Residuals of the observations over each image."""
     blocks = [
         page.paragraph(
             "An arrow is where a point was seen less where the calibration predicts it, magnified, from all poses together. "
@@ -213,7 +213,7 @@ def poses(result: Result) -> Section:
 
 
 def uncertainty_maps(result: Result, metrics: Metrics, depths: Sequence[float], volume: Array) -> Section:
-    """What the parameters' covariance means in px and mm."""
+    """Maps of the parameters' covariance, carried to px and mm."""
     found = result.adjustment.calibration
     pair = figures_of_merit.devices_that_measure(found)
     middle = depths[len(depths) // 2]
@@ -278,7 +278,7 @@ def parameters(result: Result, metrics: Metrics, truth: Calibration | None) -> S
 
 
 def consistency(result: Result) -> Section:
-    """How far two calibrations from half of the poses each are from each other."""
+    """Differences of two calibrations from half of the poses each."""
     if not np.isfinite(result.halves).all():
         return Section("Two halves", [page.paragraph("Too few poses to calibrate from two halves and compare.")])
     known = result.adjustment.calibration.uncertainty

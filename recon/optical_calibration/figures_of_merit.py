@@ -1,4 +1,4 @@
-"""Figures of a calibration: what its residuals are, what it is good for, and, on renders, how far off it is."""
+"""Figures of merit of a calibration: residuals, predicted uncertainty of measurements, and, on renders, errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ def measure(result: Result, truth: Calibration | None = None) -> Metrics:
 
 
 def errors(found: Calibration, truth: Calibration, volume: Array) -> Metrics:
-    """How far a calibration is from the true one: its devices' places, and points of a volume : (k, 3) mm measured with it."""
+    """Errors of a calibration against the true one: its devices' places, and points of a volume : (k, 3) mm measured with it."""
     figures: Metrics = {}
     for device, camera in list(found.cameras.items())[1:]:
         difference = camera.camera_from_world @ np.linalg.inv(truth.cameras[device].camera_from_world)
@@ -170,7 +170,7 @@ def tilts(result: Result) -> Array:
 
 
 def parameters(found: Calibration, truth: Calibration | None = None) -> list[Parameter]:
-    """All parameters of all devices as people read them, with what is sure about them and, if given, the true ones.
+    """All parameters of all devices in readable units, with their standard deviations and, if given, the true ones.
 
     The turn of a device is its rotation vector in deg; a device's distance from the first one's pinhole is added.
     """

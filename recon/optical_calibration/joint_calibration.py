@@ -1,4 +1,4 @@
-"""Optics calibration: from where the devices see a board's points to their parameters, and how far these can be trusted."""
+"""Joint optics calibration: from sightings of a board's points to the devices' parameters and their covariance."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""What the devices saw of a calibration board: where each point stands in each device, pose by pose, with its noise.
+"""Observations of a calibration board: each point's place in each device, pose by pose, with its noise.
 
 A projector sees nothing itself. Its coordinate of a point is read from the fringes at the pixel where camera 1 sees the point,
 so an error of that pixel moves it along: `d(projector px) = gradient @ d(cam1 px)`. What is kept as the projector's covariance is

@@ -77,7 +77,7 @@ def refuse_parallel(observations: Observations, start: Estimate, name: str) -> N
 
 
 def refuse_wrong_size(board: Board, radii: Sequence[Mapping[str, Array]], start: Estimate, name: str) -> str | None:
-    """Compare the discs' size with the design: the one thing in the images that tells a wrong spacing.
+    """Compare the discs' size with the design: nothing else in the images shows a wrong spacing.
 
     radii : pose by pose, camera -> (n, 2) px, semi-axes of the discs' images.
 
@@ -111,7 +111,7 @@ def refuse_wrong_size(board: Board, radii: Sequence[Mapping[str, Array]], start:
 
 
 def warnings(observations: Observations, adjustment: Adjustment, shape: Shape) -> list[str]:
-    """What a careful person would say about a calibration."""
+    """Warnings about a calibration, each with a cause."""
     found = []
     if shape.released and len(observations.poses) < FEW_POSES:
         found.append(

@@ -25,7 +25,7 @@ FIRST = "cam1"
 
 @dataclass(frozen=True)
 class Sighting:
-    """What the devices see of one pose; devices that see nothing have no entry."""
+    """Sighting of one pose by all devices; a device without any point has no entry."""
 
     name: str
     pixels: Mapping[str, Array]  # device: (n, 2) px, NaN where a point isn't seen
@@ -45,7 +45,7 @@ def sight(
     lit : camera -> (h, w)
         The board under even light.
     fringes : (n, h, w), optional
-        What camera 1 sees of a pattern sequence with fringes along both axes.
+        Camera 1's images of a pattern sequence with fringes along both axes.
     patterns : Patterns, optional
         That sequence.
     bits : camera -> int
@@ -78,7 +78,7 @@ def sight(
 
 
 def without_scraps(sighting: Sighting) -> Sighting:
-    """The sighting without devices that see too few points to tell the pose; they get a reason instead."""
+    """The sighting without devices that have too few points for the pose; they get a reason instead."""
     counts = {device: int(np.isfinite(pixels).all(axis=1).sum()) for device, pixels in sighting.pixels.items()}
     scraps = {device: count for device, count in counts.items() if count < ENOUGH}
     reasons = {

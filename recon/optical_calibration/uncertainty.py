@@ -1,4 +1,4 @@
-"""What a calibration's uncertainty means for what is measured with it: millimetres of a point, pixels of a projection.
+"""Propagation of a calibration's covariance to measurements: millimetres of a point, pixels of a projection.
 
 All of it is linear propagation of the parameters' covariance, which holds as long as the second derivatives are small over a
 standard deviation; for calibrations in use they are. The world is camera 1's frame, so a part of a point's uncertainty is only a

@@ -32,7 +32,7 @@ def detect(frames: list[NDArray], networks: Networks) -> list[Candidates]:
 
 
 def network_image(frame: NDArray) -> NDArray[np.float32]:
-    """What the detector takes : (240, 320) of 0 to 1, as published: the whole frame, squeezed."""
+    """The detector's input : (240, 320) of 0 to 1, as published: the whole frame, squeezed."""
     return cv2.resize(frame, DETECTOR_SIZE).astype(np.float32) / np.float32(255)
 
 

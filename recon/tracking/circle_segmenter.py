@@ -24,7 +24,7 @@ ASTRAY = 40.0  # px of the patch, from the patch's middle
 
 @dataclass(frozen=True)
 class Patches:
-    """What the segmenter looks at."""
+    """Patches for the segmenter, and their places."""
 
     images: NDArray[np.float32]  # (n, 120, 120) from 0 to 1
     corners: NDArray[np.int64]  # (n, 2) px, the first pixel in the image

@@ -40,7 +40,7 @@ class Triple:
 
 
 def triples(candidates: Candidates, target: Target, width: int) -> list[Triple]:
-    """What can be the target in an image of this width (px), the likeliest first: three candidates, or two and one unseen."""
+    """Hypotheses of the target in an image of this width (px), the likeliest first: three candidates, or two and one unseen."""
     points = np.vstack([candidates.points.reshape(-1, 2), np.full(2, np.nan)])
     scores = np.append(candidates.scores, LEAST_SCORE)
     names = np.vstack([candidates.identity[:, :3], np.full(3, 1 / 4)])

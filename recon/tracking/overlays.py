@@ -1,4 +1,4 @@
-"""Pictures of what the tracker saw: ellipses, names, the target's axes, or the reason why there is none."""
+"""Overlays of tracking results: ellipses, names, the target's axes, or the reason why there is none."""
 
 import math
 
@@ -20,7 +20,7 @@ FULL = 220.0  # of 255, to which a dark image is brightened
 
 
 def drawn(image: NDArray, view: View, pose: TargetPose | None = None, camera: Camera | None = None) -> NDArray[np.uint8]:
-    """A picture : (h, w, 3) BGR of a frame, brightened, with what was seen in it; axes need the pose and the camera.
+    """A picture : (h, w, 3) BGR of a frame, brightened, with the view's results; axes need the pose and the camera.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The poses that one view's three centres allow: a tilt either way, mostly, until another view tells which."""
+"""Pose hypotheses (P3P) of one view's three centres: a tilt either way, mostly, until another view settles it."""
 
 import cv2
 import numpy as np

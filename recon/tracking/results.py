@@ -52,7 +52,7 @@ class Step:
 
 
 def kept(found: Tracking, time_ns: int) -> Step:
-    """What is kept of a pair."""
+    """The step that is kept of a pair."""
     pose, (first, second) = found.pose, found.views
     blurs = float(np.fmax.reduce(first.blur_px)), float(np.fmax.reduce(second.blur_px))
     return Step(time_ns, pose.world_from_target, pose.covariance, found.how, pose.reason, blurs, sum(found.seconds.values()))
@@ -78,7 +78,7 @@ def write_poses(folder: Path, film: Film, steps: Sequence[Step]) -> None:
 
 
 def overlay(pair: Pair, found: Tracking, cameras: Sequence[Camera]) -> NDArray[np.uint8]:
-    """Both views side by side : (h, w, 3) BGR, scaled down, with what was seen in them."""
+    """Both views side by side : (h, w, 3) BGR, scaled down, with the results drawn in."""
     shown = []
     for image, view, camera in zip(pair, found.views, cameras, strict=True):
         height = round(image.shape[0] * OVERLAY_WIDTH / image.shape[1])

@@ -39,7 +39,7 @@ TRIALS = 10  # triples of both views that are looked at
 
 @dataclass(frozen=True)
 class Tracking:
-    """What a pair of frames shows."""
+    """The result of a pair of frames."""
 
     pose: TargetPose
     views: tuple[View, View]
@@ -54,7 +54,7 @@ class Tracking:
 
 @dataclass
 class Tracker:
-    """Follows a target through pairs of frames. Its state is what it remembers of the last poses; `forget` clears it."""
+    """Follows a target through pairs of frames. Its state is the last poses; `forget` clears it."""
 
     cameras: tuple[Camera, Camera]
     target: Target
@@ -101,7 +101,7 @@ class Tracker:
         self._past = [*(self._past[-1:] if steady else []), (time_s, world_from_target)]
 
     def forget(self) -> None:
-        """Know nothing."""
+        """Clear the last poses."""
         self._past = []
 
     def _frames(self, left: NDArray, right: NDArray) -> Frames:

@@ -1,4 +1,4 @@
-"""What one camera shows of the target: its three rims, or why they aren't there."""
+"""The target in one camera: its three rims, or the reason why they aren't found."""
 
 from dataclasses import dataclass, replace
 
@@ -41,7 +41,7 @@ class View:
         return np.where(self.outlines.found, np.linalg.norm(self.outlines.motion, axis=1), np.nan)
 
     def sighting(self, camera: Camera) -> Sighting:
-        """For the pose: what is seen."""
+        """The sighting for the pose estimate."""
         centres = np.where(self.outlines.found[:, None], self.outlines.ellipses.centre, np.nan)
         return Sighting(camera, centres, self.outlines.covariance, self.outlines.ellipses.shape, self.outlines.doubtful)
 

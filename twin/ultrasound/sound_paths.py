@@ -1,8 +1,8 @@
-"""What happens to sound along each line: delay, loss, shadow, refraction, as tables over the image plane.
+"""Propagation of sound along each line: delay, loss, shadow, refraction, as tables over the image plane.
 
-A line is followed straight down the image plane through the tissues. What it meets gives, as a function of true depth: the shown
-depth (delay at the assumed speed), the amplitude that is left both ways (attenuation and transmission), and by how much
-refraction has bent it sideways.
+A line is followed straight down the image plane through the tissues. Their borders give, as a function of true depth: the shown
+depth (delay at the assumed speed), the amplitude that is left both ways (attenuation and transmission), and the sideways
+bend by refraction.
 """
 
 from typing import NamedTuple
