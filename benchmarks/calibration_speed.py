@@ -70,7 +70,7 @@ def blobs() -> cv2.SimpleBlobDetector:
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """How long some work takes."""
+    """Seconds that some work takes."""
     start = perf_counter()
     work()
     return perf_counter() - start

@@ -113,7 +113,7 @@ def median_of(work: Callable[[], object], repeats: int) -> float:
 
 
 def network_pass(networks: Networks) -> None:
-    """What one stereo frame takes of the networks: two views and six patches."""
+    """The networks' work for one stereo frame: two views and six patches."""
     networks.detect(np.zeros((2, 240, 320), np.float32))
     networks.segment(np.zeros((6, 120, 120), np.float32))
 

@@ -1,4 +1,4 @@
-"""What things are made of acoustically, and which thing is made of what.
+"""Acoustic properties of tissues and materials, and the material of each thing.
 
 Values at room temperature (22 °C). Sources: [D] Duck 1990, Physical properties of tissue; [C] Culjat et al. 2010, A review of
 tissue substitutes for ultrasound imaging, Ultrasound Med. Biol. 36(6); [K] Kaye & Laby / ONDA tables of acoustic properties;
@@ -71,12 +71,12 @@ MADE_OF = {  # by the scene's kind, then by the thing's name without its number;
 
 
 def surroundings(scene: Scene) -> Tissue:
-    """What lies between and around a scene's things."""
+    """The medium between and around a scene's things."""
     return TISSUES[_table(scene)[""]]
 
 
 def tissue_of(scene: Scene, thing: Thing) -> Tissue:
-    """What a thing of a scene is made of.
+    """The material of a scene's thing.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Random poses of a calibration board that fill what the cameras and the projector see.
+"""Random poses of a calibration board that fill the views of the cameras and the projector.
 
 Tilt, turn, depth and place of pose k are point k of a scrambled Sobol' sequence: any number of poses covers all of them evenly,
 and pose k depends on the seed and on k alone.
@@ -32,7 +32,7 @@ ASKEW = 2.0  # power that draws turns to the quarters: half of them lie within 1
 
 
 class Config(Part):
-    """How many poses, and between which limits."""
+    """Number of poses, and their limits."""
 
     count: Annotated[int, Field(ge=1, le=1000)] = 34
     tilt_deg: Annotated[float, Field(ge=0, le=70)] = 40.0  # largest angle between the board's normal and camera 1's axis

@@ -1,4 +1,4 @@
-"""What a scene is made of: meshes with materials, and the ground-truth primitives to fit against.
+"""Types of a scene: meshes with materials, and the ground-truth primitives to fit against.
 
 World is the frame of camera 1, lengths in mm: z points away from the camera into the scene, x right and y down in the image.
 """

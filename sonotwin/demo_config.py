@@ -1,4 +1,4 @@
-"""What a demonstration is made from: its fields, and what it takes as given."""
+"""Settings of a demonstration: its fields, and its constants."""
 
 from collections.abc import Sequence
 from pathlib import Path

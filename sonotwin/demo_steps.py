@@ -173,7 +173,7 @@ def tumour_errors(folder: Path) -> Metrics:
 
 
 def compared(folder: Path) -> tuple[list[sweep_errors.Finding], sweep_errors.SweepTruth]:
-    """The true tumours with what was found of each, and the truth."""
+    """The true tumours, each with its match, and the truth."""
     truth = sweep_errors.read_truth(folder / "sweep" / "truth")
     count = int(metrics.read(folder / "tumours" / metrics.FILE)["masses"])
     found = [trimesh.load_mesh(folder / "tumours" / f"mass{number}.ply", process=False) for number in range(count)]

@@ -44,7 +44,7 @@ EDGE_WINDOW = 3  # px about a pixel
 
 @dataclass(frozen=True)
 class Stage:
-    """What stays from pose to pose: the instruments, and the board in its own frame."""
+    """The constants of all poses: the instruments, and the board in its own frame."""
 
     rig: Rig
     cameras: dict[CameraName, CameraOptics]
@@ -262,7 +262,7 @@ def finish(session: Session, settings: Settings, exposures: Mapping[CameraName, 
 
 
 def board_truth(settings: Settings, placed: rigid.Array) -> dict[str, np.ndarray]:
-    """What only evaluation may know: poses (p, 4, 4), printed centres (n, 3) mm, and where the three devices see these.
+    """Ground truth, for evaluation alone: poses (p, 4, 4), printed centres (n, 3) mm, and where the three devices see these.
 
     Pixels : (p, n, 3, 2) are those of the centres in cam1, cam2 and the projector, not of the middles of the ellipses.
     """

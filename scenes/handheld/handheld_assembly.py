@@ -1,4 +1,4 @@
-"""What moves with the probe: the target's board, its bracket, the probe with its cable, and a hand or a robot that holds it.
+"""The handheld assembly: the target's board, its bracket, the probe with its cable, and a hand or a robot that holds it.
 
 Everything is in the target's frame: c0 at the origin, c1 on x, c2 on y, z to the viewer, the board's front exactly in z = 0. The
 probe stands beside the board along z and points away from the viewer, as on the rig of Meza et al. 2021.

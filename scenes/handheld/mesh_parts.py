@@ -1,4 +1,4 @@
-"""What tracking scenes are made of: meshes that name the kind of surface they have, and many of them joined into one.
+"""Parts of tracking scenes: meshes with named kinds of surface, and many of them joined into one.
 
 A slot is a kind of surface. Its texture and reflectance are drawn per rendered sample, so a part carries geometry alone.
 """

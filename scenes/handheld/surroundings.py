@@ -1,4 +1,4 @@
-"""What stands still around the probe: a table on a bench, a phantom, tools, printed sheets, another hand.
+"""Still surroundings of the probe: a table on a bench, a phantom, tools, printed sheets, another hand.
 
 Scene frame: the table's top is z = 0, z points up to the cameras, the origin is about where they look.
 """

@@ -55,7 +55,7 @@ class Config(Part):
 
 
 def design(config: Config) -> AsymmetricCircles:
-    """The board as it was meant, which is all that a calibration knows."""
+    """The board as designed: all that a calibration is given."""
     return AsymmetricCircles(
         columns=config.columns, rows=config.rows, spacing_mm=config.spacing_mm, diameter_mm=config.diameter_mm
     )

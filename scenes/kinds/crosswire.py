@@ -1,4 +1,4 @@
-"""Two crossed wires in a water tank: what the probe is calibrated with (Meza et al. 2021, section 2.3)."""
+"""Two crossed wires in a water tank, for calibration of the probe (Meza et al. 2021, section 2.3)."""
 
 from typing import Annotated
 

@@ -92,7 +92,7 @@ def telling_step(config: Config) -> Step:
 
 
 def summary(config: Config, found: Metrics) -> list[str]:
-    """What, how well, how much of it, and where to look."""
+    """Results in some lines: accuracy, coverage, and the places of the files."""
     out, points = config.out, f"{found['points']:,}".replace(",", " ")
     parts = ", ".join(f"{name} {shown(value, '.3f')}" for name, value in things(found).items())
     return [
@@ -110,7 +110,7 @@ def summary(config: Config, found: Metrics) -> list[str]:
 
 
 def calibrated(found: Metrics) -> list[str]:
-    """How well the calibration came out, if there was one."""
+    """Figures of the calibration, if there was one."""
     if "point_error_rms_mm" not in found:
         return []
     remaining = ", ".join(f"{name} {found[f'reprojection_rms_{name}_px']:.3f}" for name in ("cam1", "cam2", "projector"))
@@ -121,7 +121,7 @@ def calibrated(found: Metrics) -> list[str]:
 
 
 def looked_inside(config: Config, found: Metrics) -> list[str]:
-    """What ultrasound found, and how well it knows where it looks; or why it wasn't asked."""
+    """Figures of the probe's calibration and of the tumours; or the reason why there are none."""
     if not config.looks_inside:
         return (
             []
@@ -142,7 +142,7 @@ def looked_inside(config: Config, found: Metrics) -> list[str]:
 
 
 def followed(found: Metrics) -> list[str]:
-    """How well the target was tracked, if there was a film."""
+    """Figures of the tracking, if there was a film."""
     if "track_found" not in found:
         return []
     medians = f"{shown(found['track_shift_median_mm'], '.3f', ' mm')} and {shown(found['track_turn_median_deg'], '.3f', ' deg')}"

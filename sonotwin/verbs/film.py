@@ -69,7 +69,7 @@ def run(config: Config) -> None:
 
 
 def ranges() -> DataRanges:
-    """What body, surroundings and light are drawn from: the ranges of data sets."""
+    """Ranges of body, surroundings and light: those of data sets."""
     return DataRanges.model_validate(yaml.safe_load((conf() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"])
 
 

@@ -121,7 +121,7 @@ def render_board(config: Config, chosen: BoardPoses, session: Session, console: 
 
 
 def render_surface(config: Config, session: Session, console: Console) -> None:
-    """What each camera sees of the scene under the patterns."""
+    """Render each camera's images of the scene under the patterns."""
     session.check()
     scene = build_scene(config.scene)
     views = {}

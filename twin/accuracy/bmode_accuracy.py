@@ -1,4 +1,4 @@
-"""How true the B-mode model is: against PyMUST, which follows every element of the array, and against diffraction.
+"""Accuracy of the B-mode model: against PyMUST, which follows every element of the array, and against diffraction.
 
 PyMUST's figures are kept in `benchmarks/pymust_peer.json`, with the command that makes them; it is no dependency.
 """

@@ -28,7 +28,7 @@ from twin.sensor import Numbers
 
 @dataclass(frozen=True)
 class BoardSet:
-    """What the devices saw of a board, and the truth."""
+    """Observations of a board, and the truth."""
 
     sightings: tuple[Sighting, ...]  # (p,)
     board: AsymmetricCircles  # as designed
@@ -76,7 +76,7 @@ def drawn(
     rng: np.random.Generator,
     points: Array | None = None,
 ) -> BoardSet:
-    """What a detector of discs would report, with noise of known size.
+    """Simulated detections of discs, with noise of known size.
 
     Parameters
     ----------

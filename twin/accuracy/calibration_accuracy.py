@@ -1,4 +1,4 @@
-"""How true the optics calibration is: against the twin's parameters, its own prediction, surfaces, bad boards, and OpenCV."""
+"""Accuracy of the optics calibration: against the twin's parameters, its own prediction, surfaces, bad boards, and OpenCV."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -150,7 +150,7 @@ def centre_bias(rig: Rig, diameter_mm: float, tilt_deg: float) -> Row:
 
 
 def lit_board(rig: Rig, config: board.Config) -> tuple[np.ndarray, Exposure]:
-    """What camera 1 sees of a board under even light : (h, w) DN, with the sensor's noise."""
+    """Camera 1's image of a board under even light : (h, w) DN, with the sensor's noise."""
     patterns = Patterns.model_validate(
         {
             "projector_size": rig.projector.optics.size,

@@ -1,4 +1,4 @@
-"""How far a calibration is from the true one, in the quantities that matter, and what its covariance lets expect of them."""
+"""Errors of a calibration in the quantities that matter, and their expectation from its covariance."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,7 +21,7 @@ def motion_error(found: Calibration, truth: Calibration, name: str) -> tuple[flo
 
 
 def motion_sigma(found: Calibration, name: str) -> tuple[float, float]:
-    """What the covariance lets expect of `motion_error`, RMS: deg, mm."""
+    """Expectation of `motion_error` from the covariance, RMS: deg, mm."""
     assert found.uncertainty is not None
     sigmas = np.array([found.uncertainty.sigma(f"{name}.{parameter}") for parameter in MOTION])
     return float(np.rad2deg(np.linalg.norm(sigmas[:3]))), float(np.linalg.norm(sigmas[3:]))
@@ -67,7 +67,7 @@ def point_errors(found: Calibration, truth: Calibration, pair: tuple[str, str], 
 
 
 def scale_error(measured: Array, true: Array) -> float:
-    """How far the scale of measured points : (m, 3) mm is off, %, by the similarity that maps the true ones onto them best.
+    """Scale error of measured points : (m, 3) mm, %, by the similarity that maps the true ones onto them best.
 
     Source: Umeyama 1991, least-squares estimation of transformation parameters between two point patterns.
     """
@@ -89,5 +89,5 @@ def rms_length(errors: Array) -> float:
 
 
 def expected_length(found: Calibration, pair: tuple[str, str], volume: Array) -> float:
-    """What the covariance lets expect of `rms_length(point_errors(...))`, mm."""
+    """Expectation of `rms_length(point_errors(...))` from the covariance, mm."""
     return float(np.sqrt(np.trace(uncertainty.triangulation(found, *pair, volume), axis1=1, axis2=2).mean()))

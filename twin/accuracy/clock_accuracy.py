@@ -1,4 +1,4 @@
-"""How well the delay between scanner and cameras is found, from B-scans of a tank's bottom stamped by clocks of all kinds."""
+"""Accuracy of the measured delay between scanner and cameras, from B-scans of a tank's bottom stamped by clocks of all kinds."""
 
 import numpy as np
 from numpy.typing import NDArray

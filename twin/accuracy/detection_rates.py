@@ -1,4 +1,4 @@
-"""How often the target is found in frames like those it was trained with, of another seed: rightly, wrongly, where it isn't."""
+"""Detection rates in frames like the training's, of another seed: found, misnamed, missed, false alarms."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ LIT_DN, DIM_DN = 15.0, 8.0
 
 @dataclass(frozen=True)
 class Seen:
-    """One view: what was there, and what was found."""
+    """One view: the truth, and the detection."""
 
     shows_target: bool  # all three discs inside the image, nothing before them
     covered: bool  # the same, but a finger or cable covers up to half of a disc

@@ -1,4 +1,4 @@
-"""How true masses are that are found in tracked B-scans: the breast's tumours against their meshes, under the measured skin."""
+"""Accuracy of masses segmented in tracked B-scans: the breast's tumours against their meshes, under the measured skin."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""How true the light transport is: against Mitsuba's own integrator, and against geometry."""
+"""Accuracy of the light transport: against Mitsuba's own integrator, and against geometry."""
 
 from collections.abc import Sequence
 

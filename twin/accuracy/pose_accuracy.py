@@ -34,7 +34,7 @@ BLURS = (4.0, 8.0, 12.0, 16.0)
 
 @dataclass(frozen=True)
 class Located:
-    """One stereo frame: errors of what was found, or nothing."""
+    """Errors of one stereo frame's result, or nothing."""
 
     centre_px: Array  # (6,) distance of each circle's centre from the true ellipse's; NaN if not found
     limit_px: Array  # (6,) RMS of that distance that noise alone would leave

@@ -1,4 +1,4 @@
-"""How true the probe's calibration is, from the twin's own B-scans of crossed wires."""
+"""Accuracy of the probe's calibration, from the twin's own B-scans of crossed wires."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

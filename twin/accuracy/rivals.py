@@ -1,4 +1,4 @@
-"""What else one could pick, over light and blur: how often each finds the target, and how exactly."""
+"""Rivals of the tracker over light and blur: detection rate and accuracy of each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ class Tried:
 
 
 def choices(target: Target, networks: Networks) -> list[Choice]:
-    """Ours, and what a user could take instead; those that need the same face side by side."""
+    """Ours and its rivals; those that need the same face side by side."""
     aruco, april = fiducials.aruco_board(target), fiducials.apriltag_board(target)
     return [
         Choice("ours", ours(target, networks)),
@@ -87,7 +87,7 @@ def over_grid(setup: Setup, alike: Sequence[Choice]) -> list[Tried]:
 
 
 def summary(tried: Tried) -> list[Row]:
-    """How often it is found, everywhere, in the dark and when blurred; how exactly at rest in good light."""
+    """Detection rates, everywhere, in the dark and when blurred; errors at rest in good light."""
     dark, blurred, lit = np.array(WHITES) <= DARK_DN, np.array(BLURS) >= BLURRED_PX, np.array(WHITES) >= LIT_DN
     still = tried.shift_mm[lit, 0], tried.turn_deg[lit, 0]
     shares = {

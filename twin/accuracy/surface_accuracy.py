@@ -1,4 +1,4 @@
-"""How true the surface is: the paper's planes and sphere, the breast, unwrapping under stress, and a real relief."""
+"""Accuracy of the surface: the paper's planes and sphere, the breast, unwrapping under stress, and a real relief."""
 
 from dataclasses import dataclass, fields
 

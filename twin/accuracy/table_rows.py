@@ -19,7 +19,7 @@ from twin.ultrasound.transducer import Transducer
 
 @dataclass(frozen=True)
 class Row:
-    """One number, beside what is asked of it and what physics allows."""
+    """One number, beside its bar and its physical limit."""
 
     id: str
     what: str
@@ -43,7 +43,7 @@ Measurement = Callable[[], Sequence[Row]]
 
 @dataclass(frozen=True)
 class Setup:
-    """What measurements are made with."""
+    """Inputs of the measurements."""
 
     rig: Rig
     sequences: Mapping[str, Patterns]  # by their names in conf/patterns

@@ -1,4 +1,4 @@
-"""How true tracking is: finding the target, circles' centres, poses, and what else one could pick."""
+"""Accuracy of tracking: detection rates, circles' centres, poses, and rivals."""
 
 from pathlib import Path
 

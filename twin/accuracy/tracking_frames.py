@@ -1,4 +1,4 @@
-"""Frames that tracking is measured on, rendered when asked for: unseen ones like training data, and studies."""
+"""Frames for measurements of tracking, rendered on demand: unseen ones like training data, and studies."""
 
 from collections.abc import Iterator
 from functools import lru_cache

@@ -1,4 +1,4 @@
-"""How true the diameter of a cylinder is that ultrasound measures in water: slices of a freehand sweep, a tube through them."""
+"""Accuracy of a cylinder's diameter measured by ultrasound in water: slices of a freehand sweep, a tube through them."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""How true ultrasound is: B-mode physics, probe calibration, clocks, objects found in sweeps, and recordings of others."""
+"""Accuracy of ultrasound: B-mode physics, probe calibration, clocks, objects found in sweeps, and recordings of others."""
 
 from twin.accuracy import bmode_accuracy, clock_accuracy, mass_accuracy, probe_accuracy, recorded_sequences, tube_accuracy
 from twin.accuracy.table_rows import Measurement, Setup

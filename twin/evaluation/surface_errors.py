@@ -48,7 +48,7 @@ TRUTH = {
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What one camera of the twin would have seen without noise and blur. Maps are (h, w), lengths mm in the world."""
+    """Ground truth of one camera, without noise and blur. Maps are (h, w), lengths mm in the world."""
 
     points: Map  # (h, w, 3); NaN where the ray meets nothing
     normals: Map  # (h, w, 3) unit, outwards
@@ -218,7 +218,7 @@ def points_with_prediction(comparison: Comparison) -> Mask:
 
 
 def shape_key(shape: Shape) -> str:
-    """What the names of a shape's figures begin with, such as `sphere_ball`."""
+    """Prefix of the names of a shape's figures, such as `sphere_ball`."""
     return f"{type(shape).__name__.lower()}_{shape.name}"
 
 

@@ -38,7 +38,7 @@ DICE_STEP_MM = 0.5  # of the grid on which volumes are laid over each other
 
 @dataclass(frozen=True, eq=False)
 class SweepTruth:
-    """What a sweep of n B-scans was rendered from. Meshes are in the world, mm."""
+    """Ground truth of a sweep of n B-scans. Meshes are in the world, mm."""
 
     body: Body
     hidden: tuple[Thing, ...]  # what only ultrasound sees, in the scene's order
@@ -50,7 +50,7 @@ class SweepTruth:
     labels: tuple[Path, ...]  # (n,) images
 
     def shown(self, frame: int) -> NDArray[np.uint8]:
-        """What each pixel of a B-scan shows : (h, w), as of `twin.ultrasound.bscan_truth.labels`; InputError if it is missing."""
+        """Label of each pixel of a B-scan : (h, w), as of `twin.ultrasound.bscan_truth.labels`; InputError if it is missing."""
         found = cv2.imread(str(self.labels[frame]), cv2.IMREAD_UNCHANGED)
         if found is None:
             raise InputError(f"{self.labels[frame]}: expected an image of labels, found none")
@@ -59,7 +59,7 @@ class SweepTruth:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """A hidden thing, and what was found of it."""
+    """A hidden thing, and its match among the masses found."""
 
     name: str
     true: trimesh.Trimesh
@@ -145,7 +145,7 @@ def placement(world_from_pixel: Array, truth: SweepTruth) -> Array:
 
 
 def compare(found: Sequence[trimesh.Trimesh], truth: SweepTruth) -> list[Finding]:
-    """Pair what was found with what there was, each with one at most, so that the sum of the centres' distances is least.
+    """Pair found with true masses, each with one at most, so that the sum of the centres' distances is least.
 
     A pair whose centres are farther apart than half the true one's greatest extent is none.
 

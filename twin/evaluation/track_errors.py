@@ -24,7 +24,7 @@ FALSE_MM, FALSE_DEG = 2.0, 2.0  # beyond which what was found is something else
 
 @dataclass(frozen=True)
 class FilmTruth:
-    """What was true of n frames."""
+    """Ground truth of n frames."""
 
     times: NDArray[np.int64]  # (n,) ns
     poses: Array  # (n, 4, 4) world_from_target, mm, in the middle of the exposure

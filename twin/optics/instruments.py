@@ -74,7 +74,7 @@ class CameraOptics:
         return mi.Float(np.float32(np.concatenate([-half[::-1], half])))
 
     def reach_px(self, depths: NDArray[np.float64]) -> float:
-        """How far from its sharp place a point's light may fall, px, at any of the depths : (n,) mm from the lens."""
+        """Largest distance of a point's light from its sharp place, px, at any of the depths : (n,) mm from the lens."""
         focal = max(self.camera.matrix[0, 0], self.camera.matrix[1, 1])
         defocus = focal * self.aperture_mm / 2 * np.abs(1 / depths - 1 / self.focus_mm).max()
         return float(0.5 + 6 * self.blur_px + 1.2 * defocus + 1)  # 1.2: what distortion stretches; 1: the place's own pixel

@@ -25,7 +25,7 @@ Profiles = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Light:
-    """What a projector sends out for a sequence of patterns, 1 for a pixel that is fully on."""
+    """Light of a projector for a sequence of patterns, 1 for a pixel that is fully on."""
 
     size: tuple[int, int]  # width, height, px
     axes: tuple[Axis, ...]  # (n,) along which each pattern varies

@@ -1,4 +1,4 @@
-"""Ground truth for each pixel's centre: what the ray through it meets, and whether the projector lights it."""
+"""Ground truth for each pixel's centre: the surface on its ray, and whether the projector lights it."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ NOTHING = 255  # object number where the ray meets nothing
 
 @dataclass(frozen=True)
 class SurfaceTruth:
-    """What one camera would see at each pixel's centre, without noise or blur."""
+    """Ground truth of one camera at each pixel's centre, without noise or blur."""
 
     points: NDArray[np.float32]  # (h, w, 3) mm, world; NaN where the ray meets nothing
     normals: NDArray[np.float32]  # (h, w, 3) outward, world; shading normals, as the surface is meant

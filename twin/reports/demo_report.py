@@ -43,7 +43,7 @@ PAPER = {  # Meza et al. 2021, Optical Engineering 60(5) 054106, section 3
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A capture, what was made of it, and the truth."""
+    """A capture, its results, and the truth."""
 
     manifest: Manifest
     shots: SurfaceCapture

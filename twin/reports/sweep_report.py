@@ -50,7 +50,7 @@ PAPER = {  # Meza et al. 2021, Optical Engineering 60(5) 054106: CR2, and the RM
 
 @dataclass(frozen=True, eq=False)
 class Inside:
-    """A sweep, what was made of it, and its truth."""
+    """A sweep, its results, and its truth."""
 
     sweep: SweepCapture
     world_from_pixel: Array  # (n, 4, 4), as measured, with depths as of speed_m_s
@@ -65,7 +65,7 @@ class Inside:
 
 
 def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: SweepTruth) -> Inside:
-    """Read what the steps left.
+    """Read the results of the steps.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def result(metrics: Metrics) -> str:
 
 
 def inside(story: Inside, points: NDArray[np.float32], skin: NDArray[np.bool_], metrics: Metrics) -> Section:
-    """What was found, in space, in the B-scans and in numbers.
+    """The masses found: in space, in the B-scans and in numbers.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def centres(story: Inside) -> list[Array]:
 
 
 def tumours(story: Inside, metrics: Metrics) -> str:
-    """The table of what was found."""
+    """The table of the masses found."""
     rows = []
     for finding in story.findings:
         figure = {

@@ -24,7 +24,7 @@ NAMES = ("error", f"predicted: {100 * LEVEL:.0f} % lie below")
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """A film of n frames, what was found in it, and its truth."""
+    """A film of n frames, its poses, and its truth."""
 
     errors: Errors
     truth: FilmTruth
@@ -52,7 +52,7 @@ def read(film: Path, track: Path) -> Tracked:
 
 
 def result(metrics: Metrics) -> str:
-    """How well the target was tracked, in one sentence; nothing if it wasn't."""
+    """Summary of the tracking in one sentence; nothing if there was none."""
     if "track_found" not in metrics:
         return ""
     seen = f"{metrics['track_visible_found']} of the {metrics['track_visible']} frames that show it whole to both cameras"
@@ -112,7 +112,7 @@ def chosen(errors: Errors, blur: np.ndarray) -> dict[int, str]:
 
 
 def errors_table(metrics: Metrics) -> str:
-    """How many were found, and how well."""
+    """Detection rates and errors."""
     rows = []
     for what, kind, unit in (("Position of the target’s origin", "shift", "mm"), ("Orientation", "turn", "deg")):
         sign = "°" if unit == "deg" else " mm"

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A B-scan, and what it was made from."""
+    """A B-scan, and its intermediate results."""
 
     image: NDArray[np.uint8]  # (h, w)
     envelope: NDArray[np.float32]  # (h, w) after the gain; 1 is the reference tissue

@@ -1,4 +1,4 @@
-"""What a B-scan should show: which pixel shows what, the exact section of each object, and the image without any artefact."""
+"""Ground truth of a B-scan: each pixel's label, the exact section of each object, and the image without artefacts."""
 
 from collections import defaultdict
 

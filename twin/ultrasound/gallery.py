@@ -1,4 +1,4 @@
-"""One picture of what the twin shows of each kind of thing, to be compared with published B-scans.
+"""One picture with a B-scan of each kind of thing, for comparison with published B-scans.
 
 python -m twin.ultrasound.gallery docs/images/bscans.png
 """

@@ -1,4 +1,4 @@
-"""A freehand sweep: the scanner's images and the cameras' poses, each by its own clock, and what they were in truth."""
+"""A freehand sweep: the scanner's images and the cameras' poses, each by its own clock, and their truth."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class PoseNoise(Part):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """When a sweep takes its n images, where the probe then is, and what the two clocks and the tracker say of it."""
+    """Plan of a sweep: true times and poses of its n images, and both clocks' stamps and the tracked poses."""
 
     times: NDArray[np.int64]  # (n,) ns, the scanner's stamps
     track: Track  # world_from_target by the cameras
@@ -47,7 +47,7 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """What a sweep records, and its truth."""
+    """The recording of a sweep, and its truth."""
 
     images: NDArray[np.uint8]  # (n, h, w)
     times: NDArray[np.int64]  # (n,) ns, the scanner's stamps

@@ -13,7 +13,7 @@ Bandwidth = Annotated[float, Field(ge=0.05, le=1.5)]
 
 
 class Transducer(Part):
-    """A linear array, its beams, and what the scanner makes of the echoes; as conf/ultrasound/linear.yaml has it."""
+    """A linear array, its beams, and the scanner's processing of the echoes; as conf/ultrasound/linear.yaml has it."""
 
     image_size: tuple[Annotated[int, Field(ge=16, le=4096)], Annotated[int, Field(ge=16, le=4096)]] = (321, 408)
     scale_mm_per_px: tuple[Positive, Positive] = (0.1229, 0.1225)  # sx, sy of the scanner, at its assumed speed
