@@ -2,6 +2,20 @@
 
 from recon.capture.manifest import CAMERAS, SCANNER, Device
 from recon.capture.writer import new_capture
+from recon.model.boards import AsymmetricCircles
+from recon.model.patterns import Fringes, GrayCode, Patterns
+
+PROJECTOR = (128, 80)
+BOARD = AsymmetricCircles(columns=4, rows=11, spacing_mm=15.0, diameter_mm=9.0)
+PATTERNS = Patterns(
+    projector_size=PROJECTOR,
+    unwrap="gray",
+    parts=tuple(
+        part
+        for axis in ("columns", "rows")
+        for part in (Fringes(axis=axis, pitch=18, steps=3), GrayCode(axis=axis, pitch=18, bits=3))
+    ),
+)
 
 
 def write_sweep(folder, images, times, track, size, probe=None, name=""):

@@ -9,20 +9,9 @@ import pytest
 from recon.capture import board_part, manifest, writer
 from recon.capture.manifest import BoardPart, Device
 from recon.errors import InputError
-from recon.model.boards import AsymmetricCircles
-from recon.model.patterns import Fringes, GrayCode, Patterns
+from tests.recon.captures import BOARD, PATTERNS, PROJECTOR
 
-SIZE, PROJECTOR = (64, 48), (128, 80)
-BOARD = AsymmetricCircles(columns=4, rows=11, spacing_mm=15.0, diameter_mm=9.0)
-PATTERNS = Patterns(
-    projector_size=PROJECTOR,
-    unwrap="gray",
-    parts=tuple(
-        part
-        for axis in ("columns", "rows")
-        for part in (Fringes(axis=axis, pitch=18, steps=3), GrayCode(axis=axis, pitch=18, bits=3))
-    ),
-)
+SIZE = (64, 48)
 NAMES = ("00", "01", "02")
 
 

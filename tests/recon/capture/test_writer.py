@@ -15,23 +15,12 @@ from recon.capture.writer import CaptureWriter, new_capture
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.boards import AsymmetricCircles
 from recon.model.calibration import Calibration
-from recon.model.patterns import Fringes, GrayCode, Patterns
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
+from tests.recon.captures import BOARD, PATTERNS, PROJECTOR
 
-SIZE, PROJECTOR, SCAN = (64, 48), (128, 80), (24, 16)
-BOARD = AsymmetricCircles(columns=4, rows=11, spacing_mm=15.0, diameter_mm=9.0)
-PATTERNS = Patterns(
-    projector_size=PROJECTOR,
-    unwrap="gray",
-    parts=tuple(
-        part
-        for axis in ("columns", "rows")
-        for part in (Fringes(axis=axis, pitch=18, steps=3), GrayCode(axis=axis, pitch=18, bits=3))
-    ),
-)
+SIZE, SCAN = (64, 48), (24, 16)
 TIMES = {SCANNER: 50_000_000 * np.arange(5), "cam1": 25_000_000 * np.arange(3), "cam2": 25_000_000 * np.arange(3) + 7}
 
 
