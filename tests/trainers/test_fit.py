@@ -84,8 +84,8 @@ import sys
 from pathlib import Path
 import torch
 from trainers import fit
-from trainers.networks import Segmenter
-from trainers.shards import read_patches, split
+from trainers.architectures import Segmenter
+from trainers.shard_reader import read_patches, split
 torch.set_num_threads(1)
 plan = fit.Plan("segmenter", 4, 64, 1e-3, 0.01, 3, 100000, None, loaders=2)
 data = split(read_patches(Path(sys.argv[1])), 0.1)
