@@ -34,7 +34,13 @@ html_copy_source = False
 
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
-autodoc_default_options = {"members": True, "undoc-members": False, "exclude-members": "model_config, model_post_init"}
+autodoc_default_options = {
+    "members": True,
+    "undoc-members": False,
+    "exclude-members": "model_config, model_post_init",
+    "ignore-module-all": True,  # the public names stand on the page of signatures, not again on their package's
+}
+suppress_warnings = ["ref.python"]  # a docstring's short name, such as Noise, may be that of several classes: then it is no link
 autodoc_preserve_defaults = True
 napoleon_google_docstring = False
 napoleon_use_rtype = False
