@@ -186,11 +186,6 @@ def trace_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine,
     return NearBoard(optics.transmission * np.float32(engine.room_radiance), pixels, near)
 
 
-def render_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine, seed: int) -> Images:
-    """The images of `trace_near`, whole : (n, h, w)."""
-    return np.stack([*trace_near(stage, optics, light, engine, seed)])
-
-
 def refine_edges(radiance: Images, stage: Stage, optics: CameraOptics, engine: Engine, seed: int) -> None:
     """Render the pixels at edges of a lit image : (h, w) again, in place, with many samples.
 

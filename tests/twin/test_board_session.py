@@ -36,6 +36,11 @@ PATTERNS = Patterns(
 DESCRIBED = {"seed": 3}
 
 
+def traced(*scene):
+    """The images of `trace_near`, whole : (n, h, w)."""
+    return np.stack([*board_session.trace_near(*scene)])
+
+
 def shrunk(device, times: int):
     """A camera with fewer, larger pixels."""
     optics = device.optics.model_copy(update={
@@ -147,7 +152,7 @@ def test_what_is_far_from_the_board_is_the_room(settings, aperture_mm):
     board_session.move_things(stage.world, stage.things, board_session.place_all(settings)[0])
     light = board_session.with_fully_on(stage.patterns)
     optics = replace(stage.cameras["cam1"], aperture_mm=aperture_mm, focus_mm=400.0)
-    near = board_session.render_near(stage, optics, light, settings.engine, 5)
+    near = traced(stage, optics, light, settings.engine, 5)
     whole = render(stage.world, optics, stage.projector, light, settings.engine, 5)
     assert near.shape == whole.shape and (whole[-1] < whole[-1].max() / 50).mean() > 0.3
     np.testing.assert_allclose(near, whole, rtol=1e-5)
@@ -160,10 +165,7 @@ def test_a_flat_board_throws_no_shadow(settings):
     assert not is_convex(board.things(board.Config(warp_mm=0.1)))
     board_session.move_things(stage.world, stage.things, board_session.place_all(settings)[0])
     light = board_session.fully_on(stage.patterns)
-    images = [
-        board_session.render_near(replace(stage, convex=convex), stage.cameras["cam1"], light, settings.engine, 5)
-        for convex in (True, False)
-    ]
+    images = [traced(replace(stage, convex=convex), stage.cameras["cam1"], light, settings.engine, 5) for convex in (True, False)]
     np.testing.assert_array_equal(*images)
 
 
@@ -171,7 +173,7 @@ def test_a_board_out_of_sight_leaves_the_room(settings):
     stage = board_session.set_up(settings)
     board_session.move_things(stage.world, stage.things, rigid.transform(np.eye(3), [5000.0, 0.0, 600.0]))
     optics = stage.cameras["cam1"]
-    image = board_session.render_near(stage, optics, board_session.fully_on(stage.patterns), settings.engine, 5)[0]
+    image = traced(stage, optics, board_session.fully_on(stage.patterns), settings.engine, 5)[0]
     np.testing.assert_allclose(image, optics.transmission * settings.engine.room_radiance, rtol=1e-6)
 
 
