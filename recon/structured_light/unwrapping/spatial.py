@@ -37,10 +37,8 @@ Mask = NDArray[np.bool_]
 
 
 class Line(NamedTuple):
-    """The image of the centre line, and the line itself."""
+    """The centre line, in the projector."""
 
-    image: NDArray  # (h, w) DN
-    valid: Mask  # (h, w) pixels with enough modulation
     turns: float  # cycles, the absolute phase of its middle
     width: float  # cycles
 
@@ -97,7 +95,8 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     distance = watershed.depth(state)
     basin, offset, broken = watershed.flood(distance, right, down)
     basin, broken, count = watershed.number(basin, broken)
-    places, values, residuals = _sightings(Line(line, valid, float(turns), width), fringe, Ground(phase, relative, basin, offset))
+    light = _line_light(line, valid, fringe)
+    places, values, residuals = _sightings(light, Line(float(turns), width), Ground(phase, relative, basin, offset))
     near = np.abs(residuals) < RESIDUAL
     votes: dict[int, Counter] = defaultdict(Counter)
     for place, value in zip(places[near].tolist(), values[near].tolist(), strict=True):
@@ -122,19 +121,32 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     return Unwrapped(order, known, unreachable, len(found.absolute), islands, len(found.disputed), *sighted)
 
 
+@njit(parallel=True, error_model="numpy")
+def _line_light(image, valid, fringe: Fringe):
+    """Light of the line over full light, where it is bright enough to be the line : (h, w), 0 elsewhere."""
+    offset, modulation, sigma = fringe.offset, fringe.modulation, fringe.sigma
+    light = np.zeros(image.shape, np.float32)
+    for v in prange(image.shape[0]):
+        for u in range(image.shape[1]):
+            dark = max(offset[v, u] - modulation[v, u], np.float32(0))
+            level = (image[v, u] - dark) / (2 * modulation[v, u])
+            light[v, u] = level if valid[v, u] and level >= LINE_LEVEL + 4 * sigma[v, u] else 0
+    return light
+
+
 @njit
-def _sightings(line: Line, fringe: Fringe, ground: Ground):
+def _sightings(light, line: Line, ground: Ground):
     """Sightings of the line on continuous ground: the basin, the absolute order of the basin's root cell, cycles off a whole."""
     rows, columns = ground.basin.shape
     places, values, residuals = [np.int32(0) for _ in range(0)], [np.int32(0) for _ in range(0)], [0.0 for _ in range(0)]
     for v in range(rows * CELL):
-        image, valid, phase = line.image[v], line.valid[v], ground.phase[v]
-        offset, modulation, sigma = fringe.offset[v], fringe.modulation[v], fringe.sigma[v]
-        u = 0
-        while u < columns * CELL:
-            start = u
-            u, middle, extent = _lit_run(image, valid, offset, modulation, sigma, phase, start, columns * CELL)
-            if u - start >= 2 and extent < 1.5 * line.width + 0.3:
+        bright, phase = light[v, : columns * CELL], ground.phase[v]
+        end = 0
+        for u in range(columns * CELL):
+            if u < end or bright[u] == 0:
+                continue
+            end, middle, extent = _lit_run(bright, phase, u)
+            if end - u >= 2 and extent < 1.5 * line.width + 0.3:
                 near = int(np.floor(middle + 0.5))
                 place = ground.basin[v // CELL, near // CELL]
                 if place >= 0:
@@ -143,24 +155,20 @@ def _sightings(line: Line, fringe: Fringe, ground: Ground):
                     places.append(place)
                     values.append(np.int32(whole) - ground.relative[v, near] - ground.offset[v // CELL, near // CELL])
                     residuals.append(line.turns - here - whole)
-            u = max(u, start + 1)
     return np.array(places), np.array(values), np.array(residuals)
 
 
 @njit(inline="always")
-def _lit_run(image, valid, offset, modulation, sigma, phase, start, end):
+def _lit_run(bright, phase, start):
     """Lit pixels of a row from `start` on: their end, the middle of their light, and their extent in cycles."""
     u, weight, moment, extent = start, 0.0, 0.0, 0.0
-    while u < end and valid[u]:
-        level = (image[u] - max(offset[u] - modulation[u], np.float32(0))) / (2 * modulation[u])
-        if level < LINE_LEVEL + 4 * sigma[u]:
-            break
+    while u < len(bright) and bright[u] > 0:
         if u > start:
             extent += abs(wrap(phase[u] - phase[u - 1]))
-        weight += level
-        moment += level * u
+        weight += bright[u]
+        moment += bright[u] * u
         u += 1
-    return u, moment / weight if weight > 0 else 0.0, extent
+    return u, moment / weight, extent
 
 
 @njit(inline="always")
