@@ -129,7 +129,7 @@ def readout_of(device: CameraDevice, wavelength_nm: float, exposure: Exposure) -
     )
 
 
-@njit(nogil=True)
+@njit(nogil=True, error_model="numpy")
 def _take(radiance, normal, response, offset, readout, numbers):
     """One image by `read_out` and `digitise` in one pass, with the noise from standard normal numbers."""
     for i in range(radiance.shape[0]):
@@ -164,7 +164,7 @@ def _drawn(mean, z, dark_variance):
     return mean + sigma * (z + bend)
 
 
-@njit(nogil=True)
+@njit(nogil=True, error_model="numpy")
 def _bent(mean, normal, dark_variance):
     """`_drawn` for each pixel : (h, w)."""
     result = np.empty_like(normal)

@@ -20,7 +20,8 @@ Size = tuple[int, int]  # width, height, px
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOURS = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}
-PNG_COMPRESSION = 1  # sensor noise hardly compresses: higher levels cost time and save a few percent
+# Sensor noise has no repeats to look for, but for runs of one value: twice as fast, and smaller, than zlib's usual search.
+PNG_ENCODER = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 
 
 def write_images(paths: Sequence[Path], images: Images) -> None:
@@ -35,7 +36,7 @@ def write_images(paths: Sequence[Path], images: Images) -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
     def write(path: Path, image: Images) -> None:
-        encoded, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
+        encoded, data = cv2.imencode(".png", image, PNG_ENCODER)
         if not encoded:
             raise OSError(f"{path}: the PNG encoder failed")
         path.write_bytes(data.tobytes())
