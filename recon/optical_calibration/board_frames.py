@@ -1,11 +1,13 @@
 """From the board part of a capture to sightings: the devices that take part, and the poses in which each found the board."""
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 
-from recon.capture.board_part import BoardCapture
+from recon.capture.board_part import BoardCapture, Pose
 from recon.errors import InputError
 from recon.optical_calibration.joint_calibration import Result
 from recon.optical_calibration.observations import Size
@@ -30,9 +32,25 @@ def sizes_of(captured: BoardCapture) -> dict[str, Size]:
     return {name: sizes[name] for name in DEVICES if name in sizes}
 
 
-def look(captured: BoardCapture, number: int) -> Sighting:
-    """Read the images of one pose and find the board in those of the cameras that can be calibrated."""
-    pose = captured.pose(number)
+def look_at_all(captured: BoardCapture) -> Iterator[Sighting]:
+    """Find the board in the images of each pose; those of the next one are read meanwhile.
+
+    Raises
+    ------
+    InputError
+        If an image is damaged, or doesn't fit its device.
+    """
+    with ThreadPoolExecutor(1) as reader:
+        waiting = deque([reader.submit(captured.pose, 0)])
+        for number in range(1, len(captured.poses) + 1):
+            pose = waiting.popleft().result()
+            if number < len(captured.poses):
+                waiting.append(reader.submit(captured.pose, number))
+            yield _look(captured, pose)
+
+
+def _look(captured: BoardCapture, pose: Pose) -> Sighting:
+    """Find the board in the images of the cameras that can be calibrated."""
     lit = {camera: image for camera, image in pose.lit.items() if camera in DEVICES}
     bits = {name: device.bits for name, device in captured.devices.items()}
     return sight(pose.name, captured.board, lit, pose.fringes, captured.patterns, bits)

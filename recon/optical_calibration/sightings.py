@@ -19,6 +19,7 @@ Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 CORNER_REACH = 0.45  # of the distance between corners: window of the fringes' local model
 DISC_REACH = 1.7  # of a disc's radius
+MARGIN = 24  # px around all such windows: orders are carried by 8 px at most, and edges are smoothed by 1
 ENOUGH = 8  # points of a pose that a device must see, to place it
 FIRST = "cam1"
 
@@ -69,8 +70,11 @@ def sight(
     gradient = np.zeros((len(board.points()), 2, 2))
     if fringes is not None and patterns is not None and FIRST in found:
         try:
-            projector_map = decode(fringes, patterns, bits=bits[FIRST], name=f"{name}: fringes")
-            seen = correspondences(projector_map, lit[FIRST], found[FIRST].pixels, _reach(found[FIRST], board))
+            centres, reach = found[FIRST].pixels, _reach(found[FIRST], board)
+            rows, columns = _around(centres, reach, lit[FIRST].shape)
+            projector_map = decode(fringes[:, rows, columns], patterns, bits=bits[FIRST], name=f"{name}: fringes")
+            corner = np.array([columns.start, rows.start])
+            seen = correspondences(projector_map, lit[FIRST][rows, columns], centres - corner, reach)
             pixels[PROJECTOR], covariance[PROJECTOR], gradient = seen.pixels, seen.covariance, seen.gradient
         except InputError as reason:
             failures[PROJECTOR] = str(reason)
@@ -112,6 +116,15 @@ def gather(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size
         np.array(covariance).swapaxes(1, 2),
         np.nan_to_num(np.array([sighting.gradient for sighting in used])),
     )
+
+
+def _around(centres: Array, reach: Array, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of the part of an image that holds the windows about all points, with a margin."""
+    known = np.isfinite(centres).all(axis=1)
+    low = np.floor((centres[known] - reach[known, None]).min(axis=0)).astype(int) - MARGIN
+    high = np.ceil((centres[known] + reach[known, None]).max(axis=0)).astype(int) + MARGIN + 1
+    (left, top), (right, bottom) = np.maximum(low, 0).tolist(), np.minimum(high, shape[::-1]).tolist()
+    return slice(top, bottom), slice(left, right)
 
 
 def _reach(detection: Detection, board: Board) -> Array:

@@ -30,6 +30,14 @@ class Cells(NamedTuple):
     inverted: bool  # each bit's image is followed by its inverse
 
 
+class Bits(NamedTuple):
+    """What the code's images say of a row's pixels. All (w,) int32."""
+
+    number: NDArray[np.int32]  # of the cell
+    doubt: NDArray[np.int32]  # digits that the last uncertain bit flips
+    uncertain: NDArray[np.int32]  # number of uncertain bits
+
+
 def fringe_order(
     images: NDArray, code: GrayCode, fringes: Fringes, fringe: Fringe, length: int, noise: Noise
 ) -> tuple[Orders, NDArray[np.float32]]:
@@ -82,51 +90,58 @@ def fringe_order(
 
 @njit(parallel=True)
 def _order(images, cells: Cells, fringe: Fringe, noise: Noise):
-    phase = fringe.phase
+    phase, offset, modulation = fringe.phase, fringe.offset, fringe.modulation
     height, width = phase.shape
     order = np.zeros((height, width), np.int32)
     trusted = np.zeros((height, width), np.bool_)
     residual = np.zeros((height, width), np.float32)
     for v in prange(height):
+        low, high = np.zeros(width), np.zeros(width)
+        if not cells.inverted:
+            _black_and_white(images[:, v], offset[v], modulation[v], low, high)
+        bits = Bits(np.zeros(width, np.int32), np.zeros(width, np.int32), np.zeros(width, np.int32))
+        _read_bits(images[:, v], cells.inverted, low, high, noise, bits)
+        number, doubt, uncertain = bits.number, bits.doubt, bits.uncertain
         for u in range(width):
-            number, doubt, uncertain = _cell_number(images, cells.inverted, fringe, noise, v, u)
-            cycles = cells.first + number * cells.width - phase[v, u] / (2 * math.pi)
+            cycles = cells.first + number[u] * cells.width - phase[v, u] / (2 * math.pi)
             nearest = math.floor(cycles + 0.5)
             order[v, u] = nearest
             residual[v, u] = cycles - nearest
-            other_way = math.floor(cells.first + (number ^ doubt) * cells.width - phase[v, u] / (2 * math.pi) + 0.5)
-            trusted[v, u] = uncertain <= 1 and other_way == nearest and abs(cycles - nearest) < 0.5 - MARGIN
+            other_way = math.floor(cells.first + (number[u] ^ doubt[u]) * cells.width - phase[v, u] / (2 * math.pi) + 0.5)
+            trusted[v, u] = uncertain[u] <= 1 and other_way == nearest and abs(cycles - nearest) < 0.5 - MARGIN
     return Orders(order, trusted), residual
 
 
-@njit(inline="always")
-def _cell_number(images, inverted, fringe: Fringe, noise: Noise, v, u):
-    """The cell of a pixel, the digits that its last uncertain bit flips, and the number of uncertain bits."""
-    bits = images.shape[0] // 2 if inverted else images.shape[0]
-    uncertain, doubt, gray, number = 0, 0, 0, 0
-    low, high = 0.0, 0.0
-    if not inverted:
-        low, high = _black_and_white(images, fringe, v, u)
-    for i in range(bits):
-        if inverted:
-            value, other = float(images[2 * i, v, u]), float(images[2 * i + 1, v, u])
-            variance = 2 * noise.read_variance + noise.gain * (value + other)
-        else:
-            value, other = float(images[i, v, u]), (low + high) / 2
-            variance = noise.read_variance + noise.gain * value + (2 * noise.read_variance + noise.gain * (low + high)) / 4
-        gray ^= 1 if value > other else 0  # running parity turns Gray into binary
-        number = 2 * number + gray
-        if (value - other) ** 2 < SURE * SURE * variance:
-            uncertain += 1
-            doubt = (1 << (bits - i)) - 1  # a Gray bit flips its binary digit and all after it
-    return number, doubt, uncertain
+@njit
+def _read_bits(images, inverted, low, high, noise: Noise, bits: Bits):
+    """Read the cells of a row's pixels from its images : (n, w), bit by bit."""
+    number, doubt, uncertain = bits.number, bits.doubt, bits.uncertain
+    count = len(images) // 2 if inverted else len(images)
+    for i in range(count):
+        here, against = (images[2 * i], images[2 * i + 1]) if inverted else (images[i], images[i])
+        for u in range(len(number)):
+            value = float(here[u])
+            if inverted:
+                other = float(against[u])
+                variance = 2 * noise.read_variance + noise.gain * (value + other)
+            else:
+                other = (low[u] + high[u]) / 2
+                level = noise.gain * (low[u] + high[u])
+                variance = noise.read_variance + noise.gain * value + (2 * noise.read_variance + level) / 4
+            parity = (number[u] & 1) ^ (1 if value > other else 0)  # the running one turns Gray into binary
+            number[u] = 2 * number[u] + parity
+            if (value - other) ** 2 < SURE * SURE * variance:
+                uncertain[u] += 1
+                doubt[u] = (1 << (count - i)) - 1  # a Gray bit flips its binary digit and all after it
 
 
-@njit(inline="always")
-def _black_and_white(images, fringe: Fringe, v, u):
-    """The darkest and the brightest that a pixel shows, over the code's images and the fringes' trough and crest."""
-    low = max(fringe.offset[v, u] - fringe.modulation[v, u], np.float32(0))  # gamma's harmonics pull the fit below black
-    high = fringe.offset[v, u] + fringe.modulation[v, u]
-    for i in range(images.shape[0]):
-        low, high = min(low, float(images[i, v, u])), max(high, float(images[i, v, u]))
-    return low, high
+@njit
+def _black_and_white(images, offset, modulation, low, high):
+    """The darkest and the brightest that a row's pixels show, over its images of the code and the fringes' trough and crest."""
+    for u in range(len(low)):
+        low[u] = max(offset[u] - modulation[u], np.float32(0))  # gamma's harmonics pull the fit below black
+        high[u] = offset[u] + modulation[u]
+    for i in range(len(images)):
+        image = images[i]
+        for u in range(len(low)):
+            low[u], high[u] = min(low[u], float(image[u])), max(high[u], float(image[u]))

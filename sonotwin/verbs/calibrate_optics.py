@@ -71,9 +71,10 @@ def run(config: Config) -> None:
     start = perf_counter()
     sightings = []
     with console.status("") as status:
-        for number, name in enumerate(captured.poses):
-            status.update(f"looking for the board, pose {name}, {number + 1} of {len(captured.poses)}")
-            sightings.append(board_frames.look(captured, number))
+        found = board_frames.look_at_all(captured)
+        for number, name in enumerate(captured.poses, start=1):
+            status.update(f"looking for the board, pose {name}, {number} of {len(captured.poses)}")
+            sightings.append(next(found))
     seconds = {"seconds_detect": round(perf_counter() - start, 3)}
     console.print(f"detect      {board_frames.found_by(sightings, sizes)}, {seconds['seconds_detect']:.0f} s", markup=False)
     missed = board_frames.not_found(sightings)
