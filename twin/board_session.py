@@ -26,6 +26,7 @@ from scenes.kinds import board
 from scenes.scene_types import Scene, Thing
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, Images, meets_something, render_pixels
+from twin.optics.printed_edges import compute_edges
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, is_convex, move_things
 from twin.optics.surface_session import CameraName, Shooting, calibration_of, camera_optics, describe_visible, device_of
@@ -37,9 +38,7 @@ CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
 UNFINISHED = "unfinished"
 
 EVEN_SAMPLES = 8  # paths for a pixel of an image without fringes, where all that it sees has one brightness
-EDGE_SAMPLES = 256  # paths for a pixel at the edge of a circle, which is half black, half white
-EDGE_RANGE = 0.1  # of the brightest pixel: contrast about a pixel that makes it one of an edge
-EDGE_WINDOW = 3  # px about a pixel
+EDGE_SAMPLES = 256  # paths for a pixel at the edge of a circle that isn't computed, which is half black, half white
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,7 @@ class Stage:
     projector: ProjectorOptics
     patterns: Light
     things: tuple[Thing, ...]  # in the board's frame
+    print: board.Print  # the same by formulas
     world: mi.Scene  # the same things; moved from pose to pose
     convex: bool  # whether they are one convex body, as a flat board is
 
@@ -78,6 +78,7 @@ def set_up(settings: Settings) -> Stage:
         ProjectorOptics.of(settings.rig.projector),
         Light.of(settings.patterns, settings.rig.projector),
         things,
+        board.printed(settings.board),
         build_world(Scene("board", things)),
         is_convex(things),
     )
@@ -139,7 +140,8 @@ def shoot_pose(
             light, engine = fully_on(stage.patterns), engine.model_copy(update={"samples": EVEN_SAMPLES})
         radiance = trace_near(stage, optics, light, engine, light_seed)
         on = radiance[-1]
-        refine_edges(on, stage, optics, settings.engine, edge_seed)
+        left = compute_edges(on, optics, stage.print, world_from_board, edge_seed)
+        refine(on, left, stage, optics, settings.engine, edge_seed)
         radiance.near[-1] = on.ravel()[radiance.pixels]
         device, wavelength = getattr(settings.rig, camera), settings.rig.projector.wavelength_nm
         images = expose(radiance, device, wavelength, exposures[camera], sensor_seed)
@@ -186,18 +188,13 @@ def trace_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine,
     return NearBoard(optics.transmission * np.float32(engine.room_radiance), pixels, near)
 
 
-def refine_edges(radiance: Images, stage: Stage, optics: CameraOptics, engine: Engine, seed: int) -> None:
-    """Render the pixels at edges of a lit image : (h, w) again, in place, with many samples.
-
-    A pixel is chosen by its neighbourhood and then gets a value of its own samples, so that the choice leaves no bias.
-    """
-    window = np.ones((EDGE_WINDOW, EDGE_WINDOW), np.uint8)
-    contrast = cv2.dilate(radiance, window) - cv2.erode(radiance, window)
-    pixels = np.flatnonzero(contrast > EDGE_RANGE * radiance.max()).astype(np.uint32)
-    finer = engine.model_copy(update={"samples": max(engine.samples, EDGE_SAMPLES)})
-    light = fully_on(stage.patterns)
-    found = render_pixels(stage.world, optics, stage.projector, light, finer, seed, pixels, convex=stage.convex)
-    radiance.ravel()[pixels] = found[0]
+def refine(radiance: Images, pixels: NDArray[np.uint32], stage: Stage, optics: CameraOptics, engine: Engine, seed: int) -> None:
+    """Render some pixels : (m,) numbers of a lit image : (h, w) again, in place, with many samples."""
+    if len(pixels):
+        finer = engine.model_copy(update={"samples": max(engine.samples, EDGE_SAMPLES)})
+        light = fully_on(stage.patterns)
+        found = render_pixels(stage.world, optics, stage.projector, light, finer, seed, pixels, convex=stage.convex)
+        radiance.ravel()[pixels] = found[0]
 
 
 def fully_on(light: Light) -> Light:

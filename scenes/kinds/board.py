@@ -5,7 +5,7 @@ right, y down, z away from the viewer, origin at the first circle.
 """
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -54,6 +54,16 @@ class Config(Part):
         return self
 
 
+class Print(NamedTuple):
+    """Black discs on a white ground that may bow to a saddle, for compiled code; in the board's frame, mm."""
+
+    centres: Array  # (n, 2)
+    radius: float
+    middle: Array  # (2,) of the ground
+    half: Array  # (2,) sides of the ground
+    warp: float  # z of the front face is `warp (x^2 - y^2)`, with x and y from the middle in half sides
+
+
 def design(config: Config) -> AsymmetricCircles:
     """The board as designed: all that a calibration is given."""
     return AsymmetricCircles(
@@ -65,6 +75,12 @@ def printed_centres(config: Config) -> Array:
     """Centres of the circles as printed on the warped board : (columns * rows, 3) mm in the board's frame, in OpenCV's order."""
     centres = _printed(config)
     return np.column_stack([centres, _saddle(config, centres)])
+
+
+def printed(config: Config) -> Print:
+    """The print by formulas, of which `things` are the mesh."""
+    middle = _middle(config)
+    return Print(_printed(config), config.diameter_mm / 2, middle, middle + config.margin_mm, config.warp_mm)
 
 
 def circle_centres(config: Config) -> Array:
