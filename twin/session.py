@@ -106,6 +106,10 @@ class Session:
         atomic.check_folder(self.truth.folder, SCENE)
         atomic.check_folder(self.capture, MANIFEST)
         atomic.restore((self.truth.folder, self.capture))
+        self._check_parts()
+
+    def _check_parts(self) -> None:
+        """Check that no other part would be lost, and that all are of one rig."""
         if not (self.capture / MANIFEST).is_file():
             return
         held = read_manifest(self.capture).contents
@@ -127,12 +131,14 @@ class Session:
     def write(self, scene: Mapping[str, object]) -> Iterator[tuple[CaptureWriter, TruthFolder]]:
         """Give the writers of the capture and of its truth; both appear whole and together, or the old ones stay.
 
+        Waits for another process that writes into `out`, so that the part which that one adds is kept too.
+
         Parameters
         ----------
         scene : as of `describe`
         """
-        self.check()
         with atomic.new_folders({self.truth.folder: SCENE, self.capture: MANIFEST}) as (folder, capture):
+            self._check_parts()
             writer, truth = CaptureWriter(capture, str(scene["name"])), TruthFolder(folder, self.part)
             kept = writer.keep(self.capture, self.part) if self.add and (self.capture / MANIFEST).is_file() else ()
             place = self._keep_truth(folder, kept) if kept else folder

@@ -160,6 +160,8 @@ class CaptureWriter:
 def new_capture(folder: Path, name: str = "", add: PartName | None = None) -> Iterator[CaptureWriter]:
     """Give the writer of a capture folder, which appears whole or not at all.
 
+    Waits, before anything is written, for another process that writes the same folder, so that no part of either is lost.
+
     Parameters
     ----------
     add : the one part that is written; all others of a capture that is there stay. None replaces the whole capture.

@@ -1,14 +1,24 @@
-"""Files and folders that appear whole or not at all: written to a temporary sibling, then renamed."""
+"""Files and folders that appear whole or not at all: written to a temporary sibling, then renamed.
 
+One process at a time writes a place, and others wait for it: a hidden lock lies beside the place meanwhile. Temporary siblings of
+a place whose lock is free are therefore leftovers of a process that was killed.
+"""
+
+import logging
 import os
 import re
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from filelock import FileLock, Timeout
+
+from recon import file_locks
 from recon.errors import InputError
+
+log = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -16,11 +26,12 @@ def new_file(path: Path) -> Iterator[Path]:
     """Give a temporary path with the same suffix to write to; on success it becomes `path`, on failure it goes away."""
     path = Path(path)
     temporary = _beside(path, "new")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with _alone(path):
+        try:
+            yield temporary
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -38,20 +49,33 @@ def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
     """Give temporary folders to fill, one a place; on success all are renamed, on failure all old folders stay.
 
     The last folder is set aside first and renamed last, so it never stands beside an old or a new one that isn't its own.
+    Waits until no other process writes one of them; what stands there then doesn't change before the end.
 
     Parameters
     ----------
     places : path -> marker, as of `check_folder`
     """
     paths = [Path(os.path.abspath(path)) for path in places]
-    for path, marker in zip(paths, places.values(), strict=True):
-        check_folder(path, marker)
-    restore(paths)
+    with ExitStack() as locks:
+        for path, marker in sorted(zip(paths, places.values(), strict=True)):
+            check_folder(path, marker)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            locks.enter_context(_alone(path))
+        _put_back(paths)
+        for path, marker in zip(paths, places.values(), strict=True):
+            check_folder(path, marker)  # again: another process may have written it meanwhile
+        with _exchanged(paths) as temporaries:
+            yield temporaries
+
+
+@contextmanager
+def _exchanged(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
+    """Give temporary folders, as `new_folders`, which holds the locks."""
     temporaries, asides = [_beside(path, "new") for path in paths], [_beside(path, "old") for path in paths]
     placed: list[Path] = []
     try:
         for temporary in temporaries:
-            temporary.mkdir(parents=True)
+            temporary.mkdir()
         yield tuple(temporaries)
         for path, aside in zip(reversed(paths), reversed(asides), strict=True):
             if path.exists():
@@ -71,13 +95,25 @@ def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
 
 
 def restore(paths: Sequence[Path]) -> None:
-    """Put back what a process has set aside that was killed in `new_folders`, and remove its other leftovers."""
+    """Put back what a process has set aside that was killed in `new_folders`, and remove its other leftovers.
+
+    Nothing is done where another process is writing.
+    """
+    if any(_leftovers(path, "new|old") for path in paths):
+        with ExitStack() as locks, suppress(Timeout):
+            for path in sorted(paths):
+                locks.enter_context(_alone(path, wait=False))
+            _put_back(paths)
+
+
+def _put_back(paths: Sequence[Path]) -> None:
+    """As `restore`, for a process that holds the locks."""
     stopped = not paths[-1].exists()
     for path in paths:
         for aside in _leftovers(path, "old") if stopped else ():
             shutil.rmtree(path, ignore_errors=True)
             aside.rename(path)
-        remove_leftovers(path)
+        _remove(_leftovers(path, "new|old"))
 
 
 def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> None:
@@ -105,7 +141,13 @@ def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> No
 
 def remove_leftovers(path: Path) -> None:
     """Remove the temporary files and folders that a process which was killed while it wrote `path` has left beside it."""
-    for entry in _leftovers(path, "new|old"):
+    if _leftovers(path, "new|old"):
+        with suppress(Timeout), _alone(path, wait=False):  # what another process is writing is no leftover
+            _remove(_leftovers(path, "new|old"))
+
+
+def _remove(entries: Iterable[Path]) -> None:
+    for entry in entries:
         shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
 
@@ -141,23 +183,29 @@ def check_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
         raise InputError(f"{path}: expected a place to write to, found {parent} not writable: {error.strerror}") from None
 
 
-def _leftovers(path: Path, states: str) -> list[Path]:
-    """Hidden names of `_beside` in one of the states, of processes that no longer run."""
-    name = re.compile(rf"\.{re.escape(path.stem)}\.(\d+)\.({states}){re.escape(path.suffix)}")
-    entries = list(path.parent.iterdir()) if path.parent.is_dir() else []
-    return [entry for entry in entries if (match := name.fullmatch(entry.name)) and not _runs(int(match[1]))]
-
-
-def _runs(process: int) -> bool:
+@contextmanager
+def _alone(path: Path, wait: bool = True) -> Iterator[None]:
+    """Hold the lock of a place. Where another process, or another thread, holds it: wait, or raise Timeout."""
+    lock = FileLock(path.with_name(f".{path.name}.lock"))
+    if wait:
+        file_locks.acquire(lock, lambda: log.warning("%s: waiting for another process that is writing it", path))
+    else:
+        lock.acquire(blocking=False)
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # somebody else's
-        return True
-    return True
+        yield
+    finally:
+        with suppress(OSError):  # Windows refuses, and removes it on release
+            os.unlink(lock.lock_file)  # before the release: whoever waits then sees that its file is gone, and makes a new one
+        lock.release()
+
+
+def _leftovers(path: Path, states: str) -> list[Path]:
+    """Hidden names of `_beside` in one of the states, of any process."""
+    name = re.compile(rf"\.{re.escape(path.stem)}\.\d+\.({states}){re.escape(path.suffix)}")
+    entries = list(path.parent.iterdir()) if path.parent.is_dir() else []
+    return [entry for entry in entries if name.fullmatch(entry.name)]
 
 
 def _beside(path: Path, state: str) -> Path:
-    """A hidden name beside `path` that no other process uses, with the same suffix."""
+    """A hidden name beside `path`, with the same suffix."""
     return path.with_name(f".{path.stem}.{os.getpid()}.{state}{path.suffix}")

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from recon.capture import manifest
 from recon.capture.images import read_image
 from recon.capture.manifest import CAMERAS, SCANNER, SCHEMA, BoardPart, Device, Manifest, SweepPart
-from recon.capture.writer import write_pose
+from recon.capture.writer import CaptureWriter, write_pose
 from recon.errors import InputError
 from recon.files.npz import Form
 from recon.geometry.camera import Camera
@@ -119,6 +120,35 @@ def test_parts_are_added_and_replaced_one_by_one(tmp_path, order):
         render(tmp_path, part, seed, add=True)
         assert seeds(tmp_path) == before | {part: seed}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "truth"]
+
+
+def test_two_runs_into_one_folder_lose_nothing(tmp_path):
+    """One that adds a board while a sweep is being added waits for it: both are there in the end, beside the surface."""
+    render(tmp_path, "surface", 1)
+    board = threading.Thread(target=render, args=(tmp_path, "board", 3), kwargs={"add": True})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CaptureWriter, "finish", lambda writer, finish=CaptureWriter.finish: (meanwhile(board), finish(writer)))
+        render(tmp_path, "sweep", 2, add=True)
+    board.join()
+    assert seeds(tmp_path) == {"surface": 1, "board": 3, "sweep": 2}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "truth"]
+
+
+def meanwhile(thread: threading.Thread) -> None:
+    """Start a thread, if it isn't started, and give it time to end: fifty times what it takes."""
+    if thread.ident is None:
+        thread.start()
+        thread.join(1)
+
+
+def test_what_another_run_has_written_meanwhile_is_refused_as_before(tmp_path):
+    """The folder was free when the run began; without `add` the part of the other run stays."""
+    session = Session(tmp_path, "board", {"seed": 2})
+    session.check()
+    render(tmp_path, "surface", 1)
+    with pytest.raises(InputError, match="an earlier board, found a surface"), session.write({"name": "board"}):
+        pass
+    assert seeds(tmp_path) == {"surface": 1}
 
 
 def test_a_part_alone_lies_where_it_always_lay(tmp_path):

@@ -1,6 +1,9 @@
 """A capture of several parts comes back part by part; one is written anew without a change to the others."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -186,6 +189,26 @@ def test_the_calibration_of_other_devices_stays(tmp_path):
         with new_capture(tmp_path / "capture", add=part) as capture:
             PARTS[part](capture)
     assert list(read_surface(tmp_path / "capture").calibration.cameras) == ["cam1", "projector", "cam2"]
+
+
+def test_two_processes_may_add_parts_at_a_time(tmp_path):
+    """The second waits for the first, so that each finds the other's part."""
+    program = "from tests.recon.capture.test_writer import *; print('begin', flush=True); add_alone(Path('capture'), 'board')"
+    env = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[3])}
+    with new_capture(tmp_path / "capture", "session", add="surface") as capture:
+        surface(capture)
+        other = subprocess.Popen([sys.executable, "-c", program], cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True)
+        assert other.stdout.readline() == "begin\n"
+        with pytest.raises(subprocess.TimeoutExpired):
+            other.wait(1)
+    assert other.wait() == 0
+    assert read_manifest(tmp_path / "capture").contents.keys() == {"surface", "board"}
+
+
+def add_alone(folder: Path, part: str) -> None:
+    """Add a part from a process of its own."""
+    with new_capture(folder, "session", add=part) as capture:
+        PARTS[part](capture)
 
 
 def test_a_failed_part_leaves_the_capture_as_it_was(whole):

@@ -87,11 +87,57 @@ def test_the_folder_set_aside_is_found_too(tmp_path):
 
 
 def test_what_another_run_is_writing_is_left_alone(tmp_path):
-    """A temporary of a process that still runs is no leftover; ours stands in for another's."""
-    living = tmp_path / f".folder.{os.getpid()}.new"
-    living.mkdir()
-    atomic.remove_leftovers(tmp_path / "folder")
-    assert living.is_dir()
+    """A temporary of a process that is still writing is no leftover."""
+    with atomic.new_folder(tmp_path / "folder", "mark") as temporary:
+        assert program(tmp_path, 'atomic.remove_leftovers(Path("folder")); atomic.restore([Path("folder")])').wait() == 0
+        assert temporary.is_dir()
+        (temporary / "mark").write_text("")
+    assert names(tmp_path) == ["folder"]
+
+
+@pytest.mark.parametrize("number", [os.getpid(), os.getppid()])
+def test_a_killed_process_may_have_had_the_number_of_a_living_one(tmp_path, number):
+    """As in containers, where every run has the same: its leftovers neither stand in the way nor hold back what was set aside."""
+    write_both(tmp_path, "first")
+    (tmp_path / "capture").rename(tmp_path / f".capture.{number}.old")
+    for name in ("capture", "truth"):
+        (tmp_path / f".{name}.{number}.new").mkdir()
+        (tmp_path / f".{name}.{number}.new" / "half").write_text("")
+    atomic.restore([tmp_path / "truth", tmp_path / "capture"])
+    assert names(tmp_path) == ["capture", "truth"] and (tmp_path / "capture" / "mark").read_text() == "first"
+    (tmp_path / f".capture.{number}.new").mkdir()
+    (tmp_path / f".capture.{number}.new" / "half").write_text("")
+    write_both(tmp_path, "second")
+    assert [sorted(path.name for path in (tmp_path / name).iterdir()) for name in names(tmp_path)] == [["mark"], ["mark"]]
+
+
+@pytest.mark.parametrize("place", ["file", "folder"])
+def test_one_process_writes_at_a_time(tmp_path, place):
+    """A second one waits for the first, and says so; it sees what the first has written."""
+    ours, theirs = {
+        "file": (
+            atomic.new_file(tmp_path / "out"),
+            'new_file(Path("out")) as new: new.write_text(Path("out").read_text() + "2")',
+        ),
+        "folder": (
+            atomic.new_folder(tmp_path / "out", "mark"),
+            'new_folder(Path("out"), "mark") as new: (new / "mark").write_text(Path("out/mark").read_text() + "2")',
+        ),
+    }[place]
+    with ours as temporary:
+        other = program(tmp_path, f"file_locks.PATIENCE_S = 0.0\nwith atomic.{theirs}")
+        assert other.stderr.readline().endswith("out: waiting for another process that is writing it\n")
+        (temporary / "mark" if place == "folder" else temporary).write_text("1")
+    assert other.wait() == 0 and other.stderr.read() == ""
+    assert (tmp_path / "out" / "mark" if place == "folder" else tmp_path / "out").read_text() == "12"
+    assert names(tmp_path) == ["out"]
+
+
+def program(folder: Path, text: str) -> subprocess.Popen:
+    """Another process, that runs some lines in a folder."""
+    text = f"from pathlib import Path\nfrom recon import file_locks\nfrom recon.files import atomic\n{text}"
+    env = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[3])}
+    return subprocess.Popen([sys.executable, "-c", text], cwd=folder, env=env, stderr=subprocess.PIPE, text=True)
 
 
 def write_both(root: Path, text: str) -> None:
