@@ -105,6 +105,15 @@ def extend(path: Path, calibration: Calibration) -> None:
     write(path, Calibration({**before, **calibration.cameras}, calibration.uncertainty))
 
 
+def complete(path: Path, calibration: Calibration) -> None:
+    """Write a calibration of those devices that the file hasn't yet, making it and the folder; what it has stays as it is."""
+    before = read(path) if path.is_file() else Calibration({}, calibration.uncertainty)
+    missing = {name: camera for name, camera in calibration.cameras.items() if name not in before.cameras}
+    if missing:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(path, Calibration({**before.cameras, **missing}, before.uncertainty))
+
+
 def _own(path: Path, storage: cv2.FileStorage) -> Calibration:
     found = storage.getNode("schema").string() if storage.getNode("schema").isString() else "a value that is no text"
     if found != SCHEMA:

@@ -65,6 +65,11 @@ class CaptureWriter:
         calibration_files.extend(self.folder / manifest.OPTICS, optics)
         self._change(calibration=manifest.OPTICS)
 
+    def complete_calibration(self, optics: Calibration) -> None:
+        """Write the calibration of cameras and projector that have none yet; that of a capture that is kept stays as it is."""
+        calibration_files.complete(self.folder / manifest.OPTICS, optics)
+        self._change(calibration=manifest.OPTICS)
+
     def add_probe(self, probe: ProbeCalibration) -> None:
         """Write the calibration of the ultrasound probe."""
         (self.folder / manifest.PROBE).parent.mkdir(exist_ok=True)

@@ -132,7 +132,7 @@ def calibration_of(rig: Rig) -> Calibration:
 
 
 def write_session(session: Session, rig: Rig, scene: Scene, patterns: Patterns, views: Mapping[CameraName, View]) -> None:
-    """Write a surface and its truth."""
+    """Write a surface and its truth; a calibration that has been measured for a capture that is added to stays in it."""
     optics = calibration_of(rig)
     devices = {"projector": Device(size=patterns.projector_size)}
     for camera, view in views.items():
@@ -142,7 +142,7 @@ def write_session(session: Session, rig: Rig, scene: Scene, patterns: Patterns, 
         for camera, view in views.items():
             arrays: dict[str, NDArray] = {field.name: getattr(view.truth, field.name) for field in fields(view.truth)}
             truth.write_arrays(f"surface/{camera}.npz", {**arrays, "limit_px": view.limit_px})
-        capture.add_calibration(optics)
+        capture.complete_calibration(optics)
         capture.add_surface({camera: view.images for camera, view in views.items()}, patterns, devices)
 
 

@@ -194,7 +194,10 @@ def shoot(
 
 
 def write_session(session: Session, rig: Rig, filming: Filming, made: Sequence[Take], frames: Iterable[Frames]) -> None:
-    """Write a film, which is a sweep without B-scans, and its truth, taking the frames one by one."""
+    """Write a film, which is a sweep without B-scans, and its truth, taking the frames one by one.
+
+    A calibration that has been measured for a capture that is added to stays in it.
+    """
     optics = Calibration({name: getattr(rig, name).optics.camera() for name in CAMERAS})
     devices = {
         name: Device(size=getattr(rig, name).optics.size, exposure_s=filming.exposure_s, gain=filming.gain) for name in CAMERAS
@@ -208,8 +211,8 @@ def write_session(session: Session, rig: Rig, filming: Filming, made: Sequence[T
                 seen.append(one.truth)
                 yield from zip(CAMERAS, one.views, strict=True)
 
+        capture.complete_calibration(optics)
         capture.add_sweep(dict.fromkeys(CAMERAS, filming.times), images(), devices)
-        capture.add_calibration(optics)
         truth.write_arrays(TRUTH, _truth_arrays(filming, made, seen))
 
 

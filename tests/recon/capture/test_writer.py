@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.capture import stereo_frames, writer
+from recon.capture import calibration_files, stereo_frames, writer
 from recon.capture.board_part import read_board
 from recon.capture.manifest import SCANNER, BoardPart, Device, read_manifest
 from recon.capture.surface_part import read_surface
@@ -18,7 +18,7 @@ from recon.capture.writer import CaptureWriter, new_capture
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.calibration import Calibration
+from recon.model.calibration import Calibration, Uncertainty
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 from tests.recon.captures import BOARD, PATTERNS, PROJECTOR
@@ -56,6 +56,10 @@ def camera(exposure_s: float, bits: int = 8) -> Device:
 
 def surface(capture: CaptureWriter, seed: int = 1) -> None:
     capture.add_calibration(optics("cam1", "projector"))
+    surface_images(capture, seed)
+
+
+def surface_images(capture: CaptureWriter, seed: int = 1) -> None:
     devices = {"projector": Device(size=PROJECTOR), "cam1": camera(0.01)}
     capture.add_surface({"cam1": noise(PATTERNS.count, SIZE, seed)}, PATTERNS, devices)
 
@@ -189,6 +193,22 @@ def test_the_calibration_of_other_devices_stays(tmp_path):
         with new_capture(tmp_path / "capture", add=part) as capture:
             PARTS[part](capture)
     assert list(read_surface(tmp_path / "capture").calibration.cameras) == ["cam1", "projector", "cam2"]
+
+
+def test_a_measured_calibration_is_completed_and_never_changed(whole):
+    """Only devices that it lacks are added; its covariance stays, and with nothing to add every byte of it."""
+    path = whole / "calibration" / "optics.yaml"
+    measured = Camera(SIZE, np.diag([201.0, 202, 1]), np.zeros(5))
+    calibration_files.write(path, Calibration({"cam1": measured}, Uncertainty(("cam1.fx",), np.array([[0.04]]))))
+    for names in (("cam1", "projector"), ("cam1",)):
+        before = path.read_bytes()
+        with new_capture(whole, add="surface") as capture:
+            capture.complete_calibration(optics(*names))
+            surface_images(capture)
+        found = read_surface(whole).calibration
+        assert list(found.cameras) == ["cam1", "projector"] and np.array_equal(found.cameras["cam1"].matrix, measured.matrix)
+        assert found.uncertainty is not None and found.uncertainty.covariance == 0.04
+    assert path.read_bytes() == before
 
 
 def test_two_processes_may_add_parts_at_a_time(tmp_path):

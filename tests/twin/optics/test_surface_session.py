@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from recon.capture import calibration_files, surface_part, writer
+from recon.capture.manifest import Device
 from recon.errors import InputError
+from recon.geometry.camera import Camera
+from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes
 from recon.structured_light.phase import Noise, wrapped_phase
 from scenes.catalogue import build_scene
@@ -19,7 +22,7 @@ from twin.optics.raster import Light
 from twin.optics.ray_world import build_world
 from twin.optics.surface_session import Shooting, noise_limit_px, shoot, write_session
 from twin.sensor import Exposure, auto_exposure, expose
-from twin.session import Session
+from twin.session import Session, TruthFolder
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +42,10 @@ def session(small_rig, tmp_path_factory) -> Path:
     return write(small_rig, tmp_path_factory.mktemp("session"), seed=4)
 
 
-def write(rig, out: Path, seed: int) -> Path:
+def write(rig, out: Path, seed: int, add: bool = False) -> Path:
     scene, patterns = build_scene({"kind": "sphere"}), paper_surface((1280, 800))
     view = shoot(rig, scene, patterns, "cam1", Engine(samples=4), Shooting(), seed)
-    write_session(Session(out, "surface", {"seed": seed}), rig, scene, patterns, {"cam1": view})
+    write_session(Session(out, "surface", {"seed": seed}, add), rig, scene, patterns, {"cam1": view})
     return out
 
 
@@ -60,6 +63,21 @@ def test_the_pipeline_reads_it(session, small_rig):
     assert read.images.shape == (9, 256, 320)
     assert read.patterns == paper_surface((1280, 800))
     np.testing.assert_allclose(read.calibration.cameras["cam1"].matrix, small_rig.cam1.optics.camera().matrix)
+
+
+def test_a_measured_calibration_stays_when_a_surface_is_added(session, small_rig, tmp_path):
+    """Somebody has measured the cameras of a capture that holds another part; the twin adds its own where there is none."""
+    with Session(tmp_path, "sweep", {}, devices=("us",)).write({"name": "scans"}) as (capture, _):
+        capture.add_sweep({"us": np.arange(1)}, [("us", np.zeros((48, 64), np.uint8))], {"us": Device(size=(64, 48))})
+    path = tmp_path / "capture" / "calibration" / "optics.yaml"
+    path.parent.mkdir()
+    measured = Camera((320, 256), np.diag([801.0, 802, 1]), np.zeros(5))
+    calibration_files.write(path, Calibration({"cam1": measured}))
+    write(small_rig, tmp_path, seed=4, add=True)
+    found = surface_part.read_surface(tmp_path / "capture").calibration
+    assert np.array_equal(found.cameras["cam1"].matrix, measured.matrix) and "projector" in found.cameras
+    true = TruthFolder(tmp_path / "truth", "surface").optics("cam1")["cam1"]
+    np.testing.assert_allclose(true.matrix, small_rig.cam1.optics.camera().matrix)
 
 
 def test_truth_lies_beside(session, small_rig):
