@@ -16,13 +16,14 @@ import numpy as np
 from recon.errors import InputError
 from recon.files import npz, opencv_storage
 from recon.geometry import rigid
-from recon.geometry.camera import Array, Camera
+from recon.geometry.camera import ROTATION, Array, Camera
 from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
 from recon.model.calibration import WORLD, Calibration, Uncertainty
 
 SCHEMA = "sonotwin-optics/1"
 SLMASTER_KEYS = ("M1", "D1", "M4", "D4", "Rlp", "Tlp", "S")
 STEREO_KEYS = ("K1", "dist1", "K2", "dist2", "R", "t")
+FEW_DIGITS = 1.1e-5  # of a rotation's products, in any of the files: five decimals mostly pass
 OWN_KEYS = ("schema", "parameters", "covariance")  # any other is a device
 
 
@@ -172,6 +173,8 @@ def _stereo_pair(path: Path, values: Mapping[str, Array], sizes: Mapping[str, tu
 
 
 def _camera(path: Path, name: str, size: tuple[int, int], matrix: Array, distortion: Array, camera_from_world: Array) -> Camera:
+    if rigid.fault(camera_from_world, ROTATION) and not rigid.fault(camera_from_world, FEW_DIGITS):
+        camera_from_world = rigid.nearest(camera_from_world)
     try:
         return Camera(size, matrix, distortion, camera_from_world)
     except ValueError as error:

@@ -17,8 +17,7 @@ from recon.geometry import rigid
 Array = NDArray[np.float64]
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
-EXACT = 1e-9  # of matrix entries that are zero or one by definition; they come from text files
-ROTATION = 1.1e-5  # of a rotation's products: far stricter than a pose's, as all points depend on it; five digits mostly pass
+ROTATION = 2e-6  # of a rotation's products: stricter than a pose's, as all points depend on it; six decimals leave 1.8e-6
 NEWTON_STEPS = 20
 NEWTON_TOLERANCE = 1e-13  # normalised image coordinates: far below a thousandth of a pixel at any focal length
 ACCEPTED = 1e-10  # the same, of a root that rounding keeps from the tolerance
@@ -54,7 +53,7 @@ class Camera:
         object.__setattr__(self, "distortion", distortion)
         if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0:
             raise ValueError(f"matrix: expected positive focal lengths, found {self.matrix[0, 0]:g}, {self.matrix[1, 1]:g}")
-        if not np.allclose(self.matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], rtol=0, atol=EXACT):
+        if not np.allclose(self.matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], rtol=0, atol=rigid.EXACT):
             raise ValueError(f"matrix: expected the form [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {self.matrix.tolist()}")
         if found := rigid.fault(self.camera_from_world, ROTATION):
             raise ValueError(f"camera_from_world: expected {rigid.RIGID}, found {found}")

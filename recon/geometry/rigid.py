@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 Array = NDArray[np.float64]
 
 RIGID = "a rigid transform of a right-handed frame"  # which `fault` expects
+EXACT = 1e-9  # of matrix entries that are zero or one by definition: any file has them with all digits
 FEW_DIGITS = 1e-3  # of a rotation's products, as text files with few digits have them
 
 
@@ -42,18 +43,28 @@ def invert(to_from: Array) -> Array:
 def fault(pose: Array, tolerance: float = FEW_DIGITS) -> str | None:
     """Name the fault of a matrix : (4, 4) that is no rigid transform of a right-handed frame; None for one that is.
 
-    tolerance : of the entries of `R @ R.T` and of the last row.
+    tolerance : of the entries of `R @ R.T`.
     """
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         return "another shape than 4x4, or values that are not finite"
-    if np.abs(pose[3] - [0, 0, 0, 1]).max() > tolerance:
-        return "another last row than 0 0 0 1"
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > EXACT:
+        return f"another last row than 0 0 0 1: {_row(pose[3])}"
     rotation = pose[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > tolerance:
-        return "a matrix that is no rotation"
+        return f"a matrix that is no rotation: {'; '.join(map(_row, rotation))}"
     if np.linalg.det(rotation) < 0:
         return "a left-handed frame: two axes swapped or one mirrored"
     return None
+
+
+def _row(values: Array) -> str:
+    return " ".join(f"{value:.9g}" for value in values)
+
+
+def nearest(pose: Array) -> Array:
+    """The rigid transform whose rotation is the nearest to that of a pose : (4, 4) with few digits."""
+    left, _, right = np.linalg.svd(pose[:3, :3])
+    return transform(left @ right, pose[:3, 3])
 
 
 def moved(pose: Array, step: ArrayLike) -> Array:

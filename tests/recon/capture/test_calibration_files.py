@@ -216,6 +216,20 @@ def test_the_fundamental_matrix_holds_the_epipolar_constraint(optics):
     assert np.abs((pixels[1] * lines).sum(axis=1) / np.linalg.norm(lines[:, :2], axis=1)).max() < 1e-6
 
 
+def test_few_digits_of_a_file_give_an_exact_rotation(optics, tmp_path):
+    """A turn about one axis with five decimals; with four it is refused, and the matrix is shown."""
+    turn = rigid.from_rotation_vector([0, 0.3, 0], [0, 0, 0])[:3, :3]
+    write_storage(tmp_path / "five.yml", slmaster(optics) | {"Rlp": np.round(turn, 5)})
+    found = calibration_files.read(tmp_path / "five.yml", SIZES).cameras["projector"].camera_from_world
+    assert np.abs(found[:3, :3] - turn).max() < 1e-5
+    assert np.abs(found[:3, :3] @ found[:3, :3].T - np.eye(3)).max() < 1e-12
+    write_storage(tmp_path / "four.yml", slmaster(optics) | {"Rlp": np.round(turn, 4)})
+    with pytest.raises(
+        InputError, match=r"projector\.camera_from_world: .*no rotation: 0\.9553 0 0\.2955; 0 1 0; -0\.2955 0 0\.9553$"
+    ):
+        calibration_files.read(tmp_path / "four.yml", SIZES)
+
+
 def without(values, key):
     return {name: value for name, value in values.items() if name != key}
 

@@ -3,6 +3,8 @@
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from recon.geometry import rigid
 from recon.geometry.camera import FEW, Camera
@@ -96,3 +98,18 @@ def test_nonsense_is_refused_by_name(change, field):
     good = {"size": (1280, 1024), "matrix": MATRIX, "distortion": np.zeros(5)}
     with pytest.raises(ValueError, match=f"^{field}: expected"):
         Camera(**(good | change))
+
+
+@given(st.tuples(*[st.floats(-3, 3)] * 3))
+def test_a_rotation_may_have_six_decimals(turn):
+    """Half a unit of the sixth decimal in each entry changes a product of two rows by less than 1.8e-6."""
+    Camera((64, 48), MATRIX, np.zeros(5), np.round(rigid.from_rotation_vector(turn, [0, 0, 0]), 6))
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 1), (0, 0), (3, 0)])
+def test_a_pose_has_all_its_digits(row, column):
+    """5e-6 rad are 0.02 px of our cameras; an error of the last row it would pass unseen into all products."""
+    pose = np.eye(4)
+    pose[row, column] += 5e-6
+    with pytest.raises(ValueError, match=r"^camera_from_world: expected a rigid transform .* 5e-06|1\.000005"):
+        Camera((64, 48), MATRIX, np.zeros(5), pose)

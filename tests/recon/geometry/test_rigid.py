@@ -56,11 +56,33 @@ def test_a_rigid_transform_is_told_from_other_matrices(pose, row, column, change
     other = pose.copy()
     other[row, column] += change
     if row == 3:
-        assert "last row" in rigid.fault(other)
+        assert f"last row than 0 0 0 1: {' '.join(f'{value:.9g}' for value in other[3])}" == rigid.fault(other)[8:]
     elif column == 3:
         assert rigid.fault(other) is None
     else:
         assert rigid.fault(other, 1e-5) is not None
+
+
+@given(poses)
+def test_the_last_row_has_all_digits_however_few_the_rotation_has(pose):
+    other = pose.copy()
+    other[3, 1] = 1e-8
+    assert rigid.fault(other, 1e-3) == "another last row than 0 0 0 1: 0 1e-08 0 1"
+
+
+def test_a_matrix_that_is_no_rotation_is_shown():
+    pose = np.eye(4)
+    pose[0, 1] = 1.25e-3
+    assert rigid.fault(pose) == "a matrix that is no rotation: 1 0.00125 0; 0 1 0; 0 0 1"
+
+
+@given(poses)
+def test_the_nearest_rotation_is_no_farther_than_the_one_that_was_rounded(pose):
+    """Each of nine entries is off by at most half a unit of the fifth decimal."""
+    rounded = np.round(pose, 5)
+    found = rigid.nearest(rounded)
+    assert rigid.fault(found, CLOSE) is None and np.array_equal(found[:3, 3], rounded[:3, 3])
+    assert np.linalg.norm(found[:3, :3] - rounded[:3, :3]) <= np.linalg.norm(pose[:3, :3] - rounded[:3, :3]) + CLOSE
 
 
 @given(poses, angles, lengths)
