@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,11 +47,11 @@ class TruthFolder:
 
     def scene(self) -> dict:
         """Read the description of the scene; InputError if it is missing or damaged."""
-        return _read_json(self.described / SCENE)
+        return read_json(self.described / SCENE)
 
     def settings(self) -> dict:
         """Read the fields that the part was rendered from; InputError if they are missing or damaged."""
-        return _read_json(self.described / SETTINGS)
+        return read_json(self.described / SETTINGS)
 
     def arrays(self, name: str, forms: Mapping[str, npz.Form]) -> dict[str, NDArray]:
         """Read arrays from a file in the folder; InputError if one is missing or damaged."""
@@ -123,9 +124,12 @@ class Session:
             raise InputError(f"{self.capture}: expected nothing or an earlier {wanted}, found a {found}; {way}")
         for part in others:
             path = TruthFolder(self.truth.folder, part).described / SETTINGS
-            rigs = [settings.get("rig") for settings in (_read_json(path) if path.is_file() else {}, self.settings)]
-            if None not in rigs and rigs[0] != rigs[1]:
-                raise InputError(f"{path}: expected the rig that is given, as all parts are of one, found another")
+            there, given = (settings.get("rig") for settings in (read_json(path) if path.is_file() else {}, self.settings))
+            if there is None or given is None:
+                continue
+            field, wanted, found = first_difference(given, there, "rig")
+            if field:
+                raise InputError(f"{path}: {field}: expected {wanted} as given, as all parts are of one rig, found {found}")
 
     @contextmanager
     def write(self, scene: Mapping[str, object]) -> Iterator[tuple[CaptureWriter, TruthFolder]]:
@@ -172,16 +176,31 @@ def write_json(path: Path, content: object) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def _read_json(path: Path) -> dict:
+def read_json(path: Path) -> dict:
+    """Read a description or settings; InputError if the file is missing or damaged."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file of the twin's ground truth, found none") from None
+    except OSError as error:
+        found = "none" if isinstance(error, FileNotFoundError) else (error.strerror or "an unreadable one").lower()
+        raise InputError(f"{path}: expected a file of the twin's ground truth, found {found}") from None
+    except RecursionError:
+        raise InputError(f"{path}: expected JSON, found it damaged: values nested too deeply") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected JSON, found it damaged: {error}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object, found a {type(content).__name__}, damaged or of something else")
     return content
+
+
+def first_difference(wanted: Any, found: Any, name: str = "") -> tuple[str, Any, Any]:
+    """Dotted name and both values of the first field that differs, below a field of the given name; no name if none does."""
+    if not (isinstance(wanted, Mapping) and isinstance(found, Mapping)):
+        return ("", None, None) if wanted == found else (name, wanted, found)
+    for key in {**wanted, **found}:
+        different = first_difference(wanted.get(key), found.get(key), f"{name}.{key}".removeprefix("."))
+        if different[0]:
+            return different
+    return "", None, None
 
 
 def _label(part: PartName, devices: tuple[str, ...]) -> str:

@@ -43,7 +43,9 @@ def scene(name: str) -> Scene:
     return Scene(name, (), (Sphere("ball", np.array([0.0, 0.0, 650.0]), 20.0),))
 
 
-def render(out: Path, part: str, seed: int, add: bool = False, rig: str = "ours", devices: tuple[str, ...] = (SCANNER,)) -> None:
+def render(
+    out: Path, part: str, seed: int, add: bool = False, rig: object = "ours", devices: tuple[str, ...] = (SCANNER,)
+) -> None:
     """Write a part whose capture and truth hold the seed."""
     session = Session(out, part, {"rig": rig, "seed": seed}, add, devices if part == "sweep" else ())
     with session.write(describe(scene(part), things=["ball"])) as (capture, truth):
@@ -168,10 +170,27 @@ def test_without_add_a_part_of_another_kind_is_refused_and_left_alone(tmp_path):
 
 def test_parts_are_of_one_rig(tmp_path):
     render(tmp_path, "surface", 1)
-    with pytest.raises(InputError, match=r"truth/settings\.json: expected the rig that is given, as all parts are of one"):
+    with pytest.raises(InputError, match=r"truth/settings\.json: rig: expected another as given, as all parts are of one rig"):
         render(tmp_path, "board", 2, add=True, rig="another")
     render(tmp_path, "surface", 3, add=True, rig="another")  # nothing else is there
     render(tmp_path, "board", 2, add=True, rig="another")
+
+
+def test_the_field_is_named_by_which_another_rig_differs(tmp_path):
+    """The first that differs, with both values; a field that one of them lacks is none there."""
+    rig = {"cam1": {"size": [64, 48], "sensor": {"gain": 5.0}}, "cam2": {"size": [64, 48]}}
+    render(tmp_path, "surface", 1, rig=rig)
+    for given, complaint in (
+        (
+            rig | {"cam1": {"size": [64, 48], "sensor": {"gain": 6.0}}},
+            r"rig\.cam1\.sensor\.gain: expected 6\.0 as given.* found 5\.0",
+        ),
+        (rig | {"cam2": {"size": [32, 24]}}, r"rig\.cam2\.size: expected \[32, 24\] as given.* found \[64, 48\]"),
+        (rig | {"probe": 1}, r"rig\.probe: expected 1 as given.* found None"),
+    ):
+        with pytest.raises(InputError, match=rf"truth/settings\.json: {complaint}$"):
+            render(tmp_path, "board", 2, add=True, rig=given)
+    render(tmp_path, "board", 2, add=True, rig=rig)
 
 
 def test_the_true_calibration_keeps_devices_that_other_parts_need(tmp_path):
@@ -274,6 +293,12 @@ def test_damaged_truth_is_named(tmp_path, name, content, complaint):
     with pytest.raises(InputError, match=f"{name}: expected .*{complaint}") as refusal:
         getattr(TruthFolder(tmp_path, "board"), name.removesuffix(".json"))()
     assert "\n" not in str(refusal.value)
+
+
+def test_truth_that_cannot_be_read_is_named(tmp_path):
+    (tmp_path / SETTINGS).mkdir()
+    with pytest.raises(InputError, match=r"settings\.json: expected a file of the twin's ground truth, found is a directory"):
+        TruthFolder(tmp_path, "board").settings()
 
 
 def test_settings_are_written_as_json(tmp_path):

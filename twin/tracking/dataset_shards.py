@@ -13,7 +13,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 from pathlib import Path
 from threading import Thread
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import drjit as dr
@@ -26,6 +26,7 @@ from pydantic import BaseModel, ConfigDict
 from recon.errors import InputError
 from recon.files import atomic
 from recon.model.rig import Rig
+from twin.session import first_difference
 from twin.tracking.mesh_bank import Bank, build_bank
 from twin.tracking.rendered_views import Frames, Quality, render_full, render_sketches, render_views
 from twin.tracking.samples import Take, draw
@@ -88,7 +89,7 @@ def prepare(place: Place, settings: Settings) -> list[int]:
         if found["samples"] > settings.samples:
             expected = f"expected at least the {found['samples']} it was begun with"
             raise InputError(f"{told}: samples: {expected}, found {settings.samples}")
-        name, wanted, there = _first_difference(written, found | {"samples": settings.samples}, "")
+        name, wanted, there = first_difference(written, found | {"samples": settings.samples})
         if name:
             expected = f"expected {wanted} as in this run, found {there}, another data set"
             raise InputError(f"{told}: {name}: {expected}; choose another out")
@@ -248,14 +249,3 @@ def write_index(place: Place, settings: Settings) -> None:
             })  # fmt: skip
     with atomic.new_file(place.folder / INDEX) as path:
         pq.write_table(pa.Table.from_pylist(rows), path)
-
-
-def _first_difference(wanted: Any, found: Any, name: str) -> tuple[str, Any, Any]:
-    """Dotted name and both values of the first field that differs; no name if none does."""
-    if not (isinstance(wanted, dict) and isinstance(found, dict)):
-        return ("", None, None) if wanted == found else (name, wanted, found)
-    for key in wanted | found:
-        different = _first_difference(wanted.get(key), found.get(key), f"{name}.{key}".removeprefix("."))
-        if different[0]:
-            return different
-    return "", None, None
