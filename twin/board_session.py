@@ -4,7 +4,6 @@ A pose that is done lies in `OUT/unfinished/`. A run that was stopped goes on fr
 finished set then takes its place as `OUT/capture/` and `OUT/truth/`.
 """
 
-import json
 import math
 import shutil
 from collections.abc import Iterator, Mapping
@@ -31,7 +30,7 @@ from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, is_convex, move_things
 from twin.optics.surface_session import CameraName, Shooting, calibration_of, camera_optics, describe_visible, device_of
 from twin.sensor import Exposure, Numbers, auto_exposure, expose
-from twin.session import SETTINGS, Session, write_json
+from twin.session import SETTINGS, Session, read_json, write_json
 
 FRINGE_CAMERA: CameraName = "cam1"  # sees the fringes; others see the board lit only
 CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
@@ -220,12 +219,18 @@ def is_finished(session: Session) -> bool:
 
 
 def missing_poses(session: Session, settings: Settings) -> list[int]:
-    """Numbers of the poses that are still to be rendered; what is left of a run with other settings is removed."""
+    """Numbers of the poses that are still to be rendered; what is left of a run with other settings is removed.
+
+    Raises
+    ------
+    InputError
+        As of `Session.check`; or if what an unfinished run has left is damaged.
+    """
     session.check()
     unfinished = session.out / UNFINISHED
     atomic.check_folder(unfinished, SETTINGS)
     kept = unfinished / SETTINGS
-    if not kept.is_file() or json.loads(kept.read_text(encoding="utf-8")) != session.settings:
+    if not kept.is_file() or read_json(kept) != session.settings:
         with atomic.new_folder(unfinished, SETTINGS) as folder:
             write_json(folder / SETTINGS, session.settings)
     return [k for k in range(settings.poses.count) if not (unfinished / "capture" / "board" / pose_name(k)).is_dir()]

@@ -146,6 +146,15 @@ def test_other_settings_start_anew(settings, tmp_path):
     assert board_session.missing_poses(Session(tmp_path, "board", {"seed": 4}), settings) == [0, 1, 2]
 
 
+@pytest.mark.parametrize(("content", "complaint"), [("{", "damaged"), ("[]", "found a list"), ("\xff", "damaged")])
+def test_damaged_settings_of_an_unfinished_run_are_named(settings, tmp_path, content, complaint):
+    (tmp_path / "unfinished").mkdir()
+    (tmp_path / "unfinished" / "settings.json").write_text(content, encoding="latin-1")
+    with pytest.raises(InputError, match=f"unfinished/settings.json: expected .*{complaint}") as refusal:
+        board_session.missing_poses(Session(tmp_path, "board", DESCRIBED), settings)
+    assert "\n" not in str(refusal.value)
+
+
 @pytest.mark.parametrize("aperture_mm", [0.0, 60.0])
 def test_what_is_far_from_the_board_is_the_room(settings, aperture_mm):
     """The image of a tilted board, sharp or far out of focus, as if every pixel were traced."""
