@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from recon.capture import calibration_files
 from recon.capture.manifest import MANIFEST, OPTICS, PartName, read_manifest
-from recon.capture.writer import CaptureWriter
+from recon.capture.writer import CaptureWriter, check_kept
 from recon.errors import InputError
 from recon.files import atomic, npz
 from recon.geometry.camera import Camera
@@ -102,7 +102,7 @@ class Session:
         ------
         InputError
             If something else is there: other files, other parts that would be lost, a sweep of other devices in the place of this
-            one, or parts rendered with another rig.
+            one, parts that can't stay where they are, or parts rendered with another rig.
         """
         atomic.check_folder(self.truth.folder, SCENE)
         atomic.check_folder(self.capture, MANIFEST)
@@ -113,7 +113,8 @@ class Session:
         """Check that no other part would be lost, and that all are of one rig."""
         if not (self.capture / MANIFEST).is_file():
             return
-        held = read_manifest(self.capture).contents
+        read = read_manifest(self.capture)
+        held = read.contents
         mine = {self.part} if self.part != "sweep" or set(held.get("sweep", self.devices)) == set(self.devices) else set()
         others = [part for part in held if part not in mine]
         refused = [part for part in others if not self.add or part == self.part]
@@ -122,6 +123,8 @@ class Session:
             way = "choose another out" if self.add or self.part in refused else "choose another out, or give add=true"
             wanted = _label(self.part, self.devices)
             raise InputError(f"{self.capture}: expected nothing or an earlier {wanted}, found a {found}; {way}")
+        if others:
+            check_kept(self.capture, read, self.part)
         for part in others:
             path = TruthFolder(self.truth.folder, part).described / SETTINGS
             there, given = (settings.get("rig") for settings in (read_json(path) if path.is_file() else {}, self.settings))

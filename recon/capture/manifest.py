@@ -7,6 +7,7 @@ Everything is checked on load; a fault is an `InputError` of one line that names
 
 import json
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -59,6 +60,10 @@ class SurfacePart(Part):
     patterns: Patterns
     images: dict[str, tuple[str, ...]]  # camera: paths relative to the manifest's root
 
+    def paths(self) -> Iterator[str]:
+        """All paths that are named."""
+        yield from chain.from_iterable(self.images.values())
+
     @model_validator(mode="after")
     def _one_image_a_pattern(self) -> "SurfacePart":
         for camera, paths in self.images.items():
@@ -81,6 +86,11 @@ class BoardPart(Part):
     board: Board
     patterns: Patterns | None = None  # along both axes of the projector; none if only cameras are to be calibrated
     poses: Annotated[tuple[BoardPose, ...], Field(min_length=1)]
+
+    def paths(self) -> Iterator[str]:
+        """All paths that are named."""
+        for pose in self.poses:
+            yield from chain(pose.lit.values(), *pose.fringes.values())
 
     @model_validator(mode="after")
     def _fringes_as_shown(self) -> "BoardPart":
@@ -113,6 +123,12 @@ class SweepPart(Part):
     images: Annotated[dict[str, str], Field(min_length=1)]  # device: folder of its images and timestamps.csv
     track: str | None = None  # path of the poses; none if they are still to be found in the cameras' images
 
+    def paths(self) -> Iterator[str]:
+        """All paths that are named."""
+        yield from self.images.values()
+        if self.track is not None:
+            yield self.track
+
 
 class Manifest(Record):
     """`manifest.json`. Parts are optional: a capture need not hold all of them."""
@@ -129,10 +145,12 @@ class Manifest(Record):
 
     @model_validator(mode="after")
     def _known_cameras(self) -> "Manifest":
-        for place, cameras in self._places():
+        for part, field, cameras in self._places():
             for camera in cameras:
                 if camera not in self.devices:
-                    raise ValueError(f"{place}.{camera}: expected one of the devices {', '.join(self.devices)}, found {camera}")
+                    raise ValueError(
+                        f"{part}.{field}.{camera}: expected one of the devices {', '.join(self.devices)}, found {camera}"
+                    )
         return self
 
     @model_validator(mode="after")
@@ -162,25 +180,23 @@ class Manifest(Record):
     def contents(self) -> dict[PartName, tuple[str, ...]]:
         """The parts that are there, each with the devices whose images it holds."""
         found: dict[PartName, dict[str, None]] = {part: {} for part in PARTS if getattr(self, part) is not None}
-        for place, devices in self._places():
-            for part in found:
-                if place.startswith(part):
-                    found[part].update(dict.fromkeys(devices))
+        for place, _, devices in self._places():
+            found[place].update(dict.fromkeys(devices))
         return {part: tuple(devices) for part, devices in found.items()}
 
     def devices_of(self, part: PartName) -> dict[str, Device]:
         """All devices, as they were set for a part."""
         return self.devices | (getattr(self, part).devices or {})
 
-    def _places(self) -> Iterator[tuple[str, Iterable[str]]]:
-        """Where cameras are named, and their names."""
+    def _places(self) -> Iterator[tuple[PartName, str, Iterable[str]]]:
+        """Parts and their fields in which devices are named, and these names."""
         if self.surface is not None:
-            yield "surface.images", self.surface.images
+            yield "surface", "images", self.surface.images
         for number, pose in enumerate(self.board.poses if self.board else ()):
-            yield f"board.poses.{number}.lit", pose.lit
-            yield f"board.poses.{number}.fringes", pose.fringes
+            yield "board", f"poses.{number}.lit", pose.lit
+            yield "board", f"poses.{number}.fringes", pose.fringes
         if self.sweep is not None:
-            yield "sweep.images", self.sweep.images
+            yield "sweep", "images", self.sweep.images
 
 
 def read_manifest(folder: Path) -> Manifest:

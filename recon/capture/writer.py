@@ -3,6 +3,7 @@
 The same input gives the same bytes.
 """
 
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,14 +40,13 @@ class CaptureWriter:
         Raises
         ------
         InputError
-            If the manifest is wrong, or the capture's files lie elsewhere.
+            As of `check_kept`.
         """
         read = manifest.read_manifest(source)
         kept = {part: used for part, used in read.contents.items() if part != replaced}
         if not kept:
             return ()
-        if read.root != "." or read.calibration not in (None, manifest.OPTICS) or read.probe not in (None, manifest.PROBE):
-            raise InputError(f"{source / manifest.MANIFEST}: expected a capture that holds all its files, found some elsewhere")
+        check_kept(source, read, replaced)
         atomic.link_tree(source, self.folder, leave_out={manifest.MANIFEST, replaced})
         self._change(name=read.name, calibration=read.calibration, probe=read.probe)
         if replaced == "sweep":
@@ -236,6 +236,33 @@ def write_pose(folder: Path, name: str, lit: Mapping[str, Images], fringes: Mapp
         for camera, image in lit.items():
             write_images([temporary / Path(record.lit[camera]).relative_to(place)], image[None])
     return record
+
+
+def check_kept(source: Path, read: Manifest, replaced: PartName) -> None:
+    """Check that the other parts of a capture can stay when one is written anew; its manifest may have been written by hand.
+
+    Raises
+    ------
+    InputError
+        If files of the capture lie elsewhere, or those of a part in the folder of the one that is written anew.
+    """
+    path = source / manifest.MANIFEST
+    for field, there, here in (
+        ("root", read.root, "."),
+        ("calibration", read.calibration, manifest.OPTICS),
+        ("probe", read.probe, manifest.PROBE),
+    ):
+        if there is not None and os.path.normpath(there) != os.path.normpath(here):
+            raise InputError(f"{path}: {field}: expected {here}, as in a capture that holds all its files, found {there}")
+    for part in sorted(read.contents.keys() - {replaced}):
+        for name in getattr(read, part).paths():
+            first = Path(os.path.normpath(name)).as_posix().partition("/")[0]
+            if Path(name).is_absolute() or first == "..":
+                raise InputError(f"{path}: {part}: expected a capture that holds all its files, found {name}")
+            if first == replaced:
+                raise InputError(
+                    f"{path}: {part}: expected none of its files in {replaced}/, which is written anew, found {name}"
+                )
 
 
 def _check_images(what: str, images: Images, device: Device) -> None:

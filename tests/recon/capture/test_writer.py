@@ -255,8 +255,45 @@ def test_a_device_of_another_size_is_refused(whole):
 def test_a_capture_with_files_elsewhere_is_not_added_to(whole):
     path = whole / "manifest.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"root": "../elsewhere"}))
-    with pytest.raises(InputError, match="expected a capture that holds all its files"), new_capture(whole, add="sweep"):
+    with (
+        pytest.raises(InputError, match=r"root: expected \., as in a capture that holds all its files"),
+        new_capture(whole, add="sweep"),
+    ):
         pass
+
+
+def test_a_manifest_of_the_fewest_keys_is_added_to(whole):
+    """As one writes it by hand: without a name, calibration, probe or settings of the devices."""
+    path = whole / "manifest.json"
+    read = json.loads(path.read_text())
+    board = {name: read["board"][name] for name in ("board", "patterns", "poses")}
+    devices = {name: {"size": device["size"]} for name, device in read["devices"].items()}
+    path.write_text(json.dumps({"schema": read["schema"], "devices": devices, "board": board, "root": "./"}))
+    with new_capture(whole, "other", add="sweep") as capture:
+        scans_alone(capture)
+    assert read_manifest(whole).contents == {"board": ("cam1", "cam2"), "sweep": (SCANNER,)}
+    assert np.array_equal(read_board(whole).pose(0).lit["cam1"], noise(PATTERNS.count + 2, SIZE, 20)[0])
+
+
+@pytest.mark.parametrize("part", ["surface", "board", "sweep"])
+@pytest.mark.parametrize(
+    ("place", "complaint"), [("{}/x", "expected none of its files in"), ("../x", "holds all"), ("/x", "holds all")]
+)
+def test_files_that_would_be_lost_are_refused_before_anything_is_written(whole, part, place, complaint):
+    """A manifest written by hand may name files in another part's folder, or outside the capture."""
+    path = whole / "manifest.json"
+    read, replaced = json.loads(path.read_text()), "sweep" if part == "surface" else "surface"
+    moved = {
+        "surface": lambda name: read["surface"]["images"]["cam1"].__setitem__(-1, name),
+        "board": lambda name: read["board"]["poses"][1]["lit"].__setitem__("cam2", name),
+        "sweep": lambda name: read["sweep"].__setitem__("track", name),
+    }
+    moved[part](place.format(replaced))
+    path.write_text(json.dumps(read))
+    before = contents(whole)
+    with pytest.raises(InputError, match=rf"manifest\.json: {part}: .*{complaint}"), new_capture(whole, add=replaced):
+        pass
+    assert contents(whole) == before
 
 
 def test_images_must_be_those_of_the_times(tmp_path):
