@@ -22,7 +22,8 @@ from typing import Any
 import numba
 from filelock import FileLock
 from numba.core import caching
-from platformdirs import user_cache_path
+
+from recon import user_cache
 
 log = logging.getLogger(__name__)
 
@@ -37,12 +38,6 @@ def njit(function: Callable | None = None, **options: Any) -> Any:
     dispatcher = numba.njit(cache=True, **options)(function)
     _one_process_compiles(dispatcher)
     return dispatcher
-
-
-def cache_folder() -> Path:
-    """The folder of everything that was compiled."""
-    place = os.environ.get("SONOTWIN_CACHE")
-    return (Path(place) if place else user_cache_path("sonotwin", appauthor=False)) / "compiled"
 
 
 def source_hash(module: Path, root: Path) -> str:
@@ -138,7 +133,7 @@ class SourceHashLocator(caching._CacheLocator):
 @cache
 def _folder(path: Path, root: Path, _: int) -> Path:
     """The folder of a module's compiled functions; those of its former sources are deleted once they are long unused."""
-    home = cache_folder() / _module_name(path, root)
+    home = user_cache.compiled_code() / _module_name(path, root)
     folder = home / source_hash(path, root)
     try:
         if folder.is_dir():

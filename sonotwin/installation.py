@@ -183,16 +183,21 @@ def _gpu() -> Iterator[Finding]:
 
 
 def _folders() -> Iterator[Finding]:
-    places = {
-        "cache": llvm.cache_file().parent,
-        "kernel cache": Path.home() / ".drjit",
-        "working folder": Path.cwd(),
-        "temporary folder": Path(tempfile.gettempdir()),
-    }
-    for what, place in places.items():
+    slower = "make it writable, or set HOME: programs start slower without"
+    places = [
+        ("cache", llvm.cache_file().parent, slower),
+        ("kernel cache", Path.home() / ".drjit", slower),
+        ("working folder", Path.cwd(), "choose another one"),
+        ("temporary folder", Path(tempfile.gettempdir()), "choose another one"),
+    ]
+    if _version("platformdirs") is not None:
+        from recon import user_cache
+
+        remedy = f"make it writable, or name another one in {user_cache.VARIABLE}: programs compile anew each time without"
+        places.insert(1, ("compiled code", user_cache.compiled_code(), remedy))
+    for what, place, remedy in places:
         existing = next(path for path in (place, *place.parents) if path.exists())
         if os.access(existing, os.W_OK):
             yield Finding("machine", what, "ok", f"{place} can be written")
         else:
-            remedy = "make it writable, or set HOME: programs start slower without" if "cache" in what else "choose another one"
             yield Finding("machine", what, "problem", f"{place} can't be written", remedy)

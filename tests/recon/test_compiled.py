@@ -52,7 +52,8 @@ def clone(tmp_path) -> Path:
 
 def written(root: Path) -> Path:
     (root / "recon").mkdir(parents=True)
-    shutil.copy(compiled.__file__, root / "recon")
+    for name in ("compiled", "file_locks", "user_cache"):
+        shutil.copy(Path(compiled.__file__).with_name(f"{name}.py"), root / "recon")
     for name, text in (("__init__", ""), ("kernel", KERNEL), ("scales", SCALES)):
         (root / "recon" / f"{name}.py").write_text(text)
     return root

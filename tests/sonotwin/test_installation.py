@@ -81,6 +81,22 @@ def test_an_unwritable_cache_is_a_problem_with_a_remedy(monkeypatch, tmp_path):
     assert all(finding.state == "problem" and finding.remedy for finding in findings)
 
 
+def test_the_folder_of_compiled_code_is_listed_without_the_compiler(tmp_path):
+    """It is that of `recon.compiled`, wherever SONOTWIN_CACHE puts it."""
+    program = """
+import sys
+from sonotwin import installation
+print([finding.found for finding in installation._folders() if finding.what == "compiled code"], "numba" in sys.modules)
+from recon import compiled
+print(compiled._folder(compiled.Path(compiled.__file__).resolve(), compiled.Path(compiled.__file__).resolve().parent.parent, 0))
+"""
+    environment = os.environ | {"SONOTWIN_CACHE": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    found, used = done.stdout.splitlines()
+    assert found == str([f"{tmp_path}/compiled can be written"]) + " False"
+    assert Path(used).is_relative_to(tmp_path / "compiled")
+
+
 @pytest.mark.parametrize(
     ("module", "part"), [("matplotlib.figure", "core"), ("omegaconf", "core"), ("torch", "train"), ("recon", None)]
 )
