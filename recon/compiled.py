@@ -14,7 +14,8 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from recon import user_cache
 log = logging.getLogger(__name__)
 
 OURS = ("recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks")  # packages; others keep Numba's own cache
+Name = tuple[str, ...]  # one with dots, in parts
 UNUSED_DAYS = 30  # after which code compiled from other sources is deleted
 
 
@@ -55,47 +57,102 @@ def source_hash(module: Path, root: Path) -> str:
 
 
 def _sources(module: Path, root: Path) -> set[Path]:
-    found, waiting = set(), [module]
+    found: dict[Path, frozenset[str]] = {}  # with the names that other modules take from each
+    waiting = [(module, frozenset[str]())]
     while waiting:
-        path = waiting.pop()
-        if path not in found:
-            found.add(path)
-            waiting.extend(_imported_for_kernels(path, root, path.stat().st_mtime_ns))
-    return found
+        path, taken = waiting.pop()
+        if path not in found or not taken <= found[path]:
+            found[path] = taken | found.get(path, frozenset())
+            waiting.extend(_imported_for_kernels(_parsed(path, path.stat().st_mtime_ns), root, found[path]))
+    return set(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Text:
+    """What a module's text says about names."""
+
+    imported: dict[str, set[Name]]  # bound by an import anywhere, with the full names of what they may stand for
+    plain: dict[str, set[Name]]  # functions that nothing decorates, with the imported names and such functions that each uses
+    used: set[Name]  # of these, by all other text
 
 
 @cache
-def _imported_for_kernels(path: Path, root: Path, _: int) -> tuple[Path, ...]:
-    """Modules of ours from which a module takes names that its compiled functions, constants or types use."""
+def _imported_for_kernels(text: _Text, root: Path, taken: frozenset[str]) -> tuple[tuple[Path, frozenset[str]], ...]:
+    """Modules of ours from which a module takes names that its compiled functions, constants or types use, and these names.
+
+    taken : names that other modules take from it, be they its own or only imported there, as in a package's `__init__`.
+    """
+    places = (
+        _place((*target, *use[1:]), root) for use in _used_for_kernels(text, taken) for target in text.imported.get(use[0], ())
+    )
+    # this file has no part in what is compiled: it only says where the result lies
+    return tuple((place, frozenset(names[:1])) for place, names in places if place is not None and place != Path(__file__))
+
+
+@cache
+def _parsed(path: Path, _: int) -> _Text:
+    """The text of a module, of a time."""
     tree = ast.parse(path.read_bytes())
-    used = _names_for_kernels(tree)
-    modules = [
-        name
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level
-        for alias in node.names
-        if (alias.asname or alias.name) in used
-        for name in (f"{node.module}.{alias.name}", node.module)
-    ]
-    files = (root.joinpath(*name.split(".")).with_suffix(".py") for name in modules)
-    return tuple(file for file in files if file.is_file() and file != Path(__file__))
-
-
-def _names_for_kernels(tree: ast.Module) -> set[str]:
-    """Names that a module's text uses, but for those of its plain functions that are never compiled."""
+    imported = _imported(tree)
     plain = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef) and not node.decorator_list}
     others = [node for node in tree.body if not isinstance(node, ast.FunctionDef) or node.decorator_list]
-    used = set(_names(others))
-    waiting = [name for name in used if name in plain]  # as in `fast = njit(slow)`
+
+    def known(nodes: Iterable[ast.AST]) -> set[Name]:
+        return {name for name in _names(nodes) if name[0] in imported or name[0] in plain}
+
+    return _Text(imported, {name: known([node]) for name, node in plain.items()}, known(others))
+
+
+def _imported(tree: ast.Module) -> dict[str, set[Name]]:
+    """Names that are bound by imports anywhere in a module, with the full names of what they may stand for."""
+    imported: dict[str, set[Name]] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                full = tuple(alias.name.split("."))
+                imported.setdefault(alias.asname or full[0], set()).add(full if alias.asname else full[:1])
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            for alias in node.names:
+                imported.setdefault(alias.asname or alias.name, set()).add((*node.module.split("."), alias.name))
+    return imported
+
+
+@cache
+def _place(full: Name, root: Path) -> tuple[Path | None, Name]:
+    """The file of the module that a full name begins with, and the rest of the name; None if it isn't ours."""
+    for length in range(len(full), 0, -1) if full[0] in OURS else ():
+        stem = root.joinpath(*full[:length])
+        for file in (stem.with_suffix(".py"), stem / "__init__.py"):
+            if file.is_file():
+                return file, full[length:]
+    return None, full
+
+
+def _used_for_kernels(text: _Text, taken: frozenset[str]) -> set[Name]:
+    """Names that a module's text uses, but for those of its plain functions that are never compiled.
+
+    taken : names that other modules use, so that plain functions among them may be compiled there.
+    """
+    used = {(name,) for name in taken} | text.used
+    waiting = [name for name, *_ in used if name in text.plain]  # as in `fast = njit(slow)`
     while waiting:
-        more = set(_names([plain[waiting.pop()]])) - used
+        more = text.plain[waiting.pop()] - used
         used |= more
-        waiting.extend(name for name in more if name in plain)
+        waiting.extend(name for name, *_ in more if name in text.plain)
     return used
 
 
-def _names(nodes: list[ast.stmt]) -> Iterator[str]:
-    return (node.id for each in nodes for node in ast.walk(each) if isinstance(node, ast.Name))
+def _names(nodes: Iterable[ast.AST]) -> Iterator[Name]:
+    """Names in a text, those with dots in one piece."""
+    for node in nodes:
+        parts, inner = [], node
+        while isinstance(inner, ast.Attribute):
+            parts.append(inner.attr)
+            inner = inner.value
+        if isinstance(inner, ast.Name):
+            yield (inner.id, *reversed(parts))
+        else:
+            yield from _names(ast.iter_child_nodes(node))
 
 
 class SourceHashLocator(caching._CacheLocator):

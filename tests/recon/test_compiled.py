@@ -108,6 +108,48 @@ def test_the_hash_leaves_out_what_plain_functions_take(clone):
     assert compiled.source_hash(kernel, clone) == before
 
 
+BINDINGS = {
+    "a module": ("import recon.scales", "recon.scales.FACTOR * recon.scales.doubled(x)"),
+    "a module by another name": ("import recon.scales as s", "s.FACTOR * s.doubled(x)"),
+    "a module of a package": ("from recon import scales", "scales.FACTOR * scales.doubled(x)"),
+    "a package": ("import recon", "recon.scales.FACTOR * recon.scales.doubled(x)"),
+    "names of a package": ("from recon.units import FACTOR, twice", "FACTOR * twice(x)"),
+    "a package with names of others": ("import recon.units as u", "u.FACTOR * u.twice(x)"),
+    "a module with names of others": ("from recon.units.again import FACTOR, twice", "FACTOR * twice(x)"),
+    "a function that is compiled here": ("from recon.units.slow import plain_scaled", "njit(plain_scaled)(x)"),
+}
+
+
+@pytest.mark.parametrize("binding", BINDINGS)
+def test_the_hash_covers_what_is_imported_in_any_way(clone, binding):
+    """And nothing besides: a module of the same package that is not used has no part in it."""
+    package = clone / "recon" / "units"
+    package.mkdir()
+    (package / "__init__.py").write_text("from recon.scales import FACTOR, doubled as twice\nfrom recon.unused import UNUSED\n")
+    (package / "again.py").write_text("from recon.units import FACTOR, twice\n")
+    (package / "slow.py").write_text("from recon import scales\n\ndef plain_scaled(x):\n    return scales.FACTOR * x\n")
+    (clone / "recon" / "unused.py").write_text("UNUSED = 1\n")
+    line, formula = BINDINGS[binding]
+    kernel = clone / "recon" / "kernel.py"
+    kernel.write_text(f"from recon.compiled import njit\n{line}\n\n@njit\ndef scaled(x):\n    return {formula}\n")
+    before = compiled.source_hash(kernel, clone)
+    (clone / "recon" / "unused.py").write_text("UNUSED = 2\n")
+    assert compiled.source_hash(kernel, clone) == before
+    edit(clone, "FACTOR = 3", "FACTOR = 4")
+    assert compiled.source_hash(kernel, clone) != before
+
+
+def test_the_hash_leaves_out_what_is_installed_beside(clone):
+    """In site-packages our packages lie among others, whose versions Numba doesn't follow either."""
+    kernel, other = clone / "recon" / "kernel.py", clone / "other"
+    other.mkdir()
+    (other / "__init__.py").write_text("NUMBER = 1\n")
+    kernel.write_text("import other\n" + kernel.read_text().replace("FACTOR *", "other.NUMBER *"))
+    before = compiled.source_hash(kernel, clone)
+    (other / "__init__.py").write_text("NUMBER = 2\n")
+    assert compiled.source_hash(kernel, clone) == before
+
+
 def test_a_cache_that_cannot_be_written_is_no_fault(clone):
     (clone.parent / "cache").write_text("a file where the folder should be")
     assert run(clone)[0] == 42
