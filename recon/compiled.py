@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from filelock import FileLock
 from numba.core import caching
 
-from recon import user_cache
+from recon import file_locks, user_cache
 
 log = logging.getLogger(__name__)
 
+NUMBA = "numba>=0.61,<0.69"  # whose undocumented parts are known to be as they are used here
 OURS = ("recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks")  # packages; others keep Numba's own cache
 Name = tuple[str, ...]  # one with dots, in parts
 UNUSED_DAYS = 30  # after which code compiled from other sources is deleted
@@ -155,7 +155,20 @@ def _names(nodes: Iterable[ast.AST]) -> Iterator[Name]:
             yield from _names(ast.iter_child_nodes(node))
 
 
-class SourceHashLocator(caching._CacheLocator):
+def _of_numba(place: Any, name: str) -> Any:
+    """A part of Numba's that it doesn't document; ImportError for a version without it."""
+    try:
+        return getattr(place, name)
+    except AttributeError:
+        where = getattr(place, "__name__", type(place).__name__)
+        found = f"numba {numba.__version__} without {where}.{name}"
+        raise ImportError(f"expected {NUMBA}, whose cache of compiled code this extends, found {found}") from None
+
+
+Locator: Any = _of_numba(caching, "_CacheLocator")
+
+
+class SourceHashLocator(Locator):
     """Numba's cache locator for the modules beside this one: a folder for each hash of sources."""
 
     def __init__(self, folder: Path, line: int):
@@ -210,17 +223,20 @@ def _module_name(path: Path, root: Path) -> str:
 
 def _one_process_compiles(dispatcher: Any) -> None:
     """Lock the compilation of a function: a process that waited for another one loads its result."""
-    compiler, cache = dispatcher._compiler, dispatcher._cache
-    compile_now, save_now = compiler.compile, cache.save_overload
+    compiler, cache = _of_numba(dispatcher, "_compiler"), _of_numba(dispatcher, "_cache")
+    compile_now, save_now = _of_numba(compiler, "compile"), _of_numba(cache, "save_overload")
 
     def compile_once(args: tuple, return_type: Any) -> Any:
         place = Path(cache.cache_path)
-        with FileLock(place / f"{dispatcher.__name__}.lock"):
+        names = dispatcher.__module__, dispatcher.__name__
+        with file_locks.held(
+            place / f"{dispatcher.__name__}.lock", lambda: log.info("waiting for another process that compiles %s.%s", *names)
+        ):
             made = cache.load_overload(tuple(args), dispatcher.targetctx)
             if made is not None:
                 dispatcher.targetctx.insert_user_function(made.entry_point, made.fndesc, [made.library])
                 return made
-            log.info("compiling %s.%s, once", dispatcher.__module__, dispatcher.__name__)
+            log.info("compiling %s.%s, once", *names)
             made = compile_now(args, return_type)
             save_now(tuple(args), made)  # before another process may look
             return made
@@ -229,5 +245,5 @@ def _one_process_compiles(dispatcher: Any) -> None:
     cache.save_overload = lambda *_: None  # saved already, and a loaded function cannot be saved
 
 
-locators: list[Any] = caching.CacheImpl._locator_classes  # tried in this order
+locators: list[Any] = _of_numba(_of_numba(caching, "CacheImpl"), "_locator_classes")  # tried in this order
 locators.insert(0, SourceHashLocator)

@@ -18,20 +18,26 @@ PARTS = {  # the modules' beginnings, what the console calls them, and the secon
 
 
 class Announcer(logging.Handler):
-    """Prints a line on stderr for the first function of each part that is compiled."""
+    """Prints a line on stderr for the first function of each part that is compiled, or that another process compiles."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
         self._announced: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Announce the part of the function that the record names."""
+        """Announce the part of the function that the record names, unless it has been announced alike."""
         module = str(record.args[0]) if isinstance(record.args, tuple) and record.args else ""
         part = next((part for part in PARTS if f"{module}.".startswith(f"{part}.")), None)
-        if part is not None and part not in self._announced:
-            self._announced.add(part)
-            name, seconds = PARTS[part]
-            print(f"compile     {name}, once on this machine (up to {seconds} s)", file=sys.stderr, flush=True)
+        if part is None:
+            return
+        name, seconds = PARTS[part]
+        if str(record.msg).startswith("waiting"):
+            line = f"wait        for another process that compiles the {name.removeprefix('the ')}"
+        else:
+            line = f"compile     {name}, once on this machine (up to {seconds} s)"
+        if line not in self._announced:
+            self._announced.add(line)
+            print(line, file=sys.stderr, flush=True)
 
 
 def announce() -> None:

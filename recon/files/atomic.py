@@ -10,6 +10,7 @@ import re
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -186,17 +187,14 @@ def check_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
 @contextmanager
 def _alone(path: Path, wait: bool = True) -> Iterator[None]:
     """Hold the lock of a place. Where another process, or another thread, holds it: wait, or raise Timeout."""
-    lock = FileLock(path.with_name(f".{path.name}.lock"))
-    if wait:
-        file_locks.acquire(lock, lambda: log.warning("%s: waiting for another process that is writing it", path))
-    else:
-        lock.acquire(blocking=False)
-    try:
-        yield
-    finally:
-        with suppress(OSError):  # Windows refuses, and removes it on release
-            os.unlink(lock.lock_file)  # before the release: whoever waits then sees that its file is gone, and makes a new one
-        lock.release()
+    place = path.with_name(f".{path.name}.lock")
+    announce = partial(log.warning, "%s: waiting for another process that is writing it", path)
+    with file_locks.held(place, announce) if wait else FileLock(place, blocking=False):
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # Windows refuses, and removes it on release
+                place.unlink()  # before the release: whoever waits then sees that its file is gone, and makes a new one
 
 
 def _leftovers(path: Path, states: str) -> list[Path]:

@@ -4,9 +4,11 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from recon import compiled
 
@@ -148,6 +150,44 @@ def test_the_hash_leaves_out_what_is_installed_beside(clone):
     before = compiled.source_hash(kernel, clone)
     (other / "__init__.py").write_text("NUMBER = 2\n")
     assert compiled.source_hash(kernel, clone) == before
+
+
+HELD = """
+import logging
+logging.basicConfig(level=logging.INFO)
+from recon import file_locks
+from recon.kernel import scaled
+file_locks.PATIENCE_S = 0.1
+print(scaled(7))
+"""
+
+
+def test_a_long_wait_for_another_process_is_told_once(clone):
+    run(clone)
+    (place,) = (clone.parent / "cache" / "compiled" / "recon.kernel").iterdir()
+    for path in place.glob("*.nb?"):
+        path.unlink()
+    env = os.environ | {"SONOTWIN_CACHE": str(clone.parent / "cache"), "PYTHONPATH": str(clone)}
+    with FileLock(place / "scaled.lock"):
+        other = subprocess.Popen([sys.executable, "-c", HELD], cwd=clone, env=env, stderr=subprocess.PIPE, text=True)
+        assert other.stderr.readline() == "INFO:recon.compiled:waiting for another process that compiles recon.kernel.scaled\n"
+    assert "waiting" not in other.communicate()[1] and other.returncode == 0
+
+
+@pytest.mark.parametrize("name", ["_CacheLocator", "CacheImpl._locator_classes"])
+def test_another_numba_is_refused_by_name(clone, name):
+    """Without what is extended here nothing would be cached, or stale code be loaded."""
+    script = f"from numba.core import caching; del caching.{name}; import recon.compiled"
+    env = os.environ | {"PYTHONPATH": str(clone)}
+    done = subprocess.run([sys.executable, "-c", script], cwd=clone, env=env, capture_output=True, text=True, check=False)
+    complaint = f"ImportError: expected {compiled.NUMBA}, whose cache of compiled code this extends, found numba "
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(complaint) and last.endswith(f" without {name if '.' in name else f'numba.core.caching.{name}'}")
+
+
+def test_the_range_of_versions_is_that_of_the_project():
+    project = tomllib.loads((Path(compiled.__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    assert compiled.NUMBA in project["dependencies"]
 
 
 def test_a_cache_that_cannot_be_written_is_no_fault(clone):

@@ -33,6 +33,16 @@ def test_a_part_is_announced_once(log, capsys):
     ]
 
 
+def test_a_wait_for_another_process_is_no_compiling(log, capsys):
+    first_use.announce()
+    for module in ("recon.structured_light.decode", "recon.structured_light.phase"):
+        log.info("waiting for another process that compiles %s.%s", module, "kernel")
+    log.info("compiling %s.%s, once", "recon.structured_light.decode", "kernel")
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "wait        for another process that compiles the decoder and mesh"
+    assert second.startswith("compile     decoder and mesh,")
+
+
 def test_every_compiled_module_belongs_to_a_part(log, capsys, request):
     """So that none is compiled in silence."""
     root = request.config.rootpath
