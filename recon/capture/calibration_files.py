@@ -41,15 +41,10 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
         If the file is missing, damaged, of no known dialect, or a value is missing, not finite, or no rotation.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: expected a calibration file, found {(error.strerror or 'none').lower()}") from None
-    if data.startswith(b"PK"):
-        matrices = npz.read(path, dict.fromkeys(STEREO_KEYS, npz.Form("fiu")))
-        return _stereo_pair(path, {key: value.astype(float) for key, value in matrices.items()}, sizes or {})
-    storage = opencv_storage.opened(path, data)
-    try:
+    with opencv_storage.opened(path, "a calibration file") as storage:
+        if storage is None:
+            matrices = npz.read(path, dict.fromkeys(STEREO_KEYS, npz.Form("fiu")))
+            return _stereo_pair(path, {key: value.astype(float) for key, value in matrices.items()}, sizes or {})
         keys = storage.root().keys() if storage.root().isMap() else []
         if "schema" in keys:
             return _own(path, storage)
@@ -58,8 +53,6 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
         if "M1" in keys or "M4" in keys:
             return _slmaster(path, _matrices(path, storage, SLMASTER_KEYS), sizes or {})
         raise InputError(f"{path}: expected schema, or M1 and M4, or K1 and K2, found {', '.join(keys) or 'no keys'}")
-    finally:
-        storage.release()
 
 
 def read_for(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Calibration:

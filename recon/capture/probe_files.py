@@ -34,17 +34,8 @@ def read(path: Path) -> ProbeCalibration:
         If the file is missing, damaged, of another kind, or a value is missing, not finite, no rotation, scale or speed of sound.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: expected a probe's calibration, found {(error.strerror or 'none').lower()}") from None
-    if data.startswith(b"PK"):
-        return _authors(path)
-    storage = opencv_storage.opened(path, data)
-    try:
-        return _own(path, storage)
-    finally:
-        storage.release()
+    with opencv_storage.opened(path, "a probe's calibration") as storage:
+        return _authors(path) if storage is None else _own(path, storage)
 
 
 def write(path: Path, calibration: ProbeCalibration) -> None:

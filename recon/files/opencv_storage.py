@@ -1,6 +1,7 @@
 """OpenCV FileStorage as calibrations are kept in it: opened, and its matrices read, or refused in one line."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -15,18 +16,34 @@ Array = NDArray[np.float64]
 SYMMETRIC = 1e-9  # of a covariance, relative to the standard deviations: it comes from a text file
 
 
-def opened(path: Path, data: bytes) -> cv2.FileStorage:
-    """The storage in a file's bytes; the path is for the message.
+@contextmanager
+def opened(path: Path, expected: str) -> Iterator[cv2.FileStorage | None]:
+    """Give the storage in a file; None for an npz file.
+
+    Parameters
+    ----------
+    expected : what the file should be, for the message where it can't be read
 
     Raises
     ------
     InputError
-        If the bytes are none.
+        If there is no such file, or it is neither.
     """
     try:
-        return cv2.FileStorage(data.decode("utf-8"), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: expected {expected}, found {(error.strerror or 'none').lower()}") from None
+    if data.startswith(b"PK"):  # of any zip file
+        yield None
+        return
+    try:
+        storage = cv2.FileStorage(data.decode("utf-8"), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
     except (cv2.error, SystemError, UnicodeDecodeError):
         raise InputError(f"{path}: expected an npz file or OpenCV's YAML, XML or JSON, found other or damaged data") from None
+    try:
+        yield storage
+    finally:
+        storage.release()
 
 
 def matrix(path: Path, name: str, node: cv2.FileNode) -> Array:
