@@ -58,13 +58,13 @@ def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
     """
     paths = [Path(os.path.abspath(path)) for path in places]
     with ExitStack() as locks:
-        for path, marker in sorted(zip(paths, places.values(), strict=True)):
-            check_folder(path, marker)
+        for path in sorted(paths):
+            _check_writable(path)
             path.parent.mkdir(parents=True, exist_ok=True)
             locks.enter_context(_alone(path))
         _put_back(paths)
         for path, marker in zip(paths, places.values(), strict=True):
-            check_folder(path, marker)  # again: another process may have written it meanwhile
+            check_folder(path, marker)
         with _exchanged(paths) as temporaries:
             yield temporaries
 
@@ -176,6 +176,10 @@ def check_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
         raise InputError(f"{path}: expected a folder or nothing, found a file")
     if path.is_dir() and any(path.iterdir()) and not (path / marker).is_file():
         raise InputError(f"{path}: expected a new or empty folder or one with {marker} to replace, found other files")
+    _check_writable(path)
+
+
+def _check_writable(path: Path) -> None:
     parent = next(parent for parent in path.parents if parent.exists())
     try:
         with TemporaryDirectory(prefix=".", dir=parent):

@@ -133,6 +133,18 @@ def test_one_process_writes_at_a_time(tmp_path, place):
     assert names(tmp_path) == ["out"]
 
 
+def test_a_folder_is_judged_once_it_stands_still(tmp_path):
+    """While another process exchanges it, a folder may lack its marker for a moment."""
+    with atomic.new_folder(tmp_path / "out", "mark") as temporary:
+        (temporary / "mark").write_text("1")
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out" / "half").write_text("")
+        lines = 'file_locks.PATIENCE_S = 0.0\nwith atomic.new_folder(Path("out"), "mark") as new: (new / "mark").write_text("2")'
+        other = program(tmp_path, lines)
+        assert "waiting" in other.stderr.readline()
+    assert other.wait() == 0 and (tmp_path / "out" / "mark").read_text() == "2"
+
+
 def program(folder: Path, text: str) -> subprocess.Popen:
     """Another process, that runs some lines in a folder."""
     text = f"from pathlib import Path\nfrom recon import file_locks\nfrom recon.files import atomic\n{text}"
