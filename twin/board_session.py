@@ -139,8 +139,7 @@ def shoot_pose(
             light, engine = fully_on(stage.patterns), engine.model_copy(update={"samples": EVEN_SAMPLES})
         radiance = trace_near(stage, optics, light, engine, light_seed)
         on = radiance[-1]
-        left = compute_edges(on, optics, stage.print, world_from_board, edge_seed)
-        refine(on, left, stage, optics, settings.engine, edge_seed)
+        refine_edges(on, stage, optics, settings.engine, world_from_board, edge_seed)
         radiance.near[-1] = on.ravel()[radiance.pixels]
         device, wavelength = getattr(settings.rig, camera), settings.rig.projector.wavelength_nm
         images = expose(radiance, device, wavelength, exposures[camera], sensor_seed)
@@ -187,13 +186,16 @@ def trace_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine,
     return NearBoard(optics.transmission * np.float32(engine.room_radiance), pixels, near)
 
 
-def refine(radiance: Images, pixels: NDArray[np.uint32], stage: Stage, optics: CameraOptics, engine: Engine, seed: int) -> None:
-    """Render some pixels : (m,) numbers of a lit image : (h, w) again, in place, with many samples."""
-    if len(pixels):
+def refine_edges(
+    radiance: Images, stage: Stage, optics: CameraOptics, engine: Engine, world_from_board: rigid.Array, seed: int
+) -> None:
+    """Compute the pixels at edges of discs in a lit image : (h, w), in place; where that can't be done, trace many paths."""
+    left = compute_edges(radiance, optics, stage.print, world_from_board, seed)
+    if len(left):
         finer = engine.model_copy(update={"samples": max(engine.samples, EDGE_SAMPLES)})
         light = fully_on(stage.patterns)
-        found = render_pixels(stage.world, optics, stage.projector, light, finer, seed, pixels, convex=stage.convex)
-        radiance.ravel()[pixels] = found[0]
+        found = render_pixels(stage.world, optics, stage.projector, light, finer, seed, left, convex=stage.convex)
+        radiance.ravel()[left] = found[0]
 
 
 def fully_on(light: Light) -> Light:

@@ -163,7 +163,7 @@ def lit_board(rig: Rig, config: board.Config) -> tuple[np.ndarray, Exposure]:
     move_things(stage.world, stage.things, board.world_from_board(config))
     optics, light = stage.cameras["cam1"], board_session.fully_on(stage.patterns)
     radiance = render(stage.world, optics, stage.projector, light, ENGINE, seed=1)
-    board_session.refine_edges(radiance[0], stage, optics, ENGINE, seed=2)
+    board_session.refine_edges(radiance[0], stage, optics, ENGINE, board.world_from_board(config), seed=2)
     wavelength = rig.projector.wavelength_nm
     exposure = Exposure(auto_exposure(radiance, rig.cam1, wavelength, level=Shooting().level), 1.0, 8)
     return expose(radiance, rig.cam1, wavelength, exposure, seed=3)[0], exposure
