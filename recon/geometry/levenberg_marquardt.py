@@ -4,6 +4,7 @@ Source: Levenberg 1944; Marquardt 1963 for the damping by tens. SciPy's `least_s
 """
 
 from collections.abc import Callable
+from math import inf
 from typing import Generic, NamedTuple, TypeVar
 
 Estimate = TypeVar("Estimate")
@@ -25,12 +26,17 @@ class Rules(NamedTuple):
 USUAL = Rules()
 
 
+class Unreachable(ValueError):
+    """A step that can not be solved for, or that leads to an estimate that can not be: a shorter one may."""
+
+
 class Descent(NamedTuple, Generic[Estimate, System, Step]):
     """The outcome."""
 
     estimate: Estimate  # of least cost
     system: System  # the problem linearised there
     step: Step | None  # the first step that was settled, not taken; None where the cost converged or steps ran out
+    converged: bool  # a step was settled, the cost stayed, or the shortest step led uphill; else steps ran out or led nowhere
 
 
 def descend(
@@ -50,19 +56,21 @@ def descend(
     solved : estimate, system, damping -> step
         Solve the equations with their diagonal times `1 + damping`.
     moved : estimate, step -> estimate
-        Take a step. A ValueError of `solved` or `moved` counts as a step uphill.
+        Take a step. `Unreachable`, raised by `solved` or `moved`, counts as a step uphill.
     settled : system, step -> bool
         Whether a step is so short that nothing is gained by taking it.
     """
-    estimate, damping = start, rules.damping
+    estimate, damping, converged = start, rules.damping, False
     system, cost = linearised(estimate)
     for _ in range(rules.steps):
+        if converged or damping > LAST_DAMPING:
+            break
         try:
             step = solved(estimate, system, damping)
             if settled(system, step):
-                return Descent(estimate, system, step)
+                return Descent(estimate, system, step, True)
             trial = moved(estimate, step)
-        except ValueError:  # too long a step, to an estimate that can not be
+        except Unreachable:
             damping = max(10 * damping, LEAST_DAMPING)
             continue
         following, new = linearised(trial)
@@ -71,6 +79,5 @@ def descend(
             estimate, system, cost, damping = trial, following, new, damping / 10
         else:
             damping = max(10 * damping, LEAST_DAMPING)
-        if converged or damping > LAST_DAMPING:
-            break
-    return Descent(estimate, system, None)
+            converged = converged or (damping > LAST_DAMPING and new < inf)
+    return Descent(estimate, system, None, converged)

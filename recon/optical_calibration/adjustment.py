@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry.camera_jacobian import MATRIX, MOTION
-from recon.geometry.levenberg_marquardt import descend
+from recon.geometry.levenberg_marquardt import Unreachable, descend
 from recon.model.calibration import Calibration, Uncertainty
 from recon.optical_calibration.bundle import ROBUST, Array, Estimate, Problem, Shape, System, linearised, stepped
 from recon.optical_calibration.observations import PROJECTOR, Observations
@@ -138,7 +138,13 @@ def _cost(system: System, estimate: Estimate, problem: Problem, prior: Array) ->
 
 
 def _step(system: System, deviation: Array, prior: Array, damping: float) -> tuple[Array, Array]:
-    """One damped Gauss-Newton step: shared unknowns (g,), poses (p, 6)."""
+    """One damped Gauss-Newton step: shared unknowns (g,), poses (p, 6).
+
+    Raises
+    ------
+    Unreachable
+        If the equations are singular.
+    """
     flat, pose_t = np.concatenate(system.shared), system.pose.swapaxes(1, 2)
     shared, right = flat.T @ flat, flat.T @ system.residuals.ravel()
     own = len(right) - len(prior)
@@ -148,10 +154,13 @@ def _step(system: System, deviation: Array, prior: Array, damping: float) -> tup
     cross, corner = system.shared.swapaxes(1, 2) @ system.pose, pose_t @ system.pose  # (p, g, 6), (p, 6, 6)
     corner = corner + np.eye(6) * (damping * np.diagonal(corner, axis1=1, axis2=2)[:, None, :] + TINY)
     pose_right = np.einsum("pam,pm->pa", pose_t, system.residuals)
-    eliminate = np.linalg.solve(corner, cross.swapaxes(1, 2))  # (p, 6, g)
-    reduced = shared - _sum_of_products(cross, eliminate)
-    solution = _solve(reduced, right - np.einsum("pag,pa->g", eliminate, pose_right))
-    return solution, np.linalg.solve(corner, pose_right[..., None])[..., 0] - eliminate @ solution
+    try:
+        eliminate = np.linalg.solve(corner, cross.swapaxes(1, 2))  # (p, 6, g)
+        reduced = shared - _sum_of_products(cross, eliminate)
+        solution = _solve(reduced, right - np.einsum("pag,pa->g", eliminate, pose_right))
+        return solution, np.linalg.solve(corner, pose_right[..., None])[..., 0] - eliminate @ solution
+    except np.linalg.LinAlgError as singular:
+        raise Unreachable(str(singular)) from None
 
 
 def _sum_of_products(left: Array, right: Array) -> Array:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise, moved
+from recon.geometry.levenberg_marquardt import Unreachable
 from recon.model.rig import NotNegative, Part
 from recon.optical_calibration.observations import PROJECTOR, Observations
 
@@ -149,11 +150,23 @@ def _weighted(plain: Array, residual: Array, shared: Array, by_pose: Array, whit
 
 
 def stepped(problem: Problem, estimate: Estimate, shared: Array, poses: Array) -> Estimate:
-    """An estimate with all unknowns changed by a step."""
+    """An estimate with all unknowns changed by a step.
+
+    Raises
+    ------
+    Unreachable
+        If the step isn't finite, or a focal length wouldn't be positive.
+    """
+    if not (np.isfinite(shared).all() and np.isfinite(poses).all()):
+        raise Unreachable("a step that is not finite")
     cameras, at = dict(estimate.cameras), 0
     for device in problem.observations.devices:
         names = problem.free.get(device, ())
-        cameras[device] = moved(cameras[device], names, shared[at : at + len(names)])
+        step = shared[at : at + len(names)]
+        focal = {"fx": cameras[device].matrix[0, 0], "fy": cameras[device].matrix[1, 1]}
+        if any(focal[name] + change <= 0 for name, change in zip(names, step, strict=True) if name in focal):
+            raise Unreachable(f"{device}: a focal length that is not positive")
+        cameras[device] = moved(cameras[device], names, step)
         at += len(names)
     points = estimate.points + shared[at:].reshape(-1, 3) if problem.shape.released else estimate.points
     return Estimate(cameras, rigid.moved(estimate.poses, poses), points)

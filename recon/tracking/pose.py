@@ -230,7 +230,7 @@ def _refined(start: Array, views: Sequence[Sighting], target: Target, model: Arr
         return (design, residual), residual @ residual
 
     try:
-        pose, (design, residual), step = descend(start, linearised, _solved, rigid.moved, _settled, RULES)
+        pose, (design, residual), step, _ = descend(start, linearised, _solved, rigid.moved, _settled, RULES)
     except _Astray as astray:
         return lost(str(astray))
     if step is None:

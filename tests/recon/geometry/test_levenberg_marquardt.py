@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from recon.geometry.levenberg_marquardt import Rules, descend
+from recon.geometry.levenberg_marquardt import Rules, Unreachable, descend
 
 numbers = st.floats(-5, 5)
 
@@ -46,9 +46,10 @@ def test_the_minimum_is_scipys(rng):
         jacobian = np.column_stack([np.exp(-p[1] * time), -p[0] * time * np.exp(-p[1] * time)])
         return (jacobian, residuals(p)), float(residuals(p) @ residuals(p))
 
-    found = descend(np.array([1.0, 0.5]), both, solved, np.add).estimate
+    found = descend(np.array([1.0, 0.5]), both, solved, np.add)
     expected = least_squares(residuals, [1.0, 0.5], xtol=1e-14, ftol=1e-14, gtol=1e-14).x
-    assert np.abs(found - expected).max() < 1e-5
+    assert np.abs(found.estimate - expected).max() < 1e-5
+    assert found.converged and found.step is None
 
 
 @given(numbers, numbers)
@@ -69,10 +70,23 @@ def test_a_step_to_nowhere_is_shortened():
 
     def fenced(p, step):
         if np.abs(step).max() > 0.5:
-            raise ValueError("too far")
+            raise Unreachable("too far")
         return p + step
 
     assert np.abs(descend(np.array([-1.2, 1.0]), linearised, solved, fenced).estimate - 1).max() < 1e-6
+
+
+@pytest.mark.parametrize("mistake", [ValueError("matmul: shapes"), np.linalg.LinAlgError("SVD did not converge")])
+@pytest.mark.parametrize("place", ["solved", "moved"])
+def test_a_mistake_is_no_step_uphill(place, mistake):
+    """Wrong shapes, and equations of values that are not finite, end the descent with their own message."""
+
+    def wrong(*_):
+        raise mistake
+
+    functions = {"solved": solved, "moved": np.add} | {place: wrong}
+    with pytest.raises(type(mistake), match=str(mistake)):
+        descend(np.array([-1.2, 1.0]), linearised, **functions)
 
 
 def test_a_settled_step_is_handed_on_and_not_taken():
@@ -87,8 +101,29 @@ def test_a_settled_step_is_handed_on_and_not_taken():
         rules=Rules(damping=0, converged=0, rounding=1e-12),
     )
     assert found.estimate == pytest.approx(np.linalg.lstsq(design, values)[0])
-    assert found.step is not None and np.abs(found.step).max() < 1e-9
+    assert found.step is not None and np.abs(found.step).max() < 1e-9 and found.converged
+
+
+def test_a_minimum_that_rounding_hides_has_converged():
+    """From the minimum itself, at a cost of zero that no relative change can be measured by."""
+    found = descend(np.array([1.0, 1.0]), linearised, solved, np.add)
+    assert found.converged and (found.estimate == 1).all()
 
 
 def test_steps_run_out():
-    assert descend(np.array([-4.0, 4.0]), linearised, solved, np.add, rules=Rules(steps=2)).step is None
+    found = descend(np.array([-4.0, 4.0]), linearised, solved, np.add, rules=Rules(steps=2))
+    assert found.step is None and not found.converged
+
+
+def test_where_no_way_leads_down_nothing_has_converged():
+    """Steps that all lead nowhere, by shape or by cost: the start is handed back."""
+
+    def nowhere(p, step):
+        raise Unreachable("no estimate there")
+
+    def lost(p, step):
+        return p + np.nan
+
+    for moved in (nowhere, lost):
+        found = descend(np.array([-1.2, 1.0]), linearised, solved, moved)
+        assert not found.converged and (found.estimate == [-1.2, 1.0]).all()

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from recon.geometry.levenberg_marquardt import Unreachable
 from recon.model.calibration import Calibration
 from recon.optical_calibration.adjustment import adjust, free_parameters
-from recon.optical_calibration.bundle import Estimate, Shape
+from recon.optical_calibration.bundle import Estimate, Problem, Shape, stepped
 from recon.optical_calibration.joint_calibration import deviation
 from tests.recon.board_sets import BOARD, DEVICES, devices, observe, random_poses
 
@@ -98,6 +99,22 @@ def test_points_that_a_device_does_not_see_are_left_out(rig, rng):
     error, count = squared_error(found.calibration, cameras)
     assert error < chi2.ppf(0.999, count)
     np.testing.assert_allclose(list(found.noise.values()), 1, atol=0.15)
+
+
+def test_a_step_to_a_camera_that_can_not_be_is_unreachable(rig, rng):
+    """A focal length below zero, and values that aren't finite; a longer focal length is one that can be."""
+    cameras = devices(rig)
+    poses = random_poses(cameras, 2, rng)
+    seen, start = observe(cameras, poses, rng), Estimate(cameras, poses, BOARD.points())
+    problem = Problem(seen, np.zeros_like(seen.pixels), free_parameters(DEVICES, LENS), Shape())
+    step, still = np.zeros(len(problem.names)), np.zeros((2, 6))
+    fy = problem.names.index("projector.fy")
+    for change in (-2 * cameras["projector"].matrix[1, 1], np.nan, -np.inf):
+        step[fy] = change
+        with pytest.raises(Unreachable):
+            stepped(problem, start, step, still)
+    step[fy] = 10.0
+    assert stepped(problem, start, step, still).cameras["projector"].matrix[1, 1] == cameras["projector"].matrix[1, 1] + 10
 
 
 def test_too_few_sightings_are_refused(rig, rng):
