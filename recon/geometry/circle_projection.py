@@ -10,11 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.geometry.ellipses import fit_ellipses, from_outline
+from recon.geometry.circle_outline import ellipses_of
 
 Array = NDArray[np.float64]
-
-OUTLINE = 48  # points a circle; the ellipse needs five, the rest averages what the lens does
 
 
 def centre_offsets(camera: Camera, world_from_board: Array, points: ArrayLike, radius_mm: float) -> Array:
@@ -36,13 +34,5 @@ def centre_offsets(camera: Camera, world_from_board: Array, points: ArrayLike, r
     (n, 2) px
         Centre of the ellipse fitted to the projected outline, minus the projection of the centre; NaN behind the camera.
     """
-    centres = np.asarray(points, float)
-    angles = 2 * np.pi * np.arange(OUTLINE) / OUTLINE
-    rim = radius_mm * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(OUTLINE)])
-    outlines = camera.project(rigid.apply(world_from_board, centres[:, None] + rim))
-    offsets = np.full((len(centres), 2), np.nan)
-    seen = np.isfinite(outlines).all(axis=(1, 2))
-    if seen.any():
-        fit = fit_ellipses(outlines[seen], np.ones((seen.sum(), OUTLINE)), from_outline(outlines[seen]))
-        offsets[seen] = fit.ellipses.centre - camera.project(rigid.apply(world_from_board, centres[seen]))
-    return offsets
+    centres = np.ascontiguousarray(points, float)
+    return ellipses_of(camera, world_from_board, centres, radius_mm)[0] - camera.project(rigid.apply(world_from_board, centres))

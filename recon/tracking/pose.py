@@ -16,10 +16,10 @@ from scipy.special import chdtri
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
+from recon.geometry.circle_outline import ellipses_of, slopes_at
 from recon.geometry.levenberg_marquardt import Rules, descend
 from recon.model.rig import Target
 from recon.tracking import pose_hypotheses
-from recon.tracking.rim_fit.circle_outline import ellipses_of, slopes_at
 
 Array = NDArray[np.float64]
 

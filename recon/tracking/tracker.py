@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
+from recon.geometry.circle_outline import ellipses_of
 from recon.geometry.ellipses import Ellipses, joined
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, pose_hypotheses, views
@@ -21,7 +22,6 @@ from recon.tracking.frames import grey
 from recon.tracking.identity import Triple
 from recon.tracking.networks import Networks
 from recon.tracking.pose import TargetPose, circle_centres, estimate, lost
-from recon.tracking.rim_fit.circle_outline import ellipses_of
 from recon.tracking.rims import Outlines, measure, measure_both
 from recon.tracking.views import View
 

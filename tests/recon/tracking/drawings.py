@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
+from recon.geometry.circle_outline import ellipses_of
 from recon.geometry.ellipses import Ellipses
 from recon.tracking import pose
-from recon.tracking.rim_fit.circle_outline import ellipses_of
 
 ELECTRONS = 7700 / 255  # a digital number
 DARK_E = 11.0

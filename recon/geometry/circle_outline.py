@@ -1,9 +1,10 @@
 """The ellipse of a circle's outline in an image, and its slopes; compiled, for a few circles at a time.
 
 Points of the outline are projected, lens and all; their second moments are nearly the ellipse, and three steps of Gauss-Newton
-on the orthogonal distances make it the one that `recon.geometry.circle_projection.centre_offsets` fits, in a hundredth of the
-time.
+on the orthogonal distances make it the one that `recon.geometry.ellipses.fit_ellipses` finds, in a hundredth of the time.
 """
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,10 @@ STEPS = 3
 
 
 def ellipses_of(camera: Camera, world_from_target: Array, centres: Array, radius_mm: float) -> tuple[Array, Array]:
-    """Centres : (n, 2) px and shapes : (n, 2, 2) px of the ellipses of circles in the target's plane; NaN behind the camera."""
+    """Centres : (n, 2) px and shapes : (n, 2, 2) px of the ellipses of circles; NaN behind the camera.
+
+    centres : (n, 3) mm, of the circles in the target's frame; the circles lie parallel to its plane z = 0.
+    """
     camera_from_target = np.ascontiguousarray(camera.camera_from_world @ world_from_target)
     rows = _ellipses(camera_from_target, centres, radius_mm, camera.matrix, camera.coefficients)
     return rows[:, :2], rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
@@ -54,65 +58,96 @@ def _slopes(camera_from_world, points, matrix, k):
 @njit(error_model="numpy")
 def _ellipses(camera_from_target, centres, radius, matrix, k):
     result = np.full((len(centres), 5), np.nan)
-    x, y = np.empty(POINTS), np.empty(POINTS)
+    x, y, place = np.empty(POINTS), np.empty(POINTS), np.empty(3)
+    room = (np.empty((5, 5)), np.empty(5), np.empty(5))
     for i in range(len(centres)):
-        rotation = camera_from_target[:3, :3]
-        place = rotation[:, 0] * centres[i, 0] + rotation[:, 1] * centres[i, 1] + camera_from_target[:3, 3]
-        in_front = True
-        for j in range(POINTS):
-            angle = 2 * np.pi * j / POINTS
-            point = place + radius * (np.cos(angle) * rotation[:, 0] + np.sin(angle) * rotation[:, 1])
-            if not point[2] > 0:
-                in_front = False
-                break
-            bent_x, bent_y = distort(point[0] / point[2], point[1] / point[2], k)
-            x[j] = matrix[0, 0] * bent_x + matrix[0, 1] * bent_y + matrix[0, 2]
-            y[j] = matrix[1, 1] * bent_y + matrix[1, 2]
-        if in_front:
-            _fit(x, y, result[i])
+        for m in range(3):
+            place[m] = camera_from_target[m, 3]
+            for n in range(3):
+                place[m] += camera_from_target[m, n] * centres[i, n]
+        if _outline(place, camera_from_target, radius, matrix, k, x, y):
+            _fit(x, y, result[i], room)
     return result
 
 
+@njit(inline="always", error_model="numpy")
+def _outline(place, camera_from_target, radius, matrix, k, x, y):
+    """Pixels of a circle's points, in place; whether all are in front of the camera."""
+    for j in range(POINTS):
+        across, along = radius * math.cos(2 * math.pi * j / POINTS), radius * math.sin(2 * math.pi * j / POINTS)
+        z = place[2] + across * camera_from_target[2, 0] + along * camera_from_target[2, 1]
+        if not z > 0:
+            return False
+        right = place[0] + across * camera_from_target[0, 0] + along * camera_from_target[0, 1]
+        down = place[1] + across * camera_from_target[1, 0] + along * camera_from_target[1, 1]
+        bent_x, bent_y = distort(right / z, down / z, k)
+        x[j] = matrix[0, 0] * bent_x + matrix[0, 1] * bent_y + matrix[0, 2]
+        y[j] = matrix[1, 1] * bent_y + matrix[1, 2]
+    return True
+
+
 @njit(error_model="numpy")
-def _fit(x, y, ellipse):
+def _fit(x, y, ellipse, room):
     """The ellipse closest to evenly spread points of a closed outline, by orthogonal distances : (5,), in place."""
-    n = len(x)
-    ellipse[0], ellipse[1] = x.mean(), y.mean()
-    a, b, c = 0.0, 0.0, 0.0
-    for j in range(n):
-        a += 2 * (x[j] - ellipse[0]) ** 2 / n
-        b += 2 * (x[j] - ellipse[0]) * (y[j] - ellipse[1]) / n
-        c += 2 * (y[j] - ellipse[1]) ** 2 / n
-    root = np.sqrt(a * c - b * b)
-    scale = np.sqrt(a + c + 2 * root)
-    ellipse[2], ellipse[3], ellipse[4] = (a + root) / scale, b / scale, (c + root) / scale
-    row = np.empty(5)
+    normal, right, row = room
+    _start(x, y, ellipse)
     for _ in range(STEPS):
-        normal, right = np.zeros((5, 5)), np.zeros(5)
+        normal[:], right[:] = 0.0, 0.0
         a, b, c = ellipse[2], ellipse[3], ellipse[4]
         determinant = a * c - b * b
         if not determinant > 1e-6 * (a + c) ** 2:  # seen from its edge
             ellipse[:] = np.nan
             return
         ia, ib, ic = c / determinant, -b / determinant, a / determinant
-        for j in range(n):
+        for j in range(len(x)):
             u, v = x[j] - ellipse[0], y[j] - ellipse[1]
             p, q = ia * u + ib * v, ib * u + ic * v
-            away = np.sqrt(p * p + q * q)
+            away = math.sqrt(p * p + q * q)
             p, q = p / away, q / away
             nx, ny = ia * p + ib * q, ib * p + ic * q
-            slope = np.sqrt(nx * nx + ny * ny)
+            slope = math.sqrt(nx * nx + ny * ny)
             distance = (away - 1) / slope
             nx, ny = nx / slope, ny / slope
             row[0], row[1], row[2], row[3], row[4] = nx, ny, nx * p, nx * q + ny * p, ny * q
-            _add_equation(row, distance, normal, right)
-        ellipse += np.linalg.solve(normal, right)
+            for m in range(5):
+                right[m] += row[m] * distance
+                for n in range(5):
+                    normal[m, n] += row[m] * row[n]
+        _solve(normal, right)
+        for m in range(5):
+            ellipse[m] += right[m]
 
 
 @njit(inline="always", error_model="numpy")
-def _add_equation(row, value, normal, right):
-    """Add one equation, `row @ unknowns = value`, to normal equations."""
-    for m in range(len(row)):
-        right[m] += row[m] * value
-        for k in range(len(row)):
-            normal[m, k] += row[m] * row[k]
+def _start(x, y, ellipse):
+    """The ellipse of the same second moments as the points, in place."""
+    n = len(x)
+    ellipse[0], ellipse[1] = 0.0, 0.0
+    for j in range(n):
+        ellipse[0] += x[j] / n
+        ellipse[1] += y[j] / n
+    a, b, c = 0.0, 0.0, 0.0
+    for j in range(n):
+        u, v = x[j] - ellipse[0], y[j] - ellipse[1]
+        a += 2 * u * u / n
+        b += 2 * u * v / n
+        c += 2 * v * v / n
+    root = math.sqrt(a * c - b * b)
+    scale = math.sqrt(a + c + 2 * root)
+    ellipse[2], ellipse[3], ellipse[4] = (a + root) / scale, b / scale, (c + root) / scale
+
+
+@njit(error_model="numpy")
+def _solve(normal, right):
+    """Solve normal equations by elimination; the solution replaces the right-hand side."""
+    n = len(right)
+    for i in range(n):
+        for j in range(i + 1, n):
+            share = normal[j, i] / normal[i, i]
+            right[j] -= share * right[i]
+            for m in range(i, n):
+                normal[j, m] -= share * normal[i, m]
+    for i in range(n - 1, -1, -1):
+        for j in range(i + 1, n):
+            right[i] -= normal[i, j] * right[j]
+        right[i] /= normal[i, i]

@@ -1,17 +1,20 @@
 """Images of circles, against the plain fit and projection."""
 
 import numpy as np
+import pytest
 
 from recon.geometry import rigid
+from recon.geometry.circle_outline import ellipses_of, slopes_at
 from recon.geometry.ellipses import fit_ellipses, from_outline
 from recon.tracking import pose
-from recon.tracking.rim_fit.circle_outline import ellipses_of, slopes_at
 from tests.recon.tracking import drawings
 
 
-def test_ellipses_are_those_of_the_plain_fit(rig, rng):
-    """Centre and shape, from 200 projected points of each outline."""
+@pytest.mark.parametrize("raised_mm", [0.0, 3.0])
+def test_ellipses_are_those_of_the_plain_fit(rig, rng, raised_mm):
+    """Centre and shape, from 200 projected points of each outline; a circle may lie above the target's plane."""
     camera, model, radius = rig.cam1.optics.camera(), pose.circle_centres(rig.target), rig.target.outer_diameter_mm / 2
+    model = model + np.array([0, 0, raised_mm])
     angles = np.linspace(0, 2 * np.pi, 201)[:-1]
     circle = radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
     for _ in range(5):
