@@ -21,7 +21,8 @@ ROTATION = 2e-6  # of a rotation's products: stricter than a pose's, as all poin
 NEWTON_STEPS = 20
 NEWTON_TOLERANCE = 1e-13  # normalised image coordinates: far below a thousandth of a pixel at any focal length
 ACCEPTED = 1e-10  # the same, of a root that rounding keeps from the tolerance
-FEW = 16  # points: threads take longer to wake than one core takes for these
+FEW = 16  # points: threads take longer to wake than one core takes to undistort these
+FEW_PROJECTED = 1000  # the same to distort them, array by array
 SLOPE_STEP = 1e-6  # normalised image coordinates: to each side, of the Jacobian by central differences
 
 
@@ -53,7 +54,7 @@ class Camera:
         object.__setattr__(self, "distortion", distortion)
         if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0:
             raise ValueError(f"matrix: expected positive focal lengths, found {self.matrix[0, 0]:g}, {self.matrix[1, 1]:g}")
-        if not np.allclose(self.matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], rtol=0, atol=rigid.EXACT):
+        if np.abs(self.matrix[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max() > rigid.EXACT:
             raise ValueError(f"matrix: expected the form [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {self.matrix.tolist()}")
         if found := rigid.fault(self.camera_from_world, ROTATION):
             raise ValueError(f"camera_from_world: expected {rigid.RIGID}, found {found}")
@@ -68,16 +69,19 @@ class Camera:
         """The distortion in a fixed layout for compiled code : (21,), 12 coefficients and the 3x3 tilt matrix, row by row."""
         padded = np.zeros(14)
         padded[: self.distortion.size] = self.distortion
-        return np.concatenate([padded[:12], tilt_matrix(padded[12], padded[13]).ravel()])
+        tilt = tilt_matrix(padded[12], padded[13]) if padded[12:].any() else np.eye(3)
+        return np.concatenate([padded[:12], tilt.ravel()])
 
     def project(self, points: ArrayLike) -> Array:
         """Project points : (..., 3) mm in the world, to pixels : (..., 2). Points behind the camera give NaN."""
         local = rigid.apply(self.camera_from_world, points)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             normalised = np.where(local[..., 2:] > 0, local[..., :2] / local[..., 2:], np.nan)
-        return self.to_pixels(_distort_all(np.ascontiguousarray(normalised.reshape(-1, 2)), self.coefficients)).reshape(
-            normalised.shape
-        )
+            if normalised.size <= 2 * FEW_PROJECTED:
+                bent = np.stack(distorted(normalised[..., 0], normalised[..., 1], self.coefficients), axis=-1)
+            else:
+                bent = _distort_all(np.ascontiguousarray(normalised.reshape(-1, 2)), self.coefficients).reshape(normalised.shape)
+            return self.to_pixels(bent)
 
     def undistort(self, pixels: ArrayLike) -> Array:
         """Undo lens and matrix: pixels : (..., 2), to normalised coordinates x/z, y/z : (..., 2) of the ideal pinhole.

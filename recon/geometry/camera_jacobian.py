@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.compiled import njit
 from recon.geometry import rigid
-from recon.geometry.camera import Camera, distorted, tilt_matrix
+from recon.geometry.camera import Camera, tilt_matrix
 
 Array = NDArray[np.float64]
 
@@ -43,26 +43,36 @@ class _Device(NamedTuple):
     turn: Array  # (3, 3) from the world's axes to the camera's
 
 
+def _tilt_slopes(angles: Array) -> Array:
+    """Derivatives : (2, 3, 3) of the tilt's homography by its angles : (2,)."""
+    return np.imag([tilt_matrix(angles[0] + 1j * STEP, angles[1]), tilt_matrix(angles[0], angles[1] + 1j * STEP)]) / STEP
+
+
+UNTILTED = _tilt_slopes(np.zeros(2))
+
+
 def linearise(camera: Camera, points: Array, names: Sequence[str]) -> Linearised:
     """Project points : (m, 3) mm in the world, with the derivatives by the point and by the parameters named."""
-    angles = np.zeros(2)
-    angles[: max(camera.distortion.size - 12, 0)] = camera.distortion[12:]
-    tilts = np.imag([tilt_matrix(angles[0] + 1j * STEP, angles[1]), tilt_matrix(angles[0], angles[1] + 1j * STEP)]) / STEP
     turned = rigid.rotate(camera.camera_from_world, points)
     local = turned + camera.camera_from_world[:3, 3]
+    tilts = _tilt_slopes(camera.distortion[12:]) if camera.distortion.size > 12 else UNTILTED
     device = _Device(camera.matrix, camera.coefficients, tilts, camera.camera_from_world[:3, :3])
-    by_point, by_parameter = _derivatives(np.ascontiguousarray(turned), local, device)
-    bent = np.stack(distorted(local[:, 0] / local[:, 2], local[:, 1] / local[:, 2], camera.coefficients), axis=-1)
-    return Linearised(camera.to_pixels(bent), by_point, by_parameter[..., [PARAMETERS.index(name) for name in names]])
+    pixels, by_point, by_parameter = _derivatives(np.ascontiguousarray(turned), local, device)
+    return Linearised(pixels, by_point, by_parameter[..., [PARAMETERS.index(name) for name in names]])
 
 
 @njit
 def _derivatives(turned, local, device):
-    """Derivatives by the point : (m, 2, 3) and by all PARAMETERS : (m, 2, 24), at points turned to the camera and moved to it."""
+    """Pixels : (m, 2) of points turned to the camera and moved to it, with their derivatives.
+
+    Returns
+    -------
+    The pixels, and their derivatives by the point : (m, 2, 3) and by all PARAMETERS : (m, 2, 24).
+    """
     fx, skew, fy = device.matrix[0, 0], device.matrix[0, 1], device.matrix[1, 1]
     turn, t = device.turn, device.coefficients[12:].copy().reshape(3, 3)
     m = len(local)
-    by_point, by_parameter = np.empty((m, 2, 3)), np.zeros((m, 2, TURNS + 6))
+    pixels, by_point, by_parameter = np.empty((m, 2)), np.empty((m, 2, 3)), np.zeros((m, 2, TURNS + 6))
     slopes, by_local, by_coefficient = np.empty((2, 2)), np.empty((2, 3)), np.zeros((12, 2))
     for i in range(m):
         a, b, c = turned[i]
@@ -71,6 +81,8 @@ def _derivatives(turned, local, device):
         u, v = _bent(x, y, device.coefficients, slopes, by_coefficient)
         w = t[2, 0] * u + t[2, 1] * v + t[2, 2]  # then the tilted sensor
         p, q = (t[0, 0] * u + t[0, 1] * v + t[0, 2]) / w, (t[1, 0] * u + t[1, 1] * v + t[1, 2]) / w
+        pixels[i, 0] = fx * p + skew * q + device.matrix[0, 2]
+        pixels[i, 1] = fy * q + device.matrix[1, 2]
         p_u, p_v = (t[0, 0] - p * t[2, 0]) / w, (t[0, 1] - p * t[2, 1]) / w
         q_u, q_v = (t[1, 0] - q * t[2, 0]) / w, (t[1, 1] - q * t[2, 1]) / w
         across_u, across_v, down_u, down_v = fx * p_u + skew * q_u, fx * p_v + skew * q_v, fy * q_u, fy * q_v
@@ -97,7 +109,7 @@ def _derivatives(turned, local, device):
             dp = (d[0, 0] * u + d[0, 1] * v + d[0, 2] - p * dw) / w
             dq = (d[1, 0] * u + d[1, 1] * v + d[1, 2] - q * dw) / w
             by_parameter[i, 0, TILTS + k], by_parameter[i, 1, TILTS + k] = fx * dp + skew * dq, fy * dq
-    return by_point, by_parameter
+    return pixels, by_point, by_parameter
 
 
 @njit(inline="always")
@@ -136,7 +148,8 @@ def moved(camera: Camera, names: Sequence[str], step: Array) -> Camera:
     distortion = np.zeros(len(DISTORTION))
     distortion[: camera.distortion.size] = camera.distortion
     distortion += [change.get(name, 0.0) for name in DISTORTION]
-    place = rigid.moved(camera.camera_from_world, [change.get(name, 0.0) for name in MOTION])
+    step = [change.get(name, 0.0) for name in MOTION]
+    place = rigid.moved(camera.camera_from_world, step) if any(step) else camera.camera_from_world
     return replace(camera, matrix=matrix, distortion=_trimmed(distortion, camera.distortion.size), camera_from_world=place)
 
 

@@ -1,5 +1,7 @@
 """The camera model against OpenCV's, and against itself backwards."""
 
+import warnings
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.geometry import rigid
-from recon.geometry.camera import FEW, Camera
+from recon.geometry.camera import FEW, FEW_PROJECTED, Camera
 
 MATRIX = np.array([[3320.0, 0, 618], [0, 3331, 523], [0, 0, 1]])
 WIDE = np.array([[1250.0, 0, 650], [0, 1240, 500], [0, 0, 1]])
@@ -70,6 +72,19 @@ def test_a_few_rays_are_those_of_all(camera):
     assert len(pixels) > FEW
     assert np.array_equal(camera.rays(pixels), np.concatenate([camera.rays(few) for few in np.array_split(pixels, 50)]))
     assert np.isnan(camera.rays(np.full((1, 2), np.nan))).all()
+
+
+def test_a_few_points_are_projected_as_all_are(camera):
+    """Array by array and in threads, to rounding; and, in silence, points whose pixels no number holds."""
+    rays = camera.rays(camera.pixel_grid()[::20, ::20].reshape(-1, 2))
+    points = camera.centre + 660 * rays
+    assert len(points) > FEW_PROJECTED
+    found = np.concatenate([camera.project(part) for part in np.array_split(points, 7)])
+    assert np.abs(found - camera.project(points)).max() < 1e-9
+    ahead = Camera(camera.size, camera.matrix, camera.distortion)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not np.isfinite(ahead.project([[1.0, 1.0, 1e-200], [0.0, 0.0, -1.0]])).any()
 
 
 def test_unreachable_pixels_give_nan():
