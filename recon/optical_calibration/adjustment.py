@@ -145,22 +145,22 @@ def _step(system: System, deviation: Array, prior: Array, damping: float) -> tup
     Unreachable
         If the equations are singular.
     """
-    flat, pose_t = np.concatenate(system.shared), system.pose.swapaxes(1, 2)
-    shared, right = flat.T @ flat, flat.T @ system.residuals.ravel()
+    equations = system.equations
+    shared, right = equations.shared.copy(), equations.right.copy()
     own = len(right) - len(prior)
     shared[own:, own:] += prior
     right[own:] -= prior @ deviation
     shared[np.diag_indices_from(shared)] *= 1 + damping
-    cross, corner = system.shared.swapaxes(1, 2) @ system.pose, pose_t @ system.pose  # (p, g, 6), (p, 6, 6)
-    corner = corner + np.eye(6) * (damping * np.diagonal(corner, axis1=1, axis2=2)[:, None, :] + TINY)
-    pose_right = np.einsum("pam,pm->pa", pose_t, system.residuals)
+    corner = equations.corner + np.eye(6) * (damping * np.diagonal(equations.corner, axis1=1, axis2=2)[:, None, :] + TINY)
+    each = np.concatenate([equations.cross.swapaxes(1, 2), equations.pose_right[..., None]], axis=2)  # (p, 6, g + 1)
     try:
-        eliminate = np.linalg.solve(corner, cross.swapaxes(1, 2))  # (p, 6, g)
-        reduced = shared - _sum_of_products(cross, eliminate)
-        solution = _solve(reduced, right - np.einsum("pag,pa->g", eliminate, pose_right))
-        return solution, np.linalg.solve(corner, pose_right[..., None])[..., 0] - eliminate @ solution
+        each = np.linalg.solve(corner, each)
+        eliminate, alone = each[..., :-1], each[..., -1]
+        reduced = shared - _sum_of_products(equations.cross, eliminate)
+        solution = _solve(reduced, right - np.einsum("pga,pa->g", equations.cross, alone))
     except np.linalg.LinAlgError as singular:
         raise Unreachable(str(singular)) from None
+    return solution, alone - eliminate @ solution
 
 
 def _sum_of_products(left: Array, right: Array) -> Array:
@@ -193,9 +193,9 @@ def _measured_noise(system: System, problem: Problem) -> Array:
 
 def _covariance(system: System, problem: Problem) -> Array:
     """Covariance of the devices' parameters : (g, g)."""
-    own, flat = len(problem.names), np.concatenate(system.shared)
-    cross, corner = system.shared.swapaxes(1, 2) @ system.pose, system.pose.swapaxes(1, 2) @ system.pose + TINY * np.eye(6)
-    reduced = flat.T @ flat - _sum_of_products(cross, np.linalg.solve(corner, cross.swapaxes(1, 2)))
+    own, equations = len(problem.names), system.equations
+    eliminate = np.linalg.solve(equations.corner + TINY * np.eye(6), equations.cross.swapaxes(1, 2))
+    reduced = equations.shared - _sum_of_products(equations.cross, eliminate)
     if problem.shape.released:
         reduced[own:, own:] += _prior(problem)
         return _inverse(reduced)[:own, :own]

@@ -12,6 +12,7 @@ from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise, moved
 from recon.geometry.levenberg_marquardt import Unreachable
 from recon.model.rig import NotNegative, Part
+from recon.optical_calibration.normal_equations import Equations, Sightings, added_up
 from recon.optical_calibration.observations import PROJECTOR, Observations
 
 Array = NDArray[np.float64]
@@ -83,70 +84,36 @@ class Problem:
 
 @dataclass(frozen=True)
 class System:
-    """The problem linearised at an estimate. Shared unknowns g: devices' parameters, then the board's 3n if they count."""
+    """The problem linearised at an estimate."""
 
-    residuals: Array  # (p, m) whitened, weighted; m = n * d * 2
-    shared: Array  # (p, m, g)
-    pose: Array  # (p, m, 6)
+    equations: Equations  # of whitened, weighted residuals
     plain: Array  # (p, n, d, 2) px, observed less predicted
     lengths: Array  # (p, n, d) of the whitened residuals before robust weights
 
 
 def linearised(problem: Problem, estimate: Estimate, noise: Array, shaped: bool) -> System:
-    """Whitened residuals and their derivatives; with those by the board's points if it is `shaped`.
+    """Normal equations of the whitened residuals; with the board's points among the unknowns if it is `shaped`.
 
     noise : (d,) by which the devices' covariances are too small.
     """
-    observations, count = problem.observations, len(estimate.points)
-    turned = np.einsum("pij,nj->pni", estimate.poses[:, :3, :3], estimate.points)  # (p, n, 3)
-    world = (turned + estimate.poses[:, None, :3, 3]).reshape(-1, 3)
-    shape, own = (len(estimate.poses), count, len(observations.devices), 2), len(problem.names)
-    residual, by_pose = np.zeros(shape), np.zeros((*shape, 6))
-    shared = np.zeros((*shape, own + (3 * count if shaped else 0)))
-    at = 0
-    for d, device in enumerate(observations.devices):
-        lines = linearise(estimate.cameras[device], world, names := problem.free.get(device, ()))
-        by_point = lines.by_point.reshape(*shape[:2], 2, 3)
-        residual[:, :, d] = observations.pixels[:, :, d] - problem.offsets[:, :, d] - lines.pixels.reshape(*shape[:2], 2)
-        shared[:, :, d, :, at : at + len(names)] = lines.by_parameter.reshape(*shape[:2], 2, -1)
-        by_pose[:, :, d, :, :3] = np.cross(turned[:, :, None], by_point)  # (a x b) . c = a . (b x c)
-        by_pose[:, :, d, :, 3:] = by_point
-        if shaped:
-            _put_own_columns(shared[:, :, d, :, own:], by_point @ estimate.poses[:, None, :3, :3])
-        at += len(names)
-    plain = residual.copy()
-    if PROJECTOR in observations.devices[1:]:  # the fringes are read where camera 1 sees the point: take its error out
-        d = observations.devices.index(PROJECTOR)
-        residual[:, :, d] -= np.einsum("pnij,pnj->pni", observations.gradient, residual[:, :, 0])
-        shared[:, :, d] -= observations.gradient @ shared[:, :, 0]
-        by_pose[:, :, d] -= observations.gradient @ by_pose[:, :, 0]
-    return _weighted(plain, residual, shared, by_pose, problem.whitening / noise[:, None, None])
-
-
-def _put_own_columns(columns: Array, by_shape: Array) -> None:
-    """Each point depends on its own three coordinates alone: put (p, n, 2, 3) on the diagonal of (p, n, 2, 3 n)."""
-    index = np.arange(by_shape.shape[1])
-    for axis in range(3):
-        columns[:, index, :, 3 * index + axis] = by_shape[..., axis].swapaxes(0, 1)
-
-
-def _weighted(plain: Array, residual: Array, shared: Array, by_pose: Array, whitening: Array) -> System:
-    """Whiten all, with the weights of Huber's loss, and lay the rows of a pose below each other."""
-    residual = np.einsum("pndij,pndj->pndi", whitening, np.nan_to_num(residual))
-    lengths = np.linalg.norm(residual, axis=-1)
-    root = np.sqrt(np.minimum(1, ROBUST / np.maximum(lengths, ROBUST)))[..., None]
-    whitening = whitening * root[..., None]
-
-    def rows(values: Array) -> Array:
-        return values.reshape(len(values), int(np.prod(values.shape[1:4])), *values.shape[4:])
-
-    return System(
-        rows(residual * root),
-        rows(whitening @ np.nan_to_num(shared)),
-        rows(whitening @ np.nan_to_num(by_pose)),
-        plain,
-        lengths,
-    )
+    observations, turns = problem.observations, estimate.poses[:, :3, :3]
+    free = [problem.free.get(device, ()) for device in observations.devices]
+    arms = np.ascontiguousarray(estimate.points @ turns.swapaxes(1, 2))  # (p, n, 3)
+    form, count = arms.shape[:2], len(free)
+    residuals = observations.pixels - problem.offsets
+    by_parameter, by_point = np.empty((count, *form, 2, max(map(len, free)))), np.empty((count, *form, 2, 3))
+    world = (arms + estimate.poses[:, None, :3, 3]).reshape(-1, 3)
+    for d, (device, names) in enumerate(zip(observations.devices, free, strict=True)):
+        lines = linearise(estimate.cameras[device], world, names)
+        residuals[:, :, d] -= lines.pixels.reshape(*form, 2)
+        by_parameter[d, ..., : len(names)] = lines.by_parameter.reshape(*form, 2, -1)
+        by_point[d] = lines.by_point.reshape(*form, 2, 3)
+    first = np.cumsum([0, *map(len, free)])
+    projector = observations.devices.index(PROJECTOR) if PROJECTOR in observations.devices else 0
+    whitening = problem.whitening / noise[:, None, None]
+    sightings = Sightings(residuals, by_parameter, by_point, arms, np.ascontiguousarray(turns), first, whitening, projector)
+    equations, lengths = added_up(sightings, observations.gradient, shaped, ROBUST)
+    return System(equations, residuals, lengths)
 
 
 def stepped(problem: Problem, estimate: Estimate, shared: Array, poses: Array) -> Estimate:
