@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry.camera_jacobian import MATRIX, MOTION
-from recon.geometry.levenberg_marquardt import Unreachable, descend
+from recon.geometry.levenberg_marquardt import Descent, Rules, Unreachable, descend
 from recon.model.calibration import Calibration, Uncertainty
 from recon.optical_calibration.bundle import ROBUST, Array, Estimate, Problem, Shape, System, linearised, stepped
 from recon.optical_calibration.observations import PROJECTOR, Observations
@@ -24,7 +24,11 @@ MEDIAN = np.sqrt(2 * np.log(2))  # of the length of a vector of two standard nor
 LEAST_NOISE = 1e-3  # of the noise that was assumed
 TINY = 1e-12  # keeps a pose that nobody sees from being singular
 SINGULAR = 1e-14  # of the largest eigenvalue: below, rounding decides
-MAX_ROUNDS = 4  # of measuring the noise
+MAX_ROUNDS, MAX_ROUGH = 10, 5  # of measuring the noise
+SIMILAR_NOISE, SAME_NOISE = 0.2, 0.01  # relative change of the noise by which rough rounds end, and by which all do
+ROUGH = Rules(converged=1e-2)
+CONVERGED = 1e-10  # relative change of the cost
+FINE = Rules(damping=1e-9)  # from nearby: damping would hold back what is hardly determined, for many steps
 
 
 @dataclass(frozen=True)
@@ -80,13 +84,7 @@ def adjust(
     """
     offsets = np.zeros_like(observations.pixels) if offsets is None else offsets
     problem = Problem(observations, offsets, free, shape or Shape())
-    estimate, noise = start, np.ones(len(observations.devices))
-    for _ in range(MAX_ROUNDS):  # the robust weights need the noise, the noise needs the residuals
-        estimate = _descend(problem, estimate, noise)
-        factor = _measured_noise(linearised(problem, estimate, noise, shaped=False), problem)
-        noise = noise * factor
-        if np.abs(factor - 1).max() < 0.01:
-            break
+    estimate, noise = fitted(problem, start)
     system = linearised(problem, estimate, noise, shaped=bool(problem.shape.sigma.any()))
     return Adjustment(
         Calibration(estimate.cameras, Uncertainty(problem.names, _covariance(system, problem))),
@@ -104,7 +102,28 @@ def free_parameters(devices: Sequence[str], distortion: Mapping[str, Sequence[st
     return {device: (*MATRIX, *distortion[device], *(MOTION if number else ())) for number, device in enumerate(devices)}
 
 
-def _descend(problem: Problem, estimate: Estimate, noise: Array) -> Estimate:
+def fitted(problem: Problem, start: Estimate, noise: Array | None = None, converged: float = CONVERGED) -> tuple[Estimate, Array]:
+    """The values alone, and the devices' measured noise over that predicted by the detection : (d,).
+
+    The robust weights need the noise, and the noise needs the residuals: both are found in turn, first roughly. While the noise
+    is misjudged, most sightings may weigh like outliers, and the descent to a minimum that moves on takes long.
+
+    noise : (d,) if it is nearly known, and the start near.
+    converged : relative change of the cost.
+    """
+    rough, estimate = noise is None, start
+    noise = np.ones(len(problem.observations.devices)) if noise is None else noise
+    for number in range(MAX_ROUNDS):
+        found = _descend(problem, estimate, noise, ROUGH if rough else FINE._replace(converged=converged))
+        factor = _measured_noise(found.system, problem)
+        estimate, noise, change = found.estimate, noise * factor, np.abs(factor - 1).max()
+        if change < SAME_NOISE and not rough:
+            break
+        rough = rough and change > SIMILAR_NOISE and number < MAX_ROUGH
+    return estimate, noise
+
+
+def _descend(problem: Problem, estimate: Estimate, noise: Array, rules: Rules) -> Descent[Estimate, System, tuple[Array, Array]]:
     """Levenberg-Marquardt from an estimate to the next minimum, at fixed noise."""
     prior = _prior(problem)
 
@@ -115,7 +134,7 @@ def _descend(problem: Problem, estimate: Estimate, noise: Array) -> Estimate:
     def step(estimate: Estimate, system: System, damping: float) -> tuple[Array, Array]:
         return _step(system, _deviation(estimate, problem), prior, damping)
 
-    return descend(estimate, system_and_cost, step, lambda estimate, step: stepped(problem, estimate, *step)).estimate
+    return descend(estimate, system_and_cost, step, lambda estimate, step: stepped(problem, estimate, *step), rules=rules)
 
 
 def _prior(problem: Problem) -> Array:

@@ -133,7 +133,7 @@ def stepped(problem: Problem, estimate: Estimate, shared: Array, poses: Array) -
         focal = {"fx": cameras[device].matrix[0, 0], "fy": cameras[device].matrix[1, 1]}
         if any(focal[name] + change <= 0 for name, change in zip(names, step, strict=True) if name in focal):
             raise Unreachable(f"{device}: a focal length that is not positive")
-        cameras[device] = moved(cameras[device], names, step)
+        cameras[device] = moved(cameras[device], names, step) if names else cameras[device]
         at += len(names)
     points = estimate.points + shared[at:].reshape(-1, 3) if problem.shape.released else estimate.points
     return Estimate(cameras, rigid.moved(estimate.poses, poses), points)

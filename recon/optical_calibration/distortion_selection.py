@@ -1,12 +1,13 @@
 """Which lens distortion a device needs: the simplest model that predicts poses it has not been fitted to as well as the best."""
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from recon.geometry.camera import Camera
-from recon.optical_calibration.adjustment import adjust, free_parameters
-from recon.optical_calibration.bundle import Array, Estimate
+from recon.optical_calibration.adjustment import OUTLIER, fitted, free_parameters
+from recon.optical_calibration.bundle import Array, Estimate, Problem, Shape, linearised
 from recon.optical_calibration.observations import Observations
 
 ModelName = Literal["none", "radial1", "radial2", "decentred", "brown", "rational", "thin_prism", "tilted"]
@@ -22,6 +23,7 @@ MODELS: dict[ModelName, tuple[str, ...]] = {  # simple to complex; each contains
     "tilted": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y"),
 }
 FOLDS = 5
+CONVERGED = 1e-7  # relative change of the cost of poses alone: far less than the scatter of errors
 TRIED: tuple[ModelName, ...] = ("none", "radial1", "radial2", "decentred", "brown", "rational")
 ENOUGH_POSES = 10  # to compare models: the scatter of fewer errors says little of their mean's
 FEW_POSES_MODEL: ModelName = (
@@ -55,42 +57,48 @@ def choose(observations: Observations, start: Estimate, device: str, offsets: Ar
     if len(seeing) < ENOUGH_POSES:
         return FEW_POSES_MODEL, {}
     own, offset = observations.of_devices([device]).of_poses(seeing), offsets[seeing][:, :, [number]]
-    begin = Estimate(start.cameras, start.poses[seeing], start.points)
-    errors = {name: held_out(own, begin, device, MODELS[name], offset) for name in TRIED}
+    camera = start.cameras[device]
+    ideal = Camera(camera.size, camera.matrix, np.zeros(0))  # at the origin: alone, a device is its own world
+    errors = held_out(own, Estimate({device: ideal}, camera.camera_from_world @ start.poses[seeing], start.points), offset)
     best = min(errors, key=lambda name: float(np.nanmean(errors[name])))
     chosen = next(name for name in TRIED if _no_worse(errors[name] - errors[best]))
     return chosen, {name: float(np.sqrt(np.nanmean(error))) for name, error in errors.items()}
 
 
-def held_out(own: Observations, start: Estimate, device: str, model: tuple[str, ...], offsets: Array) -> Array:
-    """Mean squared distance of each pose's points from where a calibration without this pose puts them : (p,) px^2.
+def held_out(own: Observations, start: Estimate, offsets: Array) -> dict[ModelName, Array]:
+    """Mean squared distance of each pose's points from where calibrations without this pose put them : (p,) px^2, by model.
 
-    Outliers of the pose itself don't count: they would decide.
+    Each model starts from the one that it contains. Outliers of the pose itself don't count: they would decide.
+
+    Parameters
+    ----------
+    own : Observations
+        Of one device.
+    start : Estimate
+        A device without distortion.
     """
-    count = len(own.poses)
-    camera = start.cameras[device]
-    ideal = Camera(camera.size, camera.matrix, np.zeros(0))  # at the origin: alone, a device is its own world
-    bare = Estimate({device: ideal}, camera.camera_from_world @ start.poses, start.points)
-    free = free_parameters([device], {device: model})
-    errors = np.full(count, np.nan)
-    for fold in range(FOLDS):
-        left_out = np.arange(fold, count, FOLDS)
-        if not len(left_out):
-            continue
-        rest = np.setdiff1d(np.arange(count), left_out)
-        fitted = adjust(own.of_poses(rest), _of_poses(bare, rest), free, offsets[rest])
-        known = Estimate(fitted.calibration.cameras, bare.poses[left_out], bare.points)
-        found = adjust(own.of_poses(left_out), known, {}, offsets[left_out])
-        squares = np.sum(found.residuals[:, :, 0] ** 2, axis=-1)
-        errors[left_out] = np.nanmean(np.where(found.outliers[:, :, 0], np.nan, squares), axis=1)
+    errors = {name: np.full(len(own.poses), np.nan) for name in TRIED}
+    for fold in range(min(FOLDS, len(own.poses))):
+        left_out = np.arange(fold, len(own.poses), FOLDS)
+        rest = np.setdiff1d(np.arange(len(own.poses)), left_out)
+        known, alone = own.of_poses(rest), Problem(own.of_poses(left_out), offsets[left_out], {}, Shape())
+        fit, place = replace(start, poses=start.poses[rest]), start.poses[left_out]
+        for name in TRIED:
+            free = free_parameters(own.devices, dict.fromkeys(own.devices, MODELS[name]))
+            fit, noise = fitted(Problem(known, offsets[rest], free, Shape()), fit)
+            laid, noise = fitted(alone, replace(fit, poses=place), noise, CONVERGED)
+            errors[name][left_out], place = _squares(alone, laid, noise), laid.poses
     return errors
+
+
+def _squares(problem: Problem, estimate: Estimate, noise: Array) -> Array:
+    """Mean squared distance of each pose's points from where a device is expected to see them, outliers left out : (p,) px^2."""
+    system = linearised(problem, estimate, noise, shaped=False)
+    counting = problem.observations.seen & (system.lengths <= OUTLIER)
+    return np.nanmean(np.where(counting[..., None], system.plain, np.nan) ** 2, axis=(1, 2, 3)) * 2
 
 
 def _no_worse(difference: Array) -> bool:
     """Whether errors : (p,) px^2 above the best model's are within one standard error of zero."""
     known = difference[np.isfinite(difference)]
     return bool(known.mean() <= known.std(ddof=1) / np.sqrt(len(known)))
-
-
-def _of_poses(estimate: Estimate, chosen: Array) -> Estimate:
-    return Estimate(estimate.cameras, estimate.poses[chosen], estimate.points)

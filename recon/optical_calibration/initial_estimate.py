@@ -13,6 +13,7 @@ from recon.optical_calibration.observations import Observations
 from recon.optical_calibration.sightings import ENOUGH
 
 HEIGHTS = (0.5, 0.0, 1.0)  # of the principal point, tried in turn: a projector's lies near an edge, and the wrong guess may stay
+ENOUGH_STEPS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 1e-6)  # to a relative change; OpenCV's is rounding's
 STRAY_DEG = 3.0  # between a device's place by one pose and by most; noise makes a tenth of it
 CONTRADICTING = 1 / 3  # share of such poses from which on the captures contradict each other
 
@@ -74,7 +75,7 @@ def _zhang(objects: list, pixels: list, size: tuple[int, int], height: float) ->
     rows = max(round(2 * height * size[1]), 1)  # OpenCV starts from the middle of the image that it is told of
     matrix = cv2.initCameraMatrix2D(objects, pixels, (size[0], rows))
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
-    return cv2.calibrateCamera(objects, pixels, size, matrix, np.zeros(5), flags=flags)
+    return cv2.calibrateCamera(objects, pixels, size, matrix, np.zeros(5), flags=flags, criteria=ENOUGH_STEPS)
 
 
 def _placed(camera: Camera, boards: Array, reference: Array, device: str) -> Camera:

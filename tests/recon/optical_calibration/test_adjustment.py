@@ -8,8 +8,9 @@ from scipy.stats import chi2
 
 from recon.geometry.levenberg_marquardt import Unreachable
 from recon.model.calibration import Calibration
+from recon.optical_calibration import adjustment
 from recon.optical_calibration.adjustment import adjust, free_parameters
-from recon.optical_calibration.bundle import Estimate, Problem, Shape, stepped
+from recon.optical_calibration.bundle import Estimate, Problem, Shape, linearised, stepped
 from recon.optical_calibration.joint_calibration import deviation
 from tests.recon.board_sets import BOARD, DEVICES, devices, observe, random_poses
 
@@ -99,6 +100,26 @@ def test_points_that_a_device_does_not_see_are_left_out(rig, rng):
     error, count = squared_error(found.calibration, cameras)
     assert error < chi2.ppf(0.999, count)
     np.testing.assert_allclose(list(found.noise.values()), 1, atol=0.15)
+
+
+def test_misjudged_noise_neither_moves_the_end_nor_takes_long(rig, rng, monkeypatch):
+    """A camera without its distortion misses by many times the noise: the noise is found, and the minimum that goes with it."""
+    cameras = {"cam1": devices(rig)["cam1"]}
+    poses = random_poses(devices(rig), 12, rng)
+    seen, start = observe(cameras, poses, rng), Estimate(cameras, poses, BOARD.points())
+    ideal = replace(start, cameras={"cam1": replace(cameras["cam1"], distortion=np.zeros(0))})
+    free, evaluations = free_parameters(["cam1"], {"cam1": ()}), []
+
+    def counted(*arguments, **options):
+        evaluations.append(arguments)
+        return linearised(*arguments, **options)
+
+    monkeypatch.setattr(adjustment, "linearised", counted)
+    found = adjust(seen, ideal, free)
+    assert found.noise["cam1"] > 5 and len(evaluations) < 40
+    known = adjust(replace(seen, covariance=seen.covariance * found.noise["cam1"] ** 2), found.estimate, free)
+    apart = deviation(found.calibration, known.calibration) / np.sqrt(np.diag(known.calibration.uncertainty.covariance))
+    assert np.abs(apart).max() < 0.02 and known.noise["cam1"] == pytest.approx(1, abs=0.01)
 
 
 def test_a_step_to_a_camera_that_can_not_be_is_unreachable(rig, rng):
