@@ -14,7 +14,9 @@ import logging
 import os
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ from platformdirs import user_cache_path
 log = logging.getLogger(__name__)
 
 OURS = ("recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks")  # packages; others keep Numba's own cache
+PARTS = 4  # of a range for each thread, so that who is done helps the other
 UNUSED_DAYS = 30  # after which code compiled from other sources is deleted
 
 
@@ -37,6 +40,22 @@ def njit(function: Callable | None = None, **options: Any) -> Any:
     dispatcher = numba.njit(cache=True, **options)(function)
     _one_process_compiles(dispatcher)
     return dispatcher
+
+
+def in_threads(kernel: Callable[[int, int], Any], count: int) -> None:
+    """Run `kernel(first, end)` over parts of range(count), in as many threads as Numba has.
+
+    What takes its time must release the GIL: functions compiled with `nogil=True`, which is quick, whereas a loop over `prange`
+    has all that is called within compiled thrice more, for each of the three functions that Numba makes of it.
+    """
+    threads = min(numba.get_num_threads(), count)
+    if threads <= 1:
+        kernel(0, count)
+        return
+    parts = min(PARTS * threads, count)
+    ends = [count * k // parts for k in range(parts + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        deque(pool.map(kernel, ends[:-1], ends[1:]), maxlen=0)
 
 
 def cache_folder() -> Path:

@@ -11,7 +11,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from recon.compiled import njit
-from recon.geometry.camera import Camera, distort
+from recon.geometry.camera import Camera, distort_side_by_side
 from recon.structured_light.decode import ProjectorMap
 
 Float32 = NDArray[np.float32]
@@ -131,7 +131,7 @@ def _triangulate(rays, centre, projector, decoded, points, sigma):
             nearness = 1 / (oz + t[i] * ez[i])
             su[i] = (matrix[0] * along_u + matrix[1] * along_v) * nearness * nearness
             sv[i] = (matrix[3] * along_u + matrix[4] * along_v) * nearness * nearness
-            xd, yd = distort((ox + t[i] * ex[i]) * nearness, (oy + t[i] * ey[i]) * nearness, coefficients)
+            xd, yd = distort_side_by_side((ox + t[i] * ex[i]) * nearness, (oy + t[i] * ey[i]) * nearness, coefficients)
             u[i], v[i] = matrix[0] * xd + matrix[1] * yd + matrix[2], matrix[3] * xd + matrix[4] * yd + matrix[5]
         # Gauss-Newton; the slopes of the distorted projection come from its last two values
         for _ in range(MAX_STEPS):
@@ -141,7 +141,7 @@ def _triangulate(rays, centre, projector, decoded, points, sigma):
                 step = gradient / (wu[i] * su[i] * su[i] + wv[i] * sv[i] * sv[i])
                 t[i] += step
                 nearness = 1 / (oz + t[i] * ez[i])
-                xd, yd = distort((ox + t[i] * ex[i]) * nearness, (oy + t[i] * ey[i]) * nearness, coefficients)
+                xd, yd = distort_side_by_side((ox + t[i] * ex[i]) * nearness, (oy + t[i] * ey[i]) * nearness, coefficients)
                 un, vn = matrix[0] * xd + matrix[1] * yd + matrix[2], matrix[3] * xd + matrix[4] * yd + matrix[5]
                 far = abs(step) > SECANT
                 su[i] = (un - u[i]) / step if far else su[i]

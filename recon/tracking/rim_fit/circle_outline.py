@@ -5,11 +5,14 @@ on the orthogonal distances make it the one that `recon.geometry.circle_projecti
 time.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.compiled import njit
 from recon.geometry.camera import SLOPE_STEP, Camera, distort
+from recon.tracking.rim_fit.cholesky import solve_and_invert
 
 Array = NDArray[np.float64]
 
@@ -53,60 +56,67 @@ def _slopes(camera_from_world, points, matrix, k):
 
 @njit(error_model="numpy")
 def _ellipses(camera_from_target, centres, radius, matrix, k):
-    result = np.full((len(centres), 5), np.nan)
-    x, y = np.empty(POINTS), np.empty(POINTS)
+    result = np.empty((len(centres), 5))
+    x, y, point, transform = np.empty(POINTS), np.empty(POINTS), np.empty(3), camera_from_target
     for i in range(len(centres)):
-        rotation = camera_from_target[:3, :3]
-        place = rotation[:, 0] * centres[i, 0] + rotation[:, 1] * centres[i, 1] + camera_from_target[:3, 3]
         in_front = True
         for j in range(POINTS):
-            angle = 2 * np.pi * j / POINTS
-            point = place + radius * (np.cos(angle) * rotation[:, 0] + np.sin(angle) * rotation[:, 1])
+            across, down = math.cos(2 * math.pi * j / POINTS), math.sin(2 * math.pi * j / POINTS)
+            for m in range(3):
+                place = transform[m, 0] * centres[i, 0] + transform[m, 1] * centres[i, 1] + transform[m, 3]
+                point[m] = place + radius * (across * transform[m, 0] + down * transform[m, 1])
             if not point[2] > 0:
                 in_front = False
                 break
             bent_x, bent_y = distort(point[0] / point[2], point[1] / point[2], k)
             x[j] = matrix[0, 0] * bent_x + matrix[0, 1] * bent_y + matrix[0, 2]
             y[j] = matrix[1, 1] * bent_y + matrix[1, 2]
-        if in_front:
-            _fit(x, y, result[i])
+        if not (in_front and _fit(x, y, result[i])):
+            for m in range(5):
+                result[i, m] = np.nan
     return result
 
 
 @njit(error_model="numpy")
 def _fit(x, y, ellipse):
-    """The ellipse closest to evenly spread points of a closed outline, by orthogonal distances : (5,), in place."""
+    """The ellipse closest to evenly spread points of a closed outline, by orthogonal distances : (5,); False of a line."""
     n = len(x)
-    ellipse[0], ellipse[1] = x.mean(), y.mean()
+    ellipse[0], ellipse[1] = 0.0, 0.0
+    for j in range(n):
+        ellipse[0] += x[j] / n
+        ellipse[1] += y[j] / n
     a, b, c = 0.0, 0.0, 0.0
     for j in range(n):
         a += 2 * (x[j] - ellipse[0]) ** 2 / n
         b += 2 * (x[j] - ellipse[0]) * (y[j] - ellipse[1]) / n
         c += 2 * (y[j] - ellipse[1]) ** 2 / n
-    root = np.sqrt(a * c - b * b)
-    scale = np.sqrt(a + c + 2 * root)
+    root = math.sqrt(a * c - b * b)
+    scale = math.sqrt(a + c + 2 * root)
     ellipse[2], ellipse[3], ellipse[4] = (a + root) / scale, b / scale, (c + root) / scale
-    row = np.empty(5)
+    row, step, inverse = np.empty(5), np.empty(5), np.empty((5, 5))
     for _ in range(STEPS):
         normal, right = np.zeros((5, 5)), np.zeros(5)
         a, b, c = ellipse[2], ellipse[3], ellipse[4]
         determinant = a * c - b * b
         if not determinant > 1e-6 * (a + c) ** 2:  # seen from its edge
-            ellipse[:] = np.nan
-            return
+            return False
         ia, ib, ic = c / determinant, -b / determinant, a / determinant
         for j in range(n):
             u, v = x[j] - ellipse[0], y[j] - ellipse[1]
             p, q = ia * u + ib * v, ib * u + ic * v
-            away = np.sqrt(p * p + q * q)
+            away = math.sqrt(p * p + q * q)
             p, q = p / away, q / away
             nx, ny = ia * p + ib * q, ib * p + ic * q
-            slope = np.sqrt(nx * nx + ny * ny)
+            slope = math.sqrt(nx * nx + ny * ny)
             distance = (away - 1) / slope
             nx, ny = nx / slope, ny / slope
             row[0], row[1], row[2], row[3], row[4] = nx, ny, nx * p, nx * q + ny * p, ny * q
             _add_equation(row, distance, normal, right)
-        ellipse += np.linalg.solve(normal, right)
+        if not solve_and_invert(normal, right, step, inverse):
+            return False
+        for m in range(5):
+            ellipse[m] += step[m]
+    return True
 
 
 @njit(inline="always", error_model="numpy")
