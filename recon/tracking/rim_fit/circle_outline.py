@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon.compiled import njit
 from recon.geometry.camera import SLOPE_STEP, Camera, distort
-from recon.tracking.rim_fit.cholesky import solve_and_invert
+from recon.geometry.cholesky import solve_and_invert
 
 Array = NDArray[np.float64]
 

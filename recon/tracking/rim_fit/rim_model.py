@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.compiled import in_threads, njit
+from recon.geometry.cholesky import solve_and_invert
 from recon.tracking.rim_fit import sector_levels
-from recon.tracking.rim_fit.cholesky import solve_and_invert
 from recon.tracking.rim_fit.rim_parameters import Rim, largest, moved, plausible
 from recon.tracking.rim_fit.rim_sums import add_up, first_levels, middle_level
 from recon.tracking.rim_fit.sector_levels import COMMON, NONE, REDUCED, Spread

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from recon.compiled import njit
+from recon.geometry.order_statistics import count, quantile_of
 from recon.tracking.rim_fit.edge_profile import blurred_step
-from recon.tracking.rim_fit.order_statistics import count, quantile
 from recon.tracking.rim_fit.rim_parameters import Rim, Shape, inverse_shape, shortest_axis, window, with_levels
 from recon.tracking.rim_fit.sectors import (
     BRIGHT,
@@ -247,7 +247,7 @@ def first_levels(image, rim: Rim, reach, hole):
     ring_like = steep(dark, bright, seen)
     if count(ring_like) < LEAST_SECTORS:
         return False, rim, none
-    low, high = quantile(dark, ring_like, 0.5), quantile(bright, ring_like, 0.5)
+    low, high = quantile_of(dark, ring_like, 0.5), quantile_of(bright, ring_like, 0.5)
     noise = max((0.1 * (high - low)) ** 2, ROUNDING)
     return high > low, with_levels(rim, low, high), SideNoise(noise, noise)
 

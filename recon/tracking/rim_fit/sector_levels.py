@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from recon.compiled import njit
-from recon.tracking.rim_fit.cholesky import solve_and_invert
-from recon.tracking.rim_fit.order_statistics import count, quantile
+from recon.geometry.cholesky import solve_and_invert
+from recon.geometry.order_statistics import count, quantile_of
 from recon.tracking.rim_fit.sectors import BRIGHT, DARK, GROWTH, SECTORS, free_levels
 
 MEDIAN = 0.455  # of a square of a normal number of mean 0 and variance 1
@@ -57,10 +57,10 @@ def estimate_spread(sums, own, weights, arc, before: Spread):
         bright_squares[j] = (own[j].bright + free.bright[j]) ** 2 - free.bright_variance[j]
         leaning_squares[j] = own[j].leaning ** 2
     if count(counted) > 0:
-        dark = math.sqrt(max(quantile(dark_squares, counted, 0.5) / MEDIAN, NONE**2))
-        bright = math.sqrt(max(quantile(bright_squares, counted, 0.5) / MEDIAN, NONE**2))
+        dark = math.sqrt(max(quantile_of(dark_squares, counted, 0.5) / MEDIAN, NONE**2))
+        bright = math.sqrt(max(quantile_of(bright_squares, counted, 0.5) / MEDIAN, NONE**2))
     if count(between) > 0:
-        growth = max(math.sqrt(quantile(leaning_squares, between, 0.5) / MEDIAN) / arc, NONE)
+        growth = max(math.sqrt(quantile_of(leaning_squares, between, 0.5) / MEDIAN) / arc, NONE)
     return Spread(dark, bright, growth)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.compiled import njit
-from recon.tracking.rim_fit.order_statistics import count, quantile
+from recon.geometry.order_statistics import count, quantile_of
 from recon.tracking.rim_fit.rim_parameters import LEAST_VARIANCE, Rim
 
 Array = NDArray[np.float64]
@@ -151,7 +151,7 @@ def steep(dark, bright, seen):
     depth, likely = np.empty(SECTORS), np.empty(SECTORS, np.bool_)
     for j in range(SECTORS):
         depth[j] = (bright[j] - dark[j]) / max(abs(bright[j]) + abs(dark[j]), 1e-9)
-    least = STEEP * quantile(depth, seen, 0.75)
+    least = STEEP * quantile_of(depth, seen, 0.75)
     for j in range(SECTORS):
         likely[j] = seen[j] and depth[j] > least
     return likely
@@ -191,7 +191,7 @@ def weigh(sums, sectors, rim: Rim, own, fewest, weights):
     likely = steep(dark, bright, seen)
     if count(likely) < LEAST_SECTORS:
         return 0.0
-    usual = quantile(mean, likely, 0.5)
+    usual = quantile_of(mean, likely, 0.5)
     if not usual > 0:
         usual = 1.0
     for j in range(SECTORS):
