@@ -36,7 +36,7 @@ def quantile(values, share):
             low = i
         else:
             break
-    if below == n - 1:
+    if at == below:
         return values[below]
     above = values[below + 1]
     for i in range(below + 2, n):

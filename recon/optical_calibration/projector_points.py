@@ -222,7 +222,7 @@ def _gather(fringes, centre, reach, blur):
 def _solve(design, measured, weight, stride):
     """Least squares over every `stride`-th pixel: the parabola : (6,) and the inverse of the normal matrix : (6, 6).
 
-    A trace of ridge keeps the matrix invertible where pixels lie on a line, and such fits are refused; of a matrix that is not, all are NaN.
+    A trace of ridge keeps the matrix invertible where pixels lie on a line, and such fits are refused; else the parabola is NaN.
     """
     normal, right, beta, inverse = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.empty(TERMS), np.empty((TERMS, TERMS))
     for i in range(0, len(measured), stride):
