@@ -14,7 +14,9 @@ import logging
 import os
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -30,16 +32,44 @@ log = logging.getLogger(__name__)
 NUMBA = "numba>=0.61,<0.69"  # whose undocumented parts are known to be as they are used here
 OURS = ("recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks")  # packages; others keep Numba's own cache
 Name = tuple[str, ...]  # one with dots, in parts
+PARTS = 4  # of a range for each thread, so that who is done helps the other
 UNUSED_DAYS = 30  # after which code compiled from other sources is deleted
 
 
-def njit(function: Callable | None = None, **options: Any) -> Any:
-    """Compile a function on first use, as the decorator `numba.njit` does with the same options, and keep the result."""
+def njit(function: Callable | None = None, noalias: bool = False, **options: Any) -> Any:
+    """Compile a function on first use, as the decorator `numba.njit` does with the same options, and keep the result.
+
+    With `noalias` no array that the function takes may share memory with another one that it writes to, as in loops over prange:
+    then LLVM finds more vector instructions.
+    """
     if function is None:
-        return lambda decorated: njit(decorated, **options)
+        return lambda decorated: njit(decorated, noalias, **options)
     dispatcher = numba.njit(cache=True, **options)(function)
+    if noalias:
+        dispatcher._compiler._customize_flags = _without_aliases
     _one_process_compiles(dispatcher)
     return dispatcher
+
+
+def _without_aliases(flags: Any) -> Any:
+    flags.noalias = True
+    return flags
+
+
+def in_threads(kernel: Callable[[int, int], Any], count: int) -> None:
+    """Run `kernel(first, end)` over parts of range(count), in as many threads as Numba has.
+
+    What takes its time must release the GIL: functions compiled with `nogil=True`, which is quick, whereas a loop over `prange`
+    has all that is called within compiled thrice more, for each of the three functions that Numba makes of it.
+    """
+    threads = min(numba.get_num_threads(), count)
+    if threads <= 1:
+        kernel(0, count)
+        return
+    parts = min(PARTS * threads, count)
+    ends = [count * k // parts for k in range(parts + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        deque(pool.map(kernel, ends[:-1], ends[1:]), maxlen=0)
 
 
 def source_hash(module: Path, root: Path) -> str:

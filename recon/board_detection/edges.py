@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, njit
 from recon.geometry.ellipses import Ellipses, on_ellipse
+from recon.geometry.order_statistics import quantile
 
 Array = NDArray[np.float64]
 
@@ -82,13 +82,26 @@ class _Band(NamedTuple):
     @staticmethod
     def of(image: Array, outlines: Ellipses, reach: Array) -> "_Band":
         """All pixels of an image : (h, w) within reach of the outlines."""
-        rims = _Rims.of(outlines, reach, image.shape)
-        return _gather(np.ascontiguousarray(image), rims, np.concatenate([[0], np.cumsum(_sizes(rims))]).astype(np.int64))
+        n, rims = len(outlines.centre), _Rims.of(outlines, reach, image.shape)
+        sizes = np.zeros(n, np.int64)
+        in_threads(lambda first, end: _count(first, end, rims, sizes), n)
+        starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        lengths, pairs = starts[-1], (starts[-1], 2)
+        band = _Band(np.empty(lengths), np.empty(pairs), np.empty(pairs), np.empty(lengths), np.empty(lengths), starts)
+        grey = np.ascontiguousarray(image, float)
+        in_threads(lambda first, end: _gather(first, end, grey, rims, band), n)
+        return band
 
     @property
     def owner(self) -> NDArray[np.int64]:
         """Number of the outline : (p,)."""
         return np.repeat(np.arange(self.starts.size - 1), np.diff(self.starts))
+
+    def first_levels(self) -> Array:
+        """Planes of the inside and the outside : (n, 6), flat at first: the medians of the halves away from the edge."""
+        levels = np.zeros((self.starts.size - 1, 6))
+        in_threads(lambda first, end: _fill_levels(first, end, self, levels), len(levels))
+        return levels
 
 
 class _Step(NamedTuple):
@@ -122,7 +135,7 @@ def find_edges(
     """
     count = len(outlines.centre)
     band = _Band.of(image, outlines, reach)
-    levels = _first_levels(band)
+    levels = band.first_levels()
     width = np.full(count, 1.0) if blur is None else np.array(blur, float)
     noise = np.full(count, np.inf)
     offset = np.zeros((count, sectors))
@@ -166,7 +179,13 @@ class _Sums(NamedTuple):
     def of(band: _Band, levels: Array, width: Array, offset: Array, noise: Array) -> "_Sums":
         """Sum over the pixels. Pixels that stand out by many times the noise count less."""
         limit = SCATTER * np.maximum(noise, 0.02 * np.abs(levels[:, 3] - levels[:, 0]))
-        return _add_up(band, _Step(levels, width, offset, limit))
+        step, (n, sectors) = _Step(levels, width, offset, limit), offset.shape
+        sums = _Sums(
+            np.zeros((n, sectors)), np.zeros((n, sectors, SHARED)), np.zeros((n, SHARED, SHARED)), np.zeros((n, sectors)),
+            np.zeros((n, SHARED)), np.zeros((n, sectors)), np.zeros((n, 2, 2)), np.zeros((n, 2)),
+        )  # fmt: skip
+        in_threads(lambda first, end: _add_up(first, end, band, step, sums), n)
+        return sums
 
     @property
     def information(self) -> Array:
@@ -232,26 +251,22 @@ def _may_be_near(x, y, rims, i):
     return abs(q - 1) * rims.axes[i, 0] < BANDWIDTH * rims.reach[i]
 
 
-@njit(parallel=True)
-def _sizes(rims):
-    """Number of pixels of each band : (n,)."""
-    sizes = np.zeros(len(rims.centre), np.int64)
-    for i in prange(len(sizes)):
+@njit(nogil=True)
+def _count(first, end, rims, sizes):
+    """Count the pixels of the bands `first` to `end`, not included."""
+    for i in range(first, end):
         for v in range(rims.low[i, 1], rims.high[i, 1]):
             for u in range(rims.low[i, 0], rims.high[i, 0]):
                 x, y = u - rims.centre[i, 0], v - rims.centre[i, 1]
                 if _may_be_near(x, y, rims, i) and abs(_nearest(x, y, rims.inverse[i])[0]) <= rims.reach[i]:
                     sizes[i] += 1
-    return sizes
 
 
-@njit(parallel=True)
-def _gather(image, rims, starts):
-    """The bands of all outlines, each where it begins."""
-    count = starts[-1]
-    values, distance, angle = np.empty(count), np.empty(count), np.empty(count)
-    xy, normal = np.empty((count, 2)), np.empty((count, 2))
-    for i in prange(len(rims.centre)):
+@njit(nogil=True)
+def _gather(first, end, image, rims, band):
+    """Fill the bands `first` to `end`, not included, each where it begins."""
+    values, xy, normal, distance, angle, starts = band
+    for i in range(first, end):
         p, radius = starts[i], rims.axes[i, 1]
         for v in range(rims.low[i, 1], rims.high[i, 1]):
             for u in range(rims.low[i, 0], rims.high[i, 0]):
@@ -264,23 +279,16 @@ def _gather(image, rims, starts):
                     xy[p, 0], xy[p, 1] = x / radius, y / radius
                     normal[p, 0], normal[p, 1] = across / radius, down / radius
                     p += 1
-    return _Band(values, xy, normal, distance, angle, starts)
 
 
-@njit(parallel=True)
-def _add_up(band, step):
-    """The sums of `_Sums`, outline by outline."""
-    n, sectors = step.offset.shape
-    sums = _Sums(
-        np.zeros((n, sectors)), np.zeros((n, sectors, SHARED)), np.zeros((n, SHARED, SHARED)), np.zeros((n, sectors)),
-        np.zeros((n, SHARED)), np.zeros((n, sectors)), np.zeros((n, 2, 2)), np.zeros((n, 2)),
-    )  # fmt: skip
-    for i in prange(n):
+@njit(nogil=True)
+def _add_up(first, end, band, step, sums):
+    """Fill the sums of the outlines `first` to `end`, not included."""
+    for i in range(first, end):
         _add_outline(i, band, step, sums)
-    return sums
 
 
-@njit
+@njit(inline="always")
 def _add_outline(i, band, step, sums):
     """Add one outline's pixels: measured less modelled, and the model's slopes.
 
@@ -324,16 +332,20 @@ def _add_outline(i, band, step, sums):
             sums.rest[i, b, a] = sums.rest[i, a, b]
 
 
-@njit(parallel=True)
-def _first_levels(band):
-    """Planes of the inside and the outside : (n, 6), flat at first: the medians of the halves away from the edge."""
-    levels = np.zeros((len(band.starts) - 1, 6))
-    for i in prange(len(levels)):
-        distance = band.distance[band.starts[i] : band.starts[i + 1]]
-        values = band.values[band.starts[i] : band.starts[i + 1]]
-        if len(distance):
-            far = 0.4 * np.abs(distance).max()
-            inside, outside = values[distance < -far], values[distance > far]
-            levels[i, 0] = np.median(inside) if len(inside) else 0.0
-            levels[i, 3] = np.median(outside) if len(outside) else 0.0
-    return levels
+@njit(nogil=True)
+def _fill_levels(first, end, band, levels):
+    """Fill the first levels of the outlines `first` to `end`, not included."""
+    for i in range(first, end):
+        begin, behind = band.starts[i], band.starts[i + 1]
+        inside, outside, m, n, far = np.empty(behind - begin), np.empty(behind - begin), 0, 0, 0.0
+        for p in range(begin, behind):
+            far = max(far, 0.4 * abs(band.distance[p]))
+        for p in range(begin, behind):
+            if band.distance[p] < -far:
+                inside[m] = band.values[p]
+                m += 1
+            elif band.distance[p] > far:
+                outside[n] = band.values[p]
+                n += 1
+        levels[i, 0] = quantile(inside[:m], 0.5) if m else 0.0
+        levels[i, 3] = quantile(outside[:n], 0.5) if n else 0.0

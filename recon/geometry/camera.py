@@ -134,7 +134,8 @@ def distorted(x, y, k):
     return (k[12] * xd + k[13] * yd + k[14]) / w, (k[15] * xd + k[16] * yd + k[17]) / w
 
 
-distort = njit(inline="always")(distorted)
+distort = njit(forceinline=True, error_model="numpy")(distorted)  # inlined by LLVM, which compiles in a sixth of the time
+distort_side_by_side = njit(inline="always")(distorted)  # by Numba: its points share vector instructions, in a loop over arrays
 
 
 @njit(parallel=True)
@@ -146,16 +147,10 @@ def _distort_all(points, k):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _distort(x, y, k):
-    """Distort a point, inlined by LLVM: nine copies that Numba inlines compile six times as long."""
-    return distort(x, y, k)
-
-
-@njit(forceinline=True, error_model="numpy")
 def _slopes(x, y, k):
     """Jacobian of the distortion at (x, y): dxd/dx, dxd/dy, dyd/dx, dyd/dy."""
-    right, left = _distort(x + SLOPE_STEP, y, k), _distort(x - SLOPE_STEP, y, k)
-    below, above = _distort(x, y + SLOPE_STEP, k), _distort(x, y - SLOPE_STEP, k)
+    right, left = distort(x + SLOPE_STEP, y, k), distort(x - SLOPE_STEP, y, k)
+    below, above = distort(x, y + SLOPE_STEP, k), distort(x, y - SLOPE_STEP, k)
     scale = 1 / (2 * SLOPE_STEP)
     return (
         (right[0] - left[0]) * scale,
@@ -171,7 +166,7 @@ def _undistort(u, v, k):
     x, y = u, v
     error = np.inf
     for _ in range(NEWTON_STEPS):
-        xd, yd = _distort(x, y, k)
+        xd, yd = distort(x, y, k)
         ex, ey = u - xd, v - yd
         error = max(abs(ex), abs(ey))
         if not error > NEWTON_TOLERANCE:

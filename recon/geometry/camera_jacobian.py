@@ -70,7 +70,7 @@ def _derivatives(turned, local, device):
     The pixels, and their derivatives by the point : (m, 2, 3) and by all PARAMETERS : (m, 2, 24).
     """
     fx, skew, fy = device.matrix[0, 0], device.matrix[0, 1], device.matrix[1, 1]
-    turn, t = device.turn, device.coefficients[12:].copy().reshape(3, 3)
+    turn, t = device.turn, device.coefficients[12:].copy().reshape((3, 3))
     m = len(local)
     pixels, by_point, by_parameter = np.empty((m, 2)), np.empty((m, 2, 3)), np.zeros((m, 2, TURNS + 6))
     slopes, by_local, by_coefficient = np.empty((2, 2)), np.empty((2, 3)), np.zeros((12, 2))
@@ -96,7 +96,8 @@ def _derivatives(turned, local, device):
             by_parameter[i, j, TURNS] = by_local[j, 2] * b - by_local[j, 1] * c  # a turn moves the point by unit x point
             by_parameter[i, j, TURNS + 1] = by_local[j, 0] * c - by_local[j, 2] * a
             by_parameter[i, j, TURNS + 2] = by_local[j, 1] * a - by_local[j, 0] * b
-            by_parameter[i, j, TURNS + 3 :] = by_local[j]
+            for k in range(3):
+                by_parameter[i, j, TURNS + 3 + k] = by_local[j, k]
         by_parameter[i, 0, 0], by_parameter[i, 1, 1] = p, q
         by_parameter[i, 0, 2], by_parameter[i, 1, 3] = 1.0, 1.0
         for k in range(12):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon.compiled import njit
 from recon.geometry.camera import SLOPE_STEP, Camera, distort
+from recon.geometry.cholesky import solve_and_invert
 
 Array = NDArray[np.float64]
 
@@ -57,16 +58,17 @@ def _slopes(camera_from_world, points, matrix, k):
 
 @njit(error_model="numpy")
 def _ellipses(camera_from_target, centres, radius, matrix, k):
-    result = np.full((len(centres), 5), np.nan)
+    result = np.empty((len(centres), 5))
     x, y, place = np.empty(POINTS), np.empty(POINTS), np.empty(3)
-    room = (np.empty((5, 5)), np.empty(5), np.empty(5))
     for i in range(len(centres)):
         for m in range(3):
             place[m] = camera_from_target[m, 3]
             for n in range(3):
                 place[m] += camera_from_target[m, n] * centres[i, n]
-        if _outline(place, camera_from_target, radius, matrix, k, x, y):
-            _fit(x, y, result[i], room)
+        in_front = _outline(place, camera_from_target, radius, matrix, k, x, y)
+        if not (in_front and _fit(x, y, result[i])):
+            for m in range(5):
+                result[i, m] = np.nan
     return result
 
 
@@ -87,17 +89,16 @@ def _outline(place, camera_from_target, radius, matrix, k, x, y):
 
 
 @njit(error_model="numpy")
-def _fit(x, y, ellipse, room):
-    """The ellipse closest to evenly spread points of a closed outline, by orthogonal distances : (5,), in place."""
-    normal, right, row = room
+def _fit(x, y, ellipse):
+    """The ellipse closest to evenly spread points of a closed outline, by orthogonal distances : (5,); False of a line."""
     _start(x, y, ellipse)
+    normal, right, row, step, inverse = np.empty((5, 5)), np.empty(5), np.empty(5), np.empty(5), np.empty((5, 5))
     for _ in range(STEPS):
         normal[:], right[:] = 0.0, 0.0
         a, b, c = ellipse[2], ellipse[3], ellipse[4]
         determinant = a * c - b * b
         if not determinant > 1e-6 * (a + c) ** 2:  # seen from its edge
-            ellipse[:] = np.nan
-            return
+            return False
         ia, ib, ic = c / determinant, -b / determinant, a / determinant
         for j in range(len(x)):
             u, v = x[j] - ellipse[0], y[j] - ellipse[1]
@@ -113,9 +114,11 @@ def _fit(x, y, ellipse, room):
                 right[m] += row[m] * distance
                 for n in range(5):
                     normal[m, n] += row[m] * row[n]
-        _solve(normal, right)
+        if not solve_and_invert(normal, right, step, inverse):
+            return False
         for m in range(5):
-            ellipse[m] += right[m]
+            ellipse[m] += step[m]
+    return True
 
 
 @njit(inline="always", error_model="numpy")
@@ -135,19 +138,3 @@ def _start(x, y, ellipse):
     root = math.sqrt(a * c - b * b)
     scale = math.sqrt(a + c + 2 * root)
     ellipse[2], ellipse[3], ellipse[4] = (a + root) / scale, b / scale, (c + root) / scale
-
-
-@njit(error_model="numpy")
-def _solve(normal, right):
-    """Solve normal equations by elimination; the solution replaces the right-hand side."""
-    n = len(right)
-    for i in range(n):
-        for j in range(i + 1, n):
-            share = normal[j, i] / normal[i, i]
-            right[j] -= share * right[i]
-            for m in range(i, n):
-                normal[j, m] -= share * normal[i, m]
-    for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            right[i] -= normal[i, j] * right[j]
-        right[i] /= normal[i, i]

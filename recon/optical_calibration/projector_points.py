@@ -12,14 +12,16 @@ a Gaussian point spread of width s the shift is `s^2 grad(I) / I` exactly, with 
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, njit
 from recon.errors import InputError
+from recon.geometry.cholesky import solve_and_invert
+from recon.geometry.order_statistics import quantile
 from recon.structured_light.decode import ProjectorMap
 
 Array = NDArray[np.float64]
@@ -47,6 +49,42 @@ class Correspondences:
     pixels: Array  # (n, 2) projector px
     covariance: Array  # (n, 2, 2) projector px^2, of the fringes' noise alone: the camera's pixels are taken as exact
     gradient: Array  # (n, 2, 2) d(projector px) / d(camera px)
+
+
+class _Fringes(NamedTuple):
+    """Images : (h, w) float32 along one axis."""
+
+    x: NDArray[np.float32]  # projector px
+    sigma: NDArray[np.float32]  # projector px
+    level: NDArray[np.float32]  # DN, lit and smoothed
+    slope: NDArray[np.float32]  # DN/px, the length of its gradient
+
+
+class _Windows(NamedTuple):
+    """The windows about n points."""
+
+    centres: Array  # (n, 2) camera px
+    reach: Array  # (n,) camera px
+    blur: Array  # (n,) camera px, width of the edges
+
+
+class _Parabolas(NamedTuple):
+    """What the parabolas of n windows say of their points; NaN where a window says too little."""
+
+    value: Array  # (n,) projector px
+    variance: Array  # (n,) projector px^2
+    gradient: Array  # (n, 2) projector px/camera px
+    chi: Array  # (n, sizes) chi-square of the means over blocks
+    freedom: Array  # (n, sizes) its degrees of freedom
+
+    @staticmethod
+    def of(fringes: _Fringes, windows: _Windows) -> "_Parabolas":
+        """Fitted to the windows."""
+        n, sizes = len(windows.reach), len(BLOCKS)
+        value, variance, gradient = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2), np.nan)
+        found = _Parabolas(value, variance, gradient, np.zeros((n, sizes)), np.zeros((n, sizes)))
+        in_threads(lambda first, end: _fit_parabolas(first, end, fringes, windows, found), n)
+        return found
 
 
 def correspondences(found: ProjectorMap, image: NDArray, centres: ArrayLike, reach_px: ArrayLike) -> Correspondences:
@@ -84,12 +122,13 @@ def correspondences(found: ProjectorMap, image: NDArray, centres: ArrayLike, rea
     centres = np.asarray(centres, float).reshape(-1, 2)
     reach = np.broadcast_to(np.asarray(reach_px, float), len(centres)).copy()
     level, slope = _slope(image)
-    blur = _blur(level, slope, centres, reach)
+    windows = _Windows(np.ascontiguousarray(centres), reach, _blur(level, slope, centres, reach))
     n = len(centres)
     pixels, covariance, gradient = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan), np.full((n, 2, 2), np.nan)
     for axis, (x, sigma) in enumerate(axes):
-        pixels[:, axis], variance, gradient[:, axis], chi, freedom = _parabolas(x, sigma, level, slope, centres, reach, blur)
-        covariance[:, axis, axis] = variance * _excess(chi, freedom)
+        parabolas = _Parabolas.of(_Fringes(x, sigma, level, slope), windows)
+        pixels[:, axis], gradient[:, axis] = parabolas.value, parabolas.gradient
+        covariance[:, axis, axis] = parabolas.variance * _excess(parabolas.chi, parabolas.freedom)
     off = np.where(np.isfinite(pixels).all(axis=1), 0.0, np.nan)  # the fringes of the axes are different images
     covariance[:, 0, 1] = covariance[:, 1, 0] = off
     nowhere = np.isnan(off)
@@ -107,14 +146,20 @@ def _slope(image: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 @njit
 def _blur(level, slope, centres, reach):
     """Width of the edges in each window : (n,) px, from `contrast = sqrt(2 pi) * width * steepest slope`."""
-    blur = np.full(len(centres), np.float64(BLUR[0]))
+    blur = np.empty(len(centres))
     for i in range(len(centres)):
+        blur[i] = BLUR[0]
         top, bottom, left, right = _window(centres[i], reach[i], level.shape)
         if bottom <= top or right <= left:
             continue
-        dark, bright = np.percentile(level[top:bottom, left:right], np.array([5.0, 95.0]))
+        levels, m, steepest = np.empty((bottom - top) * (right - left)), 0, 0.0
+        for row in range(top, bottom):
+            for column in range(left, right):
+                levels[m] = level[row, column]
+                m += 1
+                steepest = max(steepest, slope[row, column])
+        dark, bright = quantile(levels, 0.05), quantile(levels, 0.95)
         if bright - dark > CONTRAST * bright:
-            steepest = slope[top:bottom, left:right].max()
             blur[i] = min(max((bright - dark) / (math.sqrt(2 * math.pi) * steepest), BLUR[0]), BLUR[1])
     return blur
 
@@ -129,33 +174,32 @@ def _window(centre, reach, shape):
     return top, bottom, left, right
 
 
-@njit(parallel=True)
-def _parabolas(x, sigma, level, slope, centres, reach, blur):
-    """Value, its variance and gradient at each point, NaN where the window says too little; chi-square and degrees of freedom."""
-    n = len(centres)
-    chi, freedom = np.zeros((n, len(BLOCKS))), np.zeros((n, len(BLOCKS)))
-    value, variance, gradient = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2), np.nan)
-    for i in prange(n):
-        design, measured, deviation = _gather(x, sigma, level, slope, centres[i], reach[i], blur[i])
+@njit(nogil=True, error_model="numpy")
+def _fit_parabolas(first, end, fringes, windows, found):
+    """Fit the parabolas of windows `first` to `end`, not included; what says too little stays NaN."""
+    for i in range(first, end):
+        reach = windows.reach[i]
+        design, measured, deviation = _gather(fringes, windows.centres[i], reach, windows.blur[i])
         if len(measured) < FEWEST:
             continue
-        middle = np.median(measured)  # fitted about it, for the sake of the digits
-        kept, beta = _inliers(design, measured - middle, deviation)
+        middle = quantile(measured.copy(), 0.5)  # fitted about it, for the sake of the digits
+        for k in range(len(measured)):
+            measured[k] -= middle
+        kept, beta, inverse = _inliers(design, measured, deviation)
         if not _surrounded(design, deviation, kept):
             continue
-        normal = _normal(design, np.where(kept, deviation**-2.0, 0.0))
-        inverse = np.linalg.inv(normal)
-        residual = measured - middle - design @ beta
-        value[i] = middle + beta[0]
-        variance[i] = inverse[0, 0]
-        chi[i], freedom[i] = _chi_square(design, residual, deviation, kept, reach[i])
-        gradient[i] = beta[1:3] / reach[i]
-    return value, variance, gradient, chi, freedom
+        found.value[i] = middle + beta[0]
+        found.variance[i] = inverse[0, 0]
+        found.gradient[i, 0], found.gradient[i, 1] = beta[1] / reach, beta[2] / reach
+        for k in range(len(measured)):
+            measured[k] -= _at(design, k, beta)
+        _chi_square(design, measured, deviation, kept, reach, found.chi[i], found.freedom[i])
 
 
 @njit
-def _gather(x, sigma, level, slope, centre, reach, blur):
+def _gather(fringes, centre, reach, blur):
     """The window's trustworthy pixels: terms of the parabola : (m, 6) in units of reach, coordinates and sigmas : (m,) px."""
+    x, sigma, level, slope = fringes
     top, bottom, left, right = _window(centre, reach, x.shape)
     room = max(bottom - top, 0) * max(right - left, 0)
     design, measured, deviation = np.empty((room, TERMS)), np.empty(room), np.empty(room)
@@ -167,60 +211,83 @@ def _gather(x, sigma, level, slope, centre, reach, blur):
                 continue
             if blur * blur * slope[row, column] > SHIFT * level[row, column]:
                 continue
-            design[m] = 1.0, u, v, u * u, u * v, v * v
+            design[m, 0], design[m, 1], design[m, 2] = 1.0, u, v
+            design[m, 3], design[m, 4], design[m, 5] = u * u, u * v, v * v
             measured[m], deviation[m] = x[row, column], sigma[row, column]
             m += 1
     return design[:m], measured[:m], deviation[:m]
 
 
-@njit
-def _normal(design, weight):
-    """Normal matrix : (6, 6); a trace of ridge keeps it invertible where pixels lie on a line, and such fits are refused."""
-    normal = np.zeros((TERMS, TERMS))
-    for i in range(len(design)):
+@njit(error_model="numpy")
+def _solve(design, measured, weight, stride):
+    """Least squares over every `stride`-th pixel: the parabola : (6,) and the inverse of the normal matrix : (6, 6).
+
+    A trace of ridge keeps the matrix invertible where pixels lie on a line, and such fits are refused; else the parabola is NaN.
+    """
+    normal, right, beta, inverse = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.empty(TERMS), np.empty((TERMS, TERMS))
+    for i in range(0, len(measured), stride):
         for a in range(TERMS):
-            for b in range(a, TERMS):
+            right[a] += weight[i] * design[i, a] * measured[i]
+            for b in range(a + 1):
                 normal[a, b] += weight[i] * design[i, a] * design[i, b]
+    trace = 0.0
     for a in range(TERMS):
-        for b in range(a):
-            normal[a, b] = normal[b, a]
-    return normal + np.eye(TERMS) * (1e-12 * np.trace(normal) + 1e-300)
+        trace += normal[a, a]
+    for a in range(TERMS):
+        normal[a, a] += 1e-12 * trace + 1e-300
+    if not solve_and_invert(normal, right, beta, inverse):
+        for a in range(TERMS):
+            beta[a] = np.nan
+    return beta, inverse
 
 
-@njit
-def _solve(design, measured, weight):
-    return np.linalg.solve(_normal(design, weight), design.T @ (weight * measured))
+@njit(inline="always", error_model="numpy")
+def _at(design, i, beta):
+    """The parabola at a pixel."""
+    total = 0.0
+    for a in range(TERMS):
+        total += design[i, a] * beta[a]
+    return total
 
 
-@njit
+@njit(error_model="numpy")
 def _inliers(design, measured, deviation):
-    """Which pixels follow one parabola : (m,) bool, and the parabola : (6,).
+    """Which pixels follow one parabola : (m,) bool, the parabola : (6,), and its covariance : (6, 6).
 
     Reweighted least squares gives the least absolute deviations of a part of the pixels, which a third of outliers doesn't move
     far; then all pixels within the clip are fitted, until they stay the same.
     """
-    stride = max(len(measured) // STARTERS, 1)
-    part, goal, noise = design[::stride].copy(), measured[::stride].copy(), deviation[::stride].copy()
-    beta = _solve(part, goal, noise**-2.0)
+    m = len(measured)
+    stride = max(m // STARTERS, 1)
+    weight, z, kept = np.empty(m), np.empty(m), np.zeros(m, np.bool_)
+    for i in range(m):
+        weight[i] = 1 / deviation[i] ** 2
+    beta, inverse = _solve(design, measured, weight, stride)
     for _ in range(ROUNDS):
-        beta = _solve(part, goal, 1 / (noise * np.maximum(np.abs(goal - part @ beta), noise)))
-    kept = np.zeros(len(measured), np.bool_)
+        for i in range(0, m, stride):
+            weight[i] = 1 / (deviation[i] * max(abs(measured[i] - _at(design, i, beta)), deviation[i]))
+        beta, inverse = _solve(design, measured, weight, stride)
     for _ in range(ROUNDS):
-        z = np.abs(measured - design @ beta) / deviation
-        inside = z < CLIP * max(1.4826 * np.median(z), 1.0)
-        if (inside == kept).all():
+        for i in range(m):
+            z[i] = abs(measured[i] - _at(design, i, beta)) / deviation[i]
+        clip = CLIP * max(1.4826 * quantile(z.copy(), 0.5), 1.0)
+        settled = True
+        for i in range(m):
+            settled &= kept[i] == (z[i] < clip)
+            kept[i] = z[i] < clip
+            weight[i] = 1 / deviation[i] ** 2 if kept[i] else 0.0
+        if settled:
             break
-        kept = inside
-        beta = _solve(design, measured, np.where(kept, deviation**-2.0, 0.0))
-    return kept, beta
+        beta, inverse = _solve(design, measured, weight, 1)
+    return kept, beta, inverse
 
 
-@njit
+@njit(error_model="numpy")
 def _surrounded(design, deviation, kept):
     """Whether the weight is not mostly outliers, and lies on all sides of the point."""
     total, inside, sides, count = 0.0, 0.0, np.zeros(8), 0
     for i in range(len(design)):
-        weight = deviation[i] ** -2.0
+        weight = 1 / deviation[i] ** 2
         total += weight
         if not kept[i]:
             continue
@@ -229,19 +296,22 @@ def _surrounded(design, deviation, kept):
         for k in range(8):
             if design[i, 1] * math.cos(k * math.pi / 4) + design[i, 2] * math.sin(k * math.pi / 4) > BEYOND:
                 sides[k] += weight
-    return count >= FEWEST and inside > KEPT * total and sides.min() > SIDE * inside
+    for k in range(8):
+        if not sides[k] > SIDE * inside:
+            return False
+    return count >= FEWEST and inside > KEPT * total
 
 
-@njit
-def _chi_square(design, residual, deviation, kept, reach):
-    """Chi-square of the means over blocks of each size, and its degrees of freedom : (sizes,) each."""
-    chi, freedom = np.zeros(len(BLOCKS)), np.full(len(BLOCKS), -float(TERMS))
+@njit(error_model="numpy")
+def _chi_square(design, residual, deviation, kept, reach, chi, freedom):
+    """Chi-square of the means over blocks of each size, and its degrees of freedom : (sizes,) each, in place."""
     for k, block in enumerate(BLOCKS):
+        chi[k], freedom[k] = 0.0, -TERMS
         side = int(2 * reach / block) + 1
         sums, weights = np.zeros((side, side)), np.zeros((side, side))
         for i in range(len(residual)):
             if kept[i]:
-                weight = deviation[i] ** -2.0
+                weight = 1 / deviation[i] ** 2
                 row, column = int((design[i, 2] + 1) * reach / block), int((design[i, 1] + 1) * reach / block)
                 sums[row, column] += weight * residual[i]
                 weights[row, column] += weight
@@ -250,7 +320,6 @@ def _chi_square(design, residual, deviation, kept, reach):
                 if weights[row, column] > 0:
                     chi[k] += sums[row, column] ** 2 / weights[row, column]
                     freedom[k] += 1
-    return chi, freedom
 
 
 def _excess(chi: Array, freedom: Array) -> Array:

@@ -7,11 +7,10 @@ solved for so that this is the decoded coordinate: one axis determines it, two d
 from dataclasses import dataclass
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
-from recon.geometry.camera import Camera, distort
+from recon.compiled import in_threads, njit
+from recon.geometry.camera import Camera, distort_side_by_side
 from recon.structured_light.decode import ProjectorMap
 
 Float32 = NDArray[np.float32]
@@ -57,7 +56,8 @@ class Triangulator:
         points = np.empty((*shape, 3), np.float32)
         sigma = np.empty(shape, np.float32)
         projector = (self.projector.camera_from_world, self._matrix, self.projector.coefficients)
-        _triangulate(self._rays, np.ascontiguousarray(self.camera.centre), projector, decoded, points, sigma)
+        centre = np.ascontiguousarray(self.camera.centre)
+        in_threads(lambda first, end: _triangulate(first, end, self._rays, centre, projector, decoded, points, sigma), shape[0])
         return PointMap(points, sigma)
 
 
@@ -100,16 +100,19 @@ def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: t
     return coordinate, sigma
 
 
-@njit(parallel=True, error_model="numpy")
-def _triangulate(rays, centre, projector, decoded, points, sigma):
-    """Solve all pixels of an image row side by side, without branches, so that they share vector instructions."""
+@njit(nogil=True, noalias=True, error_model="numpy")
+def _triangulate(first, end, rays, centre, projector, decoded, points, sigma):
+    """Solve rows `first` to `end` (not included), a row's pixels without branches, so that they share vector instructions."""
     projector_from_world, matrix, coefficients = projector
     columns, sigma_columns, rows, sigma_rows = decoded
     height, width, _ = rays.shape
-    rotation, translation = projector_from_world[:3, :3].copy(), projector_from_world[:3, 3].copy()
-    ox, oy, oz = rotation @ centre + translation
+    rotation, origin = projector_from_world[:3, :3].copy(), np.empty(3)
+    for k in range(3):
+        turned = rotation[k, 0] * centre[0] + rotation[k, 1] * centre[1] + rotation[k, 2] * centre[2]
+        origin[k] = turned + projector_from_world[k, 3]
+    ox, oy, oz = origin
     has_columns, has_rows = columns.shape == (height, width), rows.shape == (height, width)
-    for j in prange(height):
+    for j in range(first, end):
         ex, ey, ez, t, u, v, su, sv, wu, wv, column, row = np.empty((12, width))
         certain = np.ones(width, np.bool_)
         for i in range(width):
@@ -117,7 +120,7 @@ def _triangulate(rays, centre, projector, decoded, points, sigma):
             ex[i] = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
             ey[i] = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz
             ez[i] = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
-        column[:], wu[:], row[:], wv[:] = 0, 0, 0, 0
+            column[i] = wu[i] = row[i] = wv[i] = 0.0
         if has_columns:
             _weigh(columns[j], sigma_columns[j], column, wu, certain)
         if has_rows:
@@ -131,7 +134,7 @@ def _triangulate(rays, centre, projector, decoded, points, sigma):
             nearness = 1 / (oz + t[i] * ez[i])
             su[i] = (matrix[0] * along_u + matrix[1] * along_v) * nearness * nearness
             sv[i] = (matrix[3] * along_u + matrix[4] * along_v) * nearness * nearness
-            xd, yd = distort((ox + t[i] * ex[i]) * nearness, (oy + t[i] * ey[i]) * nearness, coefficients)
+            xd, yd = distort_side_by_side((ox + t[i] * ex[i]) * nearness, (oy + t[i] * ey[i]) * nearness, coefficients)
             u[i], v[i] = matrix[0] * xd + matrix[1] * yd + matrix[2], matrix[3] * xd + matrix[4] * yd + matrix[5]
         # Gauss-Newton; the slopes of the distorted projection come from its last two values
         for _ in range(MAX_STEPS):
@@ -141,7 +144,7 @@ def _triangulate(rays, centre, projector, decoded, points, sigma):
                 step = gradient / (wu[i] * su[i] * su[i] + wv[i] * sv[i] * sv[i])
                 t[i] += step
                 nearness = 1 / (oz + t[i] * ez[i])
-                xd, yd = distort((ox + t[i] * ex[i]) * nearness, (oy + t[i] * ey[i]) * nearness, coefficients)
+                xd, yd = distort_side_by_side((ox + t[i] * ex[i]) * nearness, (oy + t[i] * ey[i]) * nearness, coefficients)
                 un, vn = matrix[0] * xd + matrix[1] * yd + matrix[2], matrix[3] * xd + matrix[4] * yd + matrix[5]
                 far = abs(step) > SECANT
                 su[i] = (un - u[i]) / step if far else su[i]

@@ -16,12 +16,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
+from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, njit
+from recon.geometry.cholesky import solve_and_invert
 from recon.tracking.rim_fit import sector_levels
-from recon.tracking.rim_fit.cholesky import solve_and_invert
-from recon.tracking.rim_fit.rim_parameters import Rim, moved, plausible
+from recon.tracking.rim_fit.rim_parameters import Rim, largest, moved, plausible
 from recon.tracking.rim_fit.rim_sums import add_up, first_levels, middle_level
 from recon.tracking.rim_fit.sector_levels import COMMON, NONE, REDUCED, Spread
 from recon.tracking.rim_fit.sectors import (
@@ -82,18 +82,20 @@ class Prior(NamedTuple):
     sigma: float
 
 
-@njit(parallel=True, error_model="numpy")
-def fit_rims(first, second, starts, hole, fits):
+def fit_rims(first: NDArray, second: NDArray, starts: NDArray, hole: float, fits: NDArray) -> None:
     """Fit n rims in two images of one type, from `starts` : (n,) START to `fits` : (n,) FIT, written where a rim is found.
 
     `hole` is the inner over the outer diameter.
     """
-    for i in prange(len(starts)):
-        k = np.int64(i)  # inside, i has another type: `_fit` would be compiled twice
-        _fit(second if starts[k].second else first, starts, k, hole, fits)
+
+    def fit(begin: int, end: int) -> None:
+        for i in range(begin, end):
+            _fit(second if starts["second"][i] else first, starts, i, hole, fits)
+
+    in_threads(fit, len(starts))
 
 
-@njit(error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _fit(image, starts, i, hole, fits):
     """Fit rim i by Gauss-Newton, first to few pixels of a wide band, then to all of a narrow one."""
     start = starts[i]
@@ -105,9 +107,9 @@ def _fit(image, starts, i, hole, fits):
     found, rim, noise = first_levels(image, rim, reach, hole)
     if not found:
         return
-    own, spread, weights = np.zeros(SECTORS, LEVELS), Spread(NONE, NONE, NONE), np.ones(SECTORS)
+    own, spread, weights = np.zeros(SECTORS, LEVELS), Spread(NONE, NONE, NONE), np.zeros(SECTORS)
     sums, reduced = np.zeros(SECTORS, SUMS), np.zeros(SECTORS, REDUCED)
-    step, inverse, slopes = np.zeros(GLOBAL), np.zeros((GLOBAL, GLOBAL)), np.ones((SECTORS, GLOBAL))
+    step, inverse, slopes = np.zeros(GLOBAL), np.zeros((GLOBAL, GLOBAL)), np.zeros((SECTORS, GLOBAL))
     change = np.inf
     for capture in (True, False):
         stride = 2 if capture and rim.a + rim.c > 40 else 1
@@ -128,37 +130,51 @@ def _fit(image, starts, i, hole, fits):
             sector_levels.update(own, reduced, _by_sector(slopes, step), weights)
             if not plausible(rim, image.shape):
                 return
-            change = np.abs(step[:5]).max()
+            change = largest(step, 0, 5)
             if change < (CAPTURED if capture else SETTLED) and (capture or k > 0):  # gradients count from the second step on
                 break
     if change < RESTLESS:
         fit = fits[i]
         fit.x, fit.y, fit.a, fit.b, fit.c = rim.x, rim.y, rim.a, rim.b, rim.c
-        fit.covariance[:] = inverse[:5, :5]
+        for m in range(5):
+            for n in range(5):
+                fit.covariance[m, n] = inverse[m, n]
         fit.inside, fit.outside, fit.middle = rim.dark, rim.bright, middle_level(image, rim, hole)
         fit.noise[0], fit.noise[1] = math.sqrt(noise.dark), math.sqrt(noise.bright)
         fit.variance[0], fit.variance[1], fit.variance[2] = rim.variance, rim.variance_cos, rim.variance_sin
-        fit.seen = (weights > 0.5).sum() / SECTORS
+        fit.seen = _seen(weights)
         fit.excess = _excess(reduced, weights)
         fit.uneven = spread.bright
         fit.found = True
 
 
+@njit(inline="always", error_model="numpy")
+def _seen(weights):
+    """Share of the sectors that look like a rim."""
+    total = 0
+    for weight in weights:
+        total += weight > 0.5
+    return total / SECTORS
+
+
 @njit(error_model="numpy")
 def _excess(reduced, weights):
     """Mean squared residual of the sectors' edges, over its expectation by the noise."""
-    scores = 0.0
+    scores, total = 0.0, 0.0
     for j in range(SECTORS):
+        total += weights[j]
         certainty = reduced[j].normal[EDGE, EDGE]
         if certainty > 0:
             scores += weights[j] * reduced[j].right[EDGE] ** 2 / certainty
-    return scores / max(weights.sum() - 6, 1.0)
+    return scores / max(total - 6, 1.0)
 
 
 @njit(error_model="numpy")
 def _slopes(sectors, slopes):
-    """Derivatives of each sector's edge, levels and variance by the parameters : (SECTORS, GLOBAL); 1 by levels."""
+    """Derivatives of each sector's edge, levels and variance by the parameters : (SECTORS, GLOBAL)."""
     for j in range(SECTORS):
+        for m in range(1, COMMON):
+            slopes[j, BLOCKS[m]] = 1.0  # a level by itself, as the mean variance
         sector = sectors[j]
         ux, uy, nx, ny = sector.ux, sector.uy, sector.nx, sector.ny
         slopes[j, 0], slopes[j, 1] = nx, ny
@@ -174,7 +190,8 @@ def _by_sector(slopes, step):
     steps = np.zeros((SECTORS, COMMON))
     for m in range(COMMON):
         for p in range(BLOCKS[m], BLOCKS[m + 1]):
-            steps[:, m] += slopes[:, p] * step[p]
+            for j in range(SECTORS):
+                steps[j, m] += slopes[j, p] * step[p]
     return steps
 
 

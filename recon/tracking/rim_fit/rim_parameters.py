@@ -3,8 +3,6 @@
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from recon.compiled import njit
 
 LEAST_VARIANCE = 0.06  # px^2: a pixel's own extent is 1/12
@@ -58,7 +56,7 @@ def plausible(rim: Rim, size):
     if not (math.isfinite(rim.a) and math.isfinite(rim.b) and math.isfinite(rim.c)):
         return False
     half, gap = (rim.a + rim.c) / 2, math.hypot((rim.a - rim.c) / 2, rim.b)
-    if half - gap < 3 or half - gap < 0.2 * (half + gap) or half + gap > max(size):
+    if half - gap < 3 or half - gap < 0.2 * (half + gap) or half + gap > max(size[0], size[1]):
         return False
     return -1 < rim.x < size[1] and -1 < rim.y < size[0]
 
@@ -79,13 +77,24 @@ def with_levels(rim: Rim, dark, bright):
     )
 
 
+@njit(inline="always", error_model="numpy")
+def largest(step, first, end):
+    """The largest size of some parameters' steps."""
+    size = 0.0
+    for k in range(first, end):
+        size = max(size, abs(step[k]))
+    return size
+
+
 @njit(error_model="numpy")
 def moved(rim: Rim, step, reach):
     """The rim after a step : (14,), which is shortened in place where it is too long for the model to hold."""
     limit = min(max(reach, 1.0), 0.3 * shortest_axis(rim))
-    step[:5] *= min(1.0, limit / max(np.abs(step[:5]).max(), 1e-12))
+    share = min(1.0, limit / max(largest(step, 0, 5), 1e-12))
+    for k in range(5):
+        step[k] *= share
     limit = 0.85 * rim.variance if step[11] < 0 else 2 * rim.variance
-    share = min(1.0, limit / max(np.abs(step[11:]).max(), 1e-12))
+    share = min(1.0, limit / max(largest(step, 11, 14), 1e-12))
     variance = max(rim.variance + share * step[11], LEAST_VARIANCE)
     cos, sin = rim.variance_cos + share * step[12], rim.variance_sin + share * step[13]
     strength = math.hypot(cos, sin)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from recon.compiled import njit
+from recon.geometry.order_statistics import count, quantile_of
 from recon.tracking.rim_fit.edge_profile import blurred_step
 from recon.tracking.rim_fit.rim_parameters import Rim, Shape, inverse_shape, shortest_axis, window, with_levels
 from recon.tracking.rim_fit.sectors import (
@@ -58,8 +59,9 @@ def add_up(image, rim: Rim, own, noise: SideNoise, sectors, stride, hole, sums):
     shape = inverse_shape(rim)
     radius = (rim.a + rim.c) / 2
     shortest = shortest_axis(rim)
-    lowest = max(1 - sectors.inner.max() * 1.2 / shortest, 1 - INNERMOST * (1 - hole)) ** 2
-    highest = min(1 + sectors.outer.max() * 1.2 / shortest, 1 + OUTERMOST)
+    inner, outer = _widest(sectors)
+    lowest = max(1 - inner * 1.2 / shortest, 1 - INNERMOST * (1 - hole)) ** 2
+    highest = min(1 + outer * 1.2 / shortest, 1 + OUTERMOST)
     left, right, top, bottom = window(rim, highest, image.shape)
     highest = highest * highest
     for v in range(top, bottom, stride):
@@ -92,13 +94,26 @@ def add_up(image, rim: Rim, own, noise: SideNoise, sectors, stride, hole, sums):
     _mirror(sums)
 
 
-@njit
+@njit(inline="always")
 def _clear(sums):
     for j in range(SECTORS):
-        sums[j].normal[:], sums[j].right[:] = 0, 0
-    sums.squares[:], sums.count[:] = 0, 0
-    sums.dark2[:], sums.mixed[:], sums.bright2[:] = 0, 0, 0
-    sums.dark_squares[:], sums.bright_squares[:] = 0, 0
+        normal, right = sums[j].normal, sums[j].right
+        for m in range(UNKNOWNS):
+            for n in range(UNKNOWNS):
+                normal[m, n] = 0.0
+            right[m] = 0.0
+        sums[j].squares = sums[j].count = 0.0
+        sums[j].dark2 = sums[j].mixed = sums[j].bright2 = 0.0
+        sums[j].dark_squares = sums[j].bright_squares = 0.0
+
+
+@njit(inline="always")
+def _widest(sectors):
+    """The largest extents of the band inwards and outwards, px."""
+    inner, outer = 0.0, 0.0
+    for j in range(SECTORS):
+        inner, outer = max(inner, sectors[j].inner), max(outer, sectors[j].outer)
+    return inner, outer
 
 
 @njit(inline="always", error_model="numpy")
@@ -186,7 +201,7 @@ def _accumulate(sums, light: Light, distance, wide, noise: SideNoise):
     sums.bright_squares += robust * share * squared
 
 
-@njit
+@njit(inline="always")
 def _mirror(sums):
     """Copy the upper triangles of the normal matrices to the lower ones."""
     for j in range(SECTORS):
@@ -223,14 +238,16 @@ def first_levels(image, rim: Rim, reach, hole):
                 bright_count[j] += 1
                 bright_sum[j] += image[v, u]
     none = SideNoise(1.0, 1.0)
-    seen = np.minimum(dark_count, bright_count) > 0
-    if seen.sum() < LEAST_SECTORS:
+    seen, dark, bright = np.empty(SECTORS, np.bool_), np.empty(SECTORS), np.empty(SECTORS)
+    for j in range(SECTORS):
+        seen[j] = min(dark_count[j], bright_count[j]) > 0
+        dark[j], bright[j] = dark_sum[j] / max(dark_count[j], 1), bright_sum[j] / max(bright_count[j], 1)
+    if count(seen) < LEAST_SECTORS:
         return False, rim, none
-    dark, bright = dark_sum / np.maximum(dark_count, 1), bright_sum / np.maximum(bright_count, 1)
     ring_like = steep(dark, bright, seen)
-    if ring_like.sum() < LEAST_SECTORS:
+    if count(ring_like) < LEAST_SECTORS:
         return False, rim, none
-    low, high = np.median(dark[ring_like]), np.median(bright[ring_like])
+    low, high = quantile_of(dark, ring_like, 0.5), quantile_of(bright, ring_like, 0.5)
     noise = max((0.1 * (high - low)) ** 2, ROUNDING)
     return high > low, with_levels(rim, low, high), SideNoise(noise, noise)
 
@@ -241,11 +258,11 @@ def middle_level(image, rim: Rim, hole):
     shape = inverse_shape(rim)
     size = 0.5 * hole
     left, right, top, bottom = window(rim, size, image.shape)
-    count, total = 0, 0.0
+    number, total = 0, 0.0
     for v in range(top, bottom):
         for u in range(left, right):
             x, y = u - rim.x, v - rim.y
             if (shape.a * x + shape.b * y) ** 2 + (shape.b * x + shape.c * y) ** 2 <= size * size:
-                count += 1
+                number += 1
                 total += image[v, u]
-    return total / count if count else np.nan
+    return total / number if number else np.nan

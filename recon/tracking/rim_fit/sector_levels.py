@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from recon.compiled import njit
-from recon.tracking.rim_fit.cholesky import solve_and_invert
+from recon.geometry.cholesky import solve_and_invert
+from recon.geometry.order_statistics import count, quantile_of
 from recon.tracking.rim_fit.sectors import BRIGHT, DARK, GROWTH, SECTORS, free_levels
 
 MEDIAN = 0.455  # of a square of a normal number of mean 0 and variance 1
@@ -47,40 +48,47 @@ def estimate_spread(sums, own, weights, arc, before: Spread):
     """
     free = free_levels(sums)
     dark, bright, growth = before.dark, before.bright, before.growth
-    counted = (weights > 0.5) & (free.dark_variance > 0)
-    if counted.sum() > 0:
-        dark = _spread_beyond_noise(own.dark + free.dark, free.dark_variance, counted)
-        bright = _spread_beyond_noise(own.bright + free.bright, free.bright_variance, counted)
-    leaning = own.leaning[own.leaning != 0]  # of sectors between two that count
-    if len(leaning) > 0:
-        growth = max(math.sqrt(np.median(leaning**2) / MEDIAN) / arc, NONE)
+    dark_squares, bright_squares, leaning_squares = np.empty(SECTORS), np.empty(SECTORS), np.empty(SECTORS)
+    counted, between = np.empty(SECTORS, np.bool_), np.empty(SECTORS, np.bool_)
+    for j in range(SECTORS):
+        counted[j] = weights[j] > 0.5 and free.dark_variance[j] > 0
+        between[j] = own[j].leaning != 0  # two that count
+        dark_squares[j] = (own[j].dark + free.dark[j]) ** 2 - free.dark_variance[j]
+        bright_squares[j] = (own[j].bright + free.bright[j]) ** 2 - free.bright_variance[j]
+        leaning_squares[j] = own[j].leaning ** 2
+    if count(counted) > 0:
+        dark = math.sqrt(max(quantile_of(dark_squares, counted, 0.5) / MEDIAN, NONE**2))
+        bright = math.sqrt(max(quantile_of(bright_squares, counted, 0.5) / MEDIAN, NONE**2))
+    if count(between) > 0:
+        growth = max(math.sqrt(quantile_of(leaning_squares, between, 0.5) / MEDIAN) / arc, NONE)
     return Spread(dark, bright, growth)
-
-
-@njit(error_model="numpy")
-def _spread_beyond_noise(levels, variance, counted):
-    """Robust standard deviation of levels, less their variance by noise."""
-    squares = levels**2 - variance
-    return math.sqrt(max(np.median(squares[counted]) / MEDIAN, NONE**2))
 
 
 @njit(error_model="numpy")
 def eliminate(sums, own, spread: Spread, reduced):
     """Fill the sectors' normal equations over the common unknowns : (SECTORS,) REDUCED, with own levels eliminated."""
-    held, across, inverse, unused = np.empty((3, 3)), np.empty((3, COMMON + 1)), np.empty((3, 3)), np.empty(3)
+    held, across, inverse, unused, goal = np.empty((3, 3)), np.empty((3, COMMON + 1)), np.empty((3, 3)), np.empty(3), np.empty(3)
     for j in range(SECTORS):
         normal, right, response = reduced[j].normal, reduced[j].right, reduced[j].response
-        normal[:], right[:], response[:] = 0, 0, 0
+        for m in range(COMMON):
+            for n in range(COMMON):
+                normal[m, n] = 0.0
+            right[m] = 0.0
+        for p in range(3):
+            for n in range(COMMON + 1):
+                response[p, n] = 0.0
         if not sums[j].count > 0:
             continue
         _hold(sums[j], own[j], spread, held, across)
-        if not solve_and_invert(held, across[:, COMMON], unused, inverse):
+        for p in range(3):
+            goal[p] = across[p, COMMON]
+        if not solve_and_invert(held, goal, unused, inverse):
             continue
         _multiply(inverse, across, response)
         for m in range(COMMON):
             for n in range(m, COMMON):
-                normal[m, n] = sums[j].normal[m, n] - (across[:, m] * response[:, n]).sum()
-            right[m] = sums[j].right[m] - (across[:, m] * response[:, COMMON]).sum()
+                normal[m, n] = sums[j].normal[m, n] - _product(across, m, response, n)
+            right[m] = sums[j].right[m] - _product(across, m, response, COMMON)
 
 
 @njit(inline="always", error_model="numpy")
@@ -106,15 +114,29 @@ def _multiply(left, right, product):
                 product[p, n] += left[p, q] * right[q, n]
 
 
+@njit(inline="always", error_model="numpy")
+def _product(left, m, right, n):
+    """Inner product of column m and column n."""
+    total = 0.0
+    for p in range(3):
+        total += left[p, m] * right[p, n]
+    return total
+
+
 @njit(error_model="numpy")
 def update(own, reduced, steps, weights):
     """Update the sectors' offsets and tangential gradients after steps of their common unknowns : (SECTORS, COMMON)."""
     for j in range(SECTORS):
         response = reduced[j].response
-        own.dark[j] += response[0, COMMON] - (response[0, :COMMON] * steps[j]).sum()
-        own.bright[j] += response[1, COMMON] - (response[1, :COMMON] * steps[j]).sum()
-        own.growth[j] += response[2, COMMON] - (response[2, :COMMON] * steps[j]).sum()
+        dark, bright, growth = 0.0, 0.0, 0.0
+        for m in range(COMMON):
+            dark += response[0, m] * steps[j, m]
+            bright += response[1, m] * steps[j, m]
+            growth += response[2, m] * steps[j, m]
+        own[j].dark += response[0, COMMON] - dark
+        own[j].bright += response[1, COMMON] - bright
+        own[j].growth += response[2, COMMON] - growth
     for j in range(SECTORS):
         before, after = (j - 1) % SECTORS, (j + 1) % SECTORS
         known = min(weights[before], weights[j], weights[after]) > 0.5
-        own.leaning[j] = (own.bright[after] - own.bright[before]) / 2 if known else 0.0
+        own[j].leaning = (own[after].bright - own[before].bright) / 2 if known else 0.0

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.compiled import njit
+from recon.geometry.order_statistics import count, quantile_of
 from recon.tracking.rim_fit.rim_parameters import LEAST_VARIANCE, Rim
 
 Array = NDArray[np.float64]
@@ -147,8 +148,13 @@ def sector(x, y):
 @njit(error_model="numpy")
 def steep(dark, bright, seen):
     """Sectors with ring-like Michelson contrast : (SECTORS,) bool, of those with pixels, by their levels in any light."""
-    depth = (bright - dark) / np.maximum(np.abs(bright) + np.abs(dark), 1e-9)
-    return seen & (depth > STEEP * np.quantile(depth[seen], 0.75))
+    depth, likely = np.empty(SECTORS), np.empty(SECTORS, np.bool_)
+    for j in range(SECTORS):
+        depth[j] = (bright[j] - dark[j]) / max(abs(bright[j]) + abs(dark[j]), 1e-9)
+    least = STEEP * quantile_of(depth, seen, 0.75)
+    for j in range(SECTORS):
+        likely[j] = seen[j] and depth[j] > least
+    return likely
 
 
 @njit(error_model="numpy")
@@ -172,17 +178,20 @@ def weigh(sums, sectors, rim: Rim, own, fewest, weights):
 
     Sectors with less than `fewest` pixels don't count.
     """
-    seen = sums.count >= fewest
-    if seen.sum() < LEAST_SECTORS:
-        return 0.0
-    mean = sums.squares / np.maximum(sums.count, 1e-9)
+    seen, mean, dark, bright = np.empty(SECTORS, np.bool_), np.empty(SECTORS), np.empty(SECTORS), np.empty(SECTORS)
     free = free_levels(sums)
-    dark = rim.dark + rim.dark_x * sectors.x + rim.dark_y * sectors.y + own.dark + free.dark
-    bright = rim.bright + rim.bright_x * sectors.x + rim.bright_y * sectors.y + own.bright + free.bright
-    likely = steep(dark, bright, seen)
-    if likely.sum() < LEAST_SECTORS:
+    for j in range(SECTORS):
+        seen[j] = sums[j].count >= fewest
+        mean[j] = sums[j].squares / max(sums[j].count, 1e-9)
+        x, y = sectors[j].x, sectors[j].y
+        dark[j] = rim.dark + rim.dark_x * x + rim.dark_y * y + own[j].dark + free.dark[j]
+        bright[j] = rim.bright + rim.bright_x * x + rim.bright_y * y + own[j].bright + free.bright[j]
+    if count(seen) < LEAST_SECTORS:
         return 0.0
-    usual = np.median(mean[likely])
+    likely = steep(dark, bright, seen)
+    if count(likely) < LEAST_SECTORS:
+        return 0.0
+    usual = quantile_of(mean, likely, 0.5)
     if not usual > 0:
         usual = 1.0
     for j in range(SECTORS):
@@ -200,8 +209,14 @@ def even_noise(noise: SideNoise, usual):
 @njit(error_model="numpy")
 def side_noise(sums, weights, noise: SideNoise):
     """Noise of the dark and of the bright side, by least squares from the weighted residuals; the one before if undetermined."""
-    a, b, c = (weights * sums.dark2).sum(), (weights * sums.mixed).sum(), (weights * sums.bright2).sum()
-    p, q = (weights * sums.dark_squares).sum() / KEPT, (weights * sums.bright_squares).sum() / KEPT
+    a, b, c, p, q = 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(SECTORS):
+        a += weights[j] * sums[j].dark2
+        b += weights[j] * sums[j].mixed
+        c += weights[j] * sums[j].bright2
+        p += weights[j] * sums[j].dark_squares
+        q += weights[j] * sums[j].bright_squares
+    p, q = p / KEPT, q / KEPT
     dark, bright = noise.dark, noise.bright
     determinant = a * c - b * b
     if determinant > 1e-6 * a * c:

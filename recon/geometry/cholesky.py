@@ -38,5 +38,7 @@ def solve_and_invert(matrix, right, solution, inverse):
                 total += half[k, i] * half[k, j]
             inverse[i, j] = inverse[j, i] = total
     for i in range(n):
-        solution[i] = (inverse[i] * right).sum()
+        solution[i] = 0.0
+        for k in range(n):
+            solution[i] += inverse[i, k] * right[k]
     return True

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recon.tracking.rim_fit.cholesky import solve_and_invert
+from recon.geometry.cholesky import solve_and_invert
 
 
 @pytest.mark.parametrize("size", [1, 3, 14])
