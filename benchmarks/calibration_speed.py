@@ -30,9 +30,9 @@ def whole_calibration() -> list[Row]:
     what = f"{len(seen.sightings)} poses, 52 images 1280x1024 each"
     together = seen.seconds + adjusting
     return [
-        Row("h", f"{what}: three devices, all together (peer: two cameras, OpenCV)", together, 60, finding + pair, "s"),
-        Row("h", f"{what}: of that, find the board and decode the fringes", seen.seconds, 45, finding, "s"),
-        Row("h", f"{what}: of that, choose the lens models and adjust", adjusting, 45, pair, "s"),
+        Row("h", f"{what}: three devices, all together (peer: two cameras, OpenCV)", together, 20, finding + pair, "s"),
+        Row("h", f"{what}: of that, find the board and decode the fringes", seen.seconds, 14, finding, "s"),
+        Row("h", f"{what}: of that, choose the lens models and adjust", adjusting, 6, pair, "s"),
     ]
 
 
