@@ -95,9 +95,10 @@ def test_what_another_run_is_writing_is_left_alone(tmp_path):
     assert names(tmp_path) == ["folder"]
 
 
-@pytest.mark.parametrize("number", [os.getpid(), os.getppid()])
-def test_a_killed_process_may_have_had_the_number_of_a_living_one(tmp_path, number):
+@pytest.mark.parametrize("process", [os.getpid, os.getppid], ids=["own", "parent"])
+def test_a_killed_process_may_have_had_the_number_of_a_living_one(tmp_path, process):
     """As in containers, where every run has the same: its leftovers neither stand in the way nor hold back what was set aside."""
+    number = process()
     write_both(tmp_path, "first")
     (tmp_path / "capture").rename(tmp_path / f".capture.{number}.old")
     for name in ("capture", "truth"):
