@@ -28,7 +28,7 @@ class Spans(NamedTuple):
 
     depths: Array  # (n / 8, m / 5, MOST, 2) mm, START and STOP
     counts: NDArray[np.int64]  # (n / 8, m / 5)
-    close: NDArray[np.bool_]  # (n / 8, m / 5, k) which solids have borders there
+    close: NDArray[np.bool_]  # (n / 8, m / 5, MOST, k) which solids have borders in a span
 
 
 class Bundles(NamedTuple):
@@ -65,9 +65,9 @@ def spans(body: Body, world_from_image: Array, x: Array, z: Array, first_mm: Arr
 def _spans(solids, pose, bundles):
     n, m = len(bundles.along), len(bundles.across)
     depths, counts = np.zeros((n, m, MOST, 2)), np.zeros((n, m), np.int64)
-    close = np.zeros((n, m, len(solids.grid)), np.bool_)
+    close = np.zeros((n, m, MOST, len(solids.grid)), np.bool_)
     for i in prange(n):
-        clear = np.zeros(len(solids.grid))
+        clear, near = np.zeros(len(solids.grid)), np.zeros(len(solids.grid), np.bool_)
         for j in range(m):
             along, across = bundles.along[i], bundles.across[j]
             x = pose[0, 0] * along + pose[0, 2] * across + pose[0, 3]
@@ -77,8 +77,7 @@ def _spans(solids, pose, bundles):
             clear[:] = t
             while t < bundles.deepest_mm:
                 point = x + pose[0, 1] * t, y + pose[1, 1] * t, z + pose[2, 1] * t
-                met = _borders_near(clear, close[i, j], solids, point, t, bundles.radius_mm)
-                if not met:
+                if not _borders_near(clear, near, solids, point, t, bundles.radius_mm):
                     t = min(clear.min(), bundles.deepest_mm) if len(clear) else bundles.deepest_mm
                     continue
                 if t > end and count < MOST:
@@ -86,20 +85,22 @@ def _spans(solids, pose, bundles):
                     count += 1
                 end = min(t + GROWTH_MM, bundles.deepest_mm)
                 depths[i, j, count - 1, STOP] = end
+                for solid in range(len(near)):
+                    close[i, j, count - 1, solid] |= near[solid]
                 t += GROWTH_MM
             counts[i, j] = count
     return depths, counts, close
 
 
 @njit(inline="always")
-def _borders_near(clear, close, solids, point, t, radius_mm):
+def _borders_near(clear, near, solids, point, t, radius_mm):
     """Whether a border may lie in a bundle at a depth; marks its solids, and the depths up to which each is sure to have none."""
     met = False
     for solid in range(len(clear)):
+        near[solid] = False
         if t >= clear[solid]:
             d = distance_at(solids, solid, point[0], point[1], point[2])
-            here = abs(d) <= radius_mm + GROWTH_MM
-            clear[solid] = t + (GROWTH_MM if here else min(abs(d) - radius_mm, LEAP_MM))
-            close[solid] |= here
-            met |= here
+            near[solid] = abs(d) <= radius_mm + GROWTH_MM
+            clear[solid] = t + (GROWTH_MM if near[solid] else min(abs(d) - radius_mm, LEAP_MM))
+            met |= near[solid]
     return met

@@ -191,8 +191,8 @@ def _crossings_of(ray, crossings, distances, solids, spans, bundle, beam, repeat
         here, stride = -1, 0.0
         t, stop = spans.depths[bundle[0], bundle[1], span, START], spans.depths[bundle[0], bundle[1], span, STOP]
         while True:
-            there, near = _tissue_at(ray, t, solids, spans.close[bundle], distances, started)
-            started = True  # solids without borders near the bundle need no second look
+            there, near = _tissue_at(ray, t, solids, spans.close[bundle[0], bundle[1], span], distances, started)
+            started = True  # a solid without borders in a span is on the same side as before
             if here >= 0 and there != here and met < CROSSINGS and _in_slice(t, ray.across, repeats, beam):
                 solid = max(here, there) - 1
                 before, after = distances[BEFORE, solid], distances[AFTER, solid]
