@@ -6,6 +6,7 @@ variance; it holds where the points' errors are independent.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
@@ -143,7 +144,7 @@ def fit_cylinder(points: ArrayLike) -> Fit[Cylinder]:
     points, middle = _checked(points, 6)
     local = points - middle
     few = local[:: max(1, len(local) // START_POINTS)]
-    axis, centre, radius = min((_circle_along(few, axis) for axis in _half_sphere(AXES_TRIED)), key=lambda start: start[3])[:3]
+    axis, centre, radius = _rough_cylinder(few)
     for _ in range(2):  # the second round turns the frame onto the solution, where tilts and covariance are meant
         across = _across(axis)
         start = np.array([*(across @ centre), 0, 0, radius])
@@ -151,9 +152,20 @@ def fit_cylinder(points: ArrayLike) -> Fit[Cylinder]:
         def distances(p: Array, across: Array = across, axis: Array = axis) -> Array:
             direction = axis + p[2:4] @ across
             direction /= np.linalg.norm(direction)
-            return np.linalg.norm(np.cross(local - p[:2] @ across, direction), axis=1) - p[4]
+            return np.linalg.norm(_radial(local - p[:2] @ across, direction), axis=1) - p[4]
 
-        solution, residuals, covariance = _solve(distances, start)
+        def jacobian(p: Array, across: Array = across, axis: Array = axis) -> Array:
+            direction = axis + p[2:4] @ across
+            size = np.linalg.norm(direction)
+            direction /= size
+            offset = local - p[:2] @ across
+            radial = _radial(offset, direction)
+            outwards = radial / np.maximum(np.linalg.norm(radial, axis=1), 1e-12)[:, None]
+            turned = (across - np.outer(across @ direction, direction)) / size  # of the direction, by the tilts
+            tilts = -(offset @ direction)[:, None] * (outwards @ turned.T)
+            return np.column_stack([-outwards @ across.T, tilts, np.full(len(local), -1.0)])
+
+        solution, residuals, covariance = _solve(distances, start, jacobian)
         axis = axis + solution[2:4] @ across
         axis /= np.linalg.norm(axis)
         centre, radius = solution[:2] @ across, float(solution[4])
@@ -161,7 +173,7 @@ def fit_cylinder(points: ArrayLike) -> Fit[Cylinder]:
     return Fit(Cylinder("", middle + centre, axis, radius), residuals, covariance)
 
 
-def _solve(distances: Callable[[Array], Array], start: Array, jacobian: Callable | str = "2-point") -> tuple[Array, Array, Array]:
+def _solve(distances: Callable[[Array], Array], start: Array, jacobian: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
     """Least squares, first with outliers held down to find the right place, then plain: solution, residuals, covariance."""
     spread = np.median(np.abs(distances(start))) + 1e-9
     held = least_squares(distances, start, jacobian, loss="soft_l1", f_scale=3 * spread, x_scale="jac")
@@ -174,15 +186,30 @@ def _covariance(jacobian: Array, residuals: Array) -> Array:
     return np.linalg.inv(jacobian.T @ jacobian) * (residuals @ residuals) / freedom
 
 
-def _circle_along(points: Array, axis: Array) -> tuple[Array, Array, float, float]:
-    """Algebraic circle of the points seen along an axis: axis, centre in space, radius, median distance."""
-    across = _across(axis)
-    flat = points @ across.T
-    system = np.column_stack([2 * flat, np.ones(len(flat))])
-    x, y, w = np.linalg.lstsq(system, (flat**2).sum(axis=1), rcond=None)[0]
-    radius = float(np.sqrt(max(w + x * x + y * y, 0)))
-    distance = np.abs(np.hypot(flat[:, 0] - x, flat[:, 1] - y) - radius)
-    return axis, np.array([x, y]) @ across, radius, float(np.median(distance))
+def _radial(offsets: Array, direction: Array) -> Array:
+    """The parts of vectors : (n, 3) across a unit direction."""
+    return offsets - np.outer(offsets @ direction, direction)
+
+
+def _rough_cylinder(points: Array) -> tuple[Array, Array, float]:
+    """Axis, a point on it and radius: of many axes the one along which points : (n, 3) lie best on an algebraic circle."""
+    axes, across = _axes_tried()
+    flat = points @ across.swapaxes(1, 2)  # (axes, n, 2)
+    system = np.concatenate([2 * flat, np.ones((*flat.shape[:2], 1))], axis=2)
+    transposed = system.swapaxes(1, 2)
+    squares = (flat**2).sum(axis=2, keepdims=True)
+    x, y, w = np.moveaxis(np.linalg.pinv(transposed @ system) @ (transposed @ squares), 1, 0)  # each (axes, 1)
+    radius = np.sqrt(np.maximum(w + x * x + y * y, 0))
+    distance = np.median(np.abs(np.hypot(flat[..., 0] - x, flat[..., 1] - y) - radius), axis=1)
+    best = int(distance.argmin())
+    return axes[best], x[best] * across[best, 0] + y[best] * across[best, 1], float(radius[best, 0])
+
+
+@cache
+def _axes_tried() -> tuple[Array, Array]:
+    """Axes : (n, 3) all over the half sphere, and two directions across each : (n, 2, 3)."""
+    axes = _half_sphere(AXES_TRIED)
+    return axes, np.array([_across(axis) for axis in axes])
 
 
 def _across(axis: Array) -> Array:
