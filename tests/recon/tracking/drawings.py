@@ -82,6 +82,7 @@ def frame(camera, poses, target, white=100.0, rng=None, lens=LENS_PX, ground=0.2
 
 def read_out(mean, rng):
     """Shot, dark and fixed noise of the rig's sensor, black level, rounding and clipping, to 8 bits."""
+    mean = np.asarray(mean, np.float32)
     electrons = np.maximum(mean * ELECTRONS * (1 + 0.008 * rng.standard_normal(mean.shape, np.float32)), 0)
     electrons = electrons + np.sqrt(electrons + DARK_E**2 + 8.0**2) * rng.standard_normal(mean.shape, np.float32)
     return np.clip(np.rint(electrons / ELECTRONS + BLACK_DN), 0, 255).astype(np.uint8)

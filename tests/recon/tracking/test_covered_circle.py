@@ -76,10 +76,14 @@ def test_a_target_with_a_middle_that_is_hidden_is_found(cameras, rig, rng, which
 
 def halved(image, ellipse, level, rng):
     """With something over more than half of an ellipse, to one side, and over what is around it there."""
-    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
-    x, y = u - ellipse.centre[0, 0], v - ellipse.centre[0, 1]
     angle, radius = rng.uniform(0, 2 * np.pi), np.sqrt(np.linalg.det(ellipse.shape[0]))
-    hidden = (x * np.cos(angle) + y * np.sin(angle) > -0.1 * radius) & (np.hypot(x, y) < 1.4 * radius)
+    left, top = np.maximum(np.floor(ellipse.centre[0] - 1.5 * radius), 0).astype(int)
+    about = np.s_[top : top + int(3 * radius) + 2, left : left + int(3 * radius) + 2]
+    v, u = np.mgrid[about]
+    hidden = np.zeros(image.shape, bool)
+    part = hidden[about]
+    x, y = (axis[: part.shape[0], : part.shape[1]] for axis in (u - ellipse.centre[0, 0], v - ellipse.centre[0, 1]))
+    part[:] = (x * np.cos(angle) + y * np.sin(angle) > -0.1 * radius) & (np.hypot(x, y) < 1.4 * radius)
     return painted(image, hidden, level, rng)
 
 
