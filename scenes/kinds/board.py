@@ -60,7 +60,7 @@ class Print(NamedTuple):
     centres: Array  # (n, 2)
     radius: float
     middle: Array  # (2,) of the ground
-    half: Array  # (2,) sides of the ground
+    half: Array  # (2,) its half sides
     warp: float  # z of the front face is `warp (x^2 - y^2)`, with x and y from the middle in half sides
 
 
