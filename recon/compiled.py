@@ -46,7 +46,9 @@ def njit(function: Callable | None = None, noalias: bool = False, **options: Any
         return lambda decorated: njit(decorated, noalias, **options)
     dispatcher = numba.njit(cache=True, **options)(function)
     if noalias:
-        dispatcher._compiler._customize_flags = _without_aliases
+        compiler = _of_numba(dispatcher, "_compiler")
+        _of_numba(compiler, "_customize_flags")
+        compiler._customize_flags = _without_aliases
     _one_process_compiles(dispatcher)
     return dispatcher
 

@@ -38,6 +38,7 @@ UNFINISHED = "unfinished"
 
 EVEN_SAMPLES = 8  # paths for a pixel of an image without fringes, where all that it sees has one brightness
 EDGE_SAMPLES = 256  # paths for a pixel at the edge of a circle that isn't computed, which is half black, half white
+SIDE_SAMPLES = 64  # paths for a pixel at a side of the board
 
 
 @dataclass(frozen=True)
@@ -189,13 +190,14 @@ def trace_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine,
 def refine_edges(
     radiance: Images, stage: Stage, optics: CameraOptics, engine: Engine, world_from_board: rigid.Array, seed: int
 ) -> None:
-    """Compute the pixels at edges of discs in a lit image : (h, w), in place; where that can't be done, trace many paths."""
+    """Compute the pixels at edges of discs in a lit image : (h, w), in place; trace the rest of them, and the sides, anew."""
     left = compute_edges(radiance, optics, stage.print, world_from_board, seed)
-    if len(left):
-        finer = engine.model_copy(update={"samples": max(engine.samples, EDGE_SAMPLES)})
-        light = fully_on(stage.patterns)
-        found = render_pixels(stage.world, optics, stage.projector, light, finer, seed, left, convex=stage.convex)
-        radiance.ravel()[left] = found[0]
+    for pixels, samples in ((left.edges, EDGE_SAMPLES), (left.sides, SIDE_SAMPLES)):
+        if len(pixels):
+            finer = engine.model_copy(update={"samples": max(engine.samples, samples)})
+            light = fully_on(stage.patterns)
+            found = render_pixels(stage.world, optics, stage.projector, light, finer, seed, pixels, convex=stage.convex)
+            radiance.ravel()[pixels] = found[0]
 
 
 def fully_on(light: Light) -> Light:

@@ -4,6 +4,7 @@ One process at a time writes a place, and others wait for it: a hidden lock lies
 a place whose lock is free are therefore leftovers of a process that was killed.
 """
 
+import errno
 import logging
 import os
 import re
@@ -26,8 +27,10 @@ log = logging.getLogger(__name__)
 def new_file(path: Path) -> Iterator[Path]:
     """Give a temporary path with the same suffix to write to; on success it becomes `path`, on failure it goes away."""
     path = Path(path)
+    if not path.parent.is_dir():  # the lock's file would make it
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
     temporary = _beside(path, "new")
-    with _alone(path):
+    with alone(path):
         try:
             yield temporary
             os.replace(temporary, path)
@@ -61,7 +64,7 @@ def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
         for path in sorted(paths):
             _check_writable(path)
             path.parent.mkdir(parents=True, exist_ok=True)
-            locks.enter_context(_alone(path))
+            locks.enter_context(alone(path))
         _put_back(paths)
         for path, marker in zip(paths, places.values(), strict=True):
             check_folder(path, marker)
@@ -103,7 +106,7 @@ def restore(paths: Sequence[Path]) -> None:
     if any(_leftovers(path, "new|old") for path in paths):
         with ExitStack() as locks, suppress(Timeout):
             for path in sorted(paths):
-                locks.enter_context(_alone(path, wait=False))
+                locks.enter_context(alone(path, wait=False))
             _put_back(paths)
 
 
@@ -143,7 +146,7 @@ def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> No
 def remove_leftovers(path: Path) -> None:
     """Remove the temporary files and folders that a process which was killed while it wrote `path` has left beside it."""
     if _leftovers(path, "new|old"):
-        with suppress(Timeout), _alone(path, wait=False):  # what another process is writing is no leftover
+        with suppress(Timeout), alone(path, wait=False):  # what another process is writing is no leftover
             _remove(_leftovers(path, "new|old"))
 
 
@@ -189,7 +192,7 @@ def _check_writable(path: Path) -> None:
 
 
 @contextmanager
-def _alone(path: Path, wait: bool = True) -> Iterator[None]:
+def alone(path: Path, wait: bool = True) -> Iterator[None]:
     """Hold the lock of a place. Where another process, or another thread, holds it: wait, or raise Timeout."""
     place = path.with_name(f".{path.name}.lock")
     announce = partial(log.warning, "%s: waiting for another process that is writing it", path)

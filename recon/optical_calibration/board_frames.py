@@ -1,6 +1,5 @@
 """From the board part of a capture to sightings: the devices that take part, and the poses in which each found the board."""
 
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -41,12 +40,11 @@ def look_at_all(captured: BoardCapture) -> Iterator[Sighting]:
         If an image is damaged, or doesn't fit its device.
     """
     with ThreadPoolExecutor(1) as reader:
-        waiting = deque([reader.submit(captured.pose, 0)])
-        for number in range(1, len(captured.poses) + 1):
-            pose = waiting.popleft().result()
-            if number < len(captured.poses):
-                waiting.append(reader.submit(captured.pose, number))
+        following = reader.submit(captured.pose, 0)
+        for number in range(1, len(captured.poses)):
+            pose, following = following.result(), reader.submit(captured.pose, number)
             yield _look(captured, pose)
+        yield _look(captured, following.result())
 
 
 def _look(captured: BoardCapture, pose: Pose) -> Sighting:

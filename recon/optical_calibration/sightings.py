@@ -71,7 +71,7 @@ def sight(
     if fringes is not None and patterns is not None and FIRST in found:
         try:
             centres, reach = found[FIRST].pixels, _reach(found[FIRST], board)
-            rows, columns = _around(centres, reach, lit[FIRST].shape)
+            rows, columns = _around(centres, reach, patterns, lit[FIRST].shape)
             projector_map = decode(fringes[:, rows, columns], patterns, bits=bits[FIRST], name=f"{name}: fringes")
             corner = np.array([columns.start, rows.start])
             seen = correspondences(projector_map, lit[FIRST][rows, columns], centres - corner, reach)
@@ -118,9 +118,16 @@ def gather(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size
     )
 
 
-def _around(centres: Array, reach: Array, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of the part of an image that holds the windows about all points, with a margin."""
-    known = np.isfinite(centres).all(axis=1)
+def _around(centres: Array, reach: Array, patterns: Patterns, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of the part of an image that holds the windows about all points, with a margin.
+
+    With a centre line, which may lie beside the board, it is the whole.
+    """
+    if patterns.unwrap == "centre_line":
+        return slice(0, shape[0]), slice(0, shape[1])
+    known = np.isfinite(centres).all(axis=1) & np.isfinite(reach)
+    if not known.any():
+        raise InputError("expected points in more than one row, found none whose distance to its neighbours is known")
     low = np.floor((centres[known] - reach[known, None]).min(axis=0)).astype(int) - MARGIN
     high = np.ceil((centres[known] + reach[known, None]).max(axis=0)).astype(int) + MARGIN + 1
     (left, top), (right, bottom) = np.maximum(low, 0).tolist(), np.minimum(high, shape[::-1]).tolist()

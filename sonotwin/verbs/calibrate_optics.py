@@ -70,11 +70,10 @@ def run(config: Config) -> None:
 
     start = perf_counter()
     sightings = []
-    with console.status("") as status:
-        found = board_frames.look_at_all(captured)
-        for number, name in enumerate(captured.poses, start=1):
-            status.update(f"looking for the board, pose {name}, {number} of {len(captured.poses)}")
-            sightings.append(next(found))
+    with console.status("looking for the board") as status:
+        for number, sighting in enumerate(board_frames.look_at_all(captured), start=1):
+            sightings.append(sighting)
+            status.update(f"looking for the board, {number} of {len(captured.poses)} poses done")
     seconds = {"seconds_detect": round(perf_counter() - start, 3)}
     console.print(f"detect      {board_frames.found_by(sightings, sizes)}, {seconds['seconds_detect']:.0f} s", markup=False)
     missed = board_frames.not_found(sightings)

@@ -22,6 +22,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon.capture.manifest import axes_without_fringes
+from recon.files import atomic
+from recon.geometry.rigid import Array
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 from scenes.board_poses import Config as BoardPoses
@@ -100,6 +102,14 @@ def render_board(config: Config, chosen: BoardPoses, session: Session, console: 
         config.seed,
     )
     placed = board_session.place_all(settings)
+    session.check()
+    with atomic.alone(session.out / "board"):
+        if not board_session.is_finished(session):  # as it may be after a wait for another run
+            render_poses(settings, placed, session, console)
+
+
+def render_poses(settings: board_session.Settings, placed: Array, session: Session, console: Console) -> None:
+    """The board in those of the poses : (p, 4, 4) that no earlier run has left."""
     missing = board_session.missing_poses(session, settings)
     if len(missing) < len(placed):
         console.print(f"continue    {len(placed) - len(missing)} of {len(placed)} poses are there already")
@@ -110,14 +120,13 @@ def render_board(config: Config, chosen: BoardPoses, session: Session, console: 
     for camera, exposure in exposures.items():
         console.print(f"exposure    {camera}, {exposure.time_s * 1e3:.2f} ms")
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        for number in progress.track(missing, description=f"rendering {config.patterns.count} patterns a pose"):
+        for number in progress.track(missing, description=f"rendering {settings.patterns.count} patterns a pose"):
             images = board_session.shoot_pose(stage, settings, exposures, number, placed[number])
             board_session.write_pose(session, number, *images)
     board_session.finish(session, settings, exposures, placed)
     seconds = perf_counter() - start
-    console.print(
-        f"render      {len(missing)} poses, {config.patterns.count} patterns, {config.engine.samples} samples/px, {seconds:.1f} s"
-    )
+    patterns, samples = settings.patterns.count, settings.engine.samples
+    console.print(f"render      {len(missing)} poses, {patterns} patterns, {samples} samples/px, {seconds:.1f} s")
 
 
 def render_surface(config: Config, session: Session, console: Console) -> None:

@@ -25,7 +25,7 @@ SAMPLES = 256  # of a pixel's light
 WINDOW = 15  # px about a pixel, in which black and white are looked for
 FEWEST = 40  # pixels of either that a plane needs
 BENDS = 4  # iterations to a ray's place on a bowed board, each a hundredth of the step before
-OFF, WHITE, BLACK, EDGE = range(4)  # kinds of pixels: not on the ground as a whole, of one brightness, at the edge of a disc
+OFF, WHITE, BLACK, EDGE, SIDE = range(5)  # kinds of pixels: off the board, of one brightness, at a disc's edge, at a side
 FEWER = 4  # times fewer samples in the outer half of the reach, where almost all light comes from one side
 DU, DV, LENS_X, LENS_Y = range(4)  # columns of the sample points
 
@@ -47,9 +47,14 @@ class Tables(NamedTuple):
     down: Array
 
 
-def compute_edges(
-    image: Images, optics: CameraOptics, board: Print, world_from_board: rigid.Array, seed: int
-) -> NDArray[np.uint32]:
+class Left(NamedTuple):
+    """Numbers `v * width + u` of pixels that aren't computed. Each (m,) uint32."""
+
+    edges: NDArray[np.uint32]  # of discs too small, or too near to each other, to leave pixels about all black or all white
+    sides: NDArray[np.uint32]  # at the sides of the board
+
+
+def compute_edges(image: Images, optics: CameraOptics, board: Print, world_from_board: rigid.Array, seed: int) -> Left:
     """Compute the pixels at the edges of discs in a traced image of the board alone, in place.
 
     Parameters
@@ -61,9 +66,8 @@ def compute_edges(
 
     Returns
     -------
-    (m,) uint32
-        Numbers `v * width + u` of those pixels at edges that stay as they were: where discs are too small, or too near to each
-        other, to leave pixels about that are all black and others that are all white.
+    Left
+        Those at edges that stay as they were.
     """
     camera = optics.camera
     board_from_camera = np.ascontiguousarray(rigid.invert(world_from_board) @ rigid.invert(camera.camera_from_world))
@@ -79,7 +83,7 @@ def compute_edges(
     found = _mixed(image / optics.transmission, kinds, edges, shares) * transmission
     known = np.isfinite(found)
     image.ravel()[edges[known]] = found[known]
-    return edges[~known].astype(np.uint32)
+    return Left(edges[~known].astype(np.uint32), np.flatnonzero(kinds == SIDE).astype(np.uint32))
 
 
 def _corners(board: Print) -> Array:
@@ -164,11 +168,11 @@ def _kinds(view: View, board: Print, tables: Tables):
 def _kind(view: View, board: Print, tables: Tables, k):
     x, y = _meet(view, board, tables.centre[k, 0], tables.centre[k, 1], 0.0, 0.0)
     aside = max(abs(x - board.middle[0]) - board.half[0], abs(y - board.middle[1]) - board.half[1])
-    if not aside < 0:
-        return OFF
     reach = _reach_mm(view, board, tables, k, x, y)
-    if aside > -reach:
+    if not aside <= reach:
         return OFF
+    if aside > -reach:
+        return SIDE
     beyond = _beyond(board, _nearest_discs(board, x, y)[0], x, y)
     if abs(beyond) <= reach:
         return EDGE

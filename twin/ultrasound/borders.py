@@ -97,7 +97,7 @@ def _borders_near(clear, near, solids, point, t, radius_mm):
     """Whether a border may lie in a bundle at a depth; marks its solids, and the depths up to which each is sure to have none."""
     met = False
     for solid in range(len(clear)):
-        near[solid] = False
+        near[solid] = t < clear[solid] < t + GROWTH_MM
         if t >= clear[solid]:
             d = distance_at(solids, solid, point[0], point[1], point[2])
             near[solid] = abs(d) <= radius_mm + GROWTH_MM

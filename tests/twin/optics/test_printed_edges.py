@@ -44,7 +44,7 @@ def test_edges_are_those_of_very_many_paths(rig, patterns, design, aperture, rng
     computed = traced.copy()
     left = compute_edges(computed, optics, stage.print, pose, 1)
     changed = np.flatnonzero(computed != traced)
-    assert len(left) < 0.001 * len(changed)
+    assert len(left.edges) < 0.001 * len(changed) and not np.isin(left.sides, changed).any()
     chosen = rng.choice(changed, PIXELS, replace=False).astype(np.uint32)
     many = Engine(samples=PATHS)
     truth = render_pixels(stage.world, optics, stage.projector, light, many, 7, chosen, convex=stage.convex)[0]
