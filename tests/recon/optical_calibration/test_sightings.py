@@ -4,10 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.boards import Chessboard
 from recon.model.patterns import Fringes, GrayCode, Patterns
+from recon.optical_calibration import sightings
 from recon.optical_calibration.sightings import sight
 from tests.recon.board_views import pose, view
 
@@ -55,3 +57,25 @@ def test_images_of_any_depth_tell_the_points_of_camera_and_projector(bits, rng):
         assert known.mean() > 0.8 and np.abs(error[known]).max() < 0.1, name
     error = found.pixels["cam1"] - CAMERA.project(truth)
     assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance["cam1"]), error)) < 4
+
+
+def test_the_decoded_part_holds_all_windows():
+    """With a margin, within the image; a point that isn't seen doesn't count."""
+    centres = np.array([[100.0, 60.0], [200.5, 90.0], [np.nan, np.nan]])
+    rows, columns = sightings._around(centres, np.array([10.0, 12.0, 1.0]), PATTERNS, (256, 320))
+    margin = sightings.MARGIN
+    assert (rows.start, rows.stop) == (50 - margin, 102 + margin + 1)
+    assert (columns.start, columns.stop) == (90 - margin, 213 + margin + 1)
+    rows, columns = sightings._around(centres, np.full(3, 1000.0), PATTERNS, (256, 320))
+    assert (rows, columns) == (slice(0, 256), slice(0, 320))
+
+
+def test_with_a_centre_line_the_whole_image_is_decoded():
+    """The line may fall beside the board, on what it stands on."""
+    line = PATTERNS.model_copy(update={"unwrap": "centre_line"})
+    assert sightings._around(np.array([[100.0, 60.0]]), np.array([5.0]), line, (256, 320)) == (slice(0, 256), slice(0, 320))
+
+
+def test_points_without_a_known_distance_are_refused_by_the_cause():
+    with pytest.raises(InputError, match="more than one row"):
+        sightings._around(np.array([[100.0, 60.0], [120.0, 60.0]]), np.array([np.nan, np.inf]), PATTERNS, (256, 320))
