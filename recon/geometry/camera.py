@@ -147,7 +147,7 @@ def _distort_all(points, k):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _slopes(x, y, k):
+def distortion_slopes(x, y, k):
     """Jacobian of the distortion at (x, y): dxd/dx, dxd/dy, dyd/dx, dyd/dy."""
     right, left = distort(x + SLOPE_STEP, y, k), distort(x - SLOPE_STEP, y, k)
     below, above = distort(x, y + SLOPE_STEP, k), distort(x, y - SLOPE_STEP, k)
@@ -171,11 +171,11 @@ def _undistort(u, v, k):
         error = max(abs(ex), abs(ey))
         if not error > NEWTON_TOLERANCE:
             break
-        a, b, c, d = _slopes(x, y, k)
+        a, b, c, d = distortion_slopes(x, y, k)
         determinant = a * d - b * c
         x += (d * ex - b * ey) / determinant
         y += (a * ey - c * ex) / determinant
-    a, b, c, d = _slopes(x, y, k)
+    a, b, c, d = distortion_slopes(x, y, k)
     # past the fold of a polynomial a root is not a ray: the distortion mirrors there, or throws to the other side
     if error < ACCEPTED and x * u + y * v >= 0 and a * d - b * c > 0:
         return x, y

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.compiled import njit
-from recon.geometry.camera import SLOPE_STEP, Camera, distort
+from recon.geometry.camera import Camera, distort, distortion_slopes
 from recon.geometry.cholesky import solve_and_invert
 
 Array = NDArray[np.float64]
@@ -44,13 +44,11 @@ def _slopes(camera_from_world, points, matrix, k):
             for n in range(3):
                 local[m] += camera_from_world[m, n] * points[i, n]
         x, y = local[0] / local[2], local[1] / local[2]
-        right, left = distort(x + SLOPE_STEP, y, k), distort(x - SLOPE_STEP, y, k)
-        below, above = distort(x, y + SLOPE_STEP, k), distort(x, y - SLOPE_STEP, k)
+        x_by_x, x_by_y, y_by_x, y_by_y = distortion_slopes(x, y, k)
         for n in range(3):
             dx = (camera_from_world[0, n] - x * camera_from_world[2, n]) / local[2]
             dy = (camera_from_world[1, n] - y * camera_from_world[2, n]) / local[2]
-            bent_x = ((right[0] - left[0]) * dx + (below[0] - above[0]) * dy) / (2 * SLOPE_STEP)
-            bent_y = ((right[1] - left[1]) * dx + (below[1] - above[1]) * dy) / (2 * SLOPE_STEP)
+            bent_x, bent_y = x_by_x * dx + x_by_y * dy, y_by_x * dx + y_by_y * dy
             result[i, 0, n] = matrix[0, 0] * bent_x + matrix[0, 1] * bent_y
             result[i, 1, n] = matrix[1, 1] * bent_y
     return result
