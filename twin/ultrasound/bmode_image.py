@@ -1,10 +1,9 @@
 """From echoes to grey levels: point spread, noise, gain over depth, envelope, logarithm, quantisation."""
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel
 from scenes.acoustics import BACKSCATTER
 from twin.ultrasound.beam import OVERSAMPLING, Beam
 from twin.ultrasound.transducer import Transducer
@@ -15,7 +14,11 @@ Field = NDArray[np.complex64]
 
 def focused(field: Field, beam: Beam) -> Field:
     """Echoes after pulse and beam : (h, w), from a field of echoes at their places: the coherent sum."""
-    return _along(_in_depth(field, beam.axial), beam.lateral, beam.reach)
+    height, (lines, width) = len(beam.axial), (len(field), len(field) - beam.lateral.shape[1] + 1)
+    pulses, focused = np.zeros((height, lines), np.complex64), np.zeros((height, width), np.complex64)
+    in_threads(lambda first, end: _in_depth(first, end, pulses, field, beam.axial), lines)
+    in_threads(lambda first, end: _along(first, end, focused, pulses, beam.lateral, beam.reach), height)
+    return focused
 
 
 def reference_power(transducer: Transducer, beam: Beam) -> Array:
@@ -59,31 +62,24 @@ def grey(envelope: NDArray[np.float32], transducer: Transducer) -> NDArray[np.ui
     return np.rint(steps * (255 / levels)).astype(np.uint8)
 
 
-@njit(parallel=True, fastmath=True)
-def _in_depth(field, axial):
-    lines, samples = field.shape
+@kernel(fastmath=True)
+def _in_depth(first, end, pulses, field, axial):
     rows, taps = axial.shape
-    reach = taps // 2
-    result = np.zeros((rows, lines), np.complex64)
-    for line in prange(lines):
+    reach, samples = taps // 2, field.shape[1]
+    for line in range(first, end):
         for r in range(rows):
             total = np.complex64(0)
             middle = OVERSAMPLING * r
             for t in range(max(0, reach - middle), min(taps, samples - middle + reach)):
                 total += axial[r, t] * field[line, middle + t - reach]
-            result[r, line] = total
-    return result
+            pulses[r, line] = total
 
 
-@njit(parallel=True, fastmath=True)
-def _along(field, lateral, reach):
-    rows, lines = field.shape
-    taps = lateral.shape[1]
-    width, half = lines - taps + 1, taps // 2
-    result = np.zeros((rows, width), np.complex64)
-    for r in prange(rows):
+@kernel(fastmath=True)
+def _along(first, end, focused, pulses, lateral, reach):
+    half = lateral.shape[1] // 2
+    for r in range(first, end):
         for t in range(half - reach[r], half + reach[r] + 1):
             weight = lateral[r, t]
-            for x in range(width):
-                result[r, x] += weight * field[r, x + t]
-    return result
+            for x in range(focused.shape[1]):
+                focused[r, x] += weight * pulses[r, x + t]

@@ -7,10 +7,9 @@ are sure to meet no border, so that only the rest has to be walked ray by ray.
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 from twin.ultrasound.echo_solids import Body, distance_at
 
 Array = NDArray[np.float64]
@@ -58,17 +57,22 @@ def spans(body: Body, world_from_image: Array, x: Array, z: Array, first_mm: Arr
     starts = np.array([part.min() for part in np.split(first_mm, range(BUNDLE[1], len(z), BUNDLE[1]))])
     radius = CLEAR * float(np.hypot(reach[0], reach[1]))
     bundles = Bundles(middles[0], middles[1], starts, deepest_mm, radius)
-    return Spans(*_spans(body.packed(), np.ascontiguousarray(world_from_image, float), bundles))
+    solids, pose, shape = body.packed(), np.ascontiguousarray(world_from_image, float), (len(middles[0]), len(middles[1]))
+    found = Spans(np.zeros((*shape, MOST, 2)), np.zeros(shape, np.int64), np.zeros((*shape, MOST, len(solids.grid)), np.bool_))
 
-
-@njit(parallel=True)
-def _spans(solids, pose, bundles):
-    n, m = len(bundles.along), len(bundles.across)
-    depths, counts = np.zeros((n, m, MOST, 2)), np.zeros((n, m), np.int64)
-    close = np.zeros((n, m, MOST, len(solids.grid)), np.bool_)
-    for i in prange(n):
+    def fill(first: int, end: int) -> None:
         clear, near = np.zeros(len(solids.grid)), np.zeros(len(solids.grid), np.bool_)
-        for j in range(m):
+        _fill(first, end, found, solids, pose, bundles, clear, near)
+
+    in_threads(fill, len(middles[0]))
+    return found
+
+
+@kernel
+def _fill(first, end, spans, solids, pose, bundles, clear, near):
+    depths, counts, close = spans.depths, spans.counts, spans.close
+    for i in range(first, end):
+        for j in range(len(bundles.across)):
             along, across = bundles.along[i], bundles.across[j]
             x = pose[0, 0] * along + pose[0, 2] * across + pose[0, 3]
             y = pose[1, 0] * along + pose[1, 2] * across + pose[1, 3]
@@ -77,8 +81,9 @@ def _spans(solids, pose, bundles):
             clear[:] = t
             while t < bundles.deepest_mm:
                 point = x + pose[0, 1] * t, y + pose[1, 1] * t, z + pose[2, 1] * t
-                if not _borders_near(clear, near, solids, point, t, bundles.radius_mm):
-                    t = min(clear.min(), bundles.deepest_mm) if len(clear) else bundles.deepest_mm
+                met, free = _borders_near(clear, near, solids, point, t, bundles.radius_mm)
+                if not met:
+                    t = min(free, bundles.deepest_mm)
                     continue
                 if t > end and count < MOST:
                     depths[i, j, count, START] = t
@@ -89,13 +94,12 @@ def _spans(solids, pose, bundles):
                     close[i, j, count - 1, solid] |= near[solid]
                 t += GROWTH_MM
             counts[i, j] = count
-    return depths, counts, close
 
 
 @njit(inline="always")
 def _borders_near(clear, near, solids, point, t, radius_mm):
-    """Whether a border may lie in a bundle at a depth; marks its solids, and the depths up to which each is sure to have none."""
-    met = False
+    """Whether a border may lie in a bundle at a depth, and the depth up to which none may; marks its solids."""
+    met, free = False, np.inf
     for solid in range(len(clear)):
         near[solid] = t < clear[solid] < t + GROWTH_MM
         if t >= clear[solid]:
@@ -103,4 +107,5 @@ def _borders_near(clear, near, solids, point, t, radius_mm):
             near[solid] = abs(d) <= radius_mm + GROWTH_MM
             clear[solid] = t + (GROWTH_MM if near[solid] else min(abs(d) - radius_mm, LEAP_MM))
             met |= near[solid]
-    return met
+        free = min(free, clear[solid])
+    return met, free

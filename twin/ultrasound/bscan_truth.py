@@ -4,10 +4,9 @@ from collections import defaultdict
 
 import numpy as np
 import trimesh
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel
 from recon.geometry import rigid
 from twin.ultrasound import bmode_image
 from twin.ultrasound.echo_solids import Body
@@ -21,7 +20,10 @@ SAME_MM = 1e-5  # between ends of neighbouring segments of a section
 
 def labels(paths: Paths, transducer: Transducer) -> NDArray[np.uint8]:
     """Label of what each pixel shows : (h, w), 0 the surroundings, k + 1 solid k; delays and refraction included."""
-    return _labels(paths, transducer.rows_mm, np.float32(transducer.scale_mm_per_px[0]))
+    rows, line = transducer.rows_mm, np.float32(transducer.scale_mm_per_px[0])
+    shown = np.empty((len(rows), len(paths.labels)), np.uint8)
+    in_threads(lambda first, end: _fill_labels(first, end, shown, paths, rows, line), len(paths.labels))
+    return shown
 
 
 def masks(shown: NDArray[np.uint8], solids: int) -> NDArray[np.bool_]:
@@ -80,15 +82,13 @@ def _loops(edges: NDArray[np.int64]) -> list[list[int]]:
     return loops
 
 
-@njit(parallel=True)
-def _labels(paths, rows_mm, line_mm):
+@kernel
+def _fill_labels(first, end, shown, paths, rows_mm, line_mm):
     lines, depths = paths.labels.shape
-    shown = np.empty((len(rows_mm), lines), np.uint8)
-    for line in prange(lines):
+    for line in range(first, end):
         level = 0  # the first that is shown at a row's depth or below
         for row in range(len(rows_mm)):
             while level < depths - 1 and paths.shown_mm[line, level] < rows_mm[row]:
                 level += 1
             aside = int(np.rint(np.float32(line) + paths.shift_mm[line, level] / line_mm))
             shown[row, line] = paths.labels[min(max(aside, 0), lines - 1), level]
-    return shown

@@ -4,13 +4,13 @@ Echoes are laid by threads on as many fields as there are parts of the slice. Th
 sum: the same bytes from any number of threads.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 from twin.ultrasound.beam import OVERSAMPLING, Beam
 from twin.ultrasound.sound_paths import Paths
 from twin.ultrasound.transducer import Transducer
@@ -66,8 +66,22 @@ def _deepest_seen(transducer: Transducer, beam: Beam, paths: Paths) -> float:
     return min(paths.step_mm * levels, beam.depth_step_mm * (len(beam.core_mm) - 1))
 
 
-@njit(inline="always")
-def slab(part, count):
+def laid(lay: Callable[[Field, int], tuple[int, int]], empty: Field) -> Field:
+    """Sum of the echoes that `lay(field, part)` lays on a field of each part's own, empty at first.
+
+    It returns the first line that it touched, and the end.
+    """
+    fields, touched = np.zeros((PARTS, *empty.shape), empty.dtype), np.zeros((PARTS, 2), np.int64)
+
+    def lay_parts(first: int, end: int) -> None:
+        for part in range(first, end):
+            touched[part] = np.clip(lay(fields[part], part), 0, len(empty))
+
+    in_threads(lay_parts, PARTS)
+    return summed(fields, touched)
+
+
+def slab(part: int, count: int) -> tuple[int, int]:
     """First and end of a part's share of a count. Threads take parts in order: so each gets some from everywhere."""
     place = part * SPREAD % PARTS
     return count * place // PARTS, count * (place + 1) // PARTS
@@ -86,12 +100,17 @@ def deposit(field, px, py, value):
     field[i + 1, j + 1] += value * (a * b)
 
 
-@njit(parallel=True)
-def summed(fields, touched):
-    """Sum over parts, always in the same order, of the lines that each has touched."""
-    total = np.zeros(fields.shape[1:], fields.dtype)
-    for line in prange(len(total)):
+def summed(fields: Field, touched: NDArray[np.int64]) -> Field:
+    """Sum over parts : (PARTS, n, m), always in the same order, of the lines that each has touched : (PARTS, 2)."""
+    total = np.zeros_like(fields[0])
+    in_threads(lambda first, end: _add_up(first, end, total, fields, touched), len(total))
+    return total
+
+
+@kernel
+def _add_up(first, end, total, fields, touched):
+    for line in range(first, end):
         for part in range(PARTS):
             if touched[part, FIRST] <= line < touched[part, END]:
-                total[line] += fields[part, line]
-    return total
+                for sample in range(total.shape[1]):
+                    total[line, sample] += fields[part, line, sample]

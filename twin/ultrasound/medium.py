@@ -8,25 +8,13 @@ has no echo of its own. A scatterer's length f follows from the backscatter coef
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from recon.compiled import njit
+from recon.compiled import kernel, njit
 from recon.geometry import rigid
 from twin.ultrasound.beam import STEP_MM, Beam
-from twin.ultrasound.echo_field import (
-    BESIDE_MM,
-    END,
-    FIRST,
-    PARTS,
-    Field,
-    deposit,
-    field_like,
-    scanner_at,
-    slab,
-    summed,
-)
+from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
 from twin.ultrasound.echo_solids import Body, between, distance_at, label_at
 from twin.ultrasound.sound_paths import Paths
 from twin.ultrasound.transducer import Transducer
@@ -56,12 +44,28 @@ class Lattice(NamedTuple):
     turns: Field  # (TURNS,) phases of an echo
 
 
+class Columns(NamedTuple):
+    """Columns of cells, side by side, and the one that is looked at."""
+
+    first: int  # of them, along the lattice's first axis
+    end: int
+    places: Array  # (7, m) of its scatterers in the slice
+    cell: NDArray[np.int64]  # (3,) its place on the lattice
+
+
 def scatter(body: Body, transducer: Transducer, beam: Beam, paths: Paths, world_from_image: Array, seed: int) -> Field:
     """Demodulated echoes of the tissue's scatterers, weighed across the plane, before the point spread in the plane."""
     scanner = scanner_at(transducer, beam, paths, world_from_image, seed)
     lattice = _lattice(body, transducer, beam, scanner.world_from_image)
-    fields = np.zeros((PARTS, *field_like(transducer, beam).shape), np.complex64)
-    return summed(fields, _scatter(fields, body.packed(), lattice, scanner, beam, paths))
+    first, solids = lattice.axes[0], body.packed()
+    most = 2 * RUN + int(4 * (lattice.half_mm.max() / lattice.edge_mm + 2))  # cells of a column; its cosine is 0.57 at least
+
+    def lay(field: Field, part: int) -> tuple[int, int]:
+        begin, end = slab(part, int(lattice.high[first] - lattice.low[first] + 1))
+        columns = Columns(lattice.low[first] + begin, lattice.low[first] + end, np.empty((7, most)), np.zeros(3, np.int64))
+        return _scatter(field, columns, solids, lattice, scanner, beam, paths)
+
+    return laid(lay, field_like(transducer, beam))
 
 
 def _lattice(body: Body, transducer: Transducer, beam: Beam, pose: Array) -> Lattice:
@@ -112,26 +116,19 @@ def mixed(x, seed):
     return x ^ (x >> np.uint64(31))
 
 
-@njit(parallel=True, fastmath=True)
-def _scatter(fields, solids, lattice, scanner, beam, paths):
-    """Lay the echoes of all scatterers in the slice; lines that each part has touched : (PARTS, 2)."""
-    first, second = lattice.axes[0], lattice.axes[1]
-    columns = lattice.high[first] - lattice.low[first] + 1
-    most = 2 * RUN + int(4 * (lattice.half_mm.max() / lattice.edge_mm + 2))  # cells of a column; its cosine is 0.57 at least
-    touched = np.zeros((PARTS, 2), np.int64)
-    for part in prange(PARTS):
-        begin, end = slab(part, columns)
-        places, cell = np.empty((7, most)), np.zeros(3, np.int64)
-        low, high = fields.shape[1], 0
-        for i in range(begin, end):
-            cell[first] = lattice.low[first] + i
-            for j in range(lattice.low[second], lattice.high[second] + 1):
-                cell[second] = j
-                found = _places_in_slice(places, cell, solids, lattice, scanner, beam, paths)
-                left, right = _lay_echoes(fields[part], places, found, solids, lattice, scanner, beam, paths)
-                low, high = min(low, left), max(high, right)
-        touched[part, FIRST], touched[part, END] = max(low, 0), min(high, fields.shape[1])
-    return touched
+@kernel(fastmath=True)
+def _scatter(field, columns, solids, lattice, scanner, beam, paths):
+    """Lay the echoes of all scatterers in the slice of some columns; the first line that they touch and the end."""
+    places, cell = columns.places, columns.cell
+    low, high = len(field), 0
+    for i in range(columns.first, columns.end):
+        cell[lattice.axes[0]] = i
+        for j in range(lattice.low[lattice.axes[1]], lattice.high[lattice.axes[1]] + 1):
+            cell[lattice.axes[1]] = j
+            found = _places_in_slice(places, cell, solids, lattice, scanner, beam, paths)
+            left, right = _lay_echoes(field, places, found, solids, lattice, scanner, beam, paths)
+            low, high = min(low, left), max(high, right)
+    return low, high
 
 
 @njit(inline="always")

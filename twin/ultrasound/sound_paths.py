@@ -8,10 +8,9 @@ bend by refraction.
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 from twin.ultrasound.beam import DEEPER
 from twin.ultrasound.echo_solids import Body, between, distance_at, label_at
 from twin.ultrasound.transducer import Transducer
@@ -33,6 +32,15 @@ class Paths(NamedTuple):
     shift_mm: Map  # (w, m) of the beam along the array, by refraction
 
 
+class Steps(NamedTuple):
+    """What a step down a line adds, by label."""
+
+    line_mm: float  # between lines
+    delay_mm: Array  # (n + 1,) shown depth
+    kept: Array  # (n + 1,) amplitude, both ways
+    refract: bool  # whether borders turn the line
+
+
 def follow(body: Body, transducer: Transducer, world_from_image: Array) -> Paths:
     """Follow the lines of one pose : world_from_image (4, 4) mm."""
     sx, sy = transducer.scale_mm_per_px
@@ -41,7 +49,9 @@ def follow(body: Body, transducer: Transducer, world_from_image: Array) -> Paths
     paths = Paths(sy, np.zeros(size, np.uint8), *tables)
     pose = np.ascontiguousarray(world_from_image, float)
     tissues = body.acoustics(transducer.frequency_mhz)
-    _follow(paths, body.packed(), tissues, pose, sx, transducer.assumed_speed, transducer.refraction)
+    steps = Steps(sx, sy * transducer.assumed_speed * (1 / tissues.speed), np.exp(-sy * tissues.loss), transducer.refraction)
+    solids = body.packed()
+    in_threads(lambda first, end: _follow(first, end, paths, solids, tissues, steps, pose), size[0])
     return paths
 
 
@@ -104,23 +114,19 @@ def _through_border(solids, tissues, pose, point, here, there):
     return max(1 - r * r, 0.0), min(max(turn, -0.3), 0.3)
 
 
-@njit(parallel=True)
-def _follow(paths, solids, tissues, pose, line_mm, assumed_speed, refract):
-    # taken from the tuple here: writes into a tuple's arrays within `prange` are lost
-    labels, shown_mm, amplitude, shift_mm = paths.labels, paths.shown_mm, paths.amplitude, paths.shift_mm
-    lines, depths = labels.shape
-    step = paths.step_mm
-    delays, kept = step * assumed_speed * (1 / tissues.speed), np.exp(-step * tissues.loss)  # of whole steps, by label
-    for line in prange(lines):
+@kernel
+def _follow(first, end, paths, solids, tissues, steps, pose):
+    step, line_mm, delays = paths.step_mm, steps.line_mm, steps.delay_mm
+    for line in range(first, end):
         x0, y0, z0 = (
             pose[0, 0] * line_mm * line + pose[0, 3],
             pose[1, 0] * line_mm * line + pose[1, 3],
             pose[2, 0] * line_mm * line + pose[2, 3],
         )
         here = label_at(solids, x0, y0, z0)
-        labels[line, 0] = here
+        paths.labels[line, 0] = here
         delay, left, slope, aside, clear = 0.0, 1.0, 0.0, 0.0, 0.0
-        for level in range(1, depths):
+        for level in range(1, paths.labels.shape[1]):
             t = step * level
             x, y, z = x0 + pose[0, 1] * t, y0 + pose[1, 1] * t, z0 + pose[2, 1] * t
             there = here
@@ -129,16 +135,16 @@ def _follow(paths, solids, tissues, pose, line_mm, assumed_speed, refract):
                 clear = t + 0.9 * _nearest(solids, x, y, z)
             if there == here:
                 delay += delays[here]
-                left *= kept[here]
+                left *= steps.kept[here]
             else:
                 part = _share_before(solids, max(here, there) - 1, pose, (x, y, z), step)
                 passed, turn = _through_border(solids, tissues, pose, (x, y, z), here, there)
                 delay += part * delays[here] + (1 - part) * delays[there]
                 left *= passed * np.exp(-step * (part * tissues.loss[here] + (1 - part) * tissues.loss[there]))
-                slope += turn if refract else 0.0
+                slope += turn if steps.refract else 0.0
             aside += slope * step
             here = there
-            labels[line, level] = here
-            shown_mm[line, level] = delay
-            amplitude[line, level] = left
-            shift_mm[line, level] = aside
+            paths.labels[line, level] = here
+            paths.shown_mm[line, level] = delay
+            paths.amplitude[line, level] = left
+            paths.shift_mm[line, level] = aside

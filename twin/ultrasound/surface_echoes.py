@@ -8,14 +8,13 @@ tilted that their phases alias reach no aperture, and are left out of the cohere
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import kernel, njit
 from twin.ultrasound import borders
 from twin.ultrasound.beam import STEP_MM, Beam
 from twin.ultrasound.borders import BUNDLE, START, STOP
-from twin.ultrasound.echo_field import BESIDE_MM, END, FIRST, PARTS, Field, deposit, field_like, scanner_at, slab, summed
+from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
 from twin.ultrasound.echo_solids import Body, Wire, distance_at
 from twin.ultrasound.medium import hashed
 from twin.ultrasound.sound_paths import Paths, normal_at, reflection, table_at
@@ -39,10 +38,13 @@ BEFORE, AFTER = range(2)  # rows of the solids' distances, of a step of the marc
 
 
 class Rays(NamedTuple):
-    """Places of rays on the probe's face, in the image's frame."""
+    """Places of rays on the probe's face, in the image's frame, and one ray's way."""
 
+    first: int  # number of the first of them along the array, of all
     along: Array  # (n,) mm
     across: Array  # (m,) mm
+    distances: Array  # (2, k) mm to the solids, BEFORE and AFTER a step
+    crossings: Array  # (CROSSINGS, 3) of borders
 
 
 class Ray(NamedTuple):
@@ -79,10 +81,17 @@ def surface_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths,
     along = (np.arange(-beside, SUBLINES * transducer.image_size[0] + beside) + 0.5) * sx / SUBLINES - sx / 2
     first = _first_depths(transducer, beam, across)
     spans = borders.spans(body, scanner.world_from_image, along, across, first, scanner.deepest_mm)
-    fields = np.zeros((PARTS, *field_like(transducer, beam).shape), np.complex64)
     tissues = body.acoustics(transducer.frequency_mhz)
-    touched = _border_echoes(fields, body.packed(), tissues, Rays(along, across), spans, scanner, beam, paths)
-    return summed(fields, touched)
+    solids, outer = body.packed(), (paths.shift_mm.max(), paths.shift_mm.min())
+
+    def lay(field: Field, part: int) -> tuple[int, int]:
+        begin, end = slab(part, len(along))
+        rays = Rays(begin, along[begin:end], across, np.zeros((2, len(solids.grid))), np.empty((CROSSINGS, 3)))
+        _border_echoes(field, solids, tissues, rays, spans, scanner, beam, paths)
+        left, right = (along[[begin, end - 1]] - outer) / sx + (len(field) - len(paths.labels)) // 2
+        return int(np.floor(left)) - 1, int(np.floor(right)) + 3
+
+    return laid(lay, field_like(transducer, beam))
 
 
 def _first_depths(transducer: Transducer, beam: Beam, across: Array) -> Array:
@@ -149,24 +158,15 @@ def _phase_of_patch(x, y, z, seed):
     return 2 * np.pi * (bits >> np.uint64(11)) / 9007199254740992.0
 
 
-@njit(parallel=True, fastmath=True)
-def _border_echoes(fields, solids, tissues, rays, spans, scanner, beam, paths):
-    """Lay the echoes of all borders in the slice; lines that each part has touched : (PARTS, 2)."""
-    touched = np.zeros((PARTS, 2), np.int64)
-    left, right = paths.shift_mm.max(), paths.shift_mm.min()
-    pad = (fields.shape[1] - len(paths.labels)) // 2
-    for part in prange(PARTS):
-        begin, end = slab(part, len(rays.along))
-        touched[part, FIRST] = max(int(np.floor((rays.along[begin] - left) / scanner.line_mm)) + pad - 1, 0)
-        touched[part, END] = min(int(np.floor((rays.along[end - 1] - right) / scanner.line_mm)) + pad + 3, fields.shape[1])
-        distances, crossings = np.zeros((2, len(solids.grid))), np.empty((CROSSINGS, 3))
-        for i in range(begin, end):
-            for j in range(len(rays.across)):
-                ray = _ray(rays.along[i], rays.across[j], scanner.world_from_image)
-                bundle = i // BUNDLE[0], j // BUNDLE[1]
-                met = _crossings_of(ray, crossings, distances, solids, spans, bundle, beam, scanner.repeats)
-                _lay_facets(fields[part], ray, crossings[:met], solids, tissues, scanner, beam, paths)
-    return touched
+@kernel(fastmath=True)
+def _border_echoes(field, solids, tissues, rays, spans, scanner, beam, paths):
+    """Lay the echoes of all borders that some rays meet in the slice."""
+    for i in range(len(rays.along)):
+        for j in range(len(rays.across)):
+            ray = _ray(rays.along[i], rays.across[j], scanner.world_from_image)
+            bundle = (rays.first + i) // BUNDLE[0], j // BUNDLE[1]
+            met = _crossings_of(ray, rays.crossings, rays.distances, solids, spans, bundle, beam, scanner.repeats)
+            _lay_facets(field, ray, rays.crossings, met, solids, tissues, scanner, beam, paths)
 
 
 @njit(inline="always")
@@ -234,9 +234,9 @@ def _in_slice(y, z, repeats, beam):
 
 
 @njit(inline="always")
-def _lay_facets(field, ray, crossings, solids, tissues, scanner, beam, paths):
+def _lay_facets(field, ray, crossings, met, solids, tissues, scanner, beam, paths):
     """Lay the echoes of all facets that a ray meets."""
-    for n in range(len(crossings)):
+    for n in range(met):
         _lay_facet(field, ray, crossings[n], solids, tissues, scanner, beam, paths)
 
 
