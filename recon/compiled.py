@@ -32,14 +32,14 @@ log = logging.getLogger(__name__)
 NUMBA = "numba>=0.61,<0.69"  # whose undocumented parts are known to be as they are used here
 OURS = ("recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks")  # packages; others keep Numba's own cache
 Name = tuple[str, ...]  # one with dots, in parts
-PARTS = 4  # of a range for each thread, so that who is done helps the other
+PARTS = 8  # of a range for each thread, so that who is done helps the other
 UNUSED_DAYS = 30  # after which code compiled from other sources is deleted
 
 
 def njit(function: Callable | None = None, noalias: bool = False, **options: Any) -> Any:
     """Compile a function on first use, as the decorator `numba.njit` does with the same options, and keep the result.
 
-    With `noalias` no array that the function takes may share memory with another one that it writes to, as in loops over prange:
+    With `noalias` no array that the function takes may share memory with another one that it writes to:
     then LLVM finds more vector instructions.
     """
     if function is None:
@@ -62,9 +62,10 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
     """Compile a loop over arrays for `in_threads`, with options of `numba.njit`.
 
     It allocates no arrays, and none that it writes to shares memory with another one. So references to arrays need no counting,
-    which takes a third to a half of the time to compile, and in inner loops as much of the time to run; and the GIL is released.
+    which takes a third to a half of the time to compile, and in inner loops as much of the time to run. The GIL is released, and
+    a division by zero gives what it gives in NumPy.
     """
-    return njit(function, noalias=True, nogil=True, _nrt=False, **options)
+    return njit(function, noalias=True, nogil=True, _nrt=False, error_model="numpy", **options)
 
 
 def in_threads(kernel: Callable[[int, int], Any], count: int) -> None:
@@ -78,9 +79,34 @@ def in_threads(kernel: Callable[[int, int], Any], count: int) -> None:
         kernel(0, count)
         return
     parts = min(PARTS * threads, count)
-    ends = [count * k // parts for k in range(parts + 1)]
-    with ThreadPoolExecutor(threads) as pool:
-        deque(pool.map(kernel, ends[:-1], ends[1:]), maxlen=0)
+    left = deque((count * k // parts, count * (k + 1) // parts) for k in range(parts))
+
+    def work() -> None:
+        while True:
+            try:
+                first, end = left.popleft()
+            except IndexError:
+                return
+            kernel(first, end)
+
+    helpers = [_helpers().submit(work) for _ in range(threads - 1)]
+    try:
+        work()
+    finally:
+        left.clear()  # by now empty, but after an error
+        for helper in helpers:
+            if not helper.cancel():  # it has begun
+                helper.result()
+
+
+@cache
+def _helpers() -> ThreadPoolExecutor:
+    """Threads beside those that call `in_threads`, kept, since making them takes as long as a small kernel."""
+    return ThreadPoolExecutor(os.cpu_count(), "kernel")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_helpers.cache_clear)  # a forked process has none of its parent's threads
 
 
 def source_hash(module: Path, root: Path) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.constants import c as LIGHT_SPEED
 from scipy.constants import h as PLANCK
 
-from recon.compiled import njit
+from recon.compiled import kernel, njit
 from recon.model.rig import CameraDevice, Sensor
 
 SMOOTHING_E = 4.0  # dark noise that leaves nothing of the steps of single electrons, and a skewness below 0.1 at any mean
@@ -129,7 +129,7 @@ def readout_of(device: CameraDevice, wavelength_nm: float, exposure: Exposure) -
     )
 
 
-@njit(nogil=True, error_model="numpy")
+@kernel
 def _take(radiance, normal, response, offset, readout, numbers):
     """One image by `read_out` and `digitise` in one pass, with the noise from standard normal numbers."""
     for i in range(radiance.shape[0]):

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, njit
+from recon.compiled import in_threads, kernel, njit
 from recon.geometry.ellipses import Ellipses, on_ellipse
 from recon.geometry.order_statistics import quantile
 
@@ -184,7 +184,7 @@ class _Sums(NamedTuple):
             np.zeros((n, sectors)), np.zeros((n, sectors, SHARED)), np.zeros((n, SHARED, SHARED)), np.zeros((n, sectors)),
             np.zeros((n, SHARED)), np.zeros((n, sectors)), np.zeros((n, 2, 2)), np.zeros((n, 2)),
         )  # fmt: skip
-        in_threads(lambda first, end: _add_up(first, end, band, step, sums), n)
+        in_threads(lambda first, end: _add_up(first, end, band, step, sums, np.empty(SHARED)), n)
         return sums
 
     @property
@@ -251,7 +251,7 @@ def _may_be_near(x, y, rims, i):
     return abs(q - 1) * rims.axes[i, 0] < BANDWIDTH * rims.reach[i]
 
 
-@njit(nogil=True)
+@kernel
 def _count(first, end, rims, sizes):
     """Count the pixels of the bands `first` to `end`, not included."""
     for i in range(first, end):
@@ -262,7 +262,7 @@ def _count(first, end, rims, sizes):
                     sizes[i] += 1
 
 
-@njit(nogil=True)
+@kernel
 def _gather(first, end, image, rims, band):
     """Fill the bands `first` to `end`, not included, each where it begins."""
     values, xy, normal, distance, angle, starts = band
@@ -281,21 +281,20 @@ def _gather(first, end, image, rims, band):
                     p += 1
 
 
-@njit(nogil=True)
-def _add_up(first, end, band, step, sums):
-    """Fill the sums of the outlines `first` to `end`, not included."""
+@kernel
+def _add_up(first, end, band, step, sums, columns):
+    """Fill the sums of the outlines `first` to `end`, not included; `columns` has room for a pixel's slopes."""
     for i in range(first, end):
-        _add_outline(i, band, step, sums)
+        _add_outline(i, band, step, sums, columns)
 
 
 @njit(inline="always")
-def _add_outline(i, band, step, sums):
+def _add_outline(i, band, step, sums, columns):
     """Add one outline's pixels: measured less modelled, and the model's slopes.
 
     A plane `a + g t` that begins at t = 0, blurred by s, is `(a + g t) Phi(t/s) + g s phi(t/s)`.
     """
     sectors = step.offset.shape[1]
-    columns = np.empty(SHARED)
     inner, outer, s, limit = step.levels[i, :3], step.levels[i, 3:], step.width[i], step.limit[i]
     for p in range(band.starts[i], band.starts[i + 1]):
         at = (band.angle[p] / (2 * np.pi) + 0.5) * sectors

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 from recon.geometry import rigid
 
 Array = NDArray[np.float64]
@@ -80,7 +79,8 @@ class Camera:
             if normalised.size <= 2 * FEW_PROJECTED:
                 bent = np.stack(distorted(normalised[..., 0], normalised[..., 1], self.coefficients), axis=-1)
             else:
-                bent = _distort_all(np.ascontiguousarray(normalised.reshape(-1, 2)), self.coefficients).reshape(normalised.shape)
+                flat, bent, k = np.ascontiguousarray(normalised.reshape(-1, 2)), np.empty(normalised.shape), self.coefficients
+                in_threads(lambda first, end: _distort_all(first, end, flat, k, bent.reshape(-1, 2)), len(flat))
             return self.to_pixels(bent)
 
     def undistort(self, pixels: ArrayLike) -> Array:
@@ -95,7 +95,9 @@ class Camera:
         x = (flat[:, 0] - self.matrix[0, 2] - self.matrix[0, 1] * y) / self.matrix[0, 0]
         if 0 < len(flat) <= FEW:
             return np.reshape([_undistort(*point, self.coefficients) for point in zip(x, y, strict=True)], pixels.shape)
-        return _undistort_all(np.stack([x, y], axis=-1), self.coefficients).reshape(pixels.shape)
+        bent, found, k = np.stack([x, y], axis=-1), np.empty((len(flat), 2)), self.coefficients
+        in_threads(lambda first, end: _undistort_all(first, end, bent, k, found), len(flat))
+        return found.reshape(pixels.shape)
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Directions of the rays through pixels : (..., 2), as unit vectors : (..., 3) in the world."""
@@ -138,12 +140,10 @@ distort = njit(forceinline=True, error_model="numpy")(distorted)  # inlined by L
 distort_side_by_side = njit(inline="always")(distorted)  # by Numba: its points share vector instructions, in a loop over arrays
 
 
-@njit(parallel=True)
-def _distort_all(points, k):
-    result = np.empty_like(points)
-    for i in prange(points.shape[0]):
-        result[i, 0], result[i, 1] = distort(points[i, 0], points[i, 1], k)
-    return result
+@kernel
+def _distort_all(first, end, points, k, found):
+    for i in range(first, end):
+        found[i, 0], found[i, 1] = distort(points[i, 0], points[i, 1], k)
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -182,9 +182,7 @@ def _undistort(u, v, k):
     return np.nan, np.nan
 
 
-@njit(parallel=True, error_model="numpy")
-def _undistort_all(points, k):
-    result = np.empty_like(points)
-    for i in prange(points.shape[0]):
-        result[i, 0], result[i, 1] = _undistort(points[i, 0], points[i, 1], k)
-    return result
+@kernel
+def _undistort_all(first, end, points, k, found):
+    for i in range(first, end):
+        found[i, 0], found[i, 1] = _undistort(points[i, 0], points[i, 1], k)

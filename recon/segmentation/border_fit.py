@@ -11,14 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from numba import prange
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import KDTree
 from scipy.special import ndtr
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 from recon.geometry import rigid
 from recon.segmentation.echo_power import EchoPower
 
@@ -88,21 +87,21 @@ def mix(places: Array, normals: Array, values: Array, patch_mm: float) -> Array:
     start = np.searchsorted(flat[order], np.arange(size.prod() + 1))
     rows = np.append(start[:-1].reshape(size), start[size[2] :: size[2]].reshape(*size[:2], 1), axis=2)
     result = np.empty_like(values)
-    result[order] = _mix(Cells(places[order], normals[order], cube[order], rows), values[order], patch_mm, reach)
+    cells, sorted_values, sums = Cells(places[order], normals[order], cube[order], rows), values[order], np.zeros_like(values)
+    in_threads(lambda first, end: _mix(first, end, cells, sorted_values, (patch_mm, reach), sums), len(values))
+    result[order] = sums
     return result
 
 
-@njit(parallel=True)
-def _mix(cells, values, patch, reach):
-    sums = np.zeros_like(values)
+@kernel
+def _mix(first, end, cells, values, lengths, sums):
     nx, ny, nz = cells.start.shape
-    for n in prange(len(values)):
+    for n in range(first, end):
         x, y, z = cells.cube[n, 0], cells.cube[n, 1], cells.cube[n, 2]
         low, high = max(z - 1, 0), min(z + 2, nz - 1)
         for i in range(max(x - 1, 0), min(x + 2, nx)):
             for j in range(max(y - 1, 0), min(y + 2, ny)):
-                _add_row(sums, cells, values, n, (cells.start[i, j, low], cells.start[i, j, high]), (patch, reach))
-    return sums
+                _add_row(sums, cells, values, n, (cells.start[i, j, low], cells.start[i, j, high]), lengths)
 
 
 @njit(inline="always")
@@ -184,22 +183,24 @@ def _steps(profiles: Array, weight: Array) -> tuple[Array, Array]:
     return np.where(found, candidates[c] + shift * STEP_MM, 0.0), np.where(found, here / bend + 1e-3, NEVER)
 
 
-@njit(parallel=True, error_model="numpy")
-def misfits(profiles, weight, trials):
+def misfits(profiles: Array, weight: Array, trials: Array) -> tuple[Array, Array]:
     """Least weighted sums of squares : (places, n) over the blurs, of steps alone and of steps with a bright line.
 
     `NEVER` where the levels don't step up, or the line isn't bright.
     """
-    places, blurs = trials.shape[:2]
-    plain = np.full((places, len(profiles)), NEVER)
-    lined = np.full((places, len(profiles)), NEVER)
-    for n in prange(len(profiles)):
-        for place in range(places):
-            for blur in range(blurs):
+    plain, lined = np.full((2, len(trials), len(profiles)), NEVER)
+    in_threads(lambda first, end: _fill_misfits(first, end, profiles, weight, trials, plain, lined), len(profiles))
+    return plain, lined
+
+
+@kernel
+def _fill_misfits(first, end, profiles, weight, trials, plain, lined):
+    for n in range(first, end):
+        for place in range(trials.shape[0]):
+            for blur in range(trials.shape[1]):
                 sums = _weighted_sums(trials[place, blur], profiles[n], weight[n])
                 plain[place, n] = min(plain[place, n], _misfit_of_step(sums))
                 lined[place, n] = min(lined[place, n], _misfit_with_line(sums))
-    return plain, lined
 
 
 class Sums(NamedTuple):

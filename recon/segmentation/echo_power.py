@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import kernel, njit
 from recon.errors import InputError
 from recon.files.volumes import Volume
 from recon.freehand import volume_compounding
@@ -125,7 +125,7 @@ def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, 
     return EchoPower(Volume(value, grid.origin, grid.spacing, grid.directions), weight)
 
 
-@njit(nogil=True)
+@kernel
 def _add(power, u, v, voxel_from_pixel, value, weight):
     """Add the powers of pixels to the eight voxels around each; those that aren't finite are left out."""
     m = voxel_from_pixel

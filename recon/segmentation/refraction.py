@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import kernel, njit
 from recon.files.volumes import Volume
 from recon.model.probe import SCANNER_SPEED
 
@@ -77,7 +77,7 @@ def follow(
     return lines
 
 
-@njit(nogil=True)
+@kernel
 def _follow(medium, columns, lines):
     """Step down each line. No border is nearer than the distance, so steps up to it aren't looked at, but for a margin."""
     sx, sy = medium.scale

@@ -6,10 +6,9 @@ from enum import IntEnum
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel
 from recon.errors import InputError
 from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns
 from recon.structured_light import gray_code, multi_frequency, plausibility
@@ -49,6 +48,14 @@ class Scale(NamedTuple):
     origin: float
     pitch: float
     length: int
+
+
+class Coordinates(NamedTuple):
+    """Projector coordinates along an axis. All (h, w)."""
+
+    x: Image  # projector px, NaN where unknown
+    sigma: Image  # projector px
+    status: NDArray[np.uint8]  # Status
 
 
 @dataclass(frozen=True)
@@ -133,7 +140,7 @@ def decode(
         counts.update(found)
         length = patterns.length(axis)
         scale = Scale(float(part.zero(length)), part.pitch, length)
-        axes[axis] = _coordinates(fringe.phase, fringe.sigma, orders, unreachable, stage, scale)
+        axes[axis] = _coordinates(fringe, orders, unreachable, stage, scale)[:2]
         fringes[axis] = fringe
         status = np.where(status == Status.OK, stage, status)
     first = fringes[patterns.axes[0]]
@@ -206,14 +213,20 @@ def _from_line(
     return Orders(order, known), unreachable, {"regions": found.regions, "islands": found.islands, "disputed": found.disputed}
 
 
-@njit(parallel=True)
-def _coordinates(phase, sigma, orders: Orders, unreachable, status, scale: Scale):
+def _coordinates(fringe: Fringe, orders: Orders, unreachable: Mask, status: NDArray[np.uint8], scale: Scale) -> Coordinates:
     """Projector coordinates and their noise, NaN where unknown; writes the reasons into `status`."""
-    order, trusted, pitch = orders.order, orders.trusted, scale.pitch
-    height, width = phase.shape
-    x, sx = np.full((height, width), np.nan, np.float32), np.full((height, width), np.nan, np.float32)
-    for v in prange(height):
-        for u in range(width):
+    shape = status.shape
+    found = Coordinates(np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32), status)
+    in_threads(lambda first, end: _place(first, end, fringe.phase, fringe.sigma, orders, unreachable, scale, found), shape[0])
+    return found
+
+
+@kernel
+def _place(first, end, phase, sigma, orders: Orders, unreachable, scale: Scale, found: Coordinates):
+    """Fill rows `first` to `end`, not included."""
+    order, trusted, pitch, status = orders.order, orders.trusted, scale.pitch, found.status
+    for v in range(first, end):
+        for u in range(phase.shape[1]):
             if status[v, u] != OK:
                 continue
             if not trusted[v, u]:
@@ -223,5 +236,4 @@ def _coordinates(phase, sigma, orders: Orders, unreachable, status, scale: Scale
             if value < -0.5 or value > scale.length - 0.5:
                 status[v, u] = OUTSIDE
                 continue
-            x[v, u], sx[v, u] = value, pitch / (2 * np.pi) * sigma[v, u]
-    return x, sx
+            found.x[v, u], found.sigma[v, u] = value, pitch / (2 * np.pi) * sigma[v, u]

@@ -4,10 +4,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel
 from recon.model.patterns import Fringes, GrayCode
 from recon.structured_light.phase import Fringe, Noise
 
@@ -31,11 +30,21 @@ class Cells(NamedTuple):
 
 
 class Bits(NamedTuple):
-    """What the code's images say of a row's pixels. All (w,) int32."""
+    """Readings of a row's pixels. All (w,)."""
 
     number: NDArray[np.int32]  # of the cell
     doubt: NDArray[np.int32]  # digits that the last uncertain bit flips
     uncertain: NDArray[np.int32]  # number of uncertain bits
+    low: NDArray[np.float64]  # DN, the darkest that a pixel shows; without inverses
+    high: NDArray[np.float64]  # DN, the brightest
+
+
+class Found(NamedTuple):
+    """Orders, and the remainders of cells and phases from whole ones. All (h, w)."""
+
+    order: NDArray[np.int32]
+    trusted: NDArray[np.bool_]
+    residual: NDArray[np.float32]  # cycles
 
 
 def fringe_order(
@@ -85,37 +94,40 @@ def fringe_order(
     borders = code.origin(length) + cell * np.arange(half * 2**code.bits)
     drawn = np.mean(np.ceil(borders - 1e-9) - 0.5 - borders)  # projector pixels are lit whole
     first = (code.origin(length) + drawn + 0.5 * cell - fringes.zero(length)) / code.pitch
-    return _order(np.ascontiguousarray(images), Cells(float(first), 1 / half, code.inverted), fringe, noise)
+    images, cells, shape = np.ascontiguousarray(images), Cells(float(first), 1 / half, code.inverted), fringe.phase.shape
+    orders = Orders(np.zeros(shape, np.int32), np.zeros(shape, np.bool_))
+    residual = np.zeros(shape, np.float32)
+
+    def fill(first: int, end: int) -> None:
+        bits = Bits(*np.zeros((3, shape[1]), np.int32), *np.zeros((2, shape[1])))
+        _fill(first, end, images, cells, fringe, noise, bits, Found(*orders, residual))
+
+    in_threads(fill, shape[0])
+    return orders, residual
 
 
-@njit(parallel=True)
-def _order(images, cells: Cells, fringe: Fringe, noise: Noise):
-    phase, offset, modulation = fringe.phase, fringe.offset, fringe.modulation
-    height, width = phase.shape
-    order = np.zeros((height, width), np.int32)
-    trusted = np.zeros((height, width), np.bool_)
-    residual = np.zeros((height, width), np.float32)
-    for v in prange(height):
-        low, high = np.zeros(width), np.zeros(width)
+@kernel
+def _fill(first, end, images, cells: Cells, fringe: Fringe, noise: Noise, bits: Bits, found: Found):
+    """Fill the orders of rows `first` to `end`, not included."""
+    phase, number, doubt, uncertain = fringe.phase, bits.number, bits.doubt, bits.uncertain
+    for v in range(first, end):
         if not cells.inverted:
-            _black_and_white(images[:, v], offset[v], modulation[v], low, high)
-        bits = Bits(np.zeros(width, np.int32), np.zeros(width, np.int32), np.zeros(width, np.int32))
-        _read_bits(images[:, v], cells.inverted, low, high, noise, bits)
-        number, doubt, uncertain = bits.number, bits.doubt, bits.uncertain
-        for u in range(width):
+            _black_and_white(images[:, v], fringe.offset[v], fringe.modulation[v], bits.low, bits.high)
+        _read_bits(images[:, v], cells.inverted, noise, bits)
+        for u in range(phase.shape[1]):
             cycles = cells.first + number[u] * cells.width - phase[v, u] / (2 * math.pi)
             nearest = math.floor(cycles + 0.5)
-            order[v, u] = nearest
-            residual[v, u] = cycles - nearest
+            found.order[v, u] = nearest
+            found.residual[v, u] = cycles - nearest
             other_way = math.floor(cells.first + (number[u] ^ doubt[u]) * cells.width - phase[v, u] / (2 * math.pi) + 0.5)
-            trusted[v, u] = uncertain[u] <= 1 and other_way == nearest and abs(cycles - nearest) < 0.5 - MARGIN
-    return Orders(order, trusted), residual
+            found.trusted[v, u] = uncertain[u] <= 1 and other_way == nearest and abs(cycles - nearest) < 0.5 - MARGIN
 
 
-@njit
-def _read_bits(images, inverted, low, high, noise: Noise, bits: Bits):
+@kernel
+def _read_bits(images, inverted, noise: Noise, bits: Bits):
     """Read the cells of a row's pixels from its images : (n, w), bit by bit."""
-    number, doubt, uncertain = bits.number, bits.doubt, bits.uncertain
+    number, doubt, uncertain, low, high = bits.number, bits.doubt, bits.uncertain, bits.low, bits.high
+    number[:], doubt[:], uncertain[:] = 0, 0, 0
     count = len(images) // 2 if inverted else len(images)
     for i in range(count):
         here, against = (images[2 * i], images[2 * i + 1]) if inverted else (images[i], images[i])
@@ -135,7 +147,7 @@ def _read_bits(images, inverted, low, high, noise: Noise, bits: Bits):
                 doubt[u] = (1 << (count - i)) - 1  # a Gray bit flips its binary digit and all after it
 
 
-@njit
+@kernel
 def _black_and_white(images, offset, modulation, low, high):
     """The darkest and the brightest that a row's pixels show, over its images of the code and the fringes' trough and crest."""
     for u in range(len(low)):

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 from recon.errors import InputError
 from recon.model.patterns import Fringes
 from recon.structured_light.gray_code import Orders
@@ -40,6 +39,14 @@ class Rungs(NamedTuple):
     pitch: NDArray[np.float64]  # (rungs,) projector px
     weights: NDArray[np.float64]  # (rungs, sets)
     lead: NDArray[np.float64]  # (sets,) rad, phase of each set in the middle of the axis
+
+
+class Span(NamedTuple):
+    """An axis of the projector, px."""
+
+    middle: float
+    origin: float  # of the finest fringes
+    half: float  # from the middle to the ends
 
 
 def ladder(pitches: Sequence[float], length: float, sigmas: Sequence[float] | None = None) -> list[Step]:
@@ -142,7 +149,10 @@ def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> Orders:
     middle = (length - 1) / 2
     lead = np.array([2 * np.pi * (middle - fringes.zero(length)) / fringes.pitch for fringes, _ in sets])
     rungs = Rungs(np.array([step.pitch for step in path]), np.array([step.weights for step in path], float), lead)
-    return _climb(phases, sigmas, rungs, middle, float(sets[0][0].zero(length)), length / 2)
+    span = Span(middle, float(sets[0][0].zero(length)), length / 2)
+    orders = Orders(np.zeros(phases.shape[1:], np.int32), np.zeros(phases.shape[1:], np.bool_))
+    in_threads(lambda first, end: _climb(first, end, phases, sigmas, rungs, span, orders), phases.shape[1])
+    return orders
 
 
 def _typical(sigmas: Image) -> NDArray[np.float64] | None:
@@ -152,14 +162,12 @@ def _typical(sigmas: Image) -> NDArray[np.float64] | None:
     return np.quantile(seen, 0.25, axis=1).astype(float) if seen.size else None
 
 
-@njit(parallel=True)
-def _climb(phases, sigmas, rungs: Rungs, middle, origin, half):
-    """Orders of all pixels; at the ends of the axis, `half` px from its middle, by both ways of unwrapping the coarsest wave."""
+@kernel
+def _climb(first, end, phases, sigmas, rungs: Rungs, span: Span, orders: Orders):
+    """Orders of rows `first` to `end`, not included; at the ends of the axis by both ways of unwrapping the coarsest wave."""
     pitch, weights = rungs.pitch, rungs.weights
-    n, height, width = phases.shape
-    order = np.zeros((height, width), np.int32)
-    trusted = np.zeros((height, width), np.bool_)
-    for v in prange(height):
+    n, _, width = phases.shape
+    for v in range(first, end):
         for u in range(width):
             start = _cycles(phases, rungs, 0, v, u)
             start -= np.floor(start + 0.5)
@@ -170,13 +178,12 @@ def _climb(phases, sigmas, rungs: Rungs, middle, origin, half):
             if 0.5 - abs(start) < SIGMAS * np.sqrt(variance) / (2 * np.pi):
                 # The ends of the coarsest wave are one phase: of both only that which leads onto the axis can be right.
                 other, too = _ascend(phases, sigmas, rungs, v, u, start - np.sign(start))
-                end = half + SIGMAS * pitch[-1] / (2 * np.pi) * sigmas[0, v, u]
-                inside, as_well = sure and abs(x) <= end, too and abs(other) <= end
+                reach = span.half + SIGMAS * pitch[-1] / (2 * np.pi) * sigmas[0, v, u]
+                inside, as_well = sure and abs(x) <= reach, too and abs(other) <= reach
                 sure = inside != as_well
                 x = other if as_well and not inside else x
-            order[v, u] = np.floor((middle + x - origin) / pitch[-1] - phases[0, v, u] / (2 * np.pi) + 0.5)
-            trusted[v, u] = sure
-    return Orders(order, trusted)
+            orders.order[v, u] = np.floor((span.middle + x - span.origin) / pitch[-1] - phases[0, v, u] / (2 * np.pi) + 0.5)
+            orders.trusted[v, u] = sure
 
 
 @njit(inline="always")

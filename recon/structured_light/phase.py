@@ -4,16 +4,17 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 
 Image = NDArray[np.float32]
 
 QUANTISATION = 1 / 12  # DN^2, variance of rounding to whole digital numbers
 MIN_STEPS_FOR_NOISE = 8  # below eight steps no temporal harmonic is free of the projector's second and third
 NOISE_SAMPLES = 40_000  # pixels of the estimate; enough for 1 % in the variance
+
+BRIGHTEST = 6  # row of the sums: the brightest image
 
 PI, HALF_PI = np.float32(np.pi), np.float32(np.pi / 2)
 # atan(t) / t as a polynomial in t^2: least squares at Chebyshev nodes of [0, 1].
@@ -43,6 +44,16 @@ class Fringe(NamedTuple):
     offset: Image  # A, DN
     sigma: Image  # rad, predicted standard deviation of the phase; inf without modulation
     saturated: NDArray[np.bool_]  # any image at or above full scale
+
+
+class Fit(NamedTuple):
+    """Figures of the fit, for compiled code. All float32."""
+
+    weights: Image  # (6, n) of the images in A, B cos(phase), B sin(phase), and in the variances of the latter two
+    quadratic: Image  # (3,) sums of the last three rows
+    read_variance: float  # DN^2
+    gain: float  # DN of variance a DN of intensity
+    saturation: float  # DN
 
 
 def wrapped_phase(images: NDArray, shifts: ArrayLike, *, noise: Noise, saturation: float) -> Fringe:
@@ -81,8 +92,12 @@ def wrapped_phase(images: NDArray, shifts: ArrayLike, *, noise: Noise, saturatio
     _, c, s = solve
     weights = np.concatenate([solve, [c * c, c * s, s * s]]).astype(np.float32)
     quadratic = weights[3:].sum(axis=1)
-    return Fringe(*_fit(np.ascontiguousarray(images), weights, quadratic, np.float32(noise.read_variance),
-                        np.float32(noise.gain), np.float32(saturation)))  # fmt: skip
+    images, shape = np.ascontiguousarray(images), images.shape[1:]
+    empty = np.empty((4, *shape), np.float32)
+    fringe = Fringe(empty[0], empty[1], empty[2], empty[3], np.empty(shape, np.bool_))
+    fit = Fit(weights, quadratic, np.float32(noise.read_variance), np.float32(noise.gain), np.float32(saturation))
+    in_threads(lambda first, end: _fit(first, end, images, fit, np.empty((7, shape[1]), np.float32), fringe), shape[0])
+    return fringe
 
 
 def pseudo_inverse(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -108,15 +123,13 @@ def _arctangent(y, x):
     return -angle if y < 0 else angle
 
 
-@njit(parallel=True, error_model="numpy")
-def _fit(images, weights, quadratic, read, gain, saturation):
-    n, height, width = images.shape
-    phase = np.empty((height, width), np.float32)
-    modulation, offset, sigma = np.empty_like(phase), np.empty_like(phase), np.empty_like(phase)
-    saturated = np.empty((height, width), np.bool_)
-    for v in prange(height):
-        sums = np.zeros((6, width), np.float32)
-        top = np.zeros(width, np.float32)
+@kernel
+def _fit(first, end, images, fit, sums, fringe):
+    """Fit rows `first` to `end`, not included; `sums` : (7, w) has room for those of a row."""
+    n, _, width = images.shape
+    weights, quadratic, read, gain = fit.weights, fit.quadratic, fit.read_variance, fit.gain
+    for v in range(first, end):
+        sums[:] = 0
         for i in range(n):
             row = images[i, v]
             w0, w1, w2, w3, w4, w5 = weights[0, i], weights[1, i], weights[2, i], weights[3, i], weights[4, i], weights[5, i]
@@ -128,20 +141,19 @@ def _fit(images, weights, quadratic, read, gain, saturation):
                 sums[3, u] += w3 * value
                 sums[4, u] += w4 * value
                 sums[5, u] += w5 * value
-                top[u] = max(top[u], value)
+                sums[BRIGHTEST, u] = max(sums[BRIGHTEST, u], value)
         for u in range(width):
             x, y = sums[1, u], sums[2, u]
             square = x * x + y * y
             amplitude = math.sqrt(square)
-            phase[v, u] = _arctangent(y, x)
-            offset[v, u], modulation[v, u] = sums[0, u], amplitude
+            fringe.phase[v, u] = _arctangent(y, x)
+            fringe.offset[v, u], fringe.modulation[v, u] = sums[0, u], amplitude
             cc = read * quadratic[0] + gain * sums[3, u]
             cs = read * quadratic[1] + gain * sums[4, u]
             ss = read * quadratic[2] + gain * sums[5, u]
-            sigma[v, u] = math.sqrt(max(x * x * ss - np.float32(2) * x * y * cs + y * y * cc, np.float32(0))) / square \
+            fringe.sigma[v, u] = math.sqrt(max(x * x * ss - np.float32(2) * x * y * cs + y * y * cc, np.float32(0))) / square \
                 if square > 0 else np.float32(np.inf)  # fmt: skip
-            saturated[v, u] = top[u] >= saturation
-    return phase, modulation, offset, sigma, saturated
+            fringe.saturated[v, u] = sums[BRIGHTEST, u] >= fit.saturation
 
 
 def estimate_noise(images: NDArray, shifts: ArrayLike, *, saturation: float = 255) -> Noise | None:

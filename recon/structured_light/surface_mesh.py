@@ -6,16 +6,15 @@ steps too, but each is like its neighbours.
 """
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
 import trimesh
-from numba import prange
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 from recon.geometry.camera import Camera
 from recon.structured_light.triangulate import Float32, PointMap
 
@@ -37,6 +36,14 @@ class Limits:
     outlier_steps: Positive = 1.0  # distance from the local plane, in sampling steps, beyond the noise
     min_modulation: Fraction = 0.5  # at an edge: fringe modulation, as a fraction of the strongest within two pixels
     min_island_px: Annotated[int, Field(ge=1)] = 400  # smaller connected pieces are left out
+
+
+class Tears(NamedTuple):
+    """Limits of a step between neighbours, for compiled code; as in `Limits`."""
+
+    slope: float
+    bend: float
+    least: float
 
 
 def clean(point_map: PointMap, camera: Camera, modulation: ArrayLike | None = None, limits: Limits | None = None) -> PointMap:
@@ -62,7 +69,7 @@ def clean(point_map: PointMap, camera: Camera, modulation: ArrayLike | None = No
     noise = _difference(point_map.sigma)
     distance[point_map.sigma > limits.max_sigma * step] = np.nan
     distance[_bump(distance) > noise + limits.outlier_steps * step] = np.nan
-    distance[_torn(distance, noise, step, limits.max_slope, limits.max_bend, limits.min_tear)] = np.nan
+    distance[_torn(distance, noise, step, limits)] = np.nan
     if modulation is not None:
         distance[_mixed(distance, np.asarray(modulation, np.float32), limits.min_modulation)] = np.nan
     gone = ~_without_islands(np.isfinite(distance), limits.min_island_px)
@@ -103,7 +110,8 @@ def mesh(point_map: PointMap, camera: Camera, max_slope: float = Limits.max_slop
 
 def _distances(points: Float32, camera: Camera) -> tuple[Float32, Float32]:
     """Distance of each point from the camera's centre, and its sampling step : (h, w) mm each."""
-    distance = _norms(points, camera.centre.astype(np.float32))
+    centre, distance = camera.centre.astype(np.float32), np.empty(points.shape[:2], np.float32)
+    in_threads(lambda first, end: _fill_norms(first, end, points, centre, distance), len(points))
     return distance, distance * np.float32(2 / (camera.matrix[0, 0] + camera.matrix[1, 1]))
 
 
@@ -112,35 +120,35 @@ def _difference(sigma: Float32) -> Float32:
     return np.nan_to_num(NOISE * np.sqrt(np.float32(2)) * sigma)
 
 
-@njit(parallel=True)
-def _norms(points, centre):
-    height, width, _ = points.shape
-    result = np.empty((height, width), np.float32)
-    for j in prange(height):
-        for i in range(width):
+@kernel
+def _fill_norms(first, end, points, centre, norms):
+    for j in range(first, end):
+        for i in range(points.shape[1]):
             x, y, z = points[j, i, 0] - centre[0], points[j, i, 1] - centre[1], points[j, i, 2] - centre[2]
-            result[j, i] = np.sqrt(x * x + y * y + z * z)
-    return result
+            norms[j, i] = np.sqrt(x * x + y * y + z * z)
 
 
-@njit(parallel=True)
-def _bump(distance):
+def _bump(distance: Float32) -> Float32:
     """Distance of each point from the local plane : (h, w) mm.
 
     Two pixels on opposite sides of a point predict its distance, exactly so on a plane and near enough on skin. Of the eight
     such pairs within two pixels the second best counts: beside a depth step the pairs along it still agree, and a lone
     outlier agrees with none. Zero where there are fewer than two pairs.
     """
-    height, width = distance.shape
-    result = np.zeros((height, width), np.float32)
-    for j in prange(height):
-        for i in range(width):
+    bump = np.zeros(distance.shape, np.float32)
+    in_threads(lambda first, end: _fill_bump(first, end, distance, bump), len(distance))
+    return bump
+
+
+@kernel
+def _fill_bump(first, end, distance, bump):
+    for j in range(first, end):
+        for i in range(distance.shape[1]):
             if not np.isfinite(distance[j, i]):
                 continue
             second = _second_best(distance, j, i)
             if np.isfinite(second):
-                result[j, i] = second
-    return result
+                bump[j, i] = second
 
 
 @njit(inline="always")
@@ -162,12 +170,17 @@ def _second_best(distance, j, i):
     return second
 
 
-@njit(parallel=True)
-def _torn(distance, noise, step, max_slope, max_bend, min_tear):
+def _torn(distance: Float32, noise: Float32, step: Float32, limits: Limits) -> Mask:
     """Pixels on either side of a tear : (h, w) bool."""
+    torn, tears = np.zeros(distance.shape, np.bool_), Tears(limits.max_slope, limits.max_bend, limits.min_tear)
+    in_threads(lambda first, end: _fill_torn(first, end, distance, noise, step, tears, torn), len(distance))
+    return torn
+
+
+@kernel
+def _fill_torn(first, end, distance, noise, step, tears, torn):
     height, width = distance.shape
-    result = np.zeros((height, width), np.bool_)
-    for j in prange(height):
+    for j in range(first, end):
         for i in range(width):
             if not np.isfinite(distance[j, i]):
                 continue
@@ -176,7 +189,7 @@ def _torn(distance, noise, step, max_slope, max_bend, min_tear):
                 if j1 < 0 or j1 >= height or i1 < 0 or i1 >= width or not np.isfinite(distance[j1, i1]):
                     continue
                 jump = abs(distance[j1, i1] - distance[j, i]) - max(noise[j, i], noise[j1, i1])
-                if jump <= min_tear * step[j, i]:
+                if jump <= tears.least * step[j, i]:
                     continue
                 # the gentler of the steps before and after this one; unknown ones don't count
                 gentler = np.float32(np.inf)
@@ -185,9 +198,8 @@ def _torn(distance, noise, step, max_slope, max_bend, min_tear):
                     gentler = abs(distance[j, i] - distance[j0, i0])
                 if 0 <= j2 < height and 0 <= i2 < width and np.isfinite(distance[j2, i2]):
                     gentler = min(gentler, abs(distance[j2, i2] - distance[j1, i1]))
-                if jump > max_slope * step[j, i] or jump > max_bend * gentler + min_tear * step[j, i]:
-                    result[j, i] = True
-    return result
+                if jump > tears.slope * step[j, i] or jump > tears.bend * gentler + tears.least * step[j, i]:
+                    torn[j, i] = True
 
 
 def _mixed(distance: Float32, modulation: Float32, fraction: float) -> Mask:

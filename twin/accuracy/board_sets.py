@@ -13,6 +13,7 @@ from recon.geometry.camera_jacobian import linearise
 from recon.model.boards import AsymmetricCircles
 from recon.model.calibration import Calibration
 from recon.model.rig import Rig
+from recon.optical_calibration.board_frames import some_at_once
 from recon.optical_calibration.bundle import Estimate
 from recon.optical_calibration.joint_calibration import Result, Settings, calibrate, circle_offsets
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
@@ -24,6 +25,8 @@ from twin import board_session
 from twin.board_session import CAMERAS, FRINGE_CAMERA
 from twin.optics.surface_session import calibration_of
 from twin.sensor import Numbers
+
+HELD = 12  # poses whose images are held at once, of 66 MB each
 
 
 @dataclass(frozen=True)
@@ -57,13 +60,19 @@ def rendered(settings: board_session.Settings) -> BoardSet:
     bits: dict[str, int] = {camera: exposure.bits for camera, exposure in exposures.items()}
     design = board.design(settings.board)
     sightings, images, seconds = [], [], 0.0
-    for number, pose in enumerate(placed):
-        lit, fringes = board_session.shoot_pose(stage, settings, exposures, number, pose)
+    for first in range(0, len(placed), HELD):
+        numbers = range(first, min(first + HELD, len(placed)))
+        shot = [board_session.shoot_pose(stage, settings, exposures, number, placed[number]) for number in numbers]
         start = perf_counter()
-        name = board_session.pose_name(number)
-        sightings.append(sight(name, design, lit, fringes[FRINGE_CAMERA], settings.patterns, bits))
+
+        def look(k: int, first: int = first, shot: list = shot) -> Sighting:
+            lit, fringes = shot[k]
+            name = board_session.pose_name(first + k)
+            return sight(name, design, lit, fringes[FRINGE_CAMERA], settings.patterns, bits)
+
+        sightings += some_at_once(look, len(shot))
         seconds += perf_counter() - start
-        images.append(lit)
+        images += [lit for lit, _ in shot]
     centres = board.printed_centres(settings.board)
     return BoardSet(tuple(sightings), design, calibration_of(settings.rig), placed, centres, tuple(images), seconds)
 

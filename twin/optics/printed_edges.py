@@ -9,11 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 from recon.geometry import rigid
 from scenes.kinds.board import Print
 from twin.optics.instruments import CameraOptics
@@ -45,6 +44,14 @@ class Tables(NamedTuple):
     centre: Array
     across: Array
     down: Array
+
+
+class Samples(NamedTuple):
+    """Sample points of the pixels' light."""
+
+    footprint: Array  # px from a pixel's centre, by even fractions of its light along one axis
+    points: Array  # (n, 4)
+    turns: Array  # (m, 3) of each pixel's own
 
 
 class Left(NamedTuple):
@@ -155,13 +162,17 @@ def _reach_mm(view: View, board: Print, tables: Tables, k, x, y):
     return view.reach_px * math.sqrt((squares + math.sqrt(max(squares * squares - 4 * area * area, 0.0))) / 2)
 
 
-@njit(parallel=True, error_model="numpy")
-def _kinds(view: View, board: Print, tables: Tables):
+def _kinds(view: View, board: Print, tables: Tables) -> NDArray[np.uint8]:
     """Kinds of pixels : (m,), by the distance of each from the nearest rim and from the board's sides."""
     kinds = np.zeros(len(tables.centre), np.uint8)
-    for k in prange(len(kinds)):
-        kinds[k] = _kind(view, board, tables, k)
+    in_threads(lambda first, end: _fill_kinds(first, end, view, board, tables, kinds), len(kinds))
     return kinds
+
+
+@kernel
+def _fill_kinds(first, end, view: View, board: Print, tables: Tables, kinds):
+    for k in range(first, end):
+        kinds[k] = _kind(view, board, tables, k)
 
 
 @njit(error_model="numpy")
@@ -179,21 +190,26 @@ def _kind(view: View, board: Print, tables: Tables, k):
     return WHITE if beyond > 0 else BLACK
 
 
-@njit(parallel=True, error_model="numpy")
-def _black_shares(view: View, board: Print, tables: Tables, footprint, points, turns):
+def _black_shares(view: View, board: Print, tables: Tables, footprint: Array, points: Array, turns: Array) -> Array:
     """Shares of pixels' light that come from discs : (m,).
 
     Each pixel shifts the sample points : (n, 4) round the unit square by some part, and turns them on the lens by some angle,
     of its own : (m, 3).
     """
-    shares = np.zeros(len(turns))
-    for k in prange(len(turns)):
-        shares[k] = _black_share(view, board, tables, footprint, points, turns[k], k)
+    shares, samples = np.zeros(len(turns)), Samples(footprint, points, turns)
+    in_threads(lambda first, end: _fill_shares(first, end, view, board, tables, samples, shares), len(turns))
     return shares
 
 
+@kernel
+def _fill_shares(first, end, view: View, board: Print, tables: Tables, samples: Samples, shares):
+    for k in range(first, end):
+        shares[k] = _black_share(view, board, tables, samples, k)
+
+
 @njit(error_model="numpy")
-def _black_share(view: View, board: Print, tables: Tables, footprint, points, turn, k):
+def _black_share(view: View, board: Print, tables: Tables, samples: Samples, k):
+    footprint, points, turn = samples.footprint, samples.points, samples.turns[k]
     cx, cy = tables.centre[k, 0], tables.centre[k, 1]
     ax, ay, bx, by = tables.across[k, 0], tables.across[k, 1], tables.down[k, 0], tables.down[k, 1]
     x, y = _meet(view, board, cx, cy, 0.0, 0.0)
@@ -227,16 +243,20 @@ def _at_fraction(table, fraction):
     return table[below] + (position - below) * (table[below + 1] - table[below])
 
 
-@njit(parallel=True, error_model="numpy")
-def _mixed(image, kinds, edges, shares):
+def _mixed(image: Images, kinds: NDArray[np.uint8], edges: NDArray[np.int64], shares: Array) -> Array:
     """Black and white in their shares : (m,), NaN where one of them isn't known."""
     values = np.full(len(edges), np.nan)
+    in_threads(lambda first, end: _fill_mixed(first, end, image, kinds, edges, shares, values), len(edges))
+    return values
+
+
+@kernel
+def _fill_mixed(first, end, image, kinds, edges, shares, values):
     width = image.shape[1]
-    for k in prange(len(edges)):
+    for k in range(first, end):
         v, u = edges[k] // width, edges[k] % width
         white, black = _level_at(image, kinds, WHITE, v, u), _level_at(image, kinds, BLACK, v, u)
         values[k] = white + shares[k] * (black - white)
-    return values
 
 
 @njit(error_model="numpy")

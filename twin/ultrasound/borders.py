@@ -77,7 +77,7 @@ def _fill(first, end, spans, solids, pose, bundles, clear, near):
             x = pose[0, 0] * along + pose[0, 2] * across + pose[0, 3]
             y = pose[1, 0] * along + pose[1, 2] * across + pose[1, 3]
             z = pose[2, 0] * along + pose[2, 2] * across + pose[2, 3]
-            t, count, end = bundles.first_mm[j], 0, -1.0
+            t, count, stop = bundles.first_mm[j], 0, -1.0
             clear[:] = t
             while t < bundles.deepest_mm:
                 point = x + pose[0, 1] * t, y + pose[1, 1] * t, z + pose[2, 1] * t
@@ -85,11 +85,11 @@ def _fill(first, end, spans, solids, pose, bundles, clear, near):
                 if not met:
                     t = min(free, bundles.deepest_mm)
                     continue
-                if t > end and count < MOST:
+                if t > stop and count < MOST:
                     depths[i, j, count, START] = t
                     count += 1
-                end = min(t + GROWTH_MM, bundles.deepest_mm)
-                depths[i, j, count - 1, STOP] = end
+                stop = min(t + GROWTH_MM, bundles.deepest_mm)
+                depths[i, j, count - 1, STOP] = stop
                 for solid in range(len(near)):
                     close[i, j, count - 1, solid] |= near[solid]
                 t += GROWTH_MM
@@ -101,11 +101,11 @@ def _borders_near(clear, near, solids, point, t, radius_mm):
     """Whether a border may lie in a bundle at a depth, and the depth up to which none may; marks its solids."""
     met, free = False, np.inf
     for solid in range(len(clear)):
-        near[solid] = t < clear[solid] < t + GROWTH_MM
-        if t >= clear[solid]:
+        near[solid] = False
+        if clear[solid] < t + GROWTH_MM:
             d = distance_at(solids, solid, point[0], point[1], point[2])
             near[solid] = abs(d) <= radius_mm + GROWTH_MM
             clear[solid] = t + (GROWTH_MM if near[solid] else min(abs(d) - radius_mm, LEAP_MM))
-            met |= near[solid]
+        met |= near[solid]
         free = min(free, clear[solid])
     return met, free

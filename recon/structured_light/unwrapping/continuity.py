@@ -7,15 +7,17 @@ beside each other, for which any border is straight enough, shows smaller jumps 
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 
 Image = NDArray[np.float32]
+Integers = NDArray[np.int32]
 Flags = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 VOID, TORN, INCOMPLETE, CLEAN = 0, 1, 2, 3  # not measured; next to a jump; too near a gap to decide; continuous both ways
 
@@ -26,14 +28,28 @@ REACH = 8  # px that an order is carried along clean pixels, less than two cells
 BLIND_REACH = 5  # px that it is carried where the stencil is incomplete: the stencil's own reach
 
 
+class Carried(NamedTuple):
+    """Orders of pixels. Both (h, w)."""
+
+    order: Integers
+    known: Mask
+
+
+class Ground(NamedTuple):
+    """The surface that orders are carried over. All (h, w)."""
+
+    phase: Image  # cycles
+    sigma: Image  # rad
+    flags: Flags
+
+
 @njit(inline="always")
 def wrap(cycles):
     """The difference of two phases in cycles, to [-0.5, 0.5)."""
     return cycles - np.floor(cycles + np.float32(0.5))
 
 
-@njit(parallel=True)
-def continuity(phase, sigma, valid):
+def continuity(phase: Image, sigma: Image, valid: Mask) -> Flags:
     """Classify pixels by the continuity of their phase.
 
     Parameters
@@ -47,11 +63,21 @@ def continuity(phase, sigma, valid):
     flags : (h, w) uint8
         VOID, TORN, INCOMPLETE or CLEAN.
     """
+    across, down = np.full((2, *phase.shape), np.nan, np.float32)
+    jumps, flags = np.empty((2, *phase.shape), np.uint8)
     height, width = phase.shape
-    across = np.full((height, width), np.float32(np.nan))  # mismatch at the pair (u, u+1), cycles; NaN where incomplete
-    down = np.full((height, width), np.float32(np.nan))  # at the pair (v, v+1)
+    in_threads(lambda first, end: _compare(first, end, phase, valid, across, down), height)
+    in_threads(lambda first, end: _find_jumps(first, end, across, down, sigma, jumps), height)
+    in_threads(lambda first, end: _combine(first, end, jumps, valid, np.empty(width, np.uint8), flags), height)
+    return flags
+
+
+@kernel
+def _compare(first, end, phase, valid, across, down):
+    """Mismatch at the pairs (u, u + 1) and (v, v + 1), cycles, of rows `first` to `end`, not included; NaN where incomplete."""
+    height, width = phase.shape
     outside = np.float32(0.75)
-    for v in prange(height):
+    for v in range(first, end):
         p = phase[v]
         for u in range(3, width - 4):
             inner = wrap(p[u] - p[u - 1]) + wrap(p[u + 1] - p[u]) + wrap(p[u + 2] - p[u + 1])
@@ -70,17 +96,22 @@ def continuity(phase, sigma, valid):
             inner = wrap(d[u] - c[u]) + wrap(e[u] - d[u]) + wrap(f[u] - e[u])
             outer = wrap(c[u] - b[u]) + wrap(b[u] - a[u]) + wrap(g[u] - f[u]) + wrap(h[u] - g[u])
             down[v, u] = wrap(inner - outside * outer)
-        whole = valid[v - 3] & valid[v - 2] & valid[v - 1] & valid[v] & valid[v + 1] & valid[v + 2] & valid[v + 3] & valid[v + 4]
         for u in range(width):
-            down[v, u] = down[v, u] if whole[u] else np.float32(np.nan)
-    jumps = np.empty((height, width), np.uint8)
-    for v in prange(height):
+            above = valid[v - 3, u] & valid[v - 2, u] & valid[v - 1, u] & valid[v, u]
+            below = valid[v + 1, u] & valid[v + 2, u] & valid[v + 3, u] & valid[v + 4, u]
+            down[v, u] = down[v, u] if above & below else np.float32(np.nan)
+
+
+@kernel
+def _find_jumps(first, end, across, down, sigma, jumps):
+    """Judge the pixels of rows `first` to `end`, not included."""
+    height, width = sigma.shape
+    for v in range(first, end):
         over, here, under = across[max(v - 1, 0)], across[v], across[min(v + 1, height - 1)]
         for u in range(1, width - 1):  # the first and last column apart: without limits on u this takes vector instructions
             jumps[v, u] = _judge(over[u], here[u], under[u], down[v, u - 1], down[v, u], down[v, u + 1], sigma[v, u])
         for u, left, right in ((0, 0, min(1, width - 1)), (width - 1, max(width - 2, 0), width - 1)):
             jumps[v, u] = _judge(over[u], here[u], under[u], down[v, left], down[v, u], down[v, right], sigma[v, u])
-    return _combine(jumps, valid)
 
 
 @njit(inline="always")
@@ -93,29 +124,26 @@ def _judge(over, x, under, left, y, right, s):
     return torn | np.uint8(4) * np.uint8(x != x) | np.uint8(8) * np.uint8(y != y)
 
 
-@njit(parallel=True)
-def _combine(jumps, valid):
+@kernel
+def _combine(first, end, jumps, valid, seen, flags):
     """A pixel is torn if any stencil is whose middle it touches, incomplete if any is; clean otherwise."""
     height, width = valid.shape
-    flags = np.zeros((height, width), np.uint8)
-    for v in prange(height):
-        seen = np.zeros(width, np.uint8)
+    for v in range(first, end):
+        seen[:] = 0
         for k in range(-2, 2):
             y = min(max(v + k, 0), height - 1)
             for u in range(width):
                 seen[u] |= jumps[y, u] & np.uint8(2 | 8)
             for u in range(2, width - 1):
                 seen[u] |= jumps[v, u + k] & np.uint8(1 | 4)
-        seen[:2] |= np.uint8(4)
-        seen[width - 1] |= np.uint8(4)
+        seen[0], seen[1], seen[width - 1] = 4 | seen[0], 4 | seen[1], 4 | seen[width - 1]
         for u in range(width):
+            flags[v, u] = VOID
             if valid[v, u]:
                 flags[v, u] = TORN if seen[u] & 3 else (INCOMPLETE if seen[u] & 12 else CLEAN)
-    return flags
 
 
-@njit(parallel=True)
-def carry(order, known, phase, sigma, flags, wanted, reach):
+def carry(order: Integers, known: Mask, phase: Image, sigma: Image, flags: Flags, wanted: int, reach: int) -> Carried:
     """Carry orders from known pixels to their neighbours, as far as the phase follows the slope it had among the known ones.
 
     Looks along the row and the column, both ways, up to `reach` px. A pixel gets an order if at least one way leads to it over
@@ -136,10 +164,17 @@ def carry(order, known, phase, sigma, flags, wanted, reach):
     order, known
         Copies with the new ones in.
     """
-    height, width = phase.shape
-    filled, found = order.copy(), known.copy()
-    for v in prange(height):
-        for u in range(width):
+    before, after, ground = Carried(order, known), Carried(order.copy(), known.copy()), Ground(phase, sigma, flags)
+    in_threads(lambda first, end: _carry(first, end, before, after, ground, wanted, reach), len(order))
+    return after
+
+
+@kernel
+def _carry(first, end, before, after, ground, wanted, reach):
+    """Carry orders to the pixels of rows `first` to `end`, not included."""
+    order, known, phase, sigma, flags = before.order, before.known, ground.phase, ground.sigma, ground.flags
+    for v in range(first, end):
+        for u in range(phase.shape[1]):
             if known[v, u] or flags[v, u] < wanted:
                 continue
             candidate, ways, clash = 0, 0, False
@@ -154,8 +189,7 @@ def carry(order, known, phase, sigma, flags, wanted, reach):
                     clash = clash or (ways > 0 and here != candidate)
                     candidate, ways = here, ways + 1
             if ways > 0 and not clash:
-                filled[v, u], found[v, u] = candidate, True
-    return filled, found
+                after.order[v, u], after.known[v, u] = candidate, True
 
 
 @njit(inline="always")

@@ -17,10 +17,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 from recon.structured_light.phase import Fringe
 from recon.structured_light.unwrapping import continuity, watershed
 from recon.structured_light.unwrapping.continuity import CLEAN, INCOMPLETE, TORN, VOID, wrap
@@ -113,7 +112,7 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     closed = _leaks(distance, home, cells, right, down) | _dilated(frontier, 1) | ((basin < 0) & _dilated(frontier, 2))
     reached = (basin >= 0) & np.append(resolved, False)[basin] & ~closed
     island = (basin >= 0) & ~np.append(resolved | contested, True)[basin] & ~closed
-    order, known, unreachable = _to_pixels(relative, flags, basin, cells, reached, island, closed)
+    order, known, unreachable = _to_pixels(Cells(cells, basin >= 0, reached, island, closed), relative, flags)
     order, known = continuity.carry(order, known, phase, fringe.sigma, flags, CLEAN, continuity.REACH)
     order, known = continuity.carry(order, known, phase, fringe.sigma, flags, INCOMPLETE, continuity.BLIND_REACH)
     islands = len(set(found.region.tolist()) - set(found.absolute) - found.disputed)
@@ -121,17 +120,21 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     return Unwrapped(order, known, unreachable, len(found.absolute), islands, len(found.disputed), *sighted)
 
 
-@njit(parallel=True, error_model="numpy")
-def _line_light(image, valid, fringe: Fringe):
+def _line_light(image: NDArray, valid: Mask, fringe: Fringe) -> NDArray[np.float32]:
     """Light of the line over full light, where it is bright enough to be the line : (h, w), 0 elsewhere."""
-    offset, modulation, sigma = fringe.offset, fringe.modulation, fringe.sigma
     light = np.zeros(image.shape, np.float32)
-    for v in prange(image.shape[0]):
+    in_threads(lambda first, end: _fill_light(first, end, image, valid, fringe, light), len(image))
+    return light
+
+
+@kernel
+def _fill_light(first, end, image, valid, fringe: Fringe, light):
+    offset, modulation, sigma = fringe.offset, fringe.modulation, fringe.sigma
+    for v in range(first, end):
         for u in range(image.shape[1]):
             dark = max(offset[v, u] - modulation[v, u], np.float32(0))
             level = (image[v, u] - dark) / (2 * modulation[v, u])
             light[v, u] = level if valid[v, u] and level >= LINE_LEVEL + 4 * sigma[v, u] else 0
-    return light
 
 
 @njit
@@ -260,26 +263,46 @@ def _dilated(mask: Mask, cells: int) -> Mask:
     return cv2.dilate(mask.view(np.uint8), np.ones((side, side), np.uint8)).view(bool)
 
 
-@njit(parallel=True)
-def _to_pixels(relative, flags, basin, cells, reached, island, closed):
+class Cells(NamedTuple):
+    """Cells after the regions were joined. All (rows, columns)."""
+
+    order: Integers  # of a cell's first pixel
+    continuous: Mask
+    reached: Mask  # by the line
+    island: Mask
+    closed: Mask  # leaks and frontiers
+
+
+class Pixels(NamedTuple):
+    """Orders of pixels. All (h, w)."""
+
+    order: Integers
+    known: Mask
+    unreachable: Mask
+
+
+def _to_pixels(cells: Cells, relative: NDArray[np.int8], flags: Flags) -> Pixels:
     """Orders of the cells, given to their pixels.
 
     Islands, leaks and frontiers are marked in the flags, so that no order is carried into them.
     """
-    height, width = flags.shape
-    rows, columns = basin.shape
-    order = np.zeros((height, width), np.int32)
-    known, unreachable = np.zeros((height, width), np.bool_), np.zeros((height, width), np.bool_)
-    for v in prange(rows * CELL):
-        for u in range(columns * CELL):
+    pixels = Pixels(np.zeros(flags.shape, np.int32), np.zeros(flags.shape, bool), np.zeros(flags.shape, bool))
+    in_threads(lambda first, end: _fill(first, end, cells, relative, flags, pixels), CELL * len(cells.order))
+    return pixels
+
+
+@kernel
+def _fill(first, end, cells, relative, flags, pixels):
+    """Fill rows `first` to `end`, not included."""
+    for v in range(first, end):
+        for u in range(CELL * cells.order.shape[1]):
             i, j = v // CELL, u // CELL
-            if reached[i, j]:
-                order[v, u], known[v, u] = cells[i, j] + relative[v, u], True
+            if cells.reached[i, j]:
+                pixels.order[v, u], pixels.known[v, u] = cells.order[i, j] + relative[v, u], True
                 continue
-            if closed[i, j]:
+            if cells.closed[i, j]:
                 flags[v, u] = min(flags[v, u], np.uint8(TORN))
                 continue
-            if basin[i, j] >= 0:
-                unreachable[v, u] = island[i, j]
+            if cells.continuous[i, j]:
+                pixels.unreachable[v, u] = cells.island[i, j]
                 flags[v, u] = VOID
-    return order, known, unreachable

@@ -4,11 +4,12 @@ A cell is a square of pixels that are continuous in themselves; its order holds 
 neighbours are gathered from the widest places to the narrow ones, as a watershed floods a landscape.
 """
 
+from typing import NamedTuple
+
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import in_threads, kernel, njit
 from recon.structured_light.unwrapping.continuity import CLEAN, INCOMPLETE, TORN, VOID
 
 CELL = 4  # px; a cell's side
@@ -19,19 +20,41 @@ Integers = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 
-@njit(parallel=True)
-def gather(phase, flags):
-    """Orders of the pixels relative to their cell's first, the cells' state, and the offsets to the cells right and below."""
-    rows, columns = phase.shape[0] // CELL, phase.shape[1] // CELL
-    relative = np.zeros(phase.shape, np.int8)
-    state = np.zeros((rows, columns), np.uint8)
-    right, down = np.full((rows, columns), NONE, np.int8), np.full((rows, columns), NONE, np.int8)
-    for i in prange(rows):
-        for j in range(columns):
-            state[i, j] = _state(flags, i * CELL, j * CELL)
-            if state[i, j] == CLEAN:
-                _follow(phase, relative, i * CELL, j * CELL)
-    for i in prange(rows):
+class Tiles(NamedTuple):
+    """Pixels gathered into cells."""
+
+    relative: NDArray[np.int8]  # (h, w) orders of the pixels relative to their cell's first
+    state: NDArray[np.uint8]  # (rows, columns) of the cells
+    right: NDArray[np.int8]  # (rows, columns) offset to the cell on the right, or NONE
+    down: NDArray[np.int8]  # (rows, columns) to the cell below
+
+
+def gather(phase: NDArray[np.float32], flags: NDArray[np.uint8]) -> Tiles:
+    """Gather pixels into cells, from their phase : (h, w) cycles and the flags of its continuity : (h, w)."""
+    shape = phase.shape[0] // CELL, phase.shape[1] // CELL
+    offsets = np.full((2, *shape), NONE, np.int8)
+    tiles = Tiles(np.zeros(phase.shape, np.int8), np.zeros(shape, np.uint8), offsets[0], offsets[1])
+    in_threads(lambda first, end: _gather(first, end, phase, flags, tiles), shape[0])
+    in_threads(lambda first, end: _compare(first, end, phase, tiles), shape[0])
+    return tiles
+
+
+@kernel
+def _gather(first, end, phase, flags, tiles):
+    """Judge the cells of rows `first` to `end`, not included, and follow the phase in them."""
+    for i in range(first, end):
+        for j in range(tiles.state.shape[1]):
+            tiles.state[i, j] = _state(flags, i * CELL, j * CELL)
+            if tiles.state[i, j] == CLEAN:
+                _follow(phase, tiles.relative, i * CELL, j * CELL)
+
+
+@kernel
+def _compare(first, end, phase, tiles):
+    """Offsets of the cells of rows `first` to `end`, not included, to their neighbours."""
+    relative, state, right, down = tiles
+    rows, columns = state.shape
+    for i in range(first, end):
         for j in range(columns):
             if state[i, j] != CLEAN:
                 continue
@@ -39,7 +62,6 @@ def gather(phase, flags):
                 right[i, j] = _offset(phase, relative, i * CELL, j * CELL + CELL - 1, 1, 0)
             if i + 1 < rows and state[i + 1, j] == CLEAN:
                 down[i, j] = _offset(phase, relative, i * CELL + CELL - 1, j * CELL, 0, 1)
-    return relative, state, right, down
 
 
 @njit(inline="always")
