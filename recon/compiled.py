@@ -14,9 +14,7 @@ import logging
 import os
 import shutil
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -32,7 +30,6 @@ log = logging.getLogger(__name__)
 NUMBA = "numba>=0.61,<0.69"  # whose undocumented parts are known to be as they are used here
 OURS = ("recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks")  # packages; others keep Numba's own cache
 Name = tuple[str, ...]  # one with dots, in parts
-PARTS = 8  # of a range for each thread, so that who is done helps the other
 UNUSED_DAYS = 30  # after which code compiled from other sources is deleted
 
 
@@ -59,54 +56,13 @@ def _without_aliases(flags: Any) -> Any:
 
 
 def kernel(function: Callable | None = None, **options: Any) -> Any:
-    """Compile a loop over arrays for `in_threads`, with options of `numba.njit`.
+    """Compile a loop over arrays for `recon.threads.in_threads`, with options of `numba.njit`.
 
     It allocates no arrays, and none that it writes to shares memory with another one. So references to arrays need no counting,
     which takes a third to a half of the time to compile, and in inner loops as much of the time to run. The GIL is released, and
     a division by zero gives what it gives in NumPy.
     """
     return njit(function, noalias=True, nogil=True, _nrt=False, error_model="numpy", **options)
-
-
-def in_threads(kernel: Callable[[int, int], Any], count: int) -> None:
-    """Run `kernel(first, end)` over parts of range(count), in as many threads as Numba has.
-
-    What takes its time must release the GIL, as a `kernel` does. A loop over `prange` would have all that is called within
-    compiled thrice more, for each of the three functions that Numba makes of it.
-    """
-    threads = min(numba.get_num_threads(), count)
-    if threads <= 1:
-        kernel(0, count)
-        return
-    parts = min(PARTS * threads, count)
-    left = deque((count * k // parts, count * (k + 1) // parts) for k in range(parts))
-
-    def work() -> None:
-        while True:
-            try:
-                first, end = left.popleft()
-            except IndexError:
-                return
-            kernel(first, end)
-
-    helpers = [_helpers().submit(work) for _ in range(threads - 1)]
-    try:
-        work()
-    finally:
-        left.clear()  # by now empty, but after an error
-        for helper in helpers:
-            if not helper.cancel():  # it has begun
-                helper.result()
-
-
-@cache
-def _helpers() -> ThreadPoolExecutor:
-    """Threads beside those that call `in_threads`, kept, since making them takes as long as a small kernel."""
-    return ThreadPoolExecutor(os.cpu_count(), "kernel")
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_helpers.cache_clear)  # a forked process has none of its parent's threads
 
 
 def source_hash(module: Path, root: Path) -> str:

@@ -6,7 +6,7 @@ import zlib
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one core a worker; before NumPy is loaded
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # compiled code's threads leave the core to the other worker while they wait
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of torch
 
 import numpy as np
 import pytest

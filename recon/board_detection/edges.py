@@ -16,9 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, kernel, njit
+from recon.compiled import kernel, njit
 from recon.geometry.ellipses import Ellipses, on_ellipse
 from recon.geometry.order_statistics import quantile
+from recon.threads import in_threads
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.compiled import in_threads, kernel, njit
+from recon.compiled import kernel, njit
 from recon.geometry import rigid
+from recon.threads import in_threads
 
 Array = NDArray[np.float64]
 

@@ -1,11 +1,8 @@
 """From the board part of a capture to sightings: the devices that take part, and the poses in which each found the board."""
 
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
-import numba
 import numpy as np
 
 from recon.capture.board_part import BoardCapture, Pose
@@ -13,6 +10,7 @@ from recon.errors import InputError
 from recon.optical_calibration.joint_calibration import Result
 from recon.optical_calibration.observations import Size
 from recon.optical_calibration.sightings import Sighting, sight
+from recon.threads import mapped
 
 MOST_AT_ONCE = 4  # poses, whose images and maps take some 0.3 GB each
 DEVICES = ("cam1", "cam2", "projector")  # in the order in which they are adjusted; the first is the world
@@ -35,31 +33,14 @@ def sizes_of(captured: BoardCapture) -> dict[str, Size]:
 
 
 def look_at_all(captured: BoardCapture) -> Iterator[Sighting]:
-    """Read the images of each pose and find the board in them.
+    """Read the images of each pose and find the board in them, some poses at once, since much of that is work for one thread.
 
     Raises
     ------
     InputError
         If an image is damaged, or doesn't fit its device.
     """
-    return some_at_once(lambda number: _look(captured, captured.pose(number)), len(captured.poses))
-
-
-def some_at_once(look: Callable[[int], Sighting], count: int) -> Iterator[Sighting]:
-    """Sightings `look(k)` of all k < count, in their order, some poses at once: much of a sighting is work for one thread."""
-    threads = min(numba.get_num_threads(), MOST_AT_ONCE)
-    with ThreadPoolExecutor(threads) as pool:
-        waiting: deque[Future[Sighting]] = deque()
-        try:
-            for number in range(count):
-                waiting.append(pool.submit(look, number))
-                if len(waiting) > threads:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for left in waiting:
-                left.cancel()
+    return mapped(lambda number: _look(captured, captured.pose(number)), range(len(captured.poses)), MOST_AT_ONCE)
 
 
 def _look(captured: BoardCapture, pose: Pose) -> Sighting:

@@ -18,11 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.compiled import in_threads, njit
+from recon.compiled import njit
 from recon.errors import InputError
 from recon.geometry.cholesky import solve_and_invert
 from recon.geometry.order_statistics import quantile
 from recon.structured_light.decode import ProjectorMap
+from recon.threads import in_threads
 
 Array = NDArray[np.float64]
 

@@ -17,9 +17,10 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial import KDTree
 from scipy.special import ndtr
 
-from recon.compiled import in_threads, kernel, njit
+from recon.compiled import kernel, njit
 from recon.geometry import rigid
 from recon.segmentation.echo_power import EchoPower
+from recon.threads import in_threads
 
 Array = NDArray[np.float64]
 

@@ -11,10 +11,10 @@ from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 
+from recon import threads
 from recon.files.volumes import Volume
 from recon.freehand.volume_compounding import Grid
 from recon.geometry import rigid
-from recon.segmentation import prefetch
 
 Array = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def distances(masses: Sequence[Mass], grid: Grid) -> Volume:
         apart, _ = ndimage.label(np.isnan(near))
         bodies, count = ndimage.label((apart != apart[0, 0, 0]) & ~(near >= 0))
         inside = bodies == np.bincount(bodies.ravel())[1:].argmax() + 1 if count else bodies > 0  # narrow hollows are unsure
-        out, into = prefetch.mapped(lambda one: ndimage.distance_transform_edt(one, grid.spacing[::-1]), (~inside, inside))
+        out, into = threads.mapped(lambda one: ndimage.distance_transform_edt(one, grid.spacing[::-1]), (~inside, inside))
         whole = np.asarray(out) - np.asarray(into) - np.where(inside, -0.5, 0.5) * grid.spacing[0]
         signed = np.where(np.isfinite(near) & ((near < 0) == inside), near, whole)
         field[part] = np.minimum(field[part], np.clip(signed, -FAR_MM, FAR_MM))

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from recon import threads
 from recon.errors import InputError
 from recon.freehand.volume_compounding import Clip
 from recon.geometry import rigid
-from recon.segmentation import border_fit, echo_power, prefetch
+from recon.segmentation import border_fit, echo_power
 from recon.segmentation.echo_power import EchoPower, pixel_mm
 from recon.segmentation.mass_surface import Mass, distances, evened, meshed
 from recon.segmentation.refraction import Sound, follow
@@ -120,7 +121,7 @@ def shown(masses: Sequence[Mass], world_from_pixel: Array, shape: tuple[int, int
         placed = np.isfinite(matrix).all()
         return follow(inside, scale, matrix, shape, sound).inside if placed else np.zeros(shape, bool)
 
-    return prefetch.mapped(mask, world_from_pixel)
+    return threads.mapped(mask, world_from_pixel)
 
 
 def find(power: EchoPower) -> list[Mass]:
@@ -182,7 +183,7 @@ def _risen(ratio: NDArray) -> Mask:
 
 def _smoothed(values: NDArray, weight: NDArray, sigma: Array) -> NDArray:
     fields = (np.asarray(field, np.float32) for field in (weight, values * weight))
-    share, total = prefetch.mapped(lambda field: ndimage.gaussian_filter(field, sigma), fields)
+    share, total = threads.mapped(lambda field: ndimage.gaussian_filter(field, sigma), fields)
     return np.divide(total, share, out=np.full_like(total, np.nan), where=share > 0.02)
 
 

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from recon import threads
 from recon.files.volumes import Volume
 from recon.freehand.volume_compounding import Clip, Grid
 from recon.geometry import rigid
-from recon.segmentation import echo_power, prefetch
+from recon.segmentation import echo_power
 from recon.segmentation.echo_power import EchoPower, pixel_mm
 from recon.segmentation.mass_surface import FAR_MM, Mass, distances
 from recon.segmentation.refraction import Sound, follow
@@ -56,7 +57,7 @@ def cleared(recording: Recording, grid: Grid, masses: Sequence[Mass], sound: Sou
         return power[top:].astype(np.float32), lines.u[top:], lines.v[top:]
 
     scans = zip(recording.images(), recording.world_from_pixel, strict=True)
-    return echo_power.accumulated(prefetch.mapped(place, scans), recording.world_from_pixel, grid)
+    return echo_power.accumulated(threads.mapped(place, scans), recording.world_from_pixel, grid)
 
 
 def losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, float]:
@@ -80,7 +81,7 @@ def losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, f
     total, count = np.zeros((2, DEPTH_BINS * PATH_BINS))
     scans = zip(recording.images(), recording.world_from_pixel, strict=True)
     placed = (scan for scan in scans if np.isfinite(scan[1]).all())
-    for bins, power in prefetch.mapped(binned, placed):
+    for bins, power in threads.mapped(binned, placed):
         total += np.bincount(bins, power, len(total))
         count += np.bincount(bins, minlength=len(count))
     return _fitted_losses(total, count)

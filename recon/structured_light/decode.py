@@ -8,13 +8,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, kernel
+from recon.compiled import kernel
 from recon.errors import InputError
 from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns
 from recon.structured_light import gray_code, multi_frequency, plausibility
 from recon.structured_light.gray_code import Orders
 from recon.structured_light.phase import DEFAULT_NOISE, Fringe, Noise, estimate_noise, wrapped_phase
 from recon.structured_light.unwrapping import continuity, spatial
+from recon.threads import in_threads
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]

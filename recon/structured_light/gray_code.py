@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, kernel
+from recon.compiled import kernel
 from recon.model.patterns import Fringes, GrayCode
 from recon.structured_light.phase import Fringe, Noise
+from recon.threads import in_threads
 
 SURE = 3.0  # sigmas between a bit's intensity and its threshold, to call the bit certain
 MARGIN = 0.1  # cycle that must lie between a decision on the order and its tipping point

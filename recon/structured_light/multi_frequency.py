@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, kernel, njit
+from recon.compiled import kernel, njit
 from recon.errors import InputError
 from recon.model.patterns import Fringes
 from recon.structured_light.gray_code import Orders
 from recon.structured_light.phase import Fringe
+from recon.threads import in_threads
 
 SLACK = 0.1  # cycle from the nearest whole order, besides noise: beyond, the phases contradict each other
 SIGMAS = 5.0  # of noise, margin of the decision on a pixel

@@ -14,9 +14,10 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from recon.compiled import in_threads, kernel, njit
+from recon.compiled import kernel, njit
 from recon.geometry.camera import Camera
 from recon.structured_light.triangulate import Float32, PointMap
+from recon.threads import in_threads
 
 Mask = NDArray[np.bool_]
 Positive = Annotated[float, Field(gt=0)]

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, njit
+from recon.compiled import njit
 from recon.geometry.camera import Camera, distort_side_by_side
 from recon.structured_light.decode import ProjectorMap
+from recon.threads import in_threads
 
 Float32 = NDArray[np.float32]
 

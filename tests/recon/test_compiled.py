@@ -4,11 +4,9 @@ import os
 import shutil
 import subprocess
 import sys
-import threading
 import tomllib
 from pathlib import Path
 
-import numba
 import pytest
 from filelock import FileLock
 
@@ -195,25 +193,3 @@ def test_the_range_of_versions_is_that_of_the_project():
 def test_a_cache_that_cannot_be_written_is_no_fault(clone):
     (clone.parent / "cache").write_text("a file where the folder should be")
     assert run(clone)[0] == 42
-
-
-@pytest.mark.parametrize("count", [0, 1, 3, 100])
-@pytest.mark.parametrize("threads", [1, 2, 5])
-def test_threads_share_a_range(monkeypatch, threads, count):
-    """Each number once, in at most so many threads."""
-    monkeypatch.setattr(numba, "get_num_threads", lambda: threads)
-    done, names = [], set()
-
-    def part(first, end):
-        done.extend(range(first, end))
-        names.add(threading.get_ident())
-
-    compiled.in_threads(part, count)
-    assert sorted(done) == list(range(count))
-    assert len(names) <= threads
-
-
-def test_a_mistake_in_a_thread_is_raised(monkeypatch):
-    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
-    with pytest.raises(ZeroDivisionError):
-        compiled.in_threads(lambda first, end: 1 / (first - 1), 2)

@@ -13,11 +13,12 @@ from recon.geometry.camera_jacobian import linearise
 from recon.model.boards import AsymmetricCircles
 from recon.model.calibration import Calibration
 from recon.model.rig import Rig
-from recon.optical_calibration.board_frames import some_at_once
+from recon.optical_calibration.board_frames import MOST_AT_ONCE
 from recon.optical_calibration.bundle import Estimate
 from recon.optical_calibration.joint_calibration import Result, Settings, calibrate, circle_offsets
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
 from recon.optical_calibration.sightings import Sighting, sight
+from recon.threads import mapped
 from scenes.board_poses import Config as Poses
 from scenes.board_poses import random_poses
 from scenes.kinds import board
@@ -70,7 +71,7 @@ def rendered(settings: board_session.Settings) -> BoardSet:
             name = board_session.pose_name(first + k)
             return sight(name, design, lit, fringes[FRINGE_CAMERA], settings.patterns, bits)
 
-        sightings += some_at_once(look, len(shot))
+        sightings += mapped(look, range(len(shot)), MOST_AT_ONCE)
         seconds += perf_counter() - start
         images += [lit for lit, _ in shot]
     centres = board.printed_centres(settings.board)

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from recon.compiled import in_threads, kernel, njit
+from recon.compiled import kernel, njit
 from recon.geometry import rigid
+from recon.threads import in_threads
 from scenes.kinds.board import Print
 from twin.optics.instruments import CameraOptics
 

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, kernel
+from recon.compiled import kernel
+from recon.threads import in_threads
 from scenes.acoustics import BACKSCATTER
 from twin.ultrasound.beam import OVERSAMPLING, Beam
 from twin.ultrasound.transducer import Transducer

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, kernel, njit
+from recon.compiled import kernel, njit
+from recon.threads import in_threads
 from twin.ultrasound.echo_solids import Body, distance_at
 
 Array = NDArray[np.float64]

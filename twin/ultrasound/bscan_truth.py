@@ -6,8 +6,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, kernel
+from recon.compiled import kernel
 from recon.geometry import rigid
+from recon.threads import in_threads
 from twin.ultrasound import bmode_image
 from twin.ultrasound.echo_solids import Body
 from twin.ultrasound.sound_paths import Paths

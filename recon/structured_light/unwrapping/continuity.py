@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, kernel, njit
+from recon.compiled import kernel, njit
+from recon.threads import in_threads
 
 Image = NDArray[np.float32]
 Integers = NDArray[np.int32]

@@ -19,12 +19,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, kernel, njit
+from recon.compiled import kernel, njit
 from recon.structured_light.phase import Fringe
 from recon.structured_light.unwrapping import continuity, watershed
 from recon.structured_light.unwrapping.continuity import CLEAN, INCOMPLETE, TORN, VOID, wrap
 from recon.structured_light.unwrapping.merging import Borders, join
 from recon.structured_light.unwrapping.watershed import CELL, NONE
+from recon.threads import in_threads
 
 MARGIN_CELLS = 3  # cells that a basin grows into torn ground, so that neighbours across a tear meet
 LINE_LEVEL = 0.25  # of full light: brighter is the line

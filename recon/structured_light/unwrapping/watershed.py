@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, kernel, njit
+from recon.compiled import kernel, njit
 from recon.structured_light.unwrapping.continuity import CLEAN, INCOMPLETE, TORN, VOID
+from recon.threads import in_threads
 
 CELL = 4  # px; a cell's side
 BOTTLENECK = 1  # cells; a basin whose half width is more than its outlet's by more than this is cut off there

@@ -18,8 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import in_threads, njit
+from recon.compiled import njit
 from recon.geometry.cholesky import solve_and_invert
+from recon.threads import in_threads
 from recon.tracking.rim_fit import sector_levels
 from recon.tracking.rim_fit.rim_parameters import Rim, largest, moved, plausible
 from recon.tracking.rim_fit.rim_sums import add_up, first_levels, middle_level

@@ -1,0 +1,97 @@
+"""Is a range shared among threads, and do results of a stream come in its order, only a few items ahead of their use?"""
+
+import os
+import threading
+import time
+
+import numba
+import pytest
+
+from recon.threads import in_threads, mapped
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 100])
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_threads_share_a_range(monkeypatch, threads, count):
+    """Each number once, in at most so many threads."""
+    monkeypatch.setattr(numba, "get_num_threads", lambda: threads)
+    done, names = [], set()
+
+    def part(first, end):
+        done.extend(range(first, end))
+        names.add(threading.get_ident())
+
+    in_threads(part, count)
+    assert sorted(done) == list(range(count))
+    assert len(names) <= threads
+
+
+def test_a_mistake_in_a_thread_is_raised(monkeypatch):
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+    with pytest.raises(ZeroDivisionError):
+        in_threads(lambda first, end: 1 / (first - 1), 2)
+
+
+def test_loops_within_loops_and_side_by_side_come_to_an_end(monkeypatch):
+    """However few threads there are: who calls works, too."""
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 4 * (os.cpu_count() or 1))
+    done = []
+
+    def outer(first, end):
+        for _ in range(first, end):
+            in_threads(lambda low, high: done.extend(range(low, high)), 50)
+
+    list(mapped(lambda _: in_threads(outer, 6), range(5)))
+    assert sorted(done) == sorted(5 * 6 * list(range(50)))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks on this system")
+def test_a_forked_process_has_threads_of_its_own(monkeypatch):
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+    in_threads(lambda first, end: time.sleep(0.001), 8)  # makes this process's threads
+    child = os.fork()
+    if child == 0:
+        done = []
+        in_threads(lambda first, end: (time.sleep(0.001), done.extend(range(first, end))), 40)
+        os._exit(0 if sorted(done) == list(range(40)) else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_results_are_in_order_and_items_are_taken_one_by_one():
+    taken = []
+
+    def items():
+        for k in range(20):
+            taken.append(k)
+            yield k
+
+    def work(k: int) -> int:
+        time.sleep(0.003 * (k % 3))
+        return k * k
+
+    for k, result in enumerate(mapped(work, items())):
+        assert result == k * k
+        assert len(taken) <= k + 2 + numba.get_num_threads()
+    assert len(taken) == 20
+
+
+def test_no_more_than_some_items_are_worked_on_at_once(monkeypatch):
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 8)
+    working, most, lock = 0, 0, threading.Lock()
+
+    def work(_: int) -> None:
+        nonlocal working, most
+        with lock:
+            working += 1
+            most = max(most, working)
+        time.sleep(0.002)
+        with lock:
+            working -= 1
+
+    list(mapped(work, range(30), 3))
+    assert most <= 3
+
+
+def test_faults_are_passed_on():
+    with pytest.raises(ZeroDivisionError):
+        list(mapped(lambda k: 1 // k, [1, 0]))
