@@ -8,6 +8,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from recon.errors import InputError
+from recon.geometry.surface_tree import surface_tree
 
 Array = NDArray[np.float64]
 
@@ -67,10 +68,10 @@ def contain(mesh: trimesh.Trimesh, surface: trimesh.Trimesh, camera: ArrayLike =
 def depths(points: Array, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     """Distance : (n,) mm of points : (n, 3) to an open surface, positive behind it, as seen from the camera that measured it.
 
-    NaN where the nearest part of the surface is its rim. The surface's search tree is kept with it, for further points.
+    NaN where the nearest part of the surface is its rim.
     """
     points = np.asarray(points, float)
-    _, nearest = surface.kdtree.query(points, workers=-1)
+    _, nearest = surface_tree(surface.vertices).query(points, workers=-1)
     vertices, normals = np.asarray(surface.vertices[nearest]), np.asarray(surface.vertex_normals[nearest])
     away = vertices - np.asarray(camera, float)
     normals = normals * np.where((normals * away).sum(axis=1) > 0, -1, 1)[:, None]  # towards the camera

@@ -9,11 +9,11 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.geometry.surface_tree import surface_tree
 from recon.model.rig import Finite, Fraction, NotNegative, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.dome import Dome, Form, dome
@@ -173,6 +173,6 @@ def _check_apart(k: int, masses: list[trimesh.Trimesh]) -> None:
 
 def _depth(points: Array, surface: trimesh.Trimesh) -> Array:
     """Distance of points : (n, 3) to a surface's nearest vertex : (n,) mm, positive on the inner side."""
-    distance, nearest = KDTree(surface.vertices).query(points)
+    distance, nearest = surface_tree(surface.vertices).query(points)
     outwards = ((points - surface.vertices[nearest]) * surface.vertex_normals[nearest]).sum(axis=1) > 0
     return np.where(outwards, -distance, distance)

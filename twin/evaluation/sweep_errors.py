@@ -10,13 +10,13 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import KDTree
 
 from recon.capture.manifest import image_name
 from recon.errors import InputError, one_line
 from recon.files import npz
 from recon.files.metrics import Metrics
 from recon.geometry import rigid
+from recon.geometry.surface_tree import surface_tree
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import Rig
 from recon.probe_calibration import point_calibration
@@ -205,7 +205,7 @@ def of_each(metrics: Metrics, figure: str) -> list[float]:
 def signed_distances(points: ArrayLike, mesh: trimesh.Trimesh) -> Array:
     """Distance : (n,) mm of points : (n, 3) to the tangent plane at a dense closed mesh's nearest vertex, positive outside."""
     points = np.asarray(points, float)
-    _, nearest = KDTree(mesh.vertices).query(points)
+    _, nearest = surface_tree(mesh.vertices).query(points)
     return ((points - mesh.vertices[nearest]) * mesh.vertex_normals[nearest]).sum(axis=1)
 
 

@@ -13,10 +13,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, label, sum_labels
-from scipy.spatial import KDTree
 
 from recon.compiled import njit
 from recon.geometry.primitives import Cylinder
+from recon.geometry.surface_tree import surface_tree
 from scenes.acoustics import BACKSCATTER, Tissue, surroundings, tissue_of
 from scenes.scene_types import Scene, Thing
 
@@ -189,7 +189,7 @@ def _from_mesh(mesh: trimesh.Trimesh, points: Array, step: float) -> NDArray[np.
     for a flat base may have no vertices of its own.
     """
     flat = points.reshape(-1, 3)
-    far, nearest = KDTree(mesh.vertices).query(flat, distance_upper_bound=BAND_MM)
+    far, nearest = surface_tree(mesh.vertices).query(flat, distance_upper_bound=BAND_MM)
     near = np.isfinite(far)
     value = np.full(len(flat), BAND_MM)
     value[near] = ((flat[near] - mesh.vertices[nearest[near]]) * mesh.vertex_normals[nearest[near]]).sum(axis=1)
