@@ -7,6 +7,7 @@ small as the shared unknowns, and its inverse is their covariance.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,7 @@ class Adjustment:
     outliers: Mask  # (p, n, d)
     noise: Mapping[str, float]  # by device: measured noise over that predicted by the detection
     normalised: Array  # (p, n, d) residuals over their measured noise, each device's own; NaN where not seen
+    converged: bool
 
     @property
     def estimate(self) -> Estimate:
@@ -84,7 +86,7 @@ def adjust(
     """
     offsets = np.zeros_like(observations.pixels) if offsets is None else offsets
     problem = Problem(observations, offsets, free, shape or Shape())
-    estimate, noise = fitted(problem, start)
+    estimate, noise, converged = fitted(problem, start)
     system = linearised(problem, estimate, noise, shaped=bool(problem.shape.sigma.any()))
     return Adjustment(
         Calibration(estimate.cameras, Uncertainty(problem.names, _covariance(system, problem))),
@@ -94,6 +96,7 @@ def adjust(
         _outliers(system.lengths, observations),
         dict(zip(observations.devices, noise.tolist(), strict=True)),
         np.where(observations.seen, system.lengths, np.nan),
+        converged,
     )
 
 
@@ -102,8 +105,16 @@ def free_parameters(devices: Sequence[str], distortion: Mapping[str, Sequence[st
     return {device: (*MATRIX, *distortion[device], *(MOTION if number else ())) for number, device in enumerate(devices)}
 
 
-def fitted(problem: Problem, start: Estimate, noise: Array | None = None, converged: float = CONVERGED) -> tuple[Estimate, Array]:
-    """The values alone, and the devices' measured noise over that predicted by the detection : (d,).
+class Fitted(NamedTuple):
+    """The values alone."""
+
+    estimate: Estimate
+    noise: Array  # (d,) of the devices, measured over predicted by the detection
+    converged: bool  # the last descent
+
+
+def fitted(problem: Problem, start: Estimate, noise: Array | None = None, converged: float = CONVERGED) -> Fitted:
+    """Fit the values, and measure the devices' noise.
 
     The robust weights need the noise, and the noise needs the residuals: both are found in turn, first roughly. While the noise
     is misjudged, most sightings may weigh like outliers, and the descent to a minimum that moves on takes long.
@@ -111,16 +122,16 @@ def fitted(problem: Problem, start: Estimate, noise: Array | None = None, conver
     noise : (d,) if it is nearly known, and the start near.
     converged : relative change of the cost.
     """
-    rough, estimate = noise is None, start
+    rough, estimate, arrived = noise is None, start, False
     noise = np.ones(len(problem.observations.devices)) if noise is None else noise
     for number in range(MAX_ROUNDS):
         found = _descend(problem, estimate, noise, ROUGH if rough else FINE._replace(converged=converged))
         factor = _measured_noise(found.system, problem)
-        estimate, noise, change = found.estimate, noise * factor, np.abs(factor - 1).max()
+        estimate, noise, arrived, change = found.estimate, noise * factor, found.converged, np.abs(factor - 1).max()
         if change < SAME_NOISE and not rough:
             break
         rough = rough and change > SIMILAR_NOISE and number < MAX_ROUGH
-    return estimate, noise
+    return Fitted(estimate, noise, arrived)
 
 
 def _descend(problem: Problem, estimate: Estimate, noise: Array, rules: Rules) -> Descent[Estimate, System, tuple[Array, Array]]:

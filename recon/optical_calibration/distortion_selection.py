@@ -85,8 +85,8 @@ def held_out(own: Observations, start: Estimate, offsets: Array) -> dict[ModelNa
         fit, place = replace(start, poses=start.poses[rest]), start.poses[left_out]
         for name in TRIED:
             free = free_parameters(own.devices, dict.fromkeys(own.devices, MODELS[name]))
-            fit, noise = fitted(Problem(known, offsets[rest], free, Shape()), fit)
-            laid, noise = fitted(alone, replace(fit, poses=place), noise, CONVERGED)
+            fit, noise, _ = fitted(Problem(known, offsets[rest], free, Shape()), fit)
+            laid, noise, _ = fitted(alone, replace(fit, poses=place), noise, CONVERGED)
             errors[name][left_out], place = _squares(alone, laid, noise), laid.poses
     return errors
 

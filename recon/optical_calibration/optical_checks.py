@@ -119,6 +119,8 @@ def warnings(observations: Observations, adjustment: Adjustment, shape: Shape) -
         )
     if len(observations.poses) < FEW_POSES:
         found.append(f"only {len(observations.poses)} poses: {FEW_POSES} to 40 are usual")
+    if not adjustment.converged:
+        found.append("the adjustment ended before it converged: the poses hardly determine the lenses; more of them, tilted more")
     uncertainty = adjustment.calibration.uncertainty
     for number, device in enumerate(observations.devices):
         camera = adjustment.calibration.cameras[device]

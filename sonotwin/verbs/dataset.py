@@ -44,12 +44,12 @@ class Config(BaseModel):
 
 
 def run(config: Config) -> None:
-    """Render what is missing, and say what was written.
+    """Render the samples that are missing, write the index of all, and print the pace.
 
     Raises
     ------
     InputError
-        If `out` holds something else.
+        If `out` holds anything but a data set of these settings.
     """
     console = Console(soft_wrap=True, highlight=False)
     place, settings = Place(config.out), config.settings()

@@ -44,12 +44,12 @@ class Config(film_session.Filming):
 
 
 def run(config: Config) -> None:
-    """Render, and say what was written.
+    """Render the frames with their truth, and print the largest blur and the time.
 
     Raises
     ------
     InputError
-        If `out` holds something else.
+        If `out` holds anything but what was rendered.
     """
     console = Console(soft_wrap=True, highlight=False)
     session = Session(config.out, "sweep", config.model_dump(mode="json", exclude={"out", "add"}), config.add, CAMERAS)

@@ -8,9 +8,10 @@ from scipy.stats import chi2
 
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.geometry.levenberg_marquardt import Rules
 from recon.model.boards import AsymmetricCircles, Charuco, Chessboard
 from recon.model.calibration import Calibration
-from recon.optical_calibration import joint_calibration
+from recon.optical_calibration import adjustment, joint_calibration
 from recon.optical_calibration.adjustment import adjust, free_parameters
 from recon.optical_calibration.bundle import Estimate, Shape
 from recon.optical_calibration.joint_calibration import Settings, departure, deviation
@@ -95,6 +96,13 @@ def test_too_few_poses_are_refused_and_few_are_warned_of(sizes, good):
     with pytest.raises(InputError, match="expected 3 poses of the board or more for cam1, found 2"):
         joint_calibration.calibrate(good[:2], BOARD, sizes, QUICK)
     assert any("only 5 poses" in warning for warning in joint_calibration.calibrate(good[:5], BOARD, sizes, QUICK).warnings)
+
+
+def test_an_adjustment_that_ends_too_early_is_warned_of(sizes, good, monkeypatch):
+    """Such as by steps that are too short to arrive."""
+    monkeypatch.setattr(adjustment, "FINE", Rules(steps=2, damping=1e6))
+    found = joint_calibration.calibrate(good, BOARD, sizes, QUICK)
+    assert any("before it converged" in warning for warning in found.warnings)
 
 
 def test_a_board_found_nowhere_says_why(sizes, good):
