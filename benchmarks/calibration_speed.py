@@ -31,8 +31,8 @@ def whole_calibration() -> list[Row]:
     together = seen.seconds + adjusting
     return [
         Row("h", f"{what}: three devices, all together (peer: two cameras, OpenCV)", together, 20, finding + pair, "s"),
-        Row("h", f"{what}: of that, find the board and decode the fringes", seen.seconds, 14, finding, "s"),
-        Row("h", f"{what}: of that, choose the lens models and adjust", adjusting, 6, pair, "s"),
+        Row("h", f"{what}: of that, find the board and decode the fringes", seen.seconds, 16, finding, "s"),
+        Row("h", f"{what}: of that, choose the lens models and adjust", adjusting, 4, pair, "s"),
     ]
 
 
