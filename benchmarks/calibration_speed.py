@@ -1,6 +1,6 @@
 """Optics calibration: from the images of 34 poses to the parameters of three devices, against OpenCV with its own detection."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from time import perf_counter
 
 import cv2
@@ -9,10 +9,12 @@ import numpy as np
 from recon.capture.surface_part import read_patterns
 from recon.model.rig import Rig
 from recon.optical_calibration.joint_calibration import calibrate
+from recon.threads import mapped
 from sonotwin.config import compose, folder
 from twin.accuracy import calibration_accuracy
 from twin.accuracy.board_sets import BoardSet, rendered
 from twin.accuracy.table_rows import Measurement, Row, Setup
+from twin.sensor import Numbers
 
 
 def measurements() -> list[Measurement]:
@@ -41,10 +43,11 @@ def opencv_pair(seen: BoardSet) -> tuple[float, float]:
     start = perf_counter()
     design = seen.board
     form, layout = (design.columns, design.rows), cv2.CALIB_CB_ASYMMETRIC_GRID
-    found = [
-        [cv2.findCirclesGrid(lit[camera], form, flags=layout, blobDetector=blobs()) for camera in ("cam1", "cam2")]
-        for lit in seen.lit
-    ]
+
+    def look(lit: Mapping[str, Numbers]) -> list[tuple[bool, np.ndarray]]:
+        return [cv2.findCirclesGrid(lit[camera], form, flags=layout, blobDetector=blobs()) for camera in ("cam1", "cam2")]
+
+    found = list(mapped(look, seen.lit))
     finding = perf_counter() - start
     both = [views for views in found if all(ok for ok, _ in views)]
     if len(both) < 3:

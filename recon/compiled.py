@@ -29,6 +29,7 @@ log = logging.getLogger(__name__)
 
 NUMBA = "numba>=0.61,<0.69"  # whose undocumented parts are known to be as they are used here
 OURS = ("recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks")  # packages; others keep Numba's own cache
+KERNEL: dict[str, Any] = {"noalias": True, "nogil": True, "_nrt": False, "error_model": "numpy"}  # options of kernels
 Name = tuple[str, ...]  # one with dots, in parts
 UNUSED_DAYS = 30  # after which code compiled from other sources is deleted
 
@@ -56,13 +57,15 @@ def _without_aliases(flags: Any) -> Any:
 
 
 def kernel(function: Callable | None = None, **options: Any) -> Any:
-    """Compile a loop over arrays for `recon.threads.in_threads`, with options of `numba.njit`.
+    """Compile a loop over arrays that may run beside others, as by `recon.threads.in_threads`, with options of `numba.njit`.
 
     It allocates no arrays, and none that it writes to shares memory with another one. So references to arrays need no counting,
     which takes a third to a half of the time to compile, and in inner loops as much of the time to run. The GIL is released, and
     a division by zero gives what it gives in NumPy.
+
+    Functions that it calls are inlined, or kernels themselves: a plain one would take options from whoever compiles it first.
     """
-    return njit(function, noalias=True, nogil=True, _nrt=False, error_model="numpy", **options)
+    return njit(function, **KERNEL, **options)
 
 
 def source_hash(module: Path, root: Path) -> str:
@@ -73,7 +76,7 @@ def source_hash(module: Path, root: Path) -> str:
     module : the source file.
     root : the folder that holds the top-level packages.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(repr(KERNEL).encode())
     for path in sorted(_sources(module, root)):
         digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:20]
@@ -108,7 +111,7 @@ def _imported_for_kernels(text: _Text, root: Path, taken: frozenset[str]) -> tup
     places = (
         _place((*target, *use[1:]), root) for use in _used_for_kernels(text, taken) for target in text.imported.get(use[0], ())
     )
-    # this file has no part in what is compiled: it only says where the result lies
+    # this file has no part in what is compiled but by the options of kernels: it says where the result lies
     return tuple((place, frozenset(names[:1])) for place, names in places if place is not None and place != Path(__file__))
 
 

@@ -3,7 +3,7 @@
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from typing import Any, TypeVar
 
@@ -12,20 +12,20 @@ import numba
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-PARTS = 8  # of a range for each thread, so that who is done helps the other
+PARTS_A_THREAD = 8  # of a range, so that idle threads take over
 
 
 def in_threads(kernel: Callable[[int, int], Any], count: int) -> None:
     """Run `kernel(first, end)` over parts of range(count), in as many threads as Numba has; the caller's is one of them.
 
-    What takes its time must release the interpreter's lock, as a `recon.compiled.kernel` does. A loop over Numba's `prange` would
+    Slow code must release the interpreter's lock, as a `recon.compiled.kernel` does. A loop over Numba's `prange` would
     have all that is called within compiled thrice more, for each of the three functions that Numba makes of it.
     """
     threads = min(numba.get_num_threads(), count)
     if threads <= 1:
         kernel(0, count)
         return
-    parts = min(PARTS * threads, count)
+    parts = min(PARTS_A_THREAD * threads, count)
     left = deque((count * k // parts, count * (k + 1) // parts) for k in range(parts))
 
     def work() -> None:
@@ -34,16 +34,20 @@ def in_threads(kernel: Callable[[int, int], Any], count: int) -> None:
                 first, end = left.popleft()
             except IndexError:
                 return
-            kernel(first, end)
+            try:
+                kernel(first, end)
+            except BaseException:
+                left.clear()  # what is left would be in vain
+                raise
 
     helpers = [_helpers().submit(work) for _ in range(threads - 1)]
     try:
         work()
     finally:
-        left.clear()  # empty by now, but after an error
-        for helper in helpers:
-            if not helper.cancel():  # it has begun
-                helper.result()
+        begun = [helper for helper in helpers if not helper.cancel()]
+        wait(begun)  # or they would go on writing after an error
+    for helper in begun:
+        helper.result()
 
 
 def mapped(work: Callable[[Item], Result], items: Iterable[Item], most: int | None = None) -> Iterator[Result]:
@@ -54,14 +58,16 @@ def mapped(work: Callable[[Item], Result], items: Iterable[Item], most: int | No
     most : threads, where each takes much memory; as many as Numba has if not given.
     """
     threads = min(numba.get_num_threads(), most or numba.get_num_threads())
-    with ThreadPoolExecutor(threads) as pool:
-        waiting = deque()
+    pool, waiting = ThreadPoolExecutor(threads), deque[Future[Result]]()
+    try:
         for item in items:
             waiting.append(pool.submit(work, item))
             if len(waiting) > threads:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)  # of those that nobody waits for any more
 
 
 @cache

@@ -5,7 +5,7 @@ import os
 import zlib
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one core a worker; before NumPy is loaded
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of NumPy's; two workers share two cores. Before NumPy is loaded
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of torch
 
 import numpy as np

@@ -76,3 +76,33 @@ def test_no_drawers_and_no_long_modules():
     long = [path for path in paths if len(path.read_text(encoding="utf-8").splitlines()) > 400]
     assert not drawers
     assert not long
+
+
+def decorators(path: Path) -> dict[str, str]:
+    """Decorators of a module's functions that are compiled, by name."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.decorator_list]
+    texts = {node.name: ast.unparse(node.decorator_list[0]) for node in functions}
+    return {name: text for name, text in texts.items() if text.startswith(("njit", "kernel"))}
+
+
+def called_by_kernels(path: Path) -> set[str]:
+    """Names that a module's kernels call."""
+    kernels = {name for name, text in decorators(path).items() if text.startswith("kernel")}
+    nodes = [node for node in ast.parse(path.read_text(encoding="utf-8")).body if getattr(node, "name", None) in kernels]
+    calls = [node.func for function in nodes for node in ast.walk(function) if isinstance(node, ast.Call)]
+    return {call.id for call in calls if isinstance(call, ast.Name)}
+
+
+def test_kernels_call_inlined_functions_and_kernels():
+    """A plain compiled function takes options, such as whether references are counted, from whoever compiles it first."""
+    paths = [path for package in ("recon", "twin", "scenes") for path in (ROOT / package).rglob("*.py")]
+    plain = {
+        name
+        for path in paths
+        for name, text in decorators(path).items()
+        if text.startswith("njit") and "inline='always'" not in text and "forceinline" not in text
+    }
+    offences = {str(path): bad for path in paths if (bad := called_by_kernels(path) & plain)}
+    assert not offences
+    assert any(called_by_kernels(path) for path in paths)

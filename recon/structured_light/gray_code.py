@@ -31,7 +31,7 @@ class Cells(NamedTuple):
 
 
 class Bits(NamedTuple):
-    """Readings of a row's pixels. All (w,)."""
+    """Readings of a row's pixels, each thread's own. All (w,)."""
 
     number: NDArray[np.int32]  # of the cell
     doubt: NDArray[np.int32]  # digits that the last uncertain bit flips

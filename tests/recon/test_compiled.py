@@ -7,6 +7,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numba
+import numpy as np
 import pytest
 from filelock import FileLock
 
@@ -99,6 +101,26 @@ def test_the_hash_covers_what_compiled_functions_take(clone, old, new, matters):
     before = compiled.source_hash(kernel, clone)
     edit(clone, old, new)
     assert (compiled.source_hash(kernel, clone) != before) == matters
+
+
+def test_the_hash_covers_the_options_of_kernels(clone, monkeypatch):
+    before = compiled.source_hash(clone / "recon" / "kernel.py", clone)
+    monkeypatch.setitem(compiled.KERNEL, "error_model", "python")
+    assert compiled.source_hash(clone / "recon" / "kernel.py", clone) != before
+
+
+def test_a_kernel_divides_as_numpy_and_allocates_nothing():
+    assert compiled.kernel(divided)(1.0, 0.0) == float("inf")
+    with pytest.raises(numba.TypingError):
+        compiled.kernel(filled)(3)
+
+
+def divided(x, y):
+    return x / y
+
+
+def filled(n):
+    return np.zeros(n)[0]
 
 
 def test_the_hash_leaves_out_what_plain_functions_take(clone):

@@ -48,13 +48,48 @@ def test_loops_within_loops_and_side_by_side_come_to_an_end(monkeypatch):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks on this system")
 def test_a_forked_process_has_threads_of_its_own(monkeypatch):
     monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
-    in_threads(lambda first, end: time.sleep(0.001), 8)  # makes this process's threads
+    meet()  # makes this process's threads
     child = os.fork()
     if child == 0:
-        done = []
-        in_threads(lambda first, end: (time.sleep(0.001), done.extend(range(first, end))), 40)
-        os._exit(0 if sorted(done) == list(range(40)) else 1)
+        status = 1
+        try:
+            meet()
+            status = 0
+        finally:
+            os._exit(status)
     assert os.waitpid(child, 0)[1] == 0
+
+
+def meet():
+    """Run two parts that wait for each other; `BrokenBarrierError` after a while if one thread is to do both."""
+    barrier = threading.Barrier(2, timeout=20)
+    in_threads(lambda first, end: barrier.wait(), 2)
+
+
+def test_parts_run_side_by_side(monkeypatch):
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+    meet()
+
+
+def test_after_a_mistake_nothing_runs_on(monkeypatch):
+    """The other threads end their parts first, and begin no further ones."""
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+    barrier, ended, begun = threading.Barrier(2, timeout=20), [], []
+
+    def part(first, end):
+        begun.append(first)
+        if len(begun) <= 2:
+            barrier.wait()
+        if threading.current_thread() is threading.main_thread():
+            raise ZeroDivisionError
+        time.sleep(0.05)
+        ended.append(first)
+
+    with pytest.raises(ZeroDivisionError):
+        in_threads(part, 1000)
+    assert len(ended) == 1 and len(begun) == 2
+    time.sleep(0.1)
+    assert len(ended) == 1
 
 
 def test_results_are_in_order_and_items_are_taken_one_by_one():
@@ -90,6 +125,21 @@ def test_no_more_than_some_items_are_worked_on_at_once(monkeypatch):
 
     list(mapped(work, range(30), 3))
     assert most <= 3
+
+
+def test_nobody_works_for_one_who_left():
+    """Items that were not begun when the results' user went away are given up."""
+    begun = []
+
+    def work(k: int) -> int:
+        begun.append(k)
+        time.sleep(0.02)
+        return k
+
+    results = mapped(work, range(100), 1)
+    next(results)
+    results.close()
+    assert len(begun) <= 3
 
 
 def test_faults_are_passed_on():

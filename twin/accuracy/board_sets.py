@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from time import perf_counter
 
 import numpy as np
@@ -28,6 +28,7 @@ from twin.optics.surface_session import calibration_of
 from twin.sensor import Numbers
 
 HELD = 12  # poses whose images are held at once, of 66 MB each
+Shot = tuple[dict[str, Numbers], dict[str, Numbers]]  # of a pose: by camera, lit (h, w), and under fringes (n, h, w)
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class BoardSet:
     poses: Array  # (p, 4, 4) world_from_board
     points: Array  # (n, 3) mm, the board as it is
     lit: tuple[dict[str, Numbers], ...] = ()  # (p,) camera: (h, w) DN, of rendered sets
-    seconds: float = 0.0  # that finding the board and decoding took, rendering not counted
+    seconds: float = 0.0  # in which the board was found and its fringes decoded, some poses at once
 
     @property
     def sizes(self) -> dict[str, Size]:
@@ -62,20 +63,24 @@ def rendered(settings: board_session.Settings) -> BoardSet:
     design = board.design(settings.board)
     sightings, images, seconds = [], [], 0.0
     for first in range(0, len(placed), HELD):
-        numbers = range(first, min(first + HELD, len(placed)))
-        shot = [board_session.shoot_pose(stage, settings, exposures, number, placed[number]) for number in numbers]
+        shot = {
+            number: board_session.shoot_pose(stage, settings, exposures, number, placed[number])
+            for number in range(first, min(first + HELD, len(placed)))
+        }
         start = perf_counter()
-
-        def look(k: int, first: int = first, shot: list = shot) -> Sighting:
-            lit, fringes = shot[k]
-            name = board_session.pose_name(first + k)
-            return sight(name, design, lit, fringes[FRINGE_CAMERA], settings.patterns, bits)
-
-        sightings += mapped(look, range(len(shot)), MOST_AT_ONCE)
+        sightings += mapped(partial(_look, shot, settings, bits), shot, MOST_AT_ONCE)
         seconds += perf_counter() - start
-        images += [lit for lit, _ in shot]
+        images += [lit for lit, _ in shot.values()]
+        shot.clear()  # before the next are rendered
     centres = board.printed_centres(settings.board)
     return BoardSet(tuple(sightings), design, calibration_of(settings.rig), placed, centres, tuple(images), seconds)
+
+
+def _look(shot: Mapping[int, Shot], settings: board_session.Settings, bits: Mapping[str, int], number: int) -> Sighting:
+    """Find the board in the images of a pose."""
+    lit, fringes = shot[number]
+    name, design = board_session.pose_name(number), board.design(settings.board)
+    return sight(name, design, lit, fringes[FRINGE_CAMERA], settings.patterns, bits)
 
 
 def drawn(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from recon.compiled import kernel, njit
+from recon.compiled import kernel
 from recon.geometry import rigid
 from recon.threads import in_threads
 from scenes.kinds.board import Print
@@ -111,7 +111,7 @@ def _sample_points() -> Array:
     return np.column_stack([du, dv, radius * np.cos(angle), radius * np.sin(angle)])
 
 
-@njit(error_model="numpy")
+@kernel
 def _meet(view: View, board: Print, x, y, lens_x, lens_y):
     """Where on the board, mm, a ray ends that leaves a point of the lens for ideal coordinates (x, y) in focus."""
     to, focus = view.board_from_camera, view.focus_mm
@@ -132,7 +132,7 @@ def _meet(view: View, board: Print, x, y, lens_x, lens_y):
     return px + step * sx, py + step * sy
 
 
-@njit(error_model="numpy")
+@kernel
 def _nearest_discs(board: Print, x, y):
     """Numbers of the two discs nearest to a place on the board; the same one twice if it is the only one."""
     first, second, near, next_near = 0, 0, np.inf, np.inf
@@ -146,13 +146,13 @@ def _nearest_discs(board: Print, x, y):
     return first, second
 
 
-@njit(error_model="numpy")
+@kernel
 def _beyond(board: Print, disc, x, y):
     """Distance of a place from a disc's rim, mm; negative inside."""
     return math.sqrt(_square(board, disc, x, y)) - board.radius
 
 
-@njit(error_model="numpy")
+@kernel
 def _reach_mm(view: View, board: Print, tables: Tables, k, x, y):
     """The reach of a pixel's light on the board, from its place there : mm."""
     centre, across, down = tables.centre[k], tables.across[k], tables.down[k]
@@ -176,7 +176,7 @@ def _fill_kinds(first, end, view: View, board: Print, tables: Tables, kinds):
         kinds[k] = _kind(view, board, tables, k)
 
 
-@njit(error_model="numpy")
+@kernel
 def _kind(view: View, board: Print, tables: Tables, k):
     x, y = _meet(view, board, tables.centre[k, 0], tables.centre[k, 1], 0.0, 0.0)
     aside = max(abs(x - board.middle[0]) - board.half[0], abs(y - board.middle[1]) - board.half[1])
@@ -208,7 +208,7 @@ def _fill_shares(first, end, view: View, board: Print, tables: Tables, samples: 
         shares[k] = _black_share(view, board, tables, samples, k)
 
 
-@njit(error_model="numpy")
+@kernel
 def _black_share(view: View, board: Print, tables: Tables, samples: Samples, k):
     footprint, points, turn = samples.footprint, samples.points, samples.turns[k]
     cx, cy = tables.centre[k, 0], tables.centre[k, 1]
@@ -229,14 +229,14 @@ def _black_share(view: View, board: Print, tables: Tables, samples: Samples, k):
     return black / count
 
 
-@njit(error_model="numpy")
+@kernel
 def _square(board: Print, disc, x, y):
     """Squared distance of a place from a disc's centre, mm^2."""
     dx, dy = x - board.centres[disc, 0], y - board.centres[disc, 1]
     return dx * dx + dy * dy
 
 
-@njit(error_model="numpy")
+@kernel
 def _at_fraction(table, fraction):
     """The value of an evenly spaced table at a fraction of its length; whole lengths don't count."""
     position = (fraction - int(fraction)) * (len(table) - 1)
@@ -260,7 +260,7 @@ def _fill_mixed(first, end, image, kinds, edges, shares, values):
         values[k] = white + shares[k] * (black - white)
 
 
-@njit(error_model="numpy")
+@kernel
 def _level_at(image, kinds, kind, v, u):
     """Level at a pixel of the plane through those of a kind in the window about it; NaN if they are too few."""
     count, sx, sy, sxx, sxy, syy = 0, 0.0, 0.0, 0.0, 0.0, 0.0

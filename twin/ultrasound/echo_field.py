@@ -70,7 +70,7 @@ def _deepest_seen(transducer: Transducer, beam: Beam, paths: Paths) -> float:
 def laid(lay: Callable[[Field, int], tuple[int, int]], empty: Field) -> Field:
     """Sum of the echoes that `lay(field, part)` lays on a field of each part's own, empty at first.
 
-    It returns the first line that it touched, and the end.
+    `lay` returns the first line that it touched, and the end.
     """
     fields, touched = np.zeros((PARTS, *empty.shape), empty.dtype), np.zeros((PARTS, 2), np.int64)
 

@@ -45,7 +45,7 @@ class Lattice(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Columns of cells, side by side, and the one that is looked at."""
+    """Columns of cells, side by side, and room for the scatterers of one: each thread's own."""
 
     first: int  # of them, along the lattice's first axis
     end: int

@@ -34,7 +34,7 @@ class Paths(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """What a step down a line adds, by label."""
+    """Delay and loss of a step down a line, by label."""
 
     line_mm: float  # between lines
     delay_mm: Array  # (n + 1,) shown depth
@@ -93,7 +93,7 @@ def _nearest(solids, x, y, z):
     return near
 
 
-@njit
+@kernel
 def _share_before(solids, solid, pose, point, step_mm):
     """Share of the last step down to a point that lies before a solid's border."""
     x, y, z = point
@@ -102,7 +102,7 @@ def _share_before(solids, solid, pose, point, step_mm):
     return min(max(back / (back - ahead), 0.0), 1.0) if back != ahead else 0.5
 
 
-@njit
+@kernel
 def _through_border(solids, tissues, pose, point, here, there):
     """Share of the amplitude that passes a border, there and back, and tangent by which the line turns along the array."""
     nx, ny, nz = normal_at(solids, max(here, there) - 1, point[0], point[1], point[2])

@@ -38,7 +38,7 @@ BEFORE, AFTER = range(2)  # rows of the solids' distances, of a step of the marc
 
 
 class Rays(NamedTuple):
-    """Places of rays on the probe's face, in the image's frame, and one ray's way."""
+    """Places of rays on the probe's face, in the image's frame, and room for the way of one: each thread's own."""
 
     first: int  # number of the first of them along the array, of all
     along: Array  # (n,) mm
@@ -166,7 +166,8 @@ def _border_echoes(field, solids, tissues, rays, spans, scanner, beam, paths):
             ray = _ray(rays.along[i], rays.across[j], scanner.world_from_image)
             bundle = (rays.first + i) // BUNDLE[0], j // BUNDLE[1]
             met = _crossings_of(ray, rays.crossings, rays.distances, solids, spans, bundle, beam, scanner.repeats)
-            _lay_facets(field, ray, rays.crossings, met, solids, tissues, scanner, beam, paths)
+            for n in range(met):
+                _lay_facet(field, ray, rays.crossings[n], solids, tissues, scanner, beam, paths)
 
 
 @njit(inline="always")
@@ -231,13 +232,6 @@ def _in_slice(y, z, repeats, beam):
         if abs(z) < beam.half_mm[row]:
             return True
     return False
-
-
-@njit(inline="always")
-def _lay_facets(field, ray, crossings, met, solids, tissues, scanner, beam, paths):
-    """Lay the echoes of all facets that a ray meets."""
-    for n in range(met):
-        _lay_facet(field, ray, crossings[n], solids, tissues, scanner, beam, paths)
 
 
 @njit(inline="always")

@@ -36,8 +36,8 @@ class Carried(NamedTuple):
     known: Mask
 
 
-class Ground(NamedTuple):
-    """The surface that orders are carried over. All (h, w)."""
+class Field(NamedTuple):
+    """Phases that orders are carried along. All (h, w)."""
 
     phase: Image  # cycles
     sigma: Image  # rad
@@ -137,7 +137,9 @@ def _combine(first, end, jumps, valid, seen, flags):
                 seen[u] |= jumps[y, u] & np.uint8(2 | 8)
             for u in range(2, width - 1):
                 seen[u] |= jumps[v, u + k] & np.uint8(1 | 4)
-        seen[0], seen[1], seen[width - 1] = 4 | seen[0], 4 | seen[1], 4 | seen[width - 1]
+        for u in (0, 1, width - 1):
+            if 0 <= u < width:
+                seen[u] |= np.uint8(4)
         for u in range(width):
             flags[v, u] = VOID
             if valid[v, u]:
@@ -165,15 +167,15 @@ def carry(order: Integers, known: Mask, phase: Image, sigma: Image, flags: Flags
     order, known
         Copies with the new ones in.
     """
-    before, after, ground = Carried(order, known), Carried(order.copy(), known.copy()), Ground(phase, sigma, flags)
-    in_threads(lambda first, end: _carry(first, end, before, after, ground, wanted, reach), len(order))
+    before, after, field = Carried(order, known), Carried(order.copy(), known.copy()), Field(phase, sigma, flags)
+    in_threads(lambda first, end: _carry(first, end, before, after, field, wanted, reach), len(order))
     return after
 
 
 @kernel
-def _carry(first, end, before, after, ground, wanted, reach):
+def _carry(first, end, before, after, field, wanted, reach):
     """Carry orders to the pixels of rows `first` to `end`, not included."""
-    order, known, phase, sigma, flags = before.order, before.known, ground.phase, ground.sigma, ground.flags
+    order, known, phase, sigma, flags = before.order, before.known, field.phase, field.sigma, field.flags
     for v in range(first, end):
         for u in range(phase.shape[1]):
             if known[v, u] or flags[v, u] < wanted:

@@ -113,7 +113,7 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
     closed = _leaks(distance, home, cells, right, down) | _dilated(frontier, 1) | ((basin < 0) & _dilated(frontier, 2))
     reached = (basin >= 0) & np.append(resolved, False)[basin] & ~closed
     island = (basin >= 0) & ~np.append(resolved | contested, True)[basin] & ~closed
-    order, known, unreachable = _to_pixels(Cells(cells, basin >= 0, reached, island, closed), relative, flags)
+    order, known, unreachable = _to_pixels(JoinedCells(cells, basin >= 0, reached, island, closed), relative, flags)
     order, known = continuity.carry(order, known, phase, fringe.sigma, flags, CLEAN, continuity.REACH)
     order, known = continuity.carry(order, known, phase, fringe.sigma, flags, INCOMPLETE, continuity.BLIND_REACH)
     islands = len(set(found.region.tolist()) - set(found.absolute) - found.disputed)
@@ -264,7 +264,7 @@ def _dilated(mask: Mask, cells: int) -> Mask:
     return cv2.dilate(mask.view(np.uint8), np.ones((side, side), np.uint8)).view(bool)
 
 
-class Cells(NamedTuple):
+class JoinedCells(NamedTuple):
     """Cells after the regions were joined. All (rows, columns)."""
 
     order: Integers  # of a cell's first pixel
@@ -282,7 +282,7 @@ class Pixels(NamedTuple):
     unreachable: Mask
 
 
-def _to_pixels(cells: Cells, relative: NDArray[np.int8], flags: Flags) -> Pixels:
+def _to_pixels(cells: JoinedCells, relative: NDArray[np.int8], flags: Flags) -> Pixels:
     """Orders of the cells, given to their pixels.
 
     Islands, leaks and frontiers are marked in the flags, so that no order is carried into them.
