@@ -4,15 +4,15 @@ import logging
 import sys
 
 PARTS = {  # the modules' beginnings, what the console calls them, and the seconds that a core takes for all of their functions
-    "recon.structured_light": ("decoder and mesh", 60),
-    "recon.tracking": ("fit of the target's rims", 80),
-    "recon.optical_calibration": ("images of the board in the projector", 30),
+    "recon.structured_light": ("decoder and mesh", 20),
+    "recon.tracking": ("fit of the target's rims", 20),
+    "recon.optical_calibration": ("images of the board in the projector", 15),
     "recon.board_detection": ("edges of the board's circles", 5),
-    "recon.freehand": ("volume from B-scans", 10),
-    "recon.segmentation": ("search for masses", 10),
+    "recon.freehand": ("volume from B-scans", 5),
+    "recon.segmentation": ("search for masses", 5),
     "recon.geometry": ("cameras", 5),
-    "twin.ultrasound": ("the rendered scanner", 60),
-    "twin.optics": ("light transport", 20),
+    "twin.ultrasound": ("the rendered scanner", 45),
+    "twin.optics": ("light transport", 5),
     "twin": ("the rendered sensor", 3),
 }
 
