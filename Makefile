@@ -7,6 +7,7 @@ REAL := $(or $(SONOTWIN_REAL),$(wildcard ../shared/real))
 ARGS ?=
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+TWIN := .venv/.twin
 # Each worker takes one half of the tests, so that few make the same fixtures; who is done helps the other.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
@@ -16,14 +17,19 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 help:  ## show this
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 18
 
-setup: $(INSTALLED)  ## make .venv and install everything that demo and tests need; the others call it
+setup: $(INSTALLED)  ## make .venv and install everything that demo and tests need; the others install what they need
 	@:
 
 $(INSTALLED): pyproject.toml constraints.txt .ci/setup
 	@PYTHON="$(PYTHON)" bash .ci/setup
+	@touch $(TWIN) $@
+
+# The demo needs neither the tools of development nor PyTorch, which take half of the time to install.
+$(TWIN): pyproject.toml constraints.txt .ci/setup
+	@PYTHON="$(PYTHON)" bash .ci/setup twin
 	@touch $@
 
-demo: setup  ## render a phantom, reconstruct its surface, compare with the truth
+demo: $(TWIN)  ## render a phantom, reconstruct its surface, compare with the truth
 	@$(BIN)/sonotwin demo
 
 test: setup  ## check style, types and arrows, then run the fast tests
