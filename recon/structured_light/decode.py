@@ -141,7 +141,7 @@ def decode(
         counts.update(found)
         length = patterns.length(axis)
         scale = Scale(float(part.zero(length)), part.pitch, length)
-        axes[axis] = _coordinates(fringe, orders, unreachable, stage, scale)[:2]
+        axes[axis] = _coordinates(fringe, orders, unreachable, stage, scale)
         fringes[axis] = fringe
         status = np.where(status == Status.OK, stage, status)
     first = fringes[patterns.axes[0]]
@@ -214,12 +214,14 @@ def _from_line(
     return Orders(order, known), unreachable, {"regions": found.regions, "islands": found.islands, "disputed": found.disputed}
 
 
-def _coordinates(fringe: Fringe, orders: Orders, unreachable: Mask, status: NDArray[np.uint8], scale: Scale) -> Coordinates:
+def _coordinates(
+    fringe: Fringe, orders: Orders, unreachable: Mask, status: NDArray[np.uint8], scale: Scale
+) -> tuple[Image, Image]:
     """Projector coordinates and their noise, NaN where unknown; writes the reasons into `status`."""
     shape = status.shape
     found = Coordinates(np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32), status)
     in_threads(lambda first, end: _place(first, end, fringe.phase, fringe.sigma, orders, unreachable, scale, found), shape[0])
-    return found
+    return found.x, found.sigma
 
 
 @kernel
