@@ -53,12 +53,13 @@ def in_threads(kernel: Callable[[int, int], Any], count: int) -> None:
 def mapped(work: Callable[[Item], Result], items: Iterable[Item], most: int | None = None) -> Iterator[Result]:
     """Results of `work`, in the items' order; pays where `work` releases the interpreter's lock.
 
-    Items are taken one by one, one more than there are threads at most before their results are used.
+    Items are taken one by one, one more than there are threads at most before their results are used. Loops `in_threads`
+    within `work` stay in its thread: all are busy already.
 
     most : threads, where each takes much memory; as many as Numba has if not given.
     """
     threads = min(numba.get_num_threads(), most or numba.get_num_threads())
-    pool, waiting = ThreadPoolExecutor(threads), deque[Future[Result]]()
+    pool, waiting = ThreadPoolExecutor(threads, initializer=numba.set_num_threads, initargs=(1,)), deque[Future[Result]]()
     try:
         for item in items:
             waiting.append(pool.submit(work, item))

@@ -26,10 +26,10 @@ from recon.model.rig import Rig
 from scenes.catalogue import build_scene
 from twin.session import Session
 from twin.ultrasound import sweep_session
-from twin.ultrasound.bscan import Scan
+from twin.ultrasound.bscan import Scan, scans
 from twin.ultrasound.echo_solids import Body, body
 from twin.ultrasound.probe_path import WirePath
-from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise, scans
+from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise
 from twin.ultrasound.transducer import Transducer
 
 
@@ -103,5 +103,5 @@ def shown(scanned: Body, config: Config, planned: Plan, console: Console) -> Ite
     """Take the images one by one, and show how far it is."""
     scan_seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        taken = scans(scanned, config.ultrasound, planned, scan_seed)
+        taken = scans(scanned, config.ultrasound, planned.truth.poses, scan_seed)
         yield from progress.track(taken, total=len(planned.times), description="rendering B-scans")

@@ -9,9 +9,10 @@ from recon.probe_calibration.latency import Lag
 from scenes.catalogue import build_scene
 from twin.accuracy.table_rows import Row, Setup
 from twin.ultrasound import sweep_session
+from twin.ultrasound.bscan import scans
 from twin.ultrasound.echo_solids import body
 from twin.ultrasound.probe_path import Bob
-from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise, plan, scans
+from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise, plan
 
 LAGS_S = np.linspace(0.0, 0.2, 5)
 DRAWS = 12  # of the clocks' jitter, the dropped frames and the tracker's noise, at each lag
@@ -25,7 +26,7 @@ def rows(setup: Setup, draws: int = DRAWS, bob: Bob | None = None) -> list[Row]:
     still = Clocks(lag_s=0.0, scanner_jitter_s=0.0)
     made, array, path = body(build_scene({"kind": "tank"})), setup.scanners["water"], bob or Bob()
     planned = sweep_session.plan_sweep(path, setup.rig, made, array, still, PoseNoise(), SEED)
-    depths = np.array([latency.bottom_depth(one.image) for one in scans(made, array, planned, SEED)])
+    depths = np.array([latency.bottom_depth(one.image) for one in scans(made, array, planned.truth.poses, SEED)])
     rng = np.random.default_rng(SEED)
     found = [(true, drawn(setup, planned, depths, true, rng)) for true in LAGS_S for _ in range(draws)]
     errors = np.array([one.seconds - true for true, one in found])

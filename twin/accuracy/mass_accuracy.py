@@ -19,9 +19,10 @@ from twin.accuracy import surface_accuracy
 from twin.accuracy.table_rows import Row, Setup
 from twin.optics.surface_session import calibration_of
 from twin.ultrasound import sweep_session
+from twin.ultrasound.bscan import scans
 from twin.ultrasound.echo_solids import body
 from twin.ultrasound.probe_path import SurfacePath
-from twin.ultrasound.timed_sweep import Clocks, PoseNoise, scans
+from twin.ultrasound.timed_sweep import Clocks, PoseNoise
 from twin.ultrasound.transducer import Transducer
 
 # as of conf/path/raster.yaml
@@ -70,7 +71,7 @@ def segmented(setup: Setup, seed: int) -> Sequence[Mass]:
     """Sweep over the breast in the twin, as `sonotwin sweep path=raster` does, and segment; poses noisy, the lag known."""
     scene, transducer, clocks = body(build_scene({"kind": "breast"})), Transducer(), Clocks()
     planned = sweep_session.plan_sweep(PATH, setup.rig, scene, transducer, clocks, PoseNoise(), seed)
-    images = np.stack([one.image for one in scans(scene, transducer, planned, seed)])
+    images = np.stack([one.image for one in scans(scene, transducer, planned.truth.poses, seed)])
     poses = poses_at(planned.track, planned.times, clocks.lag_s)
     calibration = sound_in_water.for_tissue(sweep_session.calibration_of(setup.rig, transducer), SOUND.tissue)
     world_from_pixel = poses @ sequences.target_from_pixel(calibration)

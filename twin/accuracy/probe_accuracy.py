@@ -17,7 +17,7 @@ from recon.probe_calibration.point_calibration import Adjustment, Noise, Sightin
 from scenes.acoustics import TISSUES
 from scenes.kinds import crosswire
 from twin.accuracy.table_rows import Measurement, Row, Setup
-from twin.ultrasound.bscan import scan
+from twin.ultrasound.bscan import scans
 from twin.ultrasound.echo_solids import Body, body
 from twin.ultrasound.probe_path import WirePath, about_crossing, held
 from twin.ultrasound.sweep_session import calibration_of
@@ -74,7 +74,7 @@ def recorded(rig: Rig, transducer: Transducer, count: int = CALIBRATIONS * IMAGE
 
 def looked_at(wired: Body, transducer: Transducer, world_from_image: Array) -> Frames:
     """Take a B-scan in each of n poses : (n, 4, 4), and find the crossing."""
-    images = (scan(wired, transducer, pose, 0, frame).image for frame, pose in enumerate(world_from_image))
+    images = (taken.image for taken in scans(wired, transducer, world_from_image, 0))
     found, crossings = point_calibration.from_images(images, world_from_image)
     middle = np.mean([wire.ends.mean(axis=0) for wire in wired.wires], axis=0)
     local = np.stack([rigid.apply(rigid.invert(pose), middle) for pose in world_from_image])

@@ -14,11 +14,11 @@ from recon.segmentation.tube_wall import Appearance, Ring, Tube
 from scenes.acoustics import TISSUES
 from scenes.kinds import inner_cylinder
 from twin.accuracy.table_rows import Row, Setup
-from twin.ultrasound.bscan import scan
+from twin.ultrasound.bscan import scan, scans
 from twin.ultrasound.echo_solids import Body, Wire, body
 from twin.ultrasound.probe_path import SurfacePath, along_surface
 from twin.ultrasound.sweep_session import surface_of
-from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise, moments, plan, scans
+from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise, moments, plan
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -95,7 +95,7 @@ def stroke(probe: Probe, slices: int, seed: int, transducer: Transducer = WATER)
     path = SurfacePath(start_mm=(x - half, y), end_mm=(x + half, y), speed_mm_s=PACE_MM_S, turn_deg=90.0, standoff_mm=STANDOFF_MM)
     course = along_surface(path, surface_of("inner", made), transducer, seed)
     planned = plan(probe, course, moments(course, clocks.scanner_hz), clocks, PoseNoise(), seed)
-    return Stroke(config, planned, [one.image for one in scans(made, transducer, planned, seed)])
+    return Stroke(config, planned, [one.image for one in scans(made, transducer, planned.truth.poses, seed)])
 
 
 def measured(recorded: Stroke, probe: Probe, speed: float, look: Appearance | None = None) -> tuple[list[Ring], Tube]:

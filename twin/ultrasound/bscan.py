@@ -1,10 +1,12 @@
 """One B-scan of a scene, from a pose: the front door of the B-mode model."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.threads import mapped
 from twin.ultrasound import bmode_image
 from twin.ultrasound.beam import beam
 from twin.ultrasound.echo_solids import Body
@@ -50,3 +52,8 @@ def scan(scene: Body, transducer: Transducer, world_from_image: Array, seed: int
     received += bmode_image.face(transducer).astype(np.float32)[:, None]
     envelope = np.abs(received)
     return Scan(bmode_image.grey(envelope, transducer), envelope, paths)
+
+
+def scans(scene: Body, transducer: Transducer, world_from_image: Iterable[Array], seed: int) -> Iterator[Scan]:
+    """Take the B-scans of some poses : n times (4, 4) mm, numbered from 0; see `scan`."""
+    return mapped(lambda taken: scan(scene, transducer, taken[1], seed, taken[0]), enumerate(world_from_image))

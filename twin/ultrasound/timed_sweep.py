@@ -1,6 +1,5 @@
 """A freehand sweep: the scanner's images and the cameras' poses, each by its own clock, and their truth."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,7 @@ from recon.geometry import rigid
 from recon.model import tracks
 from recon.model.rig import Finite, NotNegative, Part, Positive, Probe
 from recon.model.tracks import Track
-from twin.ultrasound.bscan import Scan, scan
+from twin.ultrasound.bscan import scans
 from twin.ultrasound.bscan_truth import labels
 from twin.ultrasound.echo_solids import Body
 from twin.ultrasound.transducer import Transducer
@@ -72,7 +71,7 @@ def sweep(
         If the path is shorter than two images.
     """
     planned = plan(probe, path, moments(path, clocks.scanner_hz), clocks, pose_noise, seed)
-    taken = list(scans(body, transducer, planned, seed))
+    taken = list(scans(body, transducer, planned.truth.poses, seed))
     images, shown = np.stack([one.image for one in taken]), np.stack([labels(one.paths, transducer) for one in taken])
     return Sweep(images, planned.times, planned.track, planned.truth, shown)
 
@@ -103,11 +102,6 @@ def plan(probe: Probe, path: Track, taken: NDArray[np.int64], clocks: Clocks, po
     seen = _noisy(poses @ rigid.invert(probe.target_from_image.matrix()), pose_noise, rng)
     track = Track(_stamped(tracked, 0.0, clocks.camera_jitter_s, rng), seen)
     return Plan(stamps, track, Track(taken, tracks.at(path, taken)))
-
-
-def scans(body: Body, transducer: Transducer, planned: Plan, seed: int) -> Iterator[Scan]:
-    """Take the images of a plan, one by one."""
-    return (scan(body, transducer, pose, seed, frame) for frame, pose in enumerate(planned.truth.poses))
 
 
 def _stamped(moments: NDArray[np.int64], lag_s: float, jitter_s: float, rng: np.random.Generator) -> NDArray[np.int64]:
