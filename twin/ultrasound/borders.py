@@ -21,6 +21,7 @@ MOST = 32  # spans of a bundle
 GROWTH_MM = 0.3  # by which a span grows
 LEAP_MM = 2.5  # at most, less than the margin of the solids' grids
 START, STOP = range(2)  # columns of a span
+INSIDE, NEAR, OUTSIDE = -1, 0, 1  # where a bundle is, in a span, of a solid: within, maybe at its border, without
 
 
 class Spans(NamedTuple):
@@ -28,7 +29,7 @@ class Spans(NamedTuple):
 
     depths: Array  # (n / 8, m / 5, MOST, 2) mm, START and STOP
     counts: NDArray[np.int64]  # (n / 8, m / 5)
-    close: NDArray[np.bool_]  # (n / 8, m / 5, MOST, k) which solids have borders in a span
+    sides: NDArray[np.int8]  # (n / 8, m / 5, MOST, k) of the solids: INSIDE, NEAR, OUTSIDE
 
 
 class Bundles(NamedTuple):
@@ -59,19 +60,19 @@ def spans(body: Body, world_from_image: Array, x: Array, z: Array, first_mm: Arr
     radius = CLEAR * float(np.hypot(reach[0], reach[1]))
     bundles = Bundles(middles[0], middles[1], starts, deepest_mm, radius)
     solids, pose, shape = body.packed(), np.ascontiguousarray(world_from_image, float), (len(middles[0]), len(middles[1]))
-    found = Spans(np.zeros((*shape, MOST, 2)), np.zeros(shape, np.int64), np.zeros((*shape, MOST, len(solids.grid)), np.bool_))
+    found = Spans(np.zeros((*shape, MOST, 2)), np.zeros(shape, np.int64), np.zeros((*shape, MOST, len(solids.grid)), np.int8))
 
     def fill(first: int, end: int) -> None:
-        clear, near = np.zeros(len(solids.grid)), np.zeros(len(solids.grid), np.bool_)
-        _fill(first, end, found, solids, pose, bundles, clear, near)
+        clear, side = np.zeros(len(solids.grid)), np.zeros(len(solids.grid), np.int8)
+        _fill(first, end, found, solids, pose, bundles, clear, side)
 
     in_threads(fill, len(middles[0]))
     return found
 
 
 @kernel
-def _fill(first, end, spans, solids, pose, bundles, clear, near):
-    depths, counts, close = spans.depths, spans.counts, spans.close
+def _fill(first, end, spans, solids, pose, bundles, clear, side):
+    depths, counts = spans.depths, spans.counts
     for i in range(first, end):
         for j in range(len(bundles.across)):
             along, across = bundles.along[i], bundles.across[j]
@@ -82,31 +83,32 @@ def _fill(first, end, spans, solids, pose, bundles, clear, near):
             clear[:] = t
             while t < bundles.deepest_mm:
                 point = x + pose[0, 1] * t, y + pose[1, 1] * t, z + pose[2, 1] * t
-                met, free = _borders_near(clear, near, solids, point, t, bundles.radius_mm)
+                met, free = _borders_near(clear, side, solids, point, t, bundles.radius_mm)
                 if not met:
                     t = min(free, bundles.deepest_mm)
                     continue
-                if t > stop and count < MOST:
+                begins = t > stop and count < MOST
+                if begins:
                     depths[i, j, count, START] = t
                     count += 1
                 stop = min(t + GROWTH_MM, bundles.deepest_mm)
                 depths[i, j, count - 1, STOP] = stop
-                for solid in range(len(near)):
-                    close[i, j, count - 1, solid] |= near[solid]
+                for solid in range(len(side)):
+                    if begins or side[solid] == NEAR:
+                        spans.sides[i, j, count - 1, solid] = side[solid]
                 t += GROWTH_MM
             counts[i, j] = count
 
 
 @njit(inline="always")
-def _borders_near(clear, near, solids, point, t, radius_mm):
-    """Whether a border may lie in a bundle at a depth, and the depth up to which none may; marks its solids."""
+def _borders_near(clear, side, solids, point, t, radius_mm):
+    """Whether a border may lie in a bundle at a depth, and the depth up to which none may; keeps the solids' sides."""
     met, free = False, np.inf
     for solid in range(len(clear)):
-        near[solid] = False
         if clear[solid] < t + GROWTH_MM:
             d = distance_at(solids, solid, point[0], point[1], point[2])
-            near[solid] = abs(d) <= radius_mm + GROWTH_MM
-            clear[solid] = t + (GROWTH_MM if near[solid] else min(abs(d) - radius_mm, LEAP_MM))
-        met |= near[solid]
+            side[solid] = NEAR if abs(d) <= radius_mm + GROWTH_MM else INSIDE if d < 0 else OUTSIDE
+            clear[solid] = t + (GROWTH_MM if side[solid] == NEAR else min(abs(d) - radius_mm, LEAP_MM))
+        met |= side[solid] == NEAR
         free = min(free, clear[solid])
     return met, free

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from recon.compiled import kernel, njit
 from twin.ultrasound import borders
 from twin.ultrasound.beam import STEP_MM, Beam
-from twin.ultrasound.borders import BUNDLE, START, STOP
+from twin.ultrasound.borders import BUNDLE, NEAR, START, STOP
 from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
 from twin.ultrasound.echo_solids import Body, Wire, distance_at
 from twin.ultrasound.medium import hashed
@@ -34,7 +34,8 @@ TAPER = (2.2, 4.4)  # rad of phase from line to line: coherent echoes fade; more
 
 FROM, TO, DEPTH = range(3)  # columns of a ray's crossings: labels before and behind the border, mm
 CROSSINGS = 256  # of a ray, at most
-BEFORE, AFTER = range(2)  # rows of the solids' distances, of a step of the march
+BEFORE, AFTER, LAST = range(3)  # rows of the solids' distances, of a step of the march and at the end of a span
+SURE = 0.9  # of a distance: no border is nearer
 
 
 class Rays(NamedTuple):
@@ -43,7 +44,7 @@ class Rays(NamedTuple):
     first: int  # number of the first of them along the array, of all
     along: Array  # (n,) mm
     across: Array  # (m,) mm
-    distances: Array  # (2, k) mm to the solids, BEFORE and AFTER a step
+    distances: Array  # (3, k) mm to the solids, BEFORE and AFTER a step, and LAST
     crossings: Array  # (CROSSINGS, 3) of borders
 
 
@@ -86,7 +87,7 @@ def surface_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths,
 
     def lay(field: Field, part: int) -> tuple[int, int]:
         begin, end = slab(part, len(along))
-        rays = Rays(begin, along[begin:end], across, np.zeros((2, len(solids.grid))), np.empty((CROSSINGS, 3)))
+        rays = Rays(begin, along[begin:end], across, np.zeros((3, len(solids.grid))), np.empty((CROSSINGS, 3)))
         _border_echoes(field, solids, tissues, rays, spans, scanner, beam, paths)
         left, right = (along[[begin, end - 1]] - outer) / sx + (len(field) - len(paths.labels)) // 2
         return int(np.floor(left)) - 1, int(np.floor(right)) + 3
@@ -187,14 +188,21 @@ def _ray(along, across, pose):
 @njit(inline="always")
 def _crossings_of(ray, crossings, distances, solids, spans, bundle, beam, repeats):
     """March a ray through the spans of its bundle; the number of borders between tissues that it crosses in the slice."""
-    met, started = 0, False
+    met = 0
     for span in range(spans.counts[bundle]):
-        here, stride = -1, 0.0
-        t, stop = spans.depths[bundle[0], bundle[1], span, START], spans.depths[bundle[0], bundle[1], span, STOP]
-        while True:
-            there, near = _tissue_at(ray, t, solids, spans.close[bundle[0], bundle[1], span], distances, started)
-            started = True  # a solid without borders in a span is on the same side as before
-            if here >= 0 and there != here and met < CROSSINGS and _in_slice(t, ray.across, repeats, beam):
+        start, stop = spans.depths[bundle[0], bundle[1], span, START], spans.depths[bundle[0], bundle[1], span, STOP]
+        sides = spans.sides[bundle[0], bundle[1], span]
+        _measure(ray, stop, solids, sides, distances)
+        for solid in range(len(sides)):
+            distances[LAST, solid] = distances[AFTER, solid]
+        t, stride, near = start, 0.0, _measure(ray, start, solids, sides, distances)
+        here = _tissue(distances)
+        while not _meets_no_more(sides, distances, stop - t):
+            stride = min(max(near, STEPS_MM[0]), stop - t + 1e-6)
+            t += stride
+            near = _measure(ray, t, solids, sides, distances)
+            there = _tissue(distances)
+            if there != here and met < CROSSINGS and _in_slice(t, ray.across, repeats, beam):
                 solid = max(here, there) - 1
                 before, after = distances[BEFORE, solid], distances[AFTER, solid]
                 part = before / (before - after) if before != after else 0.5
@@ -202,26 +210,42 @@ def _crossings_of(ray, crossings, distances, solids, spans, bundle, beam, repeat
                 crossings[met, DEPTH] = t - stride + min(max(part, 0.0), 1.0) * stride
                 met += 1
             here = there
-            if t >= stop:
-                break
-            stride = min(max(near, STEPS_MM[0]), stop - t + 1e-6)
-            t += stride
     return met
 
 
 @njit(inline="always")
-def _tissue_at(ray, t, solids, close, distances, close_alone):
-    """Label at a depth of a ray, and a step that crosses no border; brings the distances of the solids up to date."""
-    label, near = 0, STEPS_MM[1]
-    for solid in range(distances.shape[1]):
+def _measure(ray, t, solids, sides, distances):
+    """Bring distances up to date at a depth of a ray; a step that crosses no border."""
+    near = STEPS_MM[1]
+    for solid in range(len(sides)):
         distances[BEFORE, solid] = distances[AFTER, solid]
-        if close[solid] or not close_alone:
+        distances[AFTER, solid] = sides[solid]  # its sign counts, where the span has none of its borders
+        if sides[solid] == NEAR:
             d = distance_at(solids, solid, ray.x + ray.dx * t, ray.y + ray.dy * t, ray.z + ray.dz * t)
             distances[AFTER, solid] = d
-            near = min(near, 0.9 * abs(d))
+            near = min(near, SURE * abs(d))
+    return near
+
+
+@njit(inline="always")
+def _tissue(distances):
+    """Label at the place that distances were measured last."""
+    label = 0
+    for solid in range(distances.shape[1]):
         if distances[AFTER, solid] < 0:
             label = solid + 1
-    return label, near
+    return label
+
+
+@njit(inline="always")
+def _meets_no_more(sides, distances, left_mm):
+    """Whether the distances here and at a span's end are too long for a border in between."""
+    for solid in range(len(sides)):
+        if sides[solid] == NEAR:
+            here, last = distances[AFTER, solid], distances[LAST, solid]
+            if (here < 0) != (last < 0) or SURE * (abs(here) + abs(last)) < left_mm:
+                return False
+    return True
 
 
 @njit(inline="always")

@@ -20,7 +20,7 @@ def test_no_border_lies_outside_the_spans(made, small, rng, turn):
     """Rays at random, looked at every 0.05 mm: where the tissue changes, their bundle has a span; most of the way has none."""
     pose = down(small, (4.0, -2.0, 655.0)) @ rigid.from_rotation_vector(turn, [0, 0, 0])
     x, z = np.arange(-2, 14, 0.0615), 0.2 * np.arange(-15, 16)
-    spans, counts, close = borders.spans(made, pose, x, z, np.zeros(len(z)), 50.0)
+    spans, counts, sides = borders.spans(made, pose, x, z, np.zeros(len(z)), 50.0)
     packed, depths, met = made.packed(), np.arange(0, 50, 0.05), 0
     for _ in range(60):
         i, k = int(rng.integers(len(x))), int(rng.integers(len(z)))
@@ -31,7 +31,7 @@ def test_no_border_lies_outside_the_spans(made, small, rng, turn):
             found = spans[bundle][: counts[bundle]]
             about = (found[:, 0] <= depths[n + 1]) & (found[:, 1] >= depths[n])
             assert about.any()
-            assert close[bundle][: counts[bundle]][about, max(labels[n], labels[n + 1]) - 1].any()
+            assert (sides[bundle][: counts[bundle]][about, max(labels[n], labels[n + 1]) - 1] == borders.NEAR).any()
             met += 1
     assert met > 20
     assert (spans[..., 1] - spans[..., 0]).sum() < 0.5 * 50 * counts.size
