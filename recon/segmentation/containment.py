@@ -1,5 +1,6 @@
 """Containment of masses, found by ultrasound, in the outer surface that the cameras measured."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,9 +61,13 @@ def read_skin(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def contain(mesh: trimesh.Trimesh, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)) -> Containment:
-    """Containment of a mesh in a surface as of `recon.structured_light.surface_mesh`, in the same world."""
-    return Containment(depths(mesh.vertices, surface, camera))
+def contain(meshes: Sequence[trimesh.Trimesh], surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)) -> list[Containment]:
+    """Containment of each mesh in a surface as of `recon.structured_light.surface_mesh`, in the same world."""
+    if not meshes:
+        return []
+    found = depths(np.concatenate([mesh.vertices for mesh in meshes]), surface, camera)
+    ends = np.cumsum([len(mesh.vertices) for mesh in meshes])
+    return [Containment(part) for part in np.split(found, ends[:-1])]
 
 
 def depths(points: Array, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)) -> Array:

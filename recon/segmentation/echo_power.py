@@ -4,12 +4,13 @@ Speckle's power averages to the tissue's backscatter, its grey levels don't: the
 small, by the width of pulse and beam spilling into it. So grey levels are turned back into power before they are averaged.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import threads
 from recon.compiled import kernel, njit
 from recon.errors import InputError
 from recon.files.volumes import Volume
@@ -72,13 +73,12 @@ def averaged(
     """
     table = powers(tissue_grey, dynamic_range_db)
 
-    def parts() -> Iterator[tuple[Map, Map, Map]]:
-        for image in images:
-            left, right, top, bottom = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
-            v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
-            yield table[image[top : bottom + 1, left : right + 1]], u, v
+    def part(image: NDArray) -> tuple[Map, Map, Map]:
+        left, right, top, bottom = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
+        v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
+        return table[image[top : bottom + 1, left : right + 1]], u, v
 
-    return accumulated(parts(), world_from_pixel, grid)
+    return accumulated(threads.mapped(part, images), world_from_pixel, grid)
 
 
 def powers(tissue_grey: float, dynamic_range_db: float = 60.0) -> Map:
@@ -109,8 +109,9 @@ def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, 
         raise InputError(
             f"power: expected at most {volume_compounding.MOST_BYTES / 2**30:.0f} GiB, found {' x '.join(map(str, shape))} voxels"
         )
-    value, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    voxel_from_world = np.linalg.inv(Volume(value, grid.origin, grid.spacing, grid.directions).world_from_voxel)
+    value, weight = np.zeros((2, *(length + 2 for length in shape)), np.float32)  # a voxel more all round
+    inner = 3 * (slice(1, -1),)
+    voxel_from_world = np.linalg.inv(Volume(value[inner], grid.origin, grid.spacing, grid.directions).world_from_voxel)
     count = 0
     for power, u, v in parts:
         if count == len(world_from_pixel):
@@ -121,33 +122,37 @@ def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, 
             _add(power.ravel(), u.ravel(), v.ravel(), matrix, value, weight)
     if count < len(world_from_pixel):
         raise InputError(f"images: expected as many as poses, {len(world_from_pixel)}, found {count}")
-    value /= np.maximum(weight, 1e-6)
-    return EchoPower(Volume(value, grid.origin, grid.spacing, grid.directions), weight)
+    mean = value[inner] / np.maximum(weight[inner], 1e-6)
+    return EchoPower(Volume(mean, grid.origin, grid.spacing, grid.directions), np.ascontiguousarray(weight[inner]))
 
 
 @kernel
 def _add(power, u, v, voxel_from_pixel, value, weight):
-    """Add the powers of pixels to the eight voxels around each; those that aren't finite are left out."""
+    """Add the powers of pixels to the eight voxels around each, in tables with a rim of one voxel; leaves out what isn't finite."""
     m = voxel_from_pixel
+    nz, ny, nx = value.shape
     for n in range(power.size):
-        if np.isfinite(power[n]):
-            x = m[0, 0] * u[n] + m[0, 1] * v[n] + m[0, 3]
-            y = m[1, 0] * u[n] + m[1, 1] * v[n] + m[1, 3]
-            z = m[2, 0] * u[n] + m[2, 1] * v[n] + m[2, 3]
+        x = m[0, 0] * u[n] + m[0, 1] * v[n] + m[0, 3] + 1
+        y = m[1, 0] * u[n] + m[1, 1] * v[n] + m[1, 3] + 1
+        z = m[2, 0] * u[n] + m[2, 1] * v[n] + m[2, 3] + 1
+        if np.isfinite(power[n]) and 0 <= x < nx - 1 and 0 <= y < ny - 1 and 0 <= z < nz - 1:
             _share_out(power[n], x, y, z, value, weight)
 
 
 @njit(inline="always")
 def _share_out(power, x, y, z, value, weight):
     """Add a power to the voxels around a place, in voxels, each weighed by its trilinear share."""
-    nz, ny, nx = value.shape
-    i0, j0, k0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-    for k in range(max(k0, 0), min(k0 + 2, nz)):
-        for j in range(max(j0, 0), min(j0 + 2, ny)):
-            for i in range(max(i0, 0), min(i0 + 2, nx)):
-                share = np.float32((1 - abs(x - i)) * (1 - abs(y - j)) * (1 - abs(z - k)))
-                value[k, j, i] += share * power
-                weight[k, j, i] += share
+    i, j, k = np.uint64(x), np.uint64(y), np.uint64(z)  # unsigned, or each access would look for a negative index
+    across, down, aside = np.float32(x - int(i)), np.float32(y - int(j)), np.float32(z - int(k))
+    for sheet in range(2):
+        for row in range(2):
+            share = (aside if sheet else np.float32(1) - aside) * (down if row else np.float32(1) - down)
+            far = share * across
+            near, at = share - far, (k + np.uint64(sheet), j + np.uint64(row))
+            value[at[0], at[1], i] += near * power
+            value[at[0], at[1], i + np.uint64(1)] += far * power
+            weight[at[0], at[1], i] += near
+            weight[at[0], at[1], i + np.uint64(1)] += far
 
 
 def pixel_mm(world_from_pixel: Array) -> tuple[float, float]:

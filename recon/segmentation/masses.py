@@ -31,6 +31,7 @@ LEAST_MM3 = 50.0
 TOP_MM = 3.0  # ringing at the face, left out
 ROUNDS = 2  # of clearing
 REFINEMENTS = 3  # of the surface in each
+ROUGHLY = 1  # refinement before them, as exact as clearing needs the surface
 SAMPLED = 40  # images for the level of tissue
 LEAST_GREY = 5.0  # of 255, of tissue
 CORE = 0.6  # of a mass's extent: its darkest part
@@ -68,7 +69,7 @@ def from_scans(
     grid = echo_power.beam_grid(world_from_pixel, shape, SPACING_MM, clip)
     recording = Recording(images, world_from_pixel, echo_power.powers(grey, dynamic_range_db), clip)
     power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
-    masses = find(power)
+    masses = refined(rough(power), power, ROUGHLY)
     for _ in range(ROUNDS):
         if masses:
             power = cleared(recording, grid, masses, sound)
@@ -129,11 +130,15 @@ def find(power: EchoPower) -> list[Mass]:
     return sorted(refined(rough(power), power), key=lambda mass: -mass.volume)
 
 
-def refined(masses: Sequence[Mass], power: EchoPower) -> list[Mass]:
-    """The same masses with their surfaces moved to the borders in the power."""
-    for _ in range(REFINEMENTS):
-        masses = [evened(Mass(border_fit.refine(mass.mesh, power).mesh), power.volume) for mass in masses]
-    return list(masses)
+def refined(masses: Sequence[Mass], power: EchoPower, times: int = REFINEMENTS) -> list[Mass]:
+    """The same masses with their surfaces moved to the borders in the power, some times over."""
+
+    def refine(mass: Mass) -> Mass:
+        for _ in range(times):
+            mass = evened(Mass(border_fit.refine(mass.mesh, power).mesh), power.volume)
+        return mass
+
+    return list(threads.mapped(refine, masses))
 
 
 def rough(power: EchoPower) -> list[Mass]:

@@ -41,7 +41,7 @@ def rows(setup: Setup, seeds: Sequence[int] = SEEDS) -> list[Row]:
         what = f"{name} of {size} mm, worse of {len(sweeps)} sweeps"
         result.append(Row("i", f"{what}: centre", float(centre), CENTRE_MM, None, "mm"))
         result.append(Row("i", f"{what}: volume", float(volume), VOLUME_PERCENT, None, "%"))
-    inside = min(sum(contain(mass.mesh, skin).inside is True for mass in found) for found in sweeps)
+    inside = min(sum(one.inside is True for one in contain([mass.mesh for mass in found], skin)) for found in sweeps)
     wrong = max(abs(len(found) - 3) for found in sweeps)
     result.append(Row("i", "masses found that are no tumours, or tumours not found", wrong, 0, 0, "masses"))
     result.append(Row("i", "masses found inside the measured skin", inside, 3, 3, "masses", at_least=True))

@@ -181,11 +181,12 @@ def measure(findings: Sequence[Finding], truth: SweepTruth, segmented: Metrics) 
     here = [finding for finding in findings if finding.found is not None]
     false = int(segmented["masses"]) - len(here)
     metrics: Metrics = {"tumours_true": len(findings), "tumours_found": len(here), "tumours_false": false}
-    for finding in findings:
+    lie = containment.contain([finding.true for finding in findings], truth.skin)
+    for finding, under in zip(findings, lie, strict=True):
         figures = {
             "true_extent_mm": caliper(finding.true.vertices),
             "true_volume_mm3": float(finding.true.volume),
-            "true_under_skin_mm": containment.contain(finding.true, truth.skin).least_mm,
+            "true_under_skin_mm": under.least_mm,
             **_figures_of(finding),
             "under_skin_mm": segmented.get(f"mass{finding.number}_depth_mm", np.nan),
             "inside": segmented.get(f"mass{finding.number}_inside", np.nan),

@@ -32,22 +32,24 @@ def test_depth_is_the_distance_to_the_skin(dome, rng):
 def test_an_object_within_is_inside_and_one_that_pierces_the_skin_is_not(dome):
     within = trimesh.creation.icosphere(radius=8).apply_translation(MIDDLE - [10, 5, 35])
     piercing = trimesh.creation.icosphere(radius=8).apply_translation(MIDDLE - [0, 0, 54])
-    assert contain(within, dome).inside
-    assert contain(within, dome).least_mm == pytest.approx(DOME_MM - 8 - np.linalg.norm([10, 5, 35]), abs=0.15)
-    assert contain(piercing, dome).inside is False
-    assert contain(piercing, dome).least_mm == pytest.approx(-2, abs=0.1)
+    lies, sticks_out = contain([within, piercing], dome)
+    assert lies.inside
+    assert lies.least_mm == pytest.approx(DOME_MM - 8 - np.linalg.norm([10, 5, 35]), abs=0.15)
+    assert sticks_out.inside is False
+    assert sticks_out.least_mm == pytest.approx(-2, abs=0.1)
+    assert contain([], dome) == []
 
 
 def test_what_lies_beside_the_surface_is_not_said_to_be_inside(dome):
     beside = trimesh.creation.icosphere(radius=5).apply_translation(MIDDLE + np.array([90, 0, 0]))
-    result = contain(beside, dome)
+    (result,) = contain([beside], dome)
     assert result.covered == 0 and result.inside is None and np.isnan(result.least_mm)
 
 
 def test_less_than_half_under_the_surface_is_not_enough_to_tell(dome):
     """A ball under the rim: what is seen of it lies deep enough, but that is the smaller part; one that pierces it is outside."""
     rim = MIDDLE + np.array([58, 0, -15])
-    hardly = contain(trimesh.creation.icosphere(radius=5).apply_translation(rim + np.array([-5.0, 0, 3])), dome)
+    balls = [trimesh.creation.icosphere(radius=5).apply_translation(rim + offset) for offset in np.array([[-5.0, 0, 3], [0, 0, 0]])]
+    hardly, piercing = contain(balls, dome)
     assert 0 < hardly.covered < 0.5 and hardly.least_mm > 0 and hardly.inside is None
-    piercing = contain(trimesh.creation.icosphere(radius=5).apply_translation(rim), dome)
     assert 0 < piercing.covered < 0.5 and piercing.inside is False
