@@ -15,15 +15,15 @@ Result = TypeVar("Result")
 PARTS_A_THREAD = 8  # of a range, so that idle threads take over
 
 
-def in_threads(kernel: Callable[[int, int], Any], count: int) -> None:
-    """Run `kernel(first, end)` over parts of range(count), in as many threads as Numba has; the caller's is one of them.
+def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any) -> None:
+    """Run `kernel(first, end, *arguments)` over parts of range(count), in as many threads as Numba has, the caller's included.
 
     Slow code must release the interpreter's lock, as a `recon.compiled.kernel` does. A loop over Numba's `prange` would
     have all that is called within compiled thrice more, for each of the three functions that Numba makes of it.
     """
     threads = min(numba.get_num_threads(), count)
     if threads <= 1:
-        kernel(0, count)
+        kernel(0, count, *arguments)
         return
     parts = min(PARTS_A_THREAD * threads, count)
     left = deque((count * k // parts, count * (k + 1) // parts) for k in range(parts))
@@ -35,7 +35,7 @@ def in_threads(kernel: Callable[[int, int], Any], count: int) -> None:
             except IndexError:
                 return
             try:
-                kernel(first, end)
+                kernel(first, end, *arguments)
             except BaseException:
                 left.clear()  # what is left would be in vain
                 raise

@@ -4,9 +4,7 @@ Photons arrive as a Poisson process and free electrons with the quantum efficien
 own response (PRNU) and dark signal (DSNU); reading adds dark noise; gain, black level, clipping and the ADC make a number.
 """
 
-import os
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
@@ -17,6 +15,7 @@ from scipy.constants import h as PLANCK
 
 from recon.compiled import kernel, njit
 from recon.model.rig import CameraDevice, Sensor
+from recon.threads import mapped
 
 SMOOTHING_E = 4.0  # dark noise that leaves nothing of the steps of single electrons, and a skewness below 0.1 at any mean
 
@@ -101,7 +100,8 @@ def expose(radiance: Stack, device: CameraDevice, wavelength_nm: float, exposure
     readout = readout_of(device, wavelength_nm, exposure)
     numbers = np.empty((count, *shape), np.uint8 if exposure.bits == 8 else np.uint16)
 
-    def take(k: int, stream: np.random.SeedSequence) -> None:
+    def take(numbered: tuple[int, np.random.SeedSequence]) -> None:
+        k, stream = numbered
         generator = np.random.default_rng(stream)
         if sensor.dark_noise_e >= SMOOTHING_E:
             normal = generator.standard_normal(tuple(shape), np.float32)
@@ -110,8 +110,7 @@ def expose(radiance: Stack, device: CameraDevice, wavelength_nm: float, exposure
         mean = np.maximum(radiance[k] * readout.scale * response, 0) + readout.dark_e
         numbers[k] = digitise(read_out(mean, sensor.dark_noise_e, generator) + offset, sensor, exposure)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(take, range(count), np.random.SeedSequence(seed).spawn(count)))
+    list(mapped(take, enumerate(np.random.SeedSequence(seed).spawn(count))))
     return numbers
 
 

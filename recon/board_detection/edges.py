@@ -85,12 +85,12 @@ class _Band(NamedTuple):
         """All pixels of an image : (h, w) within reach of the outlines."""
         n, rims = len(outlines.centre), _Rims.of(outlines, reach, image.shape)
         sizes = np.zeros(n, np.int64)
-        in_threads(lambda first, end: _count(first, end, rims, sizes), n)
+        in_threads(_count, n, rims, sizes)
         starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
         lengths, pairs = starts[-1], (starts[-1], 2)
         band = _Band(np.empty(lengths), np.empty(pairs), np.empty(pairs), np.empty(lengths), np.empty(lengths), starts)
         grey = np.ascontiguousarray(image, float)
-        in_threads(lambda first, end: _gather(first, end, grey, rims, band), n)
+        in_threads(_gather, n, grey, rims, band)
         return band
 
     @property
@@ -101,7 +101,7 @@ class _Band(NamedTuple):
     def first_levels(self) -> Array:
         """Planes of the inside and the outside : (n, 6), flat at first: the medians of the halves away from the edge."""
         levels = np.zeros((self.starts.size - 1, 6))
-        in_threads(lambda first, end: _fill_levels(first, end, self, levels), len(levels))
+        in_threads(_fill_levels, len(levels), self, levels)
         return levels
 
 

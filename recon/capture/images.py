@@ -1,11 +1,9 @@
 """Grey PNG images of a capture: written, and read with every fault refused in one line that names the file."""
 
-import os
 import re
 import struct
 import zlib
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.files.regular import read_bytes
+from recon.threads import mapped
 
 Images = NDArray[np.uint8] | NDArray[np.uint16]
 Size = tuple[int, int]  # width, height, px
@@ -35,14 +34,14 @@ def write_images(paths: Sequence[Path], images: Images) -> None:
     for folder in {path.parent for path in paths}:
         folder.mkdir(parents=True, exist_ok=True)
 
-    def write(path: Path, image: Images) -> None:
+    def write(named: tuple[Path, Images]) -> None:
+        path, image = named
         encoded, data = cv2.imencode(".png", image, PNG_ENCODER)
         if not encoded:
             raise OSError(f"{path}: the PNG encoder failed")
         path.write_bytes(data.tobytes())
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(write, paths, images))
+    list(mapped(write, zip(paths, images, strict=True)))
 
 
 def read_images(paths: Sequence[Path], size: Size, bits: int) -> Images:
@@ -58,8 +57,7 @@ def read_images(paths: Sequence[Path], size: Size, bits: int) -> Images:
     def read(i: int) -> None:
         images[i] = read_image(paths[i], size, bits)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(read, range(len(paths))))
+    list(mapped(read, range(len(paths))))
     return images
 
 

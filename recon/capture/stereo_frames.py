@@ -4,9 +4,7 @@ A film is the sweep part of a capture with images of both cameras, `sweep/cam1` 
 The cameras share a clock. Frames belong together by their time stamps, whatever their numbers. Three pairs at most are in memory.
 """
 
-from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +17,7 @@ from recon.capture.manifest import CAMERAS, MANIFEST, STAMPS, image_name
 from recon.errors import InputError
 from recon.files.regular import check_there
 from recon.geometry.camera import Camera
+from recon.threads import mapped
 
 AHEAD = 2  # pairs that are read while one is worked on
 ALONE_NS = 33_000_000  # taken for the period where a single frame tells none
@@ -53,15 +52,12 @@ class Film:
 
     def pairs(self) -> Iterator[Pair]:
         """Read the frames, camera 1's and camera 2's : (h, w), pair by pair; InputError at one that is damaged."""
-        waiting: deque[tuple[Future[Images], ...]] = deque()
-        with ThreadPoolExecutor(len(CAMERAS)) as pool:
-            for both in self.paths():
-                cameras = zip(both, self.cameras, self.depths, strict=True)
-                waiting.append(tuple(pool.submit(read_image, path, camera.size, bits) for path, camera, bits in cameras))
-                if len(waiting) > AHEAD:
-                    yield _taken(waiting)
-            while waiting:
-                yield _taken(waiting)
+
+        def read(both: tuple[Path, Path]) -> Pair:
+            first, second = map(read_image, both, (camera.size for camera in self.cameras), self.depths)
+            return first, second
+
+        return mapped(read, self.paths(), AHEAD)
 
 
 def read_film(folder: Path, calibration_file: Path | None = None) -> Film:
@@ -96,11 +92,6 @@ def read_film(folder: Path, calibration_file: Path | None = None) -> Film:
     film = Film(read.name or folder.resolve().name, cameras, depths, (places[0], places[1]), frames, tables[0][1][first])
     check_there(path for both in film.paths() for path in both)
     return film
-
-
-def _taken(waiting: deque[tuple[Future[Images], ...]]) -> Pair:
-    first, second = waiting.popleft()
-    return first.result(), second.result()
 
 
 def _partners(

@@ -81,7 +81,7 @@ class Camera:
                 bent = np.stack(distorted(normalised[..., 0], normalised[..., 1], self.coefficients), axis=-1)
             else:
                 flat, bent, k = np.ascontiguousarray(normalised.reshape(-1, 2)), np.empty(normalised.shape), self.coefficients
-                in_threads(lambda first, end: _distort_all(first, end, flat, k, bent.reshape(-1, 2)), len(flat))
+                in_threads(_distort_all, len(flat), flat, k, bent.reshape(-1, 2))
             return self.to_pixels(bent)
 
     def undistort(self, pixels: ArrayLike) -> Array:
@@ -97,7 +97,7 @@ class Camera:
         if 0 < len(flat) <= FEW:
             return np.reshape([_undistort(*point, self.coefficients) for point in zip(x, y, strict=True)], pixels.shape)
         bent, found, k = np.stack([x, y], axis=-1), np.empty((len(flat), 2)), self.coefficients
-        in_threads(lambda first, end: _undistort_all(first, end, bent, k, found), len(flat))
+        in_threads(_undistort_all, len(flat), bent, k, found)
         return found.reshape(pixels.shape)
 
     def rays(self, pixels: ArrayLike) -> Array:

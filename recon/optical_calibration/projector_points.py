@@ -84,7 +84,7 @@ class _Parabolas(NamedTuple):
         n, sizes = len(windows.reach), len(BLOCKS)
         value, variance, gradient = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2), np.nan)
         found = _Parabolas(value, variance, gradient, np.zeros((n, sizes)), np.zeros((n, sizes)))
-        in_threads(lambda first, end: _fit_parabolas(first, end, fringes, windows, found), n)
+        in_threads(_fit_parabolas, n, fringes, windows, found)
         return found
 
 

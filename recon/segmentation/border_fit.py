@@ -89,7 +89,7 @@ def mix(places: Array, normals: Array, values: Array, patch_mm: float) -> Array:
     rows = np.append(start[:-1].reshape(size), start[size[2] :: size[2]].reshape(*size[:2], 1), axis=2)
     result = np.empty_like(values)
     cells, sorted_values, sums = Cells(places[order], normals[order], cube[order], rows), values[order], np.zeros_like(values)
-    in_threads(lambda first, end: _mix(first, end, cells, sorted_values, (patch_mm, reach), sums), len(values))
+    in_threads(_mix, len(values), cells, sorted_values, (patch_mm, reach), sums)
     result[order] = sums
     return result
 
@@ -190,7 +190,7 @@ def misfits(profiles: Array, weight: Array, trials: Array) -> tuple[Array, Array
     `NEVER` where the levels don't step up, or the line isn't bright.
     """
     plain, lined = np.full((2, len(trials), len(profiles)), NEVER)
-    in_threads(lambda first, end: _fill_misfits(first, end, profiles, weight, trials, plain, lined), len(profiles))
+    in_threads(_fill_misfits, len(profiles), profiles, weight, trials, plain, lined)
     return plain, lined
 
 

@@ -61,7 +61,9 @@ def read_skin(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def contain(meshes: Sequence[trimesh.Trimesh], surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)) -> list[Containment]:
+def contain(
+    meshes: Sequence[trimesh.Trimesh], surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)
+) -> list[Containment]:
     """Containment of each mesh in a surface as of `recon.structured_light.surface_mesh`, in the same world."""
     if not meshes:
         return []

@@ -128,7 +128,7 @@ def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, 
 
 @kernel
 def _add(power, u, v, voxel_from_pixel, value, weight):
-    """Add the powers of pixels to the eight voxels around each, in tables with a rim of one voxel; leaves out what isn't finite."""
+    """Add the finite powers of pixels to the eight voxels around each, in tables with a rim of one voxel."""
     m = voxel_from_pixel
     nz, ny, nx = value.shape
     for n in range(power.size):

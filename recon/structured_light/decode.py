@@ -220,7 +220,7 @@ def _coordinates(
     """Projector coordinates and their noise, NaN where unknown; writes the reasons into `status`."""
     shape = status.shape
     found = Coordinates(np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32), status)
-    in_threads(lambda first, end: _place(first, end, fringe.phase, fringe.sigma, orders, unreachable, scale, found), shape[0])
+    in_threads(_place, shape[0], fringe.phase, fringe.sigma, orders, unreachable, scale, found)
     return found.x, found.sigma
 
 

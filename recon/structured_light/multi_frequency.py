@@ -152,7 +152,7 @@ def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> Orders:
     rungs = Rungs(np.array([step.pitch for step in path]), np.array([step.weights for step in path], float), lead)
     span = Span(middle, float(sets[0][0].zero(length)), length / 2)
     orders = Orders(np.zeros(phases.shape[1:], np.int32), np.zeros(phases.shape[1:], np.bool_))
-    in_threads(lambda first, end: _climb(first, end, phases, sigmas, rungs, span, orders), phases.shape[1])
+    in_threads(_climb, phases.shape[1], phases, sigmas, rungs, span, orders)
     return orders
 
 

@@ -112,7 +112,7 @@ def mesh(point_map: PointMap, camera: Camera, max_slope: float = Limits.max_slop
 def _distances(points: Float32, camera: Camera) -> tuple[Float32, Float32]:
     """Distance of each point from the camera's centre, and its sampling step : (h, w) mm each."""
     centre, distance = camera.centre.astype(np.float32), np.empty(points.shape[:2], np.float32)
-    in_threads(lambda first, end: _fill_norms(first, end, points, centre, distance), len(points))
+    in_threads(_fill_norms, len(points), points, centre, distance)
     return distance, distance * np.float32(2 / (camera.matrix[0, 0] + camera.matrix[1, 1]))
 
 
@@ -137,7 +137,7 @@ def _bump(distance: Float32) -> Float32:
     outlier agrees with none. Zero where there are fewer than two pairs.
     """
     bump = np.zeros(distance.shape, np.float32)
-    in_threads(lambda first, end: _fill_bump(first, end, distance, bump), len(distance))
+    in_threads(_fill_bump, len(distance), distance, bump)
     return bump
 
 
@@ -174,7 +174,7 @@ def _second_best(distance, j, i):
 def _torn(distance: Float32, noise: Float32, step: Float32, limits: Limits) -> Mask:
     """Pixels on either side of a tear : (h, w) bool."""
     torn, tears = np.zeros(distance.shape, np.bool_), Tears(limits.max_slope, limits.max_bend, limits.min_tear)
-    in_threads(lambda first, end: _fill_torn(first, end, distance, noise, step, tears, torn), len(distance))
+    in_threads(_fill_torn, len(distance), distance, noise, step, tears, torn)
     return torn
 
 

@@ -58,7 +58,7 @@ class Triangulator:
         sigma = np.empty(shape, np.float32)
         projector = (self.projector.camera_from_world, self._matrix, self.projector.coefficients)
         centre = np.ascontiguousarray(self.camera.centre)
-        in_threads(lambda first, end: _triangulate(first, end, self._rays, centre, projector, decoded, points, sigma), shape[0])
+        in_threads(_triangulate, shape[0], self._rays, centre, projector, decoded, points, sigma)
         return PointMap(points, sigma)
 
 

@@ -17,11 +17,11 @@ def test_threads_share_a_range(monkeypatch, threads, count):
     monkeypatch.setattr(numba, "get_num_threads", lambda: threads)
     done, names = [], set()
 
-    def part(first, end):
-        done.extend(range(first, end))
-        names.add(threading.get_ident())
+    def part(first, end, numbers, others):
+        numbers.extend(range(first, end))
+        others.add(threading.get_ident())
 
-    in_threads(part, count)
+    in_threads(part, count, done, names)
     assert sorted(done) == list(range(count))
     assert len(names) <= threads
 
@@ -108,6 +108,16 @@ def test_results_are_in_order_and_items_are_taken_one_by_one():
         assert result == k * k
         assert len(taken) <= k + 2 + numba.get_num_threads()
     assert len(taken) == 20
+
+
+def test_loops_within_work_on_items_stay_in_its_thread():
+    def work(_: int) -> set[int]:
+        threads = set()
+        in_threads(lambda first, end: threads.add(threading.get_ident()), 50)
+        return threads
+
+    assert all(len(threads) == 1 for threads in mapped(work, range(20)))
+    assert numba.get_num_threads() == numba.config.NUMBA_NUM_THREADS  # those of who uses the results are as they were
 
 
 def test_no_more_than_some_items_are_worked_on_at_once(monkeypatch):

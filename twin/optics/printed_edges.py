@@ -166,7 +166,7 @@ def _reach_mm(view: View, board: Print, tables: Tables, k, x, y):
 def _kinds(view: View, board: Print, tables: Tables) -> NDArray[np.uint8]:
     """Kinds of pixels : (m,), by the distance of each from the nearest rim and from the board's sides."""
     kinds = np.zeros(len(tables.centre), np.uint8)
-    in_threads(lambda first, end: _fill_kinds(first, end, view, board, tables, kinds), len(kinds))
+    in_threads(_fill_kinds, len(kinds), view, board, tables, kinds)
     return kinds
 
 
@@ -198,7 +198,7 @@ def _black_shares(view: View, board: Print, tables: Tables, footprint: Array, po
     of its own : (m, 3).
     """
     shares, samples = np.zeros(len(turns)), Samples(footprint, points, turns)
-    in_threads(lambda first, end: _fill_shares(first, end, view, board, tables, samples, shares), len(turns))
+    in_threads(_fill_shares, len(turns), view, board, tables, samples, shares)
     return shares
 
 
@@ -247,7 +247,7 @@ def _at_fraction(table, fraction):
 def _mixed(image: Images, kinds: NDArray[np.uint8], edges: NDArray[np.int64], shares: Array) -> Array:
     """Black and white in their shares : (m,), NaN where one of them isn't known."""
     values = np.full(len(edges), np.nan)
-    in_threads(lambda first, end: _fill_mixed(first, end, image, kinds, edges, shares, values), len(edges))
+    in_threads(_fill_mixed, len(edges), image, kinds, edges, shares, values)
     return values
 
 

@@ -17,8 +17,8 @@ def focused(field: Field, beam: Beam) -> Field:
     """Echoes after pulse and beam : (h, w), from a field of echoes at their places: the coherent sum."""
     height, (lines, width) = len(beam.axial), (len(field), len(field) - beam.lateral.shape[1] + 1)
     pulses, focused = np.zeros((height, lines), np.complex64), np.zeros((height, width), np.complex64)
-    in_threads(lambda first, end: _in_depth(first, end, pulses, field, beam.axial), lines)
-    in_threads(lambda first, end: _along(first, end, focused, pulses, beam.lateral, beam.reach), height)
+    in_threads(_in_depth, lines, pulses, field, beam.axial)
+    in_threads(_along, height, focused, pulses, beam.lateral, beam.reach)
     return focused
 
 

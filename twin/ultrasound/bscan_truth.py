@@ -23,7 +23,7 @@ def labels(paths: Paths, transducer: Transducer) -> NDArray[np.uint8]:
     """Label of what each pixel shows : (h, w), 0 the surroundings, k + 1 solid k; delays and refraction included."""
     rows, line = transducer.rows_mm, np.float32(transducer.scale_mm_per_px[0])
     shown = np.empty((len(rows), len(paths.labels)), np.uint8)
-    in_threads(lambda first, end: _fill_labels(first, end, shown, paths, rows, line), len(paths.labels))
+    in_threads(_fill_labels, len(paths.labels), shown, paths, rows, line)
     return shown
 
 

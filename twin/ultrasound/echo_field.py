@@ -104,7 +104,7 @@ def deposit(field, px, py, value):
 def summed(fields: Field, touched: NDArray[np.int64]) -> Field:
     """Sum over parts : (PARTS, n, m), always in the same order, of the lines that each has touched : (PARTS, 2)."""
     total = np.zeros_like(fields[0])
-    in_threads(lambda first, end: _add_up(first, end, total, fields, touched), len(total))
+    in_threads(_add_up, len(total), total, fields, touched)
     return total
 
 

@@ -52,7 +52,7 @@ def follow(body: Body, transducer: Transducer, world_from_image: Array) -> Paths
     tissues = body.acoustics(transducer.frequency_mhz)
     steps = Steps(sx, sy * transducer.assumed_speed * (1 / tissues.speed), np.exp(-sy * tissues.loss), transducer.refraction)
     solids = body.packed()
-    in_threads(lambda first, end: _follow(first, end, paths, solids, tissues, steps, pose), size[0])
+    in_threads(_follow, size[0], paths, solids, tissues, steps, pose)
     return paths
 
 

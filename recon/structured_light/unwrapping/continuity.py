@@ -67,8 +67,8 @@ def continuity(phase: Image, sigma: Image, valid: Mask) -> Flags:
     across, down = np.full((2, *phase.shape), np.nan, np.float32)
     jumps, flags = np.empty((2, *phase.shape), np.uint8)
     height, width = phase.shape
-    in_threads(lambda first, end: _compare(first, end, phase, valid, across, down), height)
-    in_threads(lambda first, end: _find_jumps(first, end, across, down, sigma, jumps), height)
+    in_threads(_compare, height, phase, valid, across, down)
+    in_threads(_find_jumps, height, across, down, sigma, jumps)
     in_threads(lambda first, end: _combine(first, end, jumps, valid, np.empty(width, np.uint8), flags), height)
     return flags
 
@@ -168,7 +168,7 @@ def carry(order: Integers, known: Mask, phase: Image, sigma: Image, flags: Flags
         Copies with the new ones in.
     """
     before, after, field = Carried(order, known), Carried(order.copy(), known.copy()), Field(phase, sigma, flags)
-    in_threads(lambda first, end: _carry(first, end, before, after, field, wanted, reach), len(order))
+    in_threads(_carry, len(order), before, after, field, wanted, reach)
     return after
 
 

@@ -124,7 +124,7 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
 def _line_light(image: NDArray, valid: Mask, fringe: Fringe) -> NDArray[np.float32]:
     """Light of the line over full light, where it is bright enough to be the line : (h, w), 0 elsewhere."""
     light = np.zeros(image.shape, np.float32)
-    in_threads(lambda first, end: _fill_light(first, end, image, valid, fringe, light), len(image))
+    in_threads(_fill_light, len(image), image, valid, fringe, light)
     return light
 
 
@@ -288,7 +288,7 @@ def _to_pixels(cells: JoinedCells, relative: NDArray[np.int8], flags: Flags) -> 
     Islands, leaks and frontiers are marked in the flags, so that no order is carried into them.
     """
     pixels = Pixels(np.zeros(flags.shape, np.int32), np.zeros(flags.shape, bool), np.zeros(flags.shape, bool))
-    in_threads(lambda first, end: _fill(first, end, cells, relative, flags, pixels), CELL * len(cells.order))
+    in_threads(_fill, CELL * len(cells.order), cells, relative, flags, pixels)
     return pixels
 
 

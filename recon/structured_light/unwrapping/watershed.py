@@ -35,8 +35,8 @@ def gather(phase: NDArray[np.float32], flags: NDArray[np.uint8]) -> Tiles:
     shape = phase.shape[0] // CELL, phase.shape[1] // CELL
     offsets = np.full((2, *shape), NONE, np.int8)
     tiles = Tiles(np.zeros(phase.shape, np.int8), np.zeros(shape, np.uint8), offsets[0], offsets[1])
-    in_threads(lambda first, end: _gather(first, end, phase, flags, tiles), shape[0])
-    in_threads(lambda first, end: _compare(first, end, phase, tiles), shape[0])
+    in_threads(_gather, shape[0], phase, flags, tiles)
+    in_threads(_compare, shape[0], phase, tiles)
     return tiles
 
 

@@ -49,7 +49,8 @@ def test_what_lies_beside_the_surface_is_not_said_to_be_inside(dome):
 def test_less_than_half_under_the_surface_is_not_enough_to_tell(dome):
     """A ball under the rim: what is seen of it lies deep enough, but that is the smaller part; one that pierces it is outside."""
     rim = MIDDLE + np.array([58, 0, -15])
-    balls = [trimesh.creation.icosphere(radius=5).apply_translation(rim + offset) for offset in np.array([[-5.0, 0, 3], [0, 0, 0]])]
-    hardly, piercing = contain(balls, dome)
+    offsets = np.array([[-5.0, 0, 3], [0, 0, 0]])
+    under, through = (trimesh.creation.icosphere(radius=5).apply_translation(place) for place in rim + offsets)
+    hardly, piercing = contain([under, through], dome)
     assert 0 < hardly.covered < 0.5 and hardly.least_mm > 0 and hardly.inside is None
     assert 0 < piercing.covered < 0.5 and piercing.inside is False
