@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import kernel, njit
+from recon.compiled import njit
 from recon.threads import in_threads
 from twin.ultrasound.beam import OVERSAMPLING, Beam
 from twin.ultrasound.sound_paths import Paths
@@ -22,7 +22,6 @@ Field = NDArray[np.complex64]
 BESIDE_MM = 2.0  # beside the image, from where echoes still count
 PARTS = 16  # in which echoes are summed
 SPREAD = 7  # without a common factor with PARTS
-FIRST, END = range(2)  # columns of the lines that a part has touched
 
 
 class Scanner(NamedTuple):
@@ -72,14 +71,17 @@ def laid(lay: Callable[[Field, int], tuple[int, int]], empty: Field) -> Field:
 
     `lay` returns the first line that it touched, and the end.
     """
-    fields, touched = np.zeros((PARTS, *empty.shape), empty.dtype), np.zeros((PARTS, 2), np.int64)
+    fields, touched = [np.zeros_like(empty) for _ in range(PARTS)], np.zeros((PARTS, 2), np.int64)
 
-    def lay_parts(first: int, end: int) -> None:
-        for part in range(first, end):
+    def lay_parts(begin: int, stop: int) -> None:
+        for part in range(begin, stop):
             touched[part] = np.clip(lay(fields[part], part), 0, len(empty))
 
     in_threads(lay_parts, PARTS)
-    return summed(fields, touched)
+    total = np.zeros_like(empty)
+    for field, (first, end) in zip(fields, touched, strict=True):
+        total[first:end] += field[first:end]
+    return total
 
 
 def slab(part: int, count: int) -> tuple[int, int]:
@@ -99,19 +101,3 @@ def deposit(field, px, py, value):
     field[i, j + 1] += value * ((1 - a) * b)
     field[i + 1, j] += value * (a * (1 - b))
     field[i + 1, j + 1] += value * (a * b)
-
-
-def summed(fields: Field, touched: NDArray[np.int64]) -> Field:
-    """Sum over parts : (PARTS, n, m), always in the same order, of the lines that each has touched : (PARTS, 2)."""
-    total = np.zeros_like(fields[0])
-    in_threads(_add_up, len(total), total, fields, touched)
-    return total
-
-
-@kernel
-def _add_up(first, end, total, fields, touched):
-    for line in range(first, end):
-        for part in range(PARTS):
-            if touched[part, FIRST] <= line < touched[part, END]:
-                for sample in range(total.shape[1]):
-                    total[line, sample] += fields[part, line, sample]
