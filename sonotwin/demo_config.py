@@ -18,7 +18,6 @@ from twin.ultrasound.transducer import Transducer
 CALIBRATION = "calibration"  # folder
 BOARD_PATTERNS = "paper_calibration"
 WATER_C = 22.0  # of the tank, as `scenes.acoustics` has it
-ONE_SCANNER = ("ultrasound.image_size", "ultrasound.scale_mm_per_px")  # the same in all its settings
 TUMOURS = "tumour"  # what the things are called that ultrasound looks for
 
 

@@ -19,7 +19,7 @@ from recon.files.metrics import Metrics
 from recon.freehand import sequences
 from recon.probe_calibration import sound_in_water
 from sonotwin.config import load
-from sonotwin.demo_config import BOARD_PATTERNS, CALIBRATION, ONE_SCANNER, WATER_C, Config
+from sonotwin.demo_config import BOARD_PATTERNS, CALIBRATION, WATER_C, Config
 from sonotwin.pipeline import Step
 from sonotwin.verbs import calibrate_optics, calibrate_probe, film, measure_lag, render, sweep, track
 from twin.evaluation import sweep_errors, track_errors
@@ -116,8 +116,14 @@ def surface_steps(folder: Path, config: Config, given: Sequence[str]) -> list[Ve
 
 def sweep_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbStep | Step]:
     """From the probe's calibration to the tumours under the surface, and how far they are from the truth."""
-    scanner = [override for override in given if override.startswith(ONE_SCANNER)]
-    tank = ["ultrasound=water", *scanner, *_of(given, sweep.Config, without=("scene", "path", "ultrasound"))]
+    scanner = config.ultrasound  # one in the tank and on the breast, set otherwise
+    size, scale = (str(list(pair)).replace(" ", "") for pair in (scanner.image_size, scanner.scale_mm_per_px))
+    tank = [
+        "ultrasound=water",
+        f"ultrasound.image_size={size}",
+        f"ultrasound.scale_mm_per_px={scale}",
+        *_of(given, sweep.Config, without=("scene", "path", "ultrasound")),
+    ]
     rig = [override for override in given if override.startswith("rig")]
     path = _unless_given(given, "path", "raster")
     probe = f"probe={folder / 'probe' / calibrate_probe.PROBE}"

@@ -16,6 +16,7 @@ from sonotwin.cli import main
 from sonotwin.config import compose, load
 from sonotwin.demo_steps import VerbStep, verb_steps
 from sonotwin.pipeline import Step
+from sonotwin.verbs import sweep
 from sonotwin.verbs.demo import Config, commands, followed, looked_inside
 
 SMALL = (  # cameras at half their size: fringes of ten pixels a period
@@ -93,6 +94,15 @@ def test_a_small_demonstration_looks_inside(tmp_path, capsys):
     assert [line.split()[0] for line in last] == ["measured", "accuracy", "probe", "lag", "tumours", "coverage", "look"]
     report = html.unescape((out / "report.html").read_text(encoding="utf-8"))
     assert "sonotwin segment" in report and "tumours, found" in report and "not found" in report
+
+
+def test_the_tank_is_seen_by_the_scanner_of_the_sweep():
+    """Also by one of another size whose settings are a file, so that no override names it."""
+    config = load("demo", COARSE, Config)
+    steps = {step.name: step for step in verb_steps(Path("outputs/demo"), config, COARSE[:2]) if isinstance(step, VerbStep)}
+    for name in ("wires", "bottom"):
+        verb, *fields = steps[name].words(0.0)
+        assert load(verb, fields, sweep.Config).ultrasound.image_size == (161, 272)
 
 
 @pytest.mark.slow
