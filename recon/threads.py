@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 
 import numba
 
-Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 PARTS_A_THREAD = 8  # of a range, so that idle threads take over
@@ -50,19 +49,21 @@ def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any) -> None:
         helper.result()
 
 
-def mapped(work: Callable[[Item], Result], items: Iterable[Item], most: int | None = None) -> Iterator[Result]:
-    """Results of `work`, in the items' order; pays where `work` releases the interpreter's lock.
+def mapped(work: Callable[..., Result], *streams: Iterable[Any], most: int | None = None) -> Iterator[Result]:
+    """Results of `work`, called with an item of each stream, in order; pays where it releases the interpreter's lock.
 
     Items are taken one by one, one more than there are threads at most before their results are used. Loops `in_threads`
-    within `work` stay in its thread: all are busy already.
+    within `work` share the threads that are left.
 
     most : threads, where each takes much memory; as many as Numba has if not given.
     """
-    threads = min(numba.get_num_threads(), most or numba.get_num_threads())
-    pool, waiting = ThreadPoolExecutor(threads, initializer=numba.set_num_threads, initargs=(1,)), deque[Future[Result]]()
+    count = numba.get_num_threads()
+    threads = min(count, most or count)
+    pool = ThreadPoolExecutor(threads, initializer=numba.set_num_threads, initargs=(count // threads,))
+    waiting = deque[Future[Result]]()
     try:
-        for item in items:
-            waiting.append(pool.submit(work, item))
+        for items in zip(*streams, strict=True):
+            waiting.append(pool.submit(work, *items))
             if len(waiting) > threads:
                 yield waiting.popleft().result()
         while waiting:

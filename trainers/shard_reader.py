@@ -6,6 +6,7 @@ Two cores that train can't decode PNGs as well, and a set of 10 000 samples is 1
 import json
 import tarfile
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from itertools import groupby
 from pathlib import Path
@@ -15,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
-from recon.threads import mapped
 
 VIEW = (320, 240)  # px, width and height of a view as the detector gets it
 PATCH = 120  # px, edge of a patch as the segmenter gets it
@@ -107,10 +107,11 @@ def _read(folder: Path, members: Sequence[str], decode: Callable, tell: Tell, pa
         found = "no such folder" if not folder.exists() else "none" if folder.is_dir() else "a file"
         raise InputError(f"{folder}: expected a folder with shards, shard-00000.tar ..., found {found}")
     results: list[tuple] = []
-    for shard in shards:
-        for result in mapped(lambda one: decode(*one), _samples(shard, members)):
-            results.append((*result, np.full(len(result[0]), len(results))))
-            tell(len(results))
+    with ThreadPoolExecutor(2) as pool:
+        for shard in shards:
+            for result in pool.map(lambda one: decode(*one), _samples(shard, members)):
+                results.append((*result, np.full(len(result[0]), len(results))))
+                tell(len(results))
     expected = None if partial else _promised(folder)
     if expected is not None and expected != len(results):
         raise InputError(

@@ -100,8 +100,7 @@ def expose(radiance: Stack, device: CameraDevice, wavelength_nm: float, exposure
     readout = readout_of(device, wavelength_nm, exposure)
     numbers = np.empty((count, *shape), np.uint8 if exposure.bits == 8 else np.uint16)
 
-    def take(numbered: tuple[int, np.random.SeedSequence]) -> None:
-        k, stream = numbered
+    def take(k: int, stream: np.random.SeedSequence) -> None:
         generator = np.random.default_rng(stream)
         if sensor.dark_noise_e >= SMOOTHING_E:
             normal = generator.standard_normal(tuple(shape), np.float32)
@@ -110,7 +109,7 @@ def expose(radiance: Stack, device: CameraDevice, wavelength_nm: float, exposure
         mean = np.maximum(radiance[k] * readout.scale * response, 0) + readout.dark_e
         numbers[k] = digitise(read_out(mean, sensor.dark_noise_e, generator) + offset, sensor, exposure)
 
-    list(mapped(take, enumerate(np.random.SeedSequence(seed).spawn(count))))
+    list(mapped(take, range(count), np.random.SeedSequence(seed).spawn(count)))
     return numbers
 
 

@@ -34,14 +34,13 @@ def write_images(paths: Sequence[Path], images: Images) -> None:
     for folder in {path.parent for path in paths}:
         folder.mkdir(parents=True, exist_ok=True)
 
-    def write(named: tuple[Path, Images]) -> None:
-        path, image = named
+    def write(path: Path, image: Images) -> None:
         encoded, data = cv2.imencode(".png", image, PNG_ENCODER)
         if not encoded:
             raise OSError(f"{path}: the PNG encoder failed")
         path.write_bytes(data.tobytes())
 
-    list(mapped(write, zip(paths, images, strict=True)))
+    list(mapped(write, paths, images))
 
 
 def read_images(paths: Sequence[Path], size: Size, bits: int) -> Images:

@@ -19,7 +19,7 @@ from recon.files.regular import check_there
 from recon.geometry.camera import Camera
 from recon.threads import mapped
 
-AHEAD = 2  # pairs that are read while one is worked on
+AT_ONCE = 2  # pairs that are read, while one more waits or is worked on
 ALONE_NS = 33_000_000  # taken for the period where a single frame tells none
 Pair = tuple[Images, Images]
 
@@ -57,7 +57,7 @@ class Film:
             first, second = map(read_image, both, (camera.size for camera in self.cameras), self.depths)
             return first, second
 
-        return mapped(read, self.paths(), AHEAD)
+        return mapped(read, self.paths(), most=AT_ONCE)
 
 
 def read_film(folder: Path, calibration_file: Path | None = None) -> Film:

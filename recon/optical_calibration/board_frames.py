@@ -40,7 +40,7 @@ def look_at_all(captured: BoardCapture) -> Iterator[Sighting]:
     InputError
         If an image is damaged, or doesn't fit its device.
     """
-    return mapped(lambda number: _look(captured, captured.pose(number)), range(len(captured.poses)), MOST_AT_ONCE)
+    return mapped(lambda number: _look(captured, captured.pose(number)), range(len(captured.poses)), most=MOST_AT_ONCE)
 
 
 def _look(captured: BoardCapture, pose: Pose) -> Sighting:

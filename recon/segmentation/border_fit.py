@@ -9,6 +9,7 @@ distance from the rough surface: unlike a blur of the image, this doesn't shrink
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numba
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -146,7 +147,7 @@ def _near(rough: trimesh.Trimesh, power: EchoPower) -> tuple[NDArray[np.int64], 
     k, j, i = np.nonzero((power.weight[part] > 0.01) & within)
     index = np.column_stack([i, j, k]) + low
     places = rigid.apply(volume.world_from_voxel, index)
-    away, nearest = KDTree(rough.vertices).query(places, distance_upper_bound=farthest, workers=-1)
+    away, nearest = KDTree(rough.vertices).query(places, distance_upper_bound=farthest, workers=numba.get_num_threads())
     kept = np.isfinite(away)
     places, nearest, index = places[kept], nearest[kept], index[kept]
     distance = ((places - rough.vertices[nearest]) * rough.vertex_normals[nearest]).sum(axis=1)

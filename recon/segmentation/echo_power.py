@@ -73,12 +73,12 @@ def averaged(
     """
     table = powers(tissue_grey, dynamic_range_db)
 
-    def part(image: NDArray) -> tuple[Map, Map, Map]:
+    def place(image: NDArray) -> tuple[Map, Map, Map]:
         left, right, top, bottom = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
         v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
         return table[image[top : bottom + 1, left : right + 1]], u, v
 
-    return accumulated(threads.mapped(part, images), world_from_pixel, grid)
+    return accumulated(threads.mapped(place, images), world_from_pixel, grid)
 
 
 def powers(tissue_grey: float, dynamic_range_db: float = 60.0) -> Map:
@@ -105,7 +105,7 @@ def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, 
         If the grid needs too much memory, or there are more or fewer images than poses.
     """
     shape = grid.size[::-1]
-    if np.prod(grid.size, dtype=float) * 8 > volume_compounding.MOST_BYTES:
+    if np.prod(grid.size, dtype=float) * 12 > volume_compounding.MOST_BYTES:
         raise InputError(
             f"power: expected at most {volume_compounding.MOST_BYTES / 2**30:.0f} GiB, found {' x '.join(map(str, shape))} voxels"
         )
@@ -122,8 +122,9 @@ def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, 
             _add(power.ravel(), u.ravel(), v.ravel(), matrix, value, weight)
     if count < len(world_from_pixel):
         raise InputError(f"images: expected as many as poses, {len(world_from_pixel)}, found {count}")
-    mean = value[inner] / np.maximum(weight[inner], 1e-6)
-    return EchoPower(Volume(mean, grid.origin, grid.spacing, grid.directions), np.ascontiguousarray(weight[inner]))
+    value, weight = value[inner], weight[inner]
+    value /= np.maximum(weight, 1e-6)
+    return EchoPower(Volume(value, grid.origin, grid.spacing, grid.directions), weight)
 
 
 @kernel
@@ -143,16 +144,17 @@ def _add(power, u, v, voxel_from_pixel, value, weight):
 def _share_out(power, x, y, z, value, weight):
     """Add a power to the voxels around a place, in voxels, each weighed by its trilinear share."""
     i, j, k = np.uint64(x), np.uint64(y), np.uint64(z)  # unsigned, or each access would look for a negative index
-    across, down, aside = np.float32(x - int(i)), np.float32(y - int(j)), np.float32(z - int(k))
+    across, down, aside = np.float32(x - i), np.float32(y - j), np.float32(z - k)
+    one, after = np.float32(1), i + np.uint64(1)
     for sheet in range(2):
         for row in range(2):
-            share = (aside if sheet else np.float32(1) - aside) * (down if row else np.float32(1) - down)
+            share = (aside if sheet else one - aside) * (down if row else one - down)
             far = share * across
-            near, at = share - far, (k + np.uint64(sheet), j + np.uint64(row))
-            value[at[0], at[1], i] += near * power
-            value[at[0], at[1], i + np.uint64(1)] += far * power
-            weight[at[0], at[1], i] += near
-            weight[at[0], at[1], i + np.uint64(1)] += far
+            near, at, line = share - far, k + np.uint64(sheet), j + np.uint64(row)
+            value[at, line, i] += near * power
+            value[at, line, after] += far * power
+            weight[at, line, i] += near
+            weight[at, line, after] += far
 
 
 def pixel_mm(world_from_pixel: Array) -> tuple[float, float]:

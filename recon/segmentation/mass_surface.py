@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -91,7 +92,7 @@ def _near_distance(mesh: trimesh.Trimesh, volume: Volume, part: tuple[slice, ...
     apart[tuple(np.clip(voxel, 0, np.array(shape[::-1]) - 1).T[::-1])] = False
     k, j, i = np.nonzero(np.asarray(ndimage.distance_transform_edt(apart, volume.spacing[::-1])) < NEAR_MM)
     places = rigid.apply(volume.world_from_voxel, np.column_stack([i, j, k]) + low)
-    _, nearest = KDTree(mesh.vertices).query(places, k=NEIGHBOURS, workers=-1)
+    _, nearest = KDTree(mesh.vertices).query(places, k=NEIGHBOURS, workers=numba.get_num_threads())
     across = ((places[:, None] - mesh.vertices[nearest]) * mesh.vertex_normals[nearest]).sum(axis=2)
     result = np.full(shape, np.nan)
     result[k, j, i] = across.mean(axis=1)

@@ -125,11 +125,6 @@ def shown(masses: Sequence[Mass], world_from_pixel: Array, shape: tuple[int, int
     return threads.mapped(mask, world_from_pixel)
 
 
-def find(power: EchoPower) -> list[Mass]:
-    """Find masses in averaged power, largest first; see `rough`."""
-    return sorted(refined(rough(power), power), key=lambda mass: -mass.volume)
-
-
 def refined(masses: Sequence[Mass], power: EchoPower, times: int = REFINEMENTS) -> list[Mass]:
     """The same masses with their surfaces moved to the borders in the power, some times over."""
 
@@ -138,7 +133,7 @@ def refined(masses: Sequence[Mass], power: EchoPower, times: int = REFINEMENTS) 
             mass = evened(Mass(border_fit.refine(mass.mesh, power).mesh), power.volume)
         return mass
 
-    return list(threads.mapped(refine, masses))
+    return list(threads.mapped(refine, masses, most=len(masses)))
 
 
 def rough(power: EchoPower) -> list[Mass]:

@@ -55,8 +55,8 @@ def find_masses(
     found = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey)
     figures: Metrics = {"tissue_grey": grey, "masses": len(found)}
     lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {NONE_FOUND}"])]
-    lie = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
-    for number, (mass, under) in enumerate(zip(found, lie, strict=True)):
+    containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
+    for number, (mass, under) in enumerate(zip(found, containments, strict=True)):
         figures |= measure(f"mass{number}", mass, under)
         lines.append(f"mass{number}       {describe(mass, under)}")
     drawn = scan_overlays.of_masks(scans.stream(), masses.shown(found, placed, scans.shape, sound), overlays)

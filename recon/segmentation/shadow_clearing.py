@@ -46,8 +46,7 @@ def cleared(recording: Recording, grid: Grid, masses: Sequence[Mass], sound: Sou
     by_depth, by_path = losses(recording, inside, sound)
     table, top = recording.table, recording.clip.v
 
-    def place(scan: tuple[NDArray[np.uint8], Array]) -> tuple[Map, Map, Map]:
-        image, matrix = scan
+    def place(image: NDArray[np.uint8], matrix: Array) -> tuple[Map, Map, Map]:
         if not np.isfinite(matrix).all():
             return table[image], table[image], table[image]
         lines = follow(inside, scale, matrix, image.shape, sound)
@@ -56,8 +55,8 @@ def cleared(recording: Recording, grid: Grid, masses: Sequence[Mass], sound: Sou
         power = np.where(left > MOST_LOSS, table[image] / np.maximum(left, MOST_LOSS), np.nan) * np.exp(by_depth * rows)
         return power[top:].astype(np.float32), lines.u[top:], lines.v[top:]
 
-    scans = zip(recording.images(), recording.world_from_pixel, strict=True)
-    return echo_power.accumulated(threads.mapped(place, scans), recording.world_from_pixel, grid)
+    placed = threads.mapped(place, recording.images(), recording.world_from_pixel)
+    return echo_power.accumulated(placed, recording.world_from_pixel, grid)
 
 
 def losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, float]:

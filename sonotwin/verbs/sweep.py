@@ -100,7 +100,7 @@ def run(config: Config) -> None:
 
 
 def shown(scanned: Body, config: Config, planned: Plan, console: Console) -> Iterator[Scan]:
-    """Take the images one by one, and show how far it is."""
+    """Take the images, in order, and show how far it is."""
     scan_seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         taken = scans(scanned, config.ultrasound, planned.truth.poses, scan_seed)

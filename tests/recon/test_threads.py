@@ -110,14 +110,21 @@ def test_results_are_in_order_and_items_are_taken_one_by_one():
     assert len(taken) == 20
 
 
-def test_loops_within_work_on_items_stay_in_its_thread():
-    def work(_: int) -> set[int]:
-        threads = set()
-        in_threads(lambda first, end: threads.add(threading.get_ident()), 50)
-        return threads
+def test_loops_within_work_share_the_threads_that_are_left():
+    before = numba.get_num_threads()
 
-    assert all(len(threads) == 1 for threads in mapped(work, range(20)))
-    assert numba.get_num_threads() == numba.config.NUMBA_NUM_THREADS  # those of who uses the results are as they were
+    def work(_: int) -> int:
+        return numba.get_num_threads()
+
+    assert set(mapped(work, range(20))) == {1}
+    assert set(mapped(work, range(20), most=1)) == {before}
+    assert numba.get_num_threads() == before  # the caller's own
+
+
+def test_streams_are_taken_side_by_side_and_end_together():
+    assert list(mapped(lambda a, b: 10 * a + b, [1, 2, 3], iter([4, 5, 6]))) == [14, 25, 36]
+    with pytest.raises(ValueError, match="shorter"):
+        list(mapped(lambda a, b: None, [1, 2, 3], [4, 5]))
 
 
 def test_no_more_than_some_items_are_worked_on_at_once(monkeypatch):
@@ -133,7 +140,7 @@ def test_no_more_than_some_items_are_worked_on_at_once(monkeypatch):
         with lock:
             working -= 1
 
-    list(mapped(work, range(30), 3))
+    list(mapped(work, range(30), most=3))
     assert most <= 3
 
 
@@ -146,7 +153,7 @@ def test_nobody_works_for_one_who_left():
         time.sleep(0.02)
         return k
 
-    results = mapped(work, range(100), 1)
+    results = mapped(work, range(100), most=1)
     next(results)
     results.close()
     assert len(begun) <= 3

@@ -118,9 +118,9 @@ def inside(folder: Path, rig: Rig, rng: np.random.Generator) -> Inside:
 
 def segmented(found: list[trimesh.Trimesh], truth: SweepTruth) -> dict[str, float | int]:
     """What segmentation says of masses under a skin that was measured without errors."""
-    lie = containment.contain(found, truth.skin)
-    depths = {f"mass{k}_depth_mm": one.least_mm for k, one in enumerate(lie)}
-    inside = {f"mass{k}_inside": np.nan if one.inside is None else int(one.inside) for k, one in enumerate(lie)}
+    containments = containment.contain(found, truth.skin)
+    depths = {f"mass{k}_depth_mm": one.least_mm for k, one in enumerate(containments)}
+    inside = {f"mass{k}_inside": np.nan if one.inside is None else int(one.inside) for k, one in enumerate(containments)}
     return {"masses": len(found), **depths, **inside}
 
 

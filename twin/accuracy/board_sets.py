@@ -68,7 +68,7 @@ def rendered(settings: board_session.Settings) -> BoardSet:
             for number in range(first, min(first + HELD, len(placed)))
         }
         start = perf_counter()
-        sightings += mapped(partial(_look, shot, settings, bits), shot, MOST_AT_ONCE)
+        sightings += mapped(partial(_look, shot, settings, bits), shot, most=MOST_AT_ONCE)
         seconds += perf_counter() - start
         images += [lit for lit, _ in shot.values()]
         shot.clear()  # before the next are rendered

@@ -181,8 +181,8 @@ def measure(findings: Sequence[Finding], truth: SweepTruth, segmented: Metrics) 
     here = [finding for finding in findings if finding.found is not None]
     false = int(segmented["masses"]) - len(here)
     metrics: Metrics = {"tumours_true": len(findings), "tumours_found": len(here), "tumours_false": false}
-    lie = containment.contain([finding.true for finding in findings], truth.skin)
-    for finding, under in zip(findings, lie, strict=True):
+    containments = containment.contain([finding.true for finding in findings], truth.skin)
+    for finding, under in zip(findings, containments, strict=True):
         figures = {
             "true_extent_mm": caliper(finding.true.vertices),
             "true_volume_mm3": float(finding.true.volume),

@@ -21,7 +21,7 @@ MOST = 32  # spans of a bundle
 GROWTH_MM = 0.3  # by which a span grows
 LEAP_MM = 2.5  # at most, less than the margin of the solids' grids
 START, STOP = range(2)  # columns of a span
-INSIDE, NEAR, OUTSIDE = -1, 0, 1  # where a bundle is, in a span, of a solid: within, maybe at its border, without
+INSIDE, NEAR, OUTSIDE = -1, 0, 1  # side of a solid on which a bundle runs throughout a span; NEAR where it may meet the border
 
 
 class Spans(NamedTuple):
@@ -29,7 +29,7 @@ class Spans(NamedTuple):
 
     depths: Array  # (n / 8, m / 5, MOST, 2) mm, START and STOP
     counts: NDArray[np.int64]  # (n / 8, m / 5)
-    sides: NDArray[np.int8]  # (n / 8, m / 5, MOST, k) of the solids: INSIDE, NEAR, OUTSIDE
+    sides: NDArray[np.int8]  # (n / 8, m / 5, MOST, k) of each solid: INSIDE, OUTSIDE or NEAR
 
 
 class Bundles(NamedTuple):

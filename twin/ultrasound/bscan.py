@@ -1,6 +1,6 @@
-"""One B-scan of a scene, from a pose: the front door of the B-mode model."""
+"""B-scans of a scene, from poses: the front door of the B-mode model."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,6 +54,7 @@ def scan(scene: Body, transducer: Transducer, world_from_image: Array, seed: int
     return Scan(bmode_image.grey(envelope, transducer), envelope, paths)
 
 
-def scans(scene: Body, transducer: Transducer, world_from_image: Iterable[Array], seed: int) -> Iterator[Scan]:
-    """Take the B-scans of some poses : n times (4, 4) mm, numbered from 0; see `scan`."""
-    return mapped(lambda taken: scan(scene, transducer, taken[1], seed, taken[0]), enumerate(world_from_image))
+def scans(scene: Body, transducer: Transducer, world_from_image: Array, seed: int) -> Iterator[Scan]:
+    """Take the B-scans of poses : (n, 4, 4) mm, numbered from 0, one a thread at a time; see `scan`."""
+    poses = np.asarray(world_from_image)
+    return mapped(lambda pose, frame: scan(scene, transducer, pose, seed, frame), poses, range(len(poses)))

@@ -67,20 +67,23 @@ def _deepest_seen(transducer: Transducer, beam: Beam, paths: Paths) -> float:
 
 
 def laid(lay: Callable[[Field, int], tuple[int, int]], empty: Field) -> Field:
-    """Sum of the echoes that `lay(field, part)` lays on a field of each part's own, empty at first.
+    """Sum of the echoes that `lay(field, part)` lays on an empty field for each part, in the order of the parts.
 
     `lay` returns the first line that it touched, and the end.
     """
-    fields, touched = [np.zeros_like(empty) for _ in range(PARTS)], np.zeros((PARTS, 2), np.int64)
+    lines: list[tuple[int, Field]] = [(0, empty[:0])] * PARTS
 
     def lay_parts(begin: int, stop: int) -> None:
+        field = np.zeros_like(empty)
         for part in range(begin, stop):
-            touched[part] = np.clip(lay(fields[part], part), 0, len(empty))
+            first, end = np.clip(lay(field, part), 0, len(empty))
+            lines[part] = first, field[first:end].copy()
+            field[first:end] = 0
 
     in_threads(lay_parts, PARTS)
     total = np.zeros_like(empty)
-    for field, (first, end) in zip(fields, touched, strict=True):
-        total[first:end] += field[first:end]
+    for first, echoes in lines:
+        total[first : first + len(echoes)] += echoes
     return total
 
 

@@ -195,9 +195,9 @@ def _crossings_of(ray, crossings, distances, solids, spans, bundle, beam, repeat
         _measure(ray, stop, solids, sides, distances)
         for solid in range(len(sides)):
             distances[LAST, solid] = distances[AFTER, solid]
-        t, stride, near = start, 0.0, _measure(ray, start, solids, sides, distances)
+        t, near = start, _measure(ray, start, solids, sides, distances)
         here = _tissue(distances)
-        while not _meets_no_more(sides, distances, stop - t):
+        while t < stop and not _clear_to_end(sides, distances, stop - t):
             stride = min(max(near, STEPS_MM[0]), stop - t + 1e-6)
             t += stride
             near = _measure(ray, t, solids, sides, distances)
@@ -215,7 +215,7 @@ def _crossings_of(ray, crossings, distances, solids, spans, bundle, beam, repeat
 
 @njit(inline="always")
 def _measure(ray, t, solids, sides, distances):
-    """Bring distances up to date at a depth of a ray; a step that crosses no border."""
+    """Measure the distances at a depth of a ray; returns a step that crosses no border."""
     near = STEPS_MM[1]
     for solid in range(len(sides)):
         distances[BEFORE, solid] = distances[AFTER, solid]
@@ -238,12 +238,13 @@ def _tissue(distances):
 
 
 @njit(inline="always")
-def _meets_no_more(sides, distances, left_mm):
-    """Whether the distances here and at a span's end are too long for a border in between."""
+def _clear_to_end(sides, distances, left_mm):
+    """Whether the distances here and at a span's end are too long for a border in between; far ones may be a grid's end."""
     for solid in range(len(sides)):
         if sides[solid] == NEAR:
             here, last = distances[AFTER, solid], distances[LAST, solid]
-            if (here < 0) != (last < 0) or SURE * (abs(here) + abs(last)) < left_mm:
+            certain = min(SURE * abs(here), STEPS_MM[1]) + min(SURE * abs(last), STEPS_MM[1])
+            if (here < 0) != (last < 0) or certain < left_mm:
                 return False
     return True
 

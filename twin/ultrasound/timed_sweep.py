@@ -58,7 +58,7 @@ class Sweep:
 def sweep(
     body: Body, transducer: Transducer, probe: Probe, path: Track, clocks: Clocks, pose_noise: PoseNoise, seed: int
 ) -> Sweep:
-    """Record a sweep at the scanner's rate, whole in memory; `plan` and `scans` give the same one by one.
+    """Record a sweep at the scanner's rate, whole in memory; `plan` and `bscan.scans` give the same one by one.
 
     Parameters
     ----------

@@ -32,11 +32,11 @@ def test_depth_is_the_distance_to_the_skin(dome, rng):
 def test_an_object_within_is_inside_and_one_that_pierces_the_skin_is_not(dome):
     within = trimesh.creation.icosphere(radius=8).apply_translation(MIDDLE - [10, 5, 35])
     piercing = trimesh.creation.icosphere(radius=8).apply_translation(MIDDLE - [0, 0, 54])
-    lies, sticks_out = contain([within, piercing], dome)
-    assert lies.inside
-    assert lies.least_mm == pytest.approx(DOME_MM - 8 - np.linalg.norm([10, 5, 35]), abs=0.15)
-    assert sticks_out.inside is False
-    assert sticks_out.least_mm == pytest.approx(-2, abs=0.1)
+    deep, through = contain([within, piercing], dome)
+    assert deep.inside
+    assert deep.least_mm == pytest.approx(DOME_MM - 8 - np.linalg.norm([10, 5, 35]), abs=0.15)
+    assert through.inside is False
+    assert through.least_mm == pytest.approx(-2, abs=0.1)
     assert contain([], dome) == []
 
 

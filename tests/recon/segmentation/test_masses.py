@@ -8,7 +8,7 @@ from recon.errors import InputError
 from recon.files.volumes import Volume
 from recon.segmentation import masses
 from recon.segmentation.echo_power import EchoPower
-from recon.segmentation.masses import find
+from recon.segmentation.masses import refined, rough
 
 SPACING, SIZE = 0.5, (72, 72, 64)  # nx, ny, nz: 36 x 36 x 32 mm
 CENTRE, RADIUS = np.array([3.0, 698.0, 14.0]), 5.0
@@ -32,6 +32,10 @@ def ball():
     """Mean power of a dark ball, blurred over 0.3 mm, and the distance to its border."""
     distance = np.linalg.norm(grid() - CENTRE, axis=-1) - RADIUS
     return DARK + (1 - DARK) * ndtr(distance / 0.3), distance
+
+
+def find(power):
+    return refined(rough(power), power)
 
 
 VOLUME = 4 / 3 * np.pi * RADIUS**3

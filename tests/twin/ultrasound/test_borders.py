@@ -7,7 +7,7 @@ from recon.geometry import rigid
 from scenes.catalogue import build_scene
 from tests.twin.ultrasound.phantoms import down
 from twin.ultrasound import borders
-from twin.ultrasound.echo_solids import body, label_at
+from twin.ultrasound.echo_solids import body, distance_at, label_at
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +22,7 @@ def test_no_border_lies_outside_the_spans(made, small, rng, turn):
     x, z = np.arange(-2, 14, 0.0615), 0.2 * np.arange(-15, 16)
     spans, counts, sides = borders.spans(made, pose, x, z, np.zeros(len(z)), 50.0)
     packed, depths, met = made.packed(), np.arange(0, 50, 0.05), 0
+    apart = 0
     for _ in range(60):
         i, k = int(rng.integers(len(x))), int(rng.integers(len(z)))
         bundle = i // borders.BUNDLE[0], k // borders.BUNDLE[1]
@@ -33,5 +34,11 @@ def test_no_border_lies_outside_the_spans(made, small, rng, turn):
             assert about.any()
             assert (sides[bundle][: counts[bundle]][about, max(labels[n], labels[n + 1]) - 1] == borders.NEAR).any()
             met += 1
-    assert met > 20
+        for span, side in zip(spans[bundle][: counts[bundle]], sides[bundle][: counts[bundle]], strict=True):
+            inner = places[(depths >= span[borders.START]) & (depths <= span[borders.STOP])]
+            for solid in np.flatnonzero(side != borders.NEAR):
+                distances = np.array([distance_at(packed, solid, *place) for place in inner])
+                assert (distances * side[solid] > 0).all()
+                apart += 1
+    assert met > 20 and apart > 20
     assert (spans[..., 1] - spans[..., 0]).sum() < 0.5 * 50 * counts.size

@@ -7,7 +7,7 @@ from twin.ultrasound.echo_field import PARTS, laid
 
 
 def test_parts_are_summed_over_the_lines_that_they_touch(rng):
-    """The same bytes from any number of threads; what a part says it has not touched isn't looked at."""
+    """The same bytes from any number of threads; lines outside a part's range don't count."""
     values = rng.standard_normal((PARTS, 20, 7)).astype(np.complex64)
     touched = np.sort(rng.integers(-3, 24, (PARTS, 2)), axis=1)
 

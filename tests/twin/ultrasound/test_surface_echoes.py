@@ -15,6 +15,7 @@ from tests.twin.ultrasound import plain_sound
 from tests.twin.ultrasound.phantoms import down, filament
 from twin.ultrasound.beam import beam
 from twin.ultrasound.bscan import scan
+from twin.ultrasound.echo_field import scanner_at
 from twin.ultrasound.echo_solids import Body, Wire, body, solid
 from twin.ultrasound.sound_paths import follow
 from twin.ultrasound.surface_echoes import surface_echoes, wire_echoes
@@ -23,11 +24,11 @@ WATER = TISSUES["water"]
 DEPTH_MM, RADIUS_MM = 25.0, 8.0
 
 
-def rod(tissue: Tissue) -> Body:
+def rod(tissue: Tissue, depth: float = DEPTH_MM, radius: float = RADIUS_MM) -> Body:
     """A rod across the image plane in water, its front 17 mm deep."""
-    pose = rigid.transform([[0, -1, 0], [1, 0, 0], [0, 0, 1]], (0, 0, DEPTH_MM))
-    thing = Thing("rod", shapes.moved(shapes.rod(RADIUS_MM, 30.0), pose), Material(0.5))
-    shape = Cylinder("rod", np.array([0.0, 0.0, DEPTH_MM]), np.array([0.0, 1.0, 0.0]), RADIUS_MM)
+    pose = rigid.transform([[0, -1, 0], [1, 0, 0], [0, 0, 1]], (0, 0, depth))
+    thing = Thing("rod", shapes.moved(shapes.rod(radius, 30.0), pose), Material(0.5))
+    shape = Cylinder("rod", np.array([0.0, 0.0, depth]), np.array([0.0, 1.0, 0.0]), radius)
     return Body(WATER, (solid(thing, tissue, shape),), ())
 
 
@@ -117,6 +118,30 @@ def test_borders_echo_as_by_the_slow_way(small, roughness, most):
     quick, slow = (way(made, array, spread, paths, pose, 5) for way in (surface_echoes, plain_sound.border_echoes))
     assert np.count_nonzero(slow) > 1000
     assert np.linalg.norm(quick - slow) < most * np.linalg.norm(slow)
+
+
+@pytest.mark.parametrize("aside", np.arange(1.12, 1.36, 0.0615))
+def test_borders_of_bodies_one_behind_the_other_echo_as_by_the_slow_way(small, aside):
+    """Rays 1.2 mm beside the axes of two thin rods never get far from a border: where one's grid ends, the other's goes on."""
+    array = small.model_copy(update={"image_size": (4, 408), "reverberations": 0})
+    rough = replace(TISSUES["gelatin"], roughness=0.01)
+    made = Body(WATER, tuple(rod(rough, depth, 2.0).solids[0] for depth in (12.0, 17.0)), ())
+    pose, spread = down(array, (aside, 0, 0)), beam(array)
+    paths = follow(made, array, pose)
+    quick, slow = (way(made, array, spread, paths, pose, 5) for way in (surface_echoes, plain_sound.border_echoes))
+    middle = slice(len(quick) // 2 - 2, len(quick) // 2 + 2)
+    assert np.linalg.norm(quick[middle] - slow[middle]) <= 0.2 * np.linalg.norm(slow[middle])
+
+
+def test_a_border_at_the_end_of_the_rays_is_no_trap(small):
+    """A floor within a micrometre of the depth to which rays go, before it and behind."""
+    array = small.model_copy(update={"image_size": (8, 408)})
+    pose, spread = down(array, (0, 0, 0)), beam(array)
+    deepest = scanner_at(array, spread, follow(Body(WATER, (), ()), array, pose), pose, 1).deepest_mm
+    for off in np.linspace(-1e-6, 2e-6, 13):
+        plate = shapes.moved(shapes.plate((60.0, 60.0), 20.0), rigid.transform(np.eye(3), (0, 0, deepest + off)))
+        floor = Body(WATER, (solid(Thing("floor", plate, Material(0.5)), TISSUES["polymer"], None),), ())
+        assert np.isfinite(surface_echoes(floor, array, spread, follow(floor, array, pose), pose, 1)).all()
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.02])
