@@ -95,7 +95,7 @@ def _sources(module: Path, root: Path) -> set[Path]:
 
 @dataclass(frozen=True, eq=False)
 class _Text:
-    """What a module's text says about names."""
+    """A module's imports and definitions, by name."""
 
     imported: dict[str, set[Name]]  # bound by an import anywhere, with the full names of what they may stand for
     plain: dict[str, set[Name]]  # functions that nothing decorates, with the imported names and such functions that each uses

@@ -1,4 +1,4 @@
-"""The one exception that a user's mistake turns into, and the one line that says it."""
+"""The exception for a user's mistake, reported in one line."""
 
 from pydantic import ValidationError
 

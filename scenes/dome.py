@@ -149,7 +149,7 @@ def _nipple(distance: Array, width: float) -> Array:
 
 
 def _areola(form: Form, offset: Array, rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
-    """How much each point belongs to areola, nipple and Montgomery bumps : (n,) from 0 to 1, and what they add in height, mm."""
+    """Membership of each point in areola, nipple and Montgomery bumps : (n,) from 0 to 1, and their added height, mm."""
     distance, theta = np.hypot(*offset.T), np.arctan2(offset[:, 1], offset[:, 0])
     order = np.arange(2, 9)
     waves = np.cos(theta[:, None] * order + rng.uniform(0, 2 * np.pi, order.size))

@@ -14,7 +14,7 @@ from recon.geometry.primitives import Shape, Sphere
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface reflects light of the projector's wavelength (525 nm): a diffuse body, perhaps under a glossy coat.
+    """Reflection of a surface at the projector's wavelength (525 nm): a diffuse body, perhaps under a glossy coat.
 
     Raises
     ------

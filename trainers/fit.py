@@ -38,7 +38,7 @@ Row = dict[str, float | int]
 
 @dataclass(frozen=True)
 class Plan:
-    """How to train. The end comes with `steps` or `max_minutes`, whichever is first."""
+    """Settings of a training. The end comes with `steps` or `max_minutes`, whichever is first."""
 
     name: Name
     batch: int

@@ -121,7 +121,7 @@ def judge(path: Path) -> Verdict:
 
 
 def version(path: Path) -> int | None:
-    """Read the major version from the library's name, the name that it links to, or the folder; None if none tells it."""
+    """Read the major version from the library's name, the name that it links to, or the folder; None if none holds it."""
     for name in (path.name, path.resolve().name):
         if match := VERSION_IN_FILE.match(name):
             return int(match[1])
@@ -201,7 +201,7 @@ def _preference(path: Path) -> tuple[int, int, str]:
 
 
 def _linker_cache() -> list[Path]:
-    """LLVM libraries that the dynamic linker knows for a 64-bit processor."""
+    """LLVM libraries in the dynamic linker's cache, for a 64-bit processor."""
     ldconfig = next((path for path in ("/sbin/ldconfig", "/usr/sbin/ldconfig") if Path(path).exists()), None)
     if ldconfig is None or sys.platform != "linux":
         return []

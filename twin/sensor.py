@@ -25,7 +25,7 @@ Numbers = NDArray[np.uint8] | NDArray[np.uint16]
 
 @dataclass(frozen=True)
 class Exposure:
-    """How an image is taken."""
+    """Settings of a shot."""
 
     time_s: float
     gain: float = 1.0  # 1 fills the ADC's range with `saturation_e` electrons

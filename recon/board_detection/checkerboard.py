@@ -166,7 +166,7 @@ def _refine(image: Array, rough: Array, points: Array, window: float, full: floa
 
 
 def _faults(corners: Corners, window: float, full: float) -> list[str | None]:
-    """What is wrong with each corner, if anything."""
+    """Reasons to refuse each corner, None for good ones."""
     contrast = np.abs(corners.contrast)
     sigma = np.sqrt(np.trace(corners.covariance, axis1=1, axis2=2) / 2)
     tests = [

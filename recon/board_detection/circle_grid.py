@@ -45,14 +45,14 @@ def _grid(board: Circles) -> tuple[lattice.Integers, lattice.Integers]:
 
 
 def _room(rough: Ellipses, board: Circles) -> Array:
-    """How far about each rim there is nothing else : (n,) px, from the design and the disc's own size."""
+    """Width of the clear band about each rim : (n,) px, from the design and the disc's own size."""
     pitch = board.spacing_mm * (np.sqrt(2) if isinstance(board, AsymmetricCircles) else 1)
     gap = 2 * max(pitch / board.diameter_mm - 1, 0.1)  # in radii
     return np.maximum(ROOM * min(gap, 1) * rough.semi_axes[:, 1], 2.0)
 
 
 def _faults(measured: discs.Discs, full: float) -> list[str | None]:
-    """What is wrong with each disc, if anything."""
+    """Reasons to refuse each disc, None for good ones."""
     edges, fit = measured.edges, measured.fit
     longer, shorter = fit.ellipses.semi_axes.T
     contrast = edges.outside - edges.inside

@@ -64,7 +64,7 @@ def _once(image: Array, about: Ellipses, room: Array, blur: Array, sectors: int,
 
 
 def _excess(fit: EllipseFit) -> Array:
-    """How much more the edge points scatter than the noise explains : (n,), at least 1.
+    """Scatter of the edge points over that of the noise : (n,), at least 1.
 
     Texture and the printer's raster do that. What holds for all discs is told by their median; single ones must stand out.
     """

@@ -213,7 +213,7 @@ class _Sums(NamedTuple):
         return np.sqrt(np.maximum(variance / KEPT, ROUNDING))
 
     def uncertainty(self, noise: Array) -> tuple[Array, Array]:
-        """Of the offsets: each one's own : (n, m), and what they share : (n, m, 7)."""
+        """Noise of the offsets: each one's own : (n, m), and shared errors : (n, m, 7)."""
         covariance = self.rest_covariance()
         half = np.linalg.cholesky((covariance + np.swapaxes(covariance, 1, 2)) / 2)
         shared = noise[:, None, None] * (self.mixed / self.information[..., None]) @ half

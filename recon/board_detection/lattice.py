@@ -96,7 +96,7 @@ def _grown_grids(points: Array, steps: Integers):
 
 
 def _regularity(offsets: Array) -> Array:
-    """How many neighbours have another right opposite : (k,), from offsets : (k, m, 2). Within a grid all do, elsewhere few."""
+    """Neighbours with another right opposite : (k,), from offsets : (k, m, 2); in a grid all have one, elsewhere few."""
     length = np.hypot(offsets[..., 0], offsets[..., 1])
     apart = np.linalg.norm(offsets[:, :, None] + offsets[:, None], axis=-1)
     return (apart < TOLERANCE * length[:, :, None]).any(axis=2).sum(axis=1)
@@ -129,7 +129,7 @@ def _grow(points: Array, seed: int, a: Array, b: Array, steps: Integers) -> dict
 
 
 def _placements(grown: dict[tuple[int, int], int], cells: Integers, turns: list[Integers]) -> list[Integers]:
-    """The ways to lay the grid over what was grown that cover most, as assignments."""
+    """Placements of the grid that cover most of the grown points, as assignments."""
     places, numbers = np.array(list(grown)), np.array(list(grown.values()))
     options = []
     for turn in turns:

@@ -70,18 +70,18 @@ def read_film(folder: Path, calibration_file: Path | None = None) -> Film:
     """
     folder = Path(folder)
     read = manifest.read_manifest(folder)
-    told, root = folder / MANIFEST, folder / read.root
+    listed, root = folder / MANIFEST, folder / read.root
     if read.sweep is None:
-        raise InputError(f"{told}: expected sweep, with frames of {' and '.join(CAMERAS)}, found none")
+        raise InputError(f"{listed}: expected sweep, with frames of {' and '.join(CAMERAS)}, found none")
     for name in CAMERAS:
         if name not in read.sweep.images:
-            raise InputError(f"{told}: sweep.images.{name}: expected a path, found none")
+            raise InputError(f"{listed}: sweep.images.{name}: expected a path, found none")
     if calibration_file is None and read.calibration is None:
-        raise InputError(f"{told}: expected calibration, the path of a calibration file, found none")
+        raise InputError(f"{listed}: expected calibration, the path of a calibration file, found none")
     devices = [read.devices_of("sweep")[name] for name in CAMERAS]
     depths = devices[0].bits, devices[1].bits
     if min(depths) > 8 and depths[0] != depths[1]:
-        raise InputError(f"{told}: devices.cam2.bits: expected {depths[0]}, as of cam1, found {depths[1]}")
+        raise InputError(f"{listed}: devices.cam2.bits: expected {depths[0]}, as of cam1, found {depths[1]}")
     sizes = {name: device.size for name, device in zip(CAMERAS, devices, strict=True)}
     known = calibration_files.read_for(Path(calibration_file or folder / str(read.calibration)), sizes).cameras
     cameras = known[CAMERAS[0]], known[CAMERAS[1]]

@@ -51,12 +51,12 @@ class ImageFile:
         return math.prod(self.size) * self.pixel.itemsize
 
     def fault(self, field: str, expected: object, found: object) -> InputError:
-        """The error that says what is wrong with a field of this file."""
+        """The error of a field of this file."""
         return fault(self.path, field, expected, found)
 
 
 def fault(path: Path, field: str, expected: object, found: object) -> InputError:
-    """The error that says what is wrong with a field of a file; long values are shortened."""
+    """The error of a field of a file; long values are shortened."""
     text = str(found)
     return InputError(f"{path}: {field}: expected {expected}, found {text if len(text) <= 60 else text[:57] + '...'}")
 
@@ -169,7 +169,7 @@ def _metaimage(path: Path, stream: BinaryIO) -> ImageFile:
 
 
 def _nrrd(path: Path, stream: BinaryIO) -> ImageFile:
-    """The header of an NRRD file of bytes, which is what sequences are; those of other pixels are read by pynrrd."""
+    """The header of an NRRD file of bytes, the pixels of sequences; files of other pixels are read by pynrrd."""
     fields: dict[str, str] = {}
     _line(path, stream)
     while (line := _line(path, stream)).strip():

@@ -1,4 +1,4 @@
-"""How the projection into a device changes with the point and with the device's parameters.
+"""Derivatives of the projection into a device, by the point and by the device's parameters.
 
 All derivatives are the model's own formulas, but those of a tilted sensor's homography by its two angles: that is analytic, so a
 step of 1e-30 along the imaginary axis gives them without a difference (Squire & Trapp 1998).

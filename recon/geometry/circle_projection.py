@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def centre_offsets(camera: Camera, world_from_board: Array, points: ArrayLike, radius_mm: float) -> Array:
-    """What a detector of ellipses measures less where the centres are.
+    """Offset of a detected ellipse's middle from the projected centre.
 
     Parameters
     ----------

@@ -138,7 +138,7 @@ def fit_ellipses(points: Array, sigma: Array, start: Ellipses, shared: Array | N
 
 
 def _linearised(points: Array, ellipses: Ellipses, shared: Array) -> tuple[Array, Array]:
-    """Distances : (n, m), and what the parameters and the shared errors do to them : (n, m, 5 + k)."""
+    """Distances : (n, m), and their derivatives by the parameters and the shared errors : (n, m, 5 + k)."""
     distance, angles = signed_distance(points, ellipses.centre[:, None], ellipses.shape[:, None])
     _, normals = on_ellipse(ellipses, angles)
     x, y = normals[..., 0], normals[..., 1]

@@ -325,7 +325,7 @@ def models(result: Result) -> Section:
 
 
 def reading() -> Section:
-    """How to judge a calibration by this page."""
+    """Guide to judging a calibration by this page."""
     rows = [
         (
             "A pattern in the residuals",

@@ -121,7 +121,7 @@ def cell_means(result: Result, device: str) -> tuple[Array, Array, NDArray[np.in
 
 
 def pattern_ratio(result: Result, device: str) -> float:
-    """Mean residuals of the image's cells over what random residuals would leave in them, RMS: 1 if there is no pattern."""
+    """RMS of the cells' mean residuals over that of random residuals: 1 if there is no pattern."""
     _, residuals, _ = sightings(result, device)
     _, means, number = cell_means(result, device)
     return float(np.sqrt(np.mean(number * (means**2).sum(axis=1)) / np.mean((residuals**2).sum(axis=1))))

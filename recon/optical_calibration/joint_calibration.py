@@ -28,7 +28,7 @@ BENT = 1.3  # times less noise with the board's shape released, that tell of a b
 
 
 class Settings(Part):
-    """How the calibration is done."""
+    """Settings of the calibration."""
 
     distortion: Literal["auto", ModelName] = "auto"  # auto: by cross-validation, for each device
     shape: Shape = Shape()  # of the board

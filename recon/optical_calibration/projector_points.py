@@ -45,7 +45,7 @@ TERMS = 6  # of a parabola: 1, u, v, u^2, u v, v^2
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Projector coordinates of n points that a camera sees; NaN where the neighbourhood says too little."""
+    """Projector coordinates of n points in a camera's image; NaN where the neighbourhood holds too few good pixels."""
 
     pixels: Array  # (n, 2) projector px
     covariance: Array  # (n, 2, 2) projector px^2, of the fringes' noise alone: the camera's pixels are taken as exact
@@ -70,7 +70,7 @@ class _Windows(NamedTuple):
 
 
 class _Parabolas(NamedTuple):
-    """What the parabolas of n windows say of their points; NaN where a window says too little."""
+    """Values of the parabolas of n windows at their points; NaN where a window holds too few good pixels."""
 
     value: Array  # (n,) projector px
     variance: Array  # (n,) projector px^2
@@ -177,7 +177,7 @@ def _window(centre, reach, shape):
 
 @njit(nogil=True, error_model="numpy")
 def _fit_parabolas(first, end, fringes, windows, found):
-    """Fit the parabolas of windows `first` to `end`, not included; what says too little stays NaN."""
+    """Fit the parabolas of windows `first` to `end`, not included; those with too few good pixels stay NaN."""
     for i in range(first, end):
         reach = windows.reach[i]
         design, measured, deviation = _gather(fringes, windows.centres[i], reach, windows.blur[i])

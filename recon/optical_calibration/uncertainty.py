@@ -184,7 +184,7 @@ def _covariances(calibration: Calibration, slopes: Array) -> Array:
 
 
 def _point_slopes(calibration: Calibration, first: str, second: str, points: Array, pixel_sigma: tuple[float, float]) -> Array:
-    """How triangulated points move with the parameters : (m, 3, g): `d(point) = -(A^T A)^-1 A^T B d(parameters)`."""
+    """Derivatives of triangulated points by the parameters : (m, 3, g): `d(point) = -(A^T A)^-1 A^T B d(parameters)`."""
     pairs = [_slopes(calibration, device, points) for device in (first, second)]
     by_point, by_parameter = (
         np.concatenate([pair[k] / sigma for pair, sigma in zip(pairs, pixel_sigma, strict=True)], axis=-2) for k in (0, 1)
@@ -195,7 +195,7 @@ def _point_slopes(calibration: Calibration, first: str, second: str, points: Arr
 def _modes(
     calibration: Calibration, first: str, second: str, volume: Array, modes: Array, pixel_sigma: tuple[float, float]
 ) -> Array:
-    """How much of each of the modes : (k, 3, j) of a volume the parameters bring about : (j, g), by least squares."""
+    """Shares of the modes : (k, 3, j) of a volume in the effect of each parameter : (j, g), by least squares."""
     return _fit(modes, _point_slopes(calibration, first, second, volume, pixel_sigma))
 
 
@@ -205,7 +205,7 @@ def _fit(modes: Array, slopes: Array) -> Array:
 
 
 def rigid_modes(points: Array) -> Array:
-    """How points : (m, 3) move by small shifts along and turns about the three axes : (m, 3, 6), mm / mm and mm / rad."""
+    """Derivatives of points : (m, 3) by small shifts along and turns about the three axes : (m, 3, 6), mm / mm and mm / rad."""
     modes = np.zeros((len(points), 3, 6))
     modes[:, :, :3] = np.eye(3)
     x, y, z = points.T

@@ -52,7 +52,7 @@ BOTTOM_SHARE = 0.5  # of the columns, at least, on the line
 
 @dataclass(frozen=True)
 class Lag:
-    """How late the images' time stamps are: an image stamped t shows the probe as it stood at t - lag, of the poses' clock."""
+    """Delay of the images' time stamps: an image stamped t shows the probe as it stood at t - lag, of the poses' clock."""
 
     seconds: float
     sigma_s: float

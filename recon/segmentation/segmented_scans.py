@@ -27,7 +27,7 @@ NONE_FOUND = "none: no body darker than the tissue on all sides of it; one at th
 
 @dataclass(frozen=True)
 class Segmented:
-    """Surfaces of a sweep, with what is reported of them."""
+    """Surfaces of a sweep, with their figures and pictures."""
 
     meshes: dict[str, trimesh.Trimesh]  # by the files' names
     figures: Metrics

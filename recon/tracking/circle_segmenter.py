@@ -40,7 +40,7 @@ def rough_ellipses(image: NDArray, points: Array, networks: Networks, target: Ta
 
 
 def step_for(points: Array, target: Target) -> int:
-    """How coarse patches must be to hold the discs, from the distances of two or three circles : (3, 2) px."""
+    """Scale of patches that hold the discs, from the distances of two or three circles : (3, 2) px."""
     affine = affinity(points, target)
     scale = np.linalg.svd(affine, compute_uv=False)[0] if np.isfinite(affine).all() else stretch(points, target)
     return int(np.clip(np.ceil(scale * target.outer_diameter_mm / WIDEST), 1, COARSEST))

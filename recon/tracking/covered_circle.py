@@ -24,7 +24,7 @@ INK = 0.15  # of a ring's contrast: a middle that is no brighter is ink, and thi
 
 
 def completed(image: NDArray, outlines: Outlines, target: Target) -> Outlines:
-    """Three rims of an image, of which one that isn't found is looked for again where the other two ask for it."""
+    """Three rims of an image; a missing one is sought again at the place that the other two predict."""
     which = missing(outlines.found)
     if which is None:
         return outlines

@@ -159,7 +159,7 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
 
 
 def _like(off: Array, sigma: Array, share: float) -> bool:
-    """Whether shapes are a pose's but for a share, and for what they are known to."""
+    """Whether shapes agree with a pose's, within a share and their own uncertainty."""
     return bool((np.abs(off) <= share + SIGMAS * sigma).all())
 
 
@@ -168,9 +168,9 @@ def _off_shapes(pose: Array, views: Sequence[Sighting], used: Iterable[NDArray[n
     off, sigma = [np.zeros((0, 3))], [np.zeros((0, 1))]
     for view, circles in zip(views, used, strict=True):
         if view.shapes is not None:
-            told = ellipses_of(view.camera, pose, circle_centres(target)[circles], target.outer_diameter_mm / 2)[1]
-            size = np.trace(told, axis1=1, axis2=2)[:, None] / 2
-            off.append((view.shapes[circles] - told)[:, [0, 0, 1], [0, 1, 1]] / size)
+            expected = ellipses_of(view.camera, pose, circle_centres(target)[circles], target.outer_diameter_mm / 2)[1]
+            size = np.trace(expected, axis1=1, axis2=2)[:, None] / 2
+            off.append((view.shapes[circles] - expected)[:, [0, 0, 1], [0, 1, 1]] / size)
             rim = np.trace(view.covariance[circles], axis1=1, axis2=2)[:, None] / size**2  # a shape's is about its centre's
             sigma.append(np.sqrt(SHAPES**2 + rim))
     return np.concatenate(off), np.concatenate(sigma)

@@ -130,9 +130,9 @@ class Tracker:
 
     def _rough(self, world_from_target: Array) -> Ellipses:
         """Six ellipses, three a view, of a pose."""
-        return joined([self._asked(k, world_from_target) for k in (0, 1)])
+        return joined([self._expected(k, world_from_target) for k in (0, 1)])
 
-    def _asked(self, k: int, world_from_target: Array) -> Ellipses:
+    def _expected(self, k: int, world_from_target: Array) -> Ellipses:
         """Three ellipses that camera k should show of a pose."""
         radius = self.target.outer_diameter_mm / 2
         return Ellipses(*ellipses_of(self.cameras[k], world_from_target, circle_centres(self.target), radius))
@@ -156,8 +156,8 @@ class Tracker:
             both = all(view.found for view in seen)
             return Tracking(found, views.doubted(seen, found.reason) if both else self._unconfirmed(seen))
         if not found.used.all():
-            told = self._rough(found.world_from_target)
-            seen = views.with_told(seen[0], told[:3], found.used[0]), views.with_told(seen[1], told[3:], found.used[1])
+            rough = self._rough(found.world_from_target)
+            seen = views.with_predicted(seen[0], rough[:3], found.used[0]), views.with_predicted(seen[1], rough[3:], found.used[1])
         return Tracking(found, seen, how)
 
     def _unconfirmed(self, seen: tuple[View, View]) -> tuple[View, View]:
@@ -177,7 +177,7 @@ class Tracker:
         return self._fitted(frames, joined(halves), ROUGH_PX, "segmented")
 
     def _detected(self, frames: Frames, networks: Networks) -> Tracking:
-        """From nothing to the pose: a view alone tells it but for a tilt, and the other view is asked for each of these."""
+        """Search both frames; verify each pose hypothesis (P3P) of one view in the other."""
         candidates = circle_detector.detect(list(frames), networks)
         choices = [
             (k, triple)
@@ -194,7 +194,7 @@ class Tracker:
                 likeliest[k] = view
             if view.found:
                 settled[k] = triple
-                others = self._told(frames, k, view)
+                others = self._opposite_views(frames, k, view)
                 results = [self._posed((view, other) if k == 0 else (other, view), "detected") for other in others]
                 if any(result.found for result in results):
                     return min((one for one in results if one.found), key=_rank)
@@ -202,14 +202,14 @@ class Tracker:
         first, second = (likeliest.get(k, views.nothing(_absent(each))) for k, each in enumerate(candidates))
         return self._posed((first, second), "detected")
 
-    def _told(self, frames: Frames, k: int, view: View) -> list[View]:
-        """What the other camera shows where each pose that camera k's view allows asks for its circles."""
+    def _opposite_views(self, frames: Frames, k: int, view: View) -> list[View]:
+        """Views of the other camera at the circles that each pose hypothesis of camera k's view predicts."""
         poses = pose_hypotheses.poses(self.cameras[k], view.outlines.ellipses.centre, circle_centres(self.target))
-        asked = [self._asked(1 - k, pose) for pose in poses]
-        return [views.judged(self._view(frames, 1 - k, rough, REACH_PX), self.target) for rough in asked]
+        expected = [self._expected(1 - k, pose) for pose in poses]
+        return [views.judged(self._view(frames, 1 - k, rough, REACH_PX), self.target) for rough in expected]
 
     def _seen_at(self, frames: Frames, networks: Networks, k: int, triple: Triple) -> View:
-        """What one view shows where its three circles may be."""
+        """View of one camera at predicted places of its three circles."""
         rough = circle_segmenter.rough_ellipses(frames[k], triple.points, networks, self.target)
         return views.judged(views.renamed(self._view(frames, k, rough, ROUGH_PX), self.target), self.target)
 

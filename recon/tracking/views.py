@@ -65,7 +65,7 @@ def nothing(reason: str) -> View:
 
 
 def judged(outlines: Outlines, target: Target) -> View:
-    """A view of three rims: it is the target if all are rings, of the sizes that their distances ask for."""
+    """A view of three rims: the target if all are rings, of the sizes that their distances imply."""
     bad = [f"{name}: {reason}" for name, reason in zip(NAMES, outlines.reasons, strict=True) if reason is not None]
     if bad:
         return View(outlines, "; ".join(bad))
@@ -88,7 +88,7 @@ def unconfirmed(view: View, camera: Camera, target: Target) -> View:
 
 
 def lone(pair: tuple[View, View], used: NDArray[np.bool_]) -> str | None:
-    """Why a pose that uses (2, 3) circles isn't believed: what one camera alone tells of a circle may be another thing's edge."""
+    """Reason to refuse a pose from (2, 3) circles: a circle found by one camera alone may be another thing's edge."""
     reasons = (_half_seen(view.outlines, mine & ~other) for view, mine, other in zip(pair, used, used[::-1], strict=True))
     return next((reason for reason in reasons if reason), None)
 
@@ -103,11 +103,11 @@ def _half_seen(outlines: Outlines, which: NDArray[np.bool_]) -> str | None:
     return "; ".join(little) + ", by one camera only" if little else None
 
 
-def with_told(view: View, told: Ellipses, used: NDArray[np.bool_]) -> View:
-    """The view of a known pose, which tells where the circles are that it wasn't fitted to; what was measured stays as it was."""
+def with_predicted(view: View, predicted: Ellipses, used: NDArray[np.bool_]) -> View:
+    """The view of a known pose: unmeasured circles where the pose predicts them, measured ones unchanged."""
     outlines = view.outlines
-    centre = np.where(used[:, None], outlines.ellipses.centre, told.centre)
-    shape = np.where(used[:, None, None], outlines.ellipses.shape, told.shape)
+    centre = np.where(used[:, None], outlines.ellipses.centre, predicted.centre)
+    shape = np.where(used[:, None, None], outlines.ellipses.shape, predicted.shape)
     reasons = tuple(None if u else reason or ELSEWHERE for u, reason in zip(used, outlines.reasons, strict=True))
     return View(replace(outlines, ellipses=Ellipses(centre, shape), reasons=reasons))
 
@@ -119,5 +119,5 @@ def doubted(pair: tuple[View, View], reason: str | None) -> tuple[View, View]:
 
 
 def renamed(outlines: Outlines, target: Target) -> Outlines:
-    """The same rims in the order that their geometry asks for, if all are rings."""
+    """The same rims in the order of the target's geometry, if all are rings."""
     return outlines[identity.named(outlines.ellipses, target)[0]] if outlines.found.all() else outlines

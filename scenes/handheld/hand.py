@@ -285,7 +285,7 @@ def _smooth_minimum(a: NDArray[np.float32], b: NDArray[np.float32], width: float
 
 
 def _offset(outline: Array, distance: float) -> Array:
-    """A convex outline : (n, 2) grown by a distance, as its support function tells, at 180 directions."""
+    """A convex outline : (n, 2) grown by a distance, by its support function, at 180 directions."""
     turn = 2 * np.pi * np.arange(180) / 180
     normals = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     return outline[(outline @ normals.T).argmax(axis=0)] + distance * normals
@@ -315,7 +315,7 @@ def _walk(outline: Array, distances: Array, start: float, lengths: Array, way: i
 
 
 def _bent(start: Array, end: Array, lengths: Array, bulge: Array) -> Array:
-    """A chain : (4, 3) of three segments from start to end that bulges to one side as far as its lengths ask for."""
+    """A chain : (4, 3) of three segments from start to end that bulges to one side as far as its lengths allow."""
     straight = float(np.linalg.norm(end - start))
     spare = np.sqrt(max(lengths.sum() ** 2 - straight**2, 0.0)) / 2.6
     parts = np.cumsum(lengths)[:-1] / lengths.sum()

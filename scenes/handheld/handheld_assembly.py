@@ -26,7 +26,7 @@ TRIES = 40  # of a pose for the hand that covers no circle
 
 @dataclass(frozen=True)
 class Ranges:
-    """How variants differ; fractions are of all variants."""
+    """Ranges of variants; fractions are of all variants."""
 
     board: float = 0.08  # relative change of each side of the board
     thickness_mm: tuple[float, float] = (1.5, 6.0)  # of the board

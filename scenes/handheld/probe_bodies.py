@@ -66,7 +66,7 @@ def parts_of(probe: Body, rng: np.random.Generator) -> list[Part]:
 
 
 def _mark(probe: Body, rng: np.random.Generator) -> Part:
-    """A label, a button or the ridge that tells the image's left side: low plates on the housing."""
+    """A label, a button or the ridge on the image's left side: low plates on the housing."""
     level = rng.uniform(0.15, 0.85)
     half = np.abs(probe.outline_at(level)).max(axis=0)
     size = np.minimum(rng.uniform(3, 22, 2), half[0] * np.array([0.9, 1.2]))

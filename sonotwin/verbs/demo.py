@@ -50,7 +50,7 @@ OUTPUTS = (
 
 
 def run(config: Config) -> None:
-    """Play the steps, then say in some lines what came out.
+    """Play the steps, then print a summary in some lines.
 
     Raises
     ------

@@ -157,7 +157,7 @@ def exact_observations(cameras: Mapping[str, Camera], points: Array, poses: Arra
 
 
 def on_board(camera: Camera, pose: Array, world: Array) -> Array:
-    """How pixels change along the board's plane at points : (n, 3) mm in the world : (n, 2, 2) px/mm."""
+    """Derivatives of pixels along the board's plane at points : (n, 3) mm in the world : (n, 2, 2) px/mm."""
     return linearise(camera, world, ()).by_point @ pose[:3, :2]
 
 
@@ -168,7 +168,7 @@ def disc_radii(camera: Camera, pose: Array, design: AsymmetricCircles) -> Array:
 
 
 def measured_noise(result: Result) -> tuple[tuple[str, float], ...]:
-    """Noise of a sighting in u and v, (device, px): as the detection predicts it, times what the residuals say of that."""
+    """Noise of a sighting in u and v, (device, px): as the detection predicts it, scaled to the residuals."""
     levels = []
     for d, device in enumerate(result.observations.devices):
         seen = result.observations.seen[:, :, d]

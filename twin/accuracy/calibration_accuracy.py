@@ -111,7 +111,7 @@ def redrawn(setup: Setup) -> tuple[tuple[BoardSet, Result], ...]:
 
 
 def against_truth(seen: BoardSet, result: Result) -> list[Row]:
-    """Row a: residuals and parameters; the limit is what detection and covariance predict."""
+    """Row a: residuals and parameters; the limit is the prediction of detection and covariance."""
     found, what = result.adjustment.calibration, f"{len(result.observations.poses)} poses"
     rows = [
         Row(
@@ -170,7 +170,7 @@ def lit_board(rig: Rig, config: board.Config) -> tuple[np.ndarray, Exposure]:
 
 
 def baseline_bias(rig: Rig, diameter_mm: float, tilt_deg: float, count: int = DRAWN_POSES) -> Row:
-    """Row b: what it does to the longer error of the two baselines if the correction is left out; no noise."""
+    """Row b: the longer error of the two baselines without the correction; no noise."""
     truth, design = calibration_of(rig), board.design(board.Config(diameter_mm=diameter_mm))
     poses = random_poses(Poses(count=count, tilt_deg=tilt_deg), design, list(truth.cameras.values()))
     seen = drawn(truth, design, poses, QUIET, np.random.default_rng(1))
@@ -187,7 +187,7 @@ def free_of(result: Result) -> dict[str, tuple[str, ...]]:
 
 
 def honesty(drawings: Sequence[tuple[BoardSet, Result]]) -> list[Row]:
-    """Row c: errors of independent calibrations over what each predicts of itself."""
+    """Row c: errors of independent calibrations over their own predictions."""
     truth = drawings[0][0].truth
     volume = uncertainty.working_volume(truth, DEPTHS)
     squares, numbers, inside = [], [], {pair: [] for pair in PAIRS}

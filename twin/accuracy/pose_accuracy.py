@@ -54,7 +54,7 @@ def centre_rows(setup: Setup, networks: Networks) -> list[Row]:
 
 
 def centre_row(blur: float, errors: Sequence[Located], bar: float) -> Row:
-    """Median error of centres, beside what noise alone leaves."""
+    """Median error of centres, beside that of noise alone."""
     centres = np.concatenate([one.centre_px for one in errors])
     limit = np.concatenate([one.limit_px for one in errors])
     share = 100 * np.isfinite(centres).mean()

@@ -263,7 +263,7 @@ def refused(make: Callable[[], object], named: str) -> float:
 
 
 def sound(setup: Setup, frames: Frames) -> list[Row]:
-    """Row f: what water of 22 degrees does to depths is found as predicted, and is undone by the temperature."""
+    """Row f: the error of depths in water of 22 degrees, as predicted, and after its correction by the temperature."""
     rig, truth = setup.rig, calibration_of(setup.rig, setup.scanners["water"])
     speed = float(sound_in_water.speed_of_sound(TEMPERATURE_C))
     found = [each.calibration for each in sets(rig, frames)[0][0]]

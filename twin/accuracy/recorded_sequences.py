@@ -1,4 +1,4 @@
-"""How tracked sequences fare: a recording of the PLUS toolkit against its own reconstruction, and files that are damaged."""
+"""Tracked sequences: a recording of the PLUS toolkit against its own reconstruction, and damaged files."""
 
 from collections.abc import Iterator
 from pathlib import Path

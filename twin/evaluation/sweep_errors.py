@@ -238,7 +238,7 @@ def filled(mesh: trimesh.Trimesh, axes: Sequence[Array]) -> NDArray[np.bool_]:
 
 
 def _figures_of(finding: Finding) -> Metrics:
-    """How a found thing compares with the true one."""
+    """Figures of a found thing against the true one."""
     mesh = finding.found
     if mesh is None:
         names = ("extent_mm", "volume_mm3", "centre_error_mm", "outline_rms_mm", "outline_bias_mm", "dice")

@@ -82,7 +82,7 @@ def read_track(poses: Path, expected: FilmTruth) -> Track:
 
 
 def compare(track: Track, expected: FilmTruth) -> Errors:
-    """Errors of a track, frame by frame, with what its covariance predicts."""
+    """Errors of a track, frame by frame, with those that its covariance predicts."""
     count = len(expected.times)
     shift, turn = np.full((2, count), np.nan)
     bounds = np.full((2, count), np.nan)

@@ -119,7 +119,7 @@ class ProjectorOptics:
 
 
 def light_point(projector: ProjectorOptics, point: mi.Point3f, lens: mi.Point2f) -> tuple:
-    """How the projector lights points of the world through points of the unit disc on its lens.
+    """Illumination of points of the world by the projector, through points of the unit disc on its lens.
 
     Returns
     -------

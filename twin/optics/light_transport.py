@@ -22,7 +22,7 @@ LUMENS_PER_WATT = 542.0  # photopic efficacy at 525 nm (683 lm/W, CIE V = 0.793)
 
 
 class Engine(BaseModel):
-    """How light is traced."""
+    """Settings of the path tracer."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

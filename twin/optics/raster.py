@@ -1,4 +1,4 @@
-"""The projector's raster: what its micromirrors send out, and the table from which the ray tracer reads it.
+"""The projector's raster: light of its micromirrors, and the table from which the ray tracer reads it.
 
 All patterns of a sequence vary along one axis, so their light is kept as profiles along that axis, finely sampled and blurred
 by the lens's point spread. Defocus is not in here: it comes from tracing through the lens.

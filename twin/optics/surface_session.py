@@ -1,4 +1,4 @@
-"""The surface part of a session: what cameras see of a scene under a pattern sequence, and the truth about it."""
+"""The surface part of a session: images of a scene under a pattern sequence, and their truth."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -26,7 +26,7 @@ CameraName = Literal["cam1", "cam2"]
 
 
 class Shooting(BaseModel):
-    """How the cameras take their images."""
+    """Settings of the cameras' shots."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -47,7 +47,7 @@ class View:
 
 
 def shoot(rig: Rig, scene: Scene, patterns: Patterns, camera: CameraName, engine: Engine, shooting: Shooting, seed: int) -> View:
-    """Render what one camera sees of a pattern sequence, and take the images with its sensor.
+    """Render a camera's view of a pattern sequence, and take the images with its sensor.
 
     The same seed gives the same bytes. Rendering noise, sensor noise and the two cameras draw from separate streams.
     """

@@ -1,4 +1,4 @@
-"""The report of a measured surface: what the camera saw, how it became points, and how far they are from the truth."""
+"""The report of a measured surface: images, phase, points, and their errors."""
 
 import re
 from collections.abc import Sequence
@@ -155,13 +155,13 @@ def surface(measurement: Measurement) -> Section:
 
 
 def without_supports(measurement: Measurement) -> NDArray[np.bool_]:
-    """Pixels : (h, w) that see something besides what things lie on."""
+    """Pixels : (h, w) of things other than their support."""
     supports = [number for number, name in enumerate(measurement.truth.things) if name in SUPPORTS]
     return ~np.isin(measurement.truth.objects, supports)
 
 
 def errors(measurement: Measurement, metrics: Metrics) -> Section:
-    """Where the errors are, and whether they are what the points' own sigma says."""
+    """Error map, and errors over the points' own sigma."""
     comparison = measurement.comparison
     known = surface_errors.points_with_prediction(comparison)
     error, predicted = comparison.error[known], comparison.predicted[known]
@@ -217,7 +217,7 @@ def histograms(error: NDArray[np.float32], predicted: NDArray[np.float32], metri
 
 
 def images(measurement: Measurement) -> Section:
-    """What the camera saw: the scene, and some images of each part of the sequence."""
+    """The camera's images: the scene, and some of each part of the sequence."""
     stack, full = measurement.shots.images, 2.0**measurement.shots.bits - 1
     parts = measurement.shots.patterns.slices()
     fringes = next(place for part, place in parts if isinstance(part, Fringes))
@@ -293,7 +293,7 @@ def beside_the_paper(metrics: Metrics) -> Section:
 
 
 def settings(measurement: Measurement, metrics: Metrics) -> Section:
-    """How the images were taken and what their noise is."""
+    """Exposure of the images and their noise."""
     shots, found = measurement.shots, measurement.found
     device = measurement.manifest.devices_of("surface")[measurement.camera]
     parts = ", ".join(f"{part.count} × {part.kind.replace('_', ' ')} ({part.axis})" for part in shots.patterns.parts)

@@ -1,4 +1,4 @@
-"""Pictures of B-scans beside what they should show, with outlines of what was found and of what there was."""
+"""Pictures of B-scans beside ideal ones, with outlines of found and true things."""
 
 from collections.abc import Mapping, Sequence
 
@@ -44,7 +44,7 @@ def true_from_pixel(number: int, expected: SweepTruth) -> Array:
 
 
 def tissue_speed(expected: SweepTruth) -> float:
-    """Of sound in what was swept over, m/s."""
+    """Speed of sound in the thing that was swept over, m/s."""
     return sweep_session.surface_of("", expected.body).tissue.speed
 
 
@@ -72,7 +72,7 @@ def level_section(volume: Volume, z: float, findings: Sequence[Finding]) -> Colo
 
 
 def cuts(findings: Sequence[Finding], measured_from_pixel: Array, true_from_pixel: Array) -> dict[str, Array]:
-    """Outlines in an image, by their colour: what was found where the image was measured to lie, the truth where it lay."""
+    """Outlines in an image, by their colour: found things by the measured pose, true ones by the true pose."""
     empty = [np.empty((0, 2, 2))]
     found = [cut(finding.found, measured_from_pixel) for finding in findings if finding.found is not None]
     return {

@@ -1,4 +1,4 @@
-"""What ultrasound adds to the report: what was found inside the measured surface, and how the probe came to see there."""
+"""Ultrasound's sections of the report: masses inside the measured surface, the probe's calibration and its sweep."""
 
 import csv
 import json
@@ -96,7 +96,7 @@ def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: Swe
 
 
 def result(metrics: Metrics) -> str:
-    """What was found inside, in one sentence; nothing if nobody looked."""
+    """The masses found inside, in one sentence; nothing without a sweep."""
     if "tumours_true" not in metrics:
         return ""
     found, count = metrics["tumours_found"], metrics["tumours_true"]
@@ -148,7 +148,7 @@ def inside(story: Inside, points: NDArray[np.float32], skin: NDArray[np.bool_], 
 
 
 def too_deep(expected: SweepTruth, told: float) -> str:
-    """What the speed of sound in the thing that was scanned does to depths, and what was done about it."""
+    """Effect of the tissue's speed of sound on depths, and its correction."""
     speed, assumed = sweep_pictures.tissue_speed(expected), expected.transducer.assumed_speed
     off = float(sound_in_water.shown_too_deep(DEEP_MM, speed, assumed))
     lies = f"lies {abs(off):.1f} mm {'less' if off > 0 else 'more'} deep" if off else "lies there"
@@ -167,7 +167,7 @@ def too_deep(expected: SweepTruth, told: float) -> str:
 
 
 def view(story: Inside, points: NDArray[np.float32], skin: NDArray[np.bool_]) -> str:
-    """The surface, what was found under it, and the sweep, in space."""
+    """The surface, the masses found under it, and the sweep, in space."""
     shapes = [figures.surface_shape(points, skin, "measured surface", SKIN, 0.35)]
     for finding in story.findings:
         if finding.found is not None:
@@ -229,7 +229,7 @@ def tumours(story: Inside, metrics: Metrics) -> str:
 
 
 def pictures(story: Inside) -> Iterator[tuple[Colours, str, str]]:
-    """Each tumour's B-scan beside what it should show, and a level section through the volume, each with caption and detail."""
+    """Each tumour's B-scan beside an ideal one, and a level section through the volume, each with caption and detail."""
     for finding in story.findings:
         centre = finding.true.center_mass
         number = sweep_errors.nearest_frame(centre, story.world_from_pixel, story.sweep.size)
@@ -302,7 +302,7 @@ def against_speed(story: Inside, sy: float) -> tuple[Array, Array]:
 
 
 def probe_table(metrics: Metrics, story: Inside) -> str:
-    """The paper's figures, what the calibration predicts of itself, and its true errors."""
+    """The paper's figures, the calibration's own predictions, and its true errors."""
     error, sigma = sweep_errors.probe_errors(story.probe, story.truth, five_points(story.sweep.size))
     rows = [("Equations of the crossings, RMS", PAPER["equations"], "", f"{metrics['probe_rms_mm']:.3f} mm")]
     places = (

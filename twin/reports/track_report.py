@@ -1,4 +1,4 @@
-"""What tracking adds to the report: pictures of what was seen, errors against what was predicted, and what was not found."""
+"""Tracking's section of the report: pictures of frames, errors against predicted ones, and reasons for frames without a pose."""
 
 import csv
 from collections.abc import Iterator, Sequence
@@ -61,7 +61,7 @@ def result(metrics: Metrics) -> str:
 
 
 def section(story: Tracked, metrics: Metrics) -> Section:
-    """What the tracker saw, how far off it was, and what it did not find."""
+    """The tracker's frames, its errors, and the frames without a pose."""
     text = (
         "A hand leads the target past the cameras, in light as dark as the real rig’s: slowly, then so fast that rims are "
         f"blurred by up to {metrics['track_blur_most_px']:.1f} px, then partly out of one camera’s view. Networks find its "

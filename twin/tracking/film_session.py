@@ -51,7 +51,7 @@ class HandPath(Part):
 
 
 class Filming(Part):
-    """How a film is taken."""
+    """Settings of a film."""
 
     frames: Annotated[int, Field(ge=1, le=100_000)] = 30
     camera_hz: Positive = 30.0
@@ -99,7 +99,7 @@ class Way:
 
 
 def lead(path: HandPath, target: Target, eyes: Array, seed: int) -> Way:
-    """Lead the target along a path, its face to the point between the cameras : (3,) mm, as steadily as the path says."""
+    """Lead the target along a path, its face to the point between the cameras : (3,) mm, as steadily as the path demands."""
     rng = np.random.default_rng([seed, 2])
     places = np.array(path.places_mm, float)
     places = places + path.unsteady_mm * rng.standard_normal(places.shape)

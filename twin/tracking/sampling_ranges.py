@@ -27,7 +27,7 @@ Lengths = tuple[Positive, Positive]
 
 
 class CameraRanges(Ranges):
-    """How calibrations differ from rig to rig."""
+    """Ranges of calibrations, from rig to rig."""
 
     own_share: Share  # of samples with the rig's own cameras, exactly
     focal_px: Lengths
@@ -54,7 +54,7 @@ class PoseRanges(Ranges):
 
 
 class LightRanges(Ranges):
-    """How scenes are lit and exposed."""
+    """Ranges of light and exposure."""
 
     white_dn: Lengths  # of 255: brightness of the target's white, log-uniform; past 255 it saturates
     ordinary_share: Share  # of samples within ordinary_dn instead
@@ -70,7 +70,7 @@ class LightRanges(Ranges):
 
 
 class TargetRanges(Ranges):
-    """How targets are printed, worn and covered."""
+    """Ranges of the targets' print, wear and cover."""
 
     ink: tuple[Fraction, Fraction]  # reflectance
     paper: tuple[Fraction, Fraction]

@@ -33,7 +33,7 @@ class Spans(NamedTuple):
 
 
 class Bundles(NamedTuple):
-    """Middles of the bundles on the probe's face, and what their rays have in common."""
+    """Middles of the bundles on the probe's face, and figures common to all."""
 
     along: Array  # (n / 8,) mm
     across: Array  # (m / 5,) mm

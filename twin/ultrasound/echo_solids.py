@@ -113,7 +113,7 @@ class Body:
 
 
 def body(scene: Scene) -> Body:
-    """What ultrasound meets in a scene. Takes seconds for a large mesh: build it once a scene.
+    """The solids and wires of a scene for ultrasound. Takes seconds for a large mesh: build it once a scene.
 
     Raises
     ------

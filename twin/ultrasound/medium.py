@@ -32,7 +32,7 @@ NEAR_BORDER = -1  # a label that has to be looked up at each place
 
 
 class Lattice(NamedTuple):
-    """Cells around the slice, in columns along one of the lattice's axes, and what scatterers in them send back."""
+    """Cells around the slice, in columns along one of the lattice's axes, and the strength of their scatterers."""
 
     edge_mm: float
     axes: NDArray[np.int64]  # (3,) the one most along the image's x, the other, and the columns': most across the plane

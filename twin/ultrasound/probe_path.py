@@ -1,4 +1,4 @@
-"""How a hand leads the probe: along a surface in contact with it, tilted, trembling; up and down over a tank's bottom; or from
+"""Paths of a hand-led probe: along a surface in contact with it, tilted, trembling; up and down over a tank's bottom; or from
 rest to rest about crossed wires.
 """
 
@@ -29,7 +29,7 @@ TOUCHING_MM = 2.0  # between the axes of two wires that cross
 
 
 class Hand(Part):
-    """How unsteady the hand is: Gaussian processes of a correlation time, in each of three axes."""
+    """Unsteadiness of the hand: Gaussian processes of a correlation time, in each of three axes."""
 
     shift_mm: NotNegative = 0.15  # standard deviation
     turn_deg: NotNegative = 0.6

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class Clocks(Part):
-    """When scanner and cameras take their images, and what their time stamps say. Truth is the cameras' clock."""
+    """Rates of scanner and cameras, and errors of their time stamps. Truth is the cameras' clock."""
 
     scanner_hz: Positive = 20.0
     camera_hz: Positive = 40.0

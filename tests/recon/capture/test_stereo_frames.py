@@ -60,7 +60,7 @@ def test_frames_are_read_as_they_are_asked_for(copy, monkeypatch):
     pairs = stereo_frames.read_film(copy).pairs()
     assert not asked
     next(pairs)
-    assert len(asked) <= 2 * (stereo_frames.AHEAD + 1)
+    assert len(asked) <= 2 * (stereo_frames.AT_ONCE + 1)
     assert len(list(pairs)) == 11 and len(asked) == 24
 
 

@@ -163,7 +163,7 @@ def _ellipse(contour: NDArray[np.int32], shape: tuple[int, int], widen: float) -
 
 
 def _fault(measured: discs.Discs) -> str | None:
-    """What is wrong with the outlines, if anything."""
+    """Reason to refuse the outlines, or None."""
     fit, edges = measured.fit, measured.edges
     axes = fit.ellipses.semi_axes
     seen = np.isfinite(fit.residuals)

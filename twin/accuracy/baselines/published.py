@@ -35,7 +35,7 @@ def scores(detection: NDArray) -> NDArray:
 
 
 def peaks(score: NDArray) -> NDArray:
-    """What is left of scores : (h, w) once only local maxima stay; those that such a maximum hid get a second chance."""
+    """Local maxima of scores : (h, w), all else 0; maxima hidden by a greater one get a second chance."""
     window = np.ones((2 * SUPPRESSION + 1,) * 2, np.uint8)
     score = np.asarray(score, np.float32)
     top = score == cv2.dilate(score, window)
