@@ -156,8 +156,8 @@ class Tracker:
             both = all(view.found for view in seen)
             return Tracking(found, views.doubted(seen, found.reason) if both else self._unconfirmed(seen))
         if not found.used.all():
-            rough = self._rough(found.world_from_target)
-            seen = views.with_predicted(seen[0], rough[:3], found.used[0]), views.with_predicted(seen[1], rough[3:], found.used[1])
+            one, other = self._expected(0, found.world_from_target), self._expected(1, found.world_from_target)
+            seen = views.with_predicted(seen[0], one, found.used[0]), views.with_predicted(seen[1], other, found.used[1])
         return Tracking(found, seen, how)
 
     def _unconfirmed(self, seen: tuple[View, View]) -> tuple[View, View]:
