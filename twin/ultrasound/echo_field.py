@@ -1,7 +1,7 @@
 """The field of echoes before the point spread: its raster, how echoes are laid on it, and their sum.
 
-Echoes are laid by threads on as many fields as there are parts of the slice. Their number is fixed, and so is the order of the
-sum: the same bytes from any number of threads.
+Echoes are laid by threads, part by part of the slice, and the lines that each part touched are kept. The parts' number is
+fixed, and so is the order of their sum: the same bytes from any number of threads.
 """
 
 from collections.abc import Callable
