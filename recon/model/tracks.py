@@ -1,12 +1,15 @@
 """Poses over time: a tracker's poses of a moving body, and its pose at any moment between."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.spatial.transform import Rotation, Slerp
 
 Array = NDArray[np.float64]
+LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s that a device is late against the tracker
 
 MAX_GAP_S = 0.25  # between two poses, over which none is interpolated
 

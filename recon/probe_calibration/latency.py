@@ -11,12 +11,10 @@ Move the probe by 10 mm or more, three times or more, at an uneven pace: a perio
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy import stats
 from scipy.interpolate import BSpline, make_lsq_spline
 from scipy.spatial.transform import Rotation
@@ -27,7 +25,6 @@ from recon.model import tracks
 from recon.model.tracks import Track
 
 Array = NDArray[np.float64]
-LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s; of a setting
 
 SEARCH_S = (-0.5, 0.5)
 STEP_S = 0.01  # of the search

@@ -134,7 +134,7 @@ def evened(mesh: trimesh.Trimesh, vertices: Array) -> trimesh.Trimesh:
 
 def _near(rough: trimesh.Trimesh, power: EchoPower) -> tuple[NDArray[np.int64], Array, Array, Array]:
     """Voxels with data near a surface: the nearest vertex, distance (positive outside), power and weight."""
-    volume, farthest = power.volume, 1.5 * REACH_MM
+    volume, farthest = power.volume, 1.1 * REACH_MM
     voxel = rigid.apply(np.linalg.inv(volume.world_from_voxel), rough.vertices)
     margin = 2 * REACH_MM / volume.spacing
     low = np.maximum(np.floor(voxel.min(axis=0) - margin), 0).astype(int)

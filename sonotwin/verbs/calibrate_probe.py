@@ -26,9 +26,9 @@ from recon.capture import probe_files, sweep_part, sweep_tables
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 from recon.model.rig import Rig
+from recon.model.tracks import LagSeconds
 from recon.probe_calibration import crossing_frames, probe_figures, sound_in_water, tank_calibration
 from recon.probe_calibration.crossing_frames import CrossingFrames
-from recon.probe_calibration.latency import LagSeconds
 from recon.probe_calibration.tank_calibration import Result, Settings
 
 PROBE = "probe.yaml"

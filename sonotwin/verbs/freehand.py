@@ -28,7 +28,7 @@ from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Extent, Scans
 from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction
 from recon.model.probe import Speed
-from recon.probe_calibration.latency import LagSeconds
+from recon.model.tracks import LagSeconds
 
 VOLUME = "volume.nrrd"  # by which the folder of a volume is known
 SEQUENCE = "sequence.igs.mha"

@@ -27,7 +27,7 @@ from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans
 from recon.model.probe import SCANNER_SPEED, Speed
 from recon.model.rig import Positive
-from recon.probe_calibration.latency import LagSeconds
+from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, segmented_scans
 from recon.segmentation.segmented_scans import Segmented
 from recon.segmentation.tube_wall import Appearance

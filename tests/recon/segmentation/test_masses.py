@@ -35,7 +35,7 @@ def ball():
 
 
 def find(power):
-    return refined(rough(power), power)
+    return refined(rough(power), power, 3)
 
 
 VOLUME = 4 / 3 * np.pi * RADIUS**3
