@@ -9,7 +9,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation, Slerp
 
 Array = NDArray[np.float64]
-LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s that a device is late against the tracker
+LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s that images' time stamps are late; of a setting
 
 MAX_GAP_S = 0.25  # between two poses, over which none is interpolated
 

@@ -26,6 +26,7 @@ from recon.threads import in_threads
 Array = NDArray[np.float64]
 
 REACH_MM = 2.4  # of a profile, on either side of the surface
+NEARBY = 1.1  # times that: distance of a profile's voxel from its vertex, as vertices lie closer than voxels
 BIN_MM = 0.2
 MOST_MM = 1.0  # by which a vertex is moved in one round
 STEP_MM = 0.1  # between trial places
@@ -134,15 +135,18 @@ def evened(mesh: trimesh.Trimesh, vertices: Array) -> trimesh.Trimesh:
 
 def _near(rough: trimesh.Trimesh, power: EchoPower) -> tuple[NDArray[np.int64], Array, Array, Array]:
     """Voxels with data near a surface: the nearest vertex, distance (positive outside), power and weight."""
-    volume, farthest = power.volume, 1.1 * REACH_MM
+    volume = power.volume
+    farthest, spared = (
+        NEARBY * REACH_MM,
+        np.linalg.norm(volume.spacing) / 2,
+    )  # a vertex lies up to this far from its voxel's centre
     voxel = rigid.apply(np.linalg.inv(volume.world_from_voxel), rough.vertices)
-    margin = 2 * REACH_MM / volume.spacing
+    margin = (farthest + spared) / volume.spacing
     low = np.maximum(np.floor(voxel.min(axis=0) - margin), 0).astype(int)
     high = np.minimum(np.ceil(voxel.max(axis=0) + margin).astype(int) + 1, volume.voxels.shape[::-1])
     part = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
     apart = np.ones(tuple(high - low)[::-1], bool)
     apart[tuple(np.clip(np.rint(voxel).astype(int) - low, 0, high - low - 1).T[::-1])] = False
-    spared = np.linalg.norm(volume.spacing) / 2  # a vertex lies up to this far from its voxel's centre
     within = np.asarray(ndimage.distance_transform_edt(apart, volume.spacing[::-1])) < farthest + spared
     k, j, i = np.nonzero((power.weight[part] > 0.01) & within)
     index = np.column_stack([i, j, k]) + low

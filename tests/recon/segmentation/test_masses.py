@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.special import ndtr
 
 from recon.errors import InputError
@@ -35,7 +36,7 @@ def ball():
 
 
 def find(power):
-    return refined(rough(power), power, 3)
+    return refined(rough(power), power, masses.REFINEMENTS[-1])
 
 
 VOLUME = 4 / 3 * np.pi * RADIUS**3
@@ -79,3 +80,20 @@ def test_the_level_of_tissue_is_that_of_images_with_a_pose():
         masses.tissue_grey(iter(np.full((5, 200, 40), 4, np.uint8)), (200, 40), matrices)
     with pytest.raises(InputError, match="images: expected more than 6 mm of depth, found 20 rows, of which 15 are ringing"):
         masses.tissue_grey(iter(images[:, :20]), (20, 40), matrices)
+
+
+@pytest.mark.parametrize("shape", [(9, 30, 21), (1, 12, 40), (40, 5, 3)])
+def test_a_blur_is_a_gaussian_filter(rng, shape):
+    """Another width along each axis, axes shorter than the kernel too."""
+    field, sigma = rng.normal(size=shape).astype(np.float32), np.array([0.8, 2.3, 5.1])
+    np.testing.assert_allclose(masses._blurred(field, sigma), ndimage.gaussian_filter(field, sigma), atol=1e-6)
+
+
+@pytest.mark.parametrize("spacing", [(0.5, 0.5, 0.5), (0.9, 0.4, 0.25), (4.0, 0.3, 0.5)])
+def test_an_opening_is_one_by_distances(rng, spacing):
+    """Bodies of all sizes, some at the faces of the volume; the same as by exact distances from and to all voxels."""
+    mask = ndimage.gaussian_filter(rng.normal(size=(16, 40, 48)), 3 / np.array(spacing) / 2) > 0
+    core = ndimage.distance_transform_edt(mask, spacing) > 1.5
+    assert 0 < core.sum() < mask.sum() < mask.size
+    opened = mask & (ndimage.distance_transform_edt(~core, spacing) <= 1.75)
+    np.testing.assert_array_equal(masses._opened(mask, 1.5, np.array(spacing)), opened)
