@@ -23,6 +23,7 @@ from recon.model.rig import Rig
 from scenes import board_poses
 from scenes.kinds import board
 from scenes.scene_types import Scene, Thing
+from twin.optics.conditions import IDEAL, Conditions, draw, emitted, with_stray
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, Images, meets_something, render_pixels
 from twin.optics.printed_edges import compute_edges
@@ -67,6 +68,7 @@ class Settings:
     engine: Engine
     shooting: Shooting
     seed: int
+    conditions: Conditions = IDEAL
 
 
 def set_up(settings: Settings) -> Stage:
@@ -128,22 +130,27 @@ def shoot_pose(
 ) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
     """Take the images of one pose: of each camera the lit board (h, w), of camera 1 the fringes (n, h, w).
 
-    They depend on the seed and the pose's number alone, whichever poses were rendered before.
+    They depend on the seed and the pose's number alone, whichever poses were rendered before. Of the frames' errors the lit
+    image, which is one by itself, has none.
     """
     move_things(stage.world, stage.things, world_from_board)
+    frames = draw(settings.conditions.frames, settings.patterns.count, settings.seed, number)
+    shown = emitted(settings.patterns, settings.rig.projector, frames)
     lit, fringes = {}, {}
     for camera, optics in stage.cameras.items():
         key = [settings.seed, number, CAMERAS.index(camera)]
         light_seed, edge_seed, sensor_seed = np.random.SeedSequence(key).generate_state(3).tolist()
-        light, engine = with_fully_on(stage.patterns), settings.engine
+        light, engine, stray_dn = with_fully_on(shown), settings.engine, np.append(frames.stray_dn, 0.0)
         if camera != FRINGE_CAMERA:
             light, engine = fully_on(stage.patterns), engine.model_copy(update={"samples": EVEN_SAMPLES})
+            stray_dn = stray_dn[-1:]
         radiance = trace_near(stage, optics, light, engine, light_seed)
         on = radiance[-1]
         refine_edges(on, stage, optics, settings.engine, world_from_board, edge_seed)
         radiance.near[-1] = on.ravel()[radiance.pixels]
         device, wavelength = getattr(settings.rig, camera), settings.rig.projector.wavelength_nm
-        images = expose(radiance, device, wavelength, exposures[camera], sensor_seed)
+        seen = with_stray(radiance, stray_dn, device, wavelength, exposures[camera])
+        images = expose(seen, device, wavelength, exposures[camera], sensor_seed)
         lit[camera] = images[-1]
         if camera == FRINGE_CAMERA:
             fringes[camera] = images[:-1]

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from recon.compiled import kernel
 from recon.errors import InputError
 from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns
-from recon.structured_light import gray_code, multi_frequency, plausibility
+from recon.structured_light import frame_errors, gray_code, multi_frequency, plausibility
 from recon.structured_light.gray_code import Orders
-from recon.structured_light.phase import DEFAULT_NOISE, Fringe, Noise, estimate_noise, wrapped_phase
+from recon.structured_light.phase import DEFAULT_NOISE, FrameErrors, Fringe, Noise, estimate_noise, wrapped_phase
 from recon.structured_light.unwrapping import continuity, spatial
 from recon.threads import in_threads
 
@@ -119,7 +119,12 @@ def decode(
     full = 2.0**bits - 1
     least = DARKEST * full / 255 if min_modulation_dn is None else min_modulation_dn
     parts = patterns.slices()
-    noise, source = _noise(images, parts, full, noise)
+    errors = {
+        place.start: frame_errors.estimate(images[place], part.shifts, least_modulation=least, saturation=full)
+        for part, place in parts
+        if isinstance(part, Fringes)
+    }
+    noise, source = _noise(images, parts, errors, full, noise)
     axes: dict[Axis, tuple[Image, Image]] = {}
     fringes: dict[Axis, Fringe] = {}
     status = np.zeros(images.shape[1:], np.uint8)
@@ -128,7 +133,8 @@ def decode(
         sets = []
         for part, place in parts:
             if isinstance(part, Fringes) and part.axis == axis:
-                fringe = wrapped_phase(images[place], part.shifts, noise=noise, saturation=full)
+                frames = errors[place.start]
+                fringe = wrapped_phase(images[place], part.shifts, noise=noise, saturation=full, errors=frames)
                 where = f"{name}: images {place.start} to {place.stop - 1}"
                 plausibility.check_fringes(images[place], part, fringe, least, full, where, place.start)
                 sets.append((part, fringe))
@@ -153,13 +159,17 @@ def decode(
     )
 
 
-def _noise(images: NDArray, parts: list[tuple[AnyPart, slice]], full: float, given: Noise | None) -> tuple[Noise, NoiseSource]:
+def _noise(
+    images: NDArray, parts: list[tuple[AnyPart, slice]], errors: dict[int, FrameErrors], full: float, given: Noise | None
+) -> tuple[Noise, NoiseSource]:
     """The noise given, else measured on the first fringes that allow it, else a common camera's."""
     if given is not None:
         return given, "given"
     for part, place in parts:
-        if isinstance(part, Fringes) and (found := estimate_noise(images[place], part.shifts, saturation=full)) is not None:
-            return found, "measured"
+        if isinstance(part, Fringes):
+            found = estimate_noise(images[place], part.shifts, saturation=full, errors=errors[place.start])
+            if found is not None:
+                return found, "measured"
     return DEFAULT_NOISE.scaled(full / 255), "assumed"
 
 

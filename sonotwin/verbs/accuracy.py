@@ -24,7 +24,7 @@ from twin.accuracy import table_rows
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
-Group = Literal["optics", "surface", "calibration", "ultrasound", "tracking"]
+Group = Literal["optics", "surface", "reality", "calibration", "ultrasound", "tracking"]
 
 
 class Config(BaseModel):

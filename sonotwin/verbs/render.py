@@ -30,6 +30,7 @@ from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene, parse_scene
 from twin import board_session
 from twin.optics import surface_session
+from twin.optics.conditions import IDEAL, Conditions
 from twin.optics.light_transport import Engine
 from twin.session import Session
 
@@ -49,6 +50,7 @@ class Config(BaseModel):
     seed: Annotated[int, Field(ge=0)]
     shooting: surface_session.Shooting
     poses: BoardPoses | None = None
+    conditions: Conditions = IDEAL
 
     @model_validator(mode="after")
     def _fits(self) -> "Config":
@@ -100,6 +102,7 @@ def render_board(config: Config, chosen: BoardPoses, session: Session, console: 
         config.engine,
         config.shooting,
         config.seed,
+        config.conditions,
     )
     placed = board_session.place_all(settings)
     session.check()
@@ -137,7 +140,9 @@ def render_surface(config: Config, session: Session, console: Console) -> None:
     for camera in dict.fromkeys(config.cameras):
         start = perf_counter()
         with console.status(f"rendering {config.patterns.count} patterns for {camera}"):
-            view = surface_session.shoot(config.rig, scene, config.patterns, camera, config.engine, config.shooting, config.seed)
+            view = surface_session.shoot(
+                config.rig, scene, config.patterns, camera, config.engine, config.shooting, config.seed, config.conditions
+            )
         views[camera] = view
         console.print(
             f"render      {camera}, {config.patterns.count} patterns, {config.engine.samples} samples/px, "

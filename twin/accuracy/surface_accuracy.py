@@ -18,11 +18,12 @@ from scenes.scene_types import Scene
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import Comparison, Metrics, Truth
+from twin.optics.conditions import IDEAL, Conditions
 from twin.optics.light_transport import Engine
 from twin.optics.ray_world import visible
 from twin.optics.surface_session import Shooting, View, calibration_of, shoot
 
-ENGINE = Engine(samples=16, room_lux=20)
+ENGINE, SHOOTING = Engine(samples=16, room_lux=20), Shooting()
 PAPER_SPHERE_RADIUS_MM, PAPER_SPHERE_RMS_MM = 0.045, 0.040
 REAL_DEPTH_MM = (690.0, 780.0)
 WINDOW = 9  # px; patches of the real surface in which noise is told from shape by a quadratic fit
@@ -40,9 +41,17 @@ class Experiment:
     metrics: Metrics
 
 
-def experiment(rig: Rig, scene: Scene, patterns: Patterns, seed: int = 1, engine: Engine = ENGINE) -> Experiment:
+def experiment(
+    rig: Rig,
+    scene: Scene,
+    patterns: Patterns,
+    seed: int = 1,
+    engine: Engine = ENGINE,
+    shooting: Shooting = SHOOTING,
+    conditions: Conditions = IDEAL,
+) -> Experiment:
     """Render, decode, triangulate, clean and compare, as the commands do, without the files between."""
-    view = shoot(rig, scene, patterns, "cam1", engine, Shooting(), seed)
+    view = shoot(rig, scene, patterns, "cam1", engine, shooting, seed, conditions)
     cameras = calibration_of(rig).cameras
     found = decode(view.images, patterns, name=scene.name)
     points = clean(triangulate(found, cameras["cam1"], cameras["projector"]), cameras["cam1"], found.modulation)
@@ -151,29 +160,33 @@ def wrong_orders(result: Experiment, pitch: float) -> int:
 
 def real_capture(setup: Setup) -> list[Row]:
     """Row i: a plaster relief recorded by others (12 steps of 60 px, Gray code)."""
+    points, _ = relief(setup)
+    depth = points.points[..., 2]
+    known = depth[np.isfinite(depth)]
+    inside = float(np.mean((known > REAL_DEPTH_MM[0]) & (known < REAL_DEPTH_MM[1])))
+    ratio, what = relief_noise_ratio(setup), "real relief: local residual / predicted sigma on smooth patches, or its inverse"
+    return [
+        Row("i", "real relief: points", known.size, 210_000, None, "points", at_least=True),
+        Row("i", "real relief: share of points from 690 to 780 mm", inside, 0.999, 1.0, "", at_least=True),
+        Row("i", what, max(ratio, 1 / ratio), 1.4, 1.0, ""),
+    ]
+
+
+def relief(setup: Setup) -> tuple[PointMap, NDArray[np.float64]]:
+    """The real relief's points, and the centre of its camera : (3,) mm."""
     assert setup.real is not None
     folder, patterns = setup.real / "fringe_capture", setup.sequences["twelve_step_gray"]
     paths = sorted(folder.glob("*.png"))
     optics = calibration_files.read(folder / "calibration.yml", {"projector": patterns.projector_size}).cameras
     camera, projector = optics["cam1"], optics["projector"]
     found = decode(read_images(paths, camera.size, 8), patterns, name=folder.name)
-    points = clean(triangulate(found, camera, projector), camera, found.modulation)
-    depth = points.points[..., 2]
-    known = depth[np.isfinite(depth)]
-    inside = float(np.mean((known > REAL_DEPTH_MM[0]) & (known < REAL_DEPTH_MM[1])))
-    ratio = smooth_noise_ratio(np.linalg.norm(points.points - camera.centre, axis=-1), points.sigma)
-    return [
-        Row("i", "real relief: points", known.size, 210_000, None, "points", at_least=True),
-        Row("i", "real relief: share of points from 690 to 780 mm", inside, 0.999, 1.0, "", at_least=True),
-        Row(
-            "i",
-            "real relief: local residual / predicted sigma on smooth patches, or its inverse",
-            max(ratio, 1 / ratio),
-            1.4,
-            1.0,
-            "",
-        ),
-    ]
+    return clean(triangulate(found, camera, projector), camera, found.modulation), camera.centre
+
+
+def relief_noise_ratio(setup: Setup) -> float:
+    """Noise of the real relief's points over their predicted sigma."""
+    points, centre = relief(setup)
+    return smooth_noise_ratio(np.linalg.norm(points.points - centre, axis=-1), points.sigma)
 
 
 def smooth_noise_ratio(distance: NDArray[np.float32], sigma: NDArray[np.float32], smoothest: float = 0.25) -> float:

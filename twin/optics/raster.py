@@ -4,6 +4,7 @@ All patterns of a sequence vary along one axis, so their light is kept as profil
 by the lens's point spread. Defocus is not in here: it comes from tracing through the lens.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -34,15 +35,20 @@ class Light:
 
     @classmethod
     def of(cls, patterns: Patterns, device: ProjectorDevice) -> "Light":
-        """Patterns as a rig's projector shows them: grey values pass its gamma, binary ones don't; black is 1/contrast."""
+        """Patterns as a rig's projector shows them."""
+        return cls.of_profiles(patterns.projector_size, patterns.profiles(), device)
+
+    @classmethod
+    def of_profiles(
+        cls, size: tuple[int, int], profiles: Sequence[tuple[Axis, bool, Profiles]], device: ProjectorDevice
+    ) -> "Light":
+        """The same of patterns as of `Patterns.profiles`: grey values pass gamma, binary ones don't; black is 1/contrast."""
         black = 1 / device.contrast
         emitted = []
-        for _, binary, values in patterns.profiles():
+        for _, binary, values in profiles:
             on = values if binary else (np.round(values * 255) / 255) ** device.gamma
             emitted.append(np.float32(black + (1 - black) * on))
-        return cls(
-            patterns.projector_size, tuple(axis for axis, _, _ in patterns.profiles()), tuple(emitted), device.lens.blur_px
-        )
+        return cls(size, tuple(axis for axis, _, _ in profiles), tuple(emitted), device.lens.blur_px)
 
     def fine_profiles(self, axis: Axis) -> Profiles:
         """Profiles of the patterns of one axis behind the lens : (patterns of that axis, (length + 2 MARGIN) * OVERSAMPLING).

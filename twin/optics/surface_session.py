@@ -14,9 +14,9 @@ from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes, Patterns
 from recon.model.rig import CameraDevice, Positive, Rig
 from scenes.scene_types import Scene
+from twin.optics.conditions import IDEAL, Conditions, draw, emitted, with_stray
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, Images, render
-from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, visible
 from twin.optics.surface_truth import SurfaceTruth, surface_truth
 from twin.sensor import Exposure, Numbers, auto_exposure, electrons_per_radiance, expose, noise_dn, number_per_electron
@@ -46,28 +46,34 @@ class View:
     limit_px: Images  # (h, w, 2) see `noise_limit_px`
 
 
-def shoot(rig: Rig, scene: Scene, patterns: Patterns, camera: CameraName, engine: Engine, shooting: Shooting, seed: int) -> View:
+def shoot(
+    rig: Rig,
+    scene: Scene,
+    patterns: Patterns,
+    camera: CameraName,
+    engine: Engine,
+    shooting: Shooting,
+    seed: int,
+    conditions: Conditions = IDEAL,
+) -> View:
     """Render a camera's view of a pattern sequence, and take the images with its sensor.
 
-    The same seed gives the same bytes. Rendering noise, sensor noise and the two cameras draw from separate streams.
+    The same seed gives the same bytes. Rendering noise, sensor noise and the two cameras draw from separate streams; errors of
+    frames are the same for both cameras.
     """
     device: CameraDevice = getattr(rig, camera)
     light_seed, sensor_seed = np.random.SeedSequence([seed, ("cam1", "cam2").index(camera)]).generate_state(2).tolist()
     optics = camera_optics(rig, camera)
     world = build_world(scene)
+    frames = draw(conditions.frames, patterns.count, seed)
     radiance = render(
-        world,
-        optics,
-        ProjectorOptics.of(rig.projector),
-        Light.of(patterns, rig.projector),
-        engine,
-        light_seed,
+        world, optics, ProjectorOptics.of(rig.projector), emitted(patterns, rig.projector, frames), engine, light_seed
     )
     wavelength = rig.projector.wavelength_nm
     time_s = shooting.exposure_s or auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
     exposure = Exposure(time_s, shooting.gain, shooting.bits)
     return View(
-        expose(radiance, device, wavelength, exposure, sensor_seed),
+        expose(with_stray(radiance, frames.stray_dn, device, wavelength, exposure), device, wavelength, exposure, sensor_seed),
         exposure,
         surface_truth(world, device.optics.camera(), rig.projector.optics.camera()),
         noise_limit_px(radiance, patterns, device, wavelength, exposure),

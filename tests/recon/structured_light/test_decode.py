@@ -79,7 +79,8 @@ def test_a_given_noise_is_used(rng):
     loud, quiet = (decode(images, patterns, noise=Noise(v, 0.0)) for v in (4.0, 1.0))
     assert quiet.noise_source == "given"
     assert quiet.sigma_columns is not None
-    assert loud.sigma_columns == pytest.approx(2 * quiet.sigma_columns, rel=1e-4, nan_ok=True)
+    # but for the uncertainty of the frames' errors, which is the same in both
+    assert loud.sigma_columns == pytest.approx(2 * quiet.sigma_columns, rel=1e-3, nan_ok=True)
 
 
 def test_islands_are_no_obstacle_to_gray_code(rng):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.structured_light.phase import Noise, estimate_noise, wrapped_phase
+from recon.structured_light.phase import Noise, estimate_noise, phase_weights, pseudo_inverse, wrapped_phase
 
 NOISE = Noise(0.5, 0.033)
 
@@ -110,3 +110,22 @@ def test_too_few_steps_measure_no_noise(rng):
     """Below eight steps each temporal harmonic holds the projector's non-linearity too."""
     for n in (3, 4, 6):
         assert estimate_noise(np.full((n, 64, 64), 90, np.uint8), 2 * np.pi * np.arange(n) / n) is None
+
+
+@pytest.mark.parametrize("n", [3, 4, 8, 12])
+def test_gamma_stays_out_of_shifts_that_are_a_little_off(rng, n):
+    """With seven steps or more harmonics 2 and 3 don't reach the phase, at no cost; even shifts have the usual weights."""
+    even = 2 * np.pi * np.arange(n) / n
+    np.testing.assert_allclose(phase_weights(even), pseudo_inverse(even), atol=1e-12)
+    shifts = even + 0.02 * rng.normal(size=n)
+    found, usual = phase_weights(shifts), pseudo_inverse(shifts)
+    assert (found[1:] ** 2).sum() < 1.02 * (usual[1:] ** 2).sum()
+    np.testing.assert_allclose(found @ np.stack([np.ones(n), np.cos(shifts), -np.sin(shifts)], axis=1), np.eye(3), atol=1e-12)
+    leaked, before = (np.abs(weights[1:] @ np.exp(2j * shifts)).max() for weights in (found, usual))
+    assert leaked < 1e-12 if n >= 7 else leaked == before
+
+
+def test_random_shifts_keep_the_least_noise(rng):
+    """Shifts so uneven that harmonics can't be told apart are fitted without them."""
+    shifts = np.sort(rng.uniform(0, 2.2, 8))
+    np.testing.assert_array_equal(phase_weights(shifts), pseudo_inverse(shifts))

@@ -1,0 +1,55 @@
+"""Accuracy under conditions of life: a lamp that flickers, light from elsewhere, phase shifts that are off."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from scenes.catalogue import build_scene
+from scenes.kinds import plane
+from scenes.scene_types import Scene
+from twin.accuracy.surface_accuracy import experiment, relief_noise_ratio
+from twin.accuracy.table_rows import Measurement, Row, Setup
+from twin.evaluation.surface_errors import rms
+from twin.optics.conditions import Conditions, Frames
+from twin.optics.surface_session import Shooting
+
+SEEDS = range(100, 110)  # of conditions that nothing was tried on
+DISTURBED = Conditions(frames=Frames(flicker=0.03, stray_dn=1.0, shift=0.01))
+WHAT = "flicker of 3 %, offsets of 1 DN, shifts off by 1 % of a step"
+
+
+def measurements(setup: Setup) -> list[Measurement]:
+    """The rows of the group, at full size; that of the real relief only where its recording is."""
+    return [
+        lambda: compared(setup, "planes", [plane.build(pose) for pose in plane.PAPER_POSES], "plane_plate_rms_mm"),
+        lambda: compared(setup, "breasts", [build_scene({"kind": "breast"})], "surface_rms_mm"),
+        *([lambda: relief(setup)] if setup.real else []),
+    ]
+
+
+def compared(setup: Setup, name: str, scenes: Sequence[Scene], figure: str) -> list[Row]:
+    """Row c: scenes in turn, under a steady lamp and a disturbed one, as long exposed."""
+    ratios, spreads, means = [], [], []
+    for seed in SEEDS:
+        scene, patterns = scenes[seed % len(scenes)], setup.sequences["paper_surface"]
+        steady = experiment(setup.rig, scene, patterns, seed)
+        shooting = Shooting(exposure_s=steady.view.exposure.time_s)
+        disturbed = experiment(setup.rig, scene, patterns, seed, shooting=shooting, conditions=DISTURBED)
+        ratios.append(disturbed.metrics[figure] / steady.metrics[figure])
+        spreads.append(disturbed.metrics["z_std"])
+        means.append(float(np.nanmean(disturbed.comparison.error)))
+    what = f"{len(SEEDS)} {name}, {WHAT}"
+    return [
+        Row("c", f"{what}: RMS over that of a steady lamp, mean", float(np.mean(ratios)), 1.05, 1.0, ""),
+        Row("c", f"{what}: RMS over that of a steady lamp, worst", max(ratios), 1.1, 1.0, ""),
+        Row("c", f"{what}: spread of error / predicted sigma, least", min(spreads), 0.95, 1.0, "", at_least=True),
+        Row("c", f"{what}: spread of error / predicted sigma, largest", max(spreads), 1.05, 1.0, ""),
+        Row("c", f"{what}: mean error, of mean shifts that no image shows: RMS", rms(np.array(means)), None, None, "mm"),
+    ]
+
+
+def relief(setup: Setup) -> list[Row]:
+    """Row c: a relief recorded by others, under a lamp that flickers by 1.3 %."""
+    ratio = relief_noise_ratio(setup)
+    what = "real relief: local residual / predicted sigma on smooth patches, or its inverse"
+    return [Row("c", what, max(ratio, 1 / ratio), 1.08, 1.0, "")]

@@ -1,0 +1,85 @@
+"""Conditions under which a session is shot: those of theory, or a laboratory's lamp, light and timing."""
+
+from dataclasses import dataclass, replace
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.model.patterns import Fringes, Patterns
+from recon.model.rig import CameraDevice, Part, ProjectorDevice
+from twin.optics.light_transport import Images
+from twin.optics.raster import Light
+from twin.sensor import Exposure, Stack, electrons_per_radiance, number_per_electron
+
+Array = NDArray[np.float64]
+
+STREAM = 7  # of random numbers, apart from those of rendering and of the sensor
+
+
+class Frames(Part):
+    """Standard deviations of errors that each frame of a sequence has anew, the same for all devices."""
+
+    flicker: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # of the projector's light, relative
+    stray_dn: Annotated[float, Field(ge=0, le=20)] = 0.0  # of light from elsewhere, in 8-bit digital numbers
+    shift: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # of grey fringes' phase shifts, in steps of their sequence
+
+
+class Conditions(Part):
+    """The conditions of a session, see `conf/conditions`."""
+
+    frames: Frames = Frames()
+
+
+IDEAL = Conditions()
+
+
+class FrameDraw(NamedTuple):
+    """Errors of the n frames of a sequence."""
+
+    gain: Array  # (n,) of the projector's light
+    stray_dn: Array  # (n,) 8-bit DN
+    shift: Array  # (n,) steps
+
+
+def draw(frames: Frames, count: int, *key: int) -> FrameDraw:
+    """Draw the errors of some frames, the same for the same key."""
+    normal = np.random.default_rng([*key, STREAM]).standard_normal((3, count))
+    return FrameDraw(1 + frames.flicker * normal[0], frames.stray_dn * normal[1], frames.shift * normal[2])
+
+
+def emitted(patterns: Patterns, projector: ProjectorDevice, errors: FrameDraw) -> Light:
+    """A sequence as the projector shows it, each frame with its own brightness and its own shift."""
+    profiles = patterns.profiles()
+    for part, place in patterns.slices():
+        if isinstance(part, Fringes) and part.waveform == "sine":
+            length = patterns.length(part.axis)
+            for k, late in enumerate(errors.shift[place]):
+                moved = part.model_copy(update={"origin": part.zero(length) - late * part.pitch / part.steps})
+                profiles[place.start + k] = (part.axis, False, moved.profiles(length)[k])
+    light = Light.of_profiles(patterns.projector_size, profiles, projector)
+    return replace(light, profiles=tuple(np.float32(gain) * one for gain, one in zip(errors.gain, light.profiles, strict=True)))
+
+
+@dataclass(frozen=True)
+class Lit:
+    """Images : n of (h, w), W/mm^2/sr, each with an even light of its own added."""
+
+    images: Stack
+    added: NDArray[np.float32]  # (n,)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of all images together : (n, h, w)."""
+        return self.images.shape
+
+    def __getitem__(self, k: int) -> Images:
+        return self.images[k] + self.added[k]
+
+
+def with_stray(images: Stack, stray_dn: Array, device: CameraDevice, wavelength_nm: float, exposure: Exposure) -> Stack:
+    """Images : n of (h, w), W/mm^2/sr, each with its stray light : (n,) 8-bit DN."""
+    electrons = stray_dn * 2 ** (exposure.bits - 8) / number_per_electron(device.sensor, exposure)
+    radiance = electrons / (electrons_per_radiance(device, wavelength_nm) * exposure.time_s)
+    return Lit(images, radiance.astype(np.float32)) if radiance.any() else images
