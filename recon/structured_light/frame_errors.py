@@ -151,6 +151,8 @@ def _by_windows(fit: Image, valid: Mask, width: Array, shifts: Array) -> tuple[O
     twice = np.array([[0, 1, 1j, 0]]) @ slopes.T
     phasors, squares = (c + 1j * s) / modulation, (real + 1j * imaginary) / power
     usual = _usual(phasors) & _usual(squares)
+    if np.count_nonzero(usual) < FEW:
+        return ()
     return Observed(phasors[usual], once[usual]), Observed(squares[usual], twice)
 
 
