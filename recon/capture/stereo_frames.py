@@ -17,6 +17,7 @@ from recon.capture.manifest import CAMERAS, MANIFEST, STAMPS, image_name
 from recon.errors import InputError
 from recon.files.regular import check_there
 from recon.geometry.camera import Camera
+from recon.model.calibration import Uncertainty
 from recon.threads import mapped
 
 AT_ONCE = 2  # pairs that are read, while one more waits or is worked on
@@ -30,6 +31,7 @@ class Film:
 
     name: str
     cameras: tuple[Camera, Camera]
+    optics: Uncertainty | None  # of the cameras' calibration; None where the file has none
     depths: tuple[int, int]  # bits of each camera
     folders: tuple[Path, Path]  # of each camera's frames
     frames: NDArray[np.int64]  # (n, 2) their numbers
@@ -83,13 +85,14 @@ def read_film(folder: Path, calibration_file: Path | None = None) -> Film:
     if min(depths) > 8 and depths[0] != depths[1]:
         raise InputError(f"{listed}: devices.cam2.bits: expected {depths[0]}, as of cam1, found {depths[1]}")
     sizes = {name: device.size for name, device in zip(CAMERAS, devices, strict=True)}
-    known = calibration_files.read_for(Path(calibration_file or folder / str(read.calibration)), sizes).cameras
-    cameras = known[CAMERAS[0]], known[CAMERAS[1]]
+    known = calibration_files.read_for(Path(calibration_file or folder / str(read.calibration)), sizes)
+    cameras = known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]
     places = [root / read.sweep.images[name] for name in CAMERAS]
     tables = [sweep_tables.read_stamps(place / STAMPS) for place in places]
     first, second = _partners(places, tables)
     frames = np.column_stack([tables[0][0][first], tables[1][0][second]])
-    film = Film(read.name or folder.resolve().name, cameras, depths, (places[0], places[1]), frames, tables[0][1][first])
+    name, folders = read.name or folder.resolve().name, (places[0], places[1])
+    film = Film(name, cameras, known.uncertainty, depths, folders, frames, tables[0][1][first])
     check_there(path for both in film.paths() for path in both)
     return film
 

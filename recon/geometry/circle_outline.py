@@ -19,13 +19,17 @@ POINTS = 24  # of an outline
 STEPS = 3
 
 
-def ellipses_of(camera: Camera, world_from_target: Array, centres: Array, radius_mm: float) -> tuple[Array, Array]:
+def ellipses_of(
+    camera: Camera, world_from_target: Array, centres: Array, radius_mm: float, slopes: Array | None = None
+) -> tuple[Array, Array]:
     """Centres : (n, 2) px and shapes : (n, 2, 2) px of the ellipses of circles; NaN behind the camera.
 
-    centres : (n, 3) mm, of the circles in the target's frame; the circles lie parallel to its plane z = 0.
+    centres : (n, 3) mm, of the circles in the target's frame.
+    slopes : (n, 2) dz/dx and dz/dy, small, of the circles' planes there; None where they lie parallel to its plane z = 0.
     """
     camera_from_target = np.ascontiguousarray(camera.camera_from_world @ world_from_target)
-    rows = _ellipses(camera_from_target, centres, radius_mm, camera.matrix, camera.coefficients)
+    slopes = np.zeros((len(centres), 2)) if slopes is None else slopes
+    rows = _ellipses(camera_from_target, centres, slopes, radius_mm, camera.matrix, camera.coefficients)
     return rows[:, :2], rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
 
 
@@ -55,15 +59,17 @@ def _slopes(camera_from_world, points, matrix, k):
 
 
 @njit(error_model="numpy")
-def _ellipses(camera_from_target, centres, radius, matrix, k):
+def _ellipses(camera_from_target, centres, slopes, radius, matrix, k):
     result = np.empty((len(centres), 5))
-    x, y, place = np.empty(POINTS), np.empty(POINTS), np.empty(3)
+    x, y, place, plane = np.empty(POINTS), np.empty(POINTS), np.empty(3), np.empty((3, 2))
     for i in range(len(centres)):
         for m in range(3):
             place[m] = camera_from_target[m, 3]
             for n in range(3):
                 place[m] += camera_from_target[m, n] * centres[i, n]
-        in_front = _outline(place, camera_from_target, radius, matrix, k, x, y)
+            for n in range(2):
+                plane[m, n] = camera_from_target[m, n] + slopes[i, n] * camera_from_target[m, 2]
+        in_front = _outline(place, plane, radius, matrix, k, x, y)
         if not (in_front and _fit(x, y, result[i])):
             for m in range(5):
                 result[i, m] = np.nan
@@ -71,15 +77,15 @@ def _ellipses(camera_from_target, centres, radius, matrix, k):
 
 
 @njit(inline="always", error_model="numpy")
-def _outline(place, camera_from_target, radius, matrix, k, x, y):
-    """Pixels of a circle's points, in place; whether all are in front of the camera."""
+def _outline(place, plane, radius, matrix, k, x, y):
+    """Pixels of the points of a circle with its middle at a place, in its plane's two axes; whether all are in front."""
     for j in range(POINTS):
         across, along = radius * math.cos(2 * math.pi * j / POINTS), radius * math.sin(2 * math.pi * j / POINTS)
-        z = place[2] + across * camera_from_target[2, 0] + along * camera_from_target[2, 1]
+        z = place[2] + across * plane[2, 0] + along * plane[2, 1]
         if not z > 0:
             return False
-        right = place[0] + across * camera_from_target[0, 0] + along * camera_from_target[0, 1]
-        down = place[1] + across * camera_from_target[1, 0] + along * camera_from_target[1, 1]
+        right = place[0] + across * plane[0, 0] + along * plane[0, 1]
+        down = place[1] + across * plane[1, 0] + along * plane[1, 1]
         bent_x, bent_y = distort(right / z, down / z, k)
         x[j] = matrix[0, 0] * bent_x + matrix[0, 1] * bent_y + matrix[0, 2]
         y[j] = matrix[1, 1] * bent_y + matrix[1, 2]

@@ -1,10 +1,11 @@
 """A calibration: the devices of the rig in one world, and the covariance of their parameters."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from recon.geometry import camera_jacobian
 from recon.geometry.camera import Array, Camera
 
 WORLD = "cam1"  # the device whose frame the world is: it has no pose
@@ -36,3 +37,24 @@ class Calibration:
 
     cameras: Mapping[str, Camera]
     uncertainty: Uncertainty | None = None
+
+
+def projection_slopes(cameras: Mapping[str, Camera], points: Sequence[Array], names: Sequence[str]) -> Array:
+    """Derivatives : (m, g) px of all devices' projections, x and y of point after point, by the calibration's parameters.
+
+    points : of each device, (n, 3) mm in the world.
+    """
+    slopes = []
+    for (device, camera), shown in zip(cameras.items(), points, strict=True):
+        known = [k for k, name in enumerate(names) if name.startswith(f"{device}.")]
+        by_parameter = np.zeros((2 * len(shown), len(names)))
+        own = [names[k].partition(".")[2] for k in known]
+        by_parameter[:, known] = np.concatenate(camera_jacobian.linearise(camera, shown, own).by_parameter)
+        slopes.append(by_parameter)
+    return np.concatenate(slopes)
+
+
+def projection_covariance(cameras: Mapping[str, Camera], points: Sequence[Array], uncertainty: Uncertainty) -> Array:
+    """Covariance : (m, m) px^2 of all devices' projections, in the order of `projection_slopes`, by the calibration's errors."""
+    slopes = projection_slopes(cameras, points, uncertainty.names)
+    return slopes @ uncertainty.covariance @ slopes.T

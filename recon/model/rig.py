@@ -118,13 +118,17 @@ class ProjectorDevice(Part):
 
 
 class Target(Part):
-    """The probe's planar target of three circles: c0 the origin, c1 on the x axis, c2 on the y axis."""
+    """The probe's planar target of three circles: c0 the origin, c1 on the x axis, c2 on the y axis or a little beside it."""
 
     c1_mm: Positive
-    c2_mm: Positive
+    c2_mm: Positive  # along y
+    c2_aside_mm: Finite = 0.0  # along x
     outer_diameter_mm: Positive
     inner_diameter_mm: Positive
     board_mm: tuple[Positive, Positive]  # width, height
+    curvature_per_m: Vector = (0.0, 0.0, 0.0)  # of a bowed board: d2z/dx2, d2z/dxdy, d2z/dy2
+    tolerance_mm: Annotated[float, Field(ge=0, le=5)] = 0.1  # of each circle's place along each axis, one standard deviation
+    covariance_mm2: tuple[Vector, Vector, Vector] | None = None  # of c1, c2_aside, c2 as measured; instead of the tolerance
 
     @field_validator("inner_diameter_mm")
     @classmethod
@@ -132,6 +136,15 @@ class Target(Part):
         outer = info.data.get("outer_diameter_mm", np.inf)
         if value >= outer:
             raise ValueError(f"expected less than outer_diameter_mm = {outer:g}, found {value:g}")
+        return value
+
+    @field_validator("covariance_mm2")
+    @classmethod
+    def _covariance(cls, value: tuple[Vector, Vector, Vector] | None) -> tuple[Vector, Vector, Vector] | None:
+        if value is not None:
+            matrix = np.array(value)
+            if not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix).min() < -1e-12 * np.trace(matrix):
+                raise ValueError(f"expected a covariance of c1, c2_aside and c2, found {matrix.tolist()}")
         return value
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry.ellipses import Ellipses
+from recon.model.circle_layout import circle_centres
 from recon.model.rig import Target
 from recon.tracking.identity import ALIKE
-from recon.tracking.pose import circle_centres
 from recon.tracking.rim_fit.sectors import STEEP
 from recon.tracking.rims import Outlines, measure_covered
 

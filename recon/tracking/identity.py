@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry.ellipses import Ellipses, root
+from recon.model.circle_layout import circle_centres
 from recon.model.rig import Target
 from recon.tracking.circle_detector import LEAST_SCORE, Candidates
-from recon.tracking.pose import circle_centres, distances
+from recon.tracking.pose import distances
 
 Array = NDArray[np.float64]
 
@@ -77,7 +78,7 @@ def stretch(points: Array, target: Target) -> Array:
 def affinity(points: Array, target: Target) -> Array:
     """Of the target's plane to the image, from views : (..., 3, 2) px of the circles: (..., 2, 2) px/mm."""
     sides = points[..., 1:, :] - points[..., :1, :]
-    return np.swapaxes(sides, -1, -2) / np.array([target.c1_mm, target.c2_mm])
+    return np.swapaxes(sides, -1, -2) @ np.linalg.inv(circle_centres(target)[1:, :2].T)
 
 
 def disagreement(ellipses: Ellipses, target: Target) -> float:

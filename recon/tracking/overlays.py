@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.tracking.frames import grey
-from recon.tracking.pose import NAMES, TargetPose
+from recon.tracking.pose_fit import NAMES, TargetPose
 from recon.tracking.views import View
 
 FRACTION = 4  # bits of sub-pixels that cv2 draws with

@@ -15,13 +15,15 @@ from recon.capture.stereo_frames import Film, Pair
 from recon.geometry.camera import Camera
 from recon.model.tracks import Track
 from recon.tracking import overlays
+from recon.tracking.pose_fit import Triangle
 from recon.tracking.tracker import Tracking
 
 Array = NDArray[np.float64]
 
 POSES, FRAMES, OVERLAYS = "poses.csv", "frames.csv", "overlays"
 COLUMNS = (
-    "time_ns", "frame_cam1", "frame_cam2", "found", "how", "sigma_mm", "sigma_deg", "blur_px_cam1", "blur_px_cam2", "reason",
+    "time_ns", "frame_cam1", "frame_cam2", "found", "how", "sigma_mm", "sigma_deg", "shared_mm", "shared_deg", "blur_px_cam1",
+    "blur_px_cam2", "reason",
 )  # fmt: skip
 OVERLAY_WIDTH = 640  # px, of each view
 QUALITY = 88  # of JPEG
@@ -33,7 +35,9 @@ class Step:
 
     time_ns: int
     world_from_target: Array  # (4, 4) mm; NaN if it wasn't found
-    covariance: Array  # (6, 6), as in tracks.Track
+    covariance: Array  # (6, 6) by the pair's noise, as in tracks.Track
+    shared: Array  # (6, 6) by tolerances of target and cameras
+    triangle: Triangle | None  # of six circles
     how: str | None  # as of Tracking
     reason: str | None  # None where the target was found
     blur_px: tuple[float, float]  # the longest of each view
@@ -46,16 +50,22 @@ class Step:
 
     @property
     def sigmas(self) -> tuple[float, float]:
-        """Predicted standard deviations, over all directions: mm and deg; NaN without a pose."""
-        turn, shift = (float(np.sqrt(np.trace(self.covariance[part, part]))) for part in (slice(0, 3), slice(3, 6)))
-        return shift, float(np.rad2deg(turn))
+        """Predicted standard deviations of the whole error, over all directions: mm and deg; NaN without a pose."""
+        return _over_all_directions(self.covariance + self.shared)
+
+    @property
+    def shared_sigmas(self) -> tuple[float, float]:
+        """Those of the part that all pairs share."""
+        return _over_all_directions(self.shared)
 
 
 def kept(found: Tracking, time_ns: int) -> Step:
     """The step that is kept of a pair."""
     pose, (first, second) = found.pose, found.views
     blurs = float(np.fmax.reduce(first.blur_px)), float(np.fmax.reduce(second.blur_px))
-    return Step(time_ns, pose.world_from_target, pose.covariance, found.how, pose.reason, blurs, sum(found.seconds.values()))
+    seconds = sum(found.seconds.values())
+    covariances = pose.covariance, pose.shared
+    return Step(time_ns, pose.world_from_target, *covariances, pose.triangle, found.how, pose.reason, blurs, seconds)
 
 
 def track_of(steps: Sequence[Step]) -> Track:
@@ -71,7 +81,7 @@ def write_poses(folder: Path, film: Film, steps: Sequence[Step]) -> None:
     """Write `poses.csv`, the table that other verbs read, and `frames.csv`: how each pose was found, or why not."""
     sweep_tables.write_track(folder / POSES, track_of(steps))
     rows = (
-        [step.time_ns, *numbers, int(step.found), step.how or "", *_rounded([*step.sigmas, *step.blur_px]), step.reason or ""]
+        [step.time_ns, *numbers, int(step.found), step.how or "", *_numbers(step), step.reason or ""]
         for numbers, step in zip(film.frames.tolist(), steps, strict=True)
     )
     sweep_tables.write_rows(folder / FRAMES, COLUMNS, rows)
@@ -124,5 +134,13 @@ def hand_on(folder: Path, source: Path, out: Path, optics: Path | None = None) -
     return True
 
 
-def _rounded(values: Sequence[float]) -> list[float | str]:
+def _over_all_directions(covariance: Array) -> tuple[float, float]:
+    """Root of the sum of the three variances, of the shift, mm, and of the turn, deg."""
+    turn, shift = (float(np.sqrt(np.trace(covariance[part, part]))) for part in (slice(0, 3), slice(3, 6)))
+    return shift, float(np.rad2deg(turn))
+
+
+def _numbers(step: Step) -> list[float | str]:
+    """Standard deviations and blurs, in the order of COLUMNS; empty where they aren't known."""
+    values = (*step.sigmas, *step.shared_sigmas, *step.blur_px)
     return [round(value, 5) if np.isfinite(value) else "" for value in values]

@@ -2,15 +2,28 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.files.metrics import Metrics, shown
+from recon.model import circle_layout
+from recon.model.circle_layout import LENGTHS
+from recon.model.rig import Target
 from recon.tracking.results import Step
+
+Array = NDArray[np.float64]
 
 WAYS = ("predicted", "segmented", "detected")
 KINDS = 4  # of reasons that are reported one by one
+FEW = 5  # pairs, of which nothing is said in common
+GAP_MM = 0.06  # of the rays: 0.3 px of the rig, twice what a calibration with residuals of 0.15 px leaves
+OFF_MM = 0.02  # of a length
+ALIKE = 2.0  # times the spread from pair to pair
+BEYOND = 3.0  # times the tolerance
+MEASURE = "measure it with calibrate-target"
+MOVED = "a camera was moved after its calibration, or that is of others; calibrate-optics anew"
 
 
 def measure(steps: Sequence[Step]) -> Metrics:
@@ -24,6 +37,8 @@ def measure(steps: Sequence[Step]) -> Metrics:
         **{f"frames_{way}": sum(step.how == way for step in found) for way in WAYS},
         "sigma_median_mm": float(typical[0]),
         "sigma_median_deg": float(typical[1]),
+        "shared_median_mm": float(np.median([step.shared_sigmas[0] for step in found])) if found else np.nan,
+        **_triangle(steps),
         "frames_per_s": 1 / max(float(np.median([step.seconds for step in steps])), 1e-9),
     }
 
@@ -38,8 +53,44 @@ def describe(steps: Sequence[Step], figures: Metrics) -> list[str]:
         f"found       {found} of {count} frames{left}",
         f"speed       {figures['frames_per_s']:.1f} frames a second, in the median{f'; {ways}' if ways else ''}",
         f"sigma       {shown(figures['sigma_median_mm'], '.3f', ' mm')}, {shown(figures['sigma_median_deg'], '.3f', ' deg')}, "
-        "predicted, median",
+        f"predicted, median; {shown(figures['shared_median_mm'], '.3f', ' mm')} by tolerances, alike in all pairs",
     ]
+
+
+def _triangle(steps: Sequence[Step]) -> Metrics:
+    """Medians of the target's lengths and of the rays' gap, as both cameras triangulate them."""
+    known = [step.triangle for step in steps if step.triangle is not None]
+    lengths = np.median([one.lengths_mm for one in known], axis=0) if known else np.full(3, np.nan)
+    gap = float(np.median([one.gaps_mm.mean() for one in known])) if known else np.nan
+    return {f"triangulated_{name}": float(value) for name, value in zip(LENGTHS, lengths, strict=True)} | {"ray_gap_mm": gap}
+
+
+def causes(steps: Sequence[Step], target: Target) -> Iterator[str]:
+    """Lines: errors alike in all pairs, found or not, with the likely cause."""
+    known = [step.triangle for step in steps if step.triangle is not None]
+    if len(known) < FEW:
+        return
+    of = f"alike in {len(known)} pairs"
+    gap, spread = _middle(np.array([one.gaps_mm.mean() for one in known]))
+    if abs(gap) > max(GAP_MM, ALIKE * spread):
+        yield f"warning     both cameras' rays miss each other by {abs(gap):.2f} mm, {of}: {MOVED}"
+    off, spread = _middle(np.array([one.lengths_mm for one in known]) - circle_layout.lengths(target))
+    alike = np.abs(off) > np.maximum(OFF_MM, ALIKE * spread)
+    if not alike.any():
+        return
+    names = (name.removesuffix("_mm").replace("_", " ") for name in LENGTHS)
+    found = ", ".join(f"{name} by {value:+.2f} mm" for name, value, one in zip(names, off, alike, strict=True) if one)
+    tolerance = np.sqrt(np.diag(circle_layout.length_covariance(target)))
+    if (np.abs(off) > BEYOND * tolerance).any():
+        yield f"warning     the target's circles aren't where rig.target has them, off {found}, {of}: {MEASURE}"
+    else:
+        yield f"target      off its design within the tolerance, {found}: {MEASURE}, and poses get more exact"
+
+
+def _middle(values: Array) -> tuple[Array, Array]:
+    """Medians over the first axis, and standard deviations by the median deviation."""
+    middle = np.median(values, axis=0)
+    return middle, 1.4826 * np.median(np.abs(values - middle), axis=0)
 
 
 def kinds(reasons: Sequence[str | None]) -> list[tuple[str, int]]:

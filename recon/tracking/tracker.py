@@ -12,16 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
-from recon.geometry import rigid
+from recon.geometry import pose_hypotheses, rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_outline import ellipses_of
 from recon.geometry.ellipses import Ellipses, joined
+from recon.model import circle_layout
+from recon.model.calibration import Uncertainty
 from recon.model.rig import Target
-from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, pose_hypotheses, views
+from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, views
 from recon.tracking.frames import grey
 from recon.tracking.identity import Triple
 from recon.tracking.networks import Networks
-from recon.tracking.pose import TargetPose, circle_centres, estimate, lost
+from recon.tracking.pose import estimate
+from recon.tracking.pose_fit import TargetPose, lost
 from recon.tracking.rims import Outlines, measure, measure_both
 from recon.tracking.views import View
 
@@ -60,6 +63,7 @@ class Tracker:
     target: Target
     networks: Networks | None = None  # without them it only follows from a pose that it is given by `remember`
     bits: int | None = None  # of frames deeper than 8 bits, see `frames.grey`
+    optics: Uncertainty | None = None  # of the cameras' calibration; None where it isn't known, or exact
     _past: list[tuple[float, Array]] = field(default_factory=list, init=False)  # times and poses, the last one last, two at most
     _clock: float = field(default=0.0, init=False)  # counts frames that come without a time
 
@@ -134,8 +138,7 @@ class Tracker:
 
     def _expected(self, k: int, world_from_target: Array) -> Ellipses:
         """Three ellipses that camera k should show of a pose."""
-        radius = self.target.outer_diameter_mm / 2
-        return Ellipses(*ellipses_of(self.cameras[k], world_from_target, circle_centres(self.target), radius))
+        return Ellipses(*ellipses_of(self.cameras[k], world_from_target, *circle_layout.circles(self.target)))
 
     def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str) -> Tracking:
         """From six rough ellipses to the pose."""
@@ -149,7 +152,7 @@ class Tracker:
         if not (all(view.useful for view in seen) and any(view.found for view in seen)):
             each = self._unconfirmed(seen)
             return Tracking(lost(_unseen(each)), each)
-        found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target)
+        found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target, self.optics)
         if found.found and (reason := views.lone(seen, found.used)):
             found = lost(reason)
         if not found.found:
@@ -204,7 +207,7 @@ class Tracker:
 
     def _opposite_views(self, frames: Frames, k: int, view: View) -> list[View]:
         """Views of the other camera at the circles that each pose hypothesis of camera k's view predicts."""
-        poses = pose_hypotheses.poses(self.cameras[k], view.outlines.ellipses.centre, circle_centres(self.target))
+        poses = pose_hypotheses.poses(self.cameras[k], view.outlines.ellipses.centre, circle_layout.circle_centres(self.target))
         expected = [self._expected(1 - k, pose) for pose in poses]
         return [views.judged(self._view(frames, 1 - k, rough, REACH_PX), self.target) for rough in expected]
 

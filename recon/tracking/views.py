@@ -9,7 +9,8 @@ from recon.geometry.camera import Camera
 from recon.geometry.ellipses import Ellipses
 from recon.model.rig import Target
 from recon.tracking import identity
-from recon.tracking.pose import NAMES, Sighting, allowed
+from recon.tracking.pose import allowed
+from recon.tracking.pose_fit import NAMES, Sighting
 from recon.tracking.rims import Outlines
 
 Array = NDArray[np.float64]

@@ -12,6 +12,7 @@ poses are given it instead:
     sonotwin film out=outputs/film
     sonotwin track capture=outputs/film/capture out=outputs/track
     sonotwin track capture=recorded calibration=calibration/optics.yaml out=tracked
+    sonotwin track capture=recorded target=target/target.yaml out=tracked
     sonotwin freehand capture=tracked probe=probe.yaml lag_s=0.05 out=volume
 """
 
@@ -24,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from rich.progress import Progress
 
-from recon.capture import stereo_frames
+from recon.capture import stereo_frames, target_files
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
 from recon.model.rig import Rig
@@ -42,6 +43,7 @@ class Config(BaseModel):
     capture: Path
     out: Path
     calibration: Path | None = None
+    target: Path | None = None
     networks: Path | None = None
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
     overlays: bool = True
@@ -56,11 +58,13 @@ def run(config: Config) -> None:
         If the capture is incomplete or damaged, a network is missing, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    inputs = [path for path in (config.capture, config.calibration, config.networks) if path is not None]
+    inputs = [path for path in (config.capture, config.calibration, config.target, config.networks) if path is not None]
     atomic.check_folder(config.out, results.POSES, inputs=inputs)
     film = stereo_frames.read_film(config.capture, config.calibration)
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
-    tracker = Tracker(film.cameras, config.rig.target, loaded, film.bits)
+    design = config.rig.target
+    target = design if config.target is None else target_files.read(config.target, design)
+    tracker = Tracker(film.cameras, target, loaded, film.bits, film.optics)
     rate = f", {film.rate_hz:.4g} a second" if np.isfinite(film.rate_hz) else ""
     sizes = " and ".join(dict.fromkeys("x".join(map(str, camera.size)) for camera in film.cameras))
     console.print(f"read        {len(film.times)} pairs of frames, {sizes}{rate}", markup=False)
@@ -69,7 +73,7 @@ def run(config: Config) -> None:
         start = perf_counter()
         steps = follow(film, tracker, folder if config.overlays else None, console)
         figures = track_figures.measure(steps)
-        for line in track_figures.describe(steps, figures):
+        for line in (*track_figures.describe(steps, figures), *track_figures.causes(steps, target)):
             console.print(line, markup=False)
         results.write_poses(folder, film, steps)
         metrics.write(folder / metrics.FILE, figures | {"seconds_track": round(perf_counter() - start, 3)})

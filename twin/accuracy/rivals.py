@@ -13,7 +13,8 @@ from recon.files import atomic
 from recon.model.rig import Target
 from recon.reports.figures import SEQUENTIAL
 from recon.tracking.networks import Networks
-from recon.tracking.pose import Sighting, estimate
+from recon.tracking.pose import estimate
+from recon.tracking.pose_fit import Sighting
 from recon.tracking.tracker import Tracker
 from twin.accuracy import tracking_frames
 from twin.accuracy.baselines import classical, fiducials

@@ -122,7 +122,7 @@ def errors_table(metrics: Metrics) -> str:
         f"Found: {metrics['track_found']} of {metrics['track_frames']} frames, and {metrics['track_visible_found']} of the "
         f"{metrics['track_visible']} that show all circles to both cameras; {metrics['track_false']} of them wrongly. "
         f"{100 * metrics['track_within_bound']:.0f} % of the errors lie below their {100 * LEVEL:.0f} % bounds. Predicted: one "
-        "standard deviation over all directions, from the noise at the rims. The cameras’ calibration is the true one here."
+        "standard deviation over all directions, the print known to its tolerance. The cameras’ calibration is the true one here."
     )
     return page.table(("", "predicted, median", "off by, median", "off by, 95th percentile"), rows, caption)
 

@@ -20,8 +20,8 @@ from recon.capture.manifest import CAMERAS, Device
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.calibration import Calibration
+from recon.model.circle_layout import circle_centres
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig, Target, Vector
-from recon.tracking.pose import circle_centres
 from scenes.scene_types import Scene
 from twin.session import Session, describe
 from twin.tracking.mesh_bank import Bank, build_bank

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry import rigid
+from recon.model.circle_layout import circle_centres
 from recon.model.rig import Rig
-from recon.tracking.pose import circle_centres
 from twin.tracking.rendered_views import board_corners
 from twin.tracking.samples import LAMPS, SCRATCHES, SPOTS, Lighting, Motion, Print, Take, draw, facing
 from twin.tracking.sampling_ranges import DataRanges

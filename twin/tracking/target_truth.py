@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
+from recon.model.circle_layout import circle_centres
 from recon.model.rig import CameraDevice, Target
-from recon.tracking.pose import circle_centres
 from twin.tracking.samples import Motion, Take
 
 Array = NDArray[np.float64]

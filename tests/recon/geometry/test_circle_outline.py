@@ -6,14 +6,14 @@ import pytest
 from recon.geometry import rigid
 from recon.geometry.circle_outline import ellipses_of, slopes_at
 from recon.geometry.ellipses import fit_ellipses, from_outline
-from recon.tracking import pose
+from recon.model import circle_layout
 from tests.recon.tracking import drawings
 
 
 @pytest.mark.parametrize("raised_mm", [0.0, 3.0])
 def test_ellipses_are_those_of_the_plain_fit(rig, rng, raised_mm):
     """Centre and shape, from 200 projected points of each outline; a circle may lie above the target's plane."""
-    camera, model, radius = rig.cam1.optics.camera(), pose.circle_centres(rig.target), rig.target.outer_diameter_mm / 2
+    camera, model, radius = rig.cam1.optics.camera(), circle_layout.circle_centres(rig.target), rig.target.outer_diameter_mm / 2
     model = model + np.array([0, 0, raised_mm])
     angles = np.linspace(0, 2 * np.pi, 201)[:-1]
     circle = radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
@@ -29,7 +29,7 @@ def test_ellipses_are_those_of_the_plain_fit(rig, rng, raised_mm):
 def test_circles_behind_the_camera_have_no_ellipse(rig):
     behind = np.diag([1.0, 1.0, 1.0, 1.0])
     behind[2, 3] = -500
-    centres, shapes = ellipses_of(rig.cam1.optics.camera(), behind, pose.circle_centres(rig.target), 9.0)
+    centres, shapes = ellipses_of(rig.cam1.optics.camera(), behind, circle_layout.circle_centres(rig.target), 9.0)
     assert np.isnan(centres).all() and np.isnan(shapes).all()
 
 

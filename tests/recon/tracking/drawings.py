@@ -8,7 +8,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_outline import ellipses_of
 from recon.geometry.ellipses import Ellipses
-from recon.tracking import pose
+from recon.model import circle_layout
 
 ELECTRONS = 7700 / 255  # a digital number
 DARK_E = 11.0
@@ -49,7 +49,7 @@ def _board(camera, rays, world_from_target, target, ground, black, count):
         inside = [np.clip((px - BOARD[0, 0]) / scale + 0.5, 0, 1), np.clip((BOARD[1, 0] - px) / scale + 0.5, 0, 1)]
         inside += [np.clip((py - BOARD[0, 1]) / scale + 0.5, 0, 1), np.clip((BOARD[1, 1] - py) / scale + 0.5, 0, 1)]
         ink = np.zeros_like(px)
-        for cx, cy, _ in pose.circle_centres(target):
+        for cx, cy, _ in circle_layout.circle_centres(target):
             away = np.hypot(px - cx, py - cy)
             outer = np.clip((target.outer_diameter_mm / 2 - away) / scale + 0.5, 0, 1)
             ink += outer * np.clip((away - target.inner_diameter_mm / 2) / scale + 0.5, 0, 1)
@@ -57,7 +57,7 @@ def _board(camera, rays, world_from_target, target, ground, black, count):
         return ground * (1 - board) + board * (1 - (1 - black) * ink)
 
     near = np.minimum(np.abs(x[..., None] - BOARD[:, 0]), np.abs(y[..., None] - BOARD[:, 1])).min(axis=-1) < reach
-    for cx, cy, _ in pose.circle_centres(target):
+    for cx, cy, _ in circle_layout.circle_centres(target):
         away = np.hypot(x - cx, y - cy)
         for diameter in (target.outer_diameter_mm, target.inner_diameter_mm):
             near |= np.abs(away - diameter / 2) < reach
@@ -90,7 +90,7 @@ def read_out(mean, rng):
 
 def shown(camera, place, target):
     """The ellipses of the three outer rims."""
-    return Ellipses(*ellipses_of(camera, place, pose.circle_centres(target), target.outer_diameter_mm / 2))
+    return Ellipses(*ellipses_of(camera, place, circle_layout.circle_centres(target), target.outer_diameter_mm / 2))
 
 
 def facing(rng, tilt_deg=35.0):

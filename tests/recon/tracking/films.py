@@ -7,8 +7,8 @@ import numpy as np
 from recon.capture import stereo_frames
 from recon.capture.manifest import Device
 from recon.geometry import rigid
+from recon.model import circle_layout
 from recon.model.calibration import Calibration
-from recon.tracking import pose
 from tests.recon import captures
 from tests.recon.tracking import drawings
 
@@ -22,6 +22,11 @@ def places(count: int, step_mm=(1.5, -0.5, 0.4)) -> np.ndarray:
     moved = np.repeat(first[None], count, axis=0)
     moved[:, :3, 3] += np.arange(count)[:, None] * np.array(step_mm)
     return moved
+
+
+def moved(place, turn, shift) -> np.ndarray:
+    """A pose after a turn : (3,) rad about its own origin, and a shift : (3,) mm."""
+    return rigid.moved(place, np.concatenate([turn, shift]))
 
 
 def stamps(count: int) -> np.ndarray:
@@ -63,5 +68,5 @@ def blank(folder: Path, rig, count: int = 3, bits: int = 8) -> Path:
 
 def centres(rig, place) -> list[np.ndarray]:
     """Where each camera sees the circles of a pose : (3, 2) px."""
-    points = rigid.apply(place, pose.circle_centres(rig.target))
+    points = rigid.apply(place, circle_layout.circle_centres(rig.target))
     return [getattr(rig, name).optics.camera().project(points) for name in stereo_frames.CAMERAS]

@@ -7,10 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from recon.geometry import rigid
+from recon.geometry import camera_jacobian, rigid
 from recon.geometry.circle_projection import centre_offsets
+from recon.model import circle_layout
+from recon.model.calibration import Uncertainty
 from recon.tracking import pose
-from recon.tracking.pose import Sighting
+from recon.tracking.pose_fit import Sighting
 from tests.recon.tracking import drawings
 from twin.optics.surface_session import calibration_of
 
@@ -24,9 +26,15 @@ def cameras(rig):
     return known["cam1"], known["cam2"]
 
 
+@pytest.fixture(scope="module")
+def target(rig):
+    """As it is drawn, to the last digit."""
+    return rig.target.model_copy(update={"tolerance_mm": 0.0})
+
+
 def seen(cameras, target, world_from_target, rng=None):
     """What both cameras show of the target: centres of ellipses, with noise if there is a generator."""
-    model, radius = pose.circle_centres(target), target.outer_diameter_mm / 2
+    model, radius = circle_layout.circle_centres(target), target.outer_diameter_mm / 2
     views = []
     for camera in cameras:
         centres = camera.project(rigid.apply(world_from_target, model)) + centre_offsets(camera, world_from_target, model, radius)
@@ -42,21 +50,21 @@ def error(found, true):
     return np.concatenate([turn, found[:3, 3] - true[:3, 3]])
 
 
-def test_exact_where_there_is_no_noise(cameras, rig, rng):
+def test_exact_where_there_is_no_noise(cameras, target, rng):
     """Circles are followed to rounding, although their ellipses' centres are a quarter of a pixel off the projected ones."""
     for _ in range(10):
         true = drawings.facing(rng)
-        found = pose.estimate(*seen(cameras, rig.target, true), rig.target)
+        found = pose.estimate(*seen(cameras, target, true), target)
         assert np.abs(error(found.world_from_target, true)).max() < 1e-6
         assert found.misfit < 1e-6
 
 
-def test_the_covariance_is_that_of_the_errors(cameras, rig, rng):
+def test_the_covariance_is_that_of_the_errors(cameras, target, rng):
     """Squared normalised errors of 60 poses and misfits follow chi-square: means within 4 standard errors."""
     squared, misfits = [], []
     for _ in range(POSES):
         true = drawings.facing(rng)
-        found = pose.estimate(*seen(cameras, rig.target, true, rng), rig.target)
+        found = pose.estimate(*seen(cameras, target, true, rng), target)
         off = error(found.world_from_target, true)
         squared.append(off @ np.linalg.solve(found.covariance, off))
         misfits.append(found.misfit)
@@ -65,16 +73,78 @@ def test_the_covariance_is_that_of_the_errors(cameras, rig, rng):
     assert np.mean(np.array(squared) < chi2.ppf(0.95, 6)) > 0.85
 
 
+def printed(design, rng):
+    """A target of which each circle's place is off by the design's tolerance, in the frame of its own circles."""
+    x, y = design.tolerance_mm * rng.standard_normal((2, 3)) + circle_layout.circle_centres(design)[:, :2].T
+    axis, side = np.array([x[1] - x[0], y[1] - y[0]]), np.array([x[2] - x[0], y[2] - y[0]])
+    c1 = np.hypot(*axis)
+    aside, along = axis @ side / c1, (axis[0] * side[1] - axis[1] * side[0]) / c1
+    return design.model_copy(update={"c1_mm": c1, "c2_aside_mm": aside, "c2_mm": along})
+
+
+@pytest.mark.parametrize("missing", [None, (0, 1), (1, 2)])
+def test_an_imprecise_print_is_found_with_an_honest_covariance(cameras, target, rng, missing):
+    """Errors over the covariance, and misfits, are chi-square, while the design would refuse nearly all."""
+    design, squared, misfits, refused = target.model_copy(update={"tolerance_mm": 0.1}), [], [], 0
+    for _ in range(2 * POSES):
+        true, actual = drawings.facing(rng), printed(design, rng)
+        views = seen(cameras, actual, true, rng)
+        if missing:
+            views[missing[0]].centres[missing[1]] = np.nan
+        found = pose.estimate(*views, design)
+        refused += not pose.estimate(*views, target).found
+        if missing is None or found.found:
+            off = error(found.world_from_target, true)
+            squared.append(off @ np.linalg.solve(found.total, off))
+            misfits.append(found.misfit)
+            freedom = found.freedom
+    assert len(squared) > 0.9 * 2 * POSES and refused > POSES
+    for values, expected in ((squared, 6), (misfits, freedom)):
+        assert abs(np.mean(values) - expected) < 4 * np.sqrt(2 * expected / len(values))
+
+
+def test_errors_of_the_cameras_are_in_the_shared_covariance(cameras, target, rng):
+    """Cameras drawn from their covariance, the design exact: errors over the total are chi-square, over the noise's alone not."""
+    names = tuple(f"cam2.{name}" for name in ("fx", "fy", "cx", "cy", "rx", "ry", "rz", "tx", "ty", "tz"))
+    sigma = np.array([0.1, 0.1, 0.05, 0.05, 1e-5, 1e-5, 1e-5, 0.01, 0.01, 0.01])
+    optics, squared, noise, misfits = Uncertainty(names, np.diag(sigma**2)), [], [], []
+    for _ in range(2 * POSES):
+        true = drawings.facing(rng)
+        wrong = camera_jacobian.moved(cameras[1], [name.partition(".")[2] for name in names], sigma * rng.standard_normal(10))
+        views = seen((cameras[0], wrong), target, true, rng)
+        found = pose.estimate(views[0], replace(views[1], camera=cameras[1]), target, optics)
+        off = error(found.world_from_target, true)
+        squared.append(off @ np.linalg.solve(found.total, off))
+        noise.append(off @ np.linalg.solve(found.covariance, off))
+        misfits.append(found.misfit)
+    for values in (squared, misfits):
+        assert abs(np.mean(values) - 6) < 4 * np.sqrt(12 / len(values))
+    assert np.mean(noise) > 6 + 4 * np.sqrt(12 / len(noise))
+
+
+def test_the_noise_is_apart_from_what_is_shared(cameras, target, rng):
+    """Of one pose through one wrong camera, poses scatter by `covariance`."""
+    optics = Uncertainty(("cam2.ry", "cam2.tz"), np.diag([1e-8, 1e-3]))
+    design, true, found = target.model_copy(update={"tolerance_mm": 0.1}), drawings.facing(rng), []
+    actual = printed(design, rng)
+    for _ in range(4 * POSES):
+        found.append(pose.estimate(*seen(cameras, actual, true, rng), design, optics))
+    off = np.array([error(one.world_from_target, found[0].world_from_target) for one in found])
+    off -= off.mean(axis=0)
+    squared = np.einsum("ni,ij,nj->n", off, np.linalg.inv(found[0].covariance), off)
+    assert abs(squared.mean() - 6) < 4 * np.sqrt(12 / len(squared))
+
+
 @pytest.mark.parametrize("which", [0, 1, 2])
 @pytest.mark.parametrize("hidden", [0, 1])
-def test_a_circle_may_be_missing_in_one_view(cameras, rig, rng, which, hidden):
+def test_a_circle_may_be_missing_in_one_view(cameras, target, rng, which, hidden):
     """Then the misfit has 4 degrees of freedom, and the covariance still is that of the errors."""
     squared, misfits = [], []
     for _ in range(POSES // 2):
         true = drawings.facing(rng)
-        views = seen(cameras, rig.target, true, rng)
+        views = seen(cameras, target, true, rng)
         views[hidden].centres[which] = np.nan
-        found = pose.estimate(*views, rig.target)
+        found = pose.estimate(*views, target)
         off = error(found.world_from_target, true)
         squared.append(off @ np.linalg.solve(found.covariance, off))
         misfits.append(found.misfit)
@@ -94,17 +164,17 @@ def face_on(camera, rng, tilt_deg):
 
 
 @pytest.mark.parametrize(("tilt_deg", "least"), [(0.0, 0.5), (2.5, 0.85), (10.0, 0.95)])
-def test_two_tilts_are_told_apart_or_refused(cameras, rig, rng, tilt_deg, least):
+def test_two_tilts_are_told_apart_or_refused(cameras, target, rng, tilt_deg, least):
     """Where the whole view sees the target nearly face on, both tilts fit its centres; shapes are 0.1 px off."""
     squared = []
     for _ in range(POSES):
         true = face_on(cameras[0], rng, tilt_deg)
-        views = seen(cameras, rig.target, true, rng)
+        views = seen(cameras, target, true, rng)
         views[1].centres[rng.integers(3)] = np.nan
         for view in views:
             noise = 0.1 * rng.standard_normal((3, 2, 2))
             view.shapes[:] += (noise + np.swapaxes(noise, 1, 2)) / 2
-        found = pose.estimate(*views, rig.target)
+        found = pose.estimate(*views, target)
         assert found.found or "two poses" in found.reason or "no pose fits" in found.reason
         if found.found:
             off = error(found.world_from_target, true)
@@ -113,81 +183,81 @@ def test_two_tilts_are_told_apart_or_refused(cameras, rig, rng, tilt_deg, least)
     assert np.mean(np.array(squared) < chi2.ppf(0.95, 6)) > 0.85 and max(squared) < 100
 
 
-def test_without_shapes_two_tilts_are_not_told_apart(cameras, rig, rng):
+def test_without_shapes_two_tilts_are_not_told_apart(cameras, target, rng):
     """Nothing but perspective would: some are refused, none is wrong."""
     reasons = []
     for _ in range(POSES):
         true = drawings.facing(rng)
-        views = [replace(view, shapes=None) for view in seen(cameras, rig.target, true, rng)]
+        views = [replace(view, shapes=None) for view in seen(cameras, target, true, rng)]
         views[1].centres[2] = np.nan
-        found = pose.estimate(*views, rig.target)
+        found = pose.estimate(*views, target)
         reasons.append(found.reason)
         assert not found.found or np.abs(error(found.world_from_target, true)).max() < 1.0
     assert any("two poses" in str(reason) for reason in reasons)
 
 
-def test_sizes_that_no_distance_gives_are_not_the_target(cameras, rig, rng):
-    views = [replace(view, shapes=1.2 * view.shapes) for view in seen(cameras, rig.target, drawings.facing(rng), rng)]
-    assert "sizes are 20 %" in str(pose.estimate(*views, rig.target).reason)
+def test_sizes_that_no_distance_gives_are_not_the_target(cameras, target, rng):
+    views = [replace(view, shapes=1.2 * view.shapes) for view in seen(cameras, target, drawings.facing(rng), rng)]
+    assert "sizes are 20 %" in str(pose.estimate(*views, target).reason)
 
 
-def test_one_view_alone_must_have_shapes_of_a_pose(cameras, rig, rng):
+def test_one_view_alone_must_have_shapes_of_a_pose(cameras, target, rng):
     """Any three centres are those of some pose, but it tells the shapes too: three rings of a sheet aren't the target."""
     for _ in range(10):
-        view, _ = seen(cameras, rig.target, drawings.facing(rng), rng)
-        assert pose.allowed(view, rig.target)
+        view, _ = seen(cameras, target, drawings.facing(rng), rng)
+        assert pose.allowed(view, target)
         side = 0.15 * (view.centres[1] - view.centres[0])
-        assert not pose.allowed(replace(view, centres=view.centres + np.array([[0, 0], side, [0, 0]])), rig.target)
-        assert not pose.allowed(replace(view, shapes=1.1 * view.shapes), rig.target)
+        assert not pose.allowed(replace(view, centres=view.centres + np.array([[0, 0], side, [0, 0]])), target)
+        assert not pose.allowed(replace(view, shapes=1.1 * view.shapes), target)
 
 
-def test_the_back_of_a_target_is_not_found(cameras, rig, rng):
+def test_the_back_of_a_target_is_not_found(cameras, target, rng):
     """As through glass: the same circles, seen from behind."""
     flipped = drawings.facing(rng) @ np.diag([1.0, -1.0, -1.0, 1.0])
-    assert "front" in str(pose.estimate(*seen(cameras, rig.target, flipped, rng), rig.target).reason)
+    assert "front" in str(pose.estimate(*seen(cameras, target, flipped, rng), target).reason)
 
 
 @pytest.mark.parametrize("missing", [[(0, 0), (1, 0)], [(0, 0), (1, 1)], [(0, 0), (0, 1)]])
-def test_with_fewer_circles_there_is_no_pose(cameras, rig, rng, missing):
+def test_with_fewer_circles_there_is_no_pose(cameras, target, rng, missing):
     """One hidden from both cameras, another from each, two from one: (camera, circle)."""
-    views = seen(cameras, rig.target, drawings.facing(rng), rng)
+    views = seen(cameras, target, drawings.facing(rng), rng)
     for camera, which in missing:
         views[camera].centres[which] = np.nan
-    found = pose.estimate(*views, rig.target)
+    found = pose.estimate(*views, target)
     assert not found.found and "fewer circles" in found.reason
 
 
-def test_other_names_are_not_the_target(cameras, rig, rng):
+def test_other_names_are_not_the_target(cameras, target, rng):
     for order in ([1, 0, 2], [2, 1, 0], [0, 2, 1], [1, 2, 0], [2, 0, 1]):
-        views = [replace(view, centres=view.centres[order]) for view in seen(cameras, rig.target, drawings.facing(rng), rng)]
-        found = pose.estimate(*views, rig.target)
+        views = [replace(view, centres=view.centres[order]) for view in seen(cameras, target, drawings.facing(rng), rng)]
+        found = pose.estimate(*views, target)
         assert not found.found and "mm apart" in found.reason and np.isnan(found.world_from_target).all()
 
 
-def test_names_that_differ_between_the_views_are_not_the_target(cameras, rig, rng):
+def test_names_that_differ_between_the_views_are_not_the_target(cameras, target, rng):
     for order in ([1, 0, 2], [2, 1, 0], [0, 2, 1]):
-        first, second = seen(cameras, rig.target, drawings.facing(rng), rng)
-        found = pose.estimate(first, replace(second, centres=second.centres[order]), rig.target)
+        first, second = seen(cameras, target, drawings.facing(rng), rng)
+        found = pose.estimate(first, replace(second, centres=second.centres[order]), target)
         assert not found.found
 
 
-def test_swapped_cameras_are_noticed(cameras, rig, rng):
+def test_swapped_cameras_are_noticed(cameras, target, rng):
     for _ in range(10):
-        first, second = seen(cameras, rig.target, drawings.facing(rng), rng)
+        first, second = seen(cameras, target, drawings.facing(rng), rng)
         swapped = (replace(first, centres=second.centres), replace(second, centres=first.centres))
-        assert not pose.estimate(*swapped, rig.target).found
+        assert not pose.estimate(*swapped, target).found
 
 
-def test_a_centre_that_is_off_is_noticed(cameras, rig, rng):
+def test_a_centre_that_is_off_is_noticed(cameras, target, rng):
     """By half a pixel, 17 times what it is known to be."""
-    first, second = seen(cameras, rig.target, drawings.facing(rng), rng)
+    first, second = seen(cameras, target, drawings.facing(rng), rng)
     first.centres[1] += [0.35, 0.35]
-    found = pose.estimate(first, second, rig.target)
+    found = pose.estimate(first, second, target)
     assert not found.found and "misfit" in found.reason
 
 
 @pytest.mark.parametrize("hidden", [0, 1])
-def test_a_doubtful_centre_that_is_off_is_left_out(cameras, rig, rng, hidden):
+def test_a_doubtful_centre_that_is_off_is_left_out(cameras, target, rng, hidden):
     """By 20 times what it is known to be, in a view of which any circle may be; the covariance is that of the other five.
 
     Off along the other view's ray, it can't be told from that one, and there is no pose.
@@ -195,11 +265,11 @@ def test_a_doubtful_centre_that_is_off_is_left_out(cameras, rig, rng, hidden):
     squared = []
     for _ in range(POSES):
         true, which = drawings.facing(rng), rng.integers(3)
-        views = seen(cameras, rig.target, true, rng)
+        views = seen(cameras, target, true, rng)
         angle = rng.uniform(0, 2 * np.pi)
         views[hidden].centres[which] += 20 * SIGMA_PX * np.array([np.cos(angle), np.sin(angle)])
         views[hidden] = replace(views[hidden], doubtful=np.ones(3, bool))
-        found = pose.estimate(*views, rig.target)
+        found = pose.estimate(*views, target)
         if not found.found:
             continue
         assert np.argwhere(~found.used).tolist() == [[hidden, which]]
@@ -208,23 +278,23 @@ def test_a_doubtful_centre_that_is_off_is_left_out(cameras, rig, rng, hidden):
     assert len(squared) > 0.6 * POSES and abs(np.mean(squared) - 6) < 4 * np.sqrt(12 / len(squared))
 
 
-def test_a_right_circle_is_not_left_out_for_a_wrong_one(cameras, rig, rng):
+def test_a_right_circle_is_not_left_out_for_a_wrong_one(cameras, target, rng):
     """One is off by 20 times its uncertainty, and those of the other view are doubtful: then there is no pose, or a right one."""
     squared = []
     for _ in range(POSES):
         true = drawings.facing(rng)
-        views = seen(cameras, rig.target, true, rng)
+        views = seen(cameras, target, true, rng)
         angle = rng.uniform(0, 2 * np.pi)
         views[0].centres[rng.integers(3)] += 20 * SIGMA_PX * np.array([np.cos(angle), np.sin(angle)])
-        found = pose.estimate(views[0], replace(views[1], doubtful=np.ones(3, bool)), rig.target)
+        found = pose.estimate(views[0], replace(views[1], doubtful=np.ones(3, bool)), target)
         if found.found:
             off = error(found.world_from_target, true)
             squared.append(off @ np.linalg.solve(found.covariance, off))
     assert np.sum(np.array(squared) > 30) <= 1
 
 
-def test_nonsense_is_not_found(cameras, rig):
+def test_nonsense_is_not_found(cameras, target):
     view = Sighting(cameras[0], np.full((3, 2), np.nan), np.tile(np.eye(2), (3, 1, 1)))
-    assert not pose.estimate(view, replace(view, camera=cameras[1]), rig.target).found
+    assert not pose.estimate(view, replace(view, camera=cameras[1]), target).found
     same = replace(view, centres=np.full((3, 2), 500.0))
-    assert not pose.estimate(same, replace(same, camera=cameras[1]), rig.target).found
+    assert not pose.estimate(same, replace(same, camera=cameras[1]), target).found

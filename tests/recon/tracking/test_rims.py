@@ -7,7 +7,8 @@ from scipy.special import expit
 from recon.geometry import rigid
 from recon.geometry.circle_projection import centre_offsets
 from recon.geometry.ellipses import Ellipses
-from recon.tracking import pose, rims
+from recon.model import circle_layout
+from recon.tracking import rims
 from recon.tracking.rims import measure
 from tests.recon.tracking import drawings
 
@@ -157,7 +158,7 @@ def test_what_is_no_ring_is_not_found(camera, rig, rng):
 
 def test_fitted_ellipses_are_those_of_the_plain_fit(camera, rig, rng):
     """Against the projected centres with the offsets that calibration takes."""
-    model, radius = pose.circle_centres(rig.target), rig.target.outer_diameter_mm / 2
+    model, radius = circle_layout.circle_centres(rig.target), rig.target.outer_diameter_mm / 2
     for _ in range(5):
         place = drawings.facing(rng)
         expected = camera.project(rigid.apply(place, model)) + centre_offsets(camera, place, model, radius)

@@ -1,5 +1,11 @@
-"""Is it said in few words why frames have no pose?"""
+"""Is it said in few words why frames have no pose, and what is amiss in all of them alike?"""
 
+import numpy as np
+import pytest
+
+from recon.tracking import track_figures
+from recon.tracking.pose_fit import Triangle
+from recon.tracking.results import Step
 from recon.tracking.track_figures import kind, kinds
 
 
@@ -19,3 +25,42 @@ def test_reasons_are_put_together():
         "rays of c1 miss each other by … mm",
     ]
     assert kinds([f"reason {letter}" for letter in "aabcdef"])[-1] == ("others", 2)
+
+
+def steps(rng, lengths, gap_mm, count=12, noise_mm=0.005):
+    """Steps without poses, of six circles each."""
+    nothing = np.full((6, 6), np.nan)
+    triangles = [
+        Triangle(np.array(lengths) + noise_mm * rng.standard_normal(3), gap_mm + noise_mm * rng.standard_normal(3))
+        for _ in range(count)
+    ]
+    return [Step(0, np.full((4, 4), np.nan), nothing, nothing, one, None, "a misfit", (0.0, 0.0), 0.01) for one in triangles]
+
+
+@pytest.mark.parametrize(
+    ("lengths", "gap_mm", "expected"),
+    [
+        ((25.0, 0.0, 40.0), 0.0, []),
+        ((25.0, 0.0, 40.1), 0.0, ["target      off its design within the tolerance, c2 by +0.10 mm"]),
+        ((25.0, 0.0, 41.1), 0.0, ["warning     the target's circles aren't where rig.target has them, off c2 by +1.10 mm"]),
+        (
+            (25.0, -1.2, 40.0),
+            0.0,
+            ["warning     the target's circles aren't where rig.target has them, off c2 aside by -1.20 mm"],
+        ),
+        (
+            (25.0, 0.0, 40.0),
+            0.31,
+            ["warning     both cameras' rays miss each other by 0.31 mm, alike in 12 pairs: a camera was moved"],
+        ),
+    ],
+)
+def test_a_cause_of_all_pairs_is_named(rig, rng, lengths, gap_mm, expected):
+    lines = list(track_figures.causes(steps(rng, lengths, gap_mm), rig.target))
+    assert len(lines) == len(expected)
+    assert all(line.startswith(start) for line, start in zip(lines, expected, strict=True))
+
+
+def test_pairs_that_differ_have_no_cause_in_common(rig, rng):
+    assert not list(track_figures.causes(steps(rng, (25.0, 0.0, 40.0), 0.0, noise_mm=0.5), rig.target))
+    assert not list(track_figures.causes(steps(rng, (25.0, 0.0, 44.0), 1.0, count=3), rig.target))

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from recon.geometry import rigid
 from recon.geometry.ellipses import Ellipses
-from recon.tracking import overlays, photographs, pose, results, views
+from recon.model import circle_layout
+from recon.tracking import overlays, photographs, results, views
 from recon.tracking import tracker as tracking
 from recon.tracking.rims import Outlines
 from recon.tracking.tracker import Tracker
@@ -26,7 +27,7 @@ def cameras(rig):
 
 
 def centres(camera, place, target):
-    return camera.project(rigid.apply(place, pose.circle_centres(target)))
+    return camera.project(rigid.apply(place, circle_layout.circle_centres(target)))
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +144,7 @@ def shifted(found: Outlines, which: int, by, doubtful: bool) -> Outlines:
 @pytest.mark.parametrize("doubtful", [True, False])
 def test_a_doubtful_rim_that_is_off_is_told_by_the_pose(cameras, rig, pair, monkeypatch, doubtful):
     """Half a pixel: the other five tell the pose, and that where it is; a rim that nothing speaks against spoils the frame."""
-    tracker = Tracker(cameras, rig.target)
+    tracker = Tracker(cameras, rig.target.model_copy(update={"tolerance_mm": 0.0}))
     tracker.remember(FACING, 0.0)
     real = tracking.measure_both
     monkeypatch.setattr(tracking, "measure_both", lambda *given: shifted(real(*given), 4, [0.5, -0.3], doubtful))

@@ -45,7 +45,7 @@ def folders(tmp_path_factory):
     rows = []
     for k in range(COUNT):
         reason = ("only camera 2 sees the target; <b>" if k < 6 else "no rim") if k in LOST else ""
-        rows.append([times[k], k, k, int(not reason), "" if reason else "predicted", "", "", "", "", reason])
+        rows.append([times[k], k, k, int(not reason), "" if reason else "predicted", *[""] * 6, reason])
         cv2.imwrite(str(track / results.OVERLAYS / f"{k:04d}.jpg"), np.full((64, 160, 3), 100, np.uint8))
     sweep_tables.write_rows(track / results.FRAMES, results.COLUMNS, rows)
     return film, track

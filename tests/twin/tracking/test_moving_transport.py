@@ -10,7 +10,7 @@ import pytest
 from recon.board_detection.discs import measure
 from recon.geometry import rigid
 from recon.geometry.ellipses import Ellipses
-from recon.tracking.pose import circle_centres
+from recon.model.circle_layout import circle_centres
 from scenes.handheld.surroundings import surroundings
 from tests.twin.tracking.takes import facing, plain_take, ranges, rig
 from twin.optics.sampling import sobol_pair

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.geometry import rigid
-from recon.tracking.pose import circle_centres
+from recon.model.circle_layout import circle_centres
 from tests.twin.tracking.takes import ranges, rig
 from twin.tracking.samples import draw, facing
 from twin.tracking.sampling_ranges import PoseRanges

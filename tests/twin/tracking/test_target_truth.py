@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.geometry.camera import Camera
-from recon.tracking.pose import circle_centres
+from recon.model.circle_layout import circle_centres
 from tests.twin.tracking.takes import facing, rig
 from twin.tracking.samples import Motion
 from twin.tracking.target_truth import disc_masks, ellipse_rows, inside_share, outline, path_length

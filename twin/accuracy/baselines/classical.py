@@ -43,7 +43,7 @@ LEAST_SIGNAL = 4.0  # contrast over noise
 class Circles:
     """The three circles in an image, or why they are not found."""
 
-    centres: Array  # (3, 2) px of the outer outlines' ellipses, in the order of pose.NAMES; NaN if not found
+    centres: Array  # (3, 2) px of the outer outlines' ellipses, in the order of pose_fit.NAMES; NaN if not found
     covariance: Array  # (3, 2, 2) px^2
     ellipses: Ellipses | None = None  # the outer outlines
     reason: str | None = None

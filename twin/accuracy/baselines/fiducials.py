@@ -16,7 +16,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
 from recon.model.rig import Target
-from recon.tracking.pose import PARAMETERS, TargetPose, lost
+from recon.tracking.pose_fit import PARAMETERS, TargetPose, lost
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]

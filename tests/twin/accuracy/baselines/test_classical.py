@@ -6,7 +6,7 @@ import pytest
 
 from recon.geometry import rigid
 from recon.geometry.circle_projection import centre_offsets
-from recon.tracking import pose
+from recon.model import circle_layout
 from tests.recon.tracking import flat_faces
 from twin.accuracy.baselines import classical
 from twin.optics.surface_session import calibration_of
@@ -19,7 +19,7 @@ def camera(rig):
 
 def shown(camera, target, world_from_target):
     """Centres : (3, 2) px of the outlines' ellipses."""
-    model = pose.circle_centres(target)
+    model = circle_layout.circle_centres(target)
     offsets = centre_offsets(camera, world_from_target, model, target.outer_diameter_mm / 2)
     return camera.project(rigid.apply(world_from_target, model)) + offsets
 

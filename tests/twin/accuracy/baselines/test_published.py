@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from recon.geometry import rigid
-from recon.tracking import pose
+from recon.model import circle_layout
 from tests.recon.tracking import flat_faces
 from twin.accuracy.baselines import published
 from twin.optics.surface_session import calibration_of
@@ -90,7 +90,7 @@ def test_logits_above_zero_are_the_mask():
 
 
 def test_points_that_are_seen_without_error_give_the_pose(cameras, rig, rng):
-    model = pose.circle_centres(rig.target)
+    model = circle_layout.circle_centres(rig.target)
     for _ in range(10):
         true = flat_faces.facing(rng.uniform(-40, 40, 2), rng.uniform(-180, 180), rng.uniform([-50, -50, 600], [50, 50, 710]))
         seen = [camera.project(rigid.apply(true, model)) for camera in cameras]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from recon.geometry import rigid
-from recon.tracking import pose, pose_hypotheses
+from recon.geometry import pose_hypotheses, rigid
+from recon.model import circle_layout
 from recon.tracking.tracker import REACH_PX
 from tests.recon.tracking import drawings
 
@@ -17,7 +17,7 @@ def cameras(rig):
 
 
 def test_every_pose_shows_the_centres_and_one_is_true(cameras, rig, rng):
-    model = pose.circle_centres(rig.target)
+    model = circle_layout.circle_centres(rig.target)
     for _ in range(COUNT):
         true = drawings.facing(rng, 50.0)
         seen = cameras[0].project(rigid.apply(true, model))
@@ -32,7 +32,7 @@ def test_every_pose_shows_the_centres_and_one_is_true(cameras, rig, rng):
 
 def test_the_other_view_is_told_within_the_reach_of_a_fit(cameras, rig, rng):
     """From the middles of ellipses, which are not the projected centres, with 0.1 px of noise: far more than rims have."""
-    model = pose.circle_centres(rig.target)
+    model = circle_layout.circle_centres(rig.target)
     for _ in range(COUNT):
         first, second = (
             drawings.shown(camera, place, rig.target).centre for place in [drawings.facing(rng)] for camera in cameras
@@ -43,6 +43,6 @@ def test_the_other_view_is_told_within_the_reach_of_a_fit(cameras, rig, rng):
 
 
 def test_nonsense_allows_none(cameras, rig):
-    model = pose.circle_centres(rig.target)
+    model = circle_layout.circle_centres(rig.target)
     for centres in (np.full((3, 2), 500.0), np.full((3, 2), np.nan)):
         assert not pose_hypotheses.poses(cameras[0], centres, model)

@@ -1,0 +1,72 @@
+"""Files of the measured target, `target.yaml`: OpenCV FileStorage YAML.
+
+`schema`; `c1_mm`, `c2_aside_mm`, `c2_mm`, places of the circles as in `recon.model.circle_layout`; `outer_diameter_mm`;
+`curvature_per_m` (xx, xy, yy); and `parameters`, the names of all seven, with their `covariance`.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from recon.errors import InputError, one_line
+from recon.files import opencv_storage
+from recon.model.circle_layout import LENGTHS
+from recon.model.rig import Target
+
+Array = NDArray[np.float64]
+
+SCHEMA = "sonotwin-target/1"
+LENGTHS_AND_DIAMETER = (*LENGTHS, "outer_diameter_mm")
+CURVATURE = "curvature_per_m"
+PARAMETERS = (*LENGTHS_AND_DIAMETER, *(f"curvature_{axes}_per_m" for axes in ("xx", "xy", "yy")))
+
+
+def write(path: Path, target: Target, covariance: Array) -> None:
+    """Write a measured target with the covariance : (7, 7) of PARAMETERS, whole or not at all. The suffix should be `.yaml`."""
+    storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+    storage.write("schema", SCHEMA)
+    for name in LENGTHS_AND_DIAMETER:
+        storage.write(name, float(getattr(target, name)))
+    storage.write(CURVATURE, np.array(target.curvature_per_m).reshape(1, 3))
+    opencv_storage.write_covariance(storage, PARAMETERS, covariance)
+    opencv_storage.save(path, storage)
+
+
+def read(path: Path, design: Target) -> Target:
+    """Read a measured target; the design's board and inner diameter stay.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, of another kind, or a value is missing or can't be.
+    """
+    with opencv_storage.opened(path, "a measured target") as storage:
+        node = storage.getNode("schema") if storage is not None and storage.root().isMap() else None
+        found = node.string() if node is not None and node.isString() else "none"
+        if storage is None or found != SCHEMA:
+            raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
+        values: dict[str, object] = {name: _number(path, name, storage) for name in LENGTHS_AND_DIAMETER}
+        curvature = opencv_storage.matrix(path, CURVATURE, storage.getNode(CURVATURE))
+        if curvature.size != 3 or not np.isfinite(curvature).all():
+            raise InputError(f"{path}: {CURVATURE}: expected three numbers, xx, xy and yy, found {curvature.tolist()}")
+        names = opencv_storage.names(storage)
+        if names is None or sorted(names) != sorted(PARAMETERS):
+            raise InputError(f"{path}: parameters: expected {' '.join(PARAMETERS)}, found {' '.join(names or ['none'])}")
+        covariance = opencv_storage.covariance(path, storage, len(names))
+    of_lengths = [names.index(name) for name in LENGTHS]
+    values[CURVATURE] = curvature.ravel().tolist()
+    values["covariance_mm2"] = covariance[np.ix_(of_lengths, of_lengths)].tolist()
+    try:
+        return Target.model_validate(design.model_dump() | values)
+    except ValidationError as error:
+        raise InputError(f"{path}: {one_line(error)}") from None
+
+
+def _number(path: Path, name: str, storage: cv2.FileStorage) -> float:
+    node = storage.getNode(name)
+    if not (node.isReal() or node.isInt()):
+        raise InputError(f"{path}: {name}: expected a length in mm, found {'none' if node.empty() else 'something else'}")
+    return node.real()

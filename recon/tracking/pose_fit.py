@@ -1,0 +1,246 @@
+"""Least squares of the target's pose on the ellipses' centres of two views, its circles' places held within their tolerance.
+
+Each centre is predicted as that of the projected outline, which isn't the projected centre. Besides the pose's six numbers the
+lengths of the target are found, as far as they aren't known: they are measured once more, by the design, with its covariance.
+Errors of the cameras' calibration are common to all centres: their covariance is added to that of the rims' noise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.special import chdtri
+
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.geometry.circle_outline import ellipses_of, slopes_at
+from recon.geometry.levenberg_marquardt import Rules, descend
+from recon.model import circle_layout
+from recon.model.calibration import Uncertainty, projection_covariance
+from recon.model.circle_layout import Circles
+from recon.model.rig import Target
+
+Array = NDArray[np.float64]
+
+NAMES = ("c0", "c1", "c2")
+RULES = Rules(damping=0, rounding=1e-6, converged=0, steps=20)  # two or three steps from where rays meet, more from one view
+SETTLED = 1e-4  # squared standard deviations of the last step
+IMPLAUSIBLE = 1e-6  # chance of a misfit so large, by chi-square, below which it isn't the target
+SUSPICIOUS = 1e-3  # chance of a misfit below which circles that are doubtful are left out, one by one
+PARAMETERS = 6
+MISFITTING = "views that no pose fits: other circles, or cameras swapped or moved"
+RANK = 1e-7  # least ratio of singular values
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """The circles in one view."""
+
+    camera: Camera
+    centres: Array  # (3, 2) px, of the ellipses, in the order of NAMES; NaN where one isn't seen
+    covariance: Array  # (3, 2, 2) px^2
+    shapes: Array | None = None  # (3, 2, 2) px, of the ellipses, as ellipses.Ellipses has them; None if they aren't known
+    doubtful: NDArray[np.bool_] = field(default_factory=partial(np.zeros, 3, bool))  # (3,) as in outlines.Outlines
+
+    @cached_property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which circles are seen : (3,)."""
+        return np.isfinite(self.centres).all(axis=1)
+
+    def without(self, which: int) -> "Sighting":
+        """The same with one circle not seen."""
+        return replace(self, centres=np.where(np.arange(len(NAMES))[:, None] == which, np.nan, self.centres))
+
+
+class Triangle(NamedTuple):
+    """The three centres as two views triangulate them, the offsets of ellipses' centres taken off, without the design."""
+
+    lengths_mm: Array  # (3,) as `circle_layout.LENGTHS`
+    gaps_mm: Array  # (3,) by which both rays miss each other, along their common normal
+
+
+@dataclass(frozen=True)
+class TargetPose:
+    """Where the target is, or why that isn't known."""
+
+    world_from_target: Array  # (4, 4) mm; NaN if it isn't known
+    covariance: (
+        Array  # (6, 6) by the noise of this pair; of a turn (rad) after the pose's own, and a shift (mm), as in tracks.Track
+    )
+    misfit: float  # squared normalised residuals, chi-square with `freedom` degrees; NaN where it isn't told
+    reason: str | None = None
+    freedom: int = PARAMETERS  # numbers that were measured beyond the pose's own
+    used: NDArray[np.bool_] = field(default_factory=partial(np.ones, (2, 3), bool))  # (2, 3) of each view's circles, fitted to
+    shared: Array = field(
+        default_factory=partial(np.zeros, (6, 6))
+    )  # the same by tolerances of target and cameras: like in all pairs
+    triangle: Triangle | None = None  # of six circles, also where they fit no pose
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a pose."""
+        return self.reason is None
+
+    @property
+    def total(self) -> Array:
+        """Covariance : (6, 6) of the whole error, by noise and by tolerances."""
+        return self.covariance + self.shared
+
+
+def lost(reason: str, misfit: float = np.nan, triangle: Triangle | None = None) -> TargetPose:
+    """No pose, for a reason."""
+    nothing = np.full((6, 6), np.nan)
+    used = np.zeros((2, 3), bool)
+    return TargetPose(np.full((4, 4), np.nan), nothing, misfit, reason, used=used, shared=nothing, triangle=triangle)
+
+
+class _Guess(NamedTuple):
+    """The unknowns."""
+
+    world_from_target: Array  # (4, 4) mm
+    deviations: Array  # (k,) independent standard normal numbers of the lengths, see `circle_layout.deviations`
+
+
+class _Problem(NamedTuple):
+    """Two views to be fitted."""
+
+    views: Sequence[Sighting]
+    whiten: Array  # (m, m) by which residuals of the m coordinates seen become independent, of variance 1
+    circles: Circles  # by design
+    by_deviation: Array  # (3, 3, k) mm, as `circle_layout.deviations`
+
+
+def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Uncertainty | None = None) -> TargetPose:
+    """The pose by least squares from a start : (4, 4) mm, by Gauss-Newton, damped where that leads uphill.
+
+    optics : of the cameras' calibration, `cam1` and `cam2`, whose views these are; None where it isn't known, or exact.
+    """
+    noise = block_diag(*(one for view in views for one in view.covariance[view.seen]))
+    circles = circle_layout.circles(target)
+    cameras = _optics_covariance(start, views, circles, optics)
+    whiten = np.linalg.inv(np.linalg.cholesky(noise + cameras))
+    problem = _Problem(views, whiten, circles, circle_layout.deviations(target))
+
+    def linearised(guess: _Guess) -> tuple[tuple[Array, Array], float]:
+        design, residual = _linearised(guess, problem)
+        if not (np.isfinite(design).all() and np.isfinite(residual).all()):
+            raise _Astray(MISFITTING)
+        return (design, residual), residual @ residual
+
+    try:
+        first = _Guess(start, np.zeros(problem.by_deviation.shape[2]))
+        guess, (design, residual), step, _ = descend(first, linearised, _solved, _moved, _settled, RULES)
+    except _Astray as astray:
+        return lost(str(astray))
+    if step is None:
+        return lost(MISFITTING)
+    guess = _moved(guess, step)
+    misfit, freedom = float(np.sum((residual - design @ step) ** 2)), len(noise) - PARAMETERS
+    triangle = _triangle(guess, problem)
+    if not misfit < chdtri(freedom, IMPLAUSIBLE if freedom == PARAMETERS else SUSPICIOUS):
+        times = np.sqrt(misfit / freedom)
+        reason = f"a misfit of {times:.0f} times the centres' uncertainty: other circles, or cameras swapped or moved"
+        return lost(reason, misfit, triangle)
+    pose = guess.world_from_target
+    if not all(pose[:3, 2] @ (pose[:3, 3] - view.camera.centre) < 0 for view in views):
+        return lost("a target whose front does not face both cameras")
+    gain = np.linalg.inv(design.T @ design)[:PARAMETERS] @ design.T
+    by_centre, by_deviation = gain[:, : len(noise)] @ whiten, gain[:, len(noise) :]
+    covariance = by_centre @ noise @ by_centre.T
+    shared = by_centre @ cameras @ by_centre.T + by_deviation @ by_deviation.T
+    used = np.stack([view.seen for view in views])
+    return TargetPose(pose, covariance, misfit, freedom=freedom, used=used, shared=shared, triangle=triangle)
+
+
+def _optics_covariance(pose: Array, views: Sequence[Sighting], circles: Circles, optics: Uncertainty | None) -> Array:
+    """Covariance : (m, m) px^2 of all coordinates seen, by errors of the cameras."""
+    points = [rigid.apply(pose, circles.centres[view.seen]) for view in views]
+    if optics is None:
+        return np.zeros((2 * sum(map(len, points)),) * 2)
+    return projection_covariance({f"cam{k}": view.camera for k, view in enumerate(views, start=1)}, points, optics)
+
+
+def _placed(guess: _Guess, problem: _Problem) -> Circles:
+    """The circles with their deviations from the design."""
+    return problem.circles._replace(centres=problem.circles.centres + problem.by_deviation @ guess.deviations)
+
+
+def _linearised(guess: _Guess, problem: _Problem) -> tuple[Array, Array]:
+    """Slopes : (m + k, 6 + k) and residuals : (m + k,), in standard deviations; ellipses' offsets follow the pose."""
+    circles, k = _placed(guess, problem), len(guess.deviations)
+    rows, left = [], []
+    for view in problem.views:
+        seen = circles.some(view.seen)
+        predicted = ellipses_of(view.camera, guess.world_from_target, *seen)[0]
+        by_point = slopes_at(view.camera, rigid.apply(guess.world_from_target, seen.centres))
+        arms = rigid.rotate(guess.world_from_target, seen.centres)
+        by_deviation = guess.world_from_target[:3, :3] @ problem.by_deviation[view.seen]
+        rows.append((by_point @ np.concatenate([rigid.slopes(arms), by_deviation], axis=2)).reshape(-1, PARAMETERS + k))
+        left.append((view.centres[view.seen] - predicted).ravel())
+    design = np.vstack([problem.whiten @ np.concatenate(rows), np.eye(k, PARAMETERS + k, PARAMETERS)])
+    return design, np.concatenate([problem.whiten @ np.concatenate(left), -guess.deviations])
+
+
+def _solved(_: _Guess, system: tuple[Array, Array], damping: float) -> Array:
+    """The step : (6 + k,) of the equations, with others that keep it short."""
+    design, residual = system
+    if damping > 0:
+        design = np.vstack([design, np.diag(np.sqrt(damping) * np.linalg.norm(design, axis=0))])
+        residual = np.append(residual, np.zeros(design.shape[1]))
+    step, _, rank, _ = np.linalg.lstsq(design, residual, RANK)
+    if rank < design.shape[1]:
+        raise _Astray("views that do not determine the pose")
+    return step
+
+
+def _moved(guess: _Guess, step: Array) -> _Guess:
+    return _Guess(rigid.moved(guess.world_from_target, step[:PARAMETERS]), guess.deviations + step[PARAMETERS:])
+
+
+def _settled(system: tuple[Array, Array], step: Array) -> bool:
+    return bool(np.sum((system[0] @ step) ** 2) < SETTLED)
+
+
+def _triangle(guess: _Guess, problem: _Problem) -> Triangle | None:
+    """The triangle of six circles; None where one isn't seen."""
+    if not all(view.seen.all() for view in problem.views):
+        return None
+    circles = _placed(guess, problem)
+    points = rigid.apply(guess.world_from_target, circles.centres)
+    pixels = [
+        view.centres - ellipses_of(view.camera, guess.world_from_target, *circles)[0] + view.camera.project(points)
+        for view in problem.views
+    ]
+    met, gaps = meet([view.camera for view in problem.views], pixels)
+    x, side = met[1] - met[0], met[2] - met[0]
+    c1 = float(np.linalg.norm(x))
+    aside = float(side @ x) / c1
+    return Triangle(np.array([c1, aside, np.sqrt(side @ side - aside**2)]), gaps)
+
+
+def meet(cameras: Sequence[Camera], pixels: Sequence[Array]) -> tuple[Array, Array]:
+    """Midpoints : (n, 3) mm of the shortest lines between two cameras' rays of n pixels, and their signed lengths : (n,) mm.
+
+    NaN where rays are parallel or meet behind a camera.
+    """
+    origins = [camera.centre for camera in cameras]
+    rays = [camera.rays(each) for camera, each in zip(cameras, pixels, strict=True)]
+    base = origins[1] - origins[0]
+    cosine = np.einsum("ni,ni->n", *rays)
+    along = [ray @ base for ray in rays]
+    normal = np.cross(*rays)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = (along[0] - cosine * along[1]) / (1 - cosine**2)
+        t = (cosine * along[0] - along[1]) / (1 - cosine**2)
+        gaps = normal @ base / np.linalg.norm(normal, axis=1)
+    near = [origins[0] + s[:, None] * rays[0], origins[1] + t[:, None] * rays[1]]
+    behind = ~((s > 0) & (t > 0))
+    return np.where(behind[:, None], np.nan, (near[0] + near[1]) / 2), np.where(behind, np.nan, gaps)
+
+
+class _Astray(Exception):
+    """The reason why a start leads to no pose."""
