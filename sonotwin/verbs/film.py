@@ -24,6 +24,7 @@ from rich.progress import Progress
 from recon.capture.manifest import CAMERAS
 from recon.model.rig import Rig
 from sonotwin.config import folder as conf
+from twin.optics.conditions import Conditions, printed
 from twin.session import Session
 from twin.tracking import film_session
 from twin.tracking.rendered_views import Frames, Quality
@@ -36,6 +37,7 @@ class Config(film_session.Filming):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Rig
+    conditions: Conditions = Conditions()
     out: Path
     add: bool = False
     pixels: Literal["sketch", "full"] = "sketch"
@@ -54,15 +56,16 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     session = Session(config.out, "sweep", config.model_dump(mode="json", exclude={"out", "add"}), config.add, CAMERAS)
     session.check()
+    rig = config.rig.model_copy(update={"target": printed(config.rig.target, config.conditions.target, config.seed)})
     with console.status("setting up the scene"):
-        bank = film_session.make_bank(config.rig, config.seed)
-        made = film_session.takes(bank, config.rig, ranges(), config, config.seed)
+        bank = film_session.make_bank(rig, config.seed)
+        made = film_session.takes(bank, rig, ranges(), config, config.seed)
     start = perf_counter()
     blurs: list[float] = []
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        shot = film_session.shoot(bank, config.rig, made, config.quality, config.seed, config.pixels)
+        shot = film_session.shoot(bank, rig, made, config.quality, config.seed, config.pixels)
         frames = progress.track(shot, total=len(made), description="rendering")
-        film_session.write_session(session, config.rig, config, made, _noted(frames, blurs))
+        film_session.write_session(session, rig, config, made, _noted(frames, blurs))
     seconds = perf_counter() - start
     console.print(f"render      {len(made)} pairs of frames, blurred by up to {max(blurs):.1f} px, {seconds:.1f} s")
     console.print(f"wrote       {config.out}/{{capture,truth}}", markup=False)

@@ -7,15 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from recon.model import circle_layout
 from recon.model.patterns import Fringes, Patterns
-from recon.model.rig import CameraDevice, Part, ProjectorDevice
+from recon.model.rig import CameraDevice, Part, ProjectorDevice, Target
 from twin.optics.light_transport import Images
 from twin.optics.raster import Light
 from twin.sensor import Exposure, Stack, electrons_per_radiance, number_per_electron
 
 Array = NDArray[np.float64]
 
-STREAM = 7  # of random numbers, apart from those of rendering and of the sensor
+STREAM, PRINT_STREAM = 7, 8  # of random numbers, apart from those of rendering and of the sensor
 
 
 class Frames(Part):
@@ -26,10 +27,18 @@ class Frames(Part):
     shift: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # of grey fringes' phase shifts, in steps of their sequence
 
 
+class Print(Part):
+    """Standard deviations of errors that the probe's target was printed with."""
+
+    place_mm: Annotated[float, Field(ge=0, le=5)] = 0.0  # of each circle along each axis
+    diameter_mm: Annotated[float, Field(ge=0, le=5)] = 0.0  # of all outer rims alike: ink spreads
+
+
 class Conditions(Part):
     """The conditions of a session, see `conf/conditions`."""
 
     frames: Frames = Frames()
+    target: Print = Print()
 
 
 IDEAL = Conditions()
@@ -47,6 +56,19 @@ def draw(frames: Frames, count: int, *key: int) -> FrameDraw:
     """Draw the errors of some frames, the same for the same key."""
     normal = np.random.default_rng([*key, STREAM]).standard_normal((3, count))
     return FrameDraw(1 + frames.flicker * normal[0], frames.stray_dn * normal[1], frames.shift * normal[2])
+
+
+def printed(target: Target, errors: Print, *key: int) -> Target:
+    """Draw the target that comes of a design, the same for the same key; ink that spreads narrows the holes, too."""
+    if errors == Print():
+        return target
+    rng = np.random.default_rng([*key, PRINT_STREAM])
+    wider = errors.diameter_mm * rng.standard_normal()
+    scatter = circle_layout.length_covariance(target.model_copy(update={"tolerance_mm": errors.place_mm, "covariance_mm2": None}))
+    c1, aside, c2 = rng.multivariate_normal(circle_layout.lengths(target), scatter).tolist()
+    outer, inner = target.outer_diameter_mm + wider, target.inner_diameter_mm - wider
+    changed = {"c1_mm": c1, "c2_aside_mm": aside, "c2_mm": c2, "outer_diameter_mm": outer, "inner_diameter_mm": inner}
+    return target.model_copy(update=changed)
 
 
 def emitted(patterns: Patterns, projector: ProjectorDevice, errors: FrameDraw) -> Light:

@@ -208,7 +208,7 @@ class _Path:
         return place.x, place.y, self.present & (ray.d.z < 0) & (distance > 0)
 
     def _within_circle(self, x, y, circle) -> mi.Bool:
-        cx = dr.select(circle == 1, self.target.c1_mm, 0.0)
+        cx = dr.select(circle == 1, self.target.c1_mm, dr.select(circle == 2, self.target.c2_aside_mm, 0.0))
         cy = dr.select(circle == 2, self.target.c2_mm, 0.0)
         return (circle < NO_CIRCLE) & ((x - cx) ** 2 + (y - cy) ** 2 < (self.target.outer_diameter_mm / 2) ** 2)
 

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.model.circle_layout import circle_centres
 from recon.model.rig import Target
 from twin.tracking.parameter_table import Rows
 from twin.tracking.samples import SCRATCHES, SPOTS
@@ -92,7 +93,7 @@ def relief(surface: list[mi.Float], place: mi.Vector3f, seed: mi.UInt32) -> mi.F
 def ring_cover(target: Target, x: mi.Float, y: mi.Float, softness: mi.Float) -> mi.Float:
     """Share of ink on the face at x, y: three annuli."""
     covered = mi.Float(0)
-    for cx, cy in ((0.0, 0.0), (target.c1_mm, 0.0), (0.0, target.c2_mm)):
+    for cx, cy, _ in circle_centres(target).tolist():
         r = dr.sqrt((x - cx) ** 2 + (y - cy) ** 2)
         outer = dr.clip((target.outer_diameter_mm / 2 - r) / softness + 0.5, 0, 1)
         inner = dr.clip((r - target.inner_diameter_mm / 2) / softness + 0.5, 0, 1)

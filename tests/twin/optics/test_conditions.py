@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from recon.model import circle_layout
 from recon.model.patterns import Fringes, GrayCode, Patterns
 from recon.structured_light.phase import design
-from twin.optics.conditions import Conditions, Frames, draw, emitted, with_stray
+from twin.optics.conditions import Conditions, Frames, Print, draw, emitted, printed, with_stray
 from twin.optics.raster import Light
 from twin.sensor import Exposure, electrons_per_radiance, expose
 
@@ -70,3 +71,16 @@ def test_nonsense_is_refused_by_name(field):
             Conditions.model_validate({"frames": {field: value}})
     with pytest.raises(ValidationError, match="flickr"):
         Conditions.model_validate({"frames": {"flickr": 0.1}})
+
+
+def test_prints_are_off_by_their_standard_deviations(rig):
+    """Of 4000 targets; lengths have the covariance of circles each off its place, and rims grow as holes shrink."""
+    errors = Print(place_mm=0.1, diameter_mm=0.03)
+    drawn = [printed(rig.target, errors, seed) for seed in range(4000)]
+    lengths = np.array([circle_layout.lengths(target) for target in drawn]) - circle_layout.lengths(rig.target)
+    expected = np.sqrt(np.diag(circle_layout.length_covariance(rig.target)))
+    assert lengths.std(axis=0) == pytest.approx(expected, rel=0.05)
+    wider = np.array([target.outer_diameter_mm for target in drawn]) - rig.target.outer_diameter_mm
+    narrower = rig.target.inner_diameter_mm - np.array([target.inner_diameter_mm for target in drawn])
+    assert wider.std() == pytest.approx(0.03, rel=0.05) and np.allclose(wider, narrower)
+    assert printed(rig.target, errors, 7) == drawn[7] and printed(rig.target, Print(), 7) == rig.target
