@@ -39,6 +39,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("dataset", "render tracking frames with ground truth, as training data"),
     Verb("film", "render a film of the moving target with its ground truth"),
     Verb("calibrate-optics", "calibrate cameras and projector from images of a board, rendered or real"),
+    Verb("calibrate-target", "measure the probe's target as it was printed, from any film of it"),
     Verb("calibrate-probe", "calibrate the ultrasound probe from B-scans of crossed wires"),
     Verb("measure-lag", "measure the lag of the scanner's images behind the tracked poses"),
     Verb("surface", "reconstruct the surface from a capture, rendered or real"),

@@ -26,6 +26,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "dataset": {""},
     "train": {"", "detector.safetensors", "segmenter.safetensors"},
     "calibrate-optics": {"optics.yaml"},
+    "calibrate-target": {"target.yaml"},
     "calibrate-probe": {"probe.yaml"},
     "freehand": {"sequence.igs.mha"},
 }

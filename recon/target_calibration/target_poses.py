@@ -1,0 +1,94 @@
+"""Pairs of frames from which the target is measured: both cameras see all three circles whole, in poses that differ."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.tracking.pose_fit import Sighting
+from recon.tracking.tracker import Tracking
+
+Array = NDArray[np.float64]
+
+APART_MM, APART_DEG = 2.0, 1.0  # of poses that differ: a rim in the same pixels errs in the same way
+LEAST = 8  # pairs
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A pair of frames with all six circles."""
+
+    views: tuple[Sighting, Sighting]
+    world_from_target: Array  # (4, 4) mm, as the tracker found it
+
+
+def whole(found: Tracking, cameras: tuple[Camera, Camera]) -> Seen | None:
+    """The pair if all six rims are whole, evenly lit and sharp; else None."""
+    if not (found.found and found.pose.used.all()):
+        return None
+    first, second = (view.sighting(camera) for view, camera in zip(found.views, cameras, strict=True))
+    if first.doubtful.any() or second.doubtful.any():
+        return None
+    return Seen((first, second), found.pose.world_from_target)
+
+
+def spread(pairs: Sequence[Seen], most: int) -> list[Seen]:
+    """Evenly chosen ones, not more than some."""
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int))
+    return [pairs[k] for k in chosen]
+
+
+def distinct(pairs: Sequence[Seen]) -> list[Seen]:
+    """Pairs whose poses differ from those of all before."""
+    kept: list[Seen] = []
+    for pair in pairs:
+        if not any(_alike(pair.world_from_target, other.world_from_target) for other in kept):
+            kept.append(pair)
+    return kept
+
+
+def _alike(first: Array, second: Array) -> bool:
+    step = rigid.difference(first, second)
+    return bool(np.linalg.norm(step[3:]) < APART_MM and np.degrees(np.linalg.norm(step[:3])) < APART_DEG)
+
+
+def tilt_deg(pairs: Sequence[Seen]) -> float:
+    """Standard deviation, deg, of the directions in which the target is seen, along the axis in which they differ least."""
+    directions = []
+    for pair in pairs:
+        for view in pair.views:
+            away = rigid.apply(rigid.invert(pair.world_from_target), view.camera.centre)
+            directions.append(away[:2] / np.linalg.norm(away))
+    spread = np.linalg.svd(np.array(directions) - np.mean(directions, axis=0), compute_uv=False)
+    return float(np.degrees(np.arcsin(min(spread[1] / np.sqrt(len(directions)), 1.0))))
+
+
+def range_mm(pairs: Sequence[Seen]) -> float:
+    """Distance of the nearest pose to the farthest, along camera 1's axis."""
+    depths = [rigid.apply(pair.views[0].camera.camera_from_world, pair.world_from_target[:3, 3])[2] for pair in pairs]
+    return float(np.ptp(depths))
+
+
+def check(pairs: Sequence[Seen], name: str, of: int, least_tilt_deg: float, least_range_mm: float) -> None:
+    """Refuse pairs that don't show the target from enough sides.
+
+    Raises
+    ------
+    InputError
+        If pairs, tilts or distances are missing, with what to do.
+    """
+    if len(pairs) < LEAST:
+        found = f"{len(pairs)} of {of} pairs"
+        raise InputError(f"{name}: expected {LEAST} poses in which both cameras see all three circles whole, found {found}")
+    missing = []
+    if (tilt := tilt_deg(pairs)) < least_tilt_deg:
+        missing.append(f"tilts that differ by {least_tilt_deg:g} deg (standard deviation; to all sides), found {tilt:.1f}")
+    if (reach := range_mm(pairs)) < least_range_mm:
+        missing.append(f"distances over {least_range_mm:g} mm, found {reach:.0f}")
+    if missing:
+        way = "turn the target to all sides, nearer and farther; or set least_tilt_deg, least_range_mm"
+        raise InputError(f"{name}: expected {'; and '.join(missing)}: {way}")

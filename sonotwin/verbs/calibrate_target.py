@@ -1,0 +1,88 @@
+"""Measure the probe's target as it was printed: places and diameter of its circles, and the bow of its board.
+
+Reads a capture folder with frames of both cameras (sweep/cam1, sweep/cam2) and their calibration, as `sonotwin track` does: any
+film in which both cameras see the target whole, slowly moved, tilted to all sides, nearer and farther. Writes into the folder
+`out`: target.yaml (with the covariance) and metrics.json. What is there already is replaced. Takes half a second a pose, besides
+tracking the film.
+
+    sonotwin film out=outputs/turned path.turn_deg=20 white_dn=120
+    sonotwin calibrate-target capture=outputs/turned/capture out=outputs/target
+    sonotwin track capture=outputs/film/capture target=outputs/target/target.yaml out=outputs/track
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+from rich.console import Console
+from rich.progress import Progress
+
+from recon.capture import stereo_frames, target_files
+from recon.capture.stereo_frames import Film
+from recon.files import atomic, metrics
+from recon.model.rig import Rig
+from recon.target_calibration import target_bundle, target_figures, target_poses
+from recon.target_calibration.target_poses import Seen
+from recon.tracking import networks
+from recon.tracking.tracker import Tracker
+
+TARGET = "target.yaml"  # by which the folder of a target is known
+NO_COVARIANCE = "the cameras' calibration has no covariance: its errors are not in these uncertainties"
+
+
+class Config(BaseModel):
+    """Fields of `conf/calibrate-target.yaml`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rig: Rig
+    capture: Path
+    out: Path
+    calibration: Path | None = None
+    networks: Path | None = None
+    threads: Annotated[int, Field(ge=0, le=1024)] = 0
+    most_poses: Annotated[int, Field(ge=target_poses.LEAST, le=10_000)] = 100
+    least_tilt_deg: Annotated[float, Field(ge=0, le=45)] = 5.0
+    least_range_mm: Annotated[float, Field(ge=0, le=1000)] = 20.0
+
+
+def run(config: Config) -> None:
+    """Track the film, adjust the target with a pose of each pair, and write.
+
+    Raises
+    ------
+    InputError
+        If the capture is incomplete or damaged, doesn't show the target from enough sides, or `out` can't be written to.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    inputs = [path for path in (config.capture, config.calibration, config.networks) if path is not None]
+    atomic.check_folder(config.out, TARGET, inputs=inputs)
+    film = stereo_frames.read_film(config.capture, config.calibration)
+    design = config.rig.target
+    loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
+    tracker = Tracker(film.cameras, design, loaded, film.bits, film.optics)
+    seen = collect(film, tracker, console)
+    pairs = target_poses.spread(target_poses.distinct(seen), config.most_poses)
+    console.print(f"found       {len(seen)} of {len(film.times)} pairs whole, {len(pairs)} poses that differ", markup=False)
+    target_poses.check(pairs, film.name, len(film.times), config.least_tilt_deg, config.least_range_mm)
+    with console.status("adjusting"):
+        adjusted = target_bundle.adjust(pairs, design, film.optics)
+    figures = target_figures.measure(adjusted, pairs, design)
+    for line in target_figures.describe(figures):
+        console.print(line, markup=False)
+    if film.optics is None:
+        console.print(f"warning     {NO_COVARIANCE}", markup=False)
+    with atomic.new_folder(config.out, TARGET) as folder:
+        target_files.write(folder / TARGET, adjusted.target, adjusted.covariance)
+        metrics.write(folder / metrics.FILE, figures)
+    console.print(f"wrote       {config.out}/{{{TARGET},{metrics.FILE}}}", markup=False)
+
+
+def collect(film: Film, tracker: Tracker, console: Console) -> list[Seen]:
+    """Pairs of a film in which all six circles are whole."""
+    seen = []
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        pairs = progress.track(film.pairs(), total=len(film.times), description="tracking")
+        for time, pair in zip(film.times.tolist(), pairs, strict=True):
+            seen.append(target_poses.whole(tracker.step(*pair, time * 1e-9), film.cameras))
+    return [one for one in seen if one is not None]
