@@ -1,12 +1,14 @@
-"""Accuracy under conditions of life: a lamp that flickers, light from elsewhere, phase shifts that are off."""
+"""Accuracy under conditions of life: a lamp that flickers, light from elsewhere, phase shifts that are off, imprecise prints."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from recon.tracking import networks as nets
 from scenes.catalogue import build_scene
 from scenes.kinds import plane
 from scenes.scene_types import Scene
+from twin.accuracy import target_accuracy
 from twin.accuracy.surface_accuracy import experiment, relief_noise_ratio
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation.surface_errors import rms
@@ -20,10 +22,13 @@ WHAT = "flicker of 3 %, offsets of 1 DN, shifts off by 1 % of a step"
 
 def measurements(setup: Setup) -> list[Measurement]:
     """The rows of the group, at full size; that of the real relief only where its recording is."""
+    networks = nets.load()
     return [
         lambda: compared(setup, "planes", [plane.build(pose) for pose in plane.PAPER_POSES], "plane_plate_rms_mm"),
         lambda: compared(setup, "breasts", [build_scene({"kind": "breast"})], "surface_rms_mm"),
         *([lambda: relief(setup)] if setup.real else []),
+        lambda: target_accuracy.rows(setup, networks),
+        lambda: target_accuracy.false_rows(setup, networks),
     ]
 
 

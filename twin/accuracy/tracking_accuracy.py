@@ -1,5 +1,6 @@
 """Accuracy of tracking: detection rates, circles' centres, poses, and rivals."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,8 @@ BY_EYE_PX = 2.0
 def measurements(setup: Setup) -> list[Measurement]:
     """The rows of the group, at full size, with the weights that are shipped."""
     networks = nets.load()
+    exact = setup.rig.target.model_copy(update={"tolerance_mm": 0.0})  # as it is rendered, to the last digit
+    setup = replace(setup, rig=setup.rig.model_copy(update={"target": exact}))
     return [
         lambda: detection_rates.rows(setup, networks),
         lambda: pose_accuracy.centre_rows(setup, networks),
