@@ -26,6 +26,7 @@ Guide = tuple[GrayCode | CentreLine, NDArray, int]  # the part, its images, the 
 DARKEST = 4.0  # DN of 255: default of the least modulation
 SMALLEST = 8  # px, an image's shorter side: the extent of the stencil of continuity
 WORST_SIGMA = 0.3  # rad of predicted phase noise: beyond, orders can't be decided
+LIT_SIGMA = 0.25  # rad: fringes that strong come about by noise in one pixel of 3000
 
 
 class Status(IntEnum):
@@ -71,6 +72,7 @@ class ProjectorMap:
     offset: Image  # DN
     phase: Image  # rad, wrapped, of the first axis
     status: NDArray[np.uint8]  # Status; OK where every encoded axis is
+    lit: Mask  # with fringes in every set, be they too weak to be decoded
     noise: Noise  # of one image
     summary: dict[str, int]  # pixels by status in lower case; regions, islands, disputed with a centre line
     noise_source: NoiseSource = "given"  # by the caller, measured on the fringes, or assumed, as they are too few to measure it
@@ -127,7 +129,7 @@ def decode(
     noise, source = _noise(images, parts, errors, full, noise)
     axes: dict[Axis, tuple[Image, Image]] = {}
     fringes: dict[Axis, Fringe] = {}
-    status = np.zeros(images.shape[1:], np.uint8)
+    status, lit = np.zeros(images.shape[1:], np.uint8), np.ones(images.shape[1:], bool)
     counts: Counter[str] = Counter()
     for axis in patterns.axes:
         sets = []
@@ -138,6 +140,7 @@ def decode(
                 where = f"{name}: images {place.start} to {place.stop - 1}"
                 plausibility.check_fringes(images[place], part, fringe, least, full, where, place.start)
                 sets.append((part, fringe))
+                lit &= fringe.sigma < LIT_SIGMA
         part, fringe = min(sets, key=lambda pair: pair[0].pitch)
         stage = _quality([f for _, f in sets], least)
         guides = [
@@ -154,9 +157,8 @@ def decode(
     columns, rows = axes.get("columns", (None, None)), axes.get("rows", (None, None))
     pixels = np.bincount(status.ravel(), minlength=len(Status)).tolist()
     summary = {s.name.lower(): pixels[s] for s in Status} | dict(counts)
-    return ProjectorMap(
-        columns[0], rows[0], columns[1], rows[1], first.modulation, first.offset, first.phase, status, noise, summary, source
-    )
+    shown = (first.modulation, first.offset, first.phase, status, lit)
+    return ProjectorMap(columns[0], rows[0], columns[1], rows[1], *shown, noise, summary, source)
 
 
 def _noise(

@@ -17,6 +17,7 @@ MIN_STEPS_FOR_NOISE = 8  # below eight steps no temporal harmonic is free of the
 GAMMA_HARMONICS = 3  # the highest that a gamma adds with some strength
 EVEN = 3.0  # condition number up to which shifts are even enough to tell harmonics apart: of even ones it is 1.4
 NOISIER = 1.02  # variance of the phase that being blind to them may cost
+ONE_SIGMA = 0.6827  # of normal values are within a standard deviation
 NOISE_SAMPLES = 40_000  # pixels of the estimate; enough for 1 % in the variance
 
 BRIGHTEST = 6  # row of the sums: the brightest image
@@ -298,8 +299,8 @@ def _photon_transfer(level: Image, residuals: Image) -> Noise:
     levels, variances, counts = [], [], []
     for part in np.array_split(order, min(16, max(1, len(order) // 500))):
         values = residuals[:, part].ravel()
-        limit = 4 * (np.median(np.abs(values)) / 0.6745 + 0.1)  # a clip at 4 sigma keeps the variance to 0.1 %
-        kept = values[np.abs(values) < limit]
+        scale = max(np.quantile(np.abs(values), ONE_SIGMA), np.sqrt(QUANTISATION))  # in the dark half are rounded to zero
+        kept = values[np.abs(values) < 4 * scale]  # a clip at 4 sigma keeps the variance to 0.1 %
         levels.append(level[part].mean())
         variances.append(np.mean(kept.astype(float) ** 2))
         counts.append(kept.size)

@@ -11,6 +11,15 @@ from recon.model.patterns import Patterns
 from recon.structured_light.decode import ProjectorMap, Status
 from recon.structured_light.triangulate import PointMap
 
+ADVICE = {
+    Status.DARK: "too dark: expose longer, or open the lens",
+    Status.SATURATED: "saturated: expose for less, or dim the projector",
+    Status.UNREACHABLE: "on surfaces that the centre line misses: use a sequence with Gray code or several pitches",
+    Status.UNCERTAIN: "of uncertain order, near steps or in noise",
+    Status.OUTSIDE: "out of the projector's image: check that the patterns are those projected",
+}
+SPARSE = 1 / 3  # of the lit pixels: a warning comes first where fewer are decoded
+
 
 def measure(found: ProjectorMap, raw: PointMap, cleaned: PointMap) -> Metrics:
     """Figures of a reconstruction, each named with its unit."""
@@ -18,6 +27,7 @@ def measure(found: ProjectorMap, raw: PointMap, cleaned: PointMap) -> Metrics:
     points = int(after.sum())
     return {
         "points": points,
+        "coverage_of_lit": points / max(int(np.count_nonzero(found.lit)), 1),
         "removed_px": int(before.sum()) - points,
         "unreachable_px": found.summary["unreachable"],
         "uncertain_px": found.summary["uncertain"],
@@ -39,8 +49,10 @@ def predicted_rms(mesh: trimesh.Trimesh, camera: Camera) -> float:
 
 
 def describe_decoding(patterns: Patterns, found: ProjectorMap) -> Iterator[str]:
-    """Lines: modulation and saturation of the images; regions, islands and uncertain pixels of the unwrapping."""
+    """Lines: a warning of little coverage; modulation and saturation; regions, islands and uncertain pixels of the unwrapping."""
     height, width = found.status.shape
+    if found.summary["ok"] < SPARSE * np.count_nonzero(found.lit):
+        yield _warn(found)
     lit = found.modulation[found.status != Status.DARK]
     strength = np.median(lit) if lit.size else 0.0
     saturated = 100 * found.summary["saturated"] / found.status.size
@@ -51,6 +63,14 @@ def describe_decoding(patterns: Patterns, found: ProjectorMap) -> Iterator[str]:
         notes.append(f"{regions}, {islands} left out ({found.summary['unreachable']} px)")
     notes.append(f"{found.summary['uncertain']} px uncertain")
     yield f"unwrap      {', '.join(notes)}"
+
+
+def _warn(found: ProjectorMap) -> str:
+    """The share of lit pixels that was decoded, the commonest reason for the loss of others, and the way on."""
+    outcomes = np.bincount(found.status[found.lit], minlength=len(Status))
+    share = 100 * outcomes[Status.OK] / outcomes.sum()
+    reason = max(ADVICE, key=lambda status: outcomes[status])
+    return f"coverage    only {share:.0f} % of the pixels that show fringes are decoded; most others are {ADVICE[reason]}"
 
 
 def _counted(number: int, thing: str) -> str:

@@ -103,6 +103,9 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
     if not _like(off, sigma, SIZES):
         return lost(f"circles whose sizes are {100 * np.abs(off).max():.0f} % from what their distance asks for")
     rivals = [fit for k, fit in enumerate(good) if k != best and total[k] < total[best] + DISTINCT]
+    if any(fit.merging for fit in (good[best], *rivals)):
+        turn = np.degrees(np.sqrt(np.trace(good[best].total[:3, :3])))
+        return lost(f"views that leave the target's turn uncertain by {turn:.1f} deg", good[best].misfit)
     if any(_distance2(good[best], rival) > SAME for rival in rivals):
         return lost("two poses that the circles seen do not tell apart")
     return good[best]

@@ -33,6 +33,7 @@ IMPLAUSIBLE = 1e-6  # chance of a misfit so large, by chi-square, below which it
 SUSPICIOUS = 1e-3  # chance of a misfit below which circles that are doubtful are left out, one by one
 PARAMETERS = 6
 MISFITTING = "views that no pose fits: other circles, or cameras swapped or moved"
+CURVED = 0.05  # standard deviations by which the second order may shift a pose along its least certain direction
 RANK = 1e-7  # least ratio of singular values
 
 
@@ -79,6 +80,7 @@ class TargetPose:
         default_factory=partial(np.zeros, (6, 6))
     )  # the same by tolerances of target and cameras: like in all pairs
     triangle: Triangle | None = None  # of six circles, also where they fit no pose
+    merging: bool = False  # with another pose that fits, so that its error isn't linear in the centres'
 
     @property
     def found(self) -> bool:
@@ -152,8 +154,13 @@ def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Unc
     by_centre, by_deviation = gain[:, : len(noise)] @ whiten, gain[:, len(noise) :]
     covariance = by_centre @ noise @ by_centre.T
     shared = by_centre @ cameras @ by_centre.T + by_deviation @ by_deviation.T
+    merging = False
+    if freedom < PARAMETERS:
+        step, bend = _bend(guess, problem)
+        merging = not abs(bend @ step) < CURVED * (step @ step)
+        shared = shared + 2 * np.outer(bend, bend)[:PARAMETERS, :PARAMETERS]  # 2 is the variance of a normal number's square
     used = np.stack([view.seen for view in views])
-    return TargetPose(pose, covariance, misfit, freedom=freedom, used=used, shared=shared, triangle=triangle)
+    return TargetPose(pose, covariance, misfit, None, freedom, used, shared, triangle, merging)
 
 
 def _optics_covariance(pose: Array, views: Sequence[Sighting], circles: Circles, optics: Uncertainty | None) -> Array:
@@ -203,6 +210,19 @@ def _moved(guess: _Guess, step: Array) -> _Guess:
 
 def _settled(system: tuple[Array, Array], step: Array) -> bool:
     return bool(np.sum((system[0] @ step) ** 2) < SETTLED)
+
+
+def _bend(guess: _Guess, problem: _Problem) -> tuple[Array, Array]:
+    """Standard deviation along the least certain direction : (6 + k,), and the second order's shift over it : (6 + k,).
+
+    With one circle missing, two tilts may fit, and merge where the other view sees the target face on: there the shift is large.
+    Source: Bates and Watts 1980 (parameter-effects curvature).
+    """
+    design, residual = _linearised(guess, problem)
+    left, singular, directions = np.linalg.svd(design, full_matrices=False)
+    step = directions[-1] / singular[-1]
+    ahead, behind = (_linearised(_moved(guess, side * step), problem)[1] for side in (1, -1))
+    return step, directions.T @ (left.T @ ((ahead + behind) / 2 - residual) / singular)
 
 
 def _triangle(guess: _Guess, problem: _Problem) -> Triangle | None:

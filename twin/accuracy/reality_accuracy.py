@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from recon.errors import InputError
 from recon.tracking import networks as nets
 from scenes.catalogue import build_scene
 from scenes.kinds import plane
@@ -16,6 +17,8 @@ from twin.optics.conditions import Conditions, Frames
 from twin.optics.surface_session import Shooting
 
 SEEDS = range(100, 110)  # of conditions that nothing was tried on
+EXPOSURES_S = (2e-4, 5e-4, 1e-3, 1.4e-3, 2e-3, 4e-3, 8e-3, 1.6e-2)
+FEWEST = 2000  # points whose spread is known to 5 %, though neighbours share theirs
 DISTURBED = Conditions(frames=Frames(flicker=0.03, stray_dn=1.0, shift=0.01))
 WHAT = "flicker of 3 %, offsets of 1 DN, shifts off by 1 % of a step"
 
@@ -27,6 +30,7 @@ def measurements(setup: Setup) -> list[Measurement]:
         lambda: compared(setup, "planes", [plane.build(pose) for pose in plane.PAPER_POSES], "plane_plate_rms_mm"),
         lambda: compared(setup, "breasts", [build_scene({"kind": "breast"})], "surface_rms_mm"),
         *([lambda: relief(setup)] if setup.real else []),
+        lambda: exposed(setup),
         lambda: target_accuracy.rows(setup, networks),
         lambda: target_accuracy.false_rows(setup, networks),
     ]
@@ -50,6 +54,31 @@ def compared(setup: Setup, name: str, scenes: Sequence[Scene], figure: str) -> l
         Row("c", f"{what}: spread of error / predicted sigma, least", min(spreads), 0.95, 1.0, "", at_least=True),
         Row("c", f"{what}: spread of error / predicted sigma, largest", max(spreads), 1.05, 1.0, ""),
         Row("c", f"{what}: mean error, of mean shifts that no image shows: RMS", rms(np.array(means)), None, None, "mm"),
+    ]
+
+
+def exposed(setup: Setup) -> list[Row]:
+    """Row d: exposures from fringes of a digital number to those that fill the range, on planes, a sphere and the breast."""
+    scenes = [plane.build(plane.PAPER_POSES[0]), build_scene({"kind": "sphere"}), build_scene({"kind": "breast"})]
+    spreads, differences, refused = [], [], 0
+    for seed in SEEDS:
+        for time_s in EXPOSURES_S:
+            shooting = Shooting(exposure_s=time_s)
+            try:
+                shot = experiment(setup.rig, scenes[seed % 3], setup.sequences["paper_surface"], seed, shooting=shooting)
+            except InputError:
+                refused += 1
+                continue
+            points = np.isfinite(shot.points.sigma)
+            differences.append(np.count_nonzero(points) / np.count_nonzero(shot.found.lit) - shot.metrics["coverage"])
+            if np.count_nonzero(points) >= FEWEST:
+                spreads.append(shot.metrics["z_std"])
+    what = f"exposures of {1e3 * min(EXPOSURES_S):g} to {1e3 * max(EXPOSURES_S):g} ms"
+    return [
+        Row("d", f"{what}: spread of error / predicted sigma, least", min(spreads), 0.9, 1.0, "", at_least=True),
+        Row("d", f"{what}: spread of error / predicted sigma, largest", max(spreads), 1.15, 1.0, ""),
+        Row("d", f"{what}: reported coverage less the true one, largest", float(np.abs(differences).max()), 0.05, 0.0, ""),
+        Row("d", f"{what}: refused as too dark, of {len(SEEDS) * len(EXPOSURES_S)}", refused, None, None, ""),
     ]
 
 

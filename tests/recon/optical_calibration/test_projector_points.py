@@ -57,7 +57,7 @@ def projector_map(x, image, rng=None, factor=1.0):
     noisy = x if rng is None else x + factor * sigma[..., None] * rng.normal(size=x.shape)
     columns, rows, sigma = (np.ascontiguousarray(m, np.float32) for m in (noisy[..., 0], noisy[..., 1], sigma))
     status = np.zeros(image.shape, np.uint8)
-    return ProjectorMap(columns, rows, sigma, sigma.copy(), sigma, sigma, sigma, status, Noise(1, 0), {})
+    return ProjectorMap(columns, rows, sigma, sigma.copy(), sigma, sigma, sigma, status, status == 0, Noise(1, 0), {})
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +167,9 @@ def test_border_of_the_view_gives_nothing(tilted, rng):
 def test_both_axes_are_needed(tilted):
     x, image, centres, _, _ = tilted
     found = projector_map(x, image)
-    half = ProjectorMap(found.columns, None, found.sigma_columns, None, *(found.modulation,) * 3, found.status, found.noise, {})
+    half = ProjectorMap(
+        found.columns, None, found.sigma_columns, None, *(found.modulation,) * 3, found.status, found.lit, found.noise, {}
+    )
     with pytest.raises(InputError, match="both axes, found none of rows"):
         correspondences(half, image, centres, 38.0)
     with pytest.raises(InputError, match="lit image: expected 740x640 grey"):

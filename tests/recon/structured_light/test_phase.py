@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.structured_light.phase import Noise, estimate_noise, phase_weights, pseudo_inverse, wrapped_phase
+from recon.structured_light.phase import QUANTISATION, Noise, estimate_noise, phase_weights, pseudo_inverse, wrapped_phase
 
 NOISE = Noise(0.5, 0.033)
 
@@ -104,6 +104,19 @@ def test_noise_is_measured_through_flicker(rng):
     found = estimate_noise(noisy(images, rng, truth), shifts)
     assert found is not None
     assert found.read_variance + found.gain * 100 == pytest.approx(truth.read_variance + truth.gain * 100, rel=0.05)
+
+
+@pytest.mark.parametrize("darkest", [1.5, 2.5])
+def test_noise_is_measured_in_the_dark(rng, darkest):
+    """Rounded to whole digital numbers, more than half of the residuals are zero; the variance is right to 10 % all the same."""
+    shifts, truth = np.pi * np.arange(8) / 4, Noise(0.02 + QUANTISATION, 0.03)
+    v, u = np.mgrid[:512, :640]
+    level = darkest + 2 * u / 640
+    found = estimate_noise(noisy(level * (1 + 0.4 * np.cos(0.3 * v + 0.05 * u + shifts[:, None, None])), rng, truth), shifts)
+    assert found is not None
+    for dark in (darkest + 0.5, darkest + 1.5):
+        expected = truth.read_variance + truth.gain * dark
+        assert found.read_variance + found.gain * dark == pytest.approx(expected, rel=0.1)
 
 
 def test_too_few_steps_measure_no_noise(rng):

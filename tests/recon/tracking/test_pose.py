@@ -163,7 +163,7 @@ def face_on(camera, rng, tilt_deg):
     return rigid.transform((facing * lean).as_matrix(), place[:3, 3])
 
 
-@pytest.mark.parametrize(("tilt_deg", "least"), [(0.0, 0.5), (2.5, 0.85), (10.0, 0.95)])
+@pytest.mark.parametrize(("tilt_deg", "least"), [(0.0, 0.4), (2.5, 0.7), (10.0, 0.95)])
 def test_two_tilts_are_told_apart_or_refused(cameras, target, rng, tilt_deg, least):
     """Where the whole view sees the target nearly face on, both tilts fit its centres; shapes are 0.1 px off."""
     squared = []
@@ -175,12 +175,30 @@ def test_two_tilts_are_told_apart_or_refused(cameras, target, rng, tilt_deg, lea
             noise = 0.1 * rng.standard_normal((3, 2, 2))
             view.shapes[:] += (noise + np.swapaxes(noise, 1, 2)) / 2
         found = pose.estimate(*views, target)
-        assert found.found or "two poses" in found.reason or "no pose fits" in found.reason
+        reasons = ("two poses", "no pose fits", "a misfit", "turn uncertain")
+        assert found.found or any(why in found.reason for why in reasons), found.reason
         if found.found:
             off = error(found.world_from_target, true)
             squared.append(off @ np.linalg.solve(found.covariance, off))
     assert len(squared) >= least * POSES
     assert np.mean(np.array(squared) < chi2.ppf(0.95, 6)) > 0.85 and max(squared) < 100
+
+
+def test_a_turn_that_is_hardly_determined_is_refused(cameras, target, rng):
+    """Where two tilts merge, tolerances of the design leave the turn open by degrees; what is found keeps to its covariance."""
+    design, squared, reasons = target.model_copy(update={"tolerance_mm": 0.1}), [], []
+    for _ in range(2 * POSES):
+        true = face_on(cameras[0], rng, rng.uniform(0, 6))
+        views = seen(cameras, printed(design, rng), true, rng)
+        views[1].centres[rng.integers(3)] = np.nan
+        found = pose.estimate(*views, design)
+        if found.found:
+            off = error(found.world_from_target, true)
+            squared.append(off @ np.linalg.solve(found.total, off))
+        reasons.append(str(found.reason))
+    assert len(squared) > POSES / 2
+    assert any("turn uncertain" in reason for reason in reasons)
+    assert np.mean(np.array(squared) < chi2.ppf(0.95, 6)) > 0.65 and max(squared) < 100  # to first order, 0.5 and 2000
 
 
 def test_without_shapes_two_tilts_are_not_told_apart(cameras, target, rng):

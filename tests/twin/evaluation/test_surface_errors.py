@@ -162,6 +162,7 @@ def test_the_limit_is_what_noisy_projector_coordinates_do_to_the_surface(truth, 
         nothing,
         nothing,
         np.zeros(shape, np.uint8),
+        truth.lit,
         DEFAULT_NOISE,
         {},
     )
