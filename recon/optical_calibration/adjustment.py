@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from recon.geometry.camera_jacobian import MATRIX, MOTION
 from recon.geometry.levenberg_marquardt import Descent, Rules, Unreachable, descend
 from recon.model.calibration import Calibration, Uncertainty
-from recon.optical_calibration.bundle import ROBUST, Array, Estimate, Problem, Shape, System, linearised, stepped
+from recon.optical_calibration.board_shape import AS_DESIGNED, Tolerances
+from recon.optical_calibration.bundle import ROBUST, Array, Estimate, Problem, System, linearised, stepped
 from recon.optical_calibration.observations import PROJECTOR, Observations
 
 Mask = NDArray[np.bool_]
@@ -56,7 +57,8 @@ def adjust(
     start: Estimate,
     free: Mapping[str, Sequence[str]],
     offsets: Array | None = None,
-    shape: Shape | None = None,
+    tolerances: Tolerances | None = None,
+    released: bool = False,
 ) -> Adjustment:
     """Adjust devices, poses and shape to the observations.
 
@@ -71,9 +73,11 @@ def adjust(
         it has no motion to adjust.
     offsets : (p, n, d, 2) px, optional
         From where a device would see a point to where the detection puts it: see `circles.centre_offsets`.
-    shape : Shape, optional
-        Of the board. A released shape is held to its design by its standard deviations; one that is not released adds what
-        they leave unknown to the covariance ("consider parameters", Schmidt 1966).
+    tolerances : Tolerances, optional
+        Of the board.
+    released : bool
+        Whether the board's points are adjusted, too, held to their design by the tolerances. If not, the tolerances' effect is
+        added to the covariance ("consider parameters", Schmidt 1966).
 
     Returns
     -------
@@ -85,9 +89,9 @@ def adjust(
         If the observations don't determine the unknowns.
     """
     offsets = np.zeros_like(observations.pixels) if offsets is None else offsets
-    problem = Problem(observations, offsets, free, shape or Shape())
+    problem = Problem(observations, offsets, free, tolerances or AS_DESIGNED, released)
     estimate, noise, converged = fitted(problem, start)
-    system = linearised(problem, estimate, noise, shaped=bool(problem.shape.sigma.any()))
+    system = linearised(problem, estimate, noise, shaped=released or bool(problem.tolerances.sigmas.any()))
     return Adjustment(
         Calibration(estimate.cameras, Uncertainty(problem.names, _covariance(system, problem))),
         estimate.poses,
@@ -139,7 +143,7 @@ def _descend(problem: Problem, estimate: Estimate, noise: Array, rules: Rules) -
     prior = _prior(problem)
 
     def system_and_cost(estimate: Estimate) -> tuple[System, float]:
-        system = linearised(problem, estimate, noise, problem.shape.released)
+        system = linearised(problem, estimate, noise, problem.released)
         return system, _cost(system, estimate, problem, prior)
 
     def step(estimate: Estimate, system: System, damping: float) -> tuple[Array, Array]:
@@ -150,14 +154,14 @@ def _descend(problem: Problem, estimate: Estimate, noise: Array, rules: Rules) -
 
 def _prior(problem: Problem) -> Array:
     """Information on the board's points : (3 n, 3 n) 1/mm^2 if they are released, else (0, 0)."""
-    if not problem.shape.released:
+    if not problem.released:
         return np.zeros((0, 0))
-    return np.linalg.inv(problem.shape.covariance(problem.observations.points))
+    return np.linalg.inv(problem.tolerances.covariance(problem.observations.points))
 
 
 def _deviation(estimate: Estimate, problem: Problem) -> Array:
     """Of the board's points from their design : (3 n,) mm if they are released, else (0,)."""
-    return (estimate.points - problem.observations.points).ravel() if problem.shape.released else np.zeros(0)
+    return (estimate.points - problem.observations.points).ravel() if problem.released else np.zeros(0)
 
 
 def _cost(system: System, estimate: Estimate, problem: Problem, prior: Array) -> float:
@@ -208,10 +212,11 @@ def _measured_noise(system: System, problem: Problem) -> Array:
     """Noise of each device on the residuals over the noise assumed : (d,); 1 for a device that sees nothing.
 
     The median is used, as it doesn't mind outliers. The unknowns take their part of the residuals, evenly; a released board has
-    three a point, less the six of its place, which the poses have already.
+    three a point, less the six of its place, which the poses have already, or fewer, if tolerances hold it.
     """
     used = problem.observations.used
-    board = 3 * used.shape[1] - 6 if problem.shape.released else 0
+    wide = problem.tolerances.determined is None
+    board = (3 * used.shape[1] - 6 if wide else problem.tolerances.determined) if problem.released else 0
     unknowns = len(problem.names) + board + 6 * np.count_nonzero(used.any(axis=(1, 2)))
     left = 1 - unknowns / max(2 * np.count_nonzero(used), 1)
     if left <= 0:
@@ -221,18 +226,39 @@ def _measured_noise(system: System, problem: Problem) -> Array:
     return np.maximum(factors, LEAST_NOISE)
 
 
+def board_information(
+    observations: Observations, adjusted: Adjustment, free: Mapping[str, Sequence[str]], offsets: Array
+) -> tuple[Array, Array]:
+    """Information of the sightings alone on board points : (3 n, 3 n), 1/mm^2, and times their departures : (3 n,), 1/mm."""
+    problem = Problem(observations, offsets, free, released=True)
+    system = linearised(problem, adjusted.estimate, np.array(list(adjusted.noise.values())), shaped=True)
+    own, (reduced, right) = len(problem.names), _without_poses(system)
+    devices = _inverse(reduced[:own, :own])
+    information = reduced[own:, own:] - reduced[own:, :own] @ devices @ reduced[:own, own:]
+    return information, right[own:] - reduced[own:, :own] @ devices @ right[:own] + information @ _deviation(
+        adjusted.estimate, problem
+    )
+
+
+def _without_poses(system: System) -> tuple[Array, Array]:
+    """Normal equations of the shared unknowns : (g, g), (g,), the poses eliminated."""
+    equations = system.equations
+    each = np.concatenate([equations.cross.swapaxes(1, 2), equations.pose_right[..., None]], axis=2)
+    eliminate = np.linalg.solve(equations.corner + TINY * np.eye(6), each)
+    alone = np.einsum("pga,pa->g", equations.cross, eliminate[..., -1])
+    return equations.shared - _sum_of_products(equations.cross, eliminate[..., :-1]), equations.right - alone
+
+
 def _covariance(system: System, problem: Problem) -> Array:
     """Covariance of the devices' parameters : (g, g)."""
-    own, equations = len(problem.names), system.equations
-    eliminate = np.linalg.solve(equations.corner + TINY * np.eye(6), equations.cross.swapaxes(1, 2))
-    reduced = equations.shared - _sum_of_products(equations.cross, eliminate)
-    if problem.shape.released:
+    own, (reduced, _) = len(problem.names), _without_poses(system)
+    if problem.released:
         reduced[own:, own:] += _prior(problem)
         return _inverse(reduced)[:own, :own]
     covariance = _inverse(reduced[:own, :own])
     if len(reduced) > own:  # errors of the board that are not estimated carry over to the parameters
         carried = covariance @ reduced[:own, own:]
-        covariance = covariance + carried @ problem.shape.covariance(problem.observations.points) @ carried.T
+        covariance = covariance + carried @ problem.tolerances.covariance(problem.observations.points) @ carried.T
     return covariance
 
 

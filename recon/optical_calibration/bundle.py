@@ -11,44 +11,14 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise, moved
 from recon.geometry.levenberg_marquardt import Unreachable
-from recon.model.rig import NotNegative, Part
+from recon.optical_calibration.board_shape import AS_DESIGNED, Tolerances
 from recon.optical_calibration.normal_equations import Equations, Sightings, added_up
 from recon.optical_calibration.observations import PROJECTOR, Observations
 
 Array = NDArray[np.float64]
 
 ROBUST = 3.0  # normalised residual beyond which a sighting loses weight (Huber); 1 % of Gaussian ones are beyond
-BENT = 0.9  # of a board's variance out of its plane: bending, which neighbours share
-WIDE_MM = np.array([0.1, 0.1, 1.0])  # of a released shape of which nothing is said
 FLOOR_PX = 1e-4  # no sighting counts as more exact than this
-
-
-class Shape(Part):
-    """Prior of the board's shape: standard deviations of its points' distances from their design.
-
-    Print errors are each point's own. A board that isn't flat is bent: nine tenths of the variance out of the plane belong to the
-    three ways of bending it (along x, along y, as a saddle), one tenth is each point's own.
-    """
-
-    released: bool = False  # estimate the shape with the rest; else it is taken as designed
-    in_plane_mm: NotNegative = 0.0  # of each point, in x and in y: print
-    out_of_plane_mm: NotNegative = 0.0  # of each point: flatness
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations : (3,) mm; those of a released shape are wide if none are given."""
-        given = np.array([self.in_plane_mm, self.in_plane_mm, self.out_of_plane_mm])
-        return np.where(given > 0, given, WIDE_MM) if self.released else given
-
-    def covariance(self, design: Array) -> Array:
-        """Covariance : (3 n, 3 n) mm^2 of all points' coordinates, for a board of that design : (n, 3) mm."""
-        x, y = ((design - design.mean(axis=0)) / (np.ptp(design, axis=0) / 2 + 1e-9)).T[:2]
-        bends = np.column_stack([x**2, x * y, y**2])
-        bends /= np.sqrt(3 * np.mean(bends**2, axis=0))
-        covariance = np.diag(np.tile(self.sigma**2, len(design)))
-        out = np.arange(2, 3 * len(design), 3)
-        covariance[np.ix_(out, out)] = self.sigma[2] ** 2 * (BENT * bends @ bends.T + (1 - BENT) * np.eye(len(design)))
-        return covariance
 
 
 @dataclass(frozen=True)
@@ -67,7 +37,8 @@ class Problem:
     observations: Observations
     offsets: Array  # (p, n, d, 2) px, from where a device would see a point to where the detection puts it
     free: Mapping[str, Sequence[str]]  # device: parameters
-    shape: Shape
+    tolerances: Tolerances = AS_DESIGNED  # of the board
+    released: bool = False  # the board's points are among the unknowns, held by the tolerances
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -135,5 +106,5 @@ def stepped(problem: Problem, estimate: Estimate, shared: Array, poses: Array) -
             raise Unreachable(f"{device}: a focal length that is not positive")
         cameras[device] = moved(cameras[device], names, step) if names else cameras[device]
         at += len(names)
-    points = estimate.points + shared[at:].reshape(-1, 3) if problem.shape.released else estimate.points
+    points = estimate.points + shared[at:].reshape(-1, 3) if problem.released else estimate.points
     return Estimate(cameras, rigid.moved(estimate.poses, poses), points)

@@ -94,6 +94,7 @@ def opening(result: Result, metrics: Metrics) -> Opening:
         here = shown(metrics["point_error_rms_mm"], ".3f", " mm")
         shape = shown(metrics["shape_error_rms_mm"], ".4f", " mm")
         text += f"; against the true rig it is off by {here} and {shape}"
+    text += f". The board {figures_of_merit.describe_board(result, metrics)}"
     if result.warnings:
         text += ". Mind the warnings below"
     numbers = [

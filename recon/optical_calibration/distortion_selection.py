@@ -7,7 +7,7 @@ import numpy as np
 
 from recon.geometry.camera import Camera
 from recon.optical_calibration.adjustment import OUTLIER, fitted, free_parameters
-from recon.optical_calibration.bundle import Array, Estimate, Problem, Shape, linearised
+from recon.optical_calibration.bundle import Array, Estimate, Problem, linearised
 from recon.optical_calibration.observations import Observations
 
 ModelName = Literal["none", "radial1", "radial2", "decentred", "brown", "rational", "thin_prism", "tilted"]
@@ -81,11 +81,11 @@ def held_out(own: Observations, start: Estimate, offsets: Array) -> dict[ModelNa
     for fold in range(min(FOLDS, len(own.poses))):
         left_out = np.arange(fold, len(own.poses), FOLDS)
         rest = np.setdiff1d(np.arange(len(own.poses)), left_out)
-        known, alone = own.of_poses(rest), Problem(own.of_poses(left_out), offsets[left_out], {}, Shape())
+        known, alone = own.of_poses(rest), Problem(own.of_poses(left_out), offsets[left_out], {})
         fit, place = replace(start, poses=start.poses[rest]), start.poses[left_out]
         for name in TRIED:
             free = free_parameters(own.devices, dict.fromkeys(own.devices, MODELS[name]))
-            fit, noise, _ = fitted(Problem(known, offsets[rest], free, Shape()), fit)
+            fit, noise, _ = fitted(Problem(known, offsets[rest], free), fit)
             laid, noise, _ = fitted(alone, replace(fit, poses=place), noise, CONVERGED)
             errors[name][left_out], place = _squares(alone, laid, noise), laid.poses
     return errors

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recon.files.metrics import Metrics
+from recon.files.metrics import Metrics, shown
 from recon.geometry.camera import Array, Camera
 from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION, linearise
 from recon.model.calibration import Calibration
 from recon.optical_calibration import optical_checks, uncertainty
-from recon.optical_calibration.joint_calibration import Result, deviation
+from recon.optical_calibration.joint_calibration import Result, departure, deviation
 from recon.optical_calibration.observations import PROJECTOR
 from recon.optical_calibration.uncertainty import rigid_modes
 
@@ -66,10 +66,20 @@ def measure(result: Result, truth: Calibration | None = None) -> Metrics:
     figures["point_sigma_mm"] = _rms(uncertainty.triangulation(found, *pair, volume))
     figures["shape_sigma_mm"] = _rms(uncertainty.shape(found, *pair, volume, volume))
     figures["scale_sigma_ppm"] = 1e6 * uncertainty.scale(found, *pair, volume)
+    in_plane, out_of_plane = departure(result.adjustment.points, result.observations.points)
+    figures["board_in_plane_mm"], figures["board_out_of_plane_mm"] = in_plane, out_of_plane
     if np.isfinite(result.halves).all():
         figures["halves_rms_sigma"] = float(np.sqrt(np.mean(result.halves**2)))
         figures["halves_worst_sigma"] = float(np.abs(result.halves).max())
     return figures if truth is None else figures | errors(found, truth, volume)
+
+
+def describe_board(result: Result, figures: Metrics) -> str:
+    """The board's departure from its design, in words."""
+    if not result.released:
+        return "taken as designed"
+    in_plane, out_of_plane = (shown(figures[f"board_{name}_mm"], ".4f", " mm") for name in ("in_plane", "out_of_plane"))
+    return f"differs from its design by {in_plane} in its plane and {out_of_plane} out of it (RMS), which is corrected"
 
 
 def errors(found: Calibration, truth: Calibration, volume: Array) -> Metrics:

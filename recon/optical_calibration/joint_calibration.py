@@ -12,19 +12,35 @@ from recon.geometry.camera_jacobian import difference
 from recon.geometry.circle_projection import centre_offsets
 from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
 from recon.model.calibration import Calibration
-from recon.model.rig import Part
-from recon.optical_calibration import initial_estimate
+from recon.model.rig import NotNegative, Part
+from recon.optical_calibration import board_shape, initial_estimate
 from recon.optical_calibration import optical_checks as checks
-from recon.optical_calibration.adjustment import Adjustment, adjust, free_parameters
-from recon.optical_calibration.bundle import Array, Estimate, Shape
+from recon.optical_calibration.adjustment import Adjustment, adjust, board_information, free_parameters
+from recon.optical_calibration.board_shape import Tolerances
+from recon.optical_calibration.bundle import Array, Estimate
 from recon.optical_calibration.distortion_selection import MODELS, ModelName, choose
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
 from recon.optical_calibration.sightings import Sighting, gather, without_scraps
 
 FIRST_MODEL: ModelName = "brown"  # until one is chosen
 BAD_POSE = 5.0  # times the noise: median residual of a pose in one device that doesn't fit the others
-BENT_POINTS = 200  # of a board whose shape is looked at without being asked to
-BENT = 1.3  # times less noise with the board's shape released, that tell of a board unlike its design
+MANY_POINTS = 400  # of a board: the shape of one with more takes too long to find
+ENOUGH = 2.0  # sightings' coordinates an unknown, the board's points among these, to find its shape by
+BENT = 0.9  # of a flatness tolerance's variance: bowing, which neighbours share
+
+
+class Shape(Part):
+    """The board's shape: found with the rest, held by its tolerances, or taken as designed."""
+
+    released: bool = True
+    in_plane_mm: NotNegative = 0.0  # standard deviation of each point in x and in y: print; 0 if it is to be found, or exact
+    out_of_plane_mm: NotNegative = 0.0  # of each point: flatness; the same
+
+    @property
+    def tolerances(self) -> Tolerances:
+        """Those that are given."""
+        bow, dent = np.sqrt(BENT / 3) * self.out_of_plane_mm, np.sqrt(1 - BENT) * self.out_of_plane_mm
+        return Tolerances(print_mm=self.in_plane_mm, bow_mm=float(bow), dent_mm=float(dent))
 
 
 class Settings(Part):
@@ -47,6 +63,8 @@ class Result:
     warnings: tuple[str, ...]
     offsets: Array  # (p, n, d, 2) px, from the projected centres of circles to those of their ellipses
     board: Board
+    tolerances: Tolerances  # of the board, as given or as the sightings show
+    released: bool  # the board's points were adjusted
 
     @property
     def rms(self) -> dict[str, float]:
@@ -100,19 +118,46 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     adjusted, observations, contradicting = _consistent(observations, first, free, board, name)
     checks.refuse_unusable(observations, name)
     estimate, offsets = adjusted.estimate, circle_offsets(observations, adjusted.estimate, board)
-    estimate = adjust(observations, estimate, free, offsets, settings.shape).estimate
+    released = settings.shape.released and _tell_shape(observations)
+    tolerances = settings.shape.tolerances
+    estimate, tolerances = _shaped(observations, estimate, free, offsets, settings.shape) if released else (estimate, tolerances)
+    estimate = adjust(observations, estimate, free, offsets, tolerances, released).estimate
     offsets = circle_offsets(observations, estimate, board)
     model, scores = _models(observations, estimate, offsets, settings)
     free = _free(observations, model)
     bare = _without_distortion(estimate)
-    adjusted = adjust(observations, bare, free, offsets, settings.shape)
+    adjusted = adjust(observations, bare, free, offsets, tolerances, released)
     offsets = circle_offsets(observations, adjusted.estimate, board)
-    adjusted = adjust(observations, adjusted.estimate, free, offsets, settings.shape)
-    halves = compare_halves(observations, adjusted, free, offsets, settings.shape)
-    found = checks.warnings(observations, adjusted, settings.shape) + ([size_warning] if size_warning else [])
-    if not settings.shape.released and (bent := _bent(observations, adjusted, free, offsets)):
-        found.append(bent)
-    return Result(observations, adjusted, model, scores, dropped | contradicting, halves, tuple(found), offsets, board)
+    if released:
+        tolerances = _tolerances(observations, adjusted, free, offsets, settings.shape)
+    adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released)
+    halves = compare_halves(observations, adjusted, free, offsets, tolerances, released)
+    found = checks.warnings(observations, adjusted) + ([size_warning] if size_warning else [])
+    dropped |= contradicting
+    return Result(observations, adjusted, model, scores, dropped, halves, tuple(found), offsets, board, tolerances, released)
+
+
+def _tell_shape(observations: Observations) -> bool:
+    """Whether there are sightings enough to find the board's shape by."""
+    points, poses = observations.used.shape[1], np.count_nonzero(observations.used.any(axis=(1, 2)))
+    unknowns = 3 * points + 6 * poses + 15 * len(observations.devices)
+    return bool(points <= MANY_POINTS and 2 * np.count_nonzero(observations.used) > ENOUGH * unknowns)
+
+
+def _shaped(
+    observations: Observations, start: Estimate, free: Mapping[str, Sequence[str]], offsets: Array, shape: Shape
+) -> tuple[Estimate, Tolerances]:
+    """The board's shape, first held by wide tolerances, and the tolerances that it shows."""
+    adjusted = adjust(observations, start, free, offsets, board_shape.WIDE, released=True)
+    return adjusted.estimate, _tolerances(observations, adjusted, free, offsets, shape)
+
+
+def _tolerances(
+    observations: Observations, adjusted: Adjustment, free: Mapping[str, Sequence[str]], offsets: Array, shape: Shape
+) -> Tolerances:
+    """Tolerances of the board by the evidence of the sightings."""
+    information, pull = board_information(observations, adjusted, free, offsets)
+    return board_shape.estimated(information, pull, observations.points, shape.tolerances)
 
 
 def circle_offsets(observations: Observations, estimate: Estimate, board: Board) -> Array:
@@ -140,7 +185,12 @@ def reprojection_rms(observations: Observations, adjusted: Adjustment) -> dict[s
 
 
 def compare_halves(
-    observations: Observations, adjusted: Adjustment, free: Mapping[str, Sequence[str]], offsets: Array, shape: Shape
+    observations: Observations,
+    adjusted: Adjustment,
+    free: Mapping[str, Sequence[str]],
+    offsets: Array,
+    tolerances: Tolerances | None = None,
+    released: bool = False,
 ) -> Array:
     """Calibrate every other pose, and the rest, and compare : (g,) differences over their predicted standard deviation.
 
@@ -152,11 +202,11 @@ def compare_halves(
     halves = [np.arange(first, len(observations.poses), 2) for first in (0, 1)]
     if min(observations.seen[half].any(axis=1).sum(axis=0).min() for half in halves) < checks.FEWEST_POSES:
         return np.full(len(uncertainty.names), np.nan)
-    alone = shape if shape.released else Shape()  # a tolerance of the board is common to both halves
+    alone = tolerances if released else None  # of a board as designed the tolerances are common to both halves
     fits = []
     for half in halves:
         begin = Estimate(adjusted.calibration.cameras, adjusted.poses[half], adjusted.points)
-        fits.append(adjust(observations.of_poses(half), begin, free, offsets[half], alone))
+        fits.append(adjust(observations.of_poses(half), begin, free, offsets[half], alone, released))
     first, second = (fit.calibration for fit in fits)
     assert first.uncertainty is not None and second.uncertainty is not None
     variance = np.diag(first.uncertainty.covariance) + np.diag(second.uncertainty.covariance)
@@ -227,24 +277,6 @@ def _models(
 def _without_distortion(estimate: Estimate) -> Estimate:
     cameras = {device: replace(camera, distortion=np.zeros(0)) for device, camera in estimate.cameras.items()}
     return Estimate(cameras, estimate.poses, estimate.points)
-
-
-def _bent(observations: Observations, adjusted: Adjustment, free: Mapping[str, Sequence[str]], offsets: Array) -> str | None:
-    """A warning if the sightings fit another shape of the board far better than the designed one.
-
-    Few poses don't tell, and a board of very many points would take more memory than the question is worth.
-    """
-    if len(observations.poses) < checks.FEW_POSES or len(observations.points) > BENT_POINTS:
-        return None
-    released = adjust(observations, adjusted.estimate, free, offsets, Shape(released=True))
-    noise = np.array([[fit.noise[device] for device in observations.devices] for fit in (adjusted, released)])
-    if (noise[0] / noise[1]).max() < BENT:
-        return None
-    in_plane, out_of_plane = departure(released.points, observations.points)
-    return (
-        f"the board seems to differ from its design by {in_plane:.3f} mm in its plane and {out_of_plane:.3f} mm out of it (RMS): "
-        "release its shape (shape.released=true), or measure it"
-    )
 
 
 def departure(points: Array, design: Array) -> tuple[float, float]:

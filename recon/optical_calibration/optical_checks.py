@@ -10,7 +10,7 @@ from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
 from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
 from recon.optical_calibration.adjustment import Adjustment
-from recon.optical_calibration.bundle import Array, Estimate, Shape
+from recon.optical_calibration.bundle import Array, Estimate
 from recon.optical_calibration.observations import PROJECTOR, Observations
 
 FEWEST_POSES = 3
@@ -110,13 +110,9 @@ def refuse_wrong_size(board: Board, radii: Sequence[Mapping[str, Array]], start:
     return f"{text}: measure the board" if abs(ratio - 1) > DIAMETER_DOUBTED else None
 
 
-def warnings(observations: Observations, adjustment: Adjustment, shape: Shape) -> list[str]:
+def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
     """Warnings about a calibration, each with a cause."""
     found = []
-    if shape.released and len(observations.poses) < FEW_POSES:
-        found.append(
-            f"the board's shape is released on {len(observations.poses)} poses: {FEW_POSES} or more are needed to tell it"
-        )
     if len(observations.poses) < FEW_POSES:
         found.append(f"only {len(observations.poses)} poses: {FEW_POSES} to 40 are usual")
     if not adjustment.converged:

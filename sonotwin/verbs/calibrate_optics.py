@@ -107,6 +107,7 @@ def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
     remaining = ", ".join(f"{device} {shown(figures[f'reprojection_rms_{device}_px'], '.4f')}" for device in devices)
     models = ", ".join(dict.fromkeys(result.model[device] for device in devices))
     yield f"adjust      {figures['poses']} poses, {models}; reprojection RMS {remaining} px; {seconds:.0f} s"
+    yield f"board       {figures_of_merit.describe_board(result, figures)}"
     point, shape = (shown(figures[f"{name}_sigma_mm"], ".4f", " mm") for name in ("point", "shape"))
     yield f"uncertain   point {point}, within a shape {shape}, scale {shown(figures['scale_sigma_ppm'], '.0f', ' ppm')} (1 sigma)"
     if "point_error_rms_mm" in figures:

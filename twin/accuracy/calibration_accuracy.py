@@ -16,9 +16,8 @@ from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 from recon.optical_calibration import uncertainty
 from recon.optical_calibration.adjustment import adjust, free_parameters
-from recon.optical_calibration.bundle import Shape
 from recon.optical_calibration.distortion_selection import MODELS
-from recon.optical_calibration.joint_calibration import Result, Settings, calibrate, deviation
+from recon.optical_calibration.joint_calibration import Result, Settings, Shape, calibrate, deviation
 from recon.structured_light.surface_mesh import clean
 from recon.structured_light.triangulate import triangulate
 from scenes.board_poses import Config as Poses
@@ -257,24 +256,23 @@ def remeasure(setup: Setup, scene: Scene, found: Calibration, seed: int) -> Reme
 
 
 def bad_board(setup: Setup) -> list[Row]:
-    """Row e: a warped board with print errors and glare against a flat one in the same poses, and its shape released."""
+    """Row e: a warped board with print errors and glare against a flat one in the same poses, taken as designed and as found."""
     flat = rendered(session(setup)).first(BENT_POSES)
     bent = rendered(session(setup, BENT, Poses(count=BENT_POSES)))
     return board_shape(flat, bent)
 
 
 def board_shape(flat: BoardSet, bent: BoardSet) -> list[Row]:
-    """Rows of a board unlike its design, whose errors of print and flatness are known as standard deviations.
+    """Rows of a board unlike its design: taken as designed, its tolerances given, and with its shape found, as by default.
 
     Five coefficients a device, as a misfit of the board disturbs the choice of a lens model; the last row has the choice in.
     """
-    known = Shape(in_plane_mm=BENT.print_error_mm, out_of_plane_mm=float(np.std(bent.points[:, 2])))
-    released = known.model_copy(update={"released": True})
+    known = Shape(released=False, in_plane_mm=BENT.print_error_mm, out_of_plane_mm=float(np.std(bent.points[:, 2])))
     found = {
         "flat": calibrate(flat.sightings, flat.board, flat.sizes, BROWN),
         "kept": calibrate(bent.sightings, bent.board, bent.sizes, Settings(distortion="brown", shape=known)),
-        "released": calibrate(bent.sightings, bent.board, bent.sizes, Settings(distortion="brown", shape=released)),
-        "chosen": calibrate(bent.sightings, bent.board, bent.sizes, Settings(shape=released)),
+        "released": calibrate(bent.sightings, bent.board, bent.sizes, BROWN),
+        "chosen": calibrate(bent.sightings, bent.board, bent.sizes),
     }
     volume = uncertainty.working_volume(bent.truth, DEPTHS)
     error, predicted = {}, {}

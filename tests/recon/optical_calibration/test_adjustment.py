@@ -10,7 +10,8 @@ from recon.geometry.levenberg_marquardt import Unreachable
 from recon.model.calibration import Calibration
 from recon.optical_calibration import adjustment
 from recon.optical_calibration.adjustment import adjust, free_parameters
-from recon.optical_calibration.bundle import Estimate, Problem, Shape, linearised, stepped
+from recon.optical_calibration.board_shape import Tolerances
+from recon.optical_calibration.bundle import Estimate, Problem, linearised, stepped
 from recon.optical_calibration.joint_calibration import deviation
 from tests.recon.board_sets import BOARD, DEVICES, devices, observe, random_poses
 
@@ -33,9 +34,9 @@ def normalised_errors(found, cameras):
     return deviation(found, Calibration(cameras)) / np.sqrt(np.diag(found.uncertainty.covariance))
 
 
-def drawn_board(shape, rng):
+def drawn_board(tolerances, rng):
     """A board as its tolerances allow."""
-    errors = np.linalg.cholesky(shape.covariance(BOARD.points()) + 1e-12 * np.eye(132)) @ rng.standard_normal(132)
+    errors = np.linalg.cholesky(tolerances.covariance(BOARD.points()) + 1e-12 * np.eye(132)) @ rng.standard_normal(132)
     return BOARD.points() + errors.reshape(-1, 3)
 
 
@@ -127,7 +128,7 @@ def test_a_step_to_a_camera_that_can_not_be_is_unreachable(rig, rng):
     cameras = devices(rig)
     poses = random_poses(cameras, 2, rng)
     seen, start = observe(cameras, poses, rng), Estimate(cameras, poses, BOARD.points())
-    problem = Problem(seen, np.zeros_like(seen.pixels), free_parameters(DEVICES, LENS), Shape())
+    problem = Problem(seen, np.zeros_like(seen.pixels), free_parameters(DEVICES, LENS))
     step, still = np.zeros(len(problem.names)), np.zeros((2, 6))
     fy = problem.names.index("projector.fy")
     for change in (-2 * cameras["projector"].matrix[1, 1], np.nan, -np.inf):
@@ -162,13 +163,14 @@ def test_a_lens_that_is_hardly_determined_is_said_to_be(rig, rng):
 def test_a_released_board_takes_its_shape_and_the_covariance_stays_honest(rig, rng):
     """Boards drawn from the prior that the adjustment is told: all sets against chi-square (99.9 %)."""
     cameras = devices(rig)
-    shape = Shape(released=True, in_plane_mm=0.02, out_of_plane_mm=0.2)
+    tolerances = Tolerances(print_mm=0.02, stretch_mm=0.01, bow_mm=0.11, dent_mm=0.06)
     total, degrees = 0.0, 0
     for _ in range(SETS):
-        board = drawn_board(shape, rng)
+        board = drawn_board(tolerances, rng)
         poses = random_poses(cameras, 10, rng)
         seen = observe(cameras, poses, rng, points=board)
-        found = adjust(seen, Estimate(cameras, poses, BOARD.points()), free_parameters(DEVICES, LENS), shape=shape)
+        start = Estimate(cameras, poses, BOARD.points())
+        found = adjust(seen, start, free_parameters(DEVICES, LENS), tolerances=tolerances, released=True)
         error, count = squared_error(found.calibration, cameras)
         total, degrees = total + error, degrees + count
     low, high = chi2.ppf([0.0005, 0.9995], degrees)
@@ -182,14 +184,14 @@ def test_a_board_that_is_trusted_too_much_shows_in_the_covariance_if_its_toleran
     also counts as noise, so the prediction errs on the safe side.
     """
     cameras = devices(rig)
-    shape = Shape(in_plane_mm=0.02, out_of_plane_mm=0.2)
+    tolerances = Tolerances(print_mm=0.02, bow_mm=0.11, dent_mm=0.06)
     told, untold = [], []
     for _ in range(SETS):
-        board = drawn_board(shape, rng)
+        board = drawn_board(tolerances, rng)
         poses = random_poses(cameras, 10, rng)
         seen = observe(cameras, poses, rng, points=board)
         start, free = Estimate(cameras, poses, BOARD.points()), free_parameters(DEVICES, LENS)
-        told.append(normalised_errors(adjust(seen, start, free, shape=shape).calibration, cameras))
+        told.append(normalised_errors(adjust(seen, start, free, tolerances=tolerances).calibration, cameras))
         untold.append(normalised_errors(adjust(seen, start, free).calibration, cameras))
     assert 0.3 < np.sqrt(np.mean(np.square(told))) < 1.4
     assert np.sqrt(np.mean(np.square(untold))) > 2 * np.sqrt(np.mean(np.square(told)))
@@ -207,5 +209,5 @@ def test_a_bow_of_the_stated_size_stays_within_the_covariance(rig, rng, bend):
         poses = random_poses(cameras, 12, rng)
         seen = observe(cameras, poses, rng, points=bent)
         start, free = Estimate(cameras, poses, points), free_parameters(DEVICES, LENS)
-        found = adjust(seen, start, free, shape=Shape(out_of_plane_mm=0.1)).calibration
+        found = adjust(seen, start, free, tolerances=Tolerances(bow_mm=0.055, dent_mm=0.032)).calibration
         assert np.abs(normalised_errors(found, cameras)).max() < 4

@@ -74,7 +74,9 @@ def test_places_of_the_board(result, cameras):
     world += result.adjustment.poses[:, None, :3, 3]
     normals = np.cross(world[:, 3] - world[:, 0], world[:, -1] - world[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    assert np.cos(figures_of_merit.tilts(result)) == pytest.approx(np.abs(normals[:, 2]), abs=1e-6)
+    assert np.cos(figures_of_merit.tilts(result)) == pytest.approx(
+        np.abs(normals[:, 2]), abs=1e-5
+    )  # three of its points, found with the rest
     assert figures_of_merit.board_centres(result) == pytest.approx(world.mean(axis=1))
 
 

@@ -13,8 +13,8 @@ from recon.model.boards import AsymmetricCircles, Charuco, Chessboard
 from recon.model.calibration import Calibration
 from recon.optical_calibration import adjustment, joint_calibration
 from recon.optical_calibration.adjustment import adjust, free_parameters
-from recon.optical_calibration.bundle import Estimate, Shape
-from recon.optical_calibration.joint_calibration import Settings, departure, deviation
+from recon.optical_calibration.bundle import Estimate
+from recon.optical_calibration.joint_calibration import Settings, Shape, departure, deviation
 from tests.recon.board_sets import BOARD, DEVICES, corners, devices, observe, random_poses, sightings
 
 QUICK = Settings(distortion="decentred")
@@ -160,20 +160,22 @@ def test_a_board_in_one_corner_is_warned_of(cameras, sizes):
     assert any(warning.startswith("cam1: points cover") and "right" in warning for warning in found.warnings)
 
 
-def test_a_bent_board_is_noticed_and_releasing_its_shape_mends_it(cameras, sizes):
+def test_a_bent_board_takes_its_shape_by_itself(cameras, sizes):
+    """A saddle of 0.2 mm, printed to 0.02 mm, is found to some micrometres; a board as designed leaves larger residuals."""
     rng = np.random.default_rng(7)
     points = BOARD.points()
     half = points.max(axis=0)[:2] / 2
     x, y = ((points[:, :2] - half) / half).T
-    bent = points + np.column_stack([0 * x, 0 * x, 0.2 * (x**2 - y**2)])
+    bent = points + np.column_stack([0.02 * rng.standard_normal((44, 2)), 0.2 * (x**2 - y**2)])
     seen = sightings(cameras, random_poses(cameras, 15, rng), rng, points=bent)
-    trusting = joint_calibration.calibrate(seen, BOARD, sizes, QUICK)
-    assert any("release its shape" in warning for warning in trusting.warnings)
-    released = joint_calibration.calibrate(seen, BOARD, sizes, Settings(distortion="decentred", shape=Shape(released=True)))
-    assert not any("release" in warning for warning in released.warnings)
-    assert max(released.rms.values()) < 0.02 < max(trusting.rms.values())
-    in_plane, out_of_plane = departure(released.adjustment.points, bent)
+    trusting = joint_calibration.calibrate(seen, BOARD, sizes, Settings(distortion="decentred", shape=Shape(released=False)))
+    found = joint_calibration.calibrate(seen, BOARD, sizes, QUICK)
+    assert max(found.rms.values()) < 0.02 < max(trusting.rms.values())
+    assert any("not flat" in warning for warning in trusting.warnings)
+    assert not any("not flat" in warning for warning in found.warnings)
+    in_plane, out_of_plane = departure(found.adjustment.points, bent)
     assert in_plane < 0.005 and out_of_plane < 0.02
+    assert found.tolerances.print_mm == pytest.approx(0.02, rel=0.3) and found.tolerances.bow_mm > 0.05
 
 
 def test_departure_sees_shape_and_not_place(rng):
@@ -194,7 +196,7 @@ def test_halves_agree_as_predicted(cameras):
         seen = observe(cameras, poses, rng)
         nothing = np.zeros_like(seen.pixels)
         whole = adjust(seen, Estimate(cameras, poses, BOARD.points()), free, nothing)
-        found.append(np.mean(joint_calibration.compare_halves(seen, whole, free, nothing, Shape()) ** 2))
+        found.append(np.mean(joint_calibration.compare_halves(seen, whole, free, nothing) ** 2))
     assert 0.4 < np.mean(found) < 2.0
 
 
@@ -239,11 +241,21 @@ def test_with_few_poses_the_lens_is_not_made_poorer_than_it_is(cameras, sizes):
         assert np.abs(error).max() < 5
 
 
-def test_a_flat_board_is_not_called_bent(cameras, sizes):
-    for seed in range(4):
+def test_a_flat_board_stays_flat(cameras, sizes):
+    """Within the micrometres that ten poses can't exclude; errors of points are predicted to grow by less than a third."""
+    for seed in range(3):
         rng = np.random.default_rng(seed)
-        found = joint_calibration.calibrate(sightings(cameras, random_poses(cameras, 10, rng), rng), BOARD, sizes, QUICK)
-        assert not any("design" in warning for warning in found.warnings)
+        seen = sightings(cameras, random_poses(cameras, 10, rng), rng)
+        found = joint_calibration.calibrate(seen, BOARD, sizes, QUICK)
+        assert found.released and found.tolerances.sigmas.max() < 0.01
+        assert max(departure(found.adjustment.points, BOARD.points())) < 0.003
+
+
+def test_a_board_of_too_few_sightings_is_taken_as_designed(cameras, sizes):
+    rng = np.random.default_rng(3)
+    one = {"cam1": cameras["cam1"]}
+    found = joint_calibration.calibrate(sightings(one, random_poses(cameras, 3, rng), rng), BOARD, {"cam1": sizes["cam1"]}, QUICK)
+    assert not found.released and (found.adjustment.points == BOARD.points()).all()
 
 
 def test_outliers_of_camera_1_do_not_count_as_the_projectors(sizes, good):
