@@ -2,9 +2,9 @@
 
 A board is imprecise in four ways: each dot is printed off its place, the whole print is stretched or sheared, the board bows
 (along x, along y, as a twist), and each dot stands out by its own. Each way has one standard deviation. The sightings of many
-poses give the deviations themselves; the standard deviations follow from these by the evidence: the probability of the sightings when
-deviations are drawn with them (empirical Bayes). Those of a flat board come out as the little that the sightings can't exclude. A
-common scale leaves no trace, but is a stretch like aspect and shear, which do.
+poses show the deviations themselves; the standard deviations follow from these by the evidence: the probability of the sightings
+when deviations are drawn with them (empirical Bayes). Those of a flat board come out as the little that sightings can't exclude.
+A common scale leaves no trace, but is a stretch like aspect and shear, which do.
 
 Source: MacKay 1992, "Bayesian interpolation" (evidence).
 """
