@@ -215,8 +215,8 @@ def _measured_noise(system: System, problem: Problem) -> Array:
     three a point, less the six of its place, which the poses have already, or fewer, if tolerances hold it.
     """
     used = problem.observations.used
-    wide = problem.tolerances.determined is None
-    board = (3 * used.shape[1] - 6 if wide else problem.tolerances.determined) if problem.released else 0
+    determined = problem.tolerances.determined
+    board = (3 * used.shape[1] - 6 if determined is None else determined) if problem.released else 0
     unknowns = len(problem.names) + board + 6 * np.count_nonzero(used.any(axis=(1, 2)))
     left = 1 - unknowns / max(2 * np.count_nonzero(used), 1)
     if left <= 0:
