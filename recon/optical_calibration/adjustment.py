@@ -6,17 +6,29 @@ small as the shared unknowns, and its inverse is their covariance.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from recon.geometry.camera_jacobian import MATRIX, MOTION
+from recon.geometry.lens_domain import is_one_to_one
 from recon.geometry.levenberg_marquardt import Descent, Rules, Unreachable, descend
 from recon.model.calibration import Calibration, Uncertainty
 from recon.optical_calibration.board_shape import AS_DESIGNED, Tolerances
-from recon.optical_calibration.bundle import ROBUST, Array, Estimate, Problem, System, linearised, stepped
+from recon.optical_calibration.bundle import (
+    ROBUST,
+    Array,
+    Estimate,
+    Problem,
+    System,
+    coefficients,
+    lens_sigmas,
+    linearised,
+    stepped,
+)
 from recon.optical_calibration.observations import PROJECTOR, Observations
 
 Mask = NDArray[np.bool_]
@@ -28,6 +40,8 @@ TINY = 1e-12  # keeps a pose that nobody sees from being singular
 SINGULAR = 1e-14  # of the largest eigenvalue: below, rounding decides
 MAX_ROUNDS, MAX_ROUGH = 10, 5  # of measuring the noise
 SIMILAR_NOISE, SAME_NOISE = 0.2, 0.01  # relative change of the noise by which rough rounds end, and by which all do
+TIGHTER, TIGHTEST = 2.0, 1e6  # by which a lens is held that has a pole or a fold: times this each time, and at most
+STRAINED = 1.1  # times the residuals: what the sightings don't allow
 ROUGH = Rules(converged=1e-2)
 CONVERGED = 1e-10  # relative change of the cost
 FINE = Rules(damping=1e-9)  # from nearby: damping would hold back what is hardly determined, for many steps
@@ -45,6 +59,8 @@ class Adjustment:
     noise: Mapping[str, float]  # by device: measured noise over that predicted by the detection
     normalised: Array  # (p, n, d) residuals over their measured noise, each device's own; NaN where not seen
     converged: bool
+    lenses: Array  # (g,) standard deviations by which the parameters are held to zero; infinite but for those of distortion
+    tightness: Mapping[str, float]  # of devices whose lens is held tighter than usual ones, so that it has no pole or fold
 
     @property
     def estimate(self) -> Estimate:
@@ -59,6 +75,7 @@ def adjust(
     offsets: Array | None = None,
     tolerances: Tolerances | None = None,
     released: bool = False,
+    lenses: Array | None = None,
 ) -> Adjustment:
     """Adjust devices, poses and shape to the observations.
 
@@ -78,6 +95,9 @@ def adjust(
     released : bool
         Whether the board's points are adjusted, too, held to their design by the tolerances. If not, the tolerances' effect is
         added to the covariance ("consider parameters", Schmidt 1966).
+    lenses : (g,), optional
+        Standard deviations by which coefficients of distortion are held to zero, infinite for other parameters; those of usual
+        lenses if not given.
 
     Returns
     -------
@@ -89,11 +109,11 @@ def adjust(
         If the observations don't determine the unknowns.
     """
     offsets = np.zeros_like(observations.pixels) if offsets is None else offsets
-    problem = Problem(observations, offsets, free, tolerances or AS_DESIGNED, released)
-    estimate, noise, converged = fitted(problem, start)
+    problem = Problem(observations, offsets, free, tolerances or AS_DESIGNED, released, lenses)
+    problem, (estimate, noise, converged) = _one_to_one(problem, start)
     system = linearised(problem, estimate, noise, shaped=released or bool(problem.tolerances.sigmas.any()))
     return Adjustment(
-        Calibration(estimate.cameras, Uncertainty(problem.names, _covariance(system, problem))),
+        Calibration(estimate.cameras, Uncertainty(problem.names, _covariance(system, problem, estimate))),
         estimate.poses,
         estimate.points,
         np.where(observations.seen[..., None], system.plain, np.nan),
@@ -101,6 +121,8 @@ def adjust(
         dict(zip(observations.devices, noise.tolist(), strict=True)),
         np.where(observations.seen, system.lengths, np.nan),
         converged,
+        lens_sigmas(replace(problem, tightness={}), estimate.cameras),
+        problem.tightness,
     )
 
 
@@ -138,9 +160,22 @@ def fitted(problem: Problem, start: Estimate, noise: Array | None = None, conver
     return Fitted(estimate, noise, arrived)
 
 
+def _one_to_one(problem: Problem, start: Estimate) -> tuple[Problem, Fitted]:
+    """Fit; lenses that come out with a pole or a fold near their image are held tighter, as far as the sightings allow."""
+    free = fit = fitted(problem, start)
+    held = problem
+    while bent := [name for name, camera in fit.estimate.cameras.items() if not is_one_to_one(camera)]:
+        tighter = {name: TIGHTER * held.tightness.get(name, 1.0) for name in bent}
+        held = replace(problem, tightness={**held.tightness, **tighter})
+        fit = fitted(held, start)
+        if max(tighter.values()) > TIGHTEST or (fit.noise > STRAINED * free.noise).any():
+            return problem, free
+    return held, fit
+
+
 def _descend(problem: Problem, estimate: Estimate, noise: Array, rules: Rules) -> Descent[Estimate, System, tuple[Array, Array]]:
     """Levenberg-Marquardt from an estimate to the next minimum, at fixed noise."""
-    prior = _prior(problem)
+    prior = _prior(problem, estimate)
 
     def system_and_cost(estimate: Estimate) -> tuple[System, float]:
         system = linearised(problem, estimate, noise, problem.released)
@@ -152,20 +187,22 @@ def _descend(problem: Problem, estimate: Estimate, noise: Array, rules: Rules) -
     return descend(estimate, system_and_cost, step, lambda estimate, step: stepped(problem, estimate, *step), rules=rules)
 
 
-def _prior(problem: Problem) -> Array:
-    """Information on the board's points : (3 n, 3 n) 1/mm^2 if they are released, else (0, 0)."""
+def _prior(problem: Problem, estimate: Estimate) -> Array:
+    """Information on the shared unknowns : (g, g) without any sighting: that of usual lenses, and the board's tolerances."""
+    lenses = np.diag(lens_sigmas(problem, estimate.cameras) ** -2)
     if not problem.released:
-        return np.zeros((0, 0))
-    return np.linalg.inv(problem.tolerances.covariance(problem.observations.points))
+        return lenses
+    return block_diag(lenses, np.linalg.inv(problem.tolerances.covariance(problem.observations.points)))
 
 
 def _deviation(estimate: Estimate, problem: Problem) -> Array:
-    """Of the board's points from their design : (3 n,) mm if they are released, else (0,)."""
-    return (estimate.points - problem.observations.points).ravel() if problem.released else np.zeros(0)
+    """Of the shared unknowns : (g,) from those that are most likely without any sighting; zero of those that may be anything."""
+    lenses = coefficients(problem, estimate.cameras)
+    return np.append(lenses, estimate.points - problem.observations.points) if problem.released else lenses
 
 
 def _cost(system: System, estimate: Estimate, problem: Problem, prior: Array) -> float:
-    """Huber's loss of the lengths, and the shape's departure from its design."""
+    """Huber's loss of the lengths, and the departure of lenses and board from the likely ones."""
     lengths, deviation = system.lengths, _deviation(estimate, problem)
     loss = np.where(lengths <= ROBUST, lengths**2, 2 * ROBUST * lengths - ROBUST**2).sum()
     return float(loss + deviation @ prior @ deviation)
@@ -180,10 +217,7 @@ def _step(system: System, deviation: Array, prior: Array, damping: float) -> tup
         If the equations are singular.
     """
     equations = system.equations
-    shared, right = equations.shared.copy(), equations.right.copy()
-    own = len(right) - len(prior)
-    shared[own:, own:] += prior
-    right[own:] -= prior @ deviation
+    shared, right = equations.shared + prior, equations.right - prior @ deviation
     shared[np.diag_indices_from(shared)] *= 1 + damping
     corner = equations.corner + np.eye(6) * (damping * np.diagonal(equations.corner, axis1=1, axis2=2)[:, None, :] + TINY)
     each = np.concatenate([equations.cross.swapaxes(1, 2), equations.pose_right[..., None]], axis=2)  # (p, 6, g + 1)
@@ -230,14 +264,14 @@ def board_information(
     observations: Observations, adjusted: Adjustment, free: Mapping[str, Sequence[str]], offsets: Array
 ) -> tuple[Array, Array]:
     """Information of the sightings alone on board points : (3 n, 3 n), 1/mm^2, and times their departures : (3 n,), 1/mm."""
-    problem = Problem(observations, offsets, free, released=True)
+    problem = Problem(observations, offsets, free, released=True, lenses=adjusted.lenses)
     system = linearised(problem, adjusted.estimate, np.array(list(adjusted.noise.values())), shaped=True)
     own, (reduced, right) = len(problem.names), _without_poses(system)
-    devices = _inverse(reduced[:own, :own])
+    lenses, departures = adjusted.lenses**-2, _deviation(adjusted.estimate, problem)
+    devices = _inverse(reduced[:own, :own] + np.diag(lenses))
+    pull = right[own:] - reduced[own:, :own] @ devices @ (right[:own] - lenses * departures[:own])
     information = reduced[own:, own:] - reduced[own:, :own] @ devices @ reduced[:own, own:]
-    return information, right[own:] - reduced[own:, :own] @ devices @ right[:own] + information @ _deviation(
-        adjusted.estimate, problem
-    )
+    return information, pull + information @ departures[own:]
 
 
 def _without_poses(system: System) -> tuple[Array, Array]:
@@ -249,13 +283,12 @@ def _without_poses(system: System) -> tuple[Array, Array]:
     return equations.shared - _sum_of_products(equations.cross, eliminate[..., :-1]), equations.right - alone
 
 
-def _covariance(system: System, problem: Problem) -> Array:
-    """Covariance of the devices' parameters : (g, g)."""
-    own, (reduced, _) = len(problem.names), _without_poses(system)
+def _covariance(system: System, problem: Problem, estimate: Estimate) -> Array:
+    """Covariance of the devices' parameters : (g, g); that of usual lenses, however tightly they had to be held."""
+    own, (reduced, _), prior = len(problem.names), _without_poses(system), _prior(replace(problem, tightness={}), estimate)
     if problem.released:
-        reduced[own:, own:] += _prior(problem)
-        return _inverse(reduced)[:own, :own]
-    covariance = _inverse(reduced[:own, :own])
+        return _inverse(reduced + prior)[:own, :own]
+    covariance = _inverse(reduced[:own, :own] + prior)
     if len(reduced) > own:  # errors of the board that are not estimated carry over to the parameters
         carried = covariance @ reduced[:own, own:]
         covariance = covariance + carried @ problem.tolerances.covariance(problem.observations.points) @ carried.T

@@ -1,13 +1,13 @@
 """The bundle adjustment's problem: its unknowns and observations, both linearised at an estimate."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.geometry import rigid
+from recon.geometry import rigid, usual_lenses
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise, moved
 from recon.geometry.levenberg_marquardt import Unreachable
@@ -39,6 +39,8 @@ class Problem:
     free: Mapping[str, Sequence[str]]  # device: parameters
     tolerances: Tolerances = AS_DESIGNED  # of the board
     released: bool = False  # the board's points are among the unknowns, held by the tolerances
+    lenses: Array | None = None  # (g,) standard deviations by which the devices' parameters are held to zero; as usual if None
+    tightness: Mapping[str, float] = field(default_factory=dict)  # device: by how much its lens is held tighter than that
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -51,6 +53,24 @@ class Problem:
         seen, covariance = self.observations.seen[..., None, None], self.observations.covariance
         inverse = np.linalg.inv(np.linalg.cholesky(np.where(seen, covariance, np.eye(2)) + FLOOR_PX**2 * np.eye(2)))
         return np.where(self.observations.used[..., None, None], inverse, 0.0)
+
+
+def lens_sigmas(problem: Problem, cameras: Mapping[str, Camera]) -> Array:
+    """Standard deviations : (g,) by which the devices' parameters are held to zero; infinite but for those of distortion."""
+    parts = _by_device(problem, cameras, usual_lenses.largest)
+    sigmas = np.concatenate(parts) if problem.lenses is None else problem.lenses
+    tight = [problem.tightness.get(device, 1.0) for device in problem.observations.devices]
+    return sigmas / np.repeat(tight, [len(part) for part in parts])
+
+
+def coefficients(problem: Problem, cameras: Mapping[str, Camera]) -> Array:
+    """Coefficients of distortion among the devices' parameters : (g,); zero for other parameters."""
+    return np.concatenate(_by_device(problem, cameras, usual_lenses.coefficients))
+
+
+def _by_device(problem: Problem, cameras: Mapping[str, Camera], values: Callable[[Camera, Sequence[str]], Array]) -> list[Array]:
+    """Values of each device's free parameters."""
+    return [values(cameras[device], problem.free.get(device, ())) for device in problem.observations.devices]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from recon.model.calibration import Calibration
 from recon.optical_calibration import figures_of_merit, uncertainty
 from recon.optical_calibration.figures_of_merit import CELLS, Parameter
 from recon.optical_calibration.joint_calibration import Result
-from recon.optical_calibration.optical_checks import CELLS as COARSE
 from recon.reports import figures, page
 from recon.reports.figures import SEQUENTIAL, Scale
 from recon.reports.page import Opening, Section
@@ -171,8 +170,7 @@ def coverage(result: Result, metrics: Metrics) -> Section:
         used = result.observations.seen[:, :, number] & ~result.adjustment.outliers[:, :, number]
         camera = result.adjustment.calibration.cameras[device]
         svg = figures.dots(result.observations.pixels[:, :, number][used], depth[used], scale, camera.size)
-        cells = round(metrics[f"coverage_{device}"] * COARSE**2)
-        detail = f"Coloured by depth. Points lie in {cells} of {COARSE} × {COARSE} parts of the image."
+        detail = f"Coloured by depth. Points surround {100 * metrics[f'coverage_{device}']:.0f} % of the image."
         drawings.append(page.drawing(svg + page.colour_bar(scale, "mm depth"), f"Points, {NAMES[device]}", detail))
     board = result.adjustment.points
     corners = board[ConvexHull(board[:, :2]).vertices]

@@ -1,4 +1,8 @@
-"""Which lens distortion a device needs: the simplest model that predicts poses it has not been fitted to as well as the best."""
+"""Which lens distortion a device needs: a richer model only if it predicts poses better that it has not been fitted to.
+
+The choice begins with OpenCV's five coefficients. A poorer model would be confidently wrong beyond the points, while coefficients
+that no point determines are held by those of usual lenses (`recon.geometry.usual_lenses`), and show as uncertainty.
+"""
 
 from dataclasses import replace
 from typing import Literal
@@ -6,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from recon.geometry.camera import Camera
+from recon.geometry.lens_domain import is_one_to_one
 from recon.optical_calibration.adjustment import OUTLIER, fitted, free_parameters
 from recon.optical_calibration.bundle import Array, Estimate, Problem, linearised
 from recon.optical_calibration.observations import Observations
@@ -24,11 +29,9 @@ MODELS: dict[ModelName, tuple[str, ...]] = {  # simple to complex; each contains
 }
 FOLDS = 5
 CONVERGED = 1e-7  # relative change of the cost of poses alone: far less than the scatter of errors
-TRIED: tuple[ModelName, ...] = ("none", "radial1", "radial2", "decentred", "brown", "rational")
+TRIED: tuple[ModelName, ...] = ("brown", "rational")
+SURE = 2.0  # standard errors by which a richer model must be better
 ENOUGH_POSES = 10  # to compare models: the scatter of fewer errors says little of their mean's
-FEW_POSES_MODEL: ModelName = (
-    "brown"  # with fewer; a model that is too poor is worse than one too rich, which shows as uncertainty
-)
 
 
 def choose(observations: Observations, start: Estimate, device: str, offsets: Array) -> tuple[ModelName, dict[ModelName, float]]:
@@ -36,7 +39,8 @@ def choose(observations: Observations, start: Estimate, device: str, offsets: Ar
 
     The poses are dealt into five parts. Each part is left out in turn, the device is calibrated on the others, the poses left out
     are found with that calibration, and what remains of their points is the score. Of the models that are no worse than the best
-    by more than one standard error of the difference, pose by pose, the simplest is chosen (Breiman et al. 1984).
+    by more than two standard errors of the difference, pose by pose, the simplest is chosen (Breiman et al. 1984). A rich model
+    with a pole or a fold within the image, in any of the calibrations, is none to choose.
 
     Parameters
     ----------
@@ -50,18 +54,18 @@ def choose(observations: Observations, start: Estimate, device: str, offsets: Ar
     Returns
     -------
     name, scores
-        The model, and the cross-validated RMS of each one tried, px; none if the device sees too few poses to choose by.
+        The model, and the cross-validated RMS of each one to choose, px; none if the device sees too few poses to choose by.
     """
     number = observations.devices.index(device)
     seeing = np.flatnonzero(observations.seen[:, :, number].any(axis=1))
     if len(seeing) < ENOUGH_POSES:
-        return FEW_POSES_MODEL, {}
+        return TRIED[0], {}
     own, offset = observations.of_devices([device]).of_poses(seeing), offsets[seeing][:, :, [number]]
     camera = start.cameras[device]
     ideal = Camera(camera.size, camera.matrix, np.zeros(0))  # at the origin: alone, a device is its own world
     errors = held_out(own, Estimate({device: ideal}, camera.camera_from_world @ start.poses[seeing], start.points), offset)
     best = min(errors, key=lambda name: float(np.nanmean(errors[name])))
-    chosen = next(name for name in TRIED if _no_worse(errors[name] - errors[best]))
+    chosen = next(name for name in errors if _no_worse(errors[name] - errors[best]))
     return chosen, {name: float(np.sqrt(np.nanmean(error))) for name, error in errors.items()}
 
 
@@ -77,7 +81,7 @@ def held_out(own: Observations, start: Estimate, offsets: Array) -> dict[ModelNa
     start : Estimate
         A device without distortion.
     """
-    errors = {name: np.full(len(own.poses), np.nan) for name in TRIED}
+    errors, torn = {name: np.full(len(own.poses), np.nan) for name in TRIED}, set[ModelName]()
     for fold in range(min(FOLDS, len(own.poses))):
         left_out = np.arange(fold, len(own.poses), FOLDS)
         rest = np.setdiff1d(np.arange(len(own.poses)), left_out)
@@ -88,7 +92,9 @@ def held_out(own: Observations, start: Estimate, offsets: Array) -> dict[ModelNa
             fit, noise, _ = fitted(Problem(known, offsets[rest], free), fit)
             laid, noise, _ = fitted(alone, replace(fit, poses=place), noise, CONVERGED)
             errors[name][left_out], place = _squares(alone, laid, noise), laid.poses
-    return errors
+            if not all(map(is_one_to_one, fit.cameras.values())):
+                torn.add(name)
+    return {name: error for name, error in errors.items() if name not in torn or name == TRIED[0]}
 
 
 def _squares(problem: Problem, estimate: Estimate, noise: Array) -> Array:
@@ -99,6 +105,6 @@ def _squares(problem: Problem, estimate: Estimate, noise: Array) -> Array:
 
 
 def _no_worse(difference: Array) -> bool:
-    """Whether errors : (p,) px^2 above the best model's are within one standard error of zero."""
+    """Whether errors : (p,) px^2 above the best model's are within some standard errors of zero."""
     known = difference[np.isfinite(difference)]
-    return bool(known.mean() <= known.std(ddof=1) / np.sqrt(len(known)))
+    return bool(known.mean() <= SURE * known.std(ddof=1) / np.sqrt(len(known)))

@@ -138,9 +138,8 @@ def pattern_ratio(result: Result, device: str) -> float:
 
 
 def coverage(result: Result, device: str) -> float:
-    """Fraction of the image, in coarse cells, in which points were seen."""
-    camera = result.adjustment.calibration.cameras[device]
-    return float(optical_checks.coverage(sightings(result, device)[0], camera).mean())
+    """Share of the part of a device's image that measures within the hull of the points that were seen."""
+    return optical_checks.coverage(sightings(result, device)[0], optical_checks.measuring_part(result.adjustment, device))
 
 
 def devices_that_measure(calibration: Calibration) -> tuple[str, str]:

@@ -6,8 +6,10 @@ from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from recon.errors import InputError
+from recon.geometry import usual_lenses
 from recon.geometry.camera_jacobian import difference
 from recon.geometry.circle_projection import centre_offsets
 from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
@@ -18,14 +20,14 @@ from recon.optical_calibration import optical_checks as checks
 from recon.optical_calibration.adjustment import Adjustment, adjust, board_information, free_parameters
 from recon.optical_calibration.board_shape import Tolerances
 from recon.optical_calibration.bundle import Array, Estimate
-from recon.optical_calibration.distortion_selection import MODELS, ModelName, choose
+from recon.optical_calibration.distortion_selection import MODELS, TRIED, ModelName, choose
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
 from recon.optical_calibration.sightings import Sighting, gather, without_scraps
 
-FIRST_MODEL: ModelName = "brown"  # until one is chosen
 BAD_POSE = 5.0  # times the noise: median residual of a pose in one device that doesn't fit the others
 MANY_POINTS = 400  # of a board: the shape of one with more takes too long to find
 ENOUGH = 2.0  # sightings' coordinates an unknown, the board's points among these, to find its shape by
+CHANCE = 1e-3  # by which halves of the poses seem to contradict each other, though the covariance is right
 BENT = 0.9  # of a flatness tolerance's variance: bowing, which neighbours share
 
 
@@ -114,7 +116,7 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     seen = [sighting.radii for sighting in sightings if sighting.pixels]
     size_warning = checks.refuse_wrong_size(board, seen, first, name)
 
-    free = _free(observations, dict.fromkeys(observations.devices, FIRST_MODEL))
+    free = _free(observations, dict.fromkeys(observations.devices, TRIED[0]))
     adjusted, observations, contradicting = _consistent(observations, first, free, board, name)
     checks.refuse_unusable(observations, name)
     estimate, offsets = adjusted.estimate, circle_offsets(observations, adjusted.estimate, board)
@@ -130,11 +132,26 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     offsets = circle_offsets(observations, adjusted.estimate, board)
     if released:
         tolerances = _tolerances(observations, adjusted, free, offsets, settings.shape)
-    adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released)
-    halves = compare_halves(observations, adjusted, free, offsets, tolerances, released)
+    lenses = _lenses(adjusted, free)
+    adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released, lenses)
+    halves, contradiction = compare_halves(observations, adjusted, free, offsets, tolerances, released)
     found = checks.warnings(observations, adjusted) + ([size_warning] if size_warning else [])
+    if contradiction > chdtri(halves.size, CHANCE) / halves.size:
+        adjusted = _widened(adjusted, contradiction)
+        found.append(
+            f"halves of the poses differ by {np.sqrt(contradiction):.1f} times what residuals let expect, "
+            "and all uncertainties were widened by that: did a device move or warm up, or the board change between poses?"
+        )
     dropped |= contradicting
     return Result(observations, adjusted, model, scores, dropped, halves, tuple(found), offsets, board, tolerances, released)
+
+
+def _widened(adjusted: Adjustment, squared: float) -> Adjustment:
+    """An adjustment with its covariance times a factor."""
+    found = adjusted.calibration
+    assert found.uncertainty is not None
+    wider = replace(found.uncertainty, covariance=squared * found.uncertainty.covariance)
+    return replace(adjusted, calibration=replace(found, uncertainty=wider))
 
 
 def _tell_shape(observations: Observations) -> bool:
@@ -158,6 +175,17 @@ def _tolerances(
     """Tolerances of the board by the evidence of the sightings."""
     information, pull = board_information(observations, adjusted, free, offsets)
     return board_shape.estimated(information, pull, observations.points, shape.tolerances)
+
+
+def _lenses(adjusted: Adjustment, free: Mapping[str, Sequence[str]]) -> Array:
+    """Standard deviations : (g,) by which coefficients of distortion are held to zero, by the evidence of the sightings."""
+    found = adjusted.calibration
+    assert found.uncertainty is not None
+    values, most = (
+        np.concatenate([of(camera, free[device]) for device, camera in found.cameras.items()])
+        for of in (usual_lenses.coefficients, usual_lenses.largest)
+    )
+    return usual_lenses.estimated(values, found.uncertainty.covariance, adjusted.lenses, most)
 
 
 def circle_offsets(observations: Observations, estimate: Estimate, board: Board) -> Array:
@@ -191,26 +219,35 @@ def compare_halves(
     offsets: Array,
     tolerances: Tolerances | None = None,
     released: bool = False,
-) -> Array:
-    """Calibrate every other pose, and the rest, and compare : (g,) differences over their predicted standard deviation.
+) -> tuple[Array, float]:
+    """Calibrate every other pose, and the rest, and compare.
 
-    Standard normal if the predicted covariance is honest. What both halves share, as the board, doesn't show. NaN if a device
-    sees too few poses of a half.
+    What both halves share, as the board, doesn't show.
+
+    Returns
+    -------
+    differences, squared
+        Of the parameters : (g,) over their predicted standard deviation; and their square over its expectation, correlations and
+        all, a parameter. Standard normal, and one, if the predicted covariance is honest. NaN if a device sees too few poses of a
+        half.
     """
     uncertainty = adjusted.calibration.uncertainty
     assert uncertainty is not None
     halves = [np.arange(first, len(observations.poses), 2) for first in (0, 1)]
     if min(observations.seen[half].any(axis=1).sum(axis=0).min() for half in halves) < checks.FEWEST_POSES:
-        return np.full(len(uncertainty.names), np.nan)
+        return np.full(len(uncertainty.names), np.nan), np.nan
     alone = tolerances if released else None  # of a board as designed the tolerances are common to both halves
     fits = []
     for half in halves:
         begin = Estimate(adjusted.calibration.cameras, adjusted.poses[half], adjusted.points)
-        fits.append(adjust(observations.of_poses(half), begin, free, offsets[half], alone, released))
+        fits.append(adjust(observations.of_poses(half), begin, free, offsets[half], alone, released, adjusted.lenses))
     first, second = (fit.calibration for fit in fits)
     assert first.uncertainty is not None and second.uncertainty is not None
-    variance = np.diag(first.uncertainty.covariance) + np.diag(second.uncertainty.covariance)
-    return deviation(first, second) / np.sqrt(variance)
+    covariance = first.uncertainty.covariance + second.uncertainty.covariance
+    scale = np.sqrt(np.diag(covariance))
+    differences = deviation(first, second) / scale
+    squared = differences @ np.linalg.solve(covariance / np.outer(scale, scale), differences)
+    return differences, float(squared) / len(differences)
 
 
 def deviation(first: Calibration, second: Calibration) -> Array:

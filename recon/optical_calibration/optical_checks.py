@@ -3,11 +3,12 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from recon.errors import InputError
 from recon.geometry import rigid
-from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
+from recon.geometry.lens_domain import is_one_to_one
 from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
 from recon.optical_calibration.adjustment import Adjustment
 from recon.optical_calibration.bundle import Array, Estimate
@@ -16,8 +17,8 @@ from recon.optical_calibration.observations import PROJECTOR, Observations
 FEWEST_POSES = 3
 FEW_POSES = 10
 LEAST_TILT_DEG = 5.0  # between two boards, without which focal length and distance are one unknown
-CELLS = 4  # the image is looked at in 4 x 4 cells
-COVERED = 0.8  # least share of cells with points
+COVERED = 0.5  # least share of the image within the points' hull
+FAR_OFF = 0.15  # of the image's side, from it to the nearest point
 DIAMETER_REFUSED, DIAMETER_DOUBTED = 0.04, 0.015  # relative error of the discs' size; ink spreads by up to 1 %
 NOISY = 3.0  # times the predicted noise
 UNSURE_FOCAL = 2e-3  # relative standard deviation of a focal length; 0.2 % is 1.4 mm at 700 mm
@@ -120,11 +121,18 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
     uncertainty = adjustment.calibration.uncertainty
     for number, device in enumerate(observations.devices):
         camera = adjustment.calibration.cameras[device]
-        covered = coverage(observations.pixels[:, :, number].reshape(-1, 2), camera)
-        if covered.mean() < COVERED:
+        if not is_one_to_one(camera, margin=0):
             found.append(
-                f"{device}: points cover {100 * covered.mean():.0f} % of the image; "
-                f"none {_where(~covered)}, where distortion is a guess"
+                f"{device}: the lens model folds within the image, where pixels have no ray: more points there, or another model"
+            )
+        elif device in adjustment.tightness:
+            found.append(f"{device}: the points leave a pole or a fold near the image; the lens is held to weaker distortion")
+        seen = observations.pixels[:, :, number].reshape(-1, 2)
+        part = measuring_part(adjustment, device)
+        if (share := coverage(seen, part)) < COVERED:
+            found.append(
+                f"{device}: points surround {100 * share:.0f} % of the image; "
+                f"none {_where(seen, part)}, where distortion is a guess"
             )
         if (factor := adjustment.noise[device]) > NOISY:
             found.append(
@@ -136,15 +144,35 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
     return found
 
 
-def coverage(pixels: Array, camera: Camera) -> Array:
-    """Cells of the image, CELLS a side : (CELLS, CELLS) bool, in which points : (m, 2) px fell."""
+def measuring_part(adjustment: Adjustment, device: str) -> Array:
+    """Corners : (m, 2) px of the part of a device's image that measures.
+
+    Of a camera all of it; of a projector what camera 1 sees of it, from where the board was nearest to where it was farthest.
+    """
+    cameras = adjustment.calibration.cameras
+    corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
+    if device != PROJECTOR or len(cameras) == 1:
+        return corners * cameras[device].size
+    first = next(iter(cameras.values()))
+    depths = np.concatenate([rigid.apply(pose, adjustment.points)[:, 2] for pose in adjustment.poses])
+    rays = first.rays(corners * (np.array(first.size) - 1.0))
+    world = np.concatenate([rays / rays[:, 2:] * depth for depth in (depths.min(), depths.max())])
+    return np.clip(cameras[device].project(world), 0, cameras[device].size)
+
+
+def coverage(pixels: Array, part: Array) -> float:
+    """Area of the convex hull of points : (m, 2) px over that of a part of the image, by its corners : (k, 2) px; at most 1."""
     known = pixels[np.isfinite(pixels).all(axis=1)]
-    width, height = camera.size
-    counts, *_ = np.histogram2d(known[:, 1], known[:, 0], bins=CELLS, range=((-0.5, height - 0.5), (-0.5, width - 0.5)))
-    return counts > 0
+    try:
+        return min(float(ConvexHull(known).volume / ConvexHull(part).volume), 1.0)
+    except (QhullError, ValueError):  # of fewer than three points, or of some on one line
+        return 0.0
 
 
-def _where(empty: Array) -> str:
-    """The sides of the image along which all of some cells are empty, in words."""
-    sides = {"at the top": empty[0], "at the bottom": empty[-1], "at the left": empty[:, 0], "at the right": empty[:, -1]}
-    return " and ".join(name for name, cells in sides.items() if cells.all()) or "in some corners"
+def _where(pixels: Array, part: Array) -> str:
+    """The sides of a part of the image, by its corners : (k, 2) px, that no point : (m, 2) px is near, in words."""
+    known, size = pixels[np.isfinite(pixels).all(axis=1)], np.ptp(part, axis=0)
+    left, top = (known.min(axis=0) - part.min(axis=0)) / size
+    right, bottom = (part.max(axis=0) - known.max(axis=0)) / size
+    sides = {"at the top": top, "at the bottom": bottom, "at the left": left, "at the right": right}
+    return " and ".join(name for name, gap in sides.items() if gap > FAR_OFF) or "in some corners"

@@ -102,14 +102,14 @@ def dropped(reasons: Mapping[str, str]) -> Iterator[str]:
 
 
 def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
-    """Lines: residuals of the poses, predicted and true errors of points, and warnings."""
+    """Lines: predicted errors of points, which are what a calibration is worth; residuals of the poses; true errors; warnings."""
     devices = result.observations.devices
     remaining = ", ".join(f"{device} {shown(figures[f'reprojection_rms_{device}_px'], '.4f')}" for device in devices)
     models = ", ".join(dict.fromkeys(result.model[device] for device in devices))
-    yield f"adjust      {figures['poses']} poses, {models}; reprojection RMS {remaining} px; {seconds:.0f} s"
-    yield f"board       {figures_of_merit.describe_board(result, figures)}"
     point, shape = (shown(figures[f"{name}_sigma_mm"], ".4f", " mm") for name in ("point", "shape"))
     yield f"uncertain   point {point}, within a shape {shape}, scale {shown(figures['scale_sigma_ppm'], '.0f', ' ppm')} (1 sigma)"
+    yield f"adjust      {figures['poses']} poses, {models}; reprojection RMS {remaining} px; {seconds:.0f} s"
+    yield f"board       {figures_of_merit.describe_board(result, figures)}"
     if "point_error_rms_mm" in figures:
         point, shape = (shown(figures[f"{name}_error_rms_mm"], ".4f", " mm") for name in ("point", "shape"))
         yield f"error       point {point}, within a shape {shape}, against the true calibration (RMS)"

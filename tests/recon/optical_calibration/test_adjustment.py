@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from recon.geometry.camera_jacobian import MATRIX
+from recon.geometry.lens_domain import is_one_to_one
 from recon.geometry.levenberg_marquardt import Unreachable
+from recon.geometry.usual_lenses import largest
 from recon.model.calibration import Calibration
-from recon.optical_calibration import adjustment
+from recon.optical_calibration import adjustment, optical_checks
 from recon.optical_calibration.adjustment import adjust, free_parameters
 from recon.optical_calibration.board_shape import Tolerances
 from recon.optical_calibration.bundle import Estimate, Problem, linearised, stepped
+from recon.optical_calibration.distortion_selection import MODELS
 from recon.optical_calibration.joint_calibration import deviation
 from tests.recon.board_sets import BOARD, DEVICES, devices, observe, random_poses
 
@@ -211,3 +215,31 @@ def test_a_bow_of_the_stated_size_stays_within_the_covariance(rig, rng, bend):
         start, free = Estimate(cameras, poses, points), free_parameters(DEVICES, LENS)
         found = adjust(seen, start, free, tolerances=Tolerances(bow_mm=0.055, dent_mm=0.032)).calibration
         assert np.abs(normalised_errors(found, cameras)).max() < 4
+
+
+@pytest.mark.parametrize("model", ["rational", "tilted"])
+def test_a_lens_that_points_leave_open_has_neither_pole_nor_fold(rig, rng, model):
+    """Eight poses whose points all lie within 250 px: coefficients are held by those of usual lenses, errors by their sigma."""
+    camera = rig.cam1.optics.camera()
+    poses = random_poses(devices(rig), 8, rng)
+    seen = observe({"cam1": camera}, poses, rng)
+    near = np.linalg.norm(seen.pixels - camera.matrix[:2, 2], axis=-1) < 250
+    few = replace(seen, pixels=np.where(near[..., None], seen.pixels, np.nan))
+    few, start = few.of_poses(range(len(poses))), Estimate({"cam1": camera}, poses, BOARD.points())
+    found = adjust(few, start, free_parameters(["cam1"], {"cam1": MODELS[model]})).calibration
+    assert is_one_to_one(found.cameras["cam1"])
+    most = largest(found.cameras["cam1"], MATRIX + MODELS[model])
+    assert (found.uncertainty.covariance.diagonal() ** 0.5 <= 1.001 * most).all()
+    assert (np.abs(normalised_errors(found, {"cam1": camera})) < 5).all()
+
+
+def test_where_the_sightings_ask_for_a_fold_the_lens_is_not_forced(rig, rng):
+    """A lens that does fold, in the corners, is found as it is; no other fits its points."""
+    folded = rig.cam1.optics.model_copy(update={"distortion": (-2.9, 0.0, 0.0, 0.0, 0.0)}).camera()
+    assert not is_one_to_one(folded, margin=0)
+    poses = random_poses({**devices(rig), "cam1": folded}, 12, rng)
+    seen = observe({"cam1": folded}, poses, rng)
+    start = Estimate({"cam1": folded}, poses, BOARD.points())
+    found = adjust(seen, start, free_parameters(["cam1"], {"cam1": MODELS["brown"]}))
+    assert found.noise["cam1"] < 1.1 and found.calibration.cameras["cam1"].distortion[0] == pytest.approx(-2.9, rel=0.02)
+    assert any("folds within the image" in warning for warning in optical_checks.warnings(seen, found))

@@ -21,7 +21,7 @@ LENSES = {
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_the_model_is_rich_enough_and_hardly_richer(rig, rng, lens):
-    """Not a coefficient is missed that matters, and no more than one model beyond the true one is taken."""
+    """Not a coefficient is missed that matters, and a quotient is only taken where there is one."""
     camera = rig.cam1.optics.model_copy(update={"distortion": tuple(LENSES[lens])}).camera()
     cameras = {"cam1": camera}
     poses = random_poses({**devices(rig), "cam1": camera}, 15, rng)
@@ -31,8 +31,7 @@ def test_the_model_is_rich_enough_and_hardly_richer(rig, rng, lens):
     )
     best = min(scores.values())
     assert scores[chosen] < 1.1 * best
-    assert scores[lens] < 1.1 * best
-    assert len(MODELS[chosen]) <= len(MODELS[lens]) + 2
+    assert chosen == ("rational" if lens == "rational" else "brown")
     assert best == pytest.approx(0.01 * np.sqrt(2), rel=0.15)  # what is left out is predicted to the noise
 
 
