@@ -7,6 +7,7 @@ import shlex
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from recon.errors import InputError
@@ -110,7 +111,10 @@ def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path):
     out = tmp_path / "demo"
     assert main(["demo", f"out={out}", f"board={tmp_path / 'board'}"]) == 0
     metrics = figures(out)
-    assert metrics["surface_interior_rms_mm"] < 1.1 * metrics["limit_rms_mm"]
+    # the surface's noise and the calibration's: a common shift of all points, of another size in each session
+    noise = np.hypot(metrics["limit_rms_mm"], metrics["point_sigma_mm"])
+    assert metrics["surface_interior_rms_mm"] < 1.1 * noise and metrics["point_error_rms_mm"] < 2.5 * metrics["point_sigma_mm"]
+    assert metrics["shape_error_rms_mm"] < 0.1 * metrics["limit_rms_mm"]
     assert metrics["surface_rms_mm"] < 0.1  # better than the paper's planes
     assert metrics["coverage"] > 0.98 and metrics["gross_error_fraction"] < 1e-4
     assert metrics["z_std"] == pytest.approx(1, abs=0.1)
