@@ -23,7 +23,7 @@ from recon.model.rig import Rig
 from scenes import board_poses
 from scenes.kinds import board
 from scenes.scene_types import Scene, Thing
-from twin.optics.conditions import IDEAL, Conditions, draw, emitted, with_stray
+from twin.optics.conditions import IDEAL, Conditions, draw, emitted, flexed, printed_board, with_stray
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, Images, meets_something, render_pixels
 from twin.optics.printed_edges import compute_edges
@@ -70,20 +70,36 @@ class Settings:
     seed: int
     conditions: Conditions = IDEAL
 
+    @property
+    def printed(self) -> board.Config:
+        """The board as printed, which its design is not."""
+        return printed_board(self.board, self.conditions.board, self.seed)
+
+    def bent(self, number: int) -> board.Config:
+        """The board as it is bent in a pose."""
+        return flexed(self.printed, self.conditions.board, self.seed, number)
+
 
 def set_up(settings: Settings) -> Stage:
     """Build the stage of a session."""
-    things = board.things(settings.board)
+    things = board.things(settings.printed)
     return Stage(
         settings.rig,
         {camera: camera_optics(settings.rig, camera) for camera in settings.cameras},
         ProjectorOptics.of(settings.rig.projector),
         Light.of(settings.patterns, settings.rig.projector),
         things,
-        board.printed(settings.board),
+        board.printed(settings.printed),
         build_world(Scene("board", things)),
         is_convex(things),
     )
+
+
+def with_board(stage: Stage, bent: board.Config) -> Stage:
+    """The stage with another board."""
+    things = board.things(bent)
+    world = build_world(Scene("board", things))
+    return replace(stage, things=things, print=board.printed(bent), world=world, convex=is_convex(things))
 
 
 def place_all(settings: Settings) -> rigid.Array:
@@ -133,6 +149,8 @@ def shoot_pose(
     They depend on the seed and the pose's number alone, whichever poses were rendered before. Of the frames' errors the lit
     image, which is one by itself, has none.
     """
+    if settings.conditions.board.flex_mm:
+        stage = with_board(stage, settings.bent(number))
     move_things(stage.world, stage.things, world_from_board)
     frames = draw(settings.conditions.frames, settings.patterns.count, settings.seed, number)
     shown = emitted(settings.patterns, settings.rig.projector, frames)
@@ -261,7 +279,7 @@ def finish(session: Session, settings: Settings, exposures: Mapping[CameraName, 
     devices = {"projector": Device(size=settings.patterns.projector_size)}
     for camera, exposure in exposures.items():
         devices[camera] = device_of(getattr(settings.rig, camera).optics.size, exposure)
-    with session.write(describe_visible(Scene("board", board.things(settings.board)))) as (capture, truth):
+    with session.write(describe_visible(Scene("board", board.things(settings.printed)))) as (capture, truth):
         truth.write_optics(calibration_of(settings.rig))
         truth.write_arrays("board.npz", board_truth(settings, placed))
         atomic.link_tree(session.out / UNFINISHED / "capture", capture.folder, leave_out={MANIFEST})
@@ -272,10 +290,10 @@ def finish(session: Session, settings: Settings, exposures: Mapping[CameraName, 
 def board_truth(settings: Settings, placed: rigid.Array) -> dict[str, np.ndarray]:
     """Ground truth, for evaluation alone: poses (p, 4, 4), printed centres (n, 3) mm, and where the three devices see these.
 
-    Pixels : (p, n, 3, 2) are those of the centres in cam1, cam2 and the projector, not of the middles of the ellipses.
+    Pixels : (p, n, 3, 2) are those of the centres in cam1, cam2 and the projector, not of the middles of the ellipses; of a board
+    that flexes those of its shape in each pose, while the printed centres are those of its mean shape.
     """
-    centres = board.printed_centres(settings.board)
-    points = np.stack([rigid.apply(pose, centres) for pose in placed])
+    points = np.stack([rigid.apply(pose, board.printed_centres(settings.bent(k))) for k, pose in enumerate(placed)])
     cameras = calibration_of(settings.rig).cameras
     pixels = np.stack([cameras[name].project(points) for name in ("cam1", "cam2", "projector")], axis=2)
-    return {"world_from_board": placed, "points": centres, "pixels": pixels}
+    return {"world_from_board": placed, "points": board.printed_centres(settings.printed), "pixels": pixels}

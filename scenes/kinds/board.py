@@ -26,6 +26,9 @@ THICKNESS_MM = 3.0
 MAX_ERRORS = 4  # standard deviations that a print error reaches in x and in y; room for them is kept between circles
 
 
+Stretch = Annotated[float, Field(ge=-0.01, le=0.01)]
+
+
 class Config(Part):
     """The board's print and pose."""
 
@@ -37,7 +40,14 @@ class Config(Part):
     centre_mm: Vector = (4.0, -2.0, 660.0)  # the middle of the circles in the world
     rotation_deg: Vector = (0.0, 0.0, 90.0)  # rotation vector, axis times angle; 90 about z lays the board along x
     warp_mm: NotNegative = 0.0  # amplitude of a saddle: the long edges bow back by this, the short ones forward
+    bow_mm: Vector = (
+        0.0,
+        0.0,
+        0.0,
+    )  # an arch along x, a twist and an arch along y besides, in the middles of edges and in corners
     print_error_mm: Annotated[float, Field(ge=0, le=1)] = 0.0  # standard deviation of each centre, in x and in y
+    stretch: tuple[Stretch, Stretch] = (0.0, 0.0)  # of the print, relative: length along x over that along y less one, and shear
+    spread_mm: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0  # by which ink makes discs wider than diameter_mm
     white: Fraction = 0.75  # reflectance of paper
     black: Fraction = 0.05  # reflectance of printed ink
     roughness: Annotated[float, Field(gt=0, le=1)] | None = None  # GGX alpha of a glossy coat, which glares; None is matt
@@ -45,7 +55,10 @@ class Config(Part):
 
     @model_validator(mode="after")
     def _fits(self) -> "Config":
-        nearest = np.sqrt(2) * (self.spacing_mm - 2 * MAX_ERRORS * self.print_error_mm)  # two centres, along the diagonal
+        spacing = self.spacing_mm * (1 - np.abs(self.stretch).sum())
+        nearest = (
+            np.sqrt(2) * (spacing - 2 * MAX_ERRORS * self.print_error_mm) - self.spread_mm
+        )  # two centres, along the diagonal
         room = nearest / (1 + np.sin(np.pi / SIDES) / 2)  # leaves half a side of the outline between two discs
         if self.diameter_mm >= room:
             raise ValueError(f"diameter_mm: expected less than {room:.4g} to keep circles apart, found {self.diameter_mm:g}")
@@ -55,13 +68,13 @@ class Config(Part):
 
 
 class Print(NamedTuple):
-    """Black discs on a white ground that may bow to a saddle, for compiled code; in the board's frame, mm."""
+    """Black discs on a white ground that may bow, for compiled code; in the board's frame, mm."""
 
     centres: Array  # (n, 2)
     radius: float
     middle: Array  # (2,) of the ground
     half: Array  # (2,) its half sides
-    warp: float  # z of the front face is `warp (x^2 - y^2)`, with x and y from the middle in half sides
+    bow: Array  # (3,) z of the front face by x^2, x y and y^2, with x and y from the middle in half sides
 
 
 def design(config: Config) -> AsymmetricCircles:
@@ -74,13 +87,13 @@ def design(config: Config) -> AsymmetricCircles:
 def printed_centres(config: Config) -> Array:
     """Centres of the circles as printed on the warped board : (columns * rows, 3) mm in the board's frame, in OpenCV's order."""
     centres = _printed(config)
-    return np.column_stack([centres, _saddle(config, centres)])
+    return np.column_stack([centres, _heights(config, centres)])
 
 
 def printed(config: Config) -> Print:
     """The print by formulas, of which `things` are the mesh."""
     middle = _middle(config)
-    return Print(_printed(config), config.diameter_mm / 2, middle, middle + config.margin_mm, config.warp_mm)
+    return Print(_printed(config), _radius(config), middle, middle + config.margin_mm, _bow(config))
 
 
 def circle_centres(config: Config) -> Array:
@@ -108,7 +121,7 @@ def things(config: Config) -> tuple[Thing, Thing]:
     for name, chosen, reflectance in (("ground", ~black, config.white), ("discs", black, config.black)):
         used, faces = np.unique(triangles[chosen], return_inverse=True)
         part = points[used]
-        mesh = solid_meshes.slab(part, faces.reshape(-1, 3), THICKNESS_MM, _saddle(config, part))
+        mesh = solid_meshes.slab(part, faces.reshape(-1, 3), THICKNESS_MM, _heights(config, part))
         parts.append(Thing(name, mesh, Material(reflectance, config.roughness), smooth=False))
     return parts[0], parts[1]
 
@@ -116,17 +129,28 @@ def things(config: Config) -> tuple[Thing, Thing]:
 def _printed(config: Config) -> Array:
     errors = np.random.default_rng(config.seed).standard_normal((config.rows * config.columns, 2))
     errors = np.clip(errors, -MAX_ERRORS, MAX_ERRORS)
-    return design(config).points()[:, :2] + config.print_error_mm * errors
+    along, shear = config.stretch
+    stretched = np.array([[1 + along / 2, shear / 2], [shear / 2, 1 - along / 2]])
+    middle = _middle(config)
+    return (design(config).points()[:, :2] - middle) @ stretched + middle + config.print_error_mm * errors
 
 
 def _middle(config: Config) -> Array:
     return np.array([2 * config.columns - 1, config.rows - 1]) * config.spacing_mm / 2
 
 
-def _saddle(config: Config, points: Array) -> Array:
+def _radius(config: Config) -> float:
+    return (config.diameter_mm + config.spread_mm) / 2
+
+
+def _bow(config: Config) -> Array:
+    return np.array(config.bow_mm) + config.warp_mm * np.array([1.0, 0.0, -1.0])
+
+
+def _heights(config: Config, points: Array) -> Array:
     half = _middle(config) + config.margin_mm
     x, y = ((points - _middle(config)) / half).T
-    return config.warp_mm * (x**2 - y**2)
+    return np.stack([x**2, x * y, y**2], axis=-1) @ _bow(config)
 
 
 def _print(config: Config) -> tuple[Array, solid_meshes.Faces, np.ndarray]:
@@ -134,7 +158,7 @@ def _print(config: Config) -> tuple[Array, solid_meshes.Faces, np.ndarray]:
 
     No point lies nearer to a side of a disc than half that side's length, so a Delaunay triangulation keeps all the sides.
     """
-    centres, radius = _printed(config), config.diameter_mm / 2
+    centres, radius = _printed(config), _radius(config)
     turn = 2 * np.pi * np.arange(SIDES) / SIDES
     circle = radius * np.column_stack([np.cos(turn), np.sin(turn)])
     inner = 0.5 * circle[:: SIDES // 32]

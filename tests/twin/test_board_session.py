@@ -9,15 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.board_detection.detect import detect
 from recon.capture import board_part, manifest
 from recon.capture.manifest import SCHEMA, Device, Manifest, SweepPart
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.geometry.circle_projection import centre_offsets
 from recon.model.patterns import Fringes, GrayCode, Patterns
 from scenes import board_poses
 from scenes.kinds import board
 from twin import board_session
 from twin.board_session import Settings
+from twin.optics.conditions import BoardPrint, Conditions
 from twin.optics.light_transport import Engine, render
 from twin.optics.printed_edges import compute_edges
 from twin.optics.ray_world import is_convex
@@ -177,6 +180,23 @@ def test_a_flat_board_throws_no_shadow(settings):
     light = board_session.fully_on(stage.patterns)
     images = [traced(replace(stage, convex=convex), stage.cameras["cam1"], light, settings.engine, 5) for convex in (True, False)]
     np.testing.assert_array_equal(*images)
+
+
+def test_a_board_of_life_is_seen_as_it_is_bent_in_its_pose(settings):
+    """Discs far from their design, of another shape in each pose, lie where the truth says, to the noise of small discs."""
+    errors = BoardPrint(place_mm=0.2, stretch=0.002, diameter_mm=0.1, bow_mm=1.0, flex_mm=0.5)
+    lively = replace(settings, conditions=Conditions(board=errors))
+    stage, placed = board_session.set_up(lively), board_session.place_all(lively)
+    exposures, truth = board_session.set_exposures(stage, lively), board_session.board_truth(lively, placed)
+    design = board.design(lively.board)
+    camera = calibration_of(lively.rig).cameras["cam1"]
+    for number in range(2):
+        lit, _ = board_session.shoot_pose(stage, lively, exposures, number, placed[number])
+        found = detect(lit["cam1"], design, full=255.0).pixels
+        offsets = centre_offsets(camera, placed[number], board.printed_centres(lively.bent(number)), 4.5)
+        off = found - offsets - truth["pixels"][number, :, 0]
+        flat = camera.project(rigid.apply(placed[number], design.points()))
+        assert np.nanmedian(np.abs(off)) < 0.02 < 0.1 < np.nanmedian(np.abs(found - offsets - flat))
 
 
 def test_a_board_out_of_sight_leaves_the_room(settings):

@@ -1,4 +1,4 @@
-"""Conditions under which a session is shot: those of theory, or a laboratory's lamp, light and timing."""
+"""Conditions under which a session is shot: those of theory, or a laboratory's lamp, light, timing and prints."""
 
 from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
@@ -10,13 +10,15 @@ from pydantic import Field
 from recon.model import circle_layout
 from recon.model.patterns import Fringes, Patterns
 from recon.model.rig import CameraDevice, Part, ProjectorDevice, Target
+from scenes.kinds import board
 from twin.optics.light_transport import Images
 from twin.optics.raster import Light
 from twin.sensor import Exposure, Stack, electrons_per_radiance, number_per_electron
 
 Array = NDArray[np.float64]
 
-STREAM, PRINT_STREAM = 7, 8  # of random numbers, apart from those of rendering and of the sensor
+MOST = 4  # standard deviations of a print's errors
+STREAM, PRINT_STREAM, BOARD_STREAM = 7, 8, 9  # of random numbers, apart from those of rendering and of the sensor
 
 
 class Frames(Part):
@@ -34,11 +36,22 @@ class Print(Part):
     diameter_mm: Annotated[float, Field(ge=0, le=5)] = 0.0  # of all outer rims alike: ink spreads
 
 
+class BoardPrint(Part):
+    """Standard deviations of errors that a calibration board has, by its print, its ground and its handling."""
+
+    place_mm: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # of each disc along each axis
+    stretch: Annotated[float, Field(ge=0, le=0.002)] = 0.0  # of the print: of its aspect, and of its shear
+    diameter_mm: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # of all discs alike
+    bow_mm: Annotated[float, Field(ge=0, le=2)] = 0.0  # of an arch along each side, and of a twist
+    flex_mm: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # by which each of these differs from pose to pose
+
+
 class Conditions(Part):
     """The conditions of a session, see `conf/conditions`."""
 
     frames: Frames = Frames()
     target: Print = Print()
+    board: BoardPrint = BoardPrint()
 
 
 IDEAL = Conditions()
@@ -69,6 +82,31 @@ def printed(target: Target, errors: Print, *key: int) -> Target:
     outer, inner = target.outer_diameter_mm + wider, target.inner_diameter_mm - wider
     changed = {"c1_mm": c1, "c2_aside_mm": aside, "c2_mm": c2, "outer_diameter_mm": outer, "inner_diameter_mm": inner}
     return target.model_copy(update=changed)
+
+
+def printed_board(design: board.Config, errors: BoardPrint, *key: int) -> board.Config:
+    """Draw the board that comes of a design, the same for the same key; what the design itself has of errors stays in it."""
+    if errors == BoardPrint():
+        return design
+    rng = np.random.default_rng([*key, BOARD_STREAM])
+    stretch = np.clip(errors.stretch * rng.standard_normal(2), -MOST * errors.stretch, MOST * errors.stretch)
+    wider = errors.diameter_mm * np.clip(rng.standard_normal(), -MOST, MOST)
+    changed = {
+        "print_error_mm": float(np.hypot(design.print_error_mm, errors.place_mm)),
+        "stretch": tuple((np.array(design.stretch) + stretch).tolist()),
+        "spread_mm": design.spread_mm + float(wider),
+        "bow_mm": tuple((np.array(design.bow_mm) + errors.bow_mm * rng.standard_normal(3)).tolist()),
+        "seed": int(rng.integers(2**31)) if errors.place_mm else design.seed,
+    }
+    return board.Config.model_validate(design.model_dump() | changed)
+
+
+def flexed(printed: board.Config, errors: BoardPrint, *key: int) -> board.Config:
+    """Draw the same board as it is bent in one pose."""
+    if errors.flex_mm == 0:
+        return printed
+    bent = errors.flex_mm * np.random.default_rng([*key, BOARD_STREAM]).standard_normal(3)
+    return printed.model_copy(update={"bow_mm": tuple((np.array(printed.bow_mm) + bent).tolist())})
 
 
 def emitted(patterns: Patterns, projector: ProjectorDevice, errors: FrameDraw) -> Light:

@@ -124,11 +124,12 @@ def _meet(view: View, board: Print, x, y, lens_x, lens_y):
     sy = to[1, 0] * dx + to[1, 1] * dy + to[1, 2] * focus
     sz = to[2, 0] * dx + to[2, 1] * dy + to[2, 2] * focus
     step = -pz / sz
-    if board.warp != 0:
+    if board.bow[0] != 0 or board.bow[1] != 0 or board.bow[2] != 0:
         for _ in range(BENDS):
             across = (px + step * sx - board.middle[0]) / board.half[0]
             down = (py + step * sy - board.middle[1]) / board.half[1]
-            step = (board.warp * (across * across - down * down) - pz) / sz
+            bow = board.bow[0] * across * across + board.bow[1] * across * down + board.bow[2] * down * down
+            step = (bow - pz) / sz
     return px + step * sx, py + step * sy
 
 

@@ -105,6 +105,28 @@ def test_the_warp_is_a_saddle_of_the_asked_height():
         assert np.abs(mesh - centre).max(axis=1).min() < 1e-9
 
 
+def test_a_bow_is_an_arch_a_twist_and_an_arch():
+    """In the middle of a long edge, of a short one, and in two corners."""
+    config = board.Config(bow_mm=(0.4, -0.2, 0.1), warp_mm=0.05, margin_mm=12)
+    half = np.array([7, 10]) * 15 / 2 + 12
+    middle = np.array([7, 10]) * 15 / 2
+    heights = board._heights(config, middle + half * np.array([(1, 0), (0, 1), (1, 1), (1, -1)]))
+    assert heights == pytest.approx([0.45, 0.05, 0.3, 0.7])
+    assert board.printed(config).bow == pytest.approx([0.45, -0.2, 0.05])
+
+
+def test_a_stretched_print_and_wide_discs():
+    """Length over width is off by the asked share, right angles by the shear, and the design stays as it was."""
+    config = board.Config(stretch=(2e-3, 1e-3), spread_mm=0.06)
+    points, straight = board.printed_centres(config), board.design(config).points()
+    along, across = (np.linalg.lstsq(straight - straight.mean(axis=0), points[:, k] - points[:, k].mean())[0] for k in (0, 1))
+    assert along[0] - across[1] == pytest.approx(2e-3) and along[1] + across[0] == pytest.approx(1e-3)
+    assert board.printed(config).radius == pytest.approx(4.53) and board.design(config).diameter_mm == 9
+    discs = board.things(config)[1].mesh
+    front = discs.vertices[: len(discs.vertices) // 2]
+    assert np.linalg.norm(front[:, None] - points, axis=2).min(axis=1).max() == pytest.approx(4.53, abs=1e-9)
+
+
 def test_opencv_finds_the_circles_in_our_order():
     """The board drawn as camera 1 would see it; an independent reader of the asymmetric layout."""
     config = board.Config()

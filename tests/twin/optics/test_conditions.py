@@ -7,7 +7,19 @@ from pydantic import ValidationError
 from recon.model import circle_layout
 from recon.model.patterns import Fringes, GrayCode, Patterns
 from recon.structured_light.phase import design
-from twin.optics.conditions import Conditions, Frames, Print, draw, emitted, printed, with_stray
+from scenes.kinds import board
+from twin.optics.conditions import (
+    BoardPrint,
+    Conditions,
+    Frames,
+    Print,
+    draw,
+    emitted,
+    flexed,
+    printed,
+    printed_board,
+    with_stray,
+)
 from twin.optics.raster import Light
 from twin.sensor import Exposure, electrons_per_radiance, expose
 
@@ -84,3 +96,23 @@ def test_prints_are_off_by_their_standard_deviations(rig):
     narrower = rig.target.inner_diameter_mm - np.array([target.inner_diameter_mm for target in drawn])
     assert wider.std() == pytest.approx(0.03, rel=0.05) and np.allclose(wider, narrower)
     assert printed(rig.target, errors, 7) == drawn[7] and printed(rig.target, Print(), 7) == rig.target
+
+
+def test_boards_are_off_by_their_standard_deviations():
+    """Of 2000 boards, which bend anew in each pose; the design's own errors stay."""
+    design = board.Config(bow_mm=(0.3, 0.0, 0.0), print_error_mm=0.03)
+    errors = BoardPrint(place_mm=0.04, stretch=3e-4, diameter_mm=0.02, bow_mm=0.1, flex_mm=0.01)
+    drawn = [printed_board(design, errors, seed) for seed in range(2000)]
+    bows = np.array([each.bow_mm for each in drawn])
+    assert bows.mean(axis=0) == pytest.approx([0.3, 0, 0], abs=0.01) and bows.std(axis=0) == pytest.approx(0.1, rel=0.06)
+    assert np.std([each.stretch for each in drawn], axis=0) == pytest.approx(3e-4, rel=0.06)
+    assert np.std([each.spread_mm for each in drawn]) == pytest.approx(0.02, rel=0.06)
+    assert drawn[0].print_error_mm == pytest.approx(0.05) and len({each.seed for each in drawn}) == 2000
+    bent = np.array([flexed(drawn[0], errors, 0, pose).bow_mm for pose in range(2000)]) - bows[0]
+    assert bent.std(axis=0) == pytest.approx(0.01, rel=0.06)
+    assert printed_board(design, errors, 7) == drawn[7] and flexed(drawn[7], errors, 7, 1) == flexed(drawn[7], errors, 7, 1)
+
+
+def test_ideal_boards_are_as_designed():
+    design = board.Config(bow_mm=(0.3, 0.0, 0.0), seed=5)
+    assert printed_board(design, BoardPrint(), 7) is design and flexed(design, BoardPrint(), 7, 2) is design

@@ -27,7 +27,11 @@ def patterns() -> Patterns:
 
 @pytest.mark.parametrize(
     ("design", "aperture"),
-    [(board.Config(), 1.0), (board.Config(warp_mm=2.0, print_error_mm=0.1), 3.0), (board.Config(roughness=0.3), 0.0)],
+    [
+        (board.Config(), 1.0),
+        (board.Config(warp_mm=1.0, bow_mm=(0.5, 1.0, -0.5), print_error_mm=0.1, spread_mm=0.1), 3.0),
+        (board.Config(roughness=0.3), 0.0),
+    ],
 )
 def test_edges_are_those_of_very_many_paths(rig, patterns, design, aperture, rng):
     """In focus, bowed and out of focus, and glossy with a pinhole: no bias, and less noise than 256 paths leave."""
