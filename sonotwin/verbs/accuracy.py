@@ -21,6 +21,7 @@ from recon.errors import InputError
 from recon.model.rig import Rig
 from sonotwin.config import folder
 from twin.accuracy import table_rows
+from twin.optics.conditions import Conditions
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
@@ -80,4 +81,5 @@ def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> tab
         for path in (folder() / "ultrasound").glob("*.yaml")
     }
     frames = DataRanges(**yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"])
-    return table_rows.Setup(rig, sequences, real, scanners, frames, out)
+    lifelike = Conditions(**yaml.safe_load((folder() / "conditions" / "lifelike.yaml").read_text(encoding="utf-8")))
+    return table_rows.Setup(rig, sequences, real, scanners, frames, out, lifelike)

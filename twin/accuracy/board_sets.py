@@ -72,7 +72,7 @@ def rendered(settings: board_session.Settings) -> BoardSet:
         seconds += perf_counter() - start
         images += [lit for lit, _ in shot.values()]
         shot.clear()  # before the next are rendered
-    centres = board.printed_centres(settings.board)
+    centres = board.printed_centres(settings.printed)
     return BoardSet(tuple(sightings), design, calibration_of(settings.rig), placed, centres, tuple(images), seconds)
 
 
@@ -98,27 +98,29 @@ def drawn(
     poses : (p, 4, 4)
         world_from_board.
     noise : device -> px
-        Standard deviation in u and v; for the projector that of the fringes alone, to which the camera's error at the pixel
-        where they are read is added.
-    points : (n, 3) mm, optional
-        The board as it is; as designed if not given.
+        Standard deviation in u and v; for the projector, if there is one, that of the fringes alone, to which the camera's
+        error at the pixel where they are read is added.
+    points : (n, 3) or (p, n, 3) mm, optional
+        The board as it is, in all poses or in each; as designed if not given.
     """
     points = design.points() if points is None else points
     exact = exact_observations(truth.cameras, points, poses, noise)
     errors = rng.standard_normal(exact.pixels.shape) * np.array([noise[name] for name in exact.devices])[:, None]
-    errors[:, :, exact.devices.index(PROJECTOR)] += np.einsum("pnij,pnj->pni", exact.gradient, errors[:, :, 0])
-    pixels = exact.pixels + circle_offsets(exact, Estimate(truth.cameras, poses, points), design) + errors
+    if PROJECTOR in exact.devices:
+        errors[:, :, exact.devices.index(PROJECTOR)] += np.einsum("pnij,pnj->pni", exact.gradient, errors[:, :, 0])
+    usual = points if points.ndim == 2 else points.mean(axis=0)
+    pixels = exact.pixels + circle_offsets(exact, Estimate(truth.cameras, poses, usual), design) + errors
     sightings = tuple(
         Sighting(
             exact.poses[p],
             {name: pixels[p, :, d] for d, name in enumerate(exact.devices)},
             {name: exact.covariance[p, :, d] for d, name in enumerate(exact.devices)},
             exact.gradient[p],
-            {name: disc_radii(truth.cameras[name], pose, design) for name in CAMERAS},
+            {name: disc_radii(camera, pose, design) for name, camera in truth.cameras.items() if name in CAMERAS},
         )
         for p, pose in enumerate(poses)
     )
-    return BoardSet(sightings, design, truth, poses, points)
+    return BoardSet(sightings, design, truth, poses, usual)
 
 
 @cache
@@ -137,22 +139,25 @@ def recalibrated(rig: Rig, noise: tuple[tuple[str, float], ...], draws: int, cou
 
 
 def exact_observations(cameras: Mapping[str, Camera], points: Array, poses: Array, noise: Mapping[str, float]) -> Observations:
-    """Where the devices see points : (n, 3) mm of the board, without noise, but with its covariance."""
-    world = [rigid.apply(pose, points) for pose in poses]
+    """Where the devices see points : (n, 3) or (p, n, 3) mm of the board, without noise, but with its covariance."""
+    world = [
+        rigid.apply(pose, own) for pose, own in zip(poses, np.broadcast_to(points, (len(poses), *points.shape[-2:])), strict=True)
+    ]
     pixels = np.stack([[camera.project(at) for at in world] for camera in cameras.values()], axis=2)
     covariance = np.array([noise[name] ** 2 * np.eye(2) for name in cameras])
-    gradient = [
-        on_board(cameras[PROJECTOR], pose, at) @ np.linalg.inv(on_board(cameras[FRINGE_CAMERA], pose, at))
-        for pose, at in zip(poses, world, strict=True)
-    ]
+    gradient = np.zeros((len(poses), points.shape[-2], 2, 2))
+    if PROJECTOR in cameras:
+        for k, (pose, at) in enumerate(zip(poses, world, strict=True)):
+            by_camera = on_board(cameras[FRINGE_CAMERA], pose, at)
+            gradient[k] = on_board(cameras[PROJECTOR], pose, at) @ np.linalg.inv(by_camera)
     return Observations(
         tuple(board_session.pose_name(k) for k in range(len(poses))),
         tuple(cameras),
         tuple(camera.size for camera in cameras.values()),
-        points,
+        points if points.ndim == 2 else points.mean(axis=0),
         pixels,
         np.broadcast_to(covariance, (*pixels.shape, 2)).copy(),
-        np.array(gradient),
+        gradient,
     )
 
 

@@ -31,6 +31,7 @@ from twin.accuracy.baselines import opencv_peer
 from twin.accuracy.board_sets import BoardSet, drawn, measured_noise, recalibrated, rendered
 from twin.accuracy.calibration_errors import (
     DEPTHS,
+    PAIRS,
     REGION,
     baseline_error,
     expected_length,
@@ -61,7 +62,6 @@ DRAWN_POSES = 20
 DRAWS = 30  # calibrations whose errors are compared with the prediction
 
 BROWN = Settings(distortion="brown")  # OpenCV's five coefficients
-PAIRS = (("cam1", "cam2"), ("cam1", "projector"))
 BENT_POSES = 16
 BENT = board.Config(warp_mm=0.2, print_error_mm=0.02, roughness=0.2)
 

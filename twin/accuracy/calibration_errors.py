@@ -10,6 +10,7 @@ from recon.model.calibration import Calibration
 from recon.optical_calibration import figures_of_merit, uncertainty
 
 DEPTHS = (606.0, 660.0, 713.0)  # mm: the rig's working range (Meza et al. 2021) and its middle
+PAIRS = (("cam1", "cam2"), ("cam1", "projector"))
 REGION = 0.95  # probability of the regions that points are looked for in
 
 

@@ -92,3 +92,13 @@ def stereo(observations: Observations, name: str, offsets: Array) -> Calibration
     return Calibration(
         {"cam1": Camera(size, first, np.ravel(k1)[:5]), name: Camera(second_size, second, np.ravel(k2)[:5], place)}
     )
+
+
+def reprojection_rms(observations: Observations, name: str) -> float:
+    """RMS reprojection error, px, of a device that OpenCV calibrates alone, from the ellipses' middles."""
+    d = observations.devices.index(name)
+    seen = observations.seen[:, :, d]
+    poses = np.flatnonzero(seen.sum(axis=1) >= 8)
+    objects = [np.float32(observations.points[seen[p]]) for p in poses]
+    pixels = [np.float32(observations.pixels[p, seen[p], d]) for p in poses]
+    return float(cv2.calibrateCamera(objects, pixels, observations.sizes[d], np.eye(3), np.zeros(5))[0])
