@@ -28,6 +28,10 @@ BAD_POSE = 5.0  # times the noise: median residual of a pose in one device that 
 MANY_POINTS = 400  # of a board: the shape of one with more takes too long to find
 ENOUGH = 2.0  # sightings' coordinates an unknown, the board's points among these, to find its shape by
 CHANCE = 1e-3  # by which halves of the poses seem to contradict each other, though the covariance is right
+CONTRADICTION = (
+    "halves of the poses differ by {:.1f} times what residuals let expect, and all uncertainties were widened by that: "
+    "did a device move or warm up, or the board change between poses?"
+)
 BENT = 0.9  # of a flatness tolerance's variance: bowing, which neighbours share
 
 
@@ -120,7 +124,7 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     adjusted, observations, contradicting = _consistent(observations, first, free, board, name)
     checks.refuse_unusable(observations, name)
     estimate, offsets = adjusted.estimate, circle_offsets(observations, adjusted.estimate, board)
-    released = settings.shape.released and _tell_shape(observations)
+    released = settings.shape.released and _show_shape(observations)
     tolerances = settings.shape.tolerances
     estimate, tolerances = _shaped(observations, estimate, free, offsets, settings.shape) if released else (estimate, tolerances)
     estimate = adjust(observations, estimate, free, offsets, tolerances, released).estimate
@@ -134,14 +138,11 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
         tolerances = _tolerances(observations, adjusted, free, offsets, settings.shape)
     lenses = _lenses(adjusted, free)
     adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released, lenses)
-    halves, contradiction = compare_halves(observations, adjusted, free, offsets, tolerances, released)
     found = checks.warnings(observations, adjusted) + ([size_warning] if size_warning else [])
+    halves, contradiction = compare_halves(observations, adjusted, free, offsets, tolerances, released)
     if contradiction > chdtri(halves.size, CHANCE) / halves.size:
         adjusted = _widened(adjusted, contradiction)
-        found.append(
-            f"halves of the poses differ by {np.sqrt(contradiction):.1f} times what residuals let expect, "
-            "and all uncertainties were widened by that: did a device move or warm up, or the board change between poses?"
-        )
+        found.append(CONTRADICTION.format(np.sqrt(contradiction)))
     dropped |= contradicting
     return Result(observations, adjusted, model, scores, dropped, halves, tuple(found), offsets, board, tolerances, released)
 
@@ -154,7 +155,7 @@ def _widened(adjusted: Adjustment, squared: float) -> Adjustment:
     return replace(adjusted, calibration=replace(found, uncertainty=wider))
 
 
-def _tell_shape(observations: Observations) -> bool:
+def _show_shape(observations: Observations) -> bool:
     """Whether there are sightings enough to find the board's shape by."""
     points, poses = observations.used.shape[1], np.count_nonzero(observations.used.any(axis=(1, 2)))
     unknowns = 3 * points + 6 * poses + 15 * len(observations.devices)
