@@ -126,6 +126,26 @@ def adjust(
     )
 
 
+def widened(
+    observations: Observations,
+    adjusted: Adjustment,
+    free: Mapping[str, Sequence[str]],
+    offsets: Array,
+    tolerances: Tolerances,
+    released: bool,
+    factor: float,
+) -> Adjustment:
+    """The same adjustment with the covariance of sightings that are less exact by a factor than their residuals say.
+
+    What is known without them, of board and lenses, stays as it is.
+    """
+    problem = Problem(observations, offsets, free, tolerances, released, adjusted.lenses)
+    noise = factor * np.array(list(adjusted.noise.values()))
+    system = linearised(problem, adjusted.estimate, noise, shaped=released or bool(tolerances.sigmas.any()))
+    uncertainty = Uncertainty(problem.names, _covariance(system, problem, adjusted.estimate))
+    return replace(adjusted, calibration=replace(adjusted.calibration, uncertainty=uncertainty))
+
+
 def free_parameters(devices: Sequence[str], distortion: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
     """All parameters of all devices, with the distortion coefficients given for each; the first device doesn't move."""
     return {device: (*MATRIX, *distortion[device], *(MOTION if number else ())) for number, device in enumerate(devices)}

@@ -17,7 +17,7 @@ from recon.model.calibration import Calibration
 from recon.model.rig import NotNegative, Part
 from recon.optical_calibration import board_shape, initial_estimate
 from recon.optical_calibration import optical_checks as checks
-from recon.optical_calibration.adjustment import Adjustment, adjust, board_information, free_parameters
+from recon.optical_calibration.adjustment import Adjustment, adjust, board_information, free_parameters, widened
 from recon.optical_calibration.board_shape import Tolerances
 from recon.optical_calibration.bundle import Array, Estimate
 from recon.optical_calibration.distortion_selection import MODELS, TRIED, ModelName, choose
@@ -29,8 +29,8 @@ MANY_POINTS = 400  # of a board: the shape of one with more takes too long to fi
 ENOUGH = 2.0  # sightings' coordinates an unknown, the board's points among these, to find its shape by
 CHANCE = 1e-3  # by which halves of the poses seem to contradict each other, though the covariance is right
 CONTRADICTION = (
-    "halves of the poses differ by {:.1f} times what residuals let expect, and all uncertainties were widened by that: "
-    "did a device move or warm up, or the board change between poses?"
+    "halves of the poses differ by {:.1f} times what residuals let expect, so sightings count as less exact by that: "
+    "did a device move or warm up, or the board bend between poses?"
 )
 BENT = 0.9  # of a flatness tolerance's variance: bowing, which neighbours share
 
@@ -141,18 +141,11 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     found = checks.warnings(observations, adjusted) + ([size_warning] if size_warning else [])
     halves, contradiction = compare_halves(observations, adjusted, free, offsets, tolerances, released)
     if contradiction > chdtri(halves.size, CHANCE) / halves.size:
-        adjusted = _widened(adjusted, contradiction)
-        found.append(CONTRADICTION.format(np.sqrt(contradiction)))
+        factor = float(np.sqrt(contradiction))
+        adjusted = widened(observations, adjusted, free, offsets, tolerances, released, factor)
+        found.append(CONTRADICTION.format(factor))
     dropped |= contradicting
     return Result(observations, adjusted, model, scores, dropped, halves, tuple(found), offsets, board, tolerances, released)
-
-
-def _widened(adjusted: Adjustment, squared: float) -> Adjustment:
-    """An adjustment with its covariance times a factor."""
-    found = adjusted.calibration
-    assert found.uncertainty is not None
-    wider = replace(found.uncertainty, covariance=squared * found.uncertainty.covariance)
-    return replace(adjusted, calibration=replace(found, uncertainty=wider))
 
 
 def _show_shape(observations: Observations) -> bool:

@@ -25,7 +25,7 @@ from twin.optics.conditions import Conditions
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
-Group = Literal["optics", "surface", "reality", "calibration", "ultrasound", "tracking"]
+Group = Literal["optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking"]
 
 
 class Config(BaseModel):

@@ -41,7 +41,7 @@ def test_rows_are_written_and_missed_bars_told(quick, value, status, tmp_path, c
         ("real=nowhere", "accuracy: real: expected a folder of recordings, found none at nowhere"),
         (
             "only=acoustics",
-            "accuracy: only: expected 'optics', 'surface', 'reality', 'calibration', 'ultrasound' or 'tracking', "
+            "accuracy: only: expected 'optics', 'surface', 'reality', 'calibration', 'lifelike', 'ultrasound' or 'tracking', "
             "found 'acoustics'",
         ),
     ],

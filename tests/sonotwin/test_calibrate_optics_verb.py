@@ -65,7 +65,7 @@ def calibrated(session) -> tuple[Path, list[str]]:
 
 def test_a_capture_becomes_a_calibration(session, calibrated):
     out, lines = calibrated
-    assert [line.split()[0] for line in lines][:3] == ["detect", "dropped", "adjust"] and lines[-1].startswith("wrote ")
+    assert [line.split()[0] for line in lines][:3] == ["detect", "dropped", "uncertain"] and lines[-1].startswith("wrote ")
     assert re.fullmatch(r"detect +9 poses: cam1 9, cam2 8, \d+ s", lines[0])
     assert lines[1].startswith("dropped     08 cam2: ")
     assert any(line.startswith("error ") for line in lines)

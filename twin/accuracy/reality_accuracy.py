@@ -1,4 +1,4 @@
-"""Accuracy under conditions of life: imprecise prints, few points, a lamp that flickers, light from elsewhere, wrong shifts."""
+"""Accuracy with frames and targets of life: a lamp that flickers, light from elsewhere, shifts that are off, imprecise prints."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from recon.tracking import networks as nets
 from scenes.catalogue import build_scene
 from scenes.kinds import plane
 from scenes.scene_types import Scene
-from twin.accuracy import board_accuracy, lens_accuracy, lifelike_accuracy, target_accuracy
+from twin.accuracy import target_accuracy
 from twin.accuracy.surface_accuracy import experiment, relief_noise_ratio
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation.surface_errors import rms
@@ -27,15 +27,12 @@ def measurements(setup: Setup) -> list[Measurement]:
     """The rows of the group, at full size; that of the real relief only where its recording is."""
     networks = nets.load()
     return [
-        lambda: board_accuracy.rows(setup),
-        lens_accuracy.rows,
         lambda: compared(setup, "planes", [plane.build(pose) for pose in plane.PAPER_POSES], "plane_plate_rms_mm"),
         lambda: compared(setup, "breasts", [build_scene({"kind": "breast"})], "surface_rms_mm"),
         *([lambda: relief(setup)] if setup.real else []),
         lambda: exposed(setup),
         lambda: target_accuracy.rows(setup, networks),
         lambda: target_accuracy.false_rows(setup, networks),
-        lambda: lifelike_accuracy.rows(setup),
     ]
 
 
