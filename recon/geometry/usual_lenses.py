@@ -19,7 +19,9 @@ from recon.geometry.camera_jacobian import DISTORTION
 
 Array = NDArray[np.float64]
 
-LARGEST = {  # standard deviation of the share in the corner, and the power of the corner's radius that it goes with
+# Standard deviation of the share in the corner, and the power of the corner's radius that it goes with. Assumed: wide lenses bend
+# by 30 %, each further term of a series that converges by less, and decentring and tilt are a maker's tolerances.
+LARGEST = {
     "k1": (0.3, 2), "k2": (0.15, 4), "k3": (0.05, 6), "k4": (0.3, 2), "k5": (0.15, 4), "k6": (0.05, 6),
     "p1": (0.02, 1), "p2": (0.02, 1), "s1": (0.02, 1), "s2": (0.02, 3), "s3": (0.02, 1), "s4": (0.02, 3),
     "tau_x": (0.1, 0), "tau_y": (0.1, 0),
@@ -46,40 +48,28 @@ def corner_radius(camera: Camera) -> float:
     return float(np.linalg.norm(np.abs(corners - middle).max(axis=0) / camera.matrix[[0, 1], [0, 1]]))
 
 
-def estimated(values: Array, covariance: Array, held: Array, most: Array) -> Array:
-    """Standard deviations by which coefficients are held to zero, given what the sightings show of them.
+def estimated(information: Array, pull: Array, start: Array, most: Array) -> Array:
+    """Standard deviations : (k,) by which coefficients are held to zero, given what the sightings show of them.
 
     Parameters
     ----------
-    values : (g,)
-        Parameters as adjusted.
-    covariance : (g, g)
-        Theirs.
-    held : (g,)
-        Standard deviations by which they were held in that adjustment; infinite for those that were not.
-    most : (g,)
+    information : (k, k)
+        Of the coefficients by the sightings alone, all else eliminated.
+    pull : (k,)
+        Information times the values that the sightings ask for.
+    start : (k,)
+        Standard deviations to begin with.
+    most : (k,)
         The largest ones among lenses, as `largest`.
-
-    Returns
-    -------
-    (g,)
-        Infinite for those that were not held.
     """
-    chosen = np.flatnonzero(np.isfinite(held))
-    scale = most[chosen]
-    information = np.linalg.inv(covariance[np.ix_(chosen, chosen)] / np.outer(scale, scale))
-    pull = information @ (values[chosen] / scale)
-    information = information - np.diag((scale / held[chosen]) ** 2)
-    sigma = held[chosen] / scale
+    information, pull, sigma = information * np.outer(most, most), pull * most, start / most
     for _ in range(SWEEPS):
-        for k in range(len(chosen)):
+        for k in range(len(sigma)):
             posterior = np.linalg.inv(information + np.diag(sigma**-2))
             variance = 1 / max(1 / posterior[k, k] - sigma[k] ** -2, 1e-30)  # by the sightings, given the others
             found = (posterior @ pull)[k] * variance / posterior[k, k]
             sigma[k] = _shrunk(found, variance)
-    result = held.copy()
-    result[chosen] = sigma * scale
-    return result
+    return sigma * most
 
 
 def _shrunk(found: float, variance: float) -> float:
@@ -87,5 +77,5 @@ def _shrunk(found: float, variance: float) -> float:
     among = SMALLER**2
     evidence = -(np.log(among + variance) + found**2 / (among + variance)) / 2
     weight = np.exp(evidence - evidence.max())
-    shrinkage = float(weight @ (among / (among + variance)) / weight.sum())
-    return float(np.sqrt(variance * shrinkage / (1 - shrinkage)))
+    lost = float(weight @ (variance / (among + variance)) / weight.sum())  # one less the shrinkage, which may be all but one
+    return float(np.sqrt(variance * (1 - lost) / lost))

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from recon.geometry.camera_jacobian import MATRIX, MOTION
+from recon.geometry.board_shape import AS_DESIGNED, Tolerances
+from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
 from recon.geometry.lens_domain import is_one_to_one
 from recon.geometry.levenberg_marquardt import Descent, Rules, Unreachable, descend
 from recon.model.calibration import Calibration, Uncertainty
-from recon.optical_calibration.board_shape import AS_DESIGNED, Tolerances
 from recon.optical_calibration.bundle import (
     ROBUST,
     Array,
@@ -126,26 +126,6 @@ def adjust(
     )
 
 
-def widened(
-    observations: Observations,
-    adjusted: Adjustment,
-    free: Mapping[str, Sequence[str]],
-    offsets: Array,
-    tolerances: Tolerances,
-    released: bool,
-    factor: float,
-) -> Adjustment:
-    """The same adjustment with the covariance of sightings that are less exact by a factor than their residuals say.
-
-    What is known without them, of board and lenses, stays as it is.
-    """
-    problem = Problem(observations, offsets, free, tolerances, released, adjusted.lenses)
-    noise = factor * np.array(list(adjusted.noise.values()))
-    system = linearised(problem, adjusted.estimate, noise, shaped=released or bool(tolerances.sigmas.any()))
-    uncertainty = Uncertainty(problem.names, _covariance(system, problem, adjusted.estimate))
-    return replace(adjusted, calibration=replace(adjusted.calibration, uncertainty=uncertainty))
-
-
 def free_parameters(devices: Sequence[str], distortion: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
     """All parameters of all devices, with the distortion coefficients given for each; the first device doesn't move."""
     return {device: (*MATRIX, *distortion[device], *(MOTION if number else ())) for number, device in enumerate(devices)}
@@ -183,19 +163,23 @@ def fitted(problem: Problem, start: Estimate, noise: Array | None = None, conver
 def _one_to_one(problem: Problem, start: Estimate) -> tuple[Problem, Fitted]:
     """Fit; lenses that come out with a pole or a fold near their image are held tighter, as far as the sightings allow."""
     free = fit = fitted(problem, start)
+    given_up = {name for name in fit.estimate.cameras if not any(part in DISTORTION for part in problem.free.get(name, ()))}
     held = problem
-    while bent := [name for name, camera in fit.estimate.cameras.items() if not is_one_to_one(camera)]:
-        tighter = {name: TIGHTER * held.tightness.get(name, 1.0) for name in bent}
-        held = replace(problem, tightness={**held.tightness, **tighter})
+    while True:
+        strained = {problem.observations.devices[d] for d in np.flatnonzero(fit.noise > STRAINED * free.noise)}
+        given_up |= strained & held.tightness.keys()
+        bent = {name for name, camera in fit.estimate.cameras.items() if not is_one_to_one(camera)} - given_up
+        if not bent and not given_up & held.tightness.keys():
+            return held, fit
+        tightness = {**held.tightness, **{name: TIGHTER * held.tightness.get(name, 1.0) for name in bent}}
+        given_up |= {name for name in bent if tightness[name] > TIGHTEST}
+        held = replace(problem, tightness={name: tight for name, tight in tightness.items() if name not in given_up})
         fit = fitted(held, start)
-        if max(tighter.values()) > TIGHTEST or (fit.noise > STRAINED * free.noise).any():
-            return problem, free
-    return held, fit
 
 
 def _descend(problem: Problem, estimate: Estimate, noise: Array, rules: Rules) -> Descent[Estimate, System, tuple[Array, Array]]:
     """Levenberg-Marquardt from an estimate to the next minimum, at fixed noise."""
-    prior = _prior(problem, estimate)
+    prior = prior_information(problem, estimate)
 
     def system_and_cost(estimate: Estimate) -> tuple[System, float]:
         system = linearised(problem, estimate, noise, problem.released)
@@ -207,7 +191,7 @@ def _descend(problem: Problem, estimate: Estimate, noise: Array, rules: Rules) -
     return descend(estimate, system_and_cost, step, lambda estimate, step: stepped(problem, estimate, *step), rules=rules)
 
 
-def _prior(problem: Problem, estimate: Estimate) -> Array:
+def prior_information(problem: Problem, estimate: Estimate) -> Array:
     """Information on the shared unknowns : (g, g) without any sighting: that of usual lenses, and the board's tolerances."""
     lenses = np.diag(lens_sigmas(problem, estimate.cameras) ** -2)
     if not problem.released:
@@ -286,15 +270,42 @@ def board_information(
     """Information of the sightings alone on board points : (3 n, 3 n), 1/mm^2, and times their departures : (3 n,), 1/mm."""
     problem = Problem(observations, offsets, free, released=True, lenses=adjusted.lenses)
     system = linearised(problem, adjusted.estimate, np.array(list(adjusted.noise.values())), shaped=True)
-    own, (reduced, right) = len(problem.names), _without_poses(system)
+    own, (reduced, right) = len(problem.names), without_poses(system)
     lenses, departures = adjusted.lenses**-2, _deviation(adjusted.estimate, problem)
-    devices = _inverse(reduced[:own, :own] + np.diag(lenses))
+    devices = inverse(reduced[:own, :own] + np.diag(lenses))
     pull = right[own:] - reduced[own:, :own] @ devices @ (right[:own] - lenses * departures[:own])
     information = reduced[own:, own:] - reduced[own:, :own] @ devices @ reduced[:own, own:]
     return information, pull + information @ departures[own:]
 
 
-def _without_poses(system: System) -> tuple[Array, Array]:
+def lens_information(
+    observations: Observations,
+    adjusted: Adjustment,
+    free: Mapping[str, Sequence[str]],
+    offsets: Array,
+    tolerances: Tolerances,
+    released: bool,
+) -> tuple[Array, Array]:
+    """Information of the sightings alone on coefficients of distortion : (k, k), and times the values they ask for : (k,).
+
+    Poses, other parameters and, if it is released, the board, as far as its tolerances leave it open, are eliminated.
+    """
+    problem = Problem(observations, offsets, free, tolerances, released, adjusted.lenses)
+    system = linearised(problem, adjusted.estimate, np.array(list(adjusted.noise.values())), released)
+    information, right = without_poses(system)
+    held, departures = np.isfinite(adjusted.lenses), _deviation(adjusted.estimate, problem)
+    if released:
+        own, prior = len(problem.names), np.linalg.inv(tolerances.covariance(observations.points))
+        information[own:, own:] += prior
+        right[own:] -= prior @ departures[own:]
+    chosen = np.flatnonzero(held)
+    others = np.setdiff1d(np.arange(len(right)), chosen)
+    eliminate = information[np.ix_(chosen, others)] @ inverse(information[np.ix_(others, others)])
+    alone = information[np.ix_(chosen, chosen)] - eliminate @ information[np.ix_(others, chosen)]
+    return alone, right[chosen] - eliminate @ right[others] + alone @ departures[chosen]
+
+
+def without_poses(system: System) -> tuple[Array, Array]:
     """Normal equations of the shared unknowns : (g, g), (g,), the poses eliminated."""
     equations = system.equations
     each = np.concatenate([equations.cross.swapaxes(1, 2), equations.pose_right[..., None]], axis=2)
@@ -305,17 +316,21 @@ def _without_poses(system: System) -> tuple[Array, Array]:
 
 def _covariance(system: System, problem: Problem, estimate: Estimate) -> Array:
     """Covariance of the devices' parameters : (g, g); that of usual lenses, however tightly they had to be held."""
-    own, (reduced, _), prior = len(problem.names), _without_poses(system), _prior(replace(problem, tightness={}), estimate)
+    own, (reduced, _), prior = (
+        len(problem.names),
+        without_poses(system),
+        prior_information(replace(problem, tightness={}), estimate),
+    )
     if problem.released:
-        return _inverse(reduced + prior)[:own, :own]
-    covariance = _inverse(reduced[:own, :own] + prior)
+        return inverse(reduced + prior)[:own, :own]
+    covariance = inverse(reduced[:own, :own] + prior)
     if len(reduced) > own:  # errors of the board that are not estimated carry over to the parameters
         carried = covariance @ reduced[:own, own:]
         covariance = covariance + carried @ problem.tolerances.covariance(problem.observations.points) @ carried.T
     return covariance
 
 
-def _inverse(information: Array) -> Array:
+def inverse(information: Array) -> Array:
     """Covariance from an information matrix whose unknowns have different units; what is hardly determined varies widely."""
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
     values, vectors = np.linalg.eigh(scale[:, None] * information * scale)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry import rigid, usual_lenses
+from recon.geometry.board_shape import AS_DESIGNED, Tolerances
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise, moved
 from recon.geometry.levenberg_marquardt import Unreachable
-from recon.optical_calibration.board_shape import AS_DESIGNED, Tolerances
 from recon.optical_calibration.normal_equations import Equations, Sightings, added_up
 from recon.optical_calibration.observations import PROJECTOR, Observations
 

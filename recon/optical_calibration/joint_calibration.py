@@ -6,32 +6,27 @@ from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 
 from recon.errors import InputError
-from recon.geometry import usual_lenses
+from recon.geometry import board_shape, usual_lenses
+from recon.geometry.board_shape import Tolerances
 from recon.geometry.camera_jacobian import difference
 from recon.geometry.circle_projection import centre_offsets
 from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
 from recon.model.calibration import Calibration
 from recon.model.rig import NotNegative, Part
-from recon.optical_calibration import board_shape, initial_estimate
+from recon.optical_calibration import initial_estimate
 from recon.optical_calibration import optical_checks as checks
-from recon.optical_calibration.adjustment import Adjustment, adjust, board_information, free_parameters, widened
-from recon.optical_calibration.board_shape import Tolerances
+from recon.optical_calibration.adjustment import Adjustment, adjust, board_information, free_parameters, lens_information
 from recon.optical_calibration.bundle import Array, Estimate
 from recon.optical_calibration.distortion_selection import MODELS, TRIED, ModelName, choose
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
+from recon.optical_calibration.pose_consistency import consistency, widened
 from recon.optical_calibration.sightings import Sighting, gather, without_scraps
 
 BAD_POSE = 5.0  # times the noise: median residual of a pose in one device that doesn't fit the others
 MANY_POINTS = 400  # of a board: the shape of one with more takes too long to find
 ENOUGH = 2.0  # sightings' coordinates an unknown, the board's points among these, to find its shape by
-CHANCE = 1e-3  # by which halves of the poses seem to contradict each other, though the covariance is right
-CONTRADICTION = (
-    "halves of the poses differ by {:.1f} times what residuals let expect, so sightings count as less exact by that: "
-    "did a device move or warm up, or the board bend between poses?"
-)
 BENT = 0.9  # of a flatness tolerance's variance: bowing, which neighbours share
 
 
@@ -124,7 +119,7 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     adjusted, observations, contradicting = _consistent(observations, first, free, board, name)
     checks.refuse_unusable(observations, name)
     estimate, offsets = adjusted.estimate, circle_offsets(observations, adjusted.estimate, board)
-    released = settings.shape.released and _show_shape(observations)
+    released = settings.shape.released and _determine_shape(observations)
     tolerances = settings.shape.tolerances
     estimate, tolerances = _shaped(observations, estimate, free, offsets, settings.shape) if released else (estimate, tolerances)
     estimate = adjust(observations, estimate, free, offsets, tolerances, released).estimate
@@ -136,19 +131,17 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     offsets = circle_offsets(observations, adjusted.estimate, board)
     if released:
         tolerances = _tolerances(observations, adjusted, free, offsets, settings.shape)
-    lenses = _lenses(adjusted, free)
+    lenses = _lenses(observations, adjusted, free, offsets, tolerances, released)
     adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released, lenses)
-    found = checks.warnings(observations, adjusted) + ([size_warning] if size_warning else [])
-    halves, contradiction = compare_halves(observations, adjusted, free, offsets, tolerances, released)
-    if contradiction > chdtri(halves.size, CHANCE) / halves.size:
-        factor = float(np.sqrt(contradiction))
-        adjusted = widened(observations, adjusted, free, offsets, tolerances, released, factor)
-        found.append(CONTRADICTION.format(factor))
+    halves = compare_halves(observations, adjusted, free, offsets, tolerances, released)
+    agreement = consistency(observations, adjusted, free, offsets, tolerances, released)
+    adjusted = widened(adjusted, agreement.covariance)
+    found = [*checks.warnings(observations, adjusted), *filter(None, (agreement.warning, size_warning))]
     dropped |= contradicting
     return Result(observations, adjusted, model, scores, dropped, halves, tuple(found), offsets, board, tolerances, released)
 
 
-def _show_shape(observations: Observations) -> bool:
+def _determine_shape(observations: Observations) -> bool:
     """Whether there are sightings enough to find the board's shape by."""
     points, poses = observations.used.shape[1], np.count_nonzero(observations.used.any(axis=(1, 2)))
     unknowns = 3 * points + 6 * poses + 15 * len(observations.devices)
@@ -171,15 +164,22 @@ def _tolerances(
     return board_shape.estimated(information, pull, observations.points, shape.tolerances)
 
 
-def _lenses(adjusted: Adjustment, free: Mapping[str, Sequence[str]]) -> Array:
+def _lenses(
+    observations: Observations,
+    adjusted: Adjustment,
+    free: Mapping[str, Sequence[str]],
+    offsets: Array,
+    tolerances: Tolerances,
+    released: bool,
+) -> Array:
     """Standard deviations : (g,) by which coefficients of distortion are held to zero, by the evidence of the sightings."""
-    found = adjusted.calibration
-    assert found.uncertainty is not None
-    values, most = (
-        np.concatenate([of(camera, free[device]) for device, camera in found.cameras.items()])
-        for of in (usual_lenses.coefficients, usual_lenses.largest)
-    )
-    return usual_lenses.estimated(values, found.uncertainty.covariance, adjusted.lenses, most)
+    lenses, held = adjusted.lenses.copy(), np.isfinite(adjusted.lenses)
+    if held.any():
+        cameras = adjusted.calibration.cameras
+        most = np.concatenate([usual_lenses.largest(cameras[device], free[device]) for device in observations.devices])
+        shown = lens_information(observations, adjusted, free, offsets, tolerances, released)
+        lenses[held] = usual_lenses.estimated(*shown, lenses[held], most[held])
+    return lenses
 
 
 def circle_offsets(observations: Observations, estimate: Estimate, board: Board) -> Array:
@@ -213,23 +213,17 @@ def compare_halves(
     offsets: Array,
     tolerances: Tolerances | None = None,
     released: bool = False,
-) -> tuple[Array, float]:
-    """Calibrate every other pose, and the rest, and compare.
+) -> Array:
+    """Calibrate every other pose, and the rest, and compare : (g,) differences over their predicted standard deviation.
 
-    What both halves share, as the board, doesn't show.
-
-    Returns
-    -------
-    differences, squared
-        Of the parameters : (g,) over their predicted standard deviation; and their square over its expectation, correlations and
-        all, a parameter. Standard normal, and one, if the predicted covariance is honest. NaN if a device sees too few poses of a
-        half.
+    Standard normal if the predicted covariance is honest. What both halves share, as the board and what lenses usually are,
+    doesn't show. NaN if a device sees too few poses of a half.
     """
     uncertainty = adjusted.calibration.uncertainty
     assert uncertainty is not None
     halves = [np.arange(first, len(observations.poses), 2) for first in (0, 1)]
     if min(observations.seen[half].any(axis=1).sum(axis=0).min() for half in halves) < checks.FEWEST_POSES:
-        return np.full(len(uncertainty.names), np.nan), np.nan
+        return np.full(len(uncertainty.names), np.nan)
     alone = tolerances if released else None  # of a board as designed the tolerances are common to both halves
     fits = []
     for half in halves:
@@ -237,11 +231,8 @@ def compare_halves(
         fits.append(adjust(observations.of_poses(half), begin, free, offsets[half], alone, released, adjusted.lenses))
     first, second = (fit.calibration for fit in fits)
     assert first.uncertainty is not None and second.uncertainty is not None
-    covariance = first.uncertainty.covariance + second.uncertainty.covariance
-    scale = np.sqrt(np.diag(covariance))
-    differences = deviation(first, second) / scale
-    squared = differences @ np.linalg.solve(covariance / np.outer(scale, scale), differences)
-    return differences, float(squared) / len(differences)
+    variance = np.diag(first.uncertainty.covariance) + np.diag(second.uncertainty.covariance)
+    return deviation(first, second) / np.sqrt(variance)
 
 
 def deviation(first: Calibration, second: Calibration) -> Array:

@@ -127,6 +127,10 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
             )
         elif device in adjustment.tightness:
             found.append(f"{device}: the points leave a pole or a fold near the image; the lens is held to weaker distortion")
+        elif not is_one_to_one(camera):
+            found.append(
+                f"{device}: the lens model folds just outside the image, as the points ask for it: don't trust its corners"
+            )
         seen = observations.pixels[:, :, number].reshape(-1, 2)
         part = measuring_part(adjustment, device)
         if (share := coverage(seen, part)) < COVERED:
@@ -156,6 +160,8 @@ def measuring_part(adjustment: Adjustment, device: str) -> Array:
     first = next(iter(cameras.values()))
     depths = np.concatenate([rigid.apply(pose, adjustment.points)[:, 2] for pose in adjustment.poses])
     rays = first.rays(corners * (np.array(first.size) - 1.0))
+    if not np.isfinite(rays).all():
+        return corners * cameras[device].size
     world = np.concatenate([rays / rays[:, 2:] * depth for depth in (depths.min(), depths.max())])
     return np.clip(cameras[device].project(world), 0, cameras[device].size)
 
@@ -163,8 +169,9 @@ def measuring_part(adjustment: Adjustment, device: str) -> Array:
 def coverage(pixels: Array, part: Array) -> float:
     """Area of the convex hull of points : (m, 2) px over that of a part of the image, by its corners : (k, 2) px; at most 1."""
     known = pixels[np.isfinite(pixels).all(axis=1)]
+    whole = ConvexHull(part).volume
     try:
-        return min(float(ConvexHull(known).volume / ConvexHull(part).volume), 1.0)
+        return min(float(ConvexHull(known).volume / whole), 1.0)
     except (QhullError, ValueError):  # of fewer than three points, or of some on one line
         return 0.0
 

@@ -40,13 +40,9 @@ class Config(Part):
     centre_mm: Vector = (4.0, -2.0, 660.0)  # the middle of the circles in the world
     rotation_deg: Vector = (0.0, 0.0, 90.0)  # rotation vector, axis times angle; 90 about z lays the board along x
     warp_mm: NotNegative = 0.0  # amplitude of a saddle: the long edges bow back by this, the short ones forward
-    bow_mm: Vector = (
-        0.0,
-        0.0,
-        0.0,
-    )  # an arch along x, a twist and an arch along y besides, in the middles of edges and in corners
+    bow_mm: Vector = (0.0, 0.0, 0.0)  # besides: an arch along x, a twist, an arch along y; in middles of edges and in corners
     print_error_mm: Annotated[float, Field(ge=0, le=1)] = 0.0  # standard deviation of each centre, in x and in y
-    stretch: tuple[Stretch, Stretch] = (0.0, 0.0)  # of the print, relative: length along x over that along y less one, and shear
+    stretch: tuple[Stretch, Stretch, Stretch] = (0.0, 0.0, 0.0)  # of the print: its scale, its length over its width, and shear
     spread_mm: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0  # by which ink makes discs wider than diameter_mm
     white: Fraction = 0.75  # reflectance of paper
     black: Fraction = 0.05  # reflectance of printed ink
@@ -55,14 +51,18 @@ class Config(Part):
 
     @model_validator(mode="after")
     def _fits(self) -> "Config":
-        spacing = self.spacing_mm * (1 - np.abs(self.stretch).sum())
-        nearest = (
-            np.sqrt(2) * (spacing - 2 * MAX_ERRORS * self.print_error_mm) - self.spread_mm
-        )  # two centres, along the diagonal
+        printed, off = self.diameter_mm + self.spread_mm, MAX_ERRORS * self.print_error_mm
+        if printed <= 0:
+            raise ValueError(
+                f"spread_mm: expected more than {-self.diameter_mm:g}, that discs are left, found {self.spread_mm:g}"
+            )
+        stretched = float(np.abs(self.stretch).sum())
+        nearest = np.sqrt(2) * (self.spacing_mm * (1 - stretched) - 2 * off)  # two centres, along the diagonal
         room = nearest / (1 + np.sin(np.pi / SIDES) / 2)  # leaves half a side of the outline between two discs
-        if self.diameter_mm >= room:
-            raise ValueError(f"diameter_mm: expected less than {room:.4g} to keep circles apart, found {self.diameter_mm:g}")
-        if self.diameter_mm / 2 + (MAX_ERRORS + 1) * self.print_error_mm >= self.margin_mm:
+        if printed >= room:
+            raise ValueError(f"diameter_mm: expected less than {room:.4g} to keep circles apart, found {printed:g} as printed")
+        moved = stretched * float(np.max(_middle(self)))
+        if printed / 2 + moved + off + self.print_error_mm >= self.margin_mm:
             raise ValueError(f"margin_mm: expected more than half of diameter_mm, found {self.margin_mm:g}")
         return self
 
@@ -129,8 +129,8 @@ def things(config: Config) -> tuple[Thing, Thing]:
 def _printed(config: Config) -> Array:
     errors = np.random.default_rng(config.seed).standard_normal((config.rows * config.columns, 2))
     errors = np.clip(errors, -MAX_ERRORS, MAX_ERRORS)
-    along, shear = config.stretch
-    stretched = np.array([[1 + along / 2, shear / 2], [shear / 2, 1 - along / 2]])
+    scale, along, shear = config.stretch
+    stretched = (1 + scale) * np.eye(2) + np.array([[along, shear], [shear, -along]]) / 2
     middle = _middle(config)
     return (design(config).points()[:, :2] - middle) @ stretched + middle + config.print_error_mm * errors
 

@@ -30,7 +30,7 @@ from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene, parse_scene
 from twin import board_session
 from twin.optics import surface_session
-from twin.optics.conditions import IDEAL, Conditions
+from twin.optics.conditions import IDEAL, Conditions, check_board
 from twin.optics.light_transport import Engine
 from twin.session import Session
 
@@ -69,6 +69,7 @@ class Config(BaseModel):
             return self
         if self.scene.get("kind") != "board":
             raise ValueError(f"poses: expected scene=board with them, found scene.kind {self.scene.get('kind')}")
+        check_board(parse_scene(self.scene)[1], self.conditions.board)
         if lacking := axes_without_fringes(self.patterns):
             raise ValueError(f"patterns: expected fringes along both axes with poses, found none along {' and '.join(lacking)}")
         if board_session.FRINGE_CAMERA not in self.cameras:

@@ -40,7 +40,7 @@ class BoardPrint(Part):
     """Standard deviations of errors that a calibration board has, by its print, its ground and its handling."""
 
     place_mm: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # of each disc along each axis
-    stretch: Annotated[float, Field(ge=0, le=0.002)] = 0.0  # of the print: of its aspect, and of its shear
+    stretch: Annotated[float, Field(ge=0, le=0.002)] = 0.0  # of the print: of its scale, of its aspect and of its shear
     diameter_mm: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # of all discs alike
     bow_mm: Annotated[float, Field(ge=0, le=2)] = 0.0  # of an arch along each side, and of a twist
     flex_mm: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # by which each of these differs from pose to pose
@@ -85,20 +85,41 @@ def printed(target: Target, errors: Print, *key: int) -> Target:
 
 
 def printed_board(design: board.Config, errors: BoardPrint, *key: int) -> board.Config:
-    """Draw the board that comes of a design, the same for the same key; what the design itself has of errors stays in it."""
+    """Draw the board that comes of a design, the same for the same key, with errors of print drawn anew.
+
+    Stretch, bow and spread that the design has by itself stay.
+    """
     if errors == BoardPrint():
         return design
     rng = np.random.default_rng([*key, BOARD_STREAM])
-    stretch = np.clip(errors.stretch * rng.standard_normal(2), -MOST * errors.stretch, MOST * errors.stretch)
-    wider = errors.diameter_mm * np.clip(rng.standard_normal(), -MOST, MOST)
+    stretch, wider = rng.standard_normal(3).clip(-MOST, MOST), float(np.clip(rng.standard_normal(), -MOST, MOST))
     changed = {
         "print_error_mm": float(np.hypot(design.print_error_mm, errors.place_mm)),
-        "stretch": tuple((np.array(design.stretch) + stretch).tolist()),
-        "spread_mm": design.spread_mm + float(wider),
+        "stretch": tuple((np.array(design.stretch) + errors.stretch * stretch).tolist()),
+        "spread_mm": design.spread_mm + errors.diameter_mm * wider,
         "bow_mm": tuple((np.array(design.bow_mm) + errors.bow_mm * rng.standard_normal(3)).tolist()),
         "seed": int(rng.integers(2**31)) if errors.place_mm else design.seed,
     }
-    return board.Config.model_validate(design.model_dump() | changed)
+    return design.model_copy(update=changed)
+
+
+def check_board(design: board.Config, errors: BoardPrint) -> None:
+    """Refuse errors by which a drawn board may have discs that touch, or leave it.
+
+    Raises
+    ------
+    ValueError
+        In the worst case that is drawn.
+    """
+    stretch = [value + float(np.sign(value or 1)) * MOST * errors.stretch for value in design.stretch]
+    spreads = [design.spread_mm + side * MOST * errors.diameter_mm for side in (-1, 1)]
+    for spread in spreads:
+        worst = {
+            "print_error_mm": float(np.hypot(design.print_error_mm, errors.place_mm)),
+            "stretch": stretch,
+            "spread_mm": spread,
+        }
+        board.Config.model_validate(design.model_dump() | worst)
 
 
 def flexed(printed: board.Config, errors: BoardPrint, *key: int) -> board.Config:

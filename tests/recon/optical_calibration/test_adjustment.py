@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from recon.geometry.board_shape import Tolerances
 from recon.geometry.camera_jacobian import MATRIX
 from recon.geometry.lens_domain import is_one_to_one
 from recon.geometry.levenberg_marquardt import Unreachable
@@ -13,7 +14,6 @@ from recon.geometry.usual_lenses import largest
 from recon.model.calibration import Calibration
 from recon.optical_calibration import adjustment, optical_checks
 from recon.optical_calibration.adjustment import adjust, free_parameters
-from recon.optical_calibration.board_shape import Tolerances
 from recon.optical_calibration.bundle import Estimate, Problem, linearised, stepped
 from recon.optical_calibration.distortion_selection import MODELS
 from recon.optical_calibration.joint_calibration import deviation

@@ -196,24 +196,8 @@ def test_halves_agree_as_predicted(cameras):
         seen = observe(cameras, poses, rng)
         nothing = np.zeros_like(seen.pixels)
         whole = adjust(seen, Estimate(cameras, poses, BOARD.points()), free, nothing)
-        differences, squared = joint_calibration.compare_halves(seen, whole, free, nothing)
-        found.append([np.mean(differences**2), squared])
-    assert 0.4 < np.mean(found, axis=0)[0] < 2.0
-    assert 0.75 < np.mean(found, axis=0)[1] < 1.3
-
-
-def test_halves_that_contradict_each_other_widen_the_uncertainty(cameras, sizes, good):
-    """A lens that was touched after every other pose by 0.1 px of its principal point: residuals alone miss it."""
-    rng = np.random.default_rng(12)
-    matrix = cameras["cam2"].matrix.copy()
-    matrix[:2, 2] += 0.1
-    touched = sightings({**cameras, "cam2": replace(cameras["cam2"], matrix=matrix)}, random_poses(cameras, 12, rng), rng)
-    mixed = [touched[k] if k % 2 else good[k] for k in range(len(good))]
-    steady, found = (joint_calibration.calibrate(each, BOARD, sizes, QUICK) for each in (good, mixed))
-    assert not any("halves" in warning for warning in steady.warnings)
-    assert any(warning.startswith("halves of the poses differ by") for warning in found.warnings)
-    sigma, wider = (each.adjustment.calibration.uncertainty.sigma("cam2.cx") for each in (steady, found))
-    assert wider > 1.5 * sigma
+        found.append(np.mean(joint_calibration.compare_halves(seen, whole, free, nothing) ** 2))
+    assert 0.4 < np.mean(found) < 2.0
 
 
 def test_one_camera_and_projector_are_enough(cameras):

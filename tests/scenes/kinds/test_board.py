@@ -115,12 +115,27 @@ def test_a_bow_is_an_arch_a_twist_and_an_arch():
     assert board.printed(config).bow == pytest.approx([0.45, -0.2, 0.05])
 
 
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"diameter_mm": 0.4, "spread_mm": -0.5}, "spread_mm"),
+        ({"margin_mm": 4.6, "spread_mm": 0.5}, "margin_mm"),
+        ({"margin_mm": 4.6, "stretch": (0.005, 0, 0)}, "margin_mm"),
+        ({"diameter_mm": 20.9, "spread_mm": 0.4}, "diameter_mm"),
+    ],
+)
+def test_prints_that_leave_no_discs_or_leave_the_board_are_refused(fields, named):
+    with pytest.raises(ValidationError, match=named):
+        board.Config(**fields)
+
+
 def test_a_stretched_print_and_wide_discs():
     """Length over width is off by the asked share, right angles by the shear, and the design stays as it was."""
-    config = board.Config(stretch=(2e-3, 1e-3), spread_mm=0.06)
+    config = board.Config(stretch=(3e-3, 2e-3, 1e-3), spread_mm=0.06)
     points, straight = board.printed_centres(config), board.design(config).points()
     along, across = (np.linalg.lstsq(straight - straight.mean(axis=0), points[:, k] - points[:, k].mean())[0] for k in (0, 1))
     assert along[0] - across[1] == pytest.approx(2e-3) and along[1] + across[0] == pytest.approx(1e-3)
+    assert (along[0] + across[1]) / 2 == pytest.approx(1.003)
     assert board.printed(config).radius == pytest.approx(4.53) and board.design(config).diameter_mm == 9
     discs = board.things(config)[1].mesh
     front = discs.vertices[: len(discs.vertices) // 2]

@@ -13,6 +13,7 @@ from twin.optics.conditions import (
     Conditions,
     Frames,
     Print,
+    check_board,
     draw,
     emitted,
     flexed,
@@ -111,6 +112,16 @@ def test_boards_are_off_by_their_standard_deviations():
     bent = np.array([flexed(drawn[0], errors, 0, pose).bow_mm for pose in range(2000)]) - bows[0]
     assert bent.std(axis=0) == pytest.approx(0.01, rel=0.06)
     assert printed_board(design, errors, 7) == drawn[7] and flexed(drawn[7], errors, 7, 1) == flexed(drawn[7], errors, 7, 1)
+
+
+def test_a_board_that_the_worst_draw_would_spoil_is_refused_beforehand():
+    """Then none that is drawn is spoiled; of a sound one, each is a board by its own rules."""
+    with pytest.raises(ValidationError, match="stretch"):
+        check_board(board.Config(stretch=(0.009, 0, 0)), BoardPrint(stretch=0.002))
+    sound, errors = board.Config(), BoardPrint(place_mm=0.1, stretch=0.002, diameter_mm=0.1)
+    check_board(sound, errors)
+    for seed in range(200):
+        board.Config.model_validate(printed_board(sound, errors, seed).model_dump())
 
 
 def test_ideal_boards_are_as_designed():

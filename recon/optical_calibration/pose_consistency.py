@@ -1,0 +1,125 @@
+"""Consistency of the poses: what changes from one to the next, which residuals hardly show, as each pose has a place of its own.
+
+Each pose by itself would move the devices' parameters a little; at the solution these pulls cancel. How large they are by the
+sightings' noise is known. Two causes make them larger: a board that bends from pose to pose, by arches along its sides and a
+twist, and anything else, such as a device that was touched or warms up, for which all sightings count as less exact. The
+likeliest sizes of both are found, and their parts added to the covariance.
+
+Source: Liang and Zeger 1986 (covariance by clusters).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from recon.geometry.board_shape import Tolerances, departures
+from recon.model.calibration import Calibration
+from recon.optical_calibration.adjustment import Adjustment, inverse, prior_information, without_poses
+from recon.optical_calibration.bundle import Array, Estimate, Problem, linearised
+from recon.optical_calibration.observations import Observations
+
+BENDS_MM = np.append(0.0, np.geomspace(1e-4, 0.3, 29))  # standard deviations of each bend that are thought of, RMS over the board
+FACTORS = np.geomspace(1.0, 1e3, 25)  # of variances
+STEP_MM = 1e-3  # of a bend, for its slope
+DETERMINED = 1e-2  # of the largest eigenvalue: directions of less are held by what is known without sightings, not shown by poses
+SURE = 1e-4  # of the largest eigenvalue: no pull is surer in one direction
+CONTRADICTING = 1.5  # scatter from which on it is worth a warning; noise leaves 1.0 +- 0.1
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """How well the poses agree."""
+
+    scatter: float  # variance of their pulls over that by the sightings' noise; about 1 if they agree
+    bend_mm: float  # standard deviation of each bend of the board, RMS over its points
+    factor: float  # by which sightings count as less exact than their residuals besides
+    covariance: Array  # (g, g) of the devices' parameters, with both causes in it
+
+    @property
+    def warning(self) -> str | None:
+        """What is wrong, if anything is."""
+        if self.scatter < CONTRADICTING:
+            return None
+        bend = f"the board seems to bend by {self.bend_mm:.2g} mm (RMS) from pose to pose" if self.bend_mm else ""
+        rest = f"poses contradict each other by {self.factor:.1f} times the residuals" if self.factor > 1 else ""
+        causes = " and ".join(filter(None, (bend, rest)))
+        return f"{causes}, which the uncertainty includes: is the board stiff, did a device move or warm up?"
+
+
+class Pulls(NamedTuple):
+    """Pulls of p poses on the devices' parameters, in coordinates in which those of all together are of variance 1 by noise."""
+
+    found: Array  # (p, k)
+    noise: Array  # (p, k, k) covariance by the sightings' noise
+    bends: Array  # (p, k, 3) by a bend of 1 mm of each kind
+
+
+def consistency(
+    observations: Observations,
+    adjusted: Adjustment,
+    free: Mapping[str, Sequence[str]],
+    offsets: Array,
+    tolerances: Tolerances,
+    released: bool,
+) -> Consistency:
+    """Compare the poses of an adjustment, made with the same arguments."""
+    assert adjusted.calibration.uncertainty is not None
+    problem = Problem(observations, offsets, free, tolerances, released, adjusted.lenses)
+    ways = departures(observations.points)[0][:, -3:]
+    parts = [_of_pose(problem, adjusted, p, ways) for p in range(len(observations.poses))]
+    total = sum(information for information, _, _ in parts)
+    whole = inverse(total + prior_information(problem, adjusted.estimate))
+    carry = whole[: len(problem.names)]
+    covariances = np.array([carry @ (part - part @ whole @ part) @ carry.T for part, _, _ in parts])
+    scale = 1 / np.sqrt(np.maximum(np.diag(covariances.sum(axis=0)), 1e-300))
+    values, vectors = np.linalg.eigh(scale[:, None] * covariances.sum(axis=0) * scale)
+    shown = values > DETERMINED * values.max(initial=0.0)
+    root = (vectors[:, shown] / np.sqrt(values[shown])).T * scale
+    white = root @ carry  # from pulls on all shared unknowns
+    pulls = Pulls(
+        np.array([white @ right for _, right, _ in parts]),
+        np.array([root @ each @ root.T for each in covariances]),
+        np.array([white @ slopes for _, _, slopes in parts]),
+    )
+    scatter = float((pulls.found**2).sum() / max(np.count_nonzero(shown), 1))
+    covariance = adjusted.calibration.uncertainty.covariance
+    if scatter <= 1:
+        return Consistency(scatter, 0.0, 1.0, covariance)
+    causes = [(bend, factor) for bend in BENDS_MM for factor in FACTORS]
+    bends = pulls.bends @ pulls.bends.swapaxes(1, 2)
+    likely = [_likelihood(pulls, factor * pulls.noise + bend**2 * bends) for bend, factor in causes]
+    bend, factor = (float(value) for value in causes[int(np.argmax(likely))])
+    moved = np.hstack([carry @ slopes for _, _, slopes in parts])
+    added = (factor - 1) * carry @ total @ carry.T + bend**2 * moved @ moved.T
+    return Consistency(scatter, bend, float(np.sqrt(factor)), covariance + added)
+
+
+def widened(adjusted: Adjustment, covariance: Array) -> Adjustment:
+    """The same adjustment with another covariance."""
+    found = adjusted.calibration
+    assert found.uncertainty is not None
+    return replace(adjusted, calibration=Calibration(found.cameras, replace(found.uncertainty, covariance=covariance)))
+
+
+def _of_pose(problem: Problem, adjusted: Adjustment, p: int, ways: Array) -> tuple[Array, Array, Array]:
+    """One pose's information on the shared unknowns : (g, g), its pull : (g,), and the pull's slopes : (g, 3) by bends, 1/mm."""
+    one = replace(problem, observations=problem.observations.of_poses([p]), offsets=problem.offsets[[p]])
+    noise = np.array(list(adjusted.noise.values()))
+
+    def pulled(points: Array) -> tuple[Array, Array]:
+        estimate = Estimate(adjusted.calibration.cameras, adjusted.poses[[p]], points)
+        return without_poses(linearised(one, estimate, noise, problem.released))
+
+    information, right = pulled(adjusted.points)
+    bent = [pulled(adjusted.points + STEP_MM * way.reshape(-1, 3))[1] for way in ways.T]
+    return information, right, (np.stack(bent, axis=1) - right[:, None]) / STEP_MM
+
+
+def _likelihood(pulls: Pulls, covariances: Array) -> float:
+    """Logarithm of the probability of pulls with covariances : (p, k, k), up to a constant."""
+    values, vectors = np.linalg.eigh(covariances)
+    values = np.maximum(values, SURE * values.max())
+    along = np.einsum("pka,pk->pa", vectors, pulls.found)
+    return float(-(np.log(values) + along**2 / values).sum() / 2)
