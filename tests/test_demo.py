@@ -114,6 +114,7 @@ def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path):
     # the surface's noise and the calibration's: a common shift of all points, of another size in each session
     noise = np.hypot(metrics["limit_rms_mm"], metrics["point_sigma_mm"])
     assert metrics["surface_interior_rms_mm"] < 1.1 * noise and metrics["point_error_rms_mm"] < 2.5 * metrics["point_sigma_mm"]
+    assert 0.01 < metrics["point_sigma_mm"] < 0.04  # by geometry: as of drawn points with a sighting's noise
     assert metrics["shape_error_rms_mm"] < 0.1 * metrics["limit_rms_mm"]
     assert metrics["surface_rms_mm"] < 0.1  # better than the paper's planes
     assert metrics["coverage"] > 0.98 and metrics["gross_error_fraction"] < 1e-4

@@ -5,7 +5,7 @@ the middles of ellipses as they are.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from twin.accuracy.surface_accuracy import Experiment
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import rms
-from twin.optics.conditions import BoardPrint, flexed, printed_board
+from twin.optics.conditions import BoardPrint, Conditions, flexed, printed_board
 from twin.optics.surface_session import Shooting, calibration_of
 
 Array = NDArray[np.float64]
@@ -72,7 +72,7 @@ def rows(setup: Setup) -> list[Row]:
     ours, paper = ([getattr(one, name) for one in found] for name in ("ours", "paper"))
     what = f"{len(found)} laboratories, {COUNT} poses"
     squared = float(np.mean([one.squared for one in found]))
-    mean = {field.name: float(np.mean([getattr(one, field.name) for one in paper])) for field in fields(Measured)}
+    planes, spheres = (float(np.mean([getattr(one, name) for one in paper])) for name in ("plane_rms_mm", "sphere_rms_mm"))
     rows = [
         Row("g", f"{what}: planes, RMS, largest", max(one.plane_rms_mm for one in ours), 0.045, None, "mm"),
         Row("g", f"{what}: planes, form, largest", max(one.form_mm for one in ours), 0.01, None, "mm"),
@@ -84,12 +84,10 @@ def rows(setup: Setup) -> list[Row]:
         px = float(np.mean([one.paper_px[name] for one in found]))
         rows += _beside(f"{what}, the paper's method, {name}: reprojection RMS (paper: {published:g}), mean", px, published, "px")
     middle = float(np.mean(PAPER_PLANE_MM))
-    rows += _beside(f"{what}, the paper's method: planes, RMS (paper: 0.101 to 0.131), mean", mean["plane_rms_mm"], middle, "mm")
+    rows += _beside(f"{what}, the paper's method: planes, RMS (paper: 0.101 to 0.131), mean", planes, middle, "mm")
     radius = float(np.mean([abs(one.radius_error_mm) for one in paper]))
     rows += _beside(f"{what}, the paper's method: sphere, radius error (paper: 0.045), mean", radius, PAPER_SPHERE_MM[0], "mm")
-    rows += _beside(
-        f"{what}, the paper's method: sphere, RMS (paper: 0.04), mean", mean["sphere_rms_mm"], PAPER_SPHERE_MM[1], "mm"
-    )
+    rows += _beside(f"{what}, the paper's method: sphere, RMS (paper: 0.04), mean", spheres, PAPER_SPHERE_MM[1], "mm")
     return rows
 
 
@@ -105,6 +103,13 @@ def laboratory(setup: Setup, seed: int) -> Laboratory:
     return Laboratory(squared, measured(shots, ours), measured(shots, pair), reprojected)
 
 
+def conditions_of(setup: Setup) -> Conditions:
+    """Conditions of life; ValueError if the setup has none."""
+    if setup.lifelike is None:
+        raise ValueError("setup.lifelike: expected those of conf/conditions/lifelike.yaml, found none")
+    return setup.lifelike
+
+
 def session(setup: Setup, seed: int) -> board_session.Settings:
     """A board in the hands of one laboratory."""
     return board_session.Settings(
@@ -116,7 +121,7 @@ def session(setup: Setup, seed: int) -> board_session.Settings:
         surface_accuracy.ENGINE,
         Shooting(),
         seed,
-        setup.lifelike,
+        conditions_of(setup),
     )
 
 
@@ -124,7 +129,9 @@ def shoot(setup: Setup, seed: int) -> tuple[Experiment, Experiment]:
     """A plane and a sphere, rendered and decoded."""
     scenes = plane.build(plane.PAPER_POSES[seed % len(plane.PAPER_POSES)]), build_scene({"kind": "sphere"})
     patterns = setup.sequences["paper_surface"]
-    first, second = (surface_accuracy.experiment(setup.rig, scene, patterns, seed, conditions=setup.lifelike) for scene in scenes)
+    first, second = (
+        surface_accuracy.experiment(setup.rig, scene, patterns, seed, conditions=conditions_of(setup)) for scene in scenes
+    )
     return first, second
 
 
@@ -165,11 +172,10 @@ def form_rms(points: Array) -> float:
 
 def shares(setup: Setup) -> list[Row]:
     """Row h: each condition of the board alone, and all together: reprojection by the paper's method, form by both."""
-    errors, rows = setup.lifelike.board, []
+    errors, rows, truth = conditions_of(setup).board, [], calibration_of(setup.rig)
     alone = {field: BoardPrint(**{field: getattr(errors, field)}) for field in BoardPrint.model_fields if field != "diameter_mm"}
     for name, chosen in {"flat, exact board": BoardPrint(), **alone, "all of them": errors}.items():
         kinds = [sighted(setup.rig, chosen, seed) for seed in SEEDS]
-        truth = calibration_of(setup.rig)
         ours, paper, px = [], [], []
         for seen in kinds:
             result = calibrate(seen.sightings, seen.board, seen.sizes)

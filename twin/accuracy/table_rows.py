@@ -13,7 +13,7 @@ from recon.errors import InputError
 from recon.files import atomic
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
-from twin.optics.conditions import IDEAL, Conditions
+from twin.optics.conditions import Conditions
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
@@ -52,7 +52,7 @@ class Setup:
     scanners: Mapping[str, Transducer] = field(default_factory=dict)  # by their names in conf/ultrasound
     frames: DataRanges | None = None  # of tracking frames, as in conf/dataset.yaml
     out: Path | None = None  # folder for figures; without it none is drawn
-    lifelike: Conditions = IDEAL  # as in conf/conditions/lifelike.yaml
+    lifelike: Conditions | None = None  # as in conf/conditions/lifelike.yaml
 
 
 def measure(measurements: Sequence[Measurement]) -> Iterator[Row]:

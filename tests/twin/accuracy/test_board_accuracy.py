@@ -3,9 +3,12 @@
 from twin.accuracy import board_accuracy
 
 
-def test_a_bowed_board_costs_nothing_that_a_flat_one_does_not(rig):
-    """Half a millimetre of bow: hundreds of times the form by a board taken as designed, 0.005 mm at most by default."""
+def test_the_shape_of_a_bowed_board_is_found(rig):
+    """Half a millimetre of bow: hundreds of times the form by a board taken as designed, 0.005 mm at most by default.
+
+    One set's errors: of 39 parameters within chi-square's 99.9 %, of points that err together by three numbers likewise.
+    """
     seed = next(k for k in range(10, 30) if k % 4 == 3 and k % 7 % 3 == 1)
     found = board_accuracy.each(rig, seed)
     assert found["default"].form_mm < 0.005 < 0.1 * found["the true lens, taken as designed"].form_mm
-    assert found["default"].parameters < 2 and found["default"].points < 4
+    assert 0.4 < found["default"].parameters < 2 and found["default"].points < 5.4
