@@ -37,7 +37,7 @@ class Config(film_session.Filming):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Rig
-    conditions: Conditions
+    conditions: Conditions = Conditions()
     out: Path
     add: bool = False
     pixels: Literal["sketch", "full"] = "sketch"
