@@ -20,8 +20,8 @@ from recon.optical_calibration.adjustment import Adjustment, inverse, prior_info
 from recon.optical_calibration.bundle import Array, Estimate, Problem, linearised
 from recon.optical_calibration.observations import Observations
 
-BENDS_MM = np.append(0.0, np.geomspace(1e-4, 0.3, 29))  # standard deviations of each bend that are thought of, RMS over the board
-FACTORS = np.geomspace(1.0, 1e3, 25)  # of variances
+BENDS_MM = np.append(0.0, np.geomspace(2e-4, 0.2, 16))  # standard deviations of each bend that are thought of, RMS over the board
+FACTORS = np.geomspace(1.0, 100.0, 13)  # of variances
 STEP_MM = 1e-3  # of a bend, for its slope
 DETERMINED = 1e-2  # of the largest eigenvalue: directions of less are held by what is known without sightings, not shown by poses
 SURE = 1e-4  # of the largest eigenvalue: no pull is surer in one direction

