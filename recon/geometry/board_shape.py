@@ -9,6 +9,7 @@ A common scale leaves no trace, but is a stretch like aspect and shear, which do
 Source: MacKay 1992, "Bayesian interpolation" (evidence).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,17 +50,28 @@ WIDE = Tolerances(0.1, 0.1, 1.0, 0.3)  # of a board of which nothing is known
 
 def departures(design: Array) -> tuple[Array, NDArray[np.intp]]:
     """Unit departures : (3 n, 3 n + 6) of a board : (n, 3) mm, and the place of each one's standard deviation among WAYS."""
-    n, middle = len(design), design - design.mean(axis=0)
-    x, y = (middle / (np.ptp(design, axis=0) / 2 + 1e-9)).T[:2]
-    none = np.zeros(n)
-    stretches = [
-        np.column_stack(pair) for pair in ((middle[:, 0], middle[:, 1]), (middle[:, 0], -middle[:, 1]), middle[:, 1::-1].T)
-    ]
-    common = [np.column_stack([*stretch.T, none]) for stretch in stretches]
-    common += [np.column_stack([none, none, bow]) for bow in (x**2, x * y, y**2)]
-    smooth = np.stack([each.ravel() / np.sqrt(np.mean(np.sum(each**2, axis=1)) + 1e-30) for each in common], axis=1)
-    own = np.tile([0, 0, 3], n)
-    return np.hstack([np.eye(3 * n), smooth]), np.concatenate([own, np.repeat([1, 2], 3)])
+    n = len(design)
+    smooth = np.hstack([_stretches(design), bends(design)])
+    return np.hstack([np.eye(3 * n), smooth]), np.concatenate([np.tile([0, 0, 3], n), np.repeat([1, 2], 3)])
+
+
+def bends(design: Array) -> Array:
+    """An arch along x, a twist and an arch along y of a board : (n, 3) mm, each of RMS 1 mm : (3 n, 3) mm."""
+    x, y = ((design - design.mean(axis=0)) / (np.ptp(design, axis=0) / 2 + 1e-9)).T[:2]
+    none = np.zeros(len(design))
+    return _unit([np.column_stack([none, none, bow]) for bow in (x**2, x * y, y**2)])
+
+
+def _stretches(design: Array) -> Array:
+    """A larger print, a longer and narrower one, and a sheared one : (3 n, 3) mm, of RMS 1 mm."""
+    x, y = (design - design.mean(axis=0)).T[:2]
+    none = np.zeros(len(design))
+    return _unit([np.column_stack(way) for way in ((x, y, none), (x, -y, none), (y, x, none))])
+
+
+def _unit(ways: Sequence[Array]) -> Array:
+    """Displacements, each (n, 3) mm, scaled to an RMS of 1 mm, side by side."""
+    return np.stack([each.ravel() / np.sqrt(np.mean(np.sum(each**2, axis=1)) + 1e-30) for each in ways], axis=1)
 
 
 def estimated(information: Array, pull: Array, design: Array, given: Tolerances) -> Tolerances:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recon.geometry.board_shape import Tolerances, departures
+from recon.geometry.board_shape import Tolerances, bends
 from recon.model.calibration import Calibration
 from recon.optical_calibration.adjustment import Adjustment, inverse, prior_information, without_poses
 from recon.optical_calibration.bundle import Array, Estimate, Problem, linearised
@@ -67,7 +67,7 @@ def consistency(
     """Compare the poses of an adjustment, made with the same arguments."""
     assert adjusted.calibration.uncertainty is not None
     problem = Problem(observations, offsets, free, tolerances, released, adjusted.lenses)
-    ways = departures(observations.points)[0][:, -3:]
+    ways = bends(observations.points)
     parts = [_of_pose(problem, adjusted, p, ways) for p in range(len(observations.poses))]
     total = sum(information for information, _, _ in parts)
     whole = inverse(total + prior_information(problem, adjusted.estimate))
@@ -88,8 +88,8 @@ def consistency(
     if scatter <= 1:
         return Consistency(scatter, 0.0, 1.0, covariance)
     causes = [(bend, factor) for bend in BENDS_MM for factor in FACTORS]
-    bends = pulls.bends @ pulls.bends.swapaxes(1, 2)
-    likely = [_likelihood(pulls, factor * pulls.noise + bend**2 * bends) for bend, factor in causes]
+    by_bends = pulls.bends @ pulls.bends.swapaxes(1, 2)
+    likely = [_likelihood(pulls, factor * pulls.noise + bend**2 * by_bends) for bend, factor in causes]
     bend, factor = (float(value) for value in causes[int(np.argmax(likely))])
     moved = np.hstack([carry @ slopes for _, _, slopes in parts])
     added = (factor - 1) * carry @ total @ carry.T + bend**2 * moved @ moved.T
