@@ -14,7 +14,7 @@ from scenes.board_poses import Config as Poses
 from scenes.board_poses import random_poses
 from scenes.kinds import board
 from twin.accuracy.board_sets import drawn
-from twin.accuracy.calibration_errors import DEPTHS, PAIRS, inside_region, point_errors, squared_length
+from twin.accuracy.calibration_errors import DEPTHS, PAIRS, inside_region, point_errors, squared_length, squared_point_errors
 from twin.accuracy.table_rows import Row, Setup
 from twin.evaluation.surface_errors import rms
 from twin.optics.surface_session import calibration_of
@@ -97,9 +97,8 @@ def judged(found: Calibration, truth: Calibration) -> Calibrated:
     assert found.uncertainty is not None
     error, volume = deviation(found, truth), uncertainty.working_volume(truth, DEPTHS)
     parameters = squared_length(error, found.uncertainty.covariance) / len(error)
-    off, covariance = point_errors(found, truth, PAIRS[1], volume), uncertainty.triangulation(found, *PAIRS[1], volume)
-    points = np.einsum("ki,ki->k", off, np.linalg.solve(covariance, off[..., None])[..., 0]) / 3
-    return Calibrated(form(found, truth), parameters, float(points.mean()), inside_region(found, truth, PAIRS[1], volume))
+    points = float(squared_point_errors(found, truth, PAIRS[1], volume).mean()) / 3
+    return Calibrated(form(found, truth), parameters, points, inside_region(found, truth, PAIRS[1], volume))
 
 
 def form(found: Calibration, truth: Calibration) -> float:

@@ -55,10 +55,13 @@ def squared_length(error: Array, covariance: Array) -> float:
 
 def inside_region(found: Calibration, truth: Calibration, pair: tuple[str, str], volume: Array) -> float:
     """Share of a volume's points : (k, 3) mm whose error lies in its predicted 95 % region."""
-    error = point_errors(found, truth, pair, volume)
-    covariance = uncertainty.triangulation(found, *pair, volume)
-    lengths = np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[..., None])[..., 0])
-    return float(np.mean(lengths < chi2.ppf(REGION, 3)))
+    return float(np.mean(squared_point_errors(found, truth, pair, volume) < chi2.ppf(REGION, 3)))
+
+
+def squared_point_errors(found: Calibration, truth: Calibration, pair: tuple[str, str], points: Array) -> Array:
+    """Squared Mahalanobis lengths : (k,) of the errors of points : (k, 3) mm, chi-square with 3 degrees of freedom."""
+    error, covariance = point_errors(found, truth, pair, points), uncertainty.triangulation(found, *pair, points)
+    return np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[..., None])[..., 0])
 
 
 def point_errors(found: Calibration, truth: Calibration, pair: tuple[str, str], points: Array) -> Array:
