@@ -30,7 +30,7 @@ def whole(found: Tracking, cameras: tuple[Camera, Camera]) -> Seen | None:
     """The pair if all six rims are whole, evenly lit and sharp; else None."""
     if not (found.found and found.pose.used.all()):
         return None
-    first, second = (view.sighting(camera) for view, camera in zip(found.views, cameras, strict=True))
+    first, second = (view.outlines.sighting(camera) for view, camera in zip(found.views, cameras, strict=True))
     if first.doubtful.any() or second.doubtful.any():
         return None
     return Seen((first, second), found.pose.world_from_target)

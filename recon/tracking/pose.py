@@ -16,7 +16,7 @@ from recon.geometry.circle_outline import ellipses_of
 from recon.model import circle_layout
 from recon.model.calibration import Uncertainty
 from recon.model.rig import Target
-from recon.tracking.pose_fit import NAMES, SUSPICIOUS, Sighting, TargetPose, lost, meet, refined
+from recon.tracking.pose_fit import NAMES, SHAPES, SUSPICIOUS, Sighting, TargetPose, lost, meet, refined
 
 Array = NDArray[np.float64]
 
@@ -25,7 +25,6 @@ GROSS_MM = 4.0  # by which distances between centres may be off, before the fit:
 APART_MM = 4.0  # by which two views' rays of one centre may miss each other
 SIZES = 0.12  # of a disc's size, by which shapes may differ from the pose's
 SIZES_ALONE = 0.05  # the same of one view by itself: three rings of a sheet were 14 % off, targets 0.5 % in the median
-SHAPES = 0.005  # the same: what blur and gradients leave of a shape, one standard deviation
 SIGMAS = 3.0  # standard deviations that are added to what sizes may differ by
 DISTINCT = 16.0  # least excess of another pose's misfit, with shapes
 SAME = 16.0  # squared standard deviations within which two poses are one
@@ -34,19 +33,31 @@ SAME = 16.0  # squared standard deviations within which two poses are one
 def estimate(first: Sighting, second: Sighting, target: Target, optics: Uncertainty | None = None) -> TargetPose:
     """Estimate the pose from two views, by least squares over all ellipses' centres, or all but a doubtful one that misfits.
 
-    Doubtful circles are right but inexact: one whose rays don't even meet, or that lies millimetres from where the others ask for
-    it, is another thing. Never raises on what the views show: what can't be the target is not found, with a reason.
+    A doubtful circle may be inexact, or another thing's edge: one that no circle of the other view confirms must have the shape,
+    too, that the pose gives it; and so must all, where a doubtful one was so wrong that its rays don't meet. Never raises on what
+    the views show: what can't be the target is not found, with a reason.
 
     optics : of both cameras' calibration; None where it isn't known, or exact.
     """
     views = (first, second)
     found = _chosen(_fits(views, target, optics), views, target)
-    if np.isnan(found.misfit) or found.misfit < chdtri(found.freedom, SUSPICIOUS):
+    doubtful, suspicious = np.stack([view.doubtful for view in views]), False
+    if not (found.misfit < chdtri(found.freedom, SUSPICIOUS)):
+        suspicious = np.isnan(found.misfit)
+        fewer = [fit for each in _without_one(views) for fit in _fits(each, target, optics)]
+        again = _chosen(fewer, views, target) if fewer else found
+        found = again if again.found and (doubtful & ~again.used).any() else found
+    lone = found.used & ~found.used[::-1] & doubtful
+    return _confirmed(found, views, target, optics) if found.found and (suspicious or lone.any()) else found
+
+
+def _confirmed(found: TargetPose, views: Sequence[Sighting], target: Target, optics: Uncertainty | None) -> TargetPose:
+    """The pose, if the shapes of the ellipses that it was fitted to are those that it gives them, as far as they are known."""
+    if any(view.shapes is None for view in views):
         return found
-    fewer = [fit for each in _without_one(views) for fit in _fits(each, target, optics)]
-    again = _chosen(fewer, views, target) if fewer else found
-    doubtful = np.stack([view.doubtful for view in views])
-    return again if again.found and (doubtful & ~again.used).any() else found
+    whole = [view.only(used).by_shapes() for view, used in zip(views, found.used, strict=True)]
+    again = refined(found.world_from_target, whole, target, optics)
+    return found if again.found else lost("circles seen in part, of shapes that no pose gives them")
 
 
 def _without_one(views: tuple[Sighting, Sighting]) -> Iterator[tuple[Sighting, Sighting]]:
@@ -79,10 +90,16 @@ def _fits(views: tuple[Sighting, Sighting], target: Target, optics: Uncertainty 
     return [refined(start, views, target, optics) for start in starts] or [lost("no pose shows three circles so")]
 
 
-def allowed(sighting: Sighting, target: Target) -> bool:
-    """Whether some pose gives three circles of one view the centres and the shapes that they have."""
+def allowed(sighting: Sighting, covered: NDArray[np.bool_], target: Target) -> bool:
+    """Whether some pose gives three circles of one view the centres and the shapes that they have, exactly if one is covered.
+
+    covered : (3,) of which but a part of the rim is seen.
+    """
     poses = _starts([sighting], circle_layout.circle_centres(target)) if sighting.seen.all() else []
-    return any(_like(*_off_shapes(pose, [sighting], [sighting.seen], target), SIZES_ALONE) for pose in poses)
+    likely = [pose for pose in poses if _like(*_off_shapes(pose, [sighting], [sighting.seen], target), SIZES_ALONE)]
+    if not covered.any():
+        return bool(likely)
+    return any(refined(pose, [sighting.by_shapes()], target).found for pose in likely)
 
 
 def _starts(views: Sequence[Sighting], model: Array) -> list[Array]:

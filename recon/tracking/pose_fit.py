@@ -1,6 +1,7 @@
-"""Least squares of the target's pose on the ellipses' centres of two views, its circles' places held within their tolerance.
+"""Least squares of the target's pose on the ellipses of its views, its circles' places held within their tolerance.
 
-Each centre is predicted as that of the projected outline, which isn't the projected centre. Besides the pose's six numbers the
+Of each ellipse the centre counts, or all five numbers. Ellipses are predicted as those of the projected outlines, of which the
+centres aren't the projected ones. Besides the pose's six numbers the
 lengths of the target are found, as far as they aren't known: they are measured once more, by the design, with its covariance.
 Errors of the cameras' calibration are common to all centres: their covariance is added to that of the rims' noise.
 """
@@ -35,6 +36,9 @@ PARAMETERS = 6
 MISFITTING = "views that no pose fits: other circles, or cameras swapped or moved"
 CURVED = 0.05  # standard deviations by which the second order may shift a pose along its least certain direction
 RANK = 1e-7  # least ratio of singular values
+SHAPES = 0.005  # of a disc's size: what blur and gradients leave of a shape, one standard deviation
+CENTRE, WHOLE = 2, 5  # numbers of an ellipse: x and y, and these with a, b and c
+STEP = 1e-4  # rad, and mm times a hundred, by which slopes of shapes are found
 
 
 @dataclass(frozen=True)
@@ -45,16 +49,45 @@ class Sighting:
     centres: Array  # (3, 2) px, of the ellipses, in the order of NAMES; NaN where one isn't seen
     covariance: Array  # (3, 2, 2) px^2
     shapes: Array | None = None  # (3, 2, 2) px, of the ellipses, as ellipses.Ellipses has them; None if they aren't known
-    doubtful: NDArray[np.bool_] = field(default_factory=partial(np.zeros, 3, bool))  # (3,) as in outlines.Outlines
+    doubtful: NDArray[np.bool_] = field(default_factory=partial(np.zeros, 3, bool))  # (3,) as in rims.Outlines
+    joint: Array | None = None  # (3, 5, 5) px^2, of x, y, a, b, c, as in rims.Outlines; None if only that of centres is known
+    counted: int = CENTRE  # numbers of each ellipse that a pose is fitted to: its centre, or the whole
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
         """Which circles are seen : (3,)."""
         return np.isfinite(self.centres).all(axis=1)
 
+    @cached_property
+    def measured(self) -> Array:
+        """Numbers of the n circles seen that count : (n, 2 or 5) px."""
+        shapes = np.full((len(NAMES), 2, 2), np.nan) if self.shapes is None else self.shapes
+        return _numbers(self.centres, shapes)[self.seen, : self.counted]
+
+    @cached_property
+    def noise(self) -> Array:
+        """Their covariances : (n, 2 or 5, 2 or 5) px^2, of a shape with what blur and gradients leave of it."""
+        joint = np.zeros((len(NAMES), 5, 5)) if self.joint is None else self.joint.copy()
+        joint[:, :CENTRE, :CENTRE] = self.covariance
+        if self.shapes is not None:
+            size = np.trace(self.shapes, axis1=1, axis2=2) / 2
+            left = (SHAPES * size) ** 2
+            if self.joint is None:  # a shape's noise is about its centre's
+                left = left + np.trace(self.covariance, axis1=1, axis2=2)
+            joint[:, CENTRE:, CENTRE:] += left[:, None, None] * np.eye(3)
+        return joint[self.seen, : self.counted, : self.counted]
+
+    def only(self, which: NDArray[np.bool_]) -> "Sighting":
+        """The same with no other circles seen than some : (3,)."""
+        return replace(self, centres=np.where(which[:, None], self.centres, np.nan))
+
     def without(self, which: int) -> "Sighting":
         """The same with one circle not seen."""
-        return replace(self, centres=np.where(np.arange(len(NAMES))[:, None] == which, np.nan, self.centres))
+        return self.only(np.arange(len(NAMES)) != which)
+
+    def by_shapes(self) -> "Sighting":
+        """The same, of which whole ellipses count."""
+        return replace(self, counted=WHOLE)
 
 
 class Triangle(NamedTuple):
@@ -121,7 +154,7 @@ def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Unc
 
     optics : of the cameras' calibration, `cam1` and `cam2`, whose views these are; None where it isn't known, or exact.
     """
-    noise = block_diag(*(one for view in views for one in view.covariance[view.seen]))
+    noise = block_diag(*(one for view in views for one in view.noise))
     circles = circle_layout.circles(target)
     cameras = _optics_covariance(start, views, circles, optics)
     whiten = np.linalg.inv(np.linalg.cholesky(noise + cameras))
@@ -155,7 +188,7 @@ def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Unc
     covariance = by_centre @ noise @ by_centre.T
     shared = by_centre @ cameras @ by_centre.T + by_deviation @ by_deviation.T
     merging = False
-    if freedom < PARAMETERS:
+    if freedom < PARAMETERS:  # of five centres
         step, bend = _bend(guess, problem)
         merging = not abs(bend @ step) < CURVED * (step @ step)
         shared = shared + 2 * np.outer(bend, bend)[:PARAMETERS, :PARAMETERS]  # 2 is the variance of a normal number's square
@@ -164,11 +197,14 @@ def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Unc
 
 
 def _optics_covariance(pose: Array, views: Sequence[Sighting], circles: Circles, optics: Uncertainty | None) -> Array:
-    """Covariance : (m, m) px^2 of all coordinates seen, by errors of the cameras."""
-    points = [rigid.apply(pose, circles.centres[view.seen]) for view in views]
-    if optics is None:
-        return np.zeros((2 * sum(map(len, points)),) * 2)
-    return projection_covariance({f"cam{k}": view.camera for k, view in enumerate(views, start=1)}, points, optics)
+    """Covariance : (m, m) px^2 of all numbers that count, by errors of the cameras: they move ellipses as a whole."""
+    moved = np.concatenate([(np.indices(view.measured.shape)[1] < CENTRE).ravel() for view in views])
+    covariance = np.zeros((len(moved), len(moved)))
+    if optics is not None:
+        points = [rigid.apply(pose, circles.centres[view.seen]) for view in views]
+        cameras = {f"cam{k}": view.camera for k, view in enumerate(views, start=1)}
+        covariance[np.ix_(moved, moved)] = projection_covariance(cameras, points, optics)
+    return covariance
 
 
 def _placed(guess: _Guess, problem: _Problem) -> Circles:
@@ -181,15 +217,42 @@ def _linearised(guess: _Guess, problem: _Problem) -> tuple[Array, Array]:
     circles, k = _placed(guess, problem), len(guess.deviations)
     rows, left = [], []
     for view in problem.views:
-        seen = circles.some(view.seen)
-        predicted = ellipses_of(view.camera, guess.world_from_target, *seen)[0]
-        by_point = slopes_at(view.camera, rigid.apply(guess.world_from_target, seen.centres))
-        arms = rigid.rotate(guess.world_from_target, seen.centres)
-        by_deviation = guess.world_from_target[:3, :3] @ problem.by_deviation[view.seen]
-        rows.append((by_point @ np.concatenate([rigid.slopes(arms), by_deviation], axis=2)).reshape(-1, PARAMETERS + k))
-        left.append((view.centres[view.seen] - predicted).ravel())
+        slopes = _centre_slopes(view, guess, circles, problem)
+        if view.counted == WHOLE:
+            slopes = np.concatenate([slopes, _shape_slopes(view, guess, problem)], axis=1)
+        rows.append(slopes.reshape(-1, PARAMETERS + k))
+        left.append((view.measured - _predicted(view, guess, problem)[:, : view.counted]).ravel())
     design = np.vstack([problem.whiten @ np.concatenate(rows), np.eye(k, PARAMETERS + k, PARAMETERS)])
     return design, np.concatenate([problem.whiten @ np.concatenate(left), -guess.deviations])
+
+
+def _predicted(view: Sighting, guess: _Guess, problem: _Problem) -> Array:
+    """Numbers of the ellipses of the n circles seen : (n, 5) px."""
+    return _numbers(*ellipses_of(view.camera, guess.world_from_target, *_placed(guess, problem).some(view.seen)))
+
+
+def _numbers(centres: Array, shapes: Array) -> Array:
+    """Of n ellipses, x, y, a, b, c : (n, 5) px."""
+    return np.column_stack([centres, shapes[:, 0, 0], shapes[:, 0, 1], shapes[:, 1, 1]])
+
+
+def _centre_slopes(view: Sighting, guess: _Guess, circles: Circles, problem: _Problem) -> Array:
+    """Of the centres by the unknowns : (n, 2, 6 + k)."""
+    centres = circles.centres[view.seen]
+    by_point = slopes_at(view.camera, rigid.apply(guess.world_from_target, centres))
+    arms = rigid.rotate(guess.world_from_target, centres)
+    by_deviation = guess.world_from_target[:3, :3] @ problem.by_deviation[view.seen]
+    return by_point @ np.concatenate([rigid.slopes(arms), by_deviation], axis=2)
+
+
+def _shape_slopes(view: Sighting, guess: _Guess, problem: _Problem) -> Array:
+    """Of the shapes by the unknowns : (n, 3, 6 + k), by differences; a circle's place on the target hardly changes its shape."""
+    slopes = np.zeros((np.count_nonzero(view.seen), 3, PARAMETERS + len(guess.deviations)))
+    for which, step in enumerate((STEP,) * 3 + (100 * STEP,) * 3):
+        way = step * (np.arange(slopes.shape[2]) == which)
+        ahead, behind = (_predicted(view, _moved(guess, side * way), problem) for side in (1, -1))
+        slopes[:, :, which] = (ahead - behind)[:, CENTRE:] / (2 * step)
+    return slopes
 
 
 def _solved(_: _Guess, system: tuple[Array, Array], damping: float) -> Array:
@@ -227,7 +290,7 @@ def _bend(guess: _Guess, problem: _Problem) -> tuple[Array, Array]:
 
 def _triangle(guess: _Guess, problem: _Problem) -> Triangle | None:
     """The triangle of six circles; None where one isn't seen."""
-    if not all(view.seen.all() for view in problem.views):
+    if sum(np.count_nonzero(view.seen) for view in problem.views) < 2 * len(NAMES):
         return None
     circles = _placed(guess, problem)
     points = rigid.apply(guess.world_from_target, circles.centres)

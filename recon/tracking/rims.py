@@ -9,8 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.geometry.camera import Camera
 from recon.geometry.ellipses import Ellipses, joined
 from recon.model.rig import Target
+from recon.tracking.pose_fit import Sighting
 from recon.tracking.rim_fit.rim_model import FIT, START, fit_rims
 
 Array = NDArray[np.float64]
@@ -27,6 +29,7 @@ WHOLE = 0.85  # of the rim: with less in view, parts may be the edge of somethin
 SMEARED = 0.4  # of the semi-axis: on a longer path the speed isn't constant, as in the model
 EXCEEDED = 2.0  # factor of variances where the path is longer, or white is clipped; measured on rendered frames
 SKEWED = 0.03  # of the path, standard deviation of a centre by clipped white; measured on rendered frames
+SHRUNK = 0.3  # of the path, standard deviation of a semi-axis by clipped white; measured on rendered frames
 UNEVEN = 0.05  # of the contrast: white of a larger spread over the sectors isn't even within one
 BENT_PX = 0.1  # times that share: standard deviation of a centre by uneven white
 LARGEST_BLUR = 0.35  # of the ring's width; beyond that its dark ring is gone
@@ -37,7 +40,7 @@ class Outlines:
     """n fitted rims; NaN where there is none."""
 
     ellipses: Ellipses  # of n
-    covariance: Array  # (n, 2, 2) px^2, of the centres
+    joint: Array  # (n, 5, 5) px^2, covariance of centre and shape: x, y, a, b, c
     inside: Array  # (n,) DN, of the dark ring
     outside: Array  # (n,) DN, of the white around it
     middle: Array  # (n,) DN, of the white within it
@@ -46,6 +49,11 @@ class Outlines:
     seen: Array  # (n,) share of the rim that looks like one
     doubtful: NDArray[np.bool_]  # (n,) covered in part, clipped, unevenly lit or smeared: errors may exceed the covariances
     reasons: tuple[str | None, ...]  # of the rejection; None of a ring
+
+    @property
+    def covariance(self) -> Array:
+        """Of the centres : (n, 2, 2) px^2."""
+        return self.joint[:, :2, :2]
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -62,6 +70,11 @@ class Outlines:
         """Contrast in whatever light, (white - black) / (white + black) : (n,)."""
         return self.contrast / (self.outside + self.inside)
 
+    def sighting(self, camera: Camera) -> Sighting:
+        """What a camera tells of the pose, by rims of c0, c1 and c2."""
+        centres = np.where(self.found[:, None], self.ellipses.centre, np.nan)
+        return Sighting(camera, centres, self.covariance, self.ellipses.shape, self.doubtful, self.joint)
+
     def replaced(self, which: int, other: "Outlines") -> "Outlines":
         """The same, with the one rim of `other` in place of number `which`."""
         order = np.arange(len(self.reasons))
@@ -74,7 +87,7 @@ class Outlines:
         return Outlines(self.ellipses[chosen], **arrays, reasons=tuple(np.array(self.reasons, object)[chosen]))
 
 
-ARRAYS = ("covariance", "inside", "outside", "middle", "noise", "motion", "seen", "doubtful")
+ARRAYS = ("joint", "inside", "outside", "middle", "noise", "motion", "seen", "doubtful")
 
 
 def measure(image: NDArray, rough: Ellipses, reach: float | Array, target: Target) -> Outlines:
@@ -139,15 +152,17 @@ def _judged(fits: NDArray, target: Target, middles: bool) -> Outlines:
     shape = np.stack([fits["a"], fits["b"], fits["b"], fits["c"]], axis=1).reshape(-1, 2, 2)
     inside, outside, middle, seen, spread = (fits[name] for name in ("inside", "outside", "middle", "seen", "uneven"))
     noise = fits["noise"].max(axis=1, initial=0)
-    covariance = fits["covariance"][:, :2, :2] * np.maximum(fits["excess"], 1)[:, None, None]
-    covariance = covariance / np.maximum(seen, 0.1)[:, None, None] ** COVERED + FLOOR_PX**2 * np.eye(2)
+    joint = fits["covariance"] * np.maximum(fits["excess"], 1)[:, None, None]
+    joint = joint / np.maximum(seen, 0.1)[:, None, None] ** COVERED + FLOOR_PX**2 * np.eye(5)
     v0, v1, v2 = fits["variance"].T
     path, direction = np.sqrt(24 * np.hypot(v1, v2)), np.arctan2(v2, v1) / 2
     semi = np.trace(shape, axis1=1, axis2=2) / 2
     clipped, uneven = outside + 2 * spread + noise > FULL_DN, spread / np.maximum(outside - inside, LEAST_DN)
     beyond = clipped | (path > SMEARED * semi)
-    covariance[beyond] *= EXCEEDED
-    covariance += ((BENT_PX * uneven) ** 2 + clipped * (SKEWED * path) ** 2)[:, None, None] * np.eye(2)
+    joint[beyond] *= EXCEEDED
+    joint[:, :2, :2] += ((BENT_PX * uneven) ** 2 + clipped * (SKEWED * path) ** 2)[:, None, None] * np.eye(2)
+    joint[:, 2:, 2:] += ((BENT_PX * uneven) ** 2 + clipped * (SHRUNK * path) ** 2)[:, None, None] * np.eye(3)
+    sigma = np.sqrt(np.trace(joint[:, :2, :2], axis1=1, axis2=2))
     motion = path[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
     reasons: list[str | None] = []
     for i in range(len(fits)):
@@ -162,9 +177,9 @@ def _judged(fits: NDArray, target: Target, middles: bool) -> Outlines:
             reasons.append("no white middle")
         elif not np.sqrt(v0[i]) <= LARGEST_BLUR * (1 - hole) * semi[i]:
             reasons.append(f"blurred by {np.sqrt(12 * v0[i]):.0f} px")
-        elif not np.sqrt(np.trace(covariance[i])) <= LARGEST_SIGMA:
-            reasons.append(f"an uncertainty of {np.sqrt(np.trace(covariance[i])):.1f} px")
+        elif not sigma[i] <= LARGEST_SIGMA:
+            reasons.append(f"an uncertainty of {sigma[i]:.1f} px")
         else:
             reasons.append(None)
     doubtful = beyond | (uneven > UNEVEN) | (seen < WHOLE)
-    return Outlines(Ellipses(centre, shape), covariance, inside, outside, middle, noise, motion, seen, doubtful, tuple(reasons))
+    return Outlines(Ellipses(centre, shape), joint, inside, outside, middle, noise, motion, seen, doubtful, tuple(reasons))

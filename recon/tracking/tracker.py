@@ -24,7 +24,7 @@ from recon.tracking.frames import grey
 from recon.tracking.identity import Triple
 from recon.tracking.networks import Networks
 from recon.tracking.pose import estimate
-from recon.tracking.pose_fit import TargetPose, lost
+from recon.tracking.pose_fit import Sighting, TargetPose, lost
 from recon.tracking.rims import Outlines, measure, measure_both
 from recon.tracking.views import View
 
@@ -145,16 +145,25 @@ class Tracker:
         outlines = measure_both(*frames, rough, np.arange(6) >= 3, reach, self.target)
         halves = [covered_circle.completed(*each, self.target) for each in zip(frames, (outlines[:3], outlines[3:]), strict=True)]
         seen = (views.judged(halves[0], self.target), views.judged(halves[1], self.target))
-        return self._posed(seen, how)
+        return self._settled(frames, seen, how)
+
+    def _settled(self, frames: Frames, seen: tuple[View, View], how: str) -> Tracking:
+        """From two views to the pose; where each shows two circles, by a second look for the third."""
+        result = self._posed(seen, how)
+        if not all(view.outlines.found.sum() == 2 for view in seen):
+            return result
+        rims = [view.outlines for view in seen]
+        again = covered_circle.sought_again(frames, rims, self.cameras, self.target, self.optics)
+        judged = [tuple(views.judged(outlines, self.target) for outlines in pair) for pair in again]
+        found = [each for each in (self._posed((one, other), how) for one, other in judged) if each.found]
+        return found[0] if len(found) == 1 else result
 
     def _posed(self, seen: tuple[View, View], how: str) -> Tracking:
         """From two views to the pose."""
         if not (all(view.useful for view in seen) and any(view.found for view in seen)):
             each = self._unconfirmed(seen)
             return Tracking(lost(_unseen(each)), each)
-        found = estimate(seen[0].sighting(self.cameras[0]), seen[1].sighting(self.cameras[1]), self.target, self.optics)
-        if found.found and (reason := views.lone(seen, found.used)):
-            found = lost(reason)
+        found = estimate(*self._sightings(seen), self.target, self.optics)
         if not found.found:
             both = all(view.found for view in seen)
             return Tracking(found, views.doubted(seen, found.reason) if both else self._unconfirmed(seen))
@@ -162,6 +171,9 @@ class Tracker:
             one, other = self._expected(0, found.world_from_target), self._expected(1, found.world_from_target)
             seen = views.with_predicted(seen[0], one, found.used[0]), views.with_predicted(seen[1], other, found.used[1])
         return Tracking(found, seen, how)
+
+    def _sightings(self, seen: tuple[View, View]) -> tuple[Sighting, Sighting]:
+        return seen[0].outlines.sighting(self.cameras[0]), seen[1].outlines.sighting(self.cameras[1])
 
     def _unconfirmed(self, seen: tuple[View, View]) -> tuple[View, View]:
         """Two views that don't confirm each other."""
@@ -193,7 +205,7 @@ class Tracker:
             if k in settled and triple.within(settled[k]):
                 continue
             view = self._seen_at(frames, networks, k, triple)
-            if k not in likeliest or (view.found and not likeliest[k].found):
+            if k not in likeliest or _shown(view) > _shown(likeliest[k]):
                 likeliest[k] = view
             if view.found:
                 settled[k] = triple
@@ -203,7 +215,7 @@ class Tracker:
                     return min((one for one in results if one.found), key=_rank)
                 likeliest.update((1 - k, other) for other in others if other.found)
         first, second = (likeliest.get(k, views.nothing(_absent(each))) for k, each in enumerate(candidates))
-        return self._posed((first, second), "detected")
+        return self._settled(frames, (first, second), "detected")
 
     def _opposite_views(self, frames: Frames, k: int, view: View) -> list[View]:
         """Views of the other camera at the circles that each pose hypothesis of camera k's view predicts."""
@@ -236,6 +248,11 @@ class _Watch:
 def _rank(result: Tracking) -> tuple[int, float]:
     """To find the right tilt first: a wrong one misses circles, or else fits worse."""
     return -result.pose.freedom, result.pose.misfit
+
+
+def _shown(view: View) -> tuple[bool, int]:
+    """To prefer the view that shows most of the target."""
+    return view.found, int(view.outlines.found.sum())
 
 
 def _absent(candidates: circle_detector.Candidates) -> str:

@@ -10,12 +10,11 @@ from recon.geometry.ellipses import Ellipses
 from recon.model.rig import Target
 from recon.tracking import identity
 from recon.tracking.pose import allowed
-from recon.tracking.pose_fit import NAMES, Sighting
-from recon.tracking.rims import Outlines
+from recon.tracking.pose_fit import NAMES
+from recon.tracking.rims import WHOLE, Outlines
 
 Array = NDArray[np.float64]
 
-LEAST_UNCONFIRMED = 0.6  # of each rim, to be seen by one camera only
 ELSEWHERE = "not where the others ask for it"
 
 
@@ -41,18 +40,13 @@ class View:
         """Lengths : (3,) of the circles' paths over the exposure; NaN of one that isn't seen."""
         return np.where(self.outlines.found, np.linalg.norm(self.outlines.motion, axis=1), np.nan)
 
-    def sighting(self, camera: Camera) -> Sighting:
-        """The sighting for the pose estimate."""
-        centres = np.where(self.outlines.found[:, None], self.outlines.ellipses.centre, np.nan)
-        return Sighting(camera, centres, self.outlines.covariance, self.outlines.ellipses.shape, self.outlines.doubtful)
-
 
 def nothing(reason: str) -> View:
     """No circles, for a reason."""
-    numbers, pairs, squares = np.full(3, np.nan), np.full((3, 2), np.nan), np.full((3, 2, 2), np.nan)
+    numbers, pairs = np.full(3, np.nan), np.full((3, 2), np.nan)
     outlines = Outlines(
-        Ellipses(pairs, squares),
-        covariance=squares,
+        Ellipses(pairs, np.full((3, 2, 2), np.nan)),
+        joint=np.full((3, 5, 5), np.nan),
         inside=numbers,
         outside=numbers,
         middle=numbers,
@@ -80,28 +74,9 @@ def judged(outlines: Outlines, target: Target) -> View:
 
 def unconfirmed(view: View, camera: Camera, target: Target) -> View:
     """A view that the other one doesn't confirm: shapes must be those of a pose, and no rim may be another thing's edge."""
-    if not view.found:
+    if not view.found or allowed(view.outlines.sighting(camera), view.outlines.seen < WHOLE, target):
         return view
-    if not allowed(view.sighting(camera), target):
-        return replace(view, reason="circles of shapes that no pose gives them")
-    little = _half_seen(view.outlines, np.ones(len(NAMES), bool))
-    return replace(view, reason=little) if little else view
-
-
-def lone(pair: tuple[View, View], used: NDArray[np.bool_]) -> str | None:
-    """Reason to refuse a pose from (2, 3) circles: a circle found by one camera alone may be another thing's edge."""
-    reasons = (_half_seen(view.outlines, mine & ~other) for view, mine, other in zip(pair, used, used[::-1], strict=True))
-    return next((reason for reason in reasons if reason), None)
-
-
-def _half_seen(outlines: Outlines, which: NDArray[np.bool_]) -> str | None:
-    """Of some of three circles : (3,), those that show too little of their rims to be believed without the other view."""
-    little = [
-        f"{name}: {100 * seen:.0f} % of its rim seen"
-        for name, seen, asked in zip(NAMES, outlines.seen, which, strict=True)
-        if asked and seen < LEAST_UNCONFIRMED
-    ]
-    return "; ".join(little) + ", by one camera only" if little else None
+    return replace(view, reason="circles of shapes that no pose gives them")
 
 
 def with_predicted(view: View, predicted: Ellipses, used: NDArray[np.bool_]) -> View:

@@ -100,7 +100,7 @@ def located(take: Take, given: Frames, target: Target, networks: Networks) -> Lo
     nothing = Located(np.full(6, np.nan), limit, np.nan, np.nan, np.nan)
     if not result.found:
         return nothing
-    seen = [view.sighting(camera).centres for view, camera in zip(result.views, cameras, strict=True)]
+    seen = [view.outlines.sighting(camera).centres for view, camera in zip(result.views, cameras, strict=True)]
     shift, turn = pose_errors(take, result.pose.world_from_target) or (np.nan, np.nan)
     error = rigid.difference(take.motion.world_from_target, result.pose.world_from_target)
     misfit = float(error @ np.linalg.solve(result.pose.covariance, error))

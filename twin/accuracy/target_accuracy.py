@@ -127,7 +127,7 @@ def _wrong(one: Shown, design: Target, networks: Networks) -> bool:
     if errors is None:
         return False
     sigma = np.sqrt(np.trace(pose.total[3:, 3:]))
-    return not one[0].present or errors[0] > max(WRONG_MM, WRONG_SIGMAS * sigma)
+    return bool(not one[0].present or errors[0] > max(WRONG_MM, WRONG_SIGMAS * sigma))
 
 
 def _median(results: Sequence[Tracked], figure: str) -> float:

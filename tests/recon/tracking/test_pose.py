@@ -11,7 +11,7 @@ from recon.geometry import camera_jacobian, rigid
 from recon.geometry.circle_projection import centre_offsets
 from recon.model import circle_layout
 from recon.model.calibration import Uncertainty
-from recon.tracking import pose
+from recon.tracking import pose, pose_fit
 from recon.tracking.pose_fit import Sighting
 from tests.recon.tracking import drawings
 from twin.optics.surface_session import calibration_of
@@ -223,10 +223,10 @@ def test_one_view_alone_must_have_shapes_of_a_pose(cameras, target, rng):
     """Any three centres are those of some pose, but it tells the shapes too: three rings of a sheet aren't the target."""
     for _ in range(10):
         view, _ = seen(cameras, target, drawings.facing(rng), rng)
-        assert pose.allowed(view, target)
-        side = 0.15 * (view.centres[1] - view.centres[0])
-        assert not pose.allowed(replace(view, centres=view.centres + np.array([[0, 0], side, [0, 0]])), target)
-        assert not pose.allowed(replace(view, shapes=1.1 * view.shapes), target)
+        plain, side = np.zeros(3, bool), 0.15 * (view.centres[1] - view.centres[0])
+        assert pose.allowed(view, plain, target)
+        assert not pose.allowed(replace(view, centres=view.centres + np.array([[0, 0], side, [0, 0]])), plain, target)
+        assert not pose.allowed(replace(view, shapes=1.1 * view.shapes), plain, target)
 
 
 def test_the_back_of_a_target_is_not_found(cameras, target, rng):
@@ -309,6 +309,53 @@ def test_a_right_circle_is_not_left_out_for_a_wrong_one(cameras, target, rng):
             off = error(found.world_from_target, true)
             squared.append(off @ np.linalg.solve(found.covariance, off))
     assert np.sum(np.array(squared) > 30) <= 1
+
+
+@pytest.mark.parametrize(("wider", "right"), [(1.0, True), (1.04, False)])
+def test_a_doubtful_circle_of_one_view_must_have_the_shape_that_the_pose_gives_it(cameras, target, rng, wider, right):
+    """Its centre alone agrees with any two tilts; of the edge of something else the size is off."""
+    for _ in range(10):
+        views, which = seen(cameras, target, drawings.facing(rng), rng), rng.integers(3)
+        views[0].shapes[which] *= wider
+        views[0] = replace(views[0], doubtful=np.arange(3) == which)
+        views[1] = views[1].without(which)
+        found = pose.estimate(*views, target)
+        assert found.found == right
+        assert right or "shapes that no pose gives" in found.reason
+
+
+def test_a_doubtful_circle_that_is_another_thing_is_left_out(cameras, target, rng):
+    """Its rays don't meet those of the other view's; the pose is that of the other five."""
+    for _ in range(10):
+        true, which = drawings.facing(rng), rng.integers(3)
+        views = seen(cameras, target, true, rng)
+        views[1].centres[which] += [0.0, 150.0]
+        assert "miss each other" in pose.estimate(*views, target).reason
+        views[1] = replace(views[1], doubtful=np.arange(3) == which)
+        found = pose.estimate(*views, target)
+        assert found.found and np.argwhere(~found.used).tolist() == [[1, which]]
+        off = error(found.world_from_target, true)
+        assert off @ np.linalg.solve(found.covariance, off) < chi2.ppf(0.9999, 6)
+
+
+def test_whole_ellipses_tell_the_pose_of_two_circles_a_view(cameras, target, rng):
+    """With noise of shapes as of centres: errors over the covariance, and misfits, are chi-square."""
+    squared, misfits = [], []
+    for _ in range(POSES):
+        true, which = drawings.facing(rng), rng.integers(3)
+        views = [view.without(which).by_shapes() for view in seen(cameras, target, true, rng)]
+        for view in views:
+            noise = np.sqrt(view.noise[0, 2, 2]) * rng.standard_normal((3, 3))
+            view.shapes[:] += noise[:, [0, 1, 1, 2]].reshape(3, 2, 2)
+            del view.__dict__["noise"]
+        views = [replace(view) for view in views]
+        found = pose_fit.refined(true, views, target)
+        off = error(found.world_from_target, true)
+        squared.append(off @ np.linalg.solve(found.covariance, off))
+        misfits.append(found.misfit)
+        assert found.freedom == 14
+    for values, freedom in ((squared, 6), (misfits, 14)):
+        assert abs(np.mean(values) - freedom) < 4 * np.sqrt(2 * freedom / POSES)
 
 
 def test_nonsense_is_not_found(cameras, target):
