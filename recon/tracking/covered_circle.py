@@ -5,7 +5,7 @@ the other, which settles it. Their distance must be that of the circles that the
 The third place follows, as exactly as a view is affine: to 2 px in the median, 7 px at most for the rig. So does the shape there,
 which a rim of which half is covered doesn't tell by itself.
 
-Where neither view shows it, two ellipses of each tell the pose but for a half turn, and with it the place to a pixel.
+Where neither view shows it, two ellipses of each determine the pose but for a half turn, and with it the place to a pixel.
 """
 
 from collections.abc import Iterator, Sequence
@@ -72,7 +72,7 @@ def named_poses(
 ) -> Iterator[tuple[list[Outlines], Array]]:
     """Poses : (4, 4) mm by two circles of each view, with the rims in the order of the names under which they are such.
 
-    Which of two is which two can't tell, so mostly there are two poses, half a turn apart.
+    By themselves two circles have no order, so mostly there are two poses, half a turn apart.
     """
     for orders in product(*(_orders(outlines.found) for outlines in pair)):
         named = [outlines[order] for outlines, order in zip(pair, orders, strict=True)]

@@ -71,7 +71,7 @@ class Outlines:
         return self.contrast / (self.outside + self.inside)
 
     def sighting(self, camera: Camera) -> Sighting:
-        """What a camera tells of the pose, by rims of c0, c1 and c2."""
+        """The sighting for the pose estimate, of rims in the order of NAMES."""
         centres = np.where(self.found[:, None], self.ellipses.centre, np.nan)
         return Sighting(camera, centres, self.covariance, self.ellipses.shape, self.doubtful, self.joint)
 

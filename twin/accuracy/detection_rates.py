@@ -46,7 +46,7 @@ def rows(setup: Setup, networks: Networks, samples: int = SAMPLES) -> list[Row]:
     there = [view for view in seen if view.shows_target and view.blur_px <= BLURRED_PX]
     lit = [view for view in there if view.white_dn >= LIT_DN]
     dim = [view for view in there if DIM_DN <= view.white_dn < LIT_DN]
-    covered = [view for view in seen if view.covered and view.blur_px <= BLURRED_PX and view.white_dn >= LIT_DN]
+    covered = [view for view in seen if view.covered and sharp_and_lit(view)]
     found = [view for view in seen if view.found]
     empty = [view for view in seen if view.empty]
     return [
@@ -63,6 +63,11 @@ def rows(setup: Setup, networks: Networks, samples: int = SAMPLES) -> list[Row]:
         Row("b", f"found, but neither right nor exchanged ({len(found)} views)",
             percent(not view.right and not view.exchanged for view in found), 0.1, 0.0, "%"),
     ]  # fmt: skip
+
+
+def sharp_and_lit(view: Seen) -> bool:
+    """Whether a view of the target is neither blurred nor dark beyond what is asked for."""
+    return view.blur_px <= BLURRED_PX and view.white_dn >= LIT_DN
 
 
 def scored(samples: Iterable[tuple[Take, Frames]], target: Target, networks: Networks) -> Iterable[Seen]:

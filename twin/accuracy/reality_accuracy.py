@@ -1,6 +1,7 @@
-"""Accuracy with frames and targets of life: a lamp that flickers, light from elsewhere, shifts that are off, imprecise prints."""
+"""Accuracy with frames and targets of life: flicker, stray light, shifts that are off, imprecise prints, covered circles."""
 
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from recon.tracking import networks as nets
 from scenes.catalogue import build_scene
 from scenes.kinds import plane
 from scenes.scene_types import Scene
-from twin.accuracy import target_accuracy
+from twin.accuracy import detection_rates, target_accuracy, tracking_frames
 from twin.accuracy.surface_accuracy import experiment, relief_noise_ratio
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation.surface_errors import rms
@@ -19,6 +20,7 @@ from twin.optics.surface_session import Shooting
 SEEDS = range(100, 110)  # of conditions that nothing was tried on
 EXPOSURES_S = (2e-4, 5e-4, 1e-3, 1.4e-3, 2e-3, 4e-3, 8e-3, 1.6e-2)
 FEWEST = 2000  # points whose spread is known to 5 %, though neighbours share theirs
+COVERED, SAMPLES = range(1063, 1073), 100  # seeds of frames as in a data set, each of its own bodies, and pairs of each
 DISTURBED = Conditions(frames=Frames(flicker=0.03, stray_dn=1.0, shift=0.01))
 WHAT = "flicker of 3 %, offsets of 1 DN, shifts off by 1 % of a step"
 
@@ -33,6 +35,7 @@ def measurements(setup: Setup) -> list[Measurement]:
         lambda: exposed(setup),
         lambda: target_accuracy.rows(setup, networks),
         lambda: target_accuracy.false_rows(setup, networks),
+        lambda: covered(setup, networks),
     ]
 
 
@@ -79,6 +82,22 @@ def exposed(setup: Setup) -> list[Row]:
         Row("d", f"{what}: spread of error / predicted sigma, largest", max(spreads), 1.15, 1.0, ""),
         Row("d", f"{what}: reported coverage less the true one, largest", float(np.abs(differences).max()), 0.05, 0.0, ""),
         Row("d", f"{what}: refused as too dark, of {len(SEEDS) * len(EXPOSURES_S)}", refused, None, None, ""),
+    ]
+
+
+def covered(setup: Setup, networks: nets.Networks) -> list[Row]:
+    """Row f: views in which up to half of a disc is covered, lit and blurred as those of row b of tracking."""
+    unseen = chain.from_iterable(tracking_frames.unseen(setup, seed, SAMPLES) for seed in COVERED)
+    seen = list(detection_rates.scored(unseen, setup.rig.target, networks))
+    partly = [view for view in seen if view.covered and detection_rates.sharp_and_lit(view)]
+    false = sum(view.found and not view.right for view in seen)
+    what = (
+        f"up to half of a disc covered, white >= 15, blur <= 12 px ({len(partly)} views of {len(COVERED)} seeds): found rightly"
+    )
+    rightly = detection_rates.percent(view.right for view in partly)
+    return [
+        Row("f", what, rightly, 95.0, None, "%", at_least=True),
+        Row("f", f"found, but not right, of all {len(seen)} views", false, 0, 0, ""),
     ]
 
 

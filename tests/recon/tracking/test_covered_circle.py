@@ -175,7 +175,7 @@ def test_a_fingertip_near_a_rings_place_is_not_taken_for_it(cameras, rig, rng, l
 
 
 @pytest.mark.parametrize("which", [[0, 0], [1, 1], [2, 2], [0, 1], [2, 1]])
-def test_two_circles_of_each_view_tell_the_place_of_the_third(cameras, rig, rng, which):
+def test_the_third_place_follows_from_two_circles_of_each_view(cameras, rig, rng, which):
     """Under one naming, to a pixel; half a turn away there is another pose where it is the same circle that is missing."""
     for _ in range(5):
         place, halves = drawings.facing(rng, 25.0), []
@@ -216,12 +216,12 @@ def test_a_circle_that_is_covered_in_both_views_is_found_by_a_second_look(camera
         v, u = np.mgrid[: image.shape[0], : image.shape[1]]
         return painted(image, np.hypot(u - one.centre[0, 0], v - one.centre[0, 1]) < 1.6 * radius, 45, rng)
 
-    seen = [covered(in_part) for _ in range(10)]
+    seen = [covered(in_part) for _ in range(6)]
     found = [(place, result.pose) for place, result in seen if result.found]
-    assert len(found) >= 7
+    assert len(found) >= 4
     for place, each in found:
         error = rigid.difference(place, each.world_from_target)
         assert error @ np.linalg.solve(each.total, error) < chi2.ppf(0.9999, 6)
-    assert not any(covered(wholly)[1].found for _ in range(5))
+    assert not any(covered(wholly)[1].found for _ in range(3))
     monkeypatch.setattr(covered_circle, "sought_again", lambda *_: ())
-    assert sum(covered(in_part)[1].found for _ in range(10)) < 7
+    assert sum(covered(in_part)[1].found for _ in range(6)) < 4

@@ -338,7 +338,7 @@ def test_a_doubtful_circle_that_is_another_thing_is_left_out(cameras, target, rn
         assert off @ np.linalg.solve(found.covariance, off) < chi2.ppf(0.9999, 6)
 
 
-def test_whole_ellipses_tell_the_pose_of_two_circles_a_view(cameras, target, rng):
+def test_whole_ellipses_of_two_circles_a_view_determine_the_pose(cameras, target, rng):
     """With noise of shapes as of centres: errors over the covariance, and misfits, are chi-square."""
     squared, misfits = [], []
     for _ in range(POSES):

@@ -171,7 +171,7 @@ def test_uneven_light_comes_from_where_it_is():
 
 
 def test_launches_of_any_size_are_one_kernel(bank):
-    """A renderer that is compiled anew for each window would be three times as slow; a process's first launch is one of its own."""
+    """Compiled anew for each window, rendering would take three times as long; a process's first launch has its own."""
     take, hashes = plain_take(facing()), set()
     light_of(bank, take, 0, np.zeros(1), np.zeros(1), 4)
     for count in (100, 160, 1007):
