@@ -31,14 +31,16 @@ from recon.geometry import rigid
 from recon.geometry.levenberg_marquardt import descend
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
-from recon.probe_calibration import cross_wire, point_equation, probe_checks, wires
+from recon.probe_calibration import cross_wire, movement, point_equation, probe_checks, wires
 from recon.probe_calibration.cross_wire import Appearance, Crossing
+from recon.probe_calibration.movement import Equations, Movement
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Size = tuple[int, int]  # width, height, px
 
 NAMES = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")  # of the uncertainty; the wire's three follow in the normal equations
+PROBE, WIRE, SHIFT = slice(2, 8), slice(8, 11), range(5, 8)  # parameters: the probe's turn and shift, the wire's place, the shift
 NO_POSE = "the target was not tracked"
 MIN_FRAMES = 6
 DRAWS = 500  # random sixes of frames; at 30 % outliers 0.7**6 = 12 % of them are clean
@@ -92,6 +94,7 @@ class Adjustment:
     outliers: Mask  # (n,)
     noise_factor: float  # measured noise over the assumed; the covariance is scaled by its square
     apart_mm: float = 0.0  # between the wires' axes, where they were seen as lines
+    moved: Movement | None = None  # what moved, or may have, while the frames were taken; the values are those of the middle
 
     @property
     def rms_mm(self) -> float:
@@ -124,6 +127,7 @@ def calibrate(
     expected: Array | None = None,
     seed: int = 0,
     ahead_mm: float = 0.0,
+    ahead_sigma_mm: float = 0.0,
 ) -> Adjustment:
     """Calibrate a probe from poses and pixels of one point at rest: of two wires, the midpoint between their axes.
 
@@ -143,6 +147,8 @@ def calibrate(
         Of the random draws of frames for the robust start.
     ahead_mm : float
         Distance of the echo before the wires' axes: see `recon.probe_calibration.wires.echo_ahead`.
+    ahead_sigma_mm : float
+        Its standard deviation, common to all frames.
 
     Raises
     ------
@@ -165,12 +171,19 @@ def calibrate(
     probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
     probe_checks.information(estimate.target_from_image, estimate.scale, information, sightings.of(inliers), size)
     covariance = np.linalg.inv(information)[: len(NAMES), : len(NAMES)]
+    slopes, left = _whitened(estimate, sightings.of(inliers), noise)
+    moved = movement.find(Equations(slopes[..., : 11 + (sightings.beside is not None)], left, PROBE, WIRE))
+    if moved is not None:
+        estimate, covariance = estimate.moved(np.resize([*moved.step, 0.0], 12)), _by_movement(moved)
+    covariance[np.ix_(SHIFT, SHIFT)] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
     ahead = rigid.transform(np.eye(3), [0, -ahead_mm, 0])
     calibration = ProbeCalibration(estimate.target_from_image @ ahead, estimate.scale, uncertainty)
     probe_checks.outcome(calibration, size, expected)
     chi = np.sqrt(_squared(estimate, sightings, noise)) / factor
-    return Adjustment(calibration, estimate.wire, _residuals(estimate, sightings), chi, ~inliers, factor, abs(estimate.apart))
+    return Adjustment(
+        calibration, estimate.wire, _residuals(estimate, sightings), chi, ~inliers, factor, abs(estimate.apart), moved
+    )
 
 
 def from_images(
@@ -281,16 +294,31 @@ def _squared(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
     )
 
 
-def _normal_equations(estimate: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> tuple[Array, Array, float]:
-    """Matrix (12, 12), right-hand side (12,) and cost, with the covariances as they are at the estimate."""
+def _by_movement(moved: Movement) -> Array:
+    """Covariance : (8, 8) of the probe's parameters, uncertain by half of a movement of its bracket, as they are used later."""
+    covariance = moved.covariance.copy()
+    if moved.what == movement.PROBE:
+        covariance[PROBE, PROBE] += np.outer(moved.growth, moved.growth) + moved.growth_covariance
+    return covariance[: len(NAMES), : len(NAMES)]
+
+
+def _whitened(estimate: _Estimate, sightings: Sightings, noise: Noise) -> tuple[Array, Array]:
+    """Slopes : (n, 3, 12) of the residuals and these : (n, 3), in standard deviations."""
     turns, n = sightings.poses[:, :3, :3], len(sightings.pixels)
     jacobian = turns @ point_equation.point_jacobian(estimate.target_from_image, estimate.scale, estimate.pixels(sightings))
     beside = np.zeros((n, 2)) if sightings.beside is None else sightings.beside
     apart = -np.einsum("nij,jk,nk->ni", turns, estimate.target_from_image[:3, :2] * estimate.scale, beside)
     jacobian = np.concatenate([jacobian, np.broadcast_to(-np.eye(3), (n, 3, 3)), apart[..., None]], axis=-1)
     residuals = _residuals(estimate, sightings)
-    whiten = np.linalg.inv(np.linalg.cholesky(_covariances(estimate, sightings, noise))) * np.sqrt(weights)[:, None, None]
-    white, left = (whiten @ jacobian).reshape(-1, 12), (whiten @ residuals[..., None]).ravel()
+    whiten = np.linalg.inv(np.linalg.cholesky(_covariances(estimate, sightings, noise)))
+    return whiten @ jacobian, (whiten @ residuals[..., None])[..., 0]
+
+
+def _normal_equations(estimate: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> tuple[Array, Array, float]:
+    """Matrix (12, 12), right-hand side (12,) and cost, with the covariances as they are at the estimate."""
+    slopes, residuals = _whitened(estimate, sightings, noise)
+    white = (np.sqrt(weights)[:, None, None] * slopes).reshape(-1, 12)
+    left = (np.sqrt(weights)[:, None] * residuals).ravel()
     matrix, rhs, cost = white.T @ white, -white.T @ left, float(left @ left)
     matrix[11, 11] += 1 / APART_MM**2
     rhs[11] -= estimate.apart / APART_MM**2

@@ -3,13 +3,17 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
 
 from recon.files.metrics import Metrics
+from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import Probe
-from recon.probe_calibration import crossing_frames, point_calibration, repeatability, sound_in_water
+from recon.probe_calibration import crossing_frames, movement, point_calibration, repeatability, sound_in_water
 from recon.probe_calibration.crossing_frames import CrossingFrames
+from recon.probe_calibration.movement import Movement
 from recon.probe_calibration.point_calibration import Adjustment
 from recon.probe_calibration.tank_calibration import Result, Settings
 
@@ -48,7 +52,31 @@ def measure(frames: CrossingFrames, result: Result, design: Probe, settings: Set
         "speed_m_per_s": calibration.speed_m_s,
         "design_turn_deg": float(np.degrees(turn)),
         "design_centre_mm": float(np.linalg.norm(away)),
+        "moved_mm": 0.0 if found.moved is None else found.moved.shift_mm,
+        "moved_deg": 0.0 if found.moved is None else found.moved.turn_deg,
     }
+
+
+def compare(calibration: ProbeCalibration, earlier: ProbeCalibration) -> Metrics:
+    """Figures of the probe's movement against its target since an earlier calibration, both for sound of one speed."""
+    before = sound_in_water.for_tissue(earlier, calibration.speed_m_s)
+    step = rigid.difference(before.target_from_image, calibration.target_from_image)
+    covariance = sum((_of_pose(each) for each in (before, calibration)), np.zeros((6, 6)))
+    squared = float(step @ np.linalg.pinv(covariance) @ step)
+    return {
+        "since_turn_deg": float(np.degrees(np.linalg.norm(step[:3]))),
+        "since_shift_mm": float(np.linalg.norm(step[3:])),
+        "since_chance": float(chdtrc(len(step), squared)),
+    }
+
+
+def _of_pose(calibration: ProbeCalibration) -> NDArray[np.float64]:
+    """Covariance : (6, 6) of the turn and the shift; zero if there is none."""
+    known = calibration.uncertainty
+    if known is None:
+        return np.zeros((6, 6))
+    order = [known.names.index(name) for name in point_calibration.NAMES[2:]]
+    return known.covariance[np.ix_(order, order)]
 
 
 def describe_frames(frames: CrossingFrames, seconds: float) -> Iterator[str]:
@@ -76,8 +104,27 @@ def describe(frames: CrossingFrames, found: Adjustment, figures: Metrics, design
     yield f"probe       {scales} mm/px; {turn:.1f} deg and {away:.1f} mm from its design"
     corners = [figures[f"sigma_{name}_mm"] for name in FIVE_POINTS[1:]]
     centre, edge = f"{figures['sigma_centre_mm']:.3f} mm", f"{min(corners):.3f} to {max(corners):.3f} mm"
+    if found.moved is not None and found.moved.sure:
+        yield f"warning     {describe_movement(found.moved)}"
     yield f"uncertain   image centre {centre}, corners {edge} (1 sigma, of the place in space)"
     yield from _describe_sound(figures, design, settings)
+
+
+def describe_movement(moved: Movement) -> str:
+    """One line: what moved while the frames were taken, by how much, and the likely cause."""
+    shift = f"{moved.shift_mm:.2f} mm"
+    if moved.what == movement.PROBE:
+        turn = f"{moved.turn_deg:.2f} deg and {shift}"
+        return f"the probe moved against its target by {turn} from the first frame to the last: a bracket that gives, or slips"
+    return f"the crossing moved by {shift} from the first frame to the last: wires that sag or slip, or a tank that was pushed"
+
+
+def describe_comparison(figures: Metrics, earlier: object) -> str:
+    """One line: whether the probe is where an earlier calibration had it."""
+    by = f"{figures['since_turn_deg']:.2f} deg and {figures['since_shift_mm']:.2f} mm"
+    if figures["since_chance"] > movement.CHANCE:
+        return f"earlier     as in {earlier}: {by} from it, within what both calibrations leave open"
+    return f"warning     the probe moved against its target by {by} since {earlier}: a bent bracket, or a target that slipped"
 
 
 def _describe_sound(figures: Metrics, design: Probe, settings: Settings) -> Iterator[str]:

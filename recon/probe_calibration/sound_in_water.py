@@ -9,6 +9,8 @@ sweeps through the same water. For tissue, or water of another temperature, it i
 scale about the probe's face, where the delay is zero. A calibration holds the speed that it is right for.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import ArrayLike, NDArray
@@ -100,9 +102,17 @@ def in_medium(
     return ProbeCalibration(rigid.transform(turn, origin), np.array([sx, sy * ratio]), uncertainty, speed)
 
 
-def for_tissue(calibration: ProbeCalibration, speed: float | None) -> ProbeCalibration:
-    """A calibration converted from its speed to that of the images' medium; unchanged without the latter."""
-    return calibration if speed is None else in_medium(calibration, calibration.speed_m_s, speed)
+def for_tissue(calibration: ProbeCalibration, speed: float | None, sigma: float = 0.0) -> ProbeCalibration:
+    """A calibration converted from its speed to that of the images' medium, its own if that isn't given.
+
+    sigma : of the medium's speed, m/s, added to the covariance as that of sy; a calibration without one is taken as exact.
+    """
+    if sigma and calibration.uncertainty is None:
+        calibration = replace(calibration, uncertainty=Uncertainty(("sy",), np.zeros((1, 1))))
+    calibrated = calibration.speed_m_s
+    if speed is None and not sigma:
+        return calibration
+    return in_medium(calibration, calibrated, speed or calibrated, ratio_sigma=sigma / calibrated)
 
 
 def _check(**speeds: float) -> None:

@@ -24,10 +24,11 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     temperature_c: Finite | None = None
-    temperature_sigma_c: NotNegative = 0.5
+    temperature_sigma_c: NotNegative = 1.0
     assumed_speed: Speed = sound_in_water.SCANNER_SPEED
     medium_speed: Speed | None = None
     wire_radius_mm: NotNegative = 0.1
+    wire_radius_sigma_mm: NotNegative = 0.03
     wire_speed: Annotated[float, Field(ge=300, le=10000)] = 2600.0
     appearance: Appearance = Appearance()
     noise: Noise = Noise()
@@ -74,8 +75,16 @@ class Settings(BaseModel):
     @property
     def echo_ahead_mm(self) -> float:
         """Distance of the wires' echo before their axes."""
+        return self._ahead_of(self.wire_radius_mm)
+
+    @property
+    def echo_ahead_sigma_mm(self) -> float:
+        """Its standard deviation, by that of the wires' radius."""
+        return abs(self._ahead_of(self.wire_radius_sigma_mm))
+
+    def _ahead_of(self, radius_mm: float) -> float:
         temperature = ORDINARY_C if self.temperature_c is None else self.temperature_c
-        return wires.echo_ahead(self.wire_radius_mm, self.wire_speed, float(sound_in_water.speed_of_sound(temperature)))
+        return wires.echo_ahead(radius_mm, self.wire_speed, float(sound_in_water.speed_of_sound(temperature)))
 
 
 @dataclass(frozen=True)
@@ -100,7 +109,13 @@ def calibrate(frames: CrossingFrames, design: Probe, settings: Settings) -> Resu
     expected = design.target_from_image.matrix()
     try:
         found = point_calibration.calibrate(
-            frames.sightings, frames.size, settings.noise, expected, settings.seed, settings.echo_ahead_mm
+            frames.sightings,
+            frames.size,
+            settings.noise,
+            expected,
+            settings.seed,
+            settings.echo_ahead_mm,
+            settings.echo_ahead_sigma_mm,
         )
         implied = sound_in_water.implied_speed(found.calibration, design.scale_mm_per_px[1], settings.assumed_speed)
         probe_checks.speed(implied[0])

@@ -12,8 +12,9 @@ from recon.files.metrics import Metrics, shown
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans
 from recon.model.probe import SCANNER_SPEED
-from recon.segmentation import masses, scan_overlays, tube_wall
+from recon.segmentation import mass_uncertainty, masses, scan_overlays, tube_wall
 from recon.segmentation.containment import Containment, contain
+from recon.segmentation.mass_uncertainty import Sigma
 from recon.segmentation.masses import Mass
 from recon.segmentation.refraction import Sound
 from recon.segmentation.scan_overlays import Overlay
@@ -57,15 +58,20 @@ def find_masses(
     lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {NONE_FOUND}"])]
     containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
     for number, (mass, under) in enumerate(zip(found, containments, strict=True)):
-        figures |= measure(f"mass{number}", mass, under)
-        lines.append(f"mass{number}       {describe(mass, under)}")
+        sigma = mass_uncertainty.by_calibration(mass, scans)
+        figures |= measure(f"mass{number}", mass, sigma, under)
+        lines.append(f"mass{number}       {describe(mass, sigma, under)}")
     drawn = scan_overlays.of_masks(scans.stream(), masses.shown(found, placed, scans.shape, sound), overlays)
     return Segmented({f"mass{k}": mass.mesh for k, mass in enumerate(found)}, figures, lines, drawn)
 
 
-def measure(name: str, mass: Mass, under: Containment | None) -> Metrics:
-    """Figures of a mass, each named with its unit."""
-    figures: Metrics = {f"{name}_volume_mm3": mass.volume}
+def measure(name: str, mass: Mass, sigma: Sigma, under: Containment | None) -> Metrics:
+    """Figures of a mass, each named with its unit, with the uncertainty by the calibration and the speed of sound."""
+    figures: Metrics = {
+        f"{name}_volume_mm3": mass.volume,
+        f"{name}_volume_sigma_mm3": sigma.volume_mm3,
+        f"{name}_centre_sigma_mm": sigma.centre_mm,
+    }
     figures |= {f"{name}_centre_{axis}_mm": float(value) for axis, value in zip("xyz", mass.centre, strict=True)}
     figures |= {f"{name}_extent_{axis}_mm": float(value) for axis, value in zip("xyz", mass.mesh.extents, strict=True)}
     if under is not None:
@@ -74,10 +80,14 @@ def measure(name: str, mass: Mass, under: Containment | None) -> Metrics:
     return figures
 
 
-def describe(mass: Mass, under: Containment | None) -> str:
+def describe(mass: Mass, sigma: Sigma, under: Containment | None) -> str:
     """One line: volume, centre and extent of a mass, and its depth below the skin."""
     centre = ", ".join(f"{value:.1f}" for value in mass.centre)
-    text = f"{mass.volume:.0f} mm3, centre {centre} mm, {' x '.join(f'{value:.1f}' for value in mass.mesh.extents)} mm"
+    volume, away = (
+        f" ± {value:{how}}" if np.isfinite(value) else "" for value, how in ((sigma.volume_mm3, ".0f"), (sigma.centre_mm, ".1f"))
+    )
+    extent = " x ".join(f"{value:.1f}" for value in mass.mesh.extents)
+    text = f"{mass.volume:.0f}{volume} mm3, centre {centre}{away} mm, {extent} mm"
     if under is None:
         return text
     if under.inside is None:

@@ -10,6 +10,7 @@ target is seen, and bring the crossing near all corners of the image in turn.
 
     sonotwin calibrate-probe capture=outputs/wires/capture out=outputs/probe
     sonotwin calibrate-probe capture=outputs/wires/capture temperature_c=22.4 out=outputs/probe
+    sonotwin calibrate-probe capture=outputs/wires/capture earlier=outputs/probe/probe.yaml out=outputs/probe_again
     sonotwin calibrate-probe pairs=pairs.csv out=outputs/probe
 """
 
@@ -42,6 +43,7 @@ class Config(Settings):
     out: Path
     capture: Path | None = None
     pairs: Path | None = None
+    earlier: Path | None = None
     lag_s: LagSeconds = 0.0
 
     @model_validator(mode="after")
@@ -62,7 +64,8 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     source = config.capture or config.pairs
     assert source is not None
-    atomic.check_folder(config.out, FRAMES, inputs=[source])
+    atomic.check_folder(config.out, FRAMES, inputs=[source, *([] if config.earlier is None else [config.earlier])])
+    earlier = None if config.earlier is None else probe_files.read(config.earlier)
     if config.temperature_c is not None:
         sound_in_water.speed_of_sound(config.temperature_c)  # a mistake shows before the work
     start = perf_counter()
@@ -78,6 +81,9 @@ def run(config: Config) -> None:
     figures = probe_figures.measure(frames, result, config.rig.probe, config)
     for line in probe_figures.describe(frames, result.adjustment, figures, config.rig.probe, config):
         console.print(line, markup=False)
+    if earlier is not None:
+        figures |= probe_figures.compare(result.calibration, earlier)
+        console.print(probe_figures.describe_comparison(figures, config.earlier), markup=False)
     written = write(config.out, frames, result, figures | seconds)
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
 

@@ -6,6 +6,7 @@ import io
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,20 @@ def test_b_scans_become_a_calibration(calibrated, rig):
     ]
     assert re.fullmatch(r"find +30 frames, 321x408: crossing in 28, 2 rejected, \d+ s", lines[0])
     assert "1 no echo stands out: frame 4" in lines[1] and "1 the target was not tracked: frame 12" in lines[2]
+
+
+def test_a_bracket_that_was_bent_since_is_noticed(calibrated, capture):
+    """The same frames agree with an earlier calibration, and not with one of which the bracket stood two degrees otherwise."""
+    out, _ = calibrated
+    before = probe_files.read(out / "probe.yaml")
+    bent = rigid.moved(before.target_from_image, np.array([np.radians(2.0), 0, 0, 0, 0, 0]))
+    path = capture.parent / "bent.yaml"
+    probe_files.write(path, replace(before, target_from_image=bent))
+    again = [calibrate(f"capture={capture}", f"out={capture.parent / 'again'}", f"lag_s={LAG_S}", f"earlier={earlier}")
+             for earlier in (out / "probe.yaml", path)]  # fmt: skip
+    lines = [next(line for line in said if "both calibrations" in line or "since" in line) for said in again]
+    assert lines[0].startswith("earlier") and "0.00 deg" in lines[0]
+    assert lines[1].startswith("warning") and "2.00 deg" in lines[1] and "bent bracket" in lines[1]
 
 
 def test_the_authors_program_reads_it(calibrated):

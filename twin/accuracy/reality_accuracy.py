@@ -10,7 +10,7 @@ from recon.tracking import networks as nets
 from scenes.catalogue import build_scene
 from scenes.kinds import plane
 from scenes.scene_types import Scene
-from twin.accuracy import detection_rates, target_accuracy, tracking_frames
+from twin.accuracy import detection_rates, sound_reality, target_accuracy, tracking_frames
 from twin.accuracy.surface_accuracy import experiment, relief_noise_ratio
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation.surface_errors import rms
@@ -36,6 +36,7 @@ def measurements(setup: Setup) -> list[Measurement]:
         lambda: target_accuracy.rows(setup, networks),
         lambda: target_accuracy.false_rows(setup, networks),
         lambda: covered(setup, networks),
+        lambda: sound_reality.rows(setup),
     ]
 
 

@@ -94,3 +94,26 @@ def test_matrices_and_calibrations_are_converted_alike(probe, rng):
     np.testing.assert_allclose(rigid.apply(matrix, flat), made.to_target(pixels), atol=1e-9)
     with pytest.raises(InputError, match="speed: expected a speed of sound of 300 to 5000 m/s, found nan"):
         sound_in_water.in_tissue(matrix, 1540.0, np.nan)
+
+
+def test_a_thermometer_that_is_off_is_in_the_covariance(probe, rng):
+    """Of a probe of which the scale in the water is known, and the water's temperature to 1 degree: errors over their sigma."""
+    water, wanted, ratio = sound_in_water.speed_of_sound(22.0), 1540.0, []
+    exact = ProbeCalibration(probe.target_from_image, probe.scale, Uncertainty(("sy",), np.zeros((1, 1))))
+    sigma = sound_in_water.speed_sigma(22.0, 1.0)
+    made = sound_in_water.in_medium(exact, water, wanted, ratio_sigma=wanted / water**2 * sigma)
+    for true in 22.0 + rng.standard_normal(200):
+        right = probe.scale[1] * wanted / sound_in_water.speed_of_sound(true)
+        ratio.append((made.scale[1] - right) / made.uncertainty.sigma("sy"))
+    assert 0.85 < np.std(ratio) < 1.15 and abs(np.mean(ratio)) < 0.25
+
+
+def test_a_speed_of_tissue_that_is_uncertain_adds_to_that_of_depths(probe):
+    """By 25 of 1540 m/s, beside what the calibration leaves; and alone, where that has no covariance."""
+    made = sound_in_water.for_tissue(probe, 1540.0, 25.0)
+    known = sound_in_water.for_tissue(probe, 1540.0)
+    assert made.uncertainty.sigma("sy") == pytest.approx(np.hypot(known.uncertainty.sigma("sy"), 25 / 1540 * made.scale[1]))
+    alone = sound_in_water.for_tissue(ProbeCalibration(probe.target_from_image, probe.scale), None, 25.0)
+    assert alone.uncertainty.sigma("sy") == pytest.approx(25 / 1540 * probe.scale[1]) and alone.scale == pytest.approx(
+        probe.scale
+    )

@@ -6,6 +6,7 @@ import trimesh
 
 from recon.segmentation import segmented_scans
 from recon.segmentation.containment import Containment
+from recon.segmentation.mass_uncertainty import Sigma
 from recon.segmentation.masses import Mass
 
 
@@ -15,6 +16,7 @@ def test_whether_a_mass_is_inside_may_be_unknown():
     depths = np.full(len(mass.mesh.vertices), np.nan)
     depths[: round(0.48 * len(depths))] = 2.0
     under = Containment(depths)
-    assert segmented_scans.describe(mass, under).endswith("unknown: only 48 % lies under the surface")
-    figures = segmented_scans.measure("mass0", mass, under)
+    assert segmented_scans.describe(mass, Sigma(0.5, 10.0), under).endswith("unknown: only 48 % lies under the surface")
+    figures = segmented_scans.measure("mass0", mass, Sigma(0.5, 10.0), under)
+    assert figures["mass0_volume_sigma_mm3"] == 10.0 and figures["mass0_centre_sigma_mm"] == 0.5
     assert np.isnan(figures["mass0_inside"]) and figures["mass0_covered"] == pytest.approx(0.48, abs=0.01)
