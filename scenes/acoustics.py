@@ -5,9 +5,10 @@ tissue substitutes for ultrasound imaging, Ultrasound Med. Biol. 36(6); [K] Kaye
 [M] Marczak 1997 (water); [A] D'Astous & Foster 1986, Ultrasound Med. Biol. 12(10) (breast tissue).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from recon.errors import InputError
+from recon.probe_calibration.sound_in_water import speed_of_sound
 from scenes.scene_types import Scene, Thing
 
 
@@ -53,6 +54,9 @@ TISSUES = {
     "nylon": Tissue(2.9, 2600.0, 1.0, None, 0.01),  # wires and fishing line [K]
 }
 
+SOFT = ("gel", "silicone", "tumour", "gelatin", "cyst", "bright", "dark")  # of which the speed is that of tissue
+WATER_C = 22.0  # of the water above
+
 MADE_OF = {  # by the scene's kind, then by the thing's name without its number; "" is what surrounds them
     "breast": {"": "gel", "breast": "silicone", "tumour": "tumour", "table": "wood"},
     "cylinders": {"": "gel", "outer": "gelatin", "inner": "polymer", "table": "wood"},
@@ -73,6 +77,15 @@ MADE_OF = {  # by the scene's kind, then by the thing's name without its number;
 def surroundings(scene: Scene) -> Tissue:
     """The medium between and around a scene's things."""
     return TISSUES[_table(scene)[""]]
+
+
+def faster(tissue: Tissue, ratio: float, warmer_c: float) -> Tissue:
+    """The same medium, soft, at a ratio of its speed, or water at another temperature; densities stay."""
+    if tissue == TISSUES["water"]:
+        ratio = float(speed_of_sound(WATER_C + warmer_c) / speed_of_sound(WATER_C))
+    elif tissue not in [TISSUES[name] for name in SOFT]:
+        return tissue
+    return replace(tissue, speed=tissue.speed * ratio, impedance=tissue.impedance * ratio)
 
 
 def tissue_of(scene: Scene, thing: Thing) -> Tissue:

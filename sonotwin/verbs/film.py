@@ -59,7 +59,7 @@ def run(config: Config) -> None:
     rig = config.rig.model_copy(update={"target": printed(config.rig.target, config.conditions.target, config.seed)})
     with console.status("setting up the scene"):
         bank = film_session.make_bank(rig, config.seed)
-        made = film_session.takes(bank, rig, ranges(), config, config.seed)
+        made = film_session.takes(bank, rig, ranges(), config, config.seed, config.conditions.motion)
     start = perf_counter()
     blurs: list[float] = []
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:

@@ -7,6 +7,7 @@ each pixel shows. Takes about a tenth of a second a B-scan on two cores, a quart
 minute more when it first compiles. With `add=true` other parts of a capture in OUT stay; without it they are refused.
 
     sonotwin sweep out=outputs/sweep
+    sonotwin sweep conditions=lifelike out=outputs/sweep
     sonotwin sweep scene=tank ultrasound=water path=bob out=outputs/bottom
     sonotwin sweep scene=crosswire ultrasound=water path=wire out=outputs/wires
 """
@@ -24,10 +25,11 @@ from rich.progress import Progress
 from recon.capture.manifest import SCANNER
 from recon.model.rig import Rig
 from scenes.catalogue import build_scene
+from twin.optics.conditions import Conditions
 from twin.session import Session
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import Scan, scans
-from twin.ultrasound.echo_solids import Body, body
+from twin.ultrasound.echo_solids import Body, at_speeds, body
 from twin.ultrasound.probe_path import WirePath
 from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise
 from twin.ultrasound.transducer import Transducer
@@ -44,6 +46,7 @@ class Config(BaseModel):
     path: sweep_session.AnyPath
     out: Path
     add: bool = False
+    conditions: Conditions = Conditions()
     clocks: Clocks = Clocks()
     pose_noise: PoseNoise = PoseNoise()
     seed: Annotated[int, Field(ge=0)] = 0
@@ -83,9 +86,16 @@ def run(config: Config) -> None:
     session.check()
     with console.status("setting up the scene"):
         scene = build_scene(config.scene)
-        scanned = body(scene)
+        scanned = at_speeds(body(scene), config.conditions.sound, config.seed)
         planned = sweep_session.plan_sweep(
-            config.path, config.rig, scanned, config.ultrasound, config.clocks, config.pose_noise, config.seed
+            config.path,
+            config.rig,
+            scanned,
+            config.ultrasound,
+            config.clocks,
+            config.pose_noise,
+            config.seed,
+            config.conditions.motion,
         )
     count = len(planned.times)
     console.print(f"path        {config.path.kind}, {count} B-scans, {len(planned.track.times)} poses")

@@ -11,14 +11,18 @@ from recon.model import circle_layout
 from recon.model.patterns import Fringes, Patterns
 from recon.model.rig import CameraDevice, Part, ProjectorDevice, Target
 from scenes.kinds import board
+from twin import tremor
 from twin.optics.light_transport import Images
 from twin.optics.raster import Light
 from twin.sensor import Exposure, Stack, electrons_per_radiance, number_per_electron
+from twin.tremor import Tremor
 
 Array = NDArray[np.float64]
 
 MOST = 4  # standard deviations of a print's errors
-STREAM, PRINT_STREAM, BOARD_STREAM = 7, 8, 9  # of random numbers, apart from those of rendering and of the sensor
+# streams of random numbers, apart from those of rendering and of the sensor
+STREAM, PRINT_STREAM, BOARD_STREAM = 7, 8, 9
+TREMOR_STREAM, TRIGGER_STREAM, BRACKET_STREAM, SOUND_STREAM = 10, 11, 12, 13
 
 
 class Frames(Part):
@@ -46,12 +50,31 @@ class BoardPrint(Part):
     flex_mm: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # by which each of these differs from pose to pose
 
 
+class Motion(Part):
+    """Standard deviations of what hands, brackets and triggers do, in each axis where there are several."""
+
+    tremor_mm: Annotated[float, Field(ge=0, le=5)] = 0.0  # of the hand's shift, of 8 to 12 Hz
+    tremor_deg: Annotated[float, Field(ge=0, le=5)] = 0.0  # of its turn
+    trigger_s: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # of each camera's exposure, in each pair of frames
+    bracket_mm: Annotated[float, Field(ge=0, le=5)] = 0.0  # of the probe's shift against its target, from first to last image
+    bracket_deg: Annotated[float, Field(ge=0, le=5)] = 0.0  # of its turn
+
+
+class Sound(Part):
+    """Standard deviations of speeds of sound."""
+
+    tissue: Annotated[float, Field(ge=0, le=0.05)] = 0.0  # of all tissues together, relative
+    water_c: Annotated[float, Field(ge=0, le=5)] = 0.0  # of the water's temperature, deg C
+
+
 class Conditions(Part):
     """The conditions of a session, see `conf/conditions`."""
 
     frames: Frames = Frames()
     target: Print = Print()
     board: BoardPrint = BoardPrint()
+    motion: Motion = Motion()
+    sound: Sound = Sound()
 
 
 IDEAL = Conditions()
@@ -101,6 +124,29 @@ def printed_board(design: board.Config, errors: BoardPrint, *key: int) -> board.
         "seed": int(rng.integers(2**31)) if errors.place_mm else design.seed,
     }
     return design.model_copy(update=changed)
+
+
+def trembling(errors: Motion, *key: int) -> Tremor:
+    """Draw a hand's tremor, the same for the same key."""
+    return tremor.draw(errors.tremor_deg, errors.tremor_mm, *key, TREMOR_STREAM)
+
+
+def triggered(errors: Motion, count: int, *key: int) -> Array:
+    """Draw by how much later each camera exposes : (count, 2) s, the same for the same key."""
+    return errors.trigger_s * np.random.default_rng([*key, TRIGGER_STREAM]).standard_normal((count, 2))
+
+
+def given(errors: Motion, count: int, *key: int) -> Array:
+    """Draw by how much a bracket has given : (count, 6) rad and mm at even times, 0 in the middle, the same for the same key."""
+    size = np.repeat([np.deg2rad(errors.bracket_deg), errors.bracket_mm], 3)
+    growth = size * np.random.default_rng([*key, BRACKET_STREAM]).standard_normal(6)
+    return np.linspace(-0.5, 0.5, count)[:, None] * growth
+
+
+def speeds(errors: Sound, *key: int) -> tuple[float, float]:
+    """Draw the true speed in tissue over the usual one, and the water's temperature less the usual one in deg C."""
+    tissue, warmer = np.random.default_rng([*key, SOUND_STREAM]).standard_normal(2).clip(-MOST, MOST).tolist()
+    return 1 + errors.tissue * tissue, errors.water_c * warmer
 
 
 def check_board(design: board.Config, errors: BoardPrint) -> None:

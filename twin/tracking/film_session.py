@@ -23,16 +23,19 @@ from recon.model.calibration import Calibration
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig, Target, Vector
 from scenes.scene_types import Scene
+from twin.optics import conditions
 from twin.session import Session, describe
 from twin.tracking.mesh_bank import Bank, build_bank
 from twin.tracking.rendered_views import Frames, Quality, render_full, render_sketches, white_radiance
 from twin.tracking.samples import Motion, Take, draw
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import outline
+from twin.tremor import Tremor
 
 Array = NDArray[np.float64]
 
 TRUTH = "sweep/film.npz"
+STILL = conditions.Motion()
 BODIES = 4  # of which the one is taken whose fingers and cable cover least of the circles
 LOOKS = 8  # frames in which that is looked at
 NEAREST_MM = 100.0  # of a circle before a camera, along its axis
@@ -80,17 +83,21 @@ class Way:
     turn: CubicSpline  # (3,) rotation vector in the world over s, from `facing`
     facing: Array  # (3, 3)
     middle_target: Array  # (3,) mm
+    tremor: Tremor  # of the hand, about the circles' middle
 
     def pose(self, seconds: float) -> Array:
         """`world_from_target` : (4, 4) mm."""
-        turned = Rotation.from_rotvec(self.turn(seconds)).as_matrix() @ self.facing
-        return rigid.transform(turned, self.middle(seconds) - turned @ self.middle_target)
+        shaken = self.tremor.at(seconds)
+        turned = Rotation.from_rotvec(shaken[:3]).as_matrix() @ Rotation.from_rotvec(self.turn(seconds)).as_matrix() @ self.facing
+        return rigid.transform(turned, self.middle(seconds) + shaken[3:] - turned @ self.middle_target)
 
     def velocity(self, seconds: float) -> tuple[Array, Array]:
         """Of the target's origin : (3,) mm/s, and its turn : (3,) rad/s, in the world."""
-        spin = _left_jacobian(self.turn(seconds)) @ self.turn(seconds, 1)
+        shaken, rate = self.tremor.at(seconds), self.tremor.rate(seconds)
+        led = _left_jacobian(self.turn(seconds)) @ self.turn(seconds, 1)
+        spin = _left_jacobian(shaken[:3]) @ rate[:3] + Rotation.from_rotvec(shaken[:3]).as_matrix() @ led
         lever = self.pose(seconds)[:3, :3] @ self.middle_target
-        return self.middle(seconds, 1) - np.cross(spin, lever), spin
+        return self.middle(seconds, 1) + rate[3:] - np.cross(spin, lever), spin
 
     def motion(self, seconds: float, exposure_s: float) -> Motion:
         """Over an exposure with its middle at a time."""
@@ -98,15 +105,19 @@ class Way:
         return Motion(self.pose(seconds), speed * exposure_s, spin * exposure_s)
 
 
-def lead(path: HandPath, target: Target, eyes: Array, seed: int) -> Way:
-    """Lead the target along a path, its face to the point between the cameras : (3,) mm, as steadily as the path demands."""
+def lead(path: HandPath, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL) -> Way:
+    """Lead the target along a path, its face to the point between the cameras : (3,) mm, as steadily as the path demands.
+
+    errors : of which the tremor is added.
+    """
     rng = np.random.default_rng([seed, 2])
     places = np.array(path.places_mm, float)
     places = places + path.unsteady_mm * rng.standard_normal(places.shape)
     turns = np.deg2rad(path.turn_deg) * rng.standard_normal(places.shape)
     times = np.linspace(0, path.seconds, len(places) + 1)
     middle, turn = (CubicSpline(times, np.vstack([rows, rows[:1]]), bc_type="periodic") for rows in (places, turns))
-    return Way(middle, turn, _facing(eyes - places.mean(axis=0), path.roll_deg), np.array([target.c1_mm, target.c2_mm, 0]) / 2)
+    facing = _facing(eyes - places.mean(axis=0), path.roll_deg)
+    return Way(middle, turn, facing, np.array([target.c1_mm, target.c2_mm, 0]) / 2, conditions.trembling(errors, seed))
 
 
 def _facing(towards: Array, roll_deg: float) -> Array:
@@ -133,12 +144,12 @@ def make_bank(rig: Rig, seed: int) -> Bank:
     return build_bank(rig.target, BODIES, seed)
 
 
-def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int) -> list[Take]:
+def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int, errors: conditions.Motion = STILL) -> list[Take]:
     """Parameters of each frame: all is drawn once, as for a data set's sample, but the pose, the motion and the noise."""
     light = ranges.light.model_copy(update={"projector_share": 0.0})
     drawn = draw(ranges.model_copy(update={"variants": BODIES, "light": light}), rig, seed, 0)
     cameras = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
-    way = lead(filming.path, rig.target, (cameras[0].centre + cameras[1].centre) / 2, seed)
+    way = lead(filming.path, rig.target, (cameras[0].centre + cameras[1].centre) / 2, seed, errors)
     motions = [way.motion(time * 1e-9, filming.exposure_s) for time in filming.times.tolist()]
     for motion in motions:
         places = rigid.apply(motion.world_from_target, circle_centres(rig.target))
@@ -159,7 +170,10 @@ def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int)
         gain=filming.gain,
     )
     noise = np.random.default_rng([seed, 3]).integers(2**31, size=filming.frames).tolist()
-    made = [replace(same, k=k, motion=motion, noise_seed=noise[k]) for k, motion in enumerate(motions)]
+    late = conditions.triggered(errors, filming.frames, seed) / filming.exposure_s
+    made = [
+        replace(same, k=k, motion=motion, noise_seed=noise[k], late=tuple(late[k].tolist())) for k, motion in enumerate(motions)
+    ]
     falls = np.array([white_radiance(take, rig) for take in made])
     # one exposure: as bright on the whole as asked for, and in each frame as the light falls
     return [

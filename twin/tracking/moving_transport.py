@@ -79,7 +79,7 @@ def render(
     first, step, end = _shares(lanes)
     take, camera = dr.gather(mi.UInt32, mi.UInt32(lanes.take), first), dr.gather(mi.UInt32, mi.UInt32(lanes.camera), first)
     rows = Rows.of(take_columns(takes, rig, bank.body_at, bank.scene_at), take)
-    cameras = Rows.of(camera_columns([device for one in takes for device in one.cameras]), take * 2 + camera)
+    cameras = Rows.of(camera_columns(takes), take * 2 + camera)
     path = _Path(bank, rig.target, rows, cameras, grid)
     key = dr.gather(mi.UInt32, mi.UInt32([one.k for one in takes]), take) * 4 + camera
     seeds = mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed), 4)[0]
@@ -139,6 +139,7 @@ class _Path:
         self.fx, self.fy, self.cx, self.cy = cameras.all("pinhole")
         self.k1, self.k2, self.p1, self.p2, self.k3 = cameras.all("distortion")
         self.pupil, self.focus, self.blur, self.vignetting, self.mid_u, self.mid_v, self.corner = cameras.all("lens")
+        self.late = cameras.number("late")
         self.target_from_world = Turn.of(rows, "target_from_world")
         self.scene_from_world = Turn.of(rows, "scene_from_world")
         self.origin, self.shift = rows.vector("origin"), rows.vector("shift")
@@ -153,7 +154,7 @@ class _Path:
     def follow(self, u, v, circle, points: PairedPoints) -> tuple:
         """Radiance of one ray; whether it aims at the circle, reaches it, and ends on the target's paper."""
         ray, cosine = self._ray(u, v, points)
-        time = points.square().x - 0.5  # not mirrored: a long blur wants as many times as there are rays
+        time = points.square().x - 0.5 + self.late  # not mirrored: a long blur wants as many times as there are rays
         turned = self._body_ray(ray, time)
         x, y, faces = self._on_face(turned)
         aims = faces & self._within_circle(x, y, circle)

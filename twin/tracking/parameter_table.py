@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.geometry import rigid
-from recon.model.rig import CameraDevice, Rig
+from recon.model.rig import Rig
 from twin.tracking.samples import Take
 
 Array = NDArray[np.float64]
@@ -115,8 +115,9 @@ def take_columns(takes: Sequence[Take], rig: Rig, body_at: Array, scene_at: Arra
     }
 
 
-def camera_columns(devices: Sequence[CameraDevice]) -> dict[str, Array]:
-    """Columns of a camera's parameters : (cameras, ...); InputError for a lens with more than five coefficients."""
+def camera_columns(takes: Sequence[Take]) -> dict[str, Array]:
+    """Columns of the cameras' parameters : (takes * 2, ...); InputError for a lens with more than five coefficients."""
+    devices = [device for one in takes for device in one.cameras]
     cameras = [device.optics.camera() for device in devices]
     for camera in cameras:
         if np.any(camera.distortion[5:]):
@@ -127,6 +128,7 @@ def camera_columns(devices: Sequence[CameraDevice]) -> dict[str, Array]:
         "world_from_camera": np.array([rigid.invert(camera.camera_from_world) for camera in cameras]),
         "pinhole": np.array([camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras]),
         "distortion": np.array(distortion),
+        "late": np.array([late for one in takes for late in one.late]),
         "lens": np.array([
             [d.lens.aperture_mm / 2, d.lens.focus_mm, d.lens.blur_px, d.lens.vignetting, *m, 1 / (m @ m)]
             for d, m in zip(devices, middle, strict=True)

@@ -69,16 +69,19 @@ def render_sketches(
     bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int, grid: BitGrid | None = None
 ) -> list[Frames]:
     """Full camera images of which the view and a window about the target are rendered; see `pictures.Sketch`."""
-    pictures = [[_sketch(take, device, rig.target, quality) for device in take.cameras] for take in takes]
+    pictures = [
+        [_sketch(take, *seen, rig.target, quality) for seen in zip(take.cameras, take.late, strict=True)] for take in takes
+    ]
     return _rendered(bank, rig, takes, pictures, quality, seed, grid)
 
 
-def _sketch(take: Take, device: CameraDevice, target: Target, quality: Quality) -> Sketch:
+def _sketch(take: Take, device: CameraDevice, late: float, target: Target, quality: Quality) -> Sketch:
     size = device.optics.size
     first, extent = (0, 0), (1, 1)
     if take.present:
         corners = board_corners(target)
-        places = np.concatenate([device.optics.camera().project(rigid.apply(take.motion.at(t), corners)) for t in (-0.5, 0.5)])
+        motion, camera = take.motion.later(late), device.optics.camera()
+        places = np.concatenate([camera.project(rigid.apply(motion.at(t), corners)) for t in (-0.5, 0.5)])
         if np.isfinite(places).all():
             low = np.clip(np.floor(places.min(axis=0)) - AROUND, 0, np.array(size) - 2).astype(int)
             high = np.clip(np.ceil(places.max(axis=0)) + AROUND, low + 1, np.array(size) - 1).astype(int)
@@ -103,7 +106,7 @@ def _rendered(
     grid: BitGrid | None = None,
 ) -> list[Frames]:
     """One launch for all images and patches of all takes; then the sensors, image by image."""
-    truths = [[view_truth(take, device, rig.target) for device in take.cameras] for take in takes]
+    truths = [[view_truth(take, *seen, rig.target) for seen in zip(take.cameras, take.late, strict=True)] for take in takes]
     blocks, origins = [], []
     for i, take in enumerate(takes):
         for camera, device in enumerate(take.cameras):

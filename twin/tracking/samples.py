@@ -50,6 +50,10 @@ class Motion:
     shift_mm: Array  # (3,) over the exposure, of the target's origin, in the world
     turn_rad: Array  # (3,) rotation vector over the exposure, about the origin, in the world
 
+    def later(self, share: float) -> "Motion":
+        """The same over an exposure that is later by a share of itself."""
+        return Motion(self.at(share), self.shift_mm, self.turn_rad) if share else self
+
     def at(self, time: float) -> Array:
         """`world_from_target` at a time from -1/2 to 1/2 of the exposure."""
         return rigid.moved(self.world_from_target, time * np.concatenate([self.turn_rad, self.shift_mm]))
@@ -95,6 +99,7 @@ class Take:
     white_dn: float  # that the exposure aims at
     gain: float
     noise_seed: int
+    late: tuple[float, float] = (0.0, 0.0)  # of each camera's exposure, in exposures
 
 
 def draw(ranges: DataRanges, rig: Rig, seed: int, k: int) -> Take:

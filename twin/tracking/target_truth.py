@@ -30,13 +30,13 @@ class ViewTruth:
     patch_origins: NDArray[np.int64] = field(default_factory=lambda: np.zeros((3, 2), int))
 
 
-def view_truth(take: Take, device: CameraDevice, target: Target) -> ViewTruth:
-    """Ground truth of a take's target in one camera."""
+def view_truth(take: Take, device: CameraDevice, late: float, target: Target) -> ViewTruth:
+    """Ground truth of a take's target in one camera, which exposes later by a share of the exposure."""
     camera = device.optics.camera()
     if not take.present:
         nothing = np.full((3, 2), np.nan)
         return ViewTruth(camera, nothing, np.full((3, 5), np.nan), np.zeros(3, bool), np.full(3, np.nan))
-    motion, model = take.motion, circle_centres(target)
+    motion, model = take.motion.later(late), circle_centres(target)
     pose = motion.world_from_target
     rims = camera.project(rigid.apply(pose, outline(model, target.outer_diameter_mm / 2)))
     low, high = rims.min(axis=1), rims.max(axis=1)

@@ -5,7 +5,7 @@ smaller come later. A plane's distance is linear, and so exact on a grid of two 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -17,8 +17,10 @@ from scipy.ndimage import distance_transform_edt, label, sum_labels
 from recon.compiled import njit
 from recon.geometry.primitives import Cylinder
 from recon.geometry.surface_tree import surface_tree
-from scenes.acoustics import BACKSCATTER, Tissue, surroundings, tissue_of
+from scenes.acoustics import BACKSCATTER, Tissue, faster, surroundings, tissue_of
 from scenes.scene_types import Scene, Thing
+from twin.optics import conditions
+from twin.optics.conditions import Sound
 
 Array = NDArray[np.float64]
 
@@ -132,6 +134,15 @@ def body(scene: Scene) -> Body:
             solids.append(solid(thing, tissue, shape))
     solids.sort(key=lambda one: -float(np.prod(one.mesh.extents)))
     return Body(surroundings(scene), tuple(solids), tuple(wires))
+
+
+def at_speeds(body: Body, errors: Sound, *key: int) -> Body:
+    """The same body with speeds of sound drawn anew, the same for the same key."""
+    ratio, warmer = conditions.speeds(errors, *key)
+    if ratio == 1 and warmer == 0:
+        return body
+    solids = tuple(replace(one, tissue=faster(one.tissue, ratio, warmer)) for one in body.solids)
+    return Body(faster(body.medium, ratio, warmer), solids, body.wires)
 
 
 def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:

@@ -15,6 +15,8 @@ from recon.geometry import rigid
 from recon.model.rig import Finite, NotNegative, Part, Positive
 from recon.model.tracks import Track
 from recon.probe_calibration import point_calibration
+from twin import tremor
+from twin.tremor import Tremor
 from twin.ultrasound.echo_solids import Body, Solid
 from twin.ultrasound.transducer import Transducer
 
@@ -25,6 +27,7 @@ SEARCH_MM = 0.1  # steps in which the surface is looked for
 FOOT_MM = 8.0  # width of the probe's foot across the array
 FOOT_POINTS = (21, 5)  # of the foot, along and across the array
 MOVE_S = 1.0  # from one rest to the next; over such a gap no pose is interpolated
+CALM = tremor.draw(0.0, 0.0, 0)  # a hand without tremor
 TOUCHING_MM = 2.0  # between the axes of two wires that cross
 
 
@@ -33,7 +36,7 @@ class Hand(Part):
 
     shift_mm: NotNegative = 0.15  # standard deviation
     turn_deg: NotNegative = 0.6
-    correlation_s: Annotated[float, Field(gt=0.01)] = 0.15  # of the Gaussian that smooths them: tremor and drift below 3 Hz
+    correlation_s: Annotated[float, Field(gt=0.01)] = 0.15  # of the Gaussian that smooths them: drift below 3 Hz
 
 
 class SurfacePath(Part):
@@ -77,8 +80,8 @@ class WirePath(Part):
     rest_s: Annotated[float, Field(ge=0.1, le=60)] = 0.5  # in each pose; the image is taken in the middle
 
 
-def along_surface(path: SurfacePath, solid: Solid, transducer: Transducer, seed: int) -> Track:
-    """Poses `world_from_image` over time, from 0 ns, of one or more strokes over a solid.
+def along_surface(path: SurfacePath, solid: Solid, transducer: Transducer, seed: int, shaken: Tremor = CALM) -> Track:
+    """Poses `world_from_image` over time, from 0 ns, of one or more strokes over a solid, by a hand that trembles.
 
     The face touches the surface where it first meets it, square to the plane fitted to the surface under the foot.
 
@@ -99,7 +102,7 @@ def along_surface(path: SurfacePath, solid: Solid, transducer: Transducer, seed:
             places.append(_eased(one + (stroke - 1) * aside, one + stroke * aside, path.step_seconds)[1:-1])
         places.append(_eased(one + stroke * aside, other + stroke * aside, duration))
     faces = np.stack([_placed(path, place, solid, transducer) for place in np.concatenate(places)])
-    return _led(faces, path.hand, transducer, seed)
+    return _led(faces, path.hand, shaken, transducer, seed)
 
 
 def _eased(start: Array, end: Array, seconds: float) -> Array:
@@ -108,15 +111,15 @@ def _eased(start: Array, end: Array, seconds: float) -> Array:
     return start + (share * share * (3 - 2 * share))[:, None] * (end - start)
 
 
-def bobbing(bob: Bob, transducer: Transducer, seed: int) -> Track:
-    """Poses `world_from_image` over time, from 0 ns, of a probe that looks along the world's z."""
+def bobbing(bob: Bob, transducer: Transducer, seed: int, shaken: Tremor = CALM) -> Track:
+    """Poses `world_from_image` over time, from 0 ns, of a probe that looks along the world's z, in a hand that trembles."""
     times = np.arange(int(bob.seconds * RATE_HZ) + 1) / RATE_HZ
     turned = 2 * np.pi * (0.35 * times + 0.35 * np.sin(0.9 * times))  # uneven: no two strokes last alike
     faces = np.tile(np.eye(4), (len(times), 1, 1))
     faces[:, :3, :3] = _upright(bob.turn_deg)
     faces[:, :3, 3] = bob.middle_mm
     faces[:, 2, 3] += bob.height_mm * np.sin(turned)
-    return _led(faces, bob.hand, transducer, seed)
+    return _led(faces, bob.hand, shaken, transducer, seed)
 
 
 def crossing(body: Body) -> Array:
@@ -220,16 +223,20 @@ def top(solid: Solid, places: Array) -> Array:
     return np.where(first > 0, depths[np.maximum(first - 1, 0)] + share * SEARCH_MM, np.nan)
 
 
-def _led(faces: Array, hand: Hand, transducer: Transducer, seed: int) -> Track:
-    """Poses of the image from those of the face's middle, with the hand's unsteadiness about it."""
+def _led(faces: Array, hand: Hand, shaken: Tremor, transducer: Transducer, seed: int) -> Track:
+    """Poses of the image from those of the face's middle, with the hand's unsteadiness and tremor about it."""
     rng = np.random.default_rng(seed)
     wander = rng.standard_normal((2, len(faces), 3))
     smooth = hand.correlation_s * RATE_HZ
     wander = gaussian_filter1d(wander, smooth, axis=1, mode="wrap") * np.sqrt(2 * np.sqrt(np.pi) * smooth)  # of unit variance
     corner = rigid.transform(np.eye(3), (-transducer.width_mm / 2, 0, 0))
-    moves = [
-        rigid.from_rotation_vector(np.deg2rad(hand.turn_deg) * turn, hand.shift_mm * shift) @ corner
-        for turn, shift in zip(*wander, strict=True)
-    ]
+    moves = []
+    for k, (turn, shift) in enumerate(zip(*wander, strict=True)):
+        fast = shaken.at(k / RATE_HZ)
+        moves.append(
+            rigid.from_rotation_vector(fast[:3], fast[3:])
+            @ rigid.from_rotation_vector(np.deg2rad(hand.turn_deg) * turn, hand.shift_mm * shift)
+            @ corner
+        )
     times = np.rint(np.arange(len(faces)) * 1e9 / RATE_HZ).astype(np.int64)
     return Track(times, faces @ np.stack(moves))

@@ -15,12 +15,13 @@ from recon.model.probe import ProbeCalibration
 from recon.model.rig import Rig
 from recon.model.tracks import Track
 from scenes.scene_types import Scene
+from twin.optics import conditions
 from twin.session import Session, describe
 from twin.ultrasound import bscan_truth
 from twin.ultrasound.bscan import Scan
 from twin.ultrasound.echo_solids import Body, Solid, label_at
 from twin.ultrasound.probe_path import Bob, SurfacePath, WirePath, about_crossing, along_surface, bobbing
-from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise, moments, plan
+from twin.ultrasound.timed_sweep import STILL, Clocks, Plan, PoseNoise, moments, plan
 from twin.ultrasound.transducer import Transducer
 
 AnyPath = Annotated[SurfacePath | Bob | WirePath, Field(discriminator="kind")]
@@ -32,29 +33,39 @@ GIVES_MM = 5.0  # by which a surface gives way to the probe, at most
 
 
 def plan_sweep(
-    path: SurfacePath | Bob | WirePath, rig: Rig, body: Body, transducer: Transducer, clocks: Clocks, noise: PoseNoise, seed: int
+    path: SurfacePath | Bob | WirePath,
+    rig: Rig,
+    body: Body,
+    transducer: Transducer,
+    clocks: Clocks,
+    noise: PoseNoise,
+    seed: int,
+    errors: conditions.Motion = STILL,
 ) -> Plan:
     """Lead the probe along a path, and set the times of its images.
+
+    errors : of the hand, which trembles where it leads the probe, and of the bracket.
 
     Raises
     ------
     InputError
         If the scene hasn't what the path is about, the probe is led into something, or there are fewer than two images.
     """
+    shaken = conditions.trembling(errors, seed)
     path_seed, clock_seed = np.random.SeedSequence(seed).generate_state(2).tolist()
     match path:
         case SurfacePath():
-            course = along_surface(path, surface_of(path.surface, body), transducer, path_seed)
+            course = along_surface(path, surface_of(path.surface, body), transducer, path_seed, shaken)
             taken = moments(course, clocks.scanner_hz)
             refuse_inside(course, body, transducer, GIVES_MM)
         case Bob():
-            course = bobbing(path, transducer, path_seed)
+            course = bobbing(path, transducer, path_seed, shaken)
             taken = moments(course, clocks.scanner_hz)
             refuse_inside(course, body, transducer)
         case WirePath():
             course, taken = about_crossing(path, body, transducer, path_seed)
             refuse_inside(course, body, transducer)
-    return plan(rig.probe, course, taken, clocks, noise, clock_seed)
+    return plan(rig.probe, course, taken, clocks, noise, clock_seed, errors)
 
 
 def surface_of(name: str, body: Body) -> Solid:

@@ -10,12 +10,15 @@ from recon.geometry import rigid
 from recon.model import tracks
 from recon.model.rig import Finite, NotNegative, Part, Positive, Probe
 from recon.model.tracks import Track
+from twin.optics import conditions
 from twin.ultrasound.bscan import scans
 from twin.ultrasound.bscan_truth import labels
 from twin.ultrasound.echo_solids import Body
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
+
+STILL = conditions.Motion()
 
 
 class Clocks(Part):
@@ -82,8 +85,18 @@ def moments(path: Track, rate_hz: float) -> NDArray[np.int64]:
     return path.times[0] + np.rint(np.arange(int(length * rate_hz) + 1) * 1e9 / rate_hz).astype(np.int64)
 
 
-def plan(probe: Probe, path: Track, taken: NDArray[np.int64], clocks: Clocks, pose_noise: PoseNoise, seed: int) -> Plan:
+def plan(
+    probe: Probe,
+    path: Track,
+    taken: NDArray[np.int64],
+    clocks: Clocks,
+    pose_noise: PoseNoise,
+    seed: int,
+    errors: conditions.Motion = STILL,
+) -> Plan:
     """Plan a sweep whose images are taken at moments : (n,) ns on the path; the cameras see the probe where the path has poses.
+
+    errors : of which the bracket's is added: the target moves against the image.
 
     Raises
     ------
@@ -99,7 +112,9 @@ def plan(probe: Probe, path: Track, taken: NDArray[np.int64], clocks: Clocks, po
     poses = tracks.at(path, tracked)
     known = np.isfinite(poses).all(axis=(1, 2))
     tracked, poses = tracked[known], poses[known]
-    seen = _noisy(poses @ rigid.invert(probe.target_from_image.matrix()), pose_noise, rng)
+    design, given = probe.target_from_image.matrix(), conditions.given(errors, len(poses), seed)
+    held = [pose @ rigid.invert(rigid.moved(design, step)) for pose, step in zip(poses, given, strict=True)]
+    seen = _noisy(np.stack(held), pose_noise, rng)
     track = Track(_stamped(tracked, 0.0, clocks.camera_jitter_s, rng), seen)
     return Plan(stamps, track, Track(taken, tracks.at(path, taken)))
 

@@ -18,7 +18,7 @@ from twin.tracking.target_truth import view_truth
 
 RIG = rig()
 TAKE = plain_take(facing())
-TRUTH = replace(view_truth(TAKE, RIG.cam1, RIG.target), visible=np.ones(3), white_dn=100.0)
+TRUTH = replace(view_truth(TAKE, RIG.cam1, 0.0, RIG.target), visible=np.ones(3), white_dn=100.0)
 
 
 def found(centres: np.ndarray) -> views.View:

@@ -12,13 +12,18 @@ from twin.optics.conditions import (
     BoardPrint,
     Conditions,
     Frames,
+    Motion,
     Print,
+    Sound,
     check_board,
     draw,
     emitted,
     flexed,
+    given,
     printed,
     printed_board,
+    speeds,
+    triggered,
     with_stray,
 )
 from twin.optics.raster import Light
@@ -122,6 +127,19 @@ def test_a_board_that_the_worst_draw_would_spoil_is_refused_beforehand():
     check_board(sound, errors)
     for seed in range(200):
         board.Config.model_validate(printed_board(sound, errors, seed).model_dump())
+
+
+def test_triggers_brackets_and_speeds_are_off_by_their_standard_deviations():
+    """Of 3000 draws; a bracket is as designed in the middle, and ideal conditions change nothing."""
+    motion, sound = Motion(trigger_s=1e-4, bracket_mm=0.2, bracket_deg=0.3), Sound(tissue=0.016, water_c=0.5)
+    late = triggered(motion, 3000, 1)
+    assert late.std(axis=0) == pytest.approx(1e-4, rel=0.06) and abs(np.corrcoef(late.T)[0, 1]) < 0.06
+    ends = np.array([given(motion, 5, seed)[[0, 2, 4]] for seed in range(3000)])
+    assert (ends[:, 2] - ends[:, 0]).std(axis=0) == pytest.approx([np.deg2rad(0.3)] * 3 + [0.2] * 3, rel=0.06)
+    assert (ends[:, 1] == 0).all()
+    drawn = np.array([speeds(sound, seed) for seed in range(3000)])
+    assert drawn.mean(axis=0) == pytest.approx([1, 0], abs=0.03) and drawn.std(axis=0) == pytest.approx([0.016, 0.5], rel=0.06)
+    assert not triggered(Motion(), 5, 1).any() and not given(Motion(), 5, 1).any() and speeds(Sound(), 1) == (1, 0)
 
 
 def test_ideal_boards_are_as_designed():

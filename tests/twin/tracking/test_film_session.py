@@ -16,6 +16,7 @@ from sonotwin.config import load
 from sonotwin.verbs.film import Config, ranges
 from tests.twin.tracking import takes
 from twin.evaluation import track_errors
+from twin.optics.conditions import Motion
 from twin.session import Session
 from twin.tracking import film_session
 from twin.tracking.rendered_views import Frames, white_radiance
@@ -66,6 +67,20 @@ def test_over_an_exposure_the_target_moves_as_the_path(way):
         assert np.linalg.norm(apart) < 0.03 and np.linalg.norm(motion.shift_mm) > 1
 
 
+def test_a_trembling_hand_moves_as_fast_as_it_says(config):
+    """The path's own speed and turn, and the tremor's, are the slopes of its poses."""
+    eyes, shaky = np.array([50.0, 0, 0]), Motion(tremor_mm=0.2, tremor_deg=0.3)
+    calm, trembling = (film_session.lead(config.path, config.rig.target, eyes, 3, errors) for errors in (Motion(), shaky))
+    step = 1e-5
+    for time in (0.1, 0.5, 0.93):
+        before, after = trembling.pose(time - step), trembling.pose(time + step)
+        slope = rigid.difference(before, after) / (2 * step)
+        speed, spin = trembling.velocity(time)
+        np.testing.assert_allclose(slope, [*spin, *speed], rtol=1e-3, atol=1e-3)
+    apart = [rigid.difference(calm.pose(t), trembling.pose(t)) for t in np.linspace(0, 1, 200)]
+    assert np.rad2deg(np.std(apart, axis=0)[:3]) == pytest.approx(np.full(3, 0.3), rel=0.4)
+
+
 def test_frames_lie_on_the_path(made, config):
     """From one frame's motion to the next frame's pose: what is left over is the acceleration's."""
     poses = np.array([take.motion.world_from_target for take in made])
@@ -77,7 +92,7 @@ def test_frames_lie_on_the_path(made, config):
 
 def test_the_default_film_has_what_a_tracker_fails_at(made, config):
     """Slow and fast stretches, and one where camera 1 misses a circle that camera 2 sees whole."""
-    views = [[view_truth(take, device, config.rig.target) for device in take.cameras] for take in made]
+    views = [[view_truth(take, device, 0.0, config.rig.target) for device in take.cameras] for take in made]
     blur = np.array([[view.blur_px.max() for view in both] for both in views]).max(axis=1)
     inside = np.array([[view.inside.all() for view in both] for both in views])
     assert blur[0] < 4 and 9 < blur.max() < 14
@@ -106,7 +121,7 @@ def test_fingers_leave_the_circles_free(bank, made, config):
 def blanks(made, size=(1280, 1024)):
     """Frames of a film that nobody rendered, one by one."""
     for take in made:
-        first, second = (view_truth(take, device, takes.rig().target) for device in take.cameras)
+        first, second = (view_truth(take, device, 0.0, takes.rig().target) for device in take.cameras)
         image = np.full(size[::-1], take.k, np.uint8)
         yield Frames((image, image), np.zeros((2, 3, 1, 1), np.uint8), (first, second))
 

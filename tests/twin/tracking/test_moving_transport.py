@@ -50,7 +50,7 @@ def unhidden(bank, camera: int = 0, **motion):
     """A take with a body whose discs nothing covers in a view."""
     for body in (0, 1):
         take = replace(plain_take(facing(), **motion), body=body)
-        truth = view_truth(take, take.cameras[camera], RIG.target)
+        truth = view_truth(take, take.cameras[camera], 0.0, RIG.target)
         shown = []
         for circle in range(3):
             u, v, _ = window(truth, circle)
@@ -86,7 +86,7 @@ def test_rays_undo_the_lens_as_recon_does(bank):
     take = plain_take(facing(0, (60, 45, 600)))
     strong = take.cameras[0].optics.model_copy(update={"distortion": (-0.3, 0.2, 0.001, -0.002, 0.1)})
     take = replace(take, cameras=(take.cameras[0].model_copy(update={"optics": strong}), take.cameras[1]))
-    truth = view_truth(take, take.cameras[0], RIG.target)
+    truth = view_truth(take, take.cameras[0], 0.0, RIG.target)
     for circle in range(3):
         u, v, _ = window(truth, circle, 4)
         aimed = light_of(bank, take, 0, u, v, 16, circle).disc
@@ -94,11 +94,26 @@ def test_rays_undo_the_lens_as_recon_does(bank):
         assert np.abs(middle - truth.ellipses[circle, :2]).max() < 0.02
 
 
+def test_a_camera_that_exposes_later_sees_the_target_farther_on(bank):
+    """By half an exposure: as of a target that is there; the other camera sees no difference."""
+    shift, turn = np.array([3.0, 1.0, 2.0]), np.array([0.02, -0.01, 0.05])
+    punctual = replace(plain_take(facing(), shift_mm=shift, turn_rad=turn), body=0)
+    late = replace(punctual, late=(0.0, 0.5))
+    there = replace(punctual, motion=punctual.motion.later(0.5))
+    truth = view_truth(late, late.cameras[1], 0.5, RIG.target)
+    np.testing.assert_allclose(truth.ellipses, view_truth(there, there.cameras[1], 0.0, RIG.target).ellipses)
+    u, v, _ = window(truth, 1)
+    seen, expected, early = (light_of(bank, take, 1, u, v, 16).radiance for take in (late, there, punctual))
+    assert np.sqrt(np.mean((seen - expected) ** 2)) < 0.02 * np.ptp(expected) < np.sqrt(np.mean((seen - early) ** 2))
+    first, same = (light_of(bank, take, 0, u, v, 4).radiance for take in (late, punctual))
+    assert (first == same).all()
+
+
 def test_a_moved_target_is_the_mean_of_still_ones(bank):
     """Blur is what a camera adds up: the moving frame equals the mean of still frames along the way."""
     shift, turn = np.array([3.0, 1.0, 2.0]), np.array([0.02, -0.01, 0.05])
     moving = replace(plain_take(facing(), shift_mm=shift, turn_rad=turn), body=0)
-    truth = view_truth(moving, moving.cameras[0], RIG.target)
+    truth = view_truth(moving, moving.cameras[0], 0.0, RIG.target)
     u, v, _ = window(truth, 1)
     blurred = light_of(bank, moving, 0, u, v, 64).radiance
     times = (np.arange(10) + 0.5) / 10 - 0.5
@@ -120,7 +135,7 @@ def test_white_shines_as_the_closed_form_says(bank):
     lamps[0, :3] = pose[:3, 3] + pose[:3, :3] @ [200, 300, 900]
     lamps[0, 4] = 900.0**2
     take = replace(take, lighting=replace(take.lighting, lamps=lamps, ambient=0.0))
-    truth = view_truth(take, take.cameras[0], RIG.target)
+    truth = view_truth(take, take.cameras[0], 0.0, RIG.target)
     u, v, _ = window(truth, 0, 10)
     light = light_of(bank, take, 0, u, v, 16)
     shadowless = light.white_radiance[light.white > 0] / light.white[light.white > 0]
@@ -186,7 +201,7 @@ def test_projected_fringes_stand_where_the_projector_puts_them(bank):
     take = plain_take(facing(5))
     fringes = np.array([650.0**2 * 5, 0.5, 0.5, 40.0, 0.0])
     take = replace(take, lighting=replace(take.lighting, ambient=1e-9, projector=fringes))
-    truth = view_truth(take, take.cameras[0], RIG.target)
+    truth = view_truth(take, take.cameras[0], 0.0, RIG.target)
     line = truth.centres[0] + np.linspace(-60, 60, 200)[:, None] * [0.7, 0.7]
     u, v = np.rint(line).T
     light = light_of(bank, take, 0, u, v, 64)

@@ -54,7 +54,7 @@ def test_targets_face_both_cameras_and_mostly_lie_in_their_images(takes):
 def test_blur_is_the_path_that_was_asked_for(takes):
     still, moving = [], []
     for take in takes:
-        length = np.median(view_truth(take, take.cameras[0], RIG.target).blur_px) if take.present else np.nan
+        length = np.median(view_truth(take, take.cameras[0], 0.0, RIG.target).blur_px) if take.present else np.nan
         (still if np.linalg.norm(take.motion.shift_mm) < 0.3 * take.motion.world_from_target[2, 3] / 3320 else moving).append(
             length
         )
@@ -80,7 +80,7 @@ def test_studies_keep_to_the_working_volume():
         towards = (eyes - middle) / np.linalg.norm(eyes - middle)
         assert np.rad2deg(np.arccos(pose[:3, 2] @ towards)) <= TILT_DEG + 1e-9
         for device in take.cameras:
-            truth = view_truth(take, device, RIG.target)
+            truth = view_truth(take, device, 0.0, RIG.target)
             assert truth.inside.all()
             assert truth.blur_px == pytest.approx(12, abs=5)
 

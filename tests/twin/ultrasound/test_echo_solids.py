@@ -5,11 +5,14 @@ import pytest
 import trimesh
 
 from recon.errors import InputError
-from scenes.acoustics import TISSUES
+from recon.probe_calibration.sound_in_water import speed_of_sound
+from scenes.acoustics import TISSUES, faster
 from scenes.catalogue import build_scene
 from scenes.scene_types import Material, Thing
 from tests.twin.ultrasound import plain_sound
-from twin.ultrasound.echo_solids import Body, body, distance_at, label_at, solid
+from twin.optics import conditions
+from twin.optics.conditions import Sound
+from twin.ultrasound.echo_solids import Body, at_speeds, body, distance_at, label_at, solid
 
 
 def distances(one, points):
@@ -69,3 +72,17 @@ def test_distances_and_labels_are_those_of_plain_interpolation(breast, rng):
 def test_a_scene_without_acoustics_is_refused():
     with pytest.raises(InputError, match="expected one with acoustics"):
         body(build_scene({"kind": "sphere"}))
+
+
+def test_speeds_of_tissue_and_water_are_drawn_and_steel_keeps_its_own():
+    """One ratio for all soft tissues, the water's by its temperature; impedances go along, as densities stay."""
+    tank = body(build_scene({"kind": "tank"}))
+    assert at_speeds(tank, Sound(), 1) is tank
+    errors = Sound(tissue=0.02, water_c=2.0)
+    ratio, warmer = conditions.speeds(errors, 1)
+    assert at_speeds(tank, errors, 1).medium.speed == pytest.approx(speed_of_sound(22.0 + warmer), abs=0.1)
+    assert at_speeds(tank, errors, 1).solids[0].tissue == tank.solids[0].tissue
+    for name in ("silicone", "tumour", "gel"):
+        before, after = TISSUES[name], faster(TISSUES[name], ratio, warmer)
+        assert after.speed == pytest.approx(ratio * before.speed) and after.impedance == pytest.approx(ratio * before.impedance)
+    assert faster(TISSUES["steel"], ratio, warmer) == TISSUES["steel"]

@@ -8,9 +8,10 @@ from recon.geometry import rigid
 from recon.model import tracks
 from recon.probe_calibration import latency
 from scenes.catalogue import build_scene
+from twin.optics.conditions import Motion, given, trembling
 from twin.ultrasound.echo_solids import body
 from twin.ultrasound.probe_path import Bob, Hand, SurfacePath, along_surface, bobbing, top
-from twin.ultrasound.timed_sweep import Clocks, PoseNoise, sweep
+from twin.ultrasound.timed_sweep import Clocks, PoseNoise, moments, plan, sweep
 
 STILL = Hand(shift_mm=0.0, turn_deg=0.0)
 
@@ -65,3 +66,25 @@ def test_a_sweep_keeps_its_clocks(rig, small):
     seen = np.isfinite(at_images).all(axis=(1, 2))
     error = at_images[seen] @ rig.probe.target_from_image.matrix() - recorded.truth.poses[seen]
     assert np.abs(error).max() < 0.1  # mm; interpolated over a camera period
+
+
+def test_a_bracket_that_gives_moves_the_target_against_the_image(rig, small):
+    """As designed in the middle; at the end the image is where the bent bracket holds it, and truth is the image's."""
+    path = bobbing(Bob(seconds=2.0), small, 1)
+    errors, exact = Motion(bracket_mm=1.0, bracket_deg=1.0), PoseNoise(turn_deg=0.0, shift_mm=0.0)
+    taken, clocks = moments(path, 10.0), Clocks(scanner_hz=10.0, camera_hz=20.0, lag_s=0.0, scanner_jitter_s=0.0)
+    stiff, soft = (plan(rig.probe, path, taken, clocks, exact, 3, each) for each in (Motion(), errors))
+    assert (stiff.truth.poses == soft.truth.poses).all()
+    steps = given(errors, len(soft.track.poses), 3)
+    for k in (0, len(steps) // 2, -1):
+        bent = rigid.moved(rig.probe.target_from_image.matrix(), steps[k])
+        image = stiff.track.poses[k] @ rig.probe.target_from_image.matrix()
+        np.testing.assert_allclose(soft.track.poses[k] @ bent, image, atol=1e-9)
+
+
+def test_a_probe_trembles_about_its_face(small):
+    """Above the hand's own unsteadiness, by the standard deviation asked for, at the middle of the array."""
+    bob = Bob(height_mm=1e-6, seconds=20.0, hand=STILL)
+    moves = [bobbing(bob, small, 1, trembling(Motion(tremor_mm=0.1, tremor_deg=0.5), seed)).poses for seed in range(8)]
+    middle = np.array([rigid.apply(pose, [small.width_mm / 2, 0, 0]) for poses in moves for pose in poses])
+    assert middle.std(axis=0) == pytest.approx(np.full(3, 0.1), rel=0.15)
