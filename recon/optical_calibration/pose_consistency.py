@@ -93,7 +93,7 @@ def consistency(
     bend, factor = (float(value) for value in causes[int(np.argmax(likely))])
     moved = np.hstack([carry @ slopes for _, _, slopes in parts])
     added = (factor - 1) * carry @ total @ carry.T + bend**2 * moved @ moved.T
-    return Consistency(scatter, bend, float(np.sqrt(factor)), covariance + added)
+    return Consistency(scatter, bend, float(np.sqrt(factor)), covariance + (added + added.T) / 2)
 
 
 def widened(adjusted: Adjustment, covariance: Array) -> Adjustment:

@@ -56,6 +56,7 @@ def test_a_board_that_bends_is_told_and_counts(cameras, monkeypatch):
 
     found, squared = results(cameras, range(6), monkeypatch, bent)
     assert all(one.scatter > 2 and "bend" in one.warning for one in found)
+    assert all((one.covariance == one.covariance.T).all() for one in found), "as readers demand it"
     assert 0.01 < np.median([one.bend_mm for one in found]) < 0.04
     assert 0.4 < squared < 2  # 84 random bends in 6 sets, in directions that are far from alike
 
