@@ -67,7 +67,7 @@ def commands(folder: Path, config: Config, overrides: Sequence[str], lag_s: floa
 
 def verb_steps(folder: Path, config: Config, overrides: Sequence[str]) -> list[VerbStep | Step]:
     """All steps but the report, in order."""
-    given = _given(overrides)
+    given = [*_unless_given(overrides, "conditions", "lifelike"), *_given(overrides)]
     steps: list[VerbStep | Step] = [*(calibration_steps(folder, config, given) if config.poses else [])]
     steps += surface_steps(folder, config, given)
     steps += sweep_steps(folder, config, given) if config.looks_inside else []

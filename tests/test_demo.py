@@ -53,7 +53,9 @@ def test_a_small_demonstration_runs_through(tmp_path, capsys):
     assert not [name for name in MADE if not (out / name).is_file()]
     metrics = figures(out)
     # With four samples a pixel rendering noise adds to the sensor's; at this size edges are a larger part of the image.
-    assert metrics["surface_interior_rms_mm"] < 3 * metrics["limit_rms_mm"]
+    # Four poses of a board that is printed and bowed as in life leave the scale open, as the calibration says.
+    assert metrics["surface_interior_rms_mm"] < 3 * np.hypot(metrics["limit_rms_mm"], metrics["point_sigma_mm"])
+    assert metrics["point_error_rms_mm"] < 2.5 * metrics["point_sigma_mm"]
     assert metrics["coverage"] > 0.9 and metrics["gross_error_fraction"] < 0.01
     steps = ("board", "calibrate", "render", "surface", "evaluate", "report", "demo")
     assert all(f"seconds_{name}" in metrics for name in steps)
@@ -64,7 +66,9 @@ def test_a_small_demonstration_runs_through(tmp_path, capsys):
     assert all((Path(folder) / name).exists() for folder, names in (line.groups() for line in wrote) for name in names.split(","))
     assert (out / "surface.ply").read_bytes() == (out / "surface" / "surface.ply").read_bytes()
     report = html.unescape((out / "report.html").read_text(encoding="utf-8"))
-    assert f"sonotwin render '{SMALL[0]}' '{SMALL[1]}'" in report, "the settings, though this was no command line"
+    assert f"sonotwin render conditions=lifelike '{SMALL[0]}' '{SMALL[1]}'" in report, (
+        "the settings, though this was no command line"
+    )
     last = printed[-5:]
     assert [line.split()[0] for line in last] == ["measured", "accuracy", "calibrated", "coverage", "look"]
     assert str(out / "report.html") in last[-1]
@@ -109,7 +113,7 @@ def test_the_tank_is_seen_by_the_scanner_of_the_sweep():
 @pytest.mark.slow
 def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path):
     out = tmp_path / "demo"
-    assert main(["demo", f"out={out}", f"board={tmp_path / 'board'}"]) == 0
+    assert main(["demo", "conditions=ideal", f"out={out}", f"board={tmp_path / 'board'}"]) == 0
     metrics = figures(out)
     # the surface's noise and the calibration's: a common shift of all points, of another size in each session
     noise = np.hypot(metrics["limit_rms_mm"], metrics["point_sigma_mm"])
