@@ -39,6 +39,24 @@ class Calibration:
     uncertainty: Uncertainty | None = None
 
 
+def with_drift(known: Uncertainty | None, devices: Sequence[str], drift_px: float) -> Uncertainty | None:
+    """Add that devices have warmed, or turned on their mounts, since they were calibrated.
+
+    drift_px : standard deviation of each device's principal point along each axis; a turn by as much is all but the same.
+    """
+    if drift_px == 0:
+        return known
+    names = () if known is None else known.names
+    moved = [f"{device}.{name}" for device in devices for name in ("cx", "cy")]
+    extended = (*names, *(name for name in moved if name not in names))
+    covariance = np.zeros((len(extended), len(extended)))
+    if known is not None:
+        covariance[: len(names), : len(names)] = known.covariance
+    drifts = np.isin(extended, moved)
+    covariance[drifts, drifts] += drift_px**2
+    return Uncertainty(extended, covariance)
+
+
 def projection_slopes(cameras: Mapping[str, Camera], points: Sequence[Array], names: Sequence[str]) -> Array:
     """Derivatives : (m, g) px of all devices' projections, x and y of point after point, by the calibration's parameters.
 

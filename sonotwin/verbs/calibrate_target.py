@@ -18,8 +18,10 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon.capture import stereo_frames, target_files
+from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
+from recon.model.calibration import with_drift
 from recon.model.rig import Rig
 from recon.target_calibration import target_bundle, target_figures, target_poses
 from recon.target_calibration.target_poses import Seen
@@ -39,6 +41,7 @@ class Config(BaseModel):
     capture: Path
     out: Path
     calibration: Path | None = None
+    drift_px: Annotated[float, Field(ge=0, le=10)] = 0.05
     networks: Path | None = None
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
     most_poses: Annotated[int, Field(ge=target_poses.LEAST, le=10_000)] = 100
@@ -59,14 +62,15 @@ def run(config: Config) -> None:
     atomic.check_folder(config.out, TARGET, inputs=inputs)
     film = stereo_frames.read_film(config.capture, config.calibration)
     design = config.rig.target
+    optics = with_drift(film.optics, CAMERAS, config.drift_px)
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
-    tracker = Tracker(film.cameras, design, loaded, film.bits, film.optics)
+    tracker = Tracker(film.cameras, design, loaded, film.bits, optics)
     seen = collect(film, tracker, console)
     pairs = target_poses.spread(target_poses.distinct(seen), config.most_poses)
     console.print(f"found       {len(seen)} of {len(film.times)} pairs whole, {len(pairs)} poses that differ", markup=False)
     target_poses.check(pairs, film.name, len(film.times), config.least_tilt_deg, config.least_range_mm)
     with console.status("adjusting"):
-        adjusted = target_bundle.adjust(pairs, design, film.optics)
+        adjusted = target_bundle.adjust(pairs, design, optics)
     figures = target_figures.measure(adjusted, pairs, design)
     for line in target_figures.describe(figures):
         console.print(line, markup=False)

@@ -24,7 +24,7 @@ from rich.progress import Progress
 from recon.capture.manifest import CAMERAS
 from recon.model.rig import Rig
 from sonotwin.config import folder as conf
-from twin.optics.conditions import Conditions, printed
+from twin.optics.conditions import Conditions, drifted, printed
 from twin.session import Session
 from twin.tracking import film_session
 from twin.tracking.rendered_views import Frames, Quality
@@ -56,7 +56,8 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     session = Session(config.out, "sweep", config.model_dump(mode="json", exclude={"out", "add"}), config.add, CAMERAS)
     session.check()
-    rig = config.rig.model_copy(update={"target": printed(config.rig.target, config.conditions.target, config.seed)})
+    rig = drifted(config.rig, config.conditions.drift, config.seed)
+    rig = rig.model_copy(update={"target": printed(rig.target, config.conditions.target, config.seed)})
     with console.status("setting up the scene"):
         bank = film_session.make_bank(rig, config.seed)
         made = film_session.takes(bank, rig, ranges(), config, config.seed, config.conditions.motion)
@@ -65,7 +66,7 @@ def run(config: Config) -> None:
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         shot = film_session.shoot(bank, rig, made, config.quality, config.seed, config.pixels)
         frames = progress.track(shot, total=len(made), description="rendering")
-        film_session.write_session(session, rig, config, made, _noted(frames, blurs))
+        film_session.write_session(session, rig, config.rig, config, made, _noted(frames, blurs))
     seconds = perf_counter() - start
     console.print(f"render      {len(made)} pairs of frames, blurred by up to {max(blurs):.1f} px, {seconds:.1f} s")
     console.print(f"wrote       {config.out}/{{capture,truth}}", markup=False)

@@ -30,7 +30,7 @@ from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene, parse_scene
 from twin import board_session
 from twin.optics import surface_session
-from twin.optics.conditions import IDEAL, Conditions, check_board
+from twin.optics.conditions import IDEAL, Conditions, check_board, drifted
 from twin.optics.light_transport import Engine
 from twin.session import Session
 
@@ -136,17 +136,17 @@ def render_poses(settings: board_session.Settings, placed: Array, session: Sessi
 def render_surface(config: Config, session: Session, console: Console) -> None:
     """Render each camera's images of the scene under the patterns."""
     session.check()
-    scene = build_scene(config.scene)
+    scene, rig = build_scene(config.scene), drifted(config.rig, config.conditions.drift, config.seed)
     views = {}
     for camera in dict.fromkeys(config.cameras):
         start = perf_counter()
         with console.status(f"rendering {config.patterns.count} patterns for {camera}"):
             view = surface_session.shoot(
-                config.rig, scene, config.patterns, camera, config.engine, config.shooting, config.seed, config.conditions
+                rig, scene, config.patterns, camera, config.engine, config.shooting, config.seed, config.conditions
             )
         views[camera] = view
         console.print(
             f"render      {camera}, {config.patterns.count} patterns, {config.engine.samples} samples/px, "
             f"exposure {view.exposure.time_s * 1e3:.2f} ms, {perf_counter() - start:.1f} s"
         )
-    surface_session.write_session(session, config.rig, scene, config.patterns, views)
+    surface_session.write_session(session, rig, config.rig, scene, config.patterns, views)

@@ -26,8 +26,10 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon.capture import stereo_frames, target_files
+from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
+from recon.model.calibration import with_drift
 from recon.model.rig import Rig
 from recon.tracking import networks, results, track_figures
 from recon.tracking.results import Step
@@ -43,6 +45,7 @@ class Config(BaseModel):
     capture: Path
     out: Path
     calibration: Path | None = None
+    drift_px: Annotated[float, Field(ge=0, le=10)] = 0.05
     target: Path | None = None
     networks: Path | None = None
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
@@ -61,10 +64,11 @@ def run(config: Config) -> None:
     inputs = [path for path in (config.capture, config.calibration, config.target, config.networks) if path is not None]
     atomic.check_folder(config.out, results.POSES, inputs=inputs)
     film = stereo_frames.read_film(config.capture, config.calibration)
+    optics = with_drift(film.optics, CAMERAS, config.drift_px)
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
     design = config.rig.target
     target = design if config.target is None else target_files.read(config.target, design)
-    tracker = Tracker(film.cameras, target, loaded, film.bits, film.optics)
+    tracker = Tracker(film.cameras, target, loaded, film.bits, optics)
     rate = f", {film.rate_hz:.4g} a second" if np.isfinite(film.rate_hz) else ""
     sizes = " and ".join(dict.fromkeys("x".join(map(str, camera.size)) for camera in film.cameras))
     console.print(f"read        {len(film.times)} pairs of frames, {sizes}{rate}", markup=False)

@@ -28,7 +28,7 @@ from twin.accuracy.surface_accuracy import Experiment
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import rms
-from twin.optics.conditions import BoardPrint, Conditions, flexed, printed_board
+from twin.optics.conditions import BoardPrint, Conditions, drifted, flexed, printed_board
 from twin.optics.surface_session import Shooting, calibration_of
 
 Array = NDArray[np.float64]
@@ -126,12 +126,11 @@ def session(setup: Setup, seed: int) -> board_session.Settings:
 
 
 def shoot(setup: Setup, seed: int) -> tuple[Experiment, Experiment]:
-    """A plane and a sphere, rendered and decoded."""
+    """A plane and a sphere, rendered by devices that have drifted since they were calibrated, and decoded."""
     scenes = plane.build(plane.PAPER_POSES[seed % len(plane.PAPER_POSES)]), build_scene({"kind": "sphere"})
-    patterns = setup.sequences["paper_surface"]
-    first, second = (
-        surface_accuracy.experiment(setup.rig, scene, patterns, seed, conditions=conditions_of(setup)) for scene in scenes
-    )
+    patterns, life = setup.sequences["paper_surface"], conditions_of(setup)
+    rig = drifted(setup.rig, life.drift, seed)
+    first, second = (surface_accuracy.experiment(rig, scene, patterns, seed, conditions=life) for scene in scenes)
     return first, second
 
 

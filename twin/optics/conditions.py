@@ -9,7 +9,7 @@ from pydantic import Field
 
 from recon.model import circle_layout
 from recon.model.patterns import Fringes, Patterns
-from recon.model.rig import CameraDevice, Part, ProjectorDevice, Target
+from recon.model.rig import CameraDevice, Part, ProjectorDevice, Rig, Target
 from scenes.kinds import board
 from twin import tremor
 from twin.optics.light_transport import Images
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 MOST = 4  # standard deviations of a print's errors
 # streams of random numbers, apart from those of rendering and of the sensor
 STREAM, PRINT_STREAM, BOARD_STREAM = 7, 8, 9
-TREMOR_STREAM, TRIGGER_STREAM, BRACKET_STREAM, SOUND_STREAM = 10, 11, 12, 13
+TREMOR_STREAM, TRIGGER_STREAM, BRACKET_STREAM, SOUND_STREAM, DRIFT_STREAM = 10, 11, 12, 13, 14
 
 
 class Frames(Part):
@@ -67,6 +67,13 @@ class Sound(Part):
     water_c: Annotated[float, Field(ge=0, le=5)] = 0.0  # of the water's temperature, deg C
 
 
+class Drift(Part):
+    """Standard deviations by which cameras and projector differ from what they were when they were calibrated."""
+
+    centre_px: Annotated[float, Field(ge=0, le=5)] = 0.0  # of each principal point along each axis, own pixels
+    focal: Annotated[float, Field(ge=0, le=0.01)] = 0.0  # of each focal length, relative
+
+
 class Conditions(Part):
     """The conditions of a session, see `conf/conditions`."""
 
@@ -75,6 +82,7 @@ class Conditions(Part):
     board: BoardPrint = BoardPrint()
     motion: Motion = Motion()
     sound: Sound = Sound()
+    drift: Drift = Drift()
 
 
 IDEAL = Conditions()
@@ -147,6 +155,25 @@ def speeds(errors: Sound, *key: int) -> tuple[float, float]:
     """Draw the true speed in tissue over the usual one, and the water's temperature less the usual one in deg C."""
     tissue, warmer = np.random.default_rng([*key, SOUND_STREAM]).standard_normal(2).clip(-MOST, MOST).tolist()
     return 1 + errors.tissue * tissue, errors.water_c * warmer
+
+
+def drifted(rig: Rig, errors: Drift, *key: int) -> Rig:
+    """Draw the rig as it is in use, some time after its calibration, the same for the same key."""
+    if errors == Drift():
+        return rig
+    rng = np.random.default_rng([*key, DRIFT_STREAM])
+    changed = {}
+    for name in ("cam1", "cam2", "projector"):
+        device, (x, y, longer) = getattr(rig, name), rng.standard_normal(3).tolist()
+        (cx, cy), (fx, fy), ratio = device.optics.centre_px, device.optics.focal_px, 1 + errors.focal * longer
+        optics = device.optics.model_copy(
+            update={
+                "centre_px": (cx + errors.centre_px * x, cy + errors.centre_px * y),
+                "focal_px": (fx * ratio, fy * ratio),
+            }
+        )
+        changed[name] = device.model_copy(update={"optics": optics})
+    return rig.model_copy(update=changed)
 
 
 def check_board(design: board.Config, errors: BoardPrint) -> None:

@@ -137,18 +137,22 @@ def calibration_of(rig: Rig) -> Calibration:
     return Calibration({name: device.optics.camera() for name, device in devices.items()})
 
 
-def write_session(session: Session, rig: Rig, scene: Scene, patterns: Patterns, views: Mapping[CameraName, View]) -> None:
-    """Write a surface and its truth; a calibration that has been measured for a capture that is added to stays in it."""
-    optics = calibration_of(rig)
+def write_session(
+    session: Session, rig: Rig, calibrated: Rig, scene: Scene, patterns: Patterns, views: Mapping[CameraName, View]
+) -> None:
+    """Write a surface and its truth; a calibration that has been measured for a capture that is added to stays in it.
+
+    rig, calibrated : as it took the images, and as it was when it was calibrated.
+    """
     devices = {"projector": Device(size=patterns.projector_size)}
     for camera, view in views.items():
         devices[camera] = device_of(view.images.shape[:0:-1], view.exposure)
     with session.write(describe_visible(scene)) as (capture, truth):
-        truth.write_optics(optics)
+        truth.write_optics(calibration_of(rig))
         for camera, view in views.items():
             arrays: dict[str, NDArray] = {field.name: getattr(view.truth, field.name) for field in fields(view.truth)}
             truth.write_arrays(f"surface/{camera}.npz", {**arrays, "limit_px": view.limit_px})
-        capture.complete_calibration(optics)
+        capture.complete_calibration(calibration_of(calibrated))
         capture.add_surface({camera: view.images for camera, view in views.items()}, patterns, devices)
 
 

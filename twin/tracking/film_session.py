@@ -207,17 +207,20 @@ def shoot(
         yield from render(bank, rig, made[first : first + BATCH], quality, seed)
 
 
-def write_session(session: Session, rig: Rig, filming: Filming, made: Sequence[Take], frames: Iterable[Frames]) -> None:
+def write_session(
+    session: Session, rig: Rig, calibrated: Rig, filming: Filming, made: Sequence[Take], frames: Iterable[Frames]
+) -> None:
     """Write a film, which is a sweep without B-scans, and its truth, taking the frames one by one.
+
+    rig, calibrated : as it took the frames, and as it was when it was calibrated.
 
     A calibration that has been measured for a capture that is added to stays in it.
     """
-    optics = Calibration({name: getattr(rig, name).optics.camera() for name in CAMERAS})
     devices = {
         name: Device(size=getattr(rig, name).optics.size, exposure_s=filming.exposure_s, gain=filming.gain) for name in CAMERAS
     }
     with session.write(describe(Scene("film", ()), labels=[])) as (capture, truth):
-        truth.write_optics(optics)
+        truth.write_optics(_cameras(rig))
         seen = []
 
         def images() -> Iterator[tuple[str, NDArray]]:
@@ -225,9 +228,13 @@ def write_session(session: Session, rig: Rig, filming: Filming, made: Sequence[T
                 seen.append(one.truth)
                 yield from zip(CAMERAS, one.views, strict=True)
 
-        capture.complete_calibration(optics)
+        capture.complete_calibration(_cameras(calibrated))
         capture.add_sweep(dict.fromkeys(CAMERAS, filming.times), images(), devices)
         truth.write_arrays(TRUTH, _truth_arrays(filming, made, seen))
+
+
+def _cameras(rig: Rig) -> Calibration:
+    return Calibration({name: getattr(rig, name).optics.camera() for name in CAMERAS})
 
 
 def _truth_arrays(filming: Filming, made: Sequence[Take], seen: Sequence) -> dict[str, NDArray]:

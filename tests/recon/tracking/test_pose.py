@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from recon.geometry import camera_jacobian, rigid
 from recon.geometry.circle_projection import centre_offsets
 from recon.model import circle_layout
-from recon.model.calibration import Uncertainty
+from recon.model.calibration import Uncertainty, with_drift
 from recon.tracking import pose, pose_fit
 from recon.tracking.pose_fit import Sighting
 from tests.recon.tracking import drawings
@@ -120,6 +120,24 @@ def test_errors_of_the_cameras_are_in_the_shared_covariance(cameras, target, rng
     for values in (squared, misfits):
         assert abs(np.mean(values) - 6) < 4 * np.sqrt(12 / len(values))
     assert np.mean(noise) > 6 + 4 * np.sqrt(12 / len(noise))
+
+
+def test_cameras_that_drifted_since_their_calibration_are_in_the_shared_covariance(cameras, target, rng):
+    """By 0.3 px, ten times the noise: without a tolerance nearly all are refused; with it errors and misfits are chi-square."""
+    squared, misfits, refused, names = [], [], 0, ["cx", "cy"]
+    optics = with_drift(None, ("cam1", "cam2"), 0.3)
+    for _ in range(2 * POSES):
+        true = drawings.facing(rng)
+        warm = [camera_jacobian.moved(camera, names, 0.3 * rng.standard_normal(2)) for camera in cameras]
+        views = [replace(view, camera=camera) for view, camera in zip(seen(warm, target, true, rng), cameras, strict=True)]
+        refused += not pose.estimate(*views, target).found
+        found = pose.estimate(*views, target, optics)
+        off = error(found.world_from_target, true)
+        squared.append(off @ np.linalg.solve(found.total, off))
+        misfits.append(found.misfit)
+    assert refused > POSES
+    for values in (squared, misfits):
+        assert abs(np.mean(values) - 6) < 4 * np.sqrt(12 / len(values))
 
 
 def test_the_noise_is_apart_from_what_is_shared(cameras, target, rng):

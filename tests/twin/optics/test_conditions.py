@@ -11,12 +11,14 @@ from scenes.kinds import board
 from twin.optics.conditions import (
     BoardPrint,
     Conditions,
+    Drift,
     Frames,
     Motion,
     Print,
     Sound,
     check_board,
     draw,
+    drifted,
     emitted,
     flexed,
     given,
@@ -140,6 +142,21 @@ def test_triggers_brackets_and_speeds_are_off_by_their_standard_deviations():
     drawn = np.array([speeds(sound, seed) for seed in range(3000)])
     assert drawn.mean(axis=0) == pytest.approx([1, 0], abs=0.03) and drawn.std(axis=0) == pytest.approx([0.016, 0.5], rel=0.06)
     assert not triggered(Motion(), 5, 1).any() and not given(Motion(), 5, 1).any() and speeds(Sound(), 1) == (1, 0)
+
+
+def test_devices_drift_by_their_standard_deviations(rig):
+    """Of 2000 rigs: each principal point and focal length by itself, both axes of a lens alike; nothing else."""
+    errors = Drift(centre_px=0.1, focal=3e-5)
+    drawn = [drifted(rig, errors, seed) for seed in range(2000)]
+    for name in ("cam1", "cam2", "projector"):
+        before, after = getattr(rig, name), [getattr(one, name) for one in drawn]
+        centres = np.array([one.optics.centre_px for one in after]) - before.optics.centre_px
+        assert centres.std(axis=0) == pytest.approx(0.1, rel=0.06)
+        longer = np.array([one.optics.focal_px for one in after]) / before.optics.focal_px - 1
+        assert longer.std(axis=0) == pytest.approx(3e-5, rel=0.06) and np.allclose(longer[:, 0], longer[:, 1])
+        back = after[0].optics.model_copy(update={key: getattr(before.optics, key) for key in ("centre_px", "focal_px")})
+        assert after[0].model_copy(update={"optics": back}) == before
+    assert drifted(rig, errors, 7) == drawn[7] and drifted(rig, Drift(), 7) is rig
 
 
 def test_ideal_boards_are_as_designed():

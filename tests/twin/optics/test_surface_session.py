@@ -45,7 +45,7 @@ def session(small_rig, tmp_path_factory) -> Path:
 def write(rig, out: Path, seed: int, add: bool = False) -> Path:
     scene, patterns = build_scene({"kind": "sphere"}), paper_surface((1280, 800))
     view = shoot(rig, scene, patterns, "cam1", Engine(samples=4), Shooting(), seed)
-    write_session(Session(out, "surface", {"seed": seed}, add), rig, scene, patterns, {"cam1": view})
+    write_session(Session(out, "surface", {"seed": seed}, add), rig, rig, scene, patterns, {"cam1": view})
     return out
 
 

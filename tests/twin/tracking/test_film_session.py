@@ -129,7 +129,7 @@ def blanks(made, size=(1280, 1024)):
 def test_what_is_written_is_what_was_made(config, made, tmp_path):
     few = config.model_copy(update={"frames": 3})
     session = Session(tmp_path, "sweep", {"seed": 0}, devices=CAMERAS)
-    film_session.write_session(session, config.rig, few, made[:3], blanks(made[:3]))
+    film_session.write_session(session, config.rig, config.rig, few, made[:3], blanks(made[:3]))
     read = stereo_frames.read_film(tmp_path / "capture")
     assert read.times.tolist() == [0, 33_333_333, 66_666_667]
     assert [int(left[0, 0]) for left, _ in read.pairs()] == [0, 1, 2]
