@@ -55,21 +55,14 @@ def probe_of(sweep: SweepCapture, capture: Path, given: Path | None) -> ProbeCal
     return sweep.probe
 
 
-def of_sweep(
-    sweep: SweepCapture, probe: ProbeCalibration, lag_s: float, tissue_m_s: float | None, tissue_sigma_m_s: float = 0.0
-) -> Scans:
-    """Place the B-scans of a capture in the world, with depths as of the tissue's speed of sound, if it is given.
-
-    tissue_sigma_m_s : standard deviation of that speed, for the covariance of `Scans.probe`.
-    """
-    converted = sound_in_water.for_tissue(probe, tissue_m_s, tissue_sigma_m_s)
+def of_sweep(sweep: SweepCapture, probe: ProbeCalibration, lag_s: float, tissue_m_s: float | None) -> Scans:
+    """Place the B-scans of a capture in the world, with depths as of the tissue's speed of sound, if it is given."""
+    converted = sound_in_water.for_tissue(probe, tissue_m_s)
     world_from_pixel = sweep.poses(lag_s) @ sequences.target_from_pixel(converted)
     return Scans(sweep.size[::-1], world_from_pixel, sweep.images, converted.speed_m_s, probe.speed_m_s, converted)
 
 
-def of_sequence(
-    path: Path, probe: Path | None, config: Path | None, tissue_m_s: float | None, tissue_sigma_m_s: float = 0.0
-) -> Scans:
+def of_sequence(path: Path, probe: Path | None, config: Path | None, tissue_m_s: float | None) -> Scans:
     """Place the B-scans of a PLUS sequence in its reference frame; its own calibration counts as one for 1540 m/s."""
     frames, shape = sequences.read_tracking(path), sequences.image_shape(path)
     fixed, to, of = {}, "Reference", "Image"
@@ -87,7 +80,7 @@ def of_sequence(
     calibrated = SCANNER_SPEED if given is None else given.speed_m_s
     speed = tissue_m_s or calibrated
     matrices = sound_in_water.in_tissue(np.where(valid, world_from_pixel, np.nan), calibrated, speed)
-    converted = None if given is None else sound_in_water.for_tissue(given, tissue_m_s, tissue_sigma_m_s)
+    converted = None if given is None else sound_in_water.for_tissue(given, tissue_m_s)
     return Scans(shape, matrices, lambda: sequences.stream_images(path), speed, calibrated, converted)
 
 

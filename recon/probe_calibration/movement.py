@@ -1,11 +1,13 @@
 """Movement of the probe against its target, or of the wires, while the B-scans of a calibration are taken.
 
-A bracket gives under its load, wires are pushed or sag: then the crossing isn't at one place in all frames. Either is described
-by its growth from the first frame to the last, linear in the frame's number (a sudden one has three quarters of its variance so):
-six numbers of the bracket, three of the wires. Squared residuals that fall by more with them than by noise, as F has it, show a
-movement. The parameters then are those of the middle of the session, estimated along with it.
+A bracket gives under its load or slips, wires are pushed or sag: then the crossing isn't at one place in all frames. Such a
+movement is described by its course, evenly from the first frame to the last or all at once after one of them, and by its
+size: six numbers of the bracket, three of the wires. Squared residuals that fall by more with it than by noise, as F has it, show
+a movement; of two that may be, Schwarz's criterion chooses. The parameters then are those of the middle between both ends,
+estimated along with it. Source of the criterion: Schwarz 1978.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,11 +16,16 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 CHANCE = 1e-3  # of so much less residuals by noise alone, below which something moved
-RATHER = 100.0  # times as likely must the wires' movement be to be believed: a bracket's that isn't seen does harm
-SUSPECTED = 0.02  # the same, below which a movement can't be excluded
+SUSPECTED = 0.02  # the same, below which an even movement can't be excluded
+CAUTION = np.log(100.0)  # log likelihood by which wires must be likelier than a bracket: a bracket's movement does harm later
 LEAST_FREEDOM = 12  # numbers measured beyond the unknowns; with fewer a movement can't be separated from noise
+LEAST_FRAMES = 3  # before and after a sudden movement
+LEAST_LOST = 5  # frames of an end whose outliers may be right: fewer fit any movement of a bracket
+USUAL = 4.0  # times the typical length of residuals: what is longer isn't explained
+LOST = 0.6  # of the frames after a sudden movement, or before it, that are outliers without it
 PROBE, WIRES = "probe", "wires"
 
 
@@ -37,15 +44,26 @@ class Movement:
 
     what: str  # PROBE or WIRES
     growth: Array  # (6,) rad and mm of the probe's pose, or (3,) mm of the wires' place: half of the movement
-    growth_covariance: Array  # (6, 6) or (3, 3)
-    step: Array  # (g,) of the parameters, to those of the middle of the session
-    covariance: Array  # (g, g) of the parameters, with the noise that is left
-    chance: float  # of so much less residuals by noise alone
+    step: Array  # (g,) of the parameters, to those of the middle
+    covariance: Array  # (g, g) of the parameters, with the noise that is left; at either end if it is the probe that moved
+    chance: float  # of so much less residuals by noise alone, whatever the course
+    evidence: float  # logarithm of the likelihood, less Schwarz's penalty
+    frames: Mask  # (n,) that it was estimated from
 
     @property
     def sure(self) -> bool:
         """Whether something moved; else it can't be excluded."""
         return self.chance < CHANCE
+
+    @property
+    def described(self) -> str:
+        """What moved, by how much, and the likely cause."""
+        if self.what == PROBE:
+            by = f"{self.turn_deg:.2f} deg and {self.shift_mm:.2f} mm"
+            cause = "a bracket that gives, or slips"
+            return f"the probe moved against its target by {by} between the first frame and the last: {cause}"
+        cause = "wires that sag or slip, or a tank that was pushed"
+        return f"the crossing moved by {self.shift_mm:.2f} mm between the first frame and the last: {cause}"
 
     @property
     def shift_mm(self) -> float:
@@ -58,29 +76,78 @@ class Movement:
         return 2 * float(np.degrees(np.linalg.norm(self.growth[:-3])))
 
 
-def find(equations: Equations) -> Movement | None:
-    """The likelier movement of the two; None where noise explains the residuals as well."""
-    candidates = [_fitted(equations, what, which) for what, which in ((PROBE, equations.by_probe), (WIRES, equations.by_wires))]
-    likely = [one for one in candidates if one is not None and one.chance < SUSPECTED]
-    return min(likely, key=lambda one: one.chance * (RATHER if one.what == WIRES else 1.0), default=None)
+def find(equations: Equations, used: Mask) -> Movement | None:
+    """The likeliest movement; None where noise explains the residuals as well.
+
+    used : (n,) frames that aren't outliers. Those of a whole end of the session may be right, and after a sudden movement.
+    """
+    courses = list(_courses(used))
+    best = [found for what in (PROBE, WIRES) if (found := _likeliest(equations, what, courses, used)) is not None]
+    if len(best) < 2:
+        return None
+    probe, wires = best
+    same = (probe.frames == wires.frames).all()
+    likelier = wires.evidence - CAUTION > probe.evidence if same else wires.frames.sum() > probe.frames.sum()
+    return (wires if likelier else probe) if min(probe.chance, wires.chance) < SUSPECTED else None
 
 
-def _fitted(equations: Equations, what: str, which: slice) -> Movement | None:
-    """The movement by least squares, and the chance of as good a fit by noise."""
-    n, _, g = equations.slopes.shape
-    time = np.linspace(-1, 1, n)[:, None, None]
-    still = equations.slopes.reshape(-1, g)
-    moving = np.concatenate([equations.slopes, time * equations.slopes[:, :, which]], axis=2).reshape(3 * n, -1)
+def _likeliest(equations: Equations, what: str, courses: list[tuple[Array, Mask]], used: Mask) -> Movement | None:
+    """Of one kind, over all courses; one that isn't sure only if it is even, as few frames leave a sudden one open."""
+    fits = [_fitted(equations, what, course, frames, used, len(courses)) for course, frames in courses]
+    even, *sudden = fits
+    known = [one for one in (even, *(one for one in sudden if one is not None and one.sure)) if one is not None]
+    return min(known, key=lambda one: one.chance, default=None)
+
+
+def _courses(used: Mask) -> Iterator[tuple[Array, Mask]]:
+    """Courses : (n,) from -1 to 1, and the frames that each is looked for in."""
+    n = len(used)
+    number = np.arange(n)
+    yield np.linspace(-1, 1, n), used
+    for first in range(LEAST_FRAMES, n - LEAST_FRAMES + 1):
+        after = number >= first
+        frames = used.copy()
+        for end in (after, ~after):
+            if end.sum() >= LEAST_LOST and np.mean(~used[end]) > LOST:
+                frames |= end
+        if min((frames & after).sum(), (frames & ~after).sum()) >= LEAST_FRAMES:
+            yield np.where(after, 1.0, -1.0), frames
+
+
+def _fitted(equations: Equations, what: str, course: Array, frames: Mask, used: Mask, courses: int) -> Movement | None:
+    """The movement by least squares, and the chance of as good a fit by noise in any of some courses."""
+    which = equations.by_probe if what == PROBE else equations.by_wires
+    slopes, left = equations.slopes[frames], equations.residuals[frames].ravel()
+    moving = np.concatenate([slopes, course[frames][:, None, None] * slopes[:, :, which]], axis=2)
+    n, g = len(slopes), slopes.shape[2]
+    moving = moving.reshape(3 * n, -1)
     freedom, more = 3 * n - moving.shape[1], moving.shape[1] - g
     if freedom < LEAST_FREEDOM:
         return None
-    left = equations.residuals.ravel()
-    before, _ = _rest(still, left)
+    before, _ = _rest(slopes.reshape(-1, g), left)
     after, solution = _rest(moving, left)
-    ratio = (before - after) / more / (after / freedom)
-    covariance = np.linalg.inv(moving.T @ moving) * after / freedom
-    chance = float(f_distribution.sf(ratio, more, freedom))
-    return Movement(what, -solution[g:], covariance[g:, g:], -solution[:g], covariance[:g, :g], chance)
+    if not _explained(left - moving @ solution, frames & ~used, frames):
+        return None
+    whole = np.linalg.pinv(moving.T @ moving) * after / freedom
+    covariance = whole[:g, :g].copy()
+    if what == PROBE:
+        covariance[which, which] += np.outer(solution[g:], solution[g:]) + whole[g:, g:]
+    return Movement(
+        what,
+        growth=-solution[g:],
+        step=-solution[:g],
+        covariance=covariance,
+        chance=min(courses * float(f_distribution.sf((before - after) / more / (after / freedom), more, freedom)), 1.0),
+        evidence=-(3 * n * np.log(after) + moving.shape[1] * np.log(3 * n)) / 2,
+        frames=frames,
+    )
+
+
+def _explained(left: Array, doubtful: Mask, frames: Mask) -> bool:
+    """Whether residuals : (3 n,) of frames that were outliers before are as small as the others'."""
+    lengths = np.linalg.norm(left.reshape(-1, 3), axis=1)
+    before = doubtful[frames]
+    return not before.any() or bool(np.mean(lengths[before] < USUAL * np.median(lengths[~before])) > 1 - LOST / 2)
 
 
 def _rest(design: Array, left: Array) -> tuple[float, Array]:

@@ -168,13 +168,18 @@ def calibrate(
     if factor > MAX_FACTOR or rms > MAX_RMS_MM or inliers.mean() < MIN_INLIERS:
         _say_why(sightings, noise, rms, factor, inliers)
     information = _normal_equations(estimate, sightings.of(inliers), noise, np.ones(inliers.sum()))[0] / factor**2
-    probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
-    probe_checks.information(estimate.target_from_image, estimate.scale, information, sightings.of(inliers), size)
-    covariance = np.linalg.inv(information)[: len(NAMES), : len(NAMES)]
-    slopes, left = _whitened(estimate, sightings.of(inliers), noise)
-    moved = movement.find(Equations(slopes[..., : 11 + (sightings.beside is not None)], left, PROBE, WIRE))
+    slopes, left = _whitened(estimate, sightings, noise)
+    unknowns = slice(11 if sightings.beside is None else 12)
+    moved = movement.find(Equations(slopes[..., unknowns], left, PROBE, WIRE), inliers)
     if moved is not None:
-        estimate, covariance = estimate.moved(np.resize([*moved.step, 0.0], 12)), _by_movement(moved)
+        estimate = estimate.moved(np.pad(moved.step, (0, 12 - len(moved.step))))
+        information, inliers = np.linalg.inv(moved.covariance), inliers | moved.frames
+    probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
+    try:
+        probe_checks.information(estimate.target_from_image, estimate.scale, information, sightings.of(inliers), size)
+    except InputError as error:
+        raise InputError(f"{error}; {moved.described}" if moved is not None and moved.sure else str(error)) from None
+    covariance = np.linalg.inv(information)[: len(NAMES), : len(NAMES)]
     covariance[np.ix_(SHIFT, SHIFT)] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
     ahead = rigid.transform(np.eye(3), [0, -ahead_mm, 0])
@@ -292,14 +297,6 @@ def _squared(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
     return np.einsum(
         "ni,ni->n", residuals, np.linalg.solve(_covariances(estimate, sightings, noise), residuals[..., None])[..., 0]
     )
-
-
-def _by_movement(moved: Movement) -> Array:
-    """Covariance : (8, 8) of the probe's parameters, uncertain by half of a movement of its bracket, as they are used later."""
-    covariance = moved.covariance.copy()
-    if moved.what == movement.PROBE:
-        covariance[PROBE, PROBE] += np.outer(moved.growth, moved.growth) + moved.growth_covariance
-    return covariance[: len(NAMES), : len(NAMES)]
 
 
 def _whitened(estimate: _Estimate, sightings: Sightings, noise: Noise) -> tuple[Array, Array]:

@@ -13,12 +13,12 @@ from recon.model.probe import ProbeCalibration
 from recon.model.rig import Probe
 from recon.probe_calibration import crossing_frames, movement, point_calibration, repeatability, sound_in_water
 from recon.probe_calibration.crossing_frames import CrossingFrames
-from recon.probe_calibration.movement import Movement
 from recon.probe_calibration.point_calibration import Adjustment
 from recon.probe_calibration.tank_calibration import Result, Settings
 
 COLUMNS = ("frame", "status", "u", "v", "contrast_db", "residual_mm", "normalised", "reason")  # of the table of frames
 FIVE_POINTS = ("centre", "top_left", "top_right", "bottom_left", "bottom_right")
+LAST = 3  # frames, too few to find a sudden movement by
 SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reported
 
 
@@ -54,6 +54,7 @@ def measure(frames: CrossingFrames, result: Result, design: Probe, settings: Set
         "design_centre_mm": float(np.linalg.norm(away)),
         "moved_mm": 0.0 if found.moved is None else found.moved.shift_mm,
         "moved_deg": 0.0 if found.moved is None else found.moved.turn_deg,
+        "moved_chance": 1.0 if found.moved is None else found.moved.chance,
     }
 
 
@@ -75,8 +76,9 @@ def _of_pose(calibration: ProbeCalibration) -> NDArray[np.float64]:
     known = calibration.uncertainty
     if known is None:
         return np.zeros((6, 6))
-    order = [known.names.index(name) for name in point_calibration.NAMES[2:]]
-    return known.covariance[np.ix_(order, order)]
+    covariance, order = np.zeros((8, 8)), [point_calibration.NAMES.index(name) for name in known.names]
+    covariance[np.ix_(order, order)] = known.covariance
+    return covariance[2:, 2:]
 
 
 def describe_frames(frames: CrossingFrames, seconds: float) -> Iterator[str]:
@@ -104,19 +106,12 @@ def describe(frames: CrossingFrames, found: Adjustment, figures: Metrics, design
     yield f"probe       {scales} mm/px; {turn:.1f} deg and {away:.1f} mm from its design"
     corners = [figures[f"sigma_{name}_mm"] for name in FIVE_POINTS[1:]]
     centre, edge = f"{figures['sigma_centre_mm']:.3f} mm", f"{min(corners):.3f} to {max(corners):.3f} mm"
+    if found.outliers[-LAST:].all():
+        yield f"warning     the last {LAST} frames are outliers: if the bracket slipped before them, the result is of before"
     if found.moved is not None and found.moved.sure:
-        yield f"warning     {describe_movement(found.moved)}"
+        yield f"warning     {found.moved.described}"
     yield f"uncertain   image centre {centre}, corners {edge} (1 sigma, of the place in space)"
     yield from _describe_sound(figures, design, settings)
-
-
-def describe_movement(moved: Movement) -> str:
-    """One line: what moved while the frames were taken, by how much, and the likely cause."""
-    shift = f"{moved.shift_mm:.2f} mm"
-    if moved.what == movement.PROBE:
-        turn = f"{moved.turn_deg:.2f} deg and {shift}"
-        return f"the probe moved against its target by {turn} from the first frame to the last: a bracket that gives, or slips"
-    return f"the crossing moved by {shift} from the first frame to the last: wires that sag or slip, or a tank that was pushed"
 
 
 def describe_comparison(figures: Metrics, earlier: object) -> str:

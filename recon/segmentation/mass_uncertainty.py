@@ -1,7 +1,9 @@
-"""Uncertainty of a mass's place and volume by what all its B-scans share: the probe's calibration and the speed of sound.
+"""Uncertainty of a mass's place and volume by what all its B-scans share: the probe's calibration and the speeds of sound.
 
-The eight parameters of the calibration move every B-scan, and with them the border that they show. Where several B-scans show a
-point, it moves by the mean of theirs. The speed of sound is in it as the scale of depths, sy.
+The eight parameters of the calibration move every B-scan, and with them the border that they show; where several B-scans show a
+point, it moves by the mean of theirs. Another speed in the tissue scales the depths of all that lies above a mass, and so moves
+it along the beam. Its extent along the beam depends on the speed within, by which the border behind is placed
+(`recon.segmentation.refraction`). Refraction at its sides, which another speed changes too, is left out.
 """
 
 from typing import NamedTuple
@@ -13,56 +15,90 @@ from recon.freehand import sequences
 from recon.freehand.scans import Scans
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
-from recon.model.probe import ProbeCalibration
 from recon.probe_calibration.point_calibration import NAMES
 from recon.probe_calibration.point_equation import point_jacobian
 from recon.segmentation.mass_surface import Mass
 
 Array = NDArray[np.float64]
 
+DEPTH = len(NAMES)  # column of the ratio of depths
 NEAR_MM = 1.0  # of a B-scan's plane: a point there is shown by it
 
 
 class Sigma(NamedTuple):
-    """Standard deviations of a mass's place and volume; NaN where no calibration with a covariance is known."""
+    """Standard deviations of a mass's place and volume; of the calibration's part NaN where its covariance isn't known."""
 
     centre_mm: float  # as a distance in space
     volume_mm3: float
 
 
 def by_calibration(mass: Mass, scans: Scans) -> Sigma:
-    """To first order in the errors of the calibration, and of the speed of sound as far as `scans.probe` has it."""
+    """To first order in the errors of the calibration."""
     if scans.probe is None or scans.probe.uncertainty is None:
         return Sigma(np.nan, np.nan)
-    slopes = point_slopes(np.asarray(mass.mesh.vertices), scans, scans.probe)
-    order = _order(scans.probe.uncertainty)
-    covariance = scans.probe.uncertainty.covariance
-    by_face = slopes[mass.mesh.faces].mean(axis=1)[..., order]
-    normals = mass.mesh.face_normals * mass.mesh.area_faces[:, None]
-    volume = np.einsum("fi,fip->p", normals, by_face)
-    outwards = np.einsum("fi,fi->f", normals, mass.mesh.triangles_center - mass.centre) / 3 / mass.volume
-    centre = np.einsum("f,fip->ip", outwards, by_face)
-    return Sigma(float(np.sqrt(np.trace(centre @ covariance @ centre.T))), float(np.sqrt(volume @ covariance @ volume)))
+    known = scans.probe.uncertainty
+    moved = _at_faces(mass, point_slopes(np.asarray(mass.mesh.vertices), scans))[..., _order(known)]
+    centre, volume = _centre_slopes(mass, moved), _volume_slopes(mass, moved)
+    return Sigma(
+        float(np.sqrt(np.trace(centre @ known.covariance @ centre.T))), float(np.sqrt(volume @ known.covariance @ volume))
+    )
 
 
-def point_slopes(points: Array, scans: Scans, probe: ProbeCalibration) -> Array:
-    """Derivatives : (n, 3, 8) of the places of points : (n, 3) mm by sx, sy and the probe's turn and shift.
+def by_speeds(mass: Mass, scans: Scans, tissue: float, within: float) -> Sigma:
+    """To first order in the speeds of sound.
 
-    Points that no B-scan shows move as the mean of the others.
+    tissue, within : standard deviations of the speeds in the tissue and in the mass, relative.
     """
-    pixel_from_target = np.linalg.inv(sequences.target_from_pixel(probe))
-    height, width = scans.shape
-    total, count = np.zeros((len(points), 3, len(NAMES))), np.zeros(len(points))
+    deeper = point_slopes(np.asarray(mass.mesh.vertices), scans)[..., [DEPTH]]
+    centre = _centre_slopes(mass, _at_faces(mass, deeper))[:, 0]
+    extent = np.ptp(np.asarray(mass.mesh.vertices) @ (centre / np.linalg.norm(centre)))
+    return Sigma(float(np.hypot(tissue * np.linalg.norm(centre), within * extent / 2)), within * mass.volume)
+
+
+def together(*parts: Sigma) -> Sigma:
+    """Of independent errors; a part that isn't known is left out."""
+    squares = np.nansum(np.square(parts), axis=0)
+    return Sigma(*np.where(np.isnan(parts).all(axis=0), np.nan, np.sqrt(squares)).tolist())
+
+
+def point_slopes(points: Array, scans: Scans) -> Array:
+    """Derivatives : (n, 3, 9) of points : (n, 3) mm by NAMES' parameters, zero without a probe, and by the ratio of all depths.
+
+    A point that no B-scan shows moves as in the B-scan next to it.
+    """
+    size, probe = np.array(scans.shape[::-1]), scans.probe
+    total, count = np.zeros((len(points), 3, DEPTH + 1)), np.zeros(len(points))
+    next_to, nearest = np.full_like(total, np.nan), np.full(len(points), np.inf)
     for world_from_pixel in scans.world_from_pixel[np.isfinite(scans.world_from_pixel).all(axis=(1, 2))]:
-        u, v, w = rigid.apply(np.linalg.inv(world_from_pixel), points).T
-        away = np.abs(w) * np.linalg.norm(world_from_pixel[:3, 2])
-        shown = (away < NEAR_MM) & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
-        if shown.any():
-            turn = (world_from_pixel @ pixel_from_target)[:3, :3]
-            total[shown] += turn @ point_jacobian(probe.target_from_image, probe.scale, np.column_stack([u, v])[shown])
-            count[shown] += 1
-    mean = total / np.maximum(count, 1)[:, None, None]
-    return np.where((count > 0)[:, None, None], mean, mean[count > 0].mean(axis=0) if count.any() else np.nan)
+        local = rigid.apply(np.linalg.inv(world_from_pixel), points)
+        away = np.abs(local[:, 2]) * np.linalg.norm(world_from_pixel[:3, 2])
+        inside = ((local[:, :2] > -0.5) & (local[:, :2] < size - 0.5)).all(axis=1)
+        shown, closer = inside & (away < NEAR_MM), inside & (away < nearest)
+        slopes = np.zeros_like(total)
+        slopes[..., DEPTH] = local[:, 1:2] * world_from_pixel[:3, 1]
+        if probe is not None:
+            turn = (world_from_pixel @ np.linalg.inv(sequences.target_from_pixel(probe)))[:3, :3]
+            slopes[..., :DEPTH] = turn @ point_jacobian(probe.target_from_image, probe.scale, local[:, :2])
+        total[shown] += slopes[shown]
+        count[shown] += 1
+        next_to[closer], nearest[closer] = slopes[closer], away[closer]
+    return np.where((count > 0)[:, None, None], total / np.maximum(count, 1)[:, None, None], next_to)
+
+
+def _at_faces(mass: Mass, slopes: Array) -> Array:
+    """Means : (f, 3, k) over the corners of a mesh's faces."""
+    return slopes[mass.mesh.faces].mean(axis=1)
+
+
+def _volume_slopes(mass: Mass, moved: Array) -> Array:
+    """Of the volume : (k,), by the flow through the faces."""
+    return np.einsum("f,fi,fik->k", mass.mesh.area_faces, mass.mesh.face_normals, moved)
+
+
+def _centre_slopes(mass: Mass, moved: Array) -> Array:
+    """Of the centre of gravity : (3, k), by what the flow through the faces adds, and where."""
+    arms = (mass.mesh.triangles_center - mass.centre) / mass.volume
+    return np.einsum("f,fi,fik,fj->jk", mass.mesh.area_faces, mass.mesh.face_normals, moved, arms)
 
 
 def _order(known: Uncertainty) -> list[int]:

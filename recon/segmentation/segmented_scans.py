@@ -42,8 +42,11 @@ def find_masses(
     mass_m_s: float = SCANNER_SPEED,
     dynamic_range_db: float = 60.0,
     overlays: int = OVERLAYS,
+    speed_sigmas: tuple[float, float] = (0.0, 0.0),
 ) -> Segmented:
     """Find masses; with a skin, whether they lie under it.
+
+    speed_sigmas : m/s, standard deviations of the speeds of sound in the tissue and in masses.
 
     Raises
     ------
@@ -58,7 +61,10 @@ def find_masses(
     lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {NONE_FOUND}"])]
     containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
     for number, (mass, under) in enumerate(zip(found, containments, strict=True)):
-        sigma = mass_uncertainty.by_calibration(mass, scans)
+        sigma = mass_uncertainty.together(
+            mass_uncertainty.by_calibration(mass, scans),
+            mass_uncertainty.by_speeds(mass, scans, speed_sigmas[0] / scans.speed_m_s, speed_sigmas[1] / mass_m_s),
+        )
         figures |= measure(f"mass{number}", mass, sigma, under)
         lines.append(f"mass{number}       {describe(mass, sigma, under)}")
     drawn = scan_overlays.of_masks(scans.stream(), masses.shown(found, placed, scans.shape, sound), overlays)

@@ -33,6 +33,7 @@ REACH_PX = 8.0  # by which the place may be off
 REACH_AGAIN_PX = 4.0  # the same of a pose by two circles of each view
 SHAPE = 0.035  # of a disc's size, by which its shape differs from the mean of the others, one standard deviation: perspective
 SHAPE_AGAIN = 0.01  # the same of a pose by two circles of each view
+SEEN_AGAIN = 0.5  # of a rim that is found so: with less, another thing's edge was taken for it, half a turn from the target
 INK = 0.15  # of a ring's contrast: a middle that is no brighter is ink, and this a black disc
 
 
@@ -113,7 +114,8 @@ def _sought(image: NDArray, outlines: Outlines, expected: Ellipses, target: Targ
         return outlines
     rough = expected[[which]]
     again = measure_covered(image, rough, REACH_AGAIN_PX, SHAPE_AGAIN * np.trace(rough.shape, axis1=1, axis2=2) / 2, target)
-    return outlines.replaced(which, again) if again.found.all() and _as_dark(again, outlines, which) else outlines
+    sound = again.found.all() and again.seen[0] >= SEEN_AGAIN and _as_dark(again, outlines, which)
+    return outlines.replaced(which, again) if sound else outlines
 
 
 def missing(found: NDArray[np.bool_]) -> int | None:

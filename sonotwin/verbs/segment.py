@@ -26,13 +26,13 @@ from recon.files import atomic, meshes, metrics
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans
 from recon.model.probe import SCANNER_SPEED, Speed
-from recon.model.rig import NotNegative, Positive
+from recon.model.rig import Positive
 from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, segmented_scans
 from recon.segmentation.segmented_scans import Segmented
 from recon.segmentation.tube_wall import Appearance
 
-TISSUE_SIGMA = 25.0  # m/s, of a breast's tissue: fat has 1440 to 1480, glands 1510 to 1570
+SpeedSigma = Annotated[float, Field(ge=0, le=500)]
 Spread = Annotated[float, Field(ge=0, le=5)]
 
 
@@ -49,8 +49,9 @@ class Config(BaseModel):
     sequence: Path | None = None
     surface: Path | None = None
     tissue_m_s: Speed | None = None
-    tissue_sigma_m_s: NotNegative | None = None
+    tissue_sigma_m_s: SpeedSigma = 25.0
     mass_m_s: Speed = SCANNER_SPEED
+    mass_sigma_m_s: SpeedSigma = 20.0
     dynamic_range_db: Annotated[float, Field(ge=20, le=120)] = 60.0
     diameter_mm: tuple[Positive, Positive] = (5.0, 36.0)
     spread_mm: tuple[Spread, Spread] = (0.25, 0.08)
@@ -69,12 +70,6 @@ class Config(BaseModel):
         if self.diameter_mm[0] >= self.diameter_mm[1]:
             raise ValueError(f"diameter_mm: expected the least before the most, found {list(self.diameter_mm)}")
         return self
-
-    @property
-    def speed_sigma(self) -> float:
-        """Standard deviation of the speed of sound, m/s, in what was scanned."""
-        given = self.tissue_sigma_m_s
-        return (TISSUE_SIGMA if self.kind == "masses" else 0.0) if given is None else given
 
     @property
     def tube(self) -> Appearance:
@@ -118,10 +113,10 @@ def read(config: Config) -> Scans:
     """The B-scans in the world."""
     if config.capture is None:
         assert config.sequence is not None
-        return freehand_scans.of_sequence(config.sequence, config.probe, None, config.tissue_m_s, config.speed_sigma)
+        return freehand_scans.of_sequence(config.sequence, config.probe, None, config.tissue_m_s)
     sweep = sweep_part.read_sweep(config.capture)
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
-    return freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s, config.speed_sigma)
+    return freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
 
 
 def found_in(scans: Scans, config: Config, skin: trimesh.Trimesh | None) -> Segmented:
@@ -129,7 +124,8 @@ def found_in(scans: Scans, config: Config, skin: trimesh.Trimesh | None) -> Segm
     try:
         if config.kind == "tube":
             return segmented_scans.find_tube(scans, config.tube, config.overlays)
-        return segmented_scans.find_masses(scans, skin, config.mass_m_s, config.dynamic_range_db, config.overlays)
+        sigmas = config.tissue_sigma_m_s, config.mass_sigma_m_s
+        return segmented_scans.find_masses(scans, skin, config.mass_m_s, config.dynamic_range_db, config.overlays, sigmas)
     except InputError as error:
         source = str(config.capture or config.sequence)
         raise error if str(error).startswith(source) else InputError(f"{source}: {error}") from None

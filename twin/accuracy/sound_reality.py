@@ -13,14 +13,15 @@ from recon.probe_calibration.point_calibration import Adjustment, Noise, Sightin
 from scenes.acoustics import TISSUES
 from twin.accuracy import probe_accuracy
 from twin.accuracy.table_rows import Row, Setup
+from twin.evaluation.surface_errors import rms
 
 Array = NDArray[np.float64]
 
 DRAWS = range(300, 310)  # seeds of each block's errors, that nothing was tried on
-GIVES_MM, GIVES_DEG = 1.0, 0.6  # of a bracket, from the first frame to the last, to any side
+GIVES_MM, GIVES_DEG = 0.5, 0.3  # of a bracket, from the first frame to the last, to any side
+LITTLE = 0.17  # mm and deg: 0.1 along each axis, as under conditions of life
 SLIPS_MM = 0.8  # of the wires, likewise
 WATER_C, TISSUE = 1.0, 0.02  # standard deviations of the water's temperature, and of the tissue's speed over that assumed
-SHOWN_MM = 40.0  # depth at which errors of speeds are compared
 
 
 def rows(setup: Setup) -> list[Row]:
@@ -28,17 +29,20 @@ def rows(setup: Setup) -> list[Row]:
     still = list(_calibrations(setup, 0.0, 0.0, 0.0))
     giving = list(_calibrations(setup, GIVES_DEG, GIVES_MM, 0.0))
     slipping = list(_calibrations(setup, 0.0, 0.0, SLIPS_MM))
+    little = list(_calibrations(setup, LITTLE, LITTLE, 0.0))
     count = f"{len(still)} calibrations"
     gives = f"{count}, a bracket that gives by {GIVES_MM:g} mm and {GIVES_DEG:g} deg"
+    hardly = f"{count}, a bracket that gives by {LITTLE:g} mm and {LITTLE:g} deg"
     slips = f"{count}, wires that slip by {SLIPS_MM:g} mm"
     return [
         Row("s", f"{count}, nothing moves: taken for a movement", _named(still, None), 5.0, 0.1, "%"),
-        Row("s", f"{gives}: found", _named(giving, None), 90.0, None, "%", at_least=True),
+        Row("s", f"{gives}: found", _named(giving, None), None, None, "%"),
         Row("s", f"{gives}: named so", _named(giving, movement.PROBE), None, None, "%"),
         Row("s", f"{gives}: squared error at its end over covariance, of 8", _squared(giving), 10.0, 8.0, ""),
-        Row("s", f"{slips}: found", _named(slipping, None), 90.0, None, "%", at_least=True),
+        Row("s", f"{slips}: found", _named(slipping, None), None, None, "%"),
         Row("s", f"{slips}: named so, else as the bracket's", _named(slipping, movement.WIRES), None, None, "%"),
         Row("s", f"{slips}: squared error over covariance, of 8", _squared(slipping), 10.0, 8.0, ""),
+        Row("s", f"{hardly}: squared error at its end over covariance, of 8", _squared(little), None, 8.0, ""),
         _depths(setup),
     ]
 
@@ -90,7 +94,7 @@ def _depths(setup: Setup) -> Row:
     """Depths in a tissue of a speed that is off, by a calibration in water of a temperature that is off."""
     rng, errors = np.random.default_rng(DRAWS[0]), []
     exact, stated, wanted = probe_accuracy.in_water(setup), probe_accuracy.TEMPERATURE_C, sound_in_water.SCANNER_SPEED
-    water, row = float(sound_in_water.speed_of_sound(stated)), SHOWN_MM / exact.scale[1]
+    water = float(sound_in_water.speed_of_sound(stated))
     sigma = float(sound_in_water.speed_sigma(stated, WATER_C))
     known = sound_in_water.for_tissue(exact, None, 1e-9)  # with a covariance
     told = sound_in_water.in_medium(known, water, wanted, ratio_sigma=wanted / water**2 * sigma)
@@ -98,6 +102,6 @@ def _depths(setup: Setup) -> Row:
     assert told.uncertainty is not None
     for warmer, faster in rng.standard_normal((500, 2)):
         true = wanted * (1 + TISSUE * faster) / float(sound_in_water.speed_of_sound(stated + WATER_C * warmer))
-        errors.append((told.scale[1] - exact.scale[1] * true) * row / (told.uncertainty.sigma("sy") * row))
-    what = f"water off by {WATER_C:g} deg C and tissue by {100 * TISSUE:g} % (1 sigma): depths' error / predicted sigma, spread"
-    return Row("s", what, float(np.std(errors)), 1.15, 1.0, "")
+        errors.append((told.scale[1] - exact.scale[1] * true) / told.uncertainty.sigma("sy"))
+    what = f"water off by {WATER_C:g} deg C and tissue by {100 * TISSUE:g} % (1 sigma): depths' error / predicted sigma, RMS"
+    return Row("s", what, rms(np.array(errors)), 1.15, 1.0, "")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.probe_calibration import movement, point_calibration
 from recon.probe_calibration.point_calibration import Noise, Sightings
@@ -13,15 +14,19 @@ DRAWS = 30
 STILL = np.zeros(6), np.zeros(3)
 
 
-def calibrations(rig, seeds, grows):
-    """Calibrations, each with the true pose of the probe at the end, and the growth of this and of the wires' place."""
+def calibrations(rig, seeds, grows, after=None):
+    """Calibrations, each with the true pose of the probe at the end, and the growth of this and of the wires' place.
+
+    It grows evenly, or all at once after a share of the frames.
+    """
     probe, size = probe_motions.true_probe(rig), rig.probe.image_size
     for seed in seeds:
         rng = np.random.default_rng([seed, 5])
         seen = probe_motions.observe(probe, *probe_motions.motion(rig, 90.0), rng)
         by_probe, by_wires = grows(rng)
         poses = []
-        for time, pose in zip(np.linspace(-1, 1, len(seen.poses)), seen.poses, strict=True):
+        times = np.linspace(-1, 1, len(seen.poses))
+        for time, pose in zip(times if after is None else np.sign(times - 2 * after + 1), seen.poses, strict=True):
             given = rigid.moved(probe.target_from_image, time * by_probe)
             poses.append(pose @ probe.target_from_image @ rigid.invert(given))
             poses[-1][:3, 3] += time * by_wires
@@ -61,6 +66,32 @@ def test_a_bracket_that_gives_is_found_and_in_the_covariance(rig):
     assert np.median(shifts) == pytest.approx(1.0, rel=0.3)
 
 
+@pytest.mark.parametrize(("after", "slips_mm"), [(0.5, 0.5), (0.7, 0.8), (0.8, 1.2)])
+def test_a_bracket_that_slips_all_at_once_is_found_though_its_frames_look_like_outliers(rig, after, slips_mm):
+    """The later frames are as right as the earlier ones, and where they have the probe is where the sweep will find it."""
+    probe, errors = probe_motions.true_probe(rig), []
+
+    def slips(rng):
+        return np.concatenate([sideways(rng, np.radians(0.3 * slips_mm)), sideways(rng, slips_mm / 2)]), np.zeros(3)
+
+    sure = []
+    for found, at_the_end, *_ in calibrations(rig, range(DRAWS // 2), slips, after):
+        sure.append(found.moved is not None and found.moved.sure)
+        errors.append(squared(found, probe, at_the_end))
+    assert np.mean(sure) > 0.85 and np.median(errors) / 8 < 1.6
+
+
+def test_a_bracket_that_slips_by_millimetres_is_refused_by_name(rig):
+    """Where it stays afterwards isn't known to a millimetre, however many frames there are."""
+
+    def slips(rng):
+        return np.concatenate([sideways(rng, np.radians(0.9)), sideways(rng, 1.5)]), np.zeros(3)
+
+    for seed in range(4):
+        with pytest.raises(InputError, match="the probe moved against its target"):
+            list(calibrations(rig, [seed], slips, 0.7))
+
+
 def test_wires_that_slip_are_found_and_do_no_harm(rig):
     """By 0.8 mm; without that the errors would be several times what is predicted."""
     probe, errors = probe_motions.true_probe(rig), []
@@ -68,7 +99,7 @@ def test_wires_that_slip_are_found_and_do_no_harm(rig):
         assert found.moved is not None and found.moved.what == movement.WIRES and found.moved.turn_deg == 0
         assert np.linalg.norm(found.moved.growth - by_wires) < 0.25
         errors.append(squared(found, probe, probe.target_from_image))
-    assert 0.75 < np.mean(errors) / 8 < 1.3
+    assert 0.6 < np.mean(errors) / 8 < 1.3
 
 
 def test_the_wires_radius_is_uncertain_along_the_depth(rig, rng):

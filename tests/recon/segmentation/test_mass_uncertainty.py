@@ -1,4 +1,6 @@
-"""What a calibration and a speed of sound leave open of a mass's place and volume."""
+"""What a calibration and speeds of sound leave open of a mass's place and volume."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +11,6 @@ from recon.freehand.scans import Scans
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
-from recon.probe_calibration import sound_in_water
 from recon.probe_calibration.point_calibration import NAMES
 from recon.segmentation import mass_uncertainty
 from recon.segmentation.mass_surface import Mass
@@ -34,18 +35,35 @@ def probe_of(rig, covariance=None):
     return ProbeCalibration(rig.probe.target_from_image.matrix(), SCALE, known)
 
 
-def test_a_speed_of_sound_that_is_uncertain_by_2_percent(rig):
-    """Then so is the depth below the face, and the volume."""
-    probe = sound_in_water.for_tissue(probe_of(rig), 1540, 0.02 * 1540)
-    scans, mass = sweep(probe)
-    sigma = mass_uncertainty.by_calibration(mass, scans)
-    assert sigma.centre_mm == pytest.approx(0.02 * DEPTH_MM, rel=0.01)
-    assert sigma.volume_mm3 == pytest.approx(0.02 * mass.volume, rel=0.02)
-
-
-def test_without_a_covariance_nothing_is_predicted(rig):
+def test_a_speed_in_the_tissue_that_is_uncertain_by_2_percent(rig):
+    """Then so is the depth below the face, with a probe's calibration or without; the volume isn't."""
     scans, mass = sweep(probe_of(rig))
-    assert np.isnan(mass_uncertainty.by_calibration(mass, scans)).all()
+    for known in (scans, replace(scans, probe=None)):
+        sigma = mass_uncertainty.by_speeds(mass, known, 0.02, 0.0)
+        assert sigma.centre_mm == pytest.approx(0.02 * DEPTH_MM, rel=0.01) and sigma.volume_mm3 == 0
+
+
+def test_a_speed_in_the_mass_that_is_uncertain_by_2_percent(rig):
+    """Then so is its extent along the beam, and with it the volume; the middle moves by half of that."""
+    scans, mass = sweep(probe_of(rig))
+    sigma = mass_uncertainty.by_speeds(mass, scans, 0.0, 0.02)
+    assert sigma.volume_mm3 == pytest.approx(0.02 * mass.volume, rel=1e-6)
+    assert sigma.centre_mm == pytest.approx(0.02 * RADIUS_MM, rel=0.02)
+
+
+def test_between_b_scans_that_are_far_apart_the_next_one_counts(rig):
+    """3 mm apart, a third of the border is near none: the volume's uncertainty by sy is that of all of it."""
+    covariance = np.zeros((8, 8))
+    covariance[1, 1] = (0.02 * SCALE[1]) ** 2
+    scans, mass = sweep(probe_of(rig, covariance))
+    few = replace(scans, world_from_pixel=scans.world_from_pixel[2::6])
+    assert mass_uncertainty.by_calibration(mass, few).volume_mm3 == pytest.approx(0.02 * mass.volume, rel=0.1)
+
+
+def test_without_a_covariance_only_the_speeds_are_predicted(rig):
+    scans, mass = sweep(probe_of(rig))
+    unknown, speeds = mass_uncertainty.by_calibration(mass, scans), mass_uncertainty.by_speeds(mass, scans, 0.01, 0.01)
+    assert np.isnan(unknown).all() and mass_uncertainty.together(unknown, speeds) == speeds
 
 
 def test_masses_placed_by_calibrations_drawn_from_the_covariance_scatter_as_predicted(rig, rng):

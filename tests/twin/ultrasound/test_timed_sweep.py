@@ -75,7 +75,7 @@ def test_a_bracket_that_gives_moves_the_target_against_the_image(rig, small):
     taken, clocks = moments(path, 10.0), Clocks(scanner_hz=10.0, camera_hz=20.0, lag_s=0.0, scanner_jitter_s=0.0)
     stiff, soft = (plan(rig.probe, path, taken, clocks, exact, 3, each) for each in (Motion(), errors))
     assert (stiff.truth.poses == soft.truth.poses).all()
-    steps = given(errors, len(soft.track.poses), 3)
+    steps = given(errors, len(soft.track.poses), 3, len(soft.track.poses))
     for k in (0, len(steps) // 2, -1):
         bent = rigid.moved(rig.probe.target_from_image.matrix(), steps[k])
         image = stiff.track.poses[k] @ rig.probe.target_from_image.matrix()
