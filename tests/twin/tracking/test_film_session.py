@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 from recon.capture import stereo_frames
 from recon.capture.manifest import CAMERAS
 from recon.geometry import rigid
+from recon.model.calibration import with_drift
 from recon.tracking.tracker import Tracker
 from sonotwin.cli import main
 from sonotwin.config import load
+from sonotwin.verbs import track
 from sonotwin.verbs.film import Config, ranges
 from tests.twin.tracking import takes
 from twin.evaluation import track_errors
@@ -167,12 +169,13 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_rendered_film_is_tracked(tmp_path, config):
-    """Three slow frames, by a tracker that is told where the first one is: off by less than four sigma, and 0.2 mm."""
+    """Three slow frames, by a tracker as `track` makes it, started beside the first: off by less than 4 sigma, and 0.2 mm."""
     assert main(["film", f"out={tmp_path / 'film'}", "frames=3"]) == 0
     read = stereo_frames.read_film(tmp_path / "film" / "capture")
     truth = track_errors.read_truth(tmp_path / "film" / "truth")
     assert track_errors.visible_whole(truth).all()
-    tracker = Tracker(read.cameras, config.rig.target)
+    drift_px = load("track", ["capture=unused", "out=unused"], track.Config).drift_px
+    tracker = Tracker(read.cameras, config.rig.target, optics=with_drift(read.optics, CAMERAS, drift_px))
     tracker.remember(rigid.transform(truth.poses[0][:3, :3], truth.poses[0][:3, 3] + [0.3, 0, 0]), -0.03)
     for (left, right), time, true in itertools.islice(zip(read.pairs(), read.times, truth.poses, strict=True), 3):
         found = tracker.step(left, right, time * 1e-9)
