@@ -3,8 +3,8 @@
 A bracket gives under its load or slips, wires are pushed or sag: then the crossing isn't at one place in all frames. Such a
 movement is described by its course, evenly from the first frame to the last or all at once after one of them, and by its
 size: six numbers of the bracket, three of the wires. Squared residuals that fall by more with it than by noise, as F has it, show
-a movement; of two that may be, Schwarz's criterion chooses. The parameters then are those of the middle between both ends,
-estimated along with it. Source of the criterion: Schwarz 1978.
+a movement; of two that may be, Schwarz's criterion chooses. It is named here only: parameters and covariance are those of
+`open_movement`, as a movement that isn't shown can't be excluded either. Source of the criterion: Schwarz 1978.
 """
 
 from collections.abc import Iterator
@@ -19,7 +19,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 CHANCE = 1e-3  # of so much less residuals by noise alone, below which something moved
-SUSPECTED = 0.02  # the same, below which an even movement can't be excluded
 CAUTION = np.log(100.0)  # log likelihood by which wires must be likelier than a bracket: a bracket's movement does harm later
 LEAST_FREEDOM = 12  # numbers measured beyond the unknowns; with fewer a movement can't be separated from noise
 LEAST_FRAMES = 3  # before and after a sudden movement
@@ -36,6 +35,7 @@ class Equations(NamedTuple):
     residuals: Array  # (n, 3)
     by_probe: slice  # parameters of the probe's turn and shift against its target
     by_wires: slice  # and of the wires' place
+    known: Array  # (g,) information about each parameter from elsewhere, as the inverse of a variance
 
 
 @dataclass(frozen=True)
@@ -44,16 +44,9 @@ class Movement:
 
     what: str  # PROBE or WIRES
     growth: Array  # (6,) rad and mm of the probe's pose, or (3,) mm of the wires' place: half of the movement
-    step: Array  # (g,) of the parameters, to those of the middle
-    covariance: Array  # (g, g) of the parameters, with the noise that is left; at either end if it is the probe that moved
     chance: float  # of so much less residuals by noise alone, whatever the course
     evidence: float  # logarithm of the likelihood, less Schwarz's penalty
     frames: Mask  # (n,) that it was estimated from
-
-    @property
-    def sure(self) -> bool:
-        """Whether something moved; else it can't be excluded."""
-        return self.chance < CHANCE
 
     @property
     def described(self) -> str:
@@ -77,7 +70,7 @@ class Movement:
 
 
 def find(equations: Equations, used: Mask) -> Movement | None:
-    """The likeliest movement; None where noise explains the residuals as well.
+    """The likeliest movement; None where noise may explain the residuals as well.
 
     used : (n,) frames that aren't outliers. Those of a whole end of the session may be right, and after a sudden movement.
     """
@@ -88,15 +81,15 @@ def find(equations: Equations, used: Mask) -> Movement | None:
     probe, wires = best
     same = (probe.frames == wires.frames).all()
     likelier = wires.evidence - CAUTION > probe.evidence if same else wires.frames.sum() > probe.frames.sum()
-    return (wires if likelier else probe) if min(probe.chance, wires.chance) < SUSPECTED else None
+    found = wires if likelier else probe
+    return found if found.chance < CHANCE else None
 
 
 def _likeliest(equations: Equations, what: str, courses: list[tuple[Array, Mask]], used: Mask) -> Movement | None:
     """Of one kind, over all courses; one that isn't sure only if it is even, as few frames leave a sudden one open."""
-    fits = [_fitted(equations, what, course, frames, used, len(courses)) for course, frames in courses]
-    even, *sudden = fits
-    known = [one for one in (even, *(one for one in sudden if one is not None and one.sure)) if one is not None]
-    return min(known, key=lambda one: one.chance, default=None)
+    even, *sudden = (_fitted(equations, what, course, frames, used, len(courses)) for course, frames in courses)
+    sure = [one for one in sudden if one is not None and one.chance < CHANCE]
+    return min(sure if even is None else [even, *sure], key=lambda one: one.chance, default=None)
 
 
 def _courses(used: Mask) -> Iterator[tuple[Array, Mask]]:
@@ -128,15 +121,9 @@ def _fitted(equations: Equations, what: str, course: Array, frames: Mask, used: 
     after, solution = _rest(moving, left)
     if not _explained(left - moving @ solution, frames & ~used, frames):
         return None
-    whole = np.linalg.pinv(moving.T @ moving) * after / freedom
-    covariance = whole[:g, :g].copy()
-    if what == PROBE:
-        covariance[which, which] += np.outer(solution[g:], solution[g:]) + whole[g:, g:]
     return Movement(
         what,
         growth=-solution[g:],
-        step=-solution[:g],
-        covariance=covariance,
         chance=min(courses * float(f_distribution.sf((before - after) / more / (after / freedom), more, freedom)), 1.0),
         evidence=-(3 * n * np.log(after) + moving.shape[1] * np.log(3 * n)) / 2,
         frames=frames,

@@ -31,7 +31,7 @@ from recon.geometry import rigid
 from recon.geometry.levenberg_marquardt import descend
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
-from recon.probe_calibration import cross_wire, movement, point_equation, probe_checks, wires
+from recon.probe_calibration import cross_wire, movement, open_movement, point_equation, probe_checks, wires
 from recon.probe_calibration.cross_wire import Appearance, Crossing
 from recon.probe_calibration.movement import Equations, Movement
 
@@ -94,7 +94,7 @@ class Adjustment:
     outliers: Mask  # (n,)
     noise_factor: float  # measured noise over the assumed; the covariance is scaled by its square
     apart_mm: float = 0.0  # between the wires' axes, where they were seen as lines
-    moved: Movement | None = None  # what moved, or may have, while the frames were taken; the values are those of the middle
+    moved: Movement | None = None  # what moved while the frames were taken; the values are those of the middle
 
     @property
     def rms_mm(self) -> float:
@@ -167,19 +167,20 @@ def calibrate(
     rms = float(np.sqrt((_residuals(estimate, sightings.of(inliers)) ** 2).sum(axis=1).mean()))
     if factor > MAX_FACTOR or rms > MAX_RMS_MM or inliers.mean() < MIN_INLIERS:
         _say_why(sightings, noise, rms, factor, inliers)
-    information = _normal_equations(estimate, sightings.of(inliers), noise, np.ones(inliers.sum()))[0] / factor**2
     slopes, left = _whitened(estimate, sightings, noise)
-    unknowns = slice(11 if sightings.beside is None else 12)
-    moved = movement.find(Equations(slopes[..., unknowns], left, PROBE, WIRE), inliers)
-    if moved is not None:
-        estimate = estimate.moved(np.pad(moved.step, (0, 12 - len(moved.step))))
-        information, inliers = np.linalg.inv(moved.covariance), inliers | moved.frames
+    known = np.append(np.zeros(11), [] if sightings.beside is None else APART_MM**-2)
+    equations = Equations(slopes[..., : len(known)], left, PROBE, WIRE, known)
+    moved = movement.find(equations, inliers)
+    solved, inliers = inliers, inliers if moved is None else moved.frames
+    step, whole = open_movement.adjusted(equations, solved, inliers)
+    estimate = estimate.moved(np.pad(step, (0, 12 - len(known))))
     probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
     try:
+        information = np.linalg.inv(whole)
         probe_checks.information(estimate.target_from_image, estimate.scale, information, sightings.of(inliers), size)
     except InputError as error:
-        raise InputError(f"{error}; {moved.described}" if moved is not None and moved.sure else str(error)) from None
-    covariance = np.linalg.inv(information)[: len(NAMES), : len(NAMES)]
+        raise InputError(str(error) if moved is None else f"{error}; {moved.described}") from None
+    covariance = whole[: len(NAMES), : len(NAMES)].copy()
     covariance[np.ix_(SHIFT, SHIFT)] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
     ahead = rigid.transform(np.eye(3), [0, -ahead_mm, 0])

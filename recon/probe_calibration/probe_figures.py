@@ -108,7 +108,7 @@ def describe(frames: CrossingFrames, found: Adjustment, figures: Metrics, design
     centre, edge = f"{figures['sigma_centre_mm']:.3f} mm", f"{min(corners):.3f} to {max(corners):.3f} mm"
     if found.outliers[-LAST:].all():
         yield f"warning     the last {LAST} frames are outliers: if the bracket slipped before them, the result is of before"
-    if found.moved is not None and found.moved.sure:
+    if found.moved is not None:
         yield f"warning     {found.moved.described}"
     yield f"uncertain   image centre {centre}, corners {edge} (1 sigma, of the place in space)"
     yield from _describe_sound(figures, design, settings)

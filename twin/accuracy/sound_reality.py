@@ -31,18 +31,21 @@ def rows(setup: Setup) -> list[Row]:
     slipping = list(_calibrations(setup, 0.0, 0.0, SLIPS_MM))
     little = list(_calibrations(setup, LITTLE, LITTLE, 0.0))
     count = f"{len(still)} calibrations"
+    honest = f"{count}, nothing moves: squared error over covariance, of 8"
     gives = f"{count}, a bracket that gives by {GIVES_MM:g} mm and {GIVES_DEG:g} deg"
     hardly = f"{count}, a bracket that gives by {LITTLE:g} mm and {LITTLE:g} deg"
     slips = f"{count}, wires that slip by {SLIPS_MM:g} mm"
     return [
         Row("s", f"{count}, nothing moves: taken for a movement", _named(still, None), 5.0, 0.1, "%"),
+        Row("s", f"{honest}, at least", _squared(still), 6.0, 8.0, "", at_least=True),
+        Row("s", f"{honest}, at most", _squared(still), 10.0, 8.0, ""),
         Row("s", f"{gives}: found", _named(giving, None), None, None, "%"),
         Row("s", f"{gives}: named so", _named(giving, movement.PROBE), None, None, "%"),
         Row("s", f"{gives}: squared error at its end over covariance, of 8", _squared(giving), 10.0, 8.0, ""),
         Row("s", f"{slips}: found", _named(slipping, None), None, None, "%"),
         Row("s", f"{slips}: named so, else as the bracket's", _named(slipping, movement.WIRES), None, None, "%"),
         Row("s", f"{slips}: squared error over covariance, of 8", _squared(slipping), 10.0, 8.0, ""),
-        Row("s", f"{hardly}: squared error at its end over covariance, of 8", _squared(little), None, 8.0, ""),
+        Row("s", f"{hardly}: squared error at its end over covariance, of 8", _squared(little), 10.0, 8.0, ""),
         _depths(setup),
     ]
 
@@ -82,7 +85,7 @@ def _sideways(rng: np.random.Generator, length: float) -> Array:
 
 def _named(results: list[tuple[Adjustment, ProbeCalibration]], what: str | None) -> float:
     """Share in % in which a movement of some kind, or of any, is found."""
-    named = [found.moved.what if found.moved is not None and found.moved.sure else None for found, _ in results]
+    named = [found.moved and found.moved.what for found, _ in results]
     return 100 * float(np.mean([name == what if what else name is not None for name in named]))
 
 
