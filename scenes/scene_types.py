@@ -25,6 +25,8 @@ class Material:
     reflectance: float  # diffuse albedo, 0 to 1
     roughness: float | None = None  # GGX alpha of a dielectric coat (rough plastic); None is purely diffuse
     ior: float = 1.5  # refractive index of the coat
+    translucent: bool = False  # skin or silicone: under conditions of life light spreads beneath it, and gel wets it
+    spread_mm: float = 0.0  # length of that spread, see `twin.optics.light_spread`; 0 is opaque
 
     def __post_init__(self) -> None:
         if not 0 <= self.reflectance <= 1:
@@ -33,6 +35,8 @@ class Material:
             raise ValueError(f"roughness: expected more than 0, up to 1, found {self.roughness}")
         if not self.ior >= 1:
             raise ValueError(f"ior: expected at least 1, found {self.ior}")
+        if not self.spread_mm >= 0:
+            raise ValueError(f"spread_mm: expected 0 or more, found {self.spread_mm}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,24 +46,26 @@ class Thing:
     Raises
     ------
     ValueError
-        If `albedo` doesn't have one value from 0 to 1 for each vertex.
+        If `albedo` or `wet` doesn't have one value from 0 to 1 for each vertex.
     """
 
     name: str
     mesh: trimesh.Trimesh  # in the world, mm, watertight, normals outwards
     material: Material
     albedo: NDArray[np.float32] | None = None  # (n_vertices,), replaces material.reflectance where given
+    wet: NDArray[np.float32] | None = None  # (n_vertices,), share of the coat that is gel
     smooth: bool = True  # interpolated vertex normals (curved), or flat faces
     inside: bool = False  # hidden within another thing: optics leave it out, ultrasound sees it
     primitive: Sphere | None = None  # the exact shape that the mesh approximates, for a renderer that has one
 
     def __post_init__(self) -> None:
-        if self.albedo is None:
-            return
-        if self.albedo.shape != (len(self.mesh.vertices),):
-            raise ValueError(f"{self.name}: albedo: expected {len(self.mesh.vertices)} values, found shape {self.albedo.shape}")
-        if not ((self.albedo >= 0) & (self.albedo <= 1)).all():
-            raise ValueError(f"{self.name}: albedo: expected values from 0 to 1")
+        for field, values in (("albedo", self.albedo), ("wet", self.wet)):
+            if values is None:
+                continue
+            if values.shape != (len(self.mesh.vertices),):
+                raise ValueError(f"{self.name}: {field}: expected {len(self.mesh.vertices)} values, found shape {values.shape}")
+            if not ((values >= 0) & (values <= 1)).all():
+                raise ValueError(f"{self.name}: {field}: expected values from 0 to 1")
 
 
 @dataclass(frozen=True, eq=False)

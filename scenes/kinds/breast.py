@@ -103,7 +103,7 @@ def build(config: Config) -> Scene:
         _check_apart(k, masses)
 
     world = world_from_phantom(config)
-    material = Material(config.reflectance, config.roughness, config.ior)
+    material = Material(config.reflectance, config.roughness, config.ior, translucent=True)
     things = [Thing("breast", solid_meshes.moved(breast, world), material, _albedo(config, skin, colour_rng))]
     things += [
         Thing(f"tumour{k}", solid_meshes.moved(mass, world), Material(config.reflectance), inside=True)

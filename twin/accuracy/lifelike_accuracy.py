@@ -1,7 +1,7 @@
 """The optics' whole way under conditions of life, by our method and by the paper's, and each condition's share in the figures.
 
 The paper's method: pairs of devices calibrated apart by OpenCV with five coefficients each, on a board taken as designed, from
-the middles of ellipses as they are.
+the middles of ellipses as they are; and the phase of fringe images as they are.
 """
 
 from collections.abc import Mapping
@@ -10,25 +10,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.model.calibration import Calibration
 from recon.model.rig import Rig
 from recon.optical_calibration import figures_of_merit
 from recon.optical_calibration.joint_calibration import calibrate
-from recon.structured_light.surface_mesh import clean
-from recon.structured_light.triangulate import triangulate
 from scenes.board_poses import Config as Poses
 from scenes.board_poses import random_poses
 from scenes.catalogue import build_scene
 from scenes.kinds import board, plane
 from twin import board_session
-from twin.accuracy import board_accuracy, lens_accuracy, surface_accuracy
+from twin.accuracy import board_accuracy, lens_accuracy, paper_causes, surface_accuracy
 from twin.accuracy.baselines import opencv_peer
 from twin.accuracy.board_sets import BoardSet, drawn, rendered
+from twin.accuracy.plane_and_sphere import Measured, as_published, conditions_of, measured
 from twin.accuracy.surface_accuracy import Experiment
 from twin.accuracy.table_rows import Measurement, Row, Setup
-from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import rms
-from twin.optics.conditions import BoardPrint, Conditions, drifted, flexed, printed_board
+from twin.optics.conditions import BoardPrint, drifted, flexed, printed_board
 from twin.optics.surface_session import Shooting, calibration_of
 
 Array = NDArray[np.float64]
@@ -38,17 +35,6 @@ COUNT = 12  # poses of the board
 PAPER_PX = {"cam1": 0.138, "cam2": 0.151, "projector": 0.131}
 PAPER_PLANE_MM, PAPER_SPHERE_MM = (0.101, 0.131), (0.045, 0.040)  # RMS; radius error and RMS
 FACTOR = 1.5  # between the paper's figures and those of its method here
-FORM_POWERS = [(i, j) for i in range(4) for j in range(4 - i)]  # of x and y: the smooth part of a plane's error
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A plane and a sphere measured with one calibration."""
-
-    plane_rms_mm: float
-    form_mm: float  # the smooth part of the plane's error
-    radius_error_mm: float  # of the sphere
-    sphere_rms_mm: float
 
 
 @dataclass(frozen=True)
@@ -63,7 +49,13 @@ class Laboratory:
 
 def measurements(setup: Setup) -> list[Measurement]:
     """The rows of the group, at full size."""
-    return [lambda: board_accuracy.rows(setup), lens_accuracy.rows, lambda: rows(setup), lambda: shares(setup)]
+    return [
+        lambda: board_accuracy.rows(setup),
+        lens_accuracy.rows,
+        lambda: rows(setup),
+        lambda: shares(setup),
+        lambda: paper_causes.rows(setup),
+    ]
 
 
 def rows(setup: Setup) -> list[Row]:
@@ -100,14 +92,8 @@ def laboratory(setup: Setup, seed: int) -> Laboratory:
     reprojected = {name: opencv_peer.reprojection_rms(observations, name) for name in PAPER_PX}
     ours = result.adjustment.calibration
     squared = figures_of_merit.normalised_error(ours, seen.truth) ** 2
-    return Laboratory(squared, measured(shots, ours), measured(shots, pair), reprojected)
-
-
-def conditions_of(setup: Setup) -> Conditions:
-    """Conditions of life; ValueError if the setup has none."""
-    if setup.lifelike is None:
-        raise ValueError("setup.lifelike: expected those of conf/conditions/lifelike.yaml, found none")
-    return setup.lifelike
+    flat, ball = (as_published(shot, setup.sequences["paper_surface"]) for shot in shots)
+    return Laboratory(squared, measured(shots, ours), measured((flat, ball), pair), reprojected)
 
 
 def session(setup: Setup, seed: int) -> board_session.Settings:
@@ -132,41 +118,6 @@ def shoot(setup: Setup, seed: int) -> tuple[Experiment, Experiment]:
     rig = drifted(setup.rig, life.drift, seed)
     first, second = (surface_accuracy.experiment(rig, scene, patterns, seed, conditions=life) for scene in scenes)
     return first, second
-
-
-def measured(shots: tuple[Experiment, Experiment], calibration: Calibration) -> Measured:
-    """Measure a plane and a sphere with a calibration of camera 1 and projector."""
-    flat, ball = (_on_shape(shot, calibration) for shot in shots)
-    plate, sphere = (shot.truth.shapes[0] for shot in shots)
-    first, second = surface_errors.fit(plate, flat), surface_errors.fit(sphere, ball)
-    return Measured(
-        first["plane_plate_rms_mm"],
-        form_rms(flat),
-        second["sphere_sphere_radius_error_mm"],
-        second["sphere_sphere_rms_mm"],
-    )
-
-
-def _on_shape(shot: Experiment, calibration: Calibration) -> Array:
-    """Measured points : (m, 3) mm of a shot's first shape, away from edges, some of many."""
-    camera, projector = calibration.cameras["cam1"], calibration.cameras["projector"]
-    points = clean(triangulate(shot.found, camera, projector), camera, shot.found.modulation).points
-    used = shot.comparison.interior & np.isfinite(points[..., 0])
-    used &= np.abs(shot.truth.shapes[0].distance(shot.truth.points)) < surface_errors.ON_SHAPE_MM
-    chosen = np.float64(points[used])
-    return chosen[:: max(len(chosen) // surface_errors.MOST_FITTED, 1)]
-
-
-def form_rms(points: Array) -> float:
-    """RMS of the smooth part of points' : (m, 3) mm distances from their plane: a polynomial of the third degree."""
-    middle = points - points.mean(axis=0)
-    axes = np.linalg.svd(middle[:: max(len(middle) // 20000, 1)], full_matrices=False)[2]
-    x, y, z = (middle @ axes.T).T
-    powers = np.stack([(x / 100) ** i * (y / 100) ** j for i, j in FORM_POWERS], axis=1)
-    solved = np.linalg.lstsq(powers, z, rcond=None)[0]
-    plain = [k for k, (i, j) in enumerate(FORM_POWERS) if i + j <= 1]
-    smooth = powers @ solved
-    return rms(smooth - powers[:, plain] @ np.linalg.lstsq(powers[:, plain], smooth, rcond=None)[0])
 
 
 def shares(setup: Setup) -> list[Row]:

@@ -14,14 +14,15 @@ from twin.accuracy import detection_rates, sound_reality, target_accuracy, track
 from twin.accuracy.surface_accuracy import experiment, relief_noise_ratio
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation.surface_errors import rms
-from twin.optics.conditions import Conditions, Frames
+from twin.optics.conditions import Conditions, Frames, Skin
 from twin.optics.surface_session import Shooting
 
 SEEDS = range(100, 110)  # of conditions that nothing was tried on
 EXPOSURES_S = (2e-4, 5e-4, 1e-3, 1.4e-3, 2e-3, 4e-3, 8e-3, 1.6e-2)
 FEWEST = 2000  # points whose spread is known to 5 %, though neighbours share theirs
-COVERED, SAMPLES = range(1063, 1073), 100  # seeds of frames as in a data set, each of its own bodies, and pairs of each
+COVERED, SAMPLES = range(1083, 1093), 100  # seeds of frames as in a data set, each of its own bodies, and pairs of each
 DISTURBED = Conditions(frames=Frames(flicker=0.03, stray_dn=1.0, shift=0.01))
+SKIN = Skin(spread_mm=0.4, wet=0.1)
 WHAT = "flicker of 3 %, offsets of 1 DN, shifts off by 1 % of a step"
 
 
@@ -33,6 +34,7 @@ def measurements(setup: Setup) -> list[Measurement]:
         lambda: compared(setup, "breasts", [build_scene({"kind": "breast"})], "surface_rms_mm"),
         *([lambda: relief(setup)] if setup.real else []),
         lambda: exposed(setup),
+        lambda: skins(setup),
         lambda: target_accuracy.rows(setup, networks),
         lambda: target_accuracy.false_rows(setup, networks),
         lambda: covered(setup, networks),
@@ -83,6 +85,24 @@ def exposed(setup: Setup) -> list[Row]:
         Row("d", f"{what}: spread of error / predicted sigma, largest", max(spreads), 1.15, 1.0, ""),
         Row("d", f"{what}: reported coverage less the true one, largest", float(np.abs(differences).max()), 0.05, 0.0, ""),
         Row("d", f"{what}: refused as too dark, of {len(SEEDS) * len(EXPOSURES_S)}", refused, None, None, ""),
+    ]
+
+
+def skins(setup: Setup) -> list[Row]:
+    """Row k: breasts of which light spreads beneath the skin, and some is wet, beside what noise leaves of such fringes."""
+    scene, patterns = build_scene({"kind": "breast"}), setup.sequences["paper_surface"]
+    found = [experiment(setup.rig, scene, patterns, seed, conditions=Conditions(skin=SKIN)).metrics for seed in SEEDS]
+    ratios, spreads = ([one[name] for one in found] for name in ("surface_rms_mm", "z_std"))
+    ratios = [rms_mm / one["limit_rms_mm"] for rms_mm, one in zip(ratios, found, strict=True)]
+    what = f"{len(found)} breasts, light spread by {SKIN.spread_mm:g} mm, {100 * SKIN.wet:g} % wet"
+    return [
+        Row(
+            "k", f"{what}: the breast alone, RMS", float(np.mean([one["thing_breast_rms_mm"] for one in found])), None, None, "mm"
+        ),
+        Row("k", f"{what}: RMS over what noise leaves, largest", max(ratios), 1.05, 1.0, ""),
+        Row("k", f"{what}: spread of error / predicted sigma, least", min(spreads), 0.95, 1.0, "", at_least=True),
+        Row("k", f"{what}: spread of error / predicted sigma, largest", max(spreads), 1.05, 1.0, ""),
+        Row("k", f"{what}: points off by more than 1 mm, most", max(one["gross_error_fraction"] for one in found), 5e-4, 0.0, ""),
     ]
 
 

@@ -11,6 +11,8 @@ from recon.model import circle_layout
 from recon.model.patterns import Fringes, Patterns
 from recon.model.rig import CameraDevice, Part, ProjectorDevice, Rig, Target
 from scenes.kinds import board
+from scenes.noise import smooth_noise
+from scenes.scene_types import Scene, Thing
 from twin import tremor
 from twin.optics.light_transport import Images
 from twin.optics.raster import Light
@@ -22,7 +24,8 @@ Array = NDArray[np.float64]
 MOST = 4  # standard deviations of a print's errors
 # streams of random numbers, apart from those of rendering and of the sensor
 STREAM, PRINT_STREAM, BOARD_STREAM = 7, 8, 9
-TREMOR_STREAM, TRIGGER_STREAM, BRACKET_STREAM, SOUND_STREAM, DRIFT_STREAM = 10, 11, 12, 13, 14
+TREMOR_STREAM, TRIGGER_STREAM, BRACKET_STREAM, SOUND_STREAM, DRIFT_STREAM, GEL_STREAM = 10, 11, 12, 13, 14, 15
+GEL_EDGE = 0.15  # of the standard deviation of the field whose highest parts are gel: over which it thins out
 
 
 class Frames(Part):
@@ -48,6 +51,14 @@ class BoardPrint(Part):
     diameter_mm: Annotated[float, Field(ge=0, le=0.1)] = 0.0  # of all discs alike
     bow_mm: Annotated[float, Field(ge=0, le=2)] = 0.0  # of an arch along each side, and of a twist
     flex_mm: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # by which each of these differs from pose to pose
+
+
+class Skin(Part):
+    """A translucent surface as it is: skin or silicone."""
+
+    spread_mm: Annotated[float, Field(ge=0, le=3)] = 0.0  # length of light's spread beneath it
+    wet: Annotated[float, Field(ge=0, le=1)] = 0.0  # share of it with gel
+    patch_mm: Annotated[float, Field(ge=2, le=200)] = 25.0  # size of the patches of gel
 
 
 class Motion(Part):
@@ -80,6 +91,7 @@ class Conditions(Part):
     frames: Frames = Frames()
     target: Print = Print()
     board: BoardPrint = BoardPrint()
+    skin: Skin = Skin()
     motion: Motion = Motion()
     sound: Sound = Sound()
     drift: Drift = Drift()
@@ -132,6 +144,24 @@ def printed_board(design: board.Config, errors: BoardPrint, *key: int) -> board.
         "seed": int(rng.integers(2**31)) if errors.place_mm else design.seed,
     }
     return design.model_copy(update=changed)
+
+
+def as_skin(scene: Scene, skin: Skin, *key: int) -> Scene:
+    """A scene whose translucent things let light spread and have patches of gel, the same for the same key."""
+    if skin == Skin():
+        return scene
+    rng = np.random.default_rng([*key, GEL_STREAM])
+    return replace(
+        scene, things=tuple(_as_skin(thing, skin, rng) if thing.material.translucent else thing for thing in scene.things)
+    )
+
+
+def _as_skin(thing: Thing, skin: Skin, rng: np.random.Generator) -> Thing:
+    vertices = np.asarray(thing.mesh.vertices)
+    field = smooth_noise(vertices, 2 * skin.patch_mm, rng)
+    shore = np.quantile(field, 1 - skin.wet)
+    wet = np.float32(np.clip((field - shore) / GEL_EDGE + 0.5, 0, 1)) if skin.wet else None
+    return replace(thing, material=replace(thing.material, spread_mm=skin.spread_mm), wet=wet)
 
 
 def trembling(errors: Motion, *key: int) -> Tremor:

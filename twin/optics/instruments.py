@@ -142,6 +142,16 @@ def light_point(projector: ProjectorOptics, point: mi.Point3f, lens: mi.Point2f)
     return to_mitsuba(rigid.invert(matrix)) @ source, pixel, dr.select(local.z > 0, irradiance, 0)
 
 
+def pixels_per_mm(projector: ProjectorOptics, point: mi.Point3f, normal: mi.Normal3f) -> mi.Vector2f:
+    """Change of the projector's column and of its row along a surface, each where it is steepest, without distortion : px/mm."""
+    matrix = to_mitsuba(projector.camera.camera_from_world)
+    local, across = matrix @ point, matrix @ mi.Vector3f(normal)
+    focal = projector.camera.matrix[0, 0], projector.camera.matrix[1, 1]
+    slopes = mi.Vector3f(1, 0, -local.x / local.z), mi.Vector3f(0, 1, -local.y / local.z)
+    along = (dr.safe_sqrt(dr.squared_norm(slope) - dr.square(dr.dot(slope, across))) for slope in slopes)
+    return mi.Vector2f(*(float(f) * steepest / local.z for f, steepest in zip(focal, along, strict=True)))
+
+
 def _project(camera: Camera, local: mi.Point3f) -> tuple[mi.Point2f, mi.Float]:
     """Project points of the device's frame to pixels; also their squared distance from the image's middle, 1 at a corner."""
     x, y = distorted(local.x / local.z, local.y / local.z, camera.coefficients.tolist())

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from recon.model.rig import NotNegative
 from twin.optics.instruments import CameraOptics, ProjectorOptics, light_point, sample_rays
+from twin.optics.light_spread import LightSpread, Translucent
 from twin.optics.raster import Light, LightTable
 from twin.optics.sampling import PairedPoints
 
@@ -43,7 +44,15 @@ class Engine(BaseModel):
         return self.room_lux / LUMENS_PER_WATT / np.pi * 1e-6
 
 
-def render(scene: mi.Scene, camera: CameraOptics, projector: ProjectorOptics, light: Light, engine: Engine, seed: int) -> Images:
+def render(
+    scene: mi.Scene,
+    camera: CameraOptics,
+    projector: ProjectorOptics,
+    light: Light,
+    engine: Engine,
+    seed: int,
+    translucent: Translucent = (),
+) -> Images:
     """Render what a camera receives while the projector shows a sequence.
 
     Parameters
@@ -54,6 +63,8 @@ def render(scene: mi.Scene, camera: CameraOptics, projector: ProjectorOptics, li
         The sequence of n patterns as the projector shows it.
     seed : int
         The same seed gives the same images.
+    translucent : sequence of shapes with lengths, mm
+        Shapes beneath which light spreads, see `light_spread`.
 
     Returns
     -------
@@ -62,7 +73,9 @@ def render(scene: mi.Scene, camera: CameraOptics, projector: ProjectorOptics, li
     """
     width, height = camera.camera.size
     everywhere = np.arange(width * height, dtype=np.uint32)
-    return render_pixels(scene, camera, projector, light, engine, seed, everywhere).reshape(-1, height, width)
+    return render_pixels(scene, camera, projector, light, engine, seed, everywhere, translucent=translucent).reshape(
+        -1, height, width
+    )
 
 
 def render_pixels(
@@ -75,12 +88,13 @@ def render_pixels(
     pixels: NDArray[np.uint32],
     *,
     convex: bool = False,
+    translucent: Translucent = (),
 ) -> Images:
     """Render some pixels : (m,) numbers `v * width + u`, as `render` does all : (n, m) float32, W/mm^2/sr.
 
     Light that leaves a convex body meets nothing again: for a scene that is one, shadows needn't be looked for.
     """
-    table = LightTable.of(light)
+    table, spread = LightTable.of(light), LightSpread.of(translucent, light) if translucent else None
     pixel = mi.UInt32(pixels)
     centre, across, down = camera.tables
     tables = dr.gather(mi.Point2f, centre, pixel), dr.gather(mi.Vector2f, across, pixel), dr.gather(mi.Vector2f, down, pixel)
@@ -90,7 +104,7 @@ def render_pixels(
     def body(index: mi.UInt32, sums: list[mi.Float], room: mi.Float) -> tuple:
         points = PairedPoints(pixel, index, engine.samples, seed_word)
         ray = sample_rays(camera, tables, pixel_offset(camera, points), points.mirrored_disc())
-        values, from_room = trace(scene, projector, table, engine, points, ray, convex)
+        values, from_room = trace(scene, projector, (table, spread), engine, points, ray, convex)
         return index + 1, [total + value for total, value in zip(sums, values, strict=True)], room + from_room
 
     state = (mi.UInt32(0), [dr.zeros(mi.Float, len(pixels)) for _ in range(table.count)], dr.zeros(mi.Float, len(pixels)))
@@ -119,14 +133,14 @@ def pixel_offset(camera: CameraOptics, points: PairedPoints) -> mi.Point2f:
 def trace(
     scene: mi.Scene,
     projector: ProjectorOptics,
-    table: LightTable,
+    light: tuple[LightTable, LightSpread | None],
     engine: Engine,
     points: PairedPoints,
     ray: mi.Ray3f,
     convex: bool,
 ) -> tuple[list[mi.Float], mi.Float]:
     """Follow camera rays: radiance of each pattern, and of the room, W/mm^2/sr."""
-    context = mi.BSDFContext()
+    (table, spread), context = light, mi.BSDFContext()
     sums = [mi.Float(0)] * table.count
     room, throughput, active = mi.Float(0), mi.Float(1), mi.Bool(True)
     for bounce in range(engine.bounces):
@@ -141,9 +155,17 @@ def trace(
         lit = active & (irradiance > 0) & (dr.dot(shadow_ray.d, hit.n) > 0)
         if not convex:
             lit &= ~scene.ray_test(shadow_ray, lit)
-        reflected = bsdf.eval(context, hit, hit.to_local(shadow_ray.d), lit)[0]  # BRDF times cosine
+        toward = hit.to_local(shadow_ray.d)
+        reflected = bsdf.eval(context, hit, toward, lit)[0]  # BRDF times cosine
         weight = dr.select(lit, throughput * reflected * irradiance, 0)
-        sums = [total + weight * value for total, value in zip(sums, table.lookup(projector_pixel, lit), strict=True)]
+        values = table.lookup(projector_pixel, lit)
+        sums = [total + weight * value for total, value in zip(sums, values, strict=True)]
+        if spread is not None:
+            soft = lit & (spread.length_mm(hit.shape) > 0)
+            diffuse = bsdf.eval(mi.BSDFContext(mi.TransportMode.Radiance, mi.BSDFFlags.DiffuseReflection), hit, toward, soft)[0]
+            weight = dr.select(soft, throughput * diffuse * irradiance, 0)
+            after = spread.lookup(projector, hit, projector_pixel, soft)
+            sums = [total + weight * (late - value) for total, late, value in zip(sums, after, values, strict=True)]
 
         last = convex or bounce + 1 == engine.bounces
         if last and engine.room_radiance == 0:

@@ -50,6 +50,12 @@ class Light:
             emitted.append(np.float32(black + (1 - black) * on))
         return cls(size, tuple(axis for axis, _, _ in profiles), tuple(emitted), device.lens.blur_px)
 
+    @property
+    def order(self) -> tuple[int, ...]:
+        """Place of each pattern : (n,) when those along columns come first, then those along rows."""
+        places = sorted(range(len(self.axes)), key=lambda k: AXES.index(self.axes[k]))  # stable
+        return tuple(int(k) for k in np.argsort(places))
+
     def fine_profiles(self, axis: Axis) -> Profiles:
         """Profiles of the patterns of one axis behind the lens : (patterns of that axis, (length + 2 MARGIN) * OVERSAMPLING).
 
@@ -61,24 +67,47 @@ class Light:
 
 
 @dataclass(frozen=True)
+class AxisTable:
+    """Light of the patterns of one axis at fine steps along it, one step's values side by side in memory."""
+
+    values: mi.Float  # padded to whole packets a step
+    count: int  # patterns
+
+    @classmethod
+    def of(cls, fine: Profiles) -> "AxisTable":
+        """Lay out profiles : (n, steps)."""
+        padded = np.pad(fine, ((0, -len(fine) % PACKET), (0, 0)))
+        return cls(mi.Float(np.ascontiguousarray(padded.T).ravel()), len(fine))
+
+    def lookup(self, coordinate: mi.Float, active: mi.Bool, before: mi.UInt32 | int = 0) -> list[mi.Float]:
+        """Light of each pattern at a coordinate in px, in a table that has some steps before the axis's own."""
+        packets = -(-self.count // PACKET)
+        position = (coordinate + 0.5 + MARGIN) * OVERSAMPLING - 0.5
+        below = dr.floor(position)
+        fraction = position - below
+        first = (mi.UInt32(below) + before) * packets
+        values: list[mi.Float] = []
+        for packet in range(packets):
+            low = dr.gather(mi.Vector4f, self.values, first + packet, active)
+            high = dr.gather(mi.Vector4f, self.values, first + packets + packet, active)
+            values.extend(dr.lerp(low, high, fraction))
+        return values[: self.count]
+
+
+@dataclass(frozen=True)
 class LightTable:
-    """Light of N patterns at any projector coordinate, one coordinate's values side by side in memory."""
+    """Light of N patterns at any projector coordinate."""
 
     size: tuple[int, int]  # width, height, px
     order: tuple[int, ...]  # (n,) place of each pattern among the values looked up: columns first, then rows
-    tables: dict[Axis, tuple[mi.Float, int]]  # values, padded to whole packets a coordinate, and number of patterns
+    tables: dict[Axis, AxisTable]
 
     @classmethod
     def of(cls, light: Light) -> "LightTable":
         """Lay out the light of a sequence."""
-        tables = {}
-        for axis in AXES:
-            if axis in light.axes:
-                fine = light.fine_profiles(axis)
-                padded = np.pad(fine, ((0, -len(fine) % PACKET), (0, 0)))
-                tables[axis] = mi.Float(np.ascontiguousarray(padded.T).ravel()), len(fine)
-        places = sorted(range(len(light.axes)), key=lambda k: AXES.index(light.axes[k]))  # stable: keeps the order within an axis
-        return cls(light.size, tuple(int(k) for k in np.argsort(places)), tables)
+        return cls(
+            light.size, light.order, {axis: AxisTable.of(light.fine_profiles(axis)) for axis in AXES if axis in light.axes}
+        )
 
     @property
     def count(self) -> int:
@@ -87,19 +116,14 @@ class LightTable:
 
     def lookup(self, pixel: mi.Point2f, active: mi.Bool) -> list[mi.Float]:
         """Light of each pattern at projector coordinates in px; none outside the raster."""
-        width, height = self.size
-        active &= (pixel.x > -0.5) & (pixel.x < width - 0.5) & (pixel.y > -0.5) & (pixel.y < height - 0.5)
+        active &= within(self.size, pixel)
         values: list[mi.Float] = []
-        for axis, (table, count) in self.tables.items():
-            packets = -(-count // PACKET)
-            position = ((pixel.x if axis == "columns" else pixel.y) + 0.5 + MARGIN) * OVERSAMPLING - 0.5
-            below = dr.floor(position)
-            fraction = position - below
-            first = mi.UInt32(below) * packets
-            axis_values: list[mi.Float] = []
-            for packet in range(packets):
-                low = dr.gather(mi.Vector4f, table, first + packet, active)
-                high = dr.gather(mi.Vector4f, table, first + packets + packet, active)
-                axis_values.extend(dr.lerp(low, high, fraction))
-            values += axis_values[:count]
+        for axis, table in self.tables.items():
+            values += table.lookup(pixel.x if axis == "columns" else pixel.y, active)
         return [values[k] for k in self.order]
+
+
+def within(size: tuple[int, int], pixel: mi.Point2f) -> mi.Bool:
+    """Whether projector coordinates in px lie on the raster of a size."""
+    width, height = size
+    return (pixel.x > -0.5) & (pixel.x < width - 0.5) & (pixel.y > -0.5) & (pixel.y < height - 0.5)

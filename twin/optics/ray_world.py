@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -11,6 +12,7 @@ from recon.geometry.primitives import Sphere
 from scenes.scene_types import Material, Scene, Thing
 
 FILLED = 1e-6  # of a convex hull's volume may be missing by rounding: over a board's area 0.000003 mm
+GEL_ROUGHNESS, GEL_IOR = 0.08, 1.36  # GGX alpha of gel as it levels out, assumed; its index is near water's
 RAMP = 1024  # texels of the texture that turns a texture coordinate into a reflectance
 
 
@@ -56,7 +58,7 @@ def visible(scene: Scene) -> list[Thing]:
 
 def to_shape(thing: Thing) -> mi.Shape:
     """One thing as a shape with its material: an exact sphere where it is one, else its mesh."""
-    bsdf = mi.load_dict(to_bsdf(thing.material, thing.albedo is not None))
+    bsdf = mi.load_dict(to_bsdf(thing.material, thing.albedo is not None, thing.wet is not None))
     if isinstance(thing.primitive, Sphere):
         center = [float(value) for value in thing.primitive.centre]
         return mi.load_dict({"type": "sphere", "center": center, "radius": float(thing.primitive.radius), "bsdf": bsdf})
@@ -64,38 +66,66 @@ def to_shape(thing: Thing) -> mi.Shape:
     properties["bsdf"] = bsdf
     properties["face_normals"] = not thing.smooth
     vertices, faces = np.float32(thing.mesh.vertices), np.uint32(thing.mesh.faces)
-    mesh = mi.Mesh(thing.name, len(vertices), len(faces), properties, thing.smooth, thing.albedo is not None)
+    varied = thing.albedo is not None or thing.wet is not None
+    mesh = mi.Mesh(thing.name, len(vertices), len(faces), properties, thing.smooth, varied)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = vertices.ravel()
     parameters["faces"] = faces.ravel()
     if thing.smooth:
         parameters["vertex_normals"] = np.float32(thing.mesh.vertex_normals).ravel()
-    if thing.albedo is not None:
-        parameters["vertex_texcoords"] = np.stack([thing.albedo, np.full_like(thing.albedo, 0.5)], axis=1).ravel()
+    if varied:
+        values = (np.full(len(vertices), 0.5, np.float32) if one is None else one for one in (thing.albedo, thing.wet))
+        parameters["vertex_texcoords"] = np.stack(tuple(values), axis=1).ravel()
     parameters.update()
     return mesh
 
 
-def to_bsdf(material: Material, has_albedo: bool) -> dict:
-    """A material as a Mitsuba plugin: Lambertian, or a rough dielectric coat on it."""
-    reflectance = albedo_ramp() if has_albedo else material.reflectance
+def translucent(scene: Scene, world: mi.Scene) -> list[tuple[mi.Shape, float]]:
+    """Shapes of a scene's world beneath which light spreads, and the lengths of its spread in mm."""
+    shapes = zip(visible(scene), world.shapes(), strict=True)
+    return [(shape, thing.material.spread_mm) for thing, shape in shapes if thing.material.spread_mm > 0]
+
+
+def to_bsdf(material: Material, has_albedo: bool, has_wet: bool = False) -> dict:
+    """A material as a Mitsuba plugin: Lambertian, or a rough dielectric coat on it, which gel may cover."""
+    reflectance = ramp(0) if has_albedo else material.reflectance
     if material.roughness is None:
-        return {"type": "diffuse", "reflectance": reflectance}
+        dry = {"type": "diffuse", "reflectance": reflectance}
+    else:
+        dry = coated(reflectance, material.roughness, material.ior)
+    if not has_wet:
+        return dry
+    same = body_reflection(dry) / body_reflection(coated(reflectance, GEL_ROUGHNESS, GEL_IOR))
+    under_gel = ramp(0, same) if has_albedo else same * material.reflectance
+    return {"type": "blendbsdf", "weight": ramp(1), "dry": dry, "wet": coated(under_gel, GEL_ROUGHNESS, GEL_IOR)}
+
+
+def body_reflection(bsdf: dict) -> float:
+    """Diffuse reflection of a plugin in one direction, 30 deg off the normal, in which gel changes it by nothing."""
+    hit = dr.zeros(mi.SurfaceInteraction3f)
+    hit.uv, (hit.wi, wo) = mi.Point2f(0.5), (mi.Vector3f(*way) for way in ((0.5, 0, 0.866), (0, 0.5, 0.866)))
+    return float(
+        mi.load_dict(bsdf).eval(mi.BSDFContext(mi.TransportMode.Radiance, mi.BSDFFlags.DiffuseReflection), hit, wo)[0][0]
+    )
+
+
+def coated(reflectance: dict | float, roughness: float, ior: float) -> dict:
+    """A diffuse body under a rough dielectric coat."""
     return {
         "type": "roughplastic",
         "distribution": "ggx",
-        "alpha": material.roughness,
-        "int_ior": material.ior,
+        "alpha": roughness,
+        "int_ior": ior,
         "nonlinear": False,
         "diffuse_reflectance": reflectance,
     }
 
 
-def albedo_ramp() -> dict:
-    """A texture whose value is its first coordinate: vertices carry their reflectance in it.
+def ramp(axis: int, scale: float = 1.0) -> dict:
+    """A texture whose value is its first or second coordinate: vertices carry their reflectance, and how wet they are, in it.
 
     Mitsuba's own mesh attributes can't be used: its rough plastic asks a texture for its mean, which they don't have.
     """
-    ramp = (np.arange(RAMP, dtype=np.float32) + 0.5) / RAMP
-    bitmap = mi.Bitmap(np.repeat(ramp[None, :, None], 2, axis=0))
+    values = np.float32(scale) * (np.arange(RAMP, dtype=np.float32) + 0.5) / RAMP
+    bitmap = mi.Bitmap(np.repeat(values[None, :, None] if axis == 0 else values[:, None, None], 2, axis=axis))
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}

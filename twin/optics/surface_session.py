@@ -14,10 +14,10 @@ from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes, Patterns
 from recon.model.rig import CameraDevice, Positive, Rig
 from scenes.scene_types import Scene
-from twin.optics.conditions import IDEAL, Conditions, draw, emitted, with_stray
+from twin.optics.conditions import IDEAL, Conditions, as_skin, draw, emitted, with_stray
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, Images, render
-from twin.optics.ray_world import build_world, visible
+from twin.optics.ray_world import build_world, translucent, visible
 from twin.optics.surface_truth import SurfaceTruth, surface_truth
 from twin.sensor import Exposure, Numbers, auto_exposure, electrons_per_radiance, expose, noise_dn, number_per_electron
 from twin.session import Session, describe
@@ -64,11 +64,11 @@ def shoot(
     device: CameraDevice = getattr(rig, camera)
     light_seed, sensor_seed = np.random.SeedSequence([seed, ("cam1", "cam2").index(camera)]).generate_state(2).tolist()
     optics = camera_optics(rig, camera)
-    world = build_world(scene)
+    scene = as_skin(scene, conditions.skin, seed)
+    world, projector = build_world(scene), ProjectorOptics.of(rig.projector)
     frames = draw(conditions.frames, patterns.count, seed)
-    radiance = render(
-        world, optics, ProjectorOptics.of(rig.projector), emitted(patterns, rig.projector, frames), engine, light_seed
-    )
+    light = emitted(patterns, rig.projector, frames)
+    radiance = render(world, optics, projector, light, engine, light_seed, translucent(scene, world))
     wavelength = rig.projector.wavelength_nm
     time_s = shooting.exposure_s or auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
     exposure = Exposure(time_s, shooting.gain, shooting.bits)

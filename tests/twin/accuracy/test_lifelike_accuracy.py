@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.optical_calibration.joint_calibration import calibrate
-from twin.accuracy import lifelike_accuracy
+from twin.accuracy import lifelike_accuracy, plane_and_sphere
 from twin.accuracy.baselines import opencv_peer
 from twin.optics.conditions import BoardPrint
 
@@ -14,7 +14,7 @@ def test_the_form_of_a_bowed_plane_is_its_bow(rng):
     x, y = rng.uniform(-1, 1, (2, 200_000))
     z = 0.01 * x**2 + 0.3 * x - 0.2 * y + 0.02 * rng.standard_normal(x.size)
     points = np.column_stack([120 * x, 90 * y, z + 660])
-    assert lifelike_accuracy.form_rms(points) == pytest.approx(0.01 * np.sqrt(4 / 45), rel=0.05)
+    assert plane_and_sphere.form_rms(points) == pytest.approx(0.01 * np.sqrt(4 / 45), rel=0.05)
 
 
 def test_a_print_shows_in_the_reprojection_as_large_as_it_is(rig):

@@ -7,6 +7,7 @@ from pydantic import ValidationError
 from recon.model import circle_layout
 from recon.model.patterns import Fringes, GrayCode, Patterns
 from recon.structured_light.phase import design
+from scenes.catalogue import build_scene
 from scenes.kinds import board
 from twin.optics.conditions import (
     BoardPrint,
@@ -15,7 +16,9 @@ from twin.optics.conditions import (
     Frames,
     Motion,
     Print,
+    Skin,
     Sound,
+    as_skin,
     check_board,
     draw,
     drifted,
@@ -162,3 +165,19 @@ def test_devices_drift_by_their_standard_deviations(rig):
 def test_ideal_boards_are_as_designed():
     design = board.Config(bow_mm=(0.3, 0.0, 0.0), seed=5)
     assert printed_board(design, BoardPrint(), 7) is design and flexed(design, BoardPrint(), 7, 2) is design
+
+
+def test_skin_lets_light_spread_and_is_wet_in_patches():
+    """Of the phantom alone: the share that was asked for, in few patches, the same for the same seed; ideal skin is as built."""
+    scene = build_scene({"kind": "breast", "edge_mm": 3.0})
+    skin = Skin(spread_mm=0.4, wet=0.2, patch_mm=25)
+    breast, *others = as_skin(scene, skin, 5).things
+    assert breast.material.spread_mm == 0.4 and breast.wet is not None
+    assert breast.wet.mean() == pytest.approx(0.2, abs=0.02)
+    mesh = breast.mesh
+    shore = np.abs(np.diff(breast.wet[mesh.edges_unique] > 0.5, axis=1)).mean()  # of edges; 0.32 without patches
+    assert 0.002 < shore < 0.1
+    assert all(thing.material.spread_mm == 0 and thing.wet is None for thing in others)
+    np.testing.assert_array_equal(as_skin(scene, skin, 5).things[0].wet, breast.wet)
+    assert (as_skin(scene, skin, 6).things[0].wet != breast.wet).any()
+    assert as_skin(scene, Skin(), 5) is scene

@@ -1,5 +1,7 @@
 """Light transport against closed forms and against Mitsuba's own integrator."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -58,6 +60,23 @@ def test_room_light_on_a_plate():
     engine = Engine(samples=4, room_lux=100)
     image = render(build_world(plate(500)), CameraOptics.pinhole(SMALL), projector, uniform_light(), engine, seed=0)[0]
     np.testing.assert_allclose(image, 0.6 * 100 / LUMENS_PER_WATT * 1e-6 / np.pi, rtol=1e-4)
+
+
+def test_gel_is_glossy_where_it_is():
+    """Half of a plate is under gel: there its mirror image of the projector is brighter; elsewhere nothing changes."""
+    projector = ProjectorOptics(PROJECTOR, 0.0, 1.0, 0.0, 2.0)
+    dry = plate(500).things[0]
+    mesh = dry.mesh.subdivide().subdivide().subdivide().subdivide().subdivide().subdivide()
+    wet = np.float32(mesh.vertices[:, 0] > 0)
+    dry = replace(dry, mesh=mesh, material=Material(0.05, roughness=0.4, ior=1.36))
+    without, under = (
+        render(
+            build_world(Scene("plate", (thing,))), CameraOptics.pinhole(SMALL), projector, uniform_light(), Engine(samples=4), 0
+        )[0]
+        for thing in (dry, replace(dry, wet=wet))
+    )
+    np.testing.assert_allclose(under[:, :28], without[:, :28], rtol=3e-3)  # a texture of 1024 steps begins at half a step
+    assert under[31, 36] > 3 * without[31, 36]
 
 
 @pytest.mark.parametrize("depth", [560.0, 600.0, 655.0, 720.0])
