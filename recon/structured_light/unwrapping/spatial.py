@@ -29,6 +29,7 @@ from recon.threads import in_threads
 
 MARGIN_CELLS = 3  # cells that a basin grows into torn ground, so that neighbours across a tear meet
 LINE_LEVEL = 0.25  # of full light: brighter is the line
+EVERY = 97  # pixel that tells how bright the image of the line is without the line
 RESIDUAL = 0.2  # cycle that a vote may be off a whole order
 
 Flags = NDArray[np.uint8]
@@ -122,19 +123,25 @@ def unwrap(fringe: Fringe, valid: Mask, line: NDArray, turns: float, width: floa
 
 
 def _line_light(image: NDArray, valid: Mask, fringe: Fringe) -> NDArray[np.float32]:
-    """Light of the line over full light, where it is bright enough to be the line : (h, w), 0 elsewhere."""
+    """Light of the line over full light, where it is bright enough to be the line : (h, w), 0 elsewhere.
+
+    Beside the line it is as dark as between fringes, or as most of the line's image where that is darker: on translucent skin
+    nothing is dark between fringes.
+    """
     light = np.zeros(image.shape, np.float32)
-    in_threads(_fill_light, len(image), image, valid, fringe, light)
+    offset = np.maximum(fringe.offset[valid][::EVERY], 1)
+    unlit = np.float32(np.median(image[valid][::EVERY] / offset)) if offset.size else np.float32(0)
+    in_threads(_fill_light, len(image), image, valid, fringe, unlit, light)
     return light
 
 
 @kernel
-def _fill_light(first, end, image, valid, fringe: Fringe, light):
+def _fill_light(first, end, image, valid, fringe: Fringe, unlit, light):
     offset, modulation, sigma = fringe.offset, fringe.modulation, fringe.sigma
     for v in range(first, end):
         for u in range(image.shape[1]):
-            dark = max(offset[v, u] - modulation[v, u], np.float32(0))
-            level = (image[v, u] - dark) / (2 * modulation[v, u])
+            dark = max(min(offset[v, u] - modulation[v, u], unlit * offset[v, u]), np.float32(0))
+            level = (image[v, u] - dark) / (offset[v, u] + modulation[v, u] - dark)
             light[v, u] = level if valid[v, u] and level >= LINE_LEVEL + 4 * sigma[v, u] else 0
 
 

@@ -73,6 +73,19 @@ def test_predicted_coordinate_noise_is_the_noise(rng):
     assert found.noise_source == "measured"
 
 
+@pytest.mark.parametrize("blur", [2.0, 2.7])
+def test_a_line_is_found_where_nothing_is_dark_between_fringes(rng, blur):
+    """Skin blurs fringes and line: a third to half of the modulation is left, and the line is darker than the darkest fringe."""
+    patterns = load("paper_surface")
+    maps = smooth_maps(patterns, rng)
+    images = photograph(patterns, maps, rng, light=150, blur=blur)
+    found = decode(images, patterns)
+    assert (found.status == Status.OK).mean() > 0.95
+    assert found.columns is not None
+    assert np.nanmax(np.abs(found.columns - maps["columns"])) < 6  # half a period
+    assert blur < 2.5 or np.percentile(images[0], 99) < np.median(images[1:].min(axis=0))
+
+
 def test_a_given_noise_is_used(rng):
     patterns = load("gray_surface")
     images = photograph(patterns, smooth_maps(patterns, rng), rng)
