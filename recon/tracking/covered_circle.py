@@ -1,39 +1,47 @@
-"""A circle that something covers, from the other two of its view.
+"""A circle that something covers, from the others.
 
 Two discs tell the view's affinity all but exactly: it takes a circle to their ellipses, which leaves a turn, and one centre to
 the other, which settles it. Their distance must be that of the circles that they are taken for; which end is which it can't tell.
 The third place follows, as exactly as a view is affine: to 2 px in the median, 7 px at most for the rig. So does the shape there,
 which a rim of which half is covered doesn't tell by itself.
 
-Where neither view shows it, two ellipses of each determine the pose but for a half turn, and with it the place to a pixel.
+Where both views together give no pose, rims of which but a part is seen may be the edge of what covers them. Whole ellipses of
+two circles in one view and one in the other determine the pose, but for half a turn at worst, and with it all places to a pixel.
+There the others are sought a second time, held so closely that another edge beside them doesn't bend them.
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import product
+from dataclasses import replace
+from itertools import groupby, product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.geometry import pose_hypotheses
+from recon.geometry import pose_hypotheses, rigid
 from recon.geometry.camera import Camera
-from recon.geometry.circle_outline import ellipses_of
+from recon.geometry.circle_outline import ellipses_of, slopes_at
 from recon.geometry.ellipses import Ellipses
 from recon.model.calibration import Uncertainty
 from recon.model.circle_layout import circle_centres, circles
 from recon.model.rig import Target
 from recon.tracking.identity import ALIKE
-from recon.tracking.pose import APART_MM
-from recon.tracking.pose_fit import Sighting, meet, refined
+from recon.tracking.pose import APART_MM, same
+from recon.tracking.pose_fit import NAMES, Sighting, TargetPose, meet, refined
 from recon.tracking.rim_fit.sectors import STEEP
-from recon.tracking.rims import Outlines, measure_covered
+from recon.tracking.rims import WHOLE, Known, Outlines, measure_covered
 
 Array = NDArray[np.float64]
 
 REACH_PX = 8.0  # by which the place may be off
-REACH_AGAIN_PX = 4.0  # the same of a pose by two circles of each view
+REACH_AGAIN_PX = 3.0  # the same of a pose by some circles of both views
+PLACE_AGAIN_PX = 0.2  # least standard deviation of a place by such a pose: at 1 px the edge of a cable still bent a rim by 2.8 px
+BENT_AGAIN_PX = 0.3  # standard deviation that such an edge, a pixel or two beside the rim, leaves of what is found again
 SHAPE = 0.035  # of a disc's size, by which its shape differs from the mean of the others, one standard deviation: perspective
-SHAPE_AGAIN = 0.01  # the same of a pose by two circles of each view
+SHAPE_AGAIN = 0.003  # the same of a pose by some circles of both views
 SEEN_AGAIN = 0.5  # of a rim that is found so: with less, another thing's edge was taken for it, half a turn from the target
+FEWEST = 3  # rims that determine a pose by whole ellipses: two of one view, one of the other
+ENOUGH = 5  # rims by which it is the target: three of one view, two of the other
+TRIALS = 16  # choices of rims that are tried at most
 INK = 0.15  # of a ring's contrast: a middle that is no brighter is ink, and this a black disc
 
 
@@ -43,9 +51,8 @@ def completed(image: NDArray, outlines: Outlines, target: Target) -> Outlines:
     if which is None:
         return outlines
     rough = third(outlines.ellipses, which, target)
-    known = SHAPE * np.trace(rough.shape, axis1=1, axis2=2) / 2
-    again = measure_covered(image, rough, REACH_PX, known, target)
-    return outlines.replaced(which, again) if alike(again, outlines, which) else outlines
+    again = measure_covered(image, rough, REACH_PX, Known(np.inf, SHAPE), target)
+    return outlines.replaced(which, again) if alike(again, outlines) else outlines
 
 
 def sought_again(
@@ -54,38 +61,82 @@ def sought_again(
     cameras: Sequence[Camera],
     target: Target,
     optics: Uncertainty | None = None,
-) -> Iterator[list[Outlines]]:
-    """Rims of both views, which show two circles each, with the third where these have it, of the shape that it has there.
+) -> Iterator[list[list[Outlines]]]:
+    """Rims of both views, of which some count, and the others are found again where these ask for them.
 
-    Under each naming of the two by which that is so: at most under the right one, unless something looks very much like a ring.
+    Each selection of those of which but a part is seen is tried, under each naming by which whole ellipses are those of one pose.
+    Step by step fewer count; what was found with equally many comes in one list.
     """
-    for named, pose in named_poses(pair, cameras, target, optics):
-        again = [
-            _sought(frame, outlines, Ellipses(*ellipses_of(camera, pose, *circles(target))), target)
-            for frame, outlines, camera in zip(frames, named, cameras, strict=True)
+    for _, choices in groupby(_counted(pair), key=_number):
+        yield [
+            rims
+            for counted in choices
+            for named, pose in named_poses(counted, cameras, target, optics)
+            if _are_whole(rims := _completed_by(pose, named, frames, cameras, target), pose, cameras, target, optics)
         ]
-        if any(outlines.found.all() for outlines in again) and refined(pose, _whole(again, cameras), target, optics).found:
-            yield again
+
+
+def _completed_by(
+    pose: TargetPose, pair: Sequence[Outlines], frames: Sequence[NDArray], cameras: Sequence[Camera], target: Target
+) -> list[Outlines]:
+    """Rims of both views with those that are missing fitted where a pose has them."""
+    return [_sought(frame, rims, camera, pose, target) for frame, rims, camera in zip(frames, pair, cameras, strict=True)]
+
+
+def _are_whole(
+    pair: Sequence[Outlines], pose: TargetPose, cameras: Sequence[Camera], target: Target, optics: Uncertainty | None
+) -> bool:
+    """Whether rims are three of one view and two of the other, and whole ellipses those of a pose near one."""
+    return _number(pair) >= ENOUGH and refined(pose.world_from_target, _whole(pair, cameras), target, optics).found
+
+
+def _number(pair: Sequence[Outlines]) -> int:
+    """Of rims that both views show."""
+    return int(sum(outlines.found.sum() for outlines in pair))
+
+
+def _counted(pair: Sequence[Outlines]) -> list[list[Outlines]]:
+    """Choices of the rims that count, most first: those of which the whole is seen, and each selection of the others."""
+    choices = [list(choice) for choice in product(*(list(_fewer(outlines)) for outlines in pair))]
+    several = [choice for choice in choices if FEWEST <= _number(choice) < 2 * len(NAMES)]
+    return sorted(several, key=_number, reverse=True)[:TRIALS]
+
+
+def _fewer(outlines: Outlines) -> Iterator[Outlines]:
+    """The rims of a view, and the same without some of which but a part is seen; one is left at least."""
+    covered = np.flatnonzero(outlines.found & (outlines.seen < WHOLE))
+    for kept in product((True, False), repeat=len(covered)):
+        fewer = outlines.without(covered[~np.array(kept, bool)])
+        if fewer.found.any():
+            yield fewer
 
 
 def named_poses(
     pair: Sequence[Outlines], cameras: Sequence[Camera], target: Target, optics: Uncertainty | None = None
-) -> Iterator[tuple[list[Outlines], Array]]:
-    """Poses : (4, 4) mm by two circles of each view, with the rims in the order of the names under which they are such.
+) -> Iterator[tuple[list[Outlines], TargetPose]]:
+    """Poses by two or three circles of each view, with the rims in the order of the names under which they are such.
 
-    By themselves two circles have no order, so mostly there are two poses, half a turn apart.
+    By themselves two circles have no order, so mostly there are two poses of two circles a view, half a turn apart.
     """
     for orders in product(*(_orders(outlines.found) for outlines in pair)):
         named = [outlines[order] for outlines, order in zip(pair, orders, strict=True)]
         if not _meeting(named, cameras):
             continue
-        which = int(np.argmin(named[0].found))
-        centres = named[0].ellipses.centre.copy()
-        centres[which] = third(named[0].ellipses, which, target).centre[0]
-        starts = pose_hypotheses.poses(cameras[0], centres, circle_centres(target)) if np.isfinite(centres).all() else []
-        fits = [refined(start, _whole(named, cameras), target, optics) for start in starts]
-        if fits := [fit for fit in fits if fit.found]:
-            yield named, min(fits, key=lambda fit: fit.misfit).world_from_target
+        fits = [refined(start, _whole(named, cameras), target, optics) for start in _starts(named, cameras, target)]
+        distinct: list[TargetPose] = []
+        for fit in sorted((fit for fit in fits if fit.found), key=lambda fit: fit.misfit):
+            if not any(same(fit, other) for other in distinct):
+                distinct.append(fit)
+        yield from ((named, fit) for fit in distinct)
+
+
+def _starts(pair: Sequence[Outlines], cameras: Sequence[Camera], target: Target) -> list[Array]:
+    """Poses that one view allows, that with all three circles if there is one."""
+    k = int(np.argmax([outlines.found.sum() for outlines in pair]))
+    centres, which = pair[k].ellipses.centre.copy(), missing(pair[k].found)
+    if which is not None:
+        centres[which] = third(pair[k].ellipses, which, target).centre[0]
+    return pose_hypotheses.poses(cameras[k], centres, circle_centres(target)) if np.isfinite(centres).all() else []
 
 
 def _meeting(pair: Sequence[Outlines], cameras: Sequence[Camera]) -> bool:
@@ -101,21 +152,39 @@ def _whole(pair: Sequence[Outlines], cameras: Sequence[Camera]) -> list[Sighting
 
 
 def _orders(found: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """The order of three circles, and that with the two that are found exchanged."""
-    kept, exchanged = np.arange(3), np.arange(3)
-    exchanged[found] = exchanged[found][::-1]
-    return [kept, exchanged]
+    """Orders of three circles: as they are; with two that are found exchanged; with one that is found under each name."""
+    if found.all():
+        return [np.arange(3)]
+    if found.sum() == 1:
+        return [np.roll(np.arange(3), k) for k in range(3)]
+    return [np.arange(3), exchanged(found)]
 
 
-def _sought(image: NDArray, outlines: Outlines, expected: Ellipses, target: Target) -> Outlines:
-    """Three rims of an image; a missing one is sought again where a pose has it, hidden middle or not."""
-    which = missing(outlines.found)
-    if which is None:
-        return outlines
-    rough = expected[[which]]
-    again = measure_covered(image, rough, REACH_AGAIN_PX, SHAPE_AGAIN * np.trace(rough.shape, axis1=1, axis2=2) / 2, target)
-    sound = again.found.all() and again.seen[0] >= SEEN_AGAIN and _as_dark(again, outlines, which)
-    return outlines.replaced(which, again) if sound else outlines
+def exchanged(found: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The order of three circles with the two that are found exchanged."""
+    order = np.arange(3)
+    order[found] = order[found][::-1]
+    return order
+
+
+def _sought(image: NDArray, outlines: Outlines, camera: Camera, pose: TargetPose, target: Target) -> Outlines:
+    """Three rims of an image; those missing are sought again where a pose has them, hidden middle or not."""
+    expected = Ellipses(*ellipses_of(camera, pose.world_from_target, *circles(target)))
+    sigma = _place_sigma(camera, pose, target)
+    for which in np.flatnonzero(~outlines.found):
+        known = Known(np.hypot(PLACE_AGAIN_PX, sigma[which]), SHAPE_AGAIN)
+        again = measure_covered(image, expected[[which]], REACH_AGAIN_PX, known, target)
+        if again.found.all() and again.seen[0] >= SEEN_AGAIN and _as_dark(again, outlines):
+            bent = replace(again, joint=again.joint + BENT_AGAIN_PX**2 * np.eye(5))
+            outlines = outlines.replaced(which, bent)
+    return outlines
+
+
+def _place_sigma(camera: Camera, pose: TargetPose, target: Target) -> Array:
+    """Standard deviations : (3,) px, along the worse axis, of where a pose has the circles."""
+    centres, place = circle_centres(target), pose.world_from_target
+    slopes = slopes_at(camera, rigid.apply(place, centres)) @ rigid.slopes(rigid.rotate(place, centres))
+    return np.sqrt(np.linalg.eigvalsh(slopes @ pose.total @ np.swapaxes(slopes, 1, 2))[:, -1])
 
 
 def missing(found: NDArray[np.bool_]) -> int | None:
@@ -123,25 +192,58 @@ def missing(found: NDArray[np.bool_]) -> int | None:
     return int(np.argmin(found)) if found.sum() == 2 else None
 
 
+def named_and_completed(image: NDArray, outlines: Outlines, target: Target) -> Outlines:
+    """Three rims of an image, as `completed`, where names aren't sure: two that are found may be others, or exchanged."""
+    named = by_distance(outlines, target)
+    whole = completed(image, named, target)
+    if missing(whole.found) is None:
+        return whole
+    other = completed(image, named[exchanged(named.found)], target)
+    return other if other.found.all() else whole
+
+
+def by_distance(outlines: Outlines, target: Target) -> Outlines:
+    """Three rims of an image, of which two are found: in other names, if those that they have ask for another distance."""
+    which = missing(outlines.found)
+    if which is None:
+        return outlines
+    off = np.abs([_log_stretch(outlines.ellipses[np.flatnonzero(outlines.found)], unseen, target) for unseen in range(3)])
+    unseen = int(np.argmin(off))
+    if off[which] <= ALIKE or off[unseen] > ALIKE:
+        return outlines
+    order = np.arange(3)
+    order[[which, unseen]] = unseen, which
+    return outlines[order]
+
+
+def _log_stretch(two: Ellipses, unseen: int, target: Target) -> float:
+    """Logarithm of the distance of two discs, by their sizes and tilts, over that of the circles other than `unseen`."""
+    side = np.delete(circle_centres(target)[:, :2], unseen, axis=0)
+    return float(np.log(np.linalg.norm(_untilted(two, target)) / np.linalg.norm(side[1] - side[0])))
+
+
+def _untilted(two: Ellipses, target: Target) -> Array:
+    """The way : (2,) mm from one disc to another on the target, but for a turn, by their mean shape."""
+    return np.linalg.solve(two.shape.mean(axis=0) * 2 / target.outer_diameter_mm, two.centre[1] - two.centre[0])
+
+
 def third(ellipses: Ellipses, which: int, target: Target) -> Ellipses:
     """The ellipse, one, of circle number `which`, from the other two of three; NaN if their distance is another one."""
     places = circle_centres(target)[:, :2]
     a, b = (k for k in range(3) if k != which)
-    shape = (ellipses.shape[a] + ellipses.shape[b]) / 2
-    untilted = np.linalg.solve(shape * 2 / target.outer_diameter_mm, ellipses.centre[b] - ellipses.centre[a])
-    side = places[b] - places[a]
-    if abs(np.log(np.linalg.norm(untilted) / np.linalg.norm(side))) > ALIKE:
+    two = ellipses[np.array([a, b])]
+    if abs(_log_stretch(two, which, target)) > ALIKE:
         return Ellipses(np.full((1, 2), np.nan), np.full((1, 2, 2), np.nan))
+    shape, untilted, side = two.shape.mean(axis=0), _untilted(two, target), places[b] - places[a]
     # the target's y points up, the image's v down: of the two turns the one that mirrors
     angle = np.arctan2(untilted[1], untilted[0]) + np.arctan2(side[1], side[0])
     mirror = np.array([[np.cos(angle), np.sin(angle)], [np.sin(angle), -np.cos(angle)]])
     affine = shape * 2 / target.outer_diameter_mm @ mirror
-    middle = (ellipses.centre[a] + ellipses.centre[b]) / 2
-    centre = middle + affine @ (places[which] - (places[a] + places[b]) / 2)
+    centre = two.centre.mean(axis=0) + affine @ (places[which] - (places[a] + places[b]) / 2)
     return Ellipses(centre[None], shape[None])
 
 
-def alike(again: Outlines, outlines: Outlines, which: int) -> bool:
+def alike(again: Outlines, outlines: Outlines) -> bool:
     """Whether a rim, one, is a ring as the other two of three are: of ink as dark, and with a middle that isn't ink.
 
     A middle that something hides tells nothing else, and a fingertip beside the target, which is round too, must not pass.
@@ -149,8 +251,9 @@ def alike(again: Outlines, outlines: Outlines, which: int) -> bool:
     if not again.found.all():
         return False
     seen_through = again.middle[0] - again.inside[0] > INK * again.contrast[0]
-    return bool(_as_dark(again, outlines, which) and seen_through)
+    return bool(_as_dark(again, outlines) and seen_through)
 
 
-def _as_dark(again: Outlines, outlines: Outlines, which: int) -> bool:
-    return bool(again.depth[0] > STEEP * np.delete(outlines.depth, which).min())
+def _as_dark(again: Outlines, outlines: Outlines) -> bool:
+    """Whether the ink of a rim, one, is as dark as that of those that are found."""
+    return bool(again.depth[0] > STEEP * outlines.depth[outlines.found].min())

@@ -123,7 +123,7 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
     if any(fit.merging for fit in (good[best], *rivals)):
         turn = np.degrees(np.sqrt(np.trace(good[best].total[:3, :3])))
         return lost(f"views that leave the target's turn uncertain by {turn:.1f} deg", good[best].misfit)
-    if any(_distance2(good[best], rival) > SAME for rival in rivals):
+    if not all(same(good[best], rival) for rival in rivals):
         return lost("two poses that the circles seen do not tell apart")
     return good[best]
 
@@ -146,10 +146,10 @@ def _off_shapes(pose: Array, views: Sequence[Sighting], used: Iterable[NDArray[n
     return np.concatenate(off), np.concatenate(sigma)
 
 
-def _distance2(first: TargetPose, second: TargetPose) -> float:
-    """Squared distance of two poses in standard deviations of the first."""
+def same(first: TargetPose, second: TargetPose) -> bool:
+    """Whether two poses are one, within the covariance of the first."""
     off = rigid.difference(first.world_from_target, second.world_from_target)
-    return float(off @ np.linalg.solve(first.total, off))
+    return bool(off @ np.linalg.solve(first.total, off) <= SAME)
 
 
 def aligned(model: Array, points: Array) -> Array:

@@ -38,7 +38,7 @@ CURVED = 0.05  # standard deviations by which the second order may shift a pose 
 RANK = 1e-7  # least ratio of singular values
 SHAPES = 0.005  # of a disc's size: what blur and gradients leave of a shape, one standard deviation
 CENTRE, WHOLE = 2, 5  # numbers of an ellipse: x and y, and these with a, b and c
-STEP = 1e-4  # rad, and mm times a hundred, by which slopes of shapes are found
+STEPS = np.diag([1e-4] * 3 + [1e-2] * 3)  # rad and mm, by which slopes of shapes are found
 
 
 @dataclass(frozen=True)
@@ -246,12 +246,20 @@ def _centre_slopes(view: Sighting, guess: _Guess, circles: Circles, problem: _Pr
 
 
 def _shape_slopes(view: Sighting, guess: _Guess, problem: _Problem) -> Array:
-    """Of the shapes by the unknowns : (n, 3, 6 + k), by differences; a circle's place on the target hardly changes its shape."""
-    slopes = np.zeros((np.count_nonzero(view.seen), 3, PARAMETERS + len(guess.deviations)))
-    for which, step in enumerate((STEP,) * 3 + (100 * STEP,) * 3):
-        way = step * (np.arange(slopes.shape[2]) == which)
-        ahead, behind = (_predicted(view, _moved(guess, side * way), problem) for side in (1, -1))
-        slopes[:, :, which] = (ahead - behind)[:, CENTRE:] / (2 * step)
+    """Of the shapes by the unknowns : (n, 3, 6 + k), by differences; a circle's place on the target hardly changes its shape.
+
+    Circles are moved instead of the pose, all ways at once: turned about their normals they look the same. The slopes of a bowed
+    board, a percent at most, are neglected beside 1.
+    """
+    pose, circles = guess.world_from_target, _placed(guess, problem).some(view.seen)
+    moves = np.concatenate([STEPS, -STEPS]) @ block_diag(pose[:3, :3], pose[:3, :3])  # in the target's axes
+    turns, shifts = moves[:, None, :3], moves[:, None, 3:]
+    centres = circles.centres + np.cross(turns, circles.centres) + shifts
+    planes = circles.slopes + turns[..., [1, 0]] * [-1, 1]
+    ellipses = ellipses_of(view.camera, pose, centres.reshape(-1, 3), circles.radius_mm, planes.reshape(-1, 2))
+    ahead, behind = _numbers(*ellipses)[:, CENTRE:].reshape(2, PARAMETERS, -1, 3)
+    slopes = np.zeros((len(circles.centres), 3, PARAMETERS + len(guess.deviations)))
+    slopes[:, :, :PARAMETERS] = np.moveaxis((ahead - behind) / (2 * np.diag(STEPS)[:, None, None]), 0, 2)
     return slopes
 
 

@@ -4,7 +4,9 @@ The limit by noise is `(n/C) sqrt(2 sqrt(pi) s / (pi R))` px along each axis for
 and radius R: 0.0012 px for n = 1, C = 100, s = 0.6, R = 45. `recon.tracking.rim_fit.rim_model` has the model that is fitted.
 """
 
-from dataclasses import dataclass
+from collections.abc import Container
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +35,24 @@ SHRUNK = 0.3  # of the path, standard deviation of a semi-axis by clipped white;
 UNEVEN = 0.05  # of the contrast: white of a larger spread over the sectors isn't even within one
 BENT_PX = 0.1  # times that share: standard deviation of a centre by uneven white
 LARGEST_BLUR = 0.35  # of the ring's width; beyond that its dark ring is gone
+ELSEWHERE = "not where the others ask for it"
+
+
+class Known(NamedTuple):
+    """Standard deviations of what is known of a rim before it is fitted."""
+
+    place_px: float | Array  # of its centre
+    shape: float  # of its size
+
+    def certainty(self, shapes: Array) -> Array:
+        """Inverse variances : (n, 5) px^-2 of the centres and of the shapes : (n, 2, 2) px."""
+        sigma = np.empty((len(shapes), 5))
+        sigma[:, :2] = np.reshape(self.place_px, (-1, 1))
+        sigma[:, 2:] = self.shape * np.trace(shapes, axis1=1, axis2=2)[:, None] / 2
+        return sigma**-2.0
+
+
+UNKNOWN = Known(np.inf, np.inf)
 
 
 @dataclass(frozen=True)
@@ -75,6 +95,11 @@ class Outlines:
         centres = np.where(self.found[:, None], self.ellipses.centre, np.nan)
         return Sighting(camera, centres, self.covariance, self.ellipses.shape, self.doubtful, self.joint)
 
+    def without(self, which: Container[int]) -> "Outlines":
+        """The same with some rims left out."""
+        reasons = tuple(ELSEWHERE if k in which else reason for k, reason in enumerate(self.reasons))
+        return replace(self, reasons=reasons)
+
     def replaced(self, which: int, other: "Outlines") -> "Outlines":
         """The same, with the one rim of `other` in place of number `which`."""
         order = np.arange(len(self.reasons))
@@ -114,12 +139,14 @@ def measure_both(
     target: Target,
 ) -> Outlines:
     """The same for rings in two frames at once; those of `of_second` : (n,) lie in the second."""
-    return _judged(_fitted(first, second, rough, of_second, reach, np.inf, target), target, middles=True)
+    fits = _fitted(first, second, rough, of_second, reach, UNKNOWN, target)
+    return _judged(fits, np.zeros((len(fits), 5)), target, middles=True)
 
 
-def measure_covered(image: NDArray, rough: Ellipses, reach: float, known: Array, target: Target) -> Outlines:
-    """The same for rings whose middle may be hidden, with the standard deviation : (n,) px of shapes that are known before."""
-    return _judged(_fitted(image, image, rough, np.zeros(len(rough.centre), bool), reach, known, target), target, middles=False)
+def measure_covered(image: NDArray, rough: Ellipses, reach: float, known: Known, target: Target) -> Outlines:
+    """The same for rings whose middle may be hidden, of which something is known before."""
+    fits = _fitted(image, image, rough, np.zeros(len(rough.centre), bool), reach, known, target)
+    return _judged(fits, known.certainty(rough.shape), target, middles=False)
 
 
 def _fitted(
@@ -128,12 +155,13 @@ def _fitted(
     rough: Ellipses,
     of_second: NDArray[np.bool_],
     reach: float | Array,
-    known: float | Array,
+    known: Known,
     target: Target,
 ) -> NDArray:
     kind = np.uint8 if first.dtype == second.dtype == np.uint8 else np.float32
     starts, fits = np.empty(len(rough.centre), START), np.zeros(len(rough.centre), FIT)
-    starts["second"], starts["reach"], starts["sigma"] = of_second, reach, known
+    starts["second"], starts["reach"] = of_second, reach
+    starts["place_sigma"], starts["shape_sigma"] = known.place_px, known.shape * np.trace(rough.shape, axis1=1, axis2=2) / 2
     starts["x"], starts["y"] = rough.centre.T
     starts["a"], starts["b"], starts["c"] = rough.shape[:, 0, 0], rough.shape[:, 0, 1], rough.shape[:, 1, 1]
     for name in set(FIT.names) - {"found"}:
@@ -146,14 +174,26 @@ def _hole(target: Target) -> float:
     return target.inner_diameter_mm / target.outer_diameter_mm
 
 
-def _judged(fits: NDArray, target: Target, middles: bool) -> Outlines:
+def _widened(covariance: Array, times: Array, known: Array) -> Array:
+    """Covariances : (n, 5, 5) px^2 with the image's own part `times` : (n,) as large; what was known before stays as it was.
+
+    known : (n, 5) px^-2, its inverse variances, which are in the covariances.
+    """
+    if not known.any():
+        return covariance * times[:, None, None]
+    before = known[:, :, None] * np.eye(5)
+    return np.linalg.inv((np.linalg.inv(covariance) - before) / times[:, None, None] + before)
+
+
+def _judged(fits: NDArray, known: Array, target: Target, middles: bool) -> Outlines:
+    """Rims by their fits, with the inverse variances : (n, 5) px^-2 of what was known of them before."""
     hole = _hole(target)
     centre = np.stack([fits["x"], fits["y"]], axis=1)
     shape = np.stack([fits["a"], fits["b"], fits["b"], fits["c"]], axis=1).reshape(-1, 2, 2)
     inside, outside, middle, seen, spread = (fits[name] for name in ("inside", "outside", "middle", "seen", "uneven"))
     noise = fits["noise"].max(axis=1, initial=0)
-    joint = fits["covariance"] * np.maximum(fits["excess"], 1)[:, None, None]
-    joint = joint / np.maximum(seen, 0.1)[:, None, None] ** COVERED + FLOOR_PX**2 * np.eye(5)
+    joint = _widened(fits["covariance"], np.maximum(fits["excess"], 1) / np.maximum(seen, 0.1) ** COVERED, known)
+    joint = joint + FLOOR_PX**2 * np.eye(5)
     v0, v1, v2 = fits["variance"].T
     path, direction = np.sqrt(24 * np.hypot(v1, v2)), np.arctan2(v2, v1) / 2
     semi = np.trace(shape, axis1=1, axis2=2) / 2

@@ -23,7 +23,7 @@ from recon.tracking import circle_detector, circle_segmenter, covered_circle, id
 from recon.tracking.frames import grey
 from recon.tracking.identity import Triple
 from recon.tracking.networks import Networks
-from recon.tracking.pose import estimate
+from recon.tracking.pose import estimate, same
 from recon.tracking.pose_fit import Sighting, TargetPose, lost
 from recon.tracking.rims import Outlines, measure, measure_both
 from recon.tracking.views import View
@@ -148,15 +148,18 @@ class Tracker:
         return self._settled(frames, seen, how)
 
     def _settled(self, frames: Frames, seen: tuple[View, View], how: str) -> Tracking:
-        """From two views to the pose; where each shows two circles, by a second look for the third."""
+        """From two views to the pose; where they give none, by a second look for circles that something covers."""
         result = self._posed(seen, how)
-        if not all(view.outlines.found.sum() == 2 for view in seen):
+        if result.found:
             return result
         rims = [view.outlines for view in seen]
-        again = covered_circle.sought_again(frames, rims, self.cameras, self.target, self.optics)
-        judged = [tuple(views.judged(outlines, self.target) for outlines in pair) for pair in again]
-        found = [each for each in (self._posed((one, other), how) for one, other in judged) if each.found]
-        return found[0] if len(found) == 1 else result
+        for choices in covered_circle.sought_again(frames, rims, self.cameras, self.target, self.optics):
+            judged = [tuple(views.judged(outlines, self.target) for outlines in pair) for pair in choices]
+            found = [each for each in (self._posed((one, other), how) for one, other in judged) if each.found]
+            if found:
+                best = min(found, key=_rank)
+                return best if all(same(best.pose, each.pose) for each in found) else result
+        return result
 
     def _posed(self, seen: tuple[View, View], how: str) -> Tracking:
         """From two views to the pose."""
@@ -226,7 +229,9 @@ class Tracker:
     def _seen_at(self, frames: Frames, networks: Networks, k: int, triple: Triple) -> View:
         """View of one camera at predicted places of its three circles."""
         rough = circle_segmenter.rough_ellipses(frames[k], triple.points, networks, self.target)
-        return views.judged(views.renamed(self._view(frames, k, rough, ROUGH_PX), self.target), self.target)
+        rims = measure(frames[k], rough, ROUGH_PX, self.target)
+        rims = covered_circle.named_and_completed(frames[k], rims, self.target)
+        return views.judged(views.renamed(rims, self.target), self.target)
 
     def _view(self, frames: Frames, k: int, rough: Ellipses, reach: float) -> Outlines:
         """Camera k's rims, from three rough ellipses."""

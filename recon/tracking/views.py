@@ -11,11 +11,9 @@ from recon.model.rig import Target
 from recon.tracking import identity
 from recon.tracking.pose import allowed
 from recon.tracking.pose_fit import NAMES
-from recon.tracking.rims import WHOLE, Outlines
+from recon.tracking.rims import ELSEWHERE, WHOLE, Outlines
 
 Array = NDArray[np.float64]
-
-ELSEWHERE = "not where the others ask for it"
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from recon.tracking.rim_fit.sectors import (
 
 BLOCKS = (0, 5, 8, 11, 14)  # first parameter of each common unknown of a sector: edge, plane inside, plane outside, variance
 GLOBAL = 14  # parameters, in the order of `Rim`
-SHAPE = (2, 3, 4)  # parameters a, b, c
+SHAPE, ELLIPSE = 2, 5  # the first of the parameters a, b, c, and that after them
 DARK_X, DARK_Y, BRIGHT_X, BRIGHT_Y, VARIANCE_COS, VARIANCE_SIN = 6, 7, 9, 10, 12, 13  # parameters
 CAPTURE_STEPS = 8  # on every second pixel of every second row, from a rough ellipse
 STEPS = 8  # on all pixels
@@ -54,7 +54,7 @@ START = np.dtype([
     ("x", float), ("y", float),  # px, the centre
     ("a", float), ("b", float), ("c", float),  # px, the shape (a b; b c)
     ("reach", float),  # px, largest error of the rough rim
-    ("sigma", float),  # px, standard deviation of the shape if that is known before, else inf
+    ("place_sigma", float), ("shape_sigma", float),  # px, standard deviations of what is known of the rim before, else inf
 ], align=True)  # fmt: skip
 """A rough rim to start from."""
 
@@ -75,12 +75,15 @@ FIT = np.dtype([
 
 
 class Prior(NamedTuple):
-    """The shape before the fit and its standard deviation, px."""
+    """Centre and shape before the fit, and their standard deviations, px."""
 
+    x: float
+    y: float
     a: float
     b: float
     c: float
-    sigma: float
+    place_sigma: float
+    shape_sigma: float
 
 
 def fit_rims(first: NDArray, second: NDArray, starts: NDArray, hole: float, fits: NDArray) -> None:
@@ -104,7 +107,7 @@ def _fit(image, starts, i, hole, fits):
     rim = Rim(start.x, start.y, start.a, start.b, start.c, level, 0.0, 0.0, level, 0.0, 0.0, variance, 0.0, 0.0)
     if not plausible(rim, image.shape):
         return
-    prior = Prior(rim.a, rim.b, rim.c, start.sigma)
+    prior = Prior(rim.x, rim.y, rim.a, rim.b, rim.c, start.place_sigma, start.shape_sigma)
     found, rim, noise = first_levels(image, rim, reach, hole)
     if not found:
         return
@@ -206,10 +209,10 @@ def _solve(reduced, weights, slopes, rim: Rim, prior: Prior, step, inverse):
     for p in range(GLOBAL):
         for q in range(p):
             normal[p, q] = normal[q, p]
-    back = (prior.a - rim.a, prior.b - rim.b, prior.c - rim.c)
-    for k in range(3):
-        normal[SHAPE[k], SHAPE[k]] += 1 / prior.sigma**2
-        right[SHAPE[k]] += back[k] / prior.sigma**2
+    for k in range(ELLIPSE):
+        hold = 1 / (prior.place_sigma if k < SHAPE else prior.shape_sigma) ** 2
+        normal[k, k] += hold
+        right[k] += hold * (prior[k] - rim[k])
     level = (rim.bright - rim.dark) ** 2 + 1
     for k in (DARK_X, DARK_Y, BRIGHT_X, BRIGHT_Y):  # light hardly doubles from one side of a ring to the other
         normal[k, k] += 4 / level

@@ -376,6 +376,25 @@ def test_whole_ellipses_of_two_circles_a_view_determine_the_pose(cameras, target
         assert abs(np.mean(values) - freedom) < 4 * np.sqrt(2 * freedom / POSES)
 
 
+@pytest.mark.parametrize(("bow_per_m", "most"), [((0.0, 0.0, 0.0), 1e-6), ((0.3, -0.2, 0.4), 0.02)])
+def test_slopes_of_shapes_are_those_of_a_pose_that_is_moved(cameras, target, rng, bow_per_m, most):
+    """Against moving the pose itself, one way after the other; a board's slope of 1 % is neglected beside 1."""
+    bowed = target.model_copy(update={"curvature_per_m": bow_per_m})
+    problem = pose_fit._Problem([], np.eye(1), circle_layout.circles(bowed), circle_layout.deviations(bowed))
+    for _ in range(5):
+        true = drawings.facing(rng)
+        view = seen(cameras, target, true)[0].without(rng.integers(3)).by_shapes()
+        guess = pose_fit._Guess(true, np.zeros(problem.by_deviation.shape[2]))
+        for k, fast in enumerate(np.moveaxis(pose_fit._shape_slopes(view, guess, problem), 2, 0)[:6]):
+            way = pose_fit.STEPS[k]
+            ahead, behind = (
+                pose_fit._predicted(view, guess._replace(world_from_target=rigid.moved(true, side * way)), problem)[:, 2:]
+                for side in (1, -1)
+            )
+            size = 1.0 if k < 3 else 0.001  # of a disc, or of its change by 1 mm
+            assert np.abs((ahead - behind) / (2 * way[k]) - fast).max() < most * size * np.trace(view.shapes[0]) / 2
+
+
 def test_nonsense_is_not_found(cameras, target):
     view = Sighting(cameras[0], np.full((3, 2), np.nan), np.tile(np.eye(2), (3, 1, 1)))
     assert not pose.estimate(view, replace(view, camera=cameras[1]), target).found

@@ -102,6 +102,14 @@ def test_two_candidates_a_view_are_enough(cameras, rig, pair, left_out):
     assert found.found and off_mm(found) < 0.05, found.pose.reason
 
 
+@pytest.mark.parametrize(("seen", "names"), [([0, 2], [0, 1]), ([0, 1], [1, 0]), ([1, 2], [2, 1]), ([0, 2], [1, 0])])
+def test_two_candidates_under_wrong_names_are_enough(cameras, rig, pair, seen, names):
+    """Their distance tells which two they are, and the third where it is seen the end."""
+    told = Told([centres(camera, FACING, rig.target)[seen] for camera in cameras], names=names)
+    found = Tracker(cameras, rig.target, told).step(*pair)
+    assert found.found and off_mm(found) < 0.05, found.pose.reason
+
+
 def test_one_view_is_enough_to_detect_it(cameras, rig, pair):
     """It tells where to look in the other."""
     places = [centres(camera, FACING, rig.target) for camera in cameras]

@@ -33,8 +33,8 @@ def jacobian(geometry):
     return result
 
 
-@pytest.mark.parametrize("sigma", [0.3, np.inf])
-def test_the_step_is_that_of_a_dense_solution(rng, sigma):
+@pytest.mark.parametrize(("place", "sigma"), [(np.inf, 0.3), (0.2, 0.3), (np.inf, np.inf)])
+def test_the_step_is_that_of_a_dense_solution(rng, place, sigma):
     geometry = sectors.geometry(RIM, 0.0, 0.4)
     root = rng.normal(0, 5, (SECTORS, COMMON, COMMON))
     normal, right = root @ root.transpose(0, 2, 1), rng.normal(0, 10, (SECTORS, COMMON))
@@ -43,15 +43,15 @@ def test_the_step_is_that_of_a_dense_solution(rng, sigma):
     rim_model._slopes(geometry, slopes)
     reduced = np.zeros(SECTORS, REDUCED)
     reduced["normal"], reduced["right"] = normal, right
-    prior = Prior(RIM.a + 0.5, RIM.b - 0.2, RIM.c + 0.1, sigma)
+    prior = Prior(RIM.x - 0.3, RIM.y + 0.4, RIM.a + 0.5, RIM.b - 0.2, RIM.c + 0.1, place, sigma)
     assert rim_model._solve(reduced, weights, slopes, RIM, prior, step, inverse)
 
     chain = jacobian(geometry)
     whole = np.einsum("j,jmp,jmn,jnq->pq", weights, chain, normal, chain)
     side = np.einsum("j,jmp,jm->p", weights, chain, right)
-    for k, back in ((2, 0.5), (3, -0.2), (4, 0.1)):  # the shape is known before
-        whole[k, k] += sigma**-2
-        side[k] += back * sigma**-2
+    for k, back, known in ((0, -0.3, place), (1, 0.4, place), (2, 0.5, sigma), (3, -0.2, sigma), (4, 0.1, sigma)):  # before
+        whole[k, k] += known**-2
+        side[k] += back * known**-2
     for k, gradient in ((6, RIM.dark_x), (7, RIM.dark_y), (9, RIM.bright_x), (10, RIM.bright_y)):  # light is nearly even
         whole[k, k] += 4 / ((RIM.bright - RIM.dark) ** 2 + 1)
         side[k] -= gradient * 4 / ((RIM.bright - RIM.dark) ** 2 + 1)
@@ -64,7 +64,7 @@ def test_an_undetermined_step_is_refused():
     broken = np.zeros(SECTORS, REDUCED)
     broken["normal"][:, 0, 0] = np.nan
     step, inverse, slopes = np.zeros(GLOBAL), np.zeros((GLOBAL, GLOBAL)), np.ones((SECTORS, GLOBAL))
-    prior = Prior(RIM.a, RIM.b, RIM.c, np.inf)
+    prior = Prior(*RIM[:5], np.inf, np.inf)
     assert not rim_model._solve(broken, np.ones(SECTORS), slopes, RIM, prior, step, inverse)
 
 
