@@ -18,6 +18,7 @@ OLDEST_PYTHON = (3, 11)
 EXTRAS = ("twin", "train", "dev", "docs")
 MODULES = {  # where a package isn't imported by the name that it is installed by
     "hydra-core": "hydra",
+    "import-linter": "importlinter",
     "lightning-fabric": "lightning_fabric",
     "myst-parser": "myst_parser",
     "opencv-contrib-python-headless": "cv2",

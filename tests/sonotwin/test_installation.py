@@ -27,9 +27,10 @@ def test_requirements_are_those_of_the_project():
 
 
 def test_this_installation_is_sound(capsys):
-    """The tests run in it, so its core is."""
+    """The tests run in it, so its core is, and what is installed can be imported."""
     assert cli.main(["doctor"]) == 0
-    assert "numpy" in capsys.readouterr().out
+    found = capsys.readouterr().out
+    assert "numpy" in found and "can't be imported" not in found
 
 
 def test_a_bad_llvm_is_caught_before_it_ends_the_process(tmp_path, monkeypatch, capsys):
