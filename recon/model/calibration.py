@@ -8,6 +8,7 @@ import numpy as np
 from recon.geometry import camera_jacobian
 from recon.geometry.camera import Array, Camera
 
+DRIFT_PX = 0.05  # usual standard deviation of cameras' principal points since their calibration
 WORLD = "cam1"  # the device whose frame the world is: it has no pose
 
 

@@ -21,7 +21,7 @@ from recon.capture import stereo_frames, target_files
 from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
-from recon.model.calibration import with_drift
+from recon.model.calibration import DRIFT_PX, with_drift
 from recon.model.rig import Rig
 from recon.target_calibration import target_bundle, target_figures, target_poses
 from recon.target_calibration.target_poses import Seen
@@ -41,7 +41,7 @@ class Config(BaseModel):
     capture: Path
     out: Path
     calibration: Path | None = None
-    drift_px: Annotated[float, Field(ge=0, le=10)] = 0.05
+    drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
     networks: Path | None = None
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
     most_poses: Annotated[int, Field(ge=target_poses.LEAST, le=10_000)] = 100

@@ -29,7 +29,7 @@ from recon.capture import stereo_frames, target_files
 from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
-from recon.model.calibration import with_drift
+from recon.model.calibration import DRIFT_PX, with_drift
 from recon.model.rig import Rig
 from recon.tracking import networks, results, track_figures
 from recon.tracking.results import Step
@@ -45,7 +45,7 @@ class Config(BaseModel):
     capture: Path
     out: Path
     calibration: Path | None = None
-    drift_px: Annotated[float, Field(ge=0, le=10)] = 0.05
+    drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
     target: Path | None = None
     networks: Path | None = None
     threads: Annotated[int, Field(ge=0, le=1024)] = 0

@@ -7,6 +7,8 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.capture.manifest import CAMERAS
+from recon.model.calibration import DRIFT_PX, with_drift
 from recon.model.rig import Target
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
@@ -71,10 +73,11 @@ def sharp_and_lit(view: Seen) -> bool:
 
 
 def scored(samples: Iterable[tuple[Take, Frames]], target: Target, networks: Networks) -> Iterable[Seen]:
-    """Track each sample as if nothing were known before, and score both views."""
+    """Track each sample as if nothing were known before, with the usual allowance for drift, and score both views."""
+    drift = with_drift(None, CAMERAS, DRIFT_PX)
     for take, given in samples:
         first, second = (device.optics.camera() for device in take.cameras)
-        result = Tracker((first, second), target, networks).step(*given.views)
+        result = Tracker((first, second), target, networks, optics=drift).step(*given.views)
         for view, truth in zip(result.views, given.truth, strict=True):
             yield score(view, truth, take.present)
 
