@@ -23,7 +23,8 @@ from recon.model.rig import Rig
 from scenes import board_poses
 from scenes.kinds import board
 from scenes.scene_types import Scene, Thing
-from twin.optics.conditions import IDEAL, Conditions, draw, emitted, flexed, printed_board, with_stray
+from twin.conditions import IDEAL, Conditions, draw, flexed, printed_board
+from twin.optics.disturbed_light import emitted, with_stray
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, Images, meets_something, render_pixels
 from twin.optics.printed_edges import compute_edges

@@ -16,7 +16,7 @@ WAVES = 32  # of evenly spread frequencies, which make up the process
 
 @dataclass(frozen=True)
 class Tremor:
-    """Six processes over time: a turn (rad) about the world's axes, and a shift (mm) along them."""
+    """Six processes over time: a turn (rad) about three axes, and a shift (mm) along them."""
 
     hz: Array  # (WAVES,)
     cosines: Array  # (6, WAVES)

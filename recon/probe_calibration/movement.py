@@ -44,7 +44,7 @@ class Movement:
 
     what: str  # PROBE or WIRES
     growth: Array  # (6,) rad and mm of the probe's pose, or (3,) mm of the wires' place: half of the movement
-    chance: float  # of so much less residuals by noise alone, whatever the course
+    log_chance: float  # of so much less residuals by noise alone, in any of the trials
     evidence: float  # logarithm of the likelihood, less Schwarz's penalty
     frames: Mask  # (n,) that it was estimated from
 
@@ -57,6 +57,11 @@ class Movement:
             return f"the probe moved against its target by {by} between the first frame and the last: {cause}"
         cause = "wires that sag or slip, or a tank that was pushed"
         return f"the crossing moved by {self.shift_mm:.2f} mm between the first frame and the last: {cause}"
+
+    @property
+    def chance(self) -> float:
+        """Of so much less residuals by noise alone, whatever kind and course."""
+        return float(np.exp(min(self.log_chance, 0.0)))
 
     @property
     def shift_mm(self) -> float:
@@ -75,21 +80,20 @@ def find(equations: Equations, used: Mask) -> Movement | None:
     used : (n,) frames that aren't outliers. Those of a whole end of the session may be right, and after a sudden movement.
     """
     courses = list(_courses(used))
-    best = [found for what in (PROBE, WIRES) if (found := _likeliest(equations, what, courses, used)) is not None]
-    if len(best) < 2:
-        return None
-    probe, wires = best
+    kinds = [found for what in (PROBE, WIRES) if (found := _likeliest(equations, what, courses, used)) is not None]
+    if len(kinds) < 2:
+        return kinds[0] if kinds else None
+    probe, wires = kinds
     same = (probe.frames == wires.frames).all()
     likelier = wires.evidence - CAUTION > probe.evidence if same else wires.frames.sum() > probe.frames.sum()
-    found = wires if likelier else probe
-    return found if found.chance < CHANCE else None
+    return wires if likelier else probe
 
 
 def _likeliest(equations: Equations, what: str, courses: list[tuple[Array, Mask]], used: Mask) -> Movement | None:
-    """Of one kind, over all courses; one that isn't sure only if it is even, as few frames leave a sudden one open."""
-    even, *sudden = (_fitted(equations, what, course, frames, used, len(courses)) for course, frames in courses)
-    sure = [one for one in sudden if one is not None and one.chance < CHANCE]
-    return min(sure if even is None else [even, *sure], key=lambda one: one.chance, default=None)
+    """Of one kind, over all courses; None where noise may be all."""
+    fits = (_fitted(equations, what, course, frames, used, 2 * len(courses)) for course, frames in courses)
+    sure = [one for one in fits if one is not None and one.chance < CHANCE]
+    return min(sure, key=lambda one: one.log_chance, default=None)
 
 
 def _courses(used: Mask) -> Iterator[tuple[Array, Mask]]:
@@ -107,8 +111,8 @@ def _courses(used: Mask) -> Iterator[tuple[Array, Mask]]:
             yield np.where(after, 1.0, -1.0), frames
 
 
-def _fitted(equations: Equations, what: str, course: Array, frames: Mask, used: Mask, courses: int) -> Movement | None:
-    """The movement by least squares, and the chance of as good a fit by noise in any of some courses."""
+def _fitted(equations: Equations, what: str, course: Array, frames: Mask, used: Mask, trials: int) -> Movement | None:
+    """The movement by least squares, and the chance of as good a fit by noise in any of some trials."""
     which = equations.by_probe if what == PROBE else equations.by_wires
     slopes, left = equations.slopes[frames], equations.residuals[frames].ravel()
     moving = np.concatenate([slopes, course[frames][:, None, None] * slopes[:, :, which]], axis=2)
@@ -124,7 +128,7 @@ def _fitted(equations: Equations, what: str, course: Array, frames: Mask, used: 
     return Movement(
         what,
         growth=-solution[g:],
-        chance=min(courses * float(f_distribution.sf((before - after) / more / (after / freedom), more, freedom)), 1.0),
+        log_chance=float(np.log(trials) + f_distribution.logsf((before - after) / more / (after / freedom), more, freedom)),
         evidence=-(3 * n * np.log(after) + moving.shape[1] * np.log(3 * n)) / 2,
         frames=frames,
     )

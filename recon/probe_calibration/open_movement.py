@@ -25,7 +25,7 @@ STILL, GIVES, SLIP = 0.25, 0.5, 0.25  # probability beforehand that nothing move
 # a bracket that carries a probe by hand gives more often than not, and does harm later
 EVEN = 0.5  # probability beforehand that a movement is even; else it is sudden, after any frame
 LEAST, LARGEST = 0.03, 1.0  # mm and deg along each axis, of half of a movement: less is lost in noise, more is refused
-SIZES = np.geomspace(LEAST, LARGEST, 16)  # times the noise factor; all as likely beforehand, so that no magnitude is preferred
+SIZES = np.geomspace(LEAST, LARGEST, 16)  # all as likely beforehand, so that no magnitude is preferred
 PROPORTIONS = np.diag([*np.radians(np.ones(3)), *np.ones(3)])  # rad and mm of the probe's turn and shift: 1 deg to 1 mm
 NO_NOISE = 1e-12  # sum of squares of residuals that are none
 
@@ -52,7 +52,7 @@ class Outcomes(NamedTuple):
     covariances: Array  # (s, g, g), with the movement of the probe
 
 
-def adjusted(equations: Equations, used: Mask, frames: Mask) -> tuple[Array, Array]:
+def adjusted(equations: Equations, used: Mask, frames: Mask, noise: float = 1.0) -> tuple[Array, Array]:
     """Parameters and their covariance over all movements.
 
     Parameters
@@ -61,6 +61,8 @@ def adjusted(equations: Equations, used: Mask, frames: Mask) -> tuple[Array, Arr
         Frames whose least squares the equations' solution is.
     frames : (n,)
         Frames to adjust: these, and others that are as right if something moved.
+    noise : float
+        Standard deviation of the equations' residuals, roughly: the sizes are in units of the noise.
 
     Returns
     -------
@@ -74,7 +76,7 @@ def adjusted(equations: Equations, used: Mask, frames: Mask) -> tuple[Array, Arr
     probe[equations.by_probe], wires[equations.by_wires] = PROPORTIONS, np.eye(3)
     still = _outcomes(rigid, rigid.slopes @ probe, probe, np.zeros(1), STILL)
     moving = [
-        _outcomes(rigid, np.repeat(course, 3)[:, None] * (rigid.slopes @ by), at_ends, SIZES, chance * share)
+        _outcomes(rigid, np.repeat(course, 3)[:, None] * (rigid.slopes @ by), at_ends, SIZES / noise, chance * share)
         for course, share in _courses(frames)
         for by, at_ends, chance in ((probe, probe, GIVES), (wires, 0 * wires, SLIP))
     ]
@@ -110,6 +112,7 @@ def _outcomes(rigid: Rigid, moving: Array, at_ends: Array, sizes: Array, chance:
     """
     pull = rigid.inverse @ rigid.slopes.T @ moving  # of rigid parameters, by the movement
     shown, axes = np.linalg.eigh(moving.T @ (moving - rigid.slopes @ pull))
+    shown = np.maximum(shown, 0)  # rounding may make it less
     along = -axes.T @ moving.T @ rigid.left
     ratio = sizes[:, None] ** 2 / (1 + sizes[:, None] ** 2 * shown)  # (s, m) of the movement's variance to the noise's
     rest = np.maximum(rigid.left @ rigid.left - ratio @ along**2, NO_NOISE)

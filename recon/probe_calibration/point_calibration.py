@@ -172,7 +172,7 @@ def calibrate(
     equations = Equations(slopes[..., : len(known)], left, PROBE, WIRE, known)
     moved = movement.find(equations, inliers)
     solved, inliers = inliers, inliers if moved is None else moved.frames
-    step, whole = open_movement.adjusted(equations, solved, inliers)
+    step, whole = open_movement.adjusted(equations, solved, inliers, factor)
     estimate = estimate.moved(np.pad(step, (0, 12 - len(known))))
     probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
     try:

@@ -59,7 +59,10 @@ def measure(frames: CrossingFrames, result: Result, design: Probe, settings: Set
 
 
 def compare(calibration: ProbeCalibration, earlier: ProbeCalibration) -> Metrics:
-    """Figures of the probe's movement against its target since an earlier calibration, both for sound of one speed."""
+    """Figures of the probe's movement against its target since an earlier calibration, both for sound of one speed.
+
+    `since_chance`, of as much by what both leave open, is NaN where the earlier one has no covariance.
+    """
     before = sound_in_water.for_tissue(earlier, calibration.speed_m_s)
     step = rigid.difference(before.target_from_image, calibration.target_from_image)
     covariance = sum((_of_pose(each) for each in (before, calibration)), np.zeros((6, 6)))
@@ -67,7 +70,7 @@ def compare(calibration: ProbeCalibration, earlier: ProbeCalibration) -> Metrics
     return {
         "since_turn_deg": float(np.degrees(np.linalg.norm(step[:3]))),
         "since_shift_mm": float(np.linalg.norm(step[3:])),
-        "since_chance": float(chdtrc(len(step), squared)),
+        "since_chance": np.nan if earlier.uncertainty is None else float(chdtrc(len(step), squared)),
     }
 
 
@@ -117,6 +120,8 @@ def describe(frames: CrossingFrames, found: Adjustment, figures: Metrics, design
 def describe_comparison(figures: Metrics, earlier: object) -> str:
     """One line: whether the probe is where an earlier calibration had it."""
     by = f"{figures['since_turn_deg']:.2f} deg and {figures['since_shift_mm']:.2f} mm"
+    if np.isnan(figures["since_chance"]):
+        return f"earlier     {by} from {earlier}, which has no covariance to judge that by"
     if figures["since_chance"] > movement.CHANCE:
         return f"earlier     as in {earlier}: {by} from it, within what both calibrations leave open"
     return f"warning     the probe moved against its target by {by} since {earlier}: a bent bracket, or a target that slipped"

@@ -1,8 +1,8 @@
 """Uncertainty of a mass's place and volume by what all its B-scans share: the probe's calibration and the speeds of sound.
 
 The eight parameters of the calibration move every B-scan, and with them the border that they show; where several B-scans show a
-point, it moves by the mean of theirs. Another speed in the tissue scales the depths of all that lies above a mass, and so moves
-it along the beam. Its extent along the beam depends on the speed within, by which the border behind is placed
+point, it moves by the mean of theirs. Another speed in the tissue scales the depths of all that lies above a mass, so its front
+and all of it move along the beam. Its extent along the beam depends on the speed within, by which the border behind is placed
 (`recon.segmentation.refraction`). Refraction at its sides, which another speed changes too, is left out.
 """
 
@@ -26,45 +26,45 @@ NEAR_MM = 1.0  # of a B-scan's plane: a point there is shown by it
 
 
 class Sigma(NamedTuple):
-    """Standard deviations of a mass's place and volume; of the calibration's part NaN where its covariance isn't known."""
+    """Standard deviations of a mass's place and volume; NaN where the calibration's covariance isn't known."""
 
     centre_mm: float  # as a distance in space
     volume_mm3: float
 
 
-def by_calibration(mass: Mass, scans: Scans) -> Sigma:
-    """To first order in the errors of the calibration."""
-    if scans.probe is None or scans.probe.uncertainty is None:
+def by_all(mass: Mass, scans: Scans, tissue: float, within: float) -> Sigma:
+    """By the calibration and the speeds of sound, see `by_speeds`, which err independently."""
+    slopes = point_slopes(np.asarray(mass.mesh.vertices), scans)
+    known = None if scans.probe is None else scans.probe.uncertainty
+    return Sigma(*np.hypot(by_calibration(mass, slopes, known), by_speeds(mass, slopes, tissue, within)).tolist())
+
+
+def by_calibration(mass: Mass, slopes: Array, known: Uncertainty | None) -> Sigma:
+    """To first order in the errors of the calibration; slopes : (n, 3, 9) of the mesh's vertices, as of `point_slopes`."""
+    if known is None:
         return Sigma(np.nan, np.nan)
-    known = scans.probe.uncertainty
-    moved = _at_faces(mass, point_slopes(np.asarray(mass.mesh.vertices), scans))[..., _order(known)]
+    moved = _at_faces(mass, slopes)[..., _order(known)]
     centre, volume = _centre_slopes(mass, moved), _volume_slopes(mass, moved)
     return Sigma(
         float(np.sqrt(np.trace(centre @ known.covariance @ centre.T))), float(np.sqrt(volume @ known.covariance @ volume))
     )
 
 
-def by_speeds(mass: Mass, scans: Scans, tissue: float, within: float) -> Sigma:
-    """To first order in the speeds of sound.
+def by_speeds(mass: Mass, slopes: Array, tissue: float, within: float) -> Sigma:
+    """To first order in the speeds of sound: the tissue's moves the front, that within the border behind.
 
     tissue, within : standard deviations of the speeds in the tissue and in the mass, relative.
     """
-    deeper = point_slopes(np.asarray(mass.mesh.vertices), scans)[..., [DEPTH]]
-    centre = _centre_slopes(mass, _at_faces(mass, deeper))[:, 0]
-    extent = np.ptp(np.asarray(mass.mesh.vertices) @ (centre / np.linalg.norm(centre)))
-    return Sigma(float(np.hypot(tissue * np.linalg.norm(centre), within * extent / 2)), within * mass.volume)
-
-
-def together(*parts: Sigma) -> Sigma:
-    """Of independent errors; a part that isn't known is left out."""
-    squares = np.nansum(np.square(parts), axis=0)
-    return Sigma(*np.where(np.isnan(parts).all(axis=0), np.nan, np.sqrt(squares)).tolist())
+    deeper = _centre_slopes(mass, _at_faces(mass, slopes[..., [DEPTH]]))[:, 0]
+    depth = np.linalg.norm(deeper)
+    half = np.ptp(np.asarray(mass.mesh.vertices) @ (deeper / depth)) / 2
+    return Sigma(float(np.hypot(tissue * (depth - half), within * half)), within * mass.volume)
 
 
 def point_slopes(points: Array, scans: Scans) -> Array:
     """Derivatives : (n, 3, 9) of points : (n, 3) mm by NAMES' parameters, zero without a probe, and by the ratio of all depths.
 
-    A point that no B-scan shows moves as in the B-scan next to it.
+    A point that no B-scan shows moves as in the B-scan nearest to it.
     """
     size, probe = np.array(scans.shape[::-1]), scans.probe
     total, count = np.zeros((len(points), 3, DEPTH + 1)), np.zeros(len(points))
@@ -72,8 +72,9 @@ def point_slopes(points: Array, scans: Scans) -> Array:
     for world_from_pixel in scans.world_from_pixel[np.isfinite(scans.world_from_pixel).all(axis=(1, 2))]:
         local = rigid.apply(np.linalg.inv(world_from_pixel), points)
         away = np.abs(local[:, 2]) * np.linalg.norm(world_from_pixel[:3, 2])
-        inside = ((local[:, :2] > -0.5) & (local[:, :2] < size - 0.5)).all(axis=1)
-        shown, closer = inside & (away < NEAR_MM), inside & (away < nearest)
+        beside = np.maximum(np.maximum(-0.5 - local[:, :2], local[:, :2] - (size - 0.5)), 0)
+        away = np.hypot(away, np.linalg.norm(beside * np.linalg.norm(world_from_pixel[:3, :2], axis=0), axis=1))
+        shown, closer = (beside == 0).all(axis=1) & (away < NEAR_MM), away < nearest
         slopes = np.zeros_like(total)
         slopes[..., DEPTH] = local[:, 1:2] * world_from_pixel[:3, 1]
         if probe is not None:

@@ -61,10 +61,7 @@ def find_masses(
     lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {NONE_FOUND}"])]
     containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
     for number, (mass, under) in enumerate(zip(found, containments, strict=True)):
-        sigma = mass_uncertainty.together(
-            mass_uncertainty.by_calibration(mass, scans),
-            mass_uncertainty.by_speeds(mass, scans, speed_sigmas[0] / scans.speed_m_s, speed_sigmas[1] / mass_m_s),
-        )
+        sigma = mass_uncertainty.by_all(mass, scans, speed_sigmas[0] / scans.speed_m_s, speed_sigmas[1] / mass_m_s)
         figures |= measure(f"mass{number}", mass, sigma, under)
         lines.append(f"mass{number}       {describe(mass, sigma, under)}")
     drawn = scan_overlays.of_masks(scans.stream(), masses.shown(found, placed, scans.shape, sound), overlays)

@@ -41,7 +41,7 @@ SHAPE_AGAIN = 0.003  # the same of a pose by some circles of both views
 SEEN_AGAIN = 0.5  # of a rim that is found so: with less, another thing's edge was taken for it, half a turn from the target
 FEWEST = 3  # rims that determine a pose by whole ellipses: two of one view, one of the other
 ENOUGH = 5  # rims by which it is the target: three of one view, two of the other
-TRIALS = 16  # choices of rims that are tried at most
+TRIALS = 16  # choices of rims, after which no fewer rims are tried
 INK = 0.15  # of a ring's contrast: a middle that is no brighter is ink, and this a black disc
 
 
@@ -96,10 +96,14 @@ def _number(pair: Sequence[Outlines]) -> int:
 
 
 def _counted(pair: Sequence[Outlines]) -> list[list[Outlines]]:
-    """Choices of the rims that count, most first: those of which the whole is seen, and each selection of the others."""
+    """Choices of the rims that count, most first: those of which the whole is seen, and each selection of the others.
+
+    All selections of as many rims are tried or none, so that a rival of what is found isn't missed.
+    """
     choices = [list(choice) for choice in product(*(list(_fewer(outlines)) for outlines in pair))]
-    several = [choice for choice in choices if FEWEST <= _number(choice) < 2 * len(NAMES)]
-    return sorted(several, key=_number, reverse=True)[:TRIALS]
+    several = sorted((choice for choice in choices if FEWEST <= _number(choice) < 2 * len(NAMES)), key=_number, reverse=True)
+    fewest = _number(several[min(TRIALS, len(several)) - 1]) if several else FEWEST
+    return [choice for choice in several if _number(choice) >= fewest]
 
 
 def _fewer(outlines: Outlines) -> Iterator[Outlines]:

@@ -21,7 +21,7 @@ from recon.errors import InputError
 from recon.model.rig import Rig
 from sonotwin.config import folder
 from twin.accuracy import table_rows
-from twin.optics.conditions import Conditions
+from twin.conditions import Conditions
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 

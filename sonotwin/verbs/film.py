@@ -24,7 +24,7 @@ from rich.progress import Progress
 from recon.capture.manifest import CAMERAS
 from recon.model.rig import Rig
 from sonotwin.config import folder as conf
-from twin.optics.conditions import Conditions, drifted, printed
+from twin.conditions import Conditions, drifted, printed
 from twin.session import Session
 from twin.tracking import film_session
 from twin.tracking.rendered_views import Frames, Quality

@@ -29,8 +29,8 @@ from recon.model.rig import Rig
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene, parse_scene
 from twin import board_session
+from twin.conditions import IDEAL, Conditions, check_board, drifted
 from twin.optics import surface_session
-from twin.optics.conditions import IDEAL, Conditions, check_board, drifted
 from twin.optics.light_transport import Engine
 from twin.session import Session
 

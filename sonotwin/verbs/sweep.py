@@ -25,7 +25,7 @@ from rich.progress import Progress
 from recon.capture.manifest import SCANNER
 from recon.model.rig import Rig
 from scenes.catalogue import build_scene
-from twin.optics.conditions import Conditions
+from twin.conditions import Conditions
 from twin.session import Session
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import Scan, scans

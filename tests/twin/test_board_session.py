@@ -20,7 +20,7 @@ from scenes import board_poses
 from scenes.kinds import board
 from twin import board_session
 from twin.board_session import Settings
-from twin.optics.conditions import BoardPrint, Conditions
+from twin.conditions import BoardPrint, Conditions
 from twin.optics.light_transport import Engine, render
 from twin.optics.printed_edges import compute_edges
 from twin.optics.ray_world import is_convex

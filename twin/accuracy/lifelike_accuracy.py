@@ -24,8 +24,8 @@ from twin.accuracy.board_sets import BoardSet, drawn, rendered
 from twin.accuracy.plane_and_sphere import Measured, as_published, conditions_of, measured
 from twin.accuracy.surface_accuracy import Experiment
 from twin.accuracy.table_rows import Measurement, Row, Setup
+from twin.conditions import BoardPrint, drifted, flexed, printed_board
 from twin.evaluation.surface_errors import rms
-from twin.optics.conditions import BoardPrint, drifted, flexed, printed_board
 from twin.optics.surface_session import Shooting, calibration_of
 
 Array = NDArray[np.float64]

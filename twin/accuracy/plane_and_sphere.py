@@ -12,9 +12,9 @@ from recon.structured_light.surface_mesh import clean
 from recon.structured_light.triangulate import triangulate
 from twin.accuracy.surface_accuracy import Experiment
 from twin.accuracy.table_rows import Setup
+from twin.conditions import Conditions
 from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import rms
-from twin.optics.conditions import Conditions
 
 Array = NDArray[np.float64]
 

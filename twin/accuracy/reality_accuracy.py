@@ -13,8 +13,8 @@ from scenes.scene_types import Scene
 from twin.accuracy import detection_rates, sound_reality, target_accuracy, tracking_frames
 from twin.accuracy.surface_accuracy import experiment, relief_noise_ratio
 from twin.accuracy.table_rows import Measurement, Row, Setup
+from twin.conditions import Conditions, Frames, Skin
 from twin.evaluation.surface_errors import rms
-from twin.optics.conditions import Conditions, Frames, Skin
 from twin.optics.surface_session import Shooting
 
 SEEDS = range(100, 110)  # of conditions that nothing was tried on

@@ -16,9 +16,9 @@ from scenes.catalogue import build_scene
 from scenes.kinds import plane
 from scenes.scene_types import Scene
 from twin.accuracy.table_rows import Measurement, Row, Setup
+from twin.conditions import IDEAL, Conditions
 from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import Comparison, Metrics, Truth
-from twin.optics.conditions import IDEAL, Conditions
 from twin.optics.light_transport import Engine
 from twin.optics.ray_world import visible
 from twin.optics.surface_session import Shooting, View, calibration_of, shoot

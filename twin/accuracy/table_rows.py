@@ -13,7 +13,7 @@ from recon.errors import InputError
 from recon.files import atomic
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
-from twin.optics.conditions import Conditions
+from twin.conditions import Conditions
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 

@@ -59,14 +59,14 @@ def visible(scene: Scene) -> list[Thing]:
 def to_shape(thing: Thing) -> mi.Shape:
     """One thing as a shape with its material: an exact sphere where it is one, else its mesh."""
     bsdf = mi.load_dict(to_bsdf(thing.material, thing.albedo is not None, thing.wet is not None))
-    if isinstance(thing.primitive, Sphere):
+    varied = thing.albedo is not None or thing.wet is not None
+    if isinstance(thing.primitive, Sphere) and not varied:
         center = [float(value) for value in thing.primitive.centre]
         return mi.load_dict({"type": "sphere", "center": center, "radius": float(thing.primitive.radius), "bsdf": bsdf})
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     properties["face_normals"] = not thing.smooth
     vertices, faces = np.float32(thing.mesh.vertices), np.uint32(thing.mesh.faces)
-    varied = thing.albedo is not None or thing.wet is not None
     mesh = mi.Mesh(thing.name, len(vertices), len(faces), properties, thing.smooth, varied)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = vertices.ravel()

@@ -14,7 +14,8 @@ from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes, Patterns
 from recon.model.rig import CameraDevice, Positive, Rig
 from scenes.scene_types import Scene
-from twin.optics.conditions import IDEAL, Conditions, as_skin, draw, emitted, with_stray
+from twin.conditions import IDEAL, Conditions, as_skin, draw
+from twin.optics.disturbed_light import emitted, with_stray
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Engine, Images, render
 from twin.optics.ray_world import build_world, translucent, visible

@@ -23,7 +23,7 @@ from recon.model.calibration import Calibration
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig, Target, Vector
 from scenes.scene_types import Scene
-from twin.optics import conditions
+from twin import conditions
 from twin.session import Session, describe
 from twin.tracking.mesh_bank import Bank, build_bank
 from twin.tracking.rendered_views import Frames, Quality, render_full, render_sketches, white_radiance

@@ -19,8 +19,8 @@ from recon.geometry.primitives import Cylinder
 from recon.geometry.surface_tree import surface_tree
 from scenes.acoustics import BACKSCATTER, Tissue, faster, surroundings, tissue_of
 from scenes.scene_types import Scene, Thing
-from twin.optics import conditions
-from twin.optics.conditions import Sound
+from twin import conditions
+from twin.conditions import Sound
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from recon.model.probe import ProbeCalibration
 from recon.model.rig import Rig
 from recon.model.tracks import Track
 from scenes.scene_types import Scene
-from twin.optics import conditions
+from twin import conditions
 from twin.session import Session, describe
 from twin.ultrasound import bscan_truth
 from twin.ultrasound.bscan import Scan

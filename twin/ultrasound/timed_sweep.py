@@ -10,7 +10,7 @@ from recon.geometry import rigid
 from recon.model import tracks
 from recon.model.rig import Finite, NotNegative, Part, Positive, Probe
 from recon.model.tracks import Track
-from twin.optics import conditions
+from twin import conditions
 from twin.ultrasound.bscan import scans
 from twin.ultrasound.bscan_truth import labels
 from twin.ultrasound.echo_solids import Body
@@ -112,7 +112,7 @@ def plan(
     poses = tracks.at(path, tracked)
     known = np.isfinite(poses).all(axis=(1, 2))
     tracked, poses = tracked[known], poses[known]
-    design, given = probe.target_from_image.matrix(), conditions.given(errors, len(poses), seed, len(poses))
+    design, given = probe.target_from_image.matrix(), conditions.given(errors, tracked, seed)
     held = [pose @ rigid.invert(rigid.moved(design, step)) for pose, step in zip(poses, given, strict=True)]
     seen = _noisy(np.stack(held), pose_noise, rng)
     track = Track(_stamped(tracked, 0.0, clocks.camera_jitter_s, rng), seen)

@@ -6,7 +6,7 @@ import pytest
 from recon.optical_calibration.joint_calibration import calibrate
 from twin.accuracy import lifelike_accuracy, plane_and_sphere
 from twin.accuracy.baselines import opencv_peer
-from twin.optics.conditions import BoardPrint
+from twin.conditions import BoardPrint
 
 
 def test_the_form_of_a_bowed_plane_is_its_bow(rng):

@@ -8,7 +8,7 @@ from recon.capture.surface_part import read_patterns
 from twin.accuracy import paper_causes
 from twin.accuracy.paper_causes import Cause
 from twin.accuracy.table_rows import Setup
-from twin.optics.conditions import Conditions, Frames
+from twin.conditions import Conditions, Frames
 
 PATTERNS = Path(__file__).resolve().parents[3] / "conf" / "patterns" / "paper_surface.yaml"
 

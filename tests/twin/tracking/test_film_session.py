@@ -17,8 +17,8 @@ from sonotwin.config import load
 from sonotwin.verbs import track
 from sonotwin.verbs.film import Config, ranges
 from tests.twin.tracking import takes
+from twin.conditions import Motion
 from twin.evaluation import track_errors
-from twin.optics.conditions import Motion
 from twin.session import Session
 from twin.tracking import film_session
 from twin.tracking.rendered_views import Frames, white_radiance

@@ -10,8 +10,8 @@ from scenes.acoustics import TISSUES, faster
 from scenes.catalogue import build_scene
 from scenes.scene_types import Material, Thing
 from tests.twin.ultrasound import plain_sound
-from twin.optics import conditions
-from twin.optics.conditions import Sound
+from twin import conditions
+from twin.conditions import Sound
 from twin.ultrasound.echo_solids import Body, at_speeds, body, distance_at, label_at, solid
 
 

@@ -8,7 +8,7 @@ from recon.geometry import rigid
 from recon.model import tracks
 from recon.probe_calibration import latency
 from scenes.catalogue import build_scene
-from twin.optics.conditions import Motion, given, trembling
+from twin.conditions import Motion, given, trembling
 from twin.ultrasound.echo_solids import body
 from twin.ultrasound.probe_path import Bob, Hand, SurfacePath, along_surface, bobbing, top
 from twin.ultrasound.timed_sweep import Clocks, PoseNoise, moments, plan, sweep
@@ -75,7 +75,7 @@ def test_a_bracket_that_gives_moves_the_target_against_the_image(rig, small):
     taken, clocks = moments(path, 10.0), Clocks(scanner_hz=10.0, camera_hz=20.0, lag_s=0.0, scanner_jitter_s=0.0)
     stiff, soft = (plan(rig.probe, path, taken, clocks, exact, 3, each) for each in (Motion(), errors))
     assert (stiff.truth.poses == soft.truth.poses).all()
-    steps = given(errors, len(soft.track.poses), 3, len(soft.track.poses))
+    steps = given(errors, moments(path, 20.0), 3)
     for k in (0, len(steps) // 2, -1):
         bent = rigid.moved(rig.probe.target_from_image.matrix(), steps[k])
         image = stiff.track.poses[k] @ rig.probe.target_from_image.matrix()

@@ -1,6 +1,6 @@
-"""Conditions under which a session is shot: those of theory, or a laboratory's lamp, light, timing and prints."""
+"""Conditions of a session: those of theory, or a laboratory's lamp, prints, skin, hands, brackets, sound and drift."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -8,15 +8,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.model import circle_layout
-from recon.model.patterns import Fringes, Patterns
-from recon.model.rig import CameraDevice, Part, ProjectorDevice, Rig, Target
+from recon.model.rig import Part, Rig, Target
 from scenes.kinds import board
 from scenes.noise import smooth_noise
 from scenes.scene_types import Scene, Thing
 from twin import tremor
-from twin.optics.light_transport import Images
-from twin.optics.raster import Light
-from twin.sensor import Exposure, Stack, electrons_per_radiance, number_per_electron
 from twin.tremor import Tremor
 
 Array = NDArray[np.float64]
@@ -157,11 +153,16 @@ def as_skin(scene: Scene, skin: Skin, *key: int) -> Scene:
 
 
 def _as_skin(thing: Thing, skin: Skin, rng: np.random.Generator) -> Thing:
-    vertices = np.asarray(thing.mesh.vertices)
-    field = smooth_noise(vertices, 2 * skin.patch_mm, rng)
-    shore = np.quantile(field, 1 - skin.wet)
-    wet = np.float32(np.clip((field - shore) / GEL_EDGE + 0.5, 0, 1)) if skin.wet else None
+    wet = _patches(np.asarray(thing.mesh.vertices), skin, rng) if skin.wet else None
     return replace(thing, material=replace(thing.material, spread_mm=skin.spread_mm), wet=wet)
+
+
+def _patches(vertices: Array, skin: Skin, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Share of gel at vertices : (n, 3), as (n,); all of the skin has it if all is wet."""
+    if skin.wet == 1:
+        return np.ones(len(vertices), np.float32)
+    field = smooth_noise(vertices, 2 * skin.patch_mm, rng)
+    return np.float32(np.clip((field - np.quantile(field, 1 - skin.wet)) / GEL_EDGE + 0.5, 0, 1))
 
 
 def trembling(errors: Motion, *key: int) -> Tremor:
@@ -174,11 +175,11 @@ def triggered(errors: Motion, count: int, *key: int) -> Array:
     return errors.trigger_s * np.random.default_rng([*key, TRIGGER_STREAM]).standard_normal((count, 2))
 
 
-def given(errors: Motion, count: int, *key: int) -> Array:
-    """Draw by how much a bracket has given : (count, 6) rad and mm at even times, 0 in the middle, the same for the same key."""
+def given(errors: Motion, moments: NDArray[np.int64], *key: int) -> Array:
+    """Draw a bracket's giving at moments : (n,) ns, as (n, 6) rad and mm, 0 in the middle, the same for the same key."""
     size = np.repeat([np.deg2rad(errors.bracket_deg), errors.bracket_mm], 3)
     growth = size * np.random.default_rng([*key, BRACKET_STREAM]).standard_normal(6)
-    return np.linspace(-0.5, 0.5, count)[:, None] * growth
+    return ((moments - moments[0]) / max(moments[-1] - moments[0], 1) - 0.5)[:, None] * growth
 
 
 def speeds(errors: Sound, *key: int) -> tuple[float, float]:
@@ -231,39 +232,3 @@ def flexed(printed: board.Config, errors: BoardPrint, *key: int) -> board.Config
         return printed
     bent = errors.flex_mm * np.random.default_rng([*key, BOARD_STREAM]).standard_normal(3)
     return printed.model_copy(update={"bow_mm": tuple((np.array(printed.bow_mm) + bent).tolist())})
-
-
-def emitted(patterns: Patterns, projector: ProjectorDevice, errors: FrameDraw) -> Light:
-    """A sequence as the projector shows it, each frame with its own brightness and its own shift."""
-    profiles = patterns.profiles()
-    for part, place in patterns.slices():
-        if isinstance(part, Fringes) and part.waveform == "sine":
-            length = patterns.length(part.axis)
-            for k, late in enumerate(errors.shift[place]):
-                moved = part.model_copy(update={"origin": part.zero(length) - late * part.pitch / part.steps})
-                profiles[place.start + k] = (part.axis, False, moved.profiles(length)[k])
-    light = Light.of_profiles(patterns.projector_size, profiles, projector)
-    return replace(light, profiles=tuple(np.float32(gain) * one for gain, one in zip(errors.gain, light.profiles, strict=True)))
-
-
-@dataclass(frozen=True)
-class Lit:
-    """Images : n of (h, w), W/mm^2/sr, each with an even light of its own added."""
-
-    images: Stack
-    added: NDArray[np.float32]  # (n,)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Of all images together : (n, h, w)."""
-        return self.images.shape
-
-    def __getitem__(self, k: int) -> Images:
-        return self.images[k] + self.added[k]
-
-
-def with_stray(images: Stack, stray_dn: Array, device: CameraDevice, wavelength_nm: float, exposure: Exposure) -> Stack:
-    """Images : n of (h, w), W/mm^2/sr, each with its stray light : (n,) 8-bit DN."""
-    electrons = stray_dn * 2 ** (exposure.bits - 8) / number_per_electron(device.sensor, exposure)
-    radiance = electrons / (electrons_per_radiance(device, wavelength_nm) * exposure.time_s)
-    return Lit(images, radiance.astype(np.float32)) if radiance.any() else images
