@@ -19,5 +19,5 @@ def test_flicker_stays_in_the_published_decoding_alone(rig):
     ours, published = paper_causes.compared(setup, Cause(), 3)
     assert published.plane_rms_mm == pytest.approx(ours.plane_rms_mm, rel=0.02)
     flickering, plainly = paper_causes.compared(setup, Cause(Conditions(frames=Frames(flicker=0.03))), 3)
-    assert flickering.plane_rms_mm == pytest.approx(ours.plane_rms_mm, rel=0.03)
+    assert flickering.plane_rms_mm == pytest.approx(ours.plane_rms_mm, rel=0.05)
     assert plainly.plane_rms_mm**2 > ours.plane_rms_mm**2 + 0.02**2
