@@ -25,9 +25,10 @@ from recon.segmentation import containment
 from scenes.catalogue import build_scene
 from scenes.scene_types import Thing
 from scenes.tumour import caliper
+from twin.conditions import Sound
 from twin.session import SETTINGS, TruthFolder
 from twin.ultrasound import sweep_session
-from twin.ultrasound.echo_solids import Body, body
+from twin.ultrasound.echo_solids import Body, at_speeds, body
 from twin.ultrasound.timed_sweep import Clocks
 from twin.ultrasound.transducer import Transducer
 
@@ -85,9 +86,10 @@ def read_truth(folder: Path) -> SweepTruth:
     try:
         rig, clocks = Rig.model_validate(settings["rig"]), Clocks.model_validate(settings["clocks"])
         transducer, wanted = Transducer.model_validate(settings["ultrasound"]), dict(settings["scene"])
+        sound, seed = Sound.model_validate(settings.get("conditions", {}).get("sound", {})), int(settings["seed"])
     except ValidationError as error:
         raise InputError(f"{path}: {one_line(error)}") from None
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: expected the settings of a rendered sweep, found them damaged at {error}") from None
     poses = kept.arrays(sweep_session.POSES, {"world_from_image": npz.Form("f", (None, 4, 4))})["world_from_image"]
     labels = tuple(kept.folder / sweep_session.LABELS / image_name(number) for number in range(len(poses)))
@@ -97,7 +99,7 @@ def read_truth(folder: Path) -> SweepTruth:
     hidden = tuple(thing for thing in scene.things if thing.inside)
     if not hidden:
         raise InputError(f"{path}: expected a scene with something inside, found {scene.name}")
-    scanned = body(scene)
+    scanned = at_speeds(body(scene), sound, seed)
     return SweepTruth(
         scanned,
         hidden,

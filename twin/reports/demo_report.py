@@ -27,7 +27,7 @@ from twin.reports.sweep_report import Inside
 from twin.reports.track_report import Tracked
 from twin.ultrasound.sweep_session import SUPPORTS
 
-ERROR_MM = 0.1  # colours of errors span plus and minus this
+ERROR_MM = 0.1  # colours of errors span plus and minus this, or twice their RMS if that is more
 SYSTEMATIC_MM = 0.02  # colours of averaged errors span plus and minus this
 AVERAGED_PX = 15  # width of the square that errors are averaged over
 FRINGES_SHOWN = 4
@@ -149,7 +149,9 @@ def opening(measurement: Measurement, metrics: Metrics) -> Opening:
 
 def surface(measurement: Measurement) -> Section:
     """The surface in 3-D."""
-    drawn = figures.surface_view(measurement.points, measurement.comparison.error, ERROR_MM)
+    drawn = figures.surface_view(
+        measurement.points, measurement.comparison.error, _half_range(measurement.comparison.error, ERROR_MM)
+    )
     caption = "Drag to turn, scroll to come nearer. Red lies outside the true surface, blue inside; equal scales on all axes."
     return Section("The surface", [page.switch("surface"), page.view("surface", drawn, caption)])
 
@@ -165,8 +167,10 @@ def errors(measurement: Measurement, metrics: Metrics) -> Section:
     comparison = measurement.comparison
     known = surface_errors.points_with_prediction(comparison)
     error, predicted = comparison.error[known], comparison.predicted[known]
-    scale = Scale(DIVERGING, -ERROR_MM, ERROR_MM)
-    systematic = Scale(DIVERGING, -SYSTEMATIC_MM, SYSTEMATIC_MM)
+    mean = local_mean(comparison.error, comparison.interior, AVERAGED_PX)
+    scale, systematic = (
+        Scale(DIVERGING, -end, end) for end in (_half_range(comparison.error, ERROR_MM), _half_range(mean, SYSTEMATIC_MM))
+    )
     sigma = Scale(SEQUENTIAL, 0, _round_up(float(np.quantile(predicted, 0.99))) if predicted.size else ERROR_MM)
     maps = [
         page.picture(
@@ -177,7 +181,7 @@ def errors(measurement: Measurement, metrics: Metrics) -> Section:
             "mm",
         ),
         page.picture(
-            systematic(local_mean(comparison.error, comparison.interior, AVERAGED_PX)),
+            systematic(mean),
             "Systematic part",
             f"Mean error over {AVERAGED_PX} × {AVERAGED_PX} px: noise falls fifteenfold, and what stands out is not noise.",
             systematic,
@@ -341,6 +345,12 @@ def _fitted(metrics: Metrics, what: str, kind: str, figure: str) -> tuple[str, s
 def _span(values: NDArray, usable: NDArray[np.bool_]) -> Scale:
     low, high = np.quantile(values[usable], (0.001, 0.999)) if usable.any() else (0, 1)
     return Scale(SEQUENTIAL, float(np.floor(low)), float(np.ceil(high)))
+
+
+def _half_range(error: NDArray[np.float32], least: float) -> float:
+    """The end of a scale for errors : (h, w) mm, NaN where there are none."""
+    known = error[np.isfinite(error)]
+    return max(least, _round_up(2 * surface_errors.rms(known))) if known.any() else least
 
 
 def _round_up(value: float) -> float:

@@ -319,7 +319,7 @@ def probe_table(metrics: Metrics, story: Inside) -> str:
             "Speed of sound that the scale in depth implies",
             "not measured",
             f"± {metrics['probe_implied_speed_sigma_m_per_s']:.1f} m/s",
-            f"{speed:.1f} m/s; of this water {known:.1f}",
+            f"{speed:.1f} m/s; of water as warm as given {known:.1f}",
         ),
         (
             "Lag of the scanner’s images",

@@ -12,6 +12,7 @@ from recon.geometry import rigid
 from sonotwin.config import compose
 from tests.twin import drawn_sweep
 from tests.twin.drawn_sweep import PROBE_MM, SHIFT, SIZE, TUMOURS, ball
+from twin.conditions import Sound, speeds
 from twin.evaluation import sweep_errors
 
 
@@ -106,10 +107,32 @@ def test_a_closed_mesh_is_opened_to_the_cameras():
     assert sweep_errors.facing(box).triangles_center[:, 2] == pytest.approx([-5, -5])
 
 
-def settings() -> str:
-    parts = {"scene": {"kind": "breast"}, "clocks": {}}
+def settings(**more) -> str:
+    parts = {"scene": {"kind": "breast"}, "clocks": {}, "seed": 3}
     composed = compose("sweep", ["out=none"])
-    return json.dumps({name: composed[name] for name in ("rig", "ultrasound")} | parts)
+    return json.dumps({name: composed[name] for name in ("rig", "ultrasound")} | parts | more)
+
+
+def write_truth(folder, text: str) -> None:
+    (folder / "sweep" / "labels").mkdir(parents=True)
+    (folder / "settings.json").write_text(text, encoding="utf-8")
+    np.savez(folder / "sweep/sweep.npz", world_from_image=np.tile(np.eye(4), (2, 1, 1)))
+    for number in range(2):
+        (folder / f"sweep/labels/{number:04d}.png").write_bytes(b"")
+
+
+def test_the_truth_has_the_speeds_of_sound_that_were_drawn(tmp_path):
+    """Those of the seed and the conditions; a truth of before conditions has the usual ones."""
+    sound = Sound(tissue=0.02, water_c=0.5)
+    write_truth(tmp_path / "life", settings(conditions={"sound": sound.model_dump()}))
+    write_truth(tmp_path / "before", settings())
+    life, before = (
+        {solid.name: solid.tissue.speed for solid in sweep_errors.read_truth(tmp_path / name).body.solids}
+        for name in ("life", "before")
+    )
+    ratio, _ = speeds(sound, 3)
+    assert abs(ratio - 1) > 0.005  # so that it says something
+    assert life["breast"] == pytest.approx(ratio * before["breast"])
 
 
 @pytest.mark.parametrize(
@@ -122,11 +145,7 @@ def settings() -> str:
     ],
 )
 def test_a_damaged_truth_is_refused_in_one_line(damage, complaint, tmp_path):
-    (tmp_path / "sweep" / "labels").mkdir(parents=True)
-    (tmp_path / "settings.json").write_text(settings(), encoding="utf-8")
-    np.savez(tmp_path / "sweep/sweep.npz", world_from_image=np.tile(np.eye(4), (2, 1, 1)))
-    for number in range(2):
-        (tmp_path / f"sweep/labels/{number:04d}.png").write_bytes(b"")
+    write_truth(tmp_path, settings())
     damage(tmp_path)
     with pytest.raises(InputError, match=complaint) as raised:
         sweep_errors.read_truth(tmp_path)
