@@ -1,11 +1,11 @@
 """Adjustment of a calibration whose bracket may have given, or whose wires may have slipped, by any amount or not at all.
 
-A test finds a movement or doesn't; one too small for it still makes errors. Here nothing moved, the probe did, or the wires did,
-evenly or all at once after any frame. Half of a movement, six numbers of the probe or three of the wires, is normal, with its
-size as standard deviation. Size and noise aren't known: each course and size is weighed by its evidence, which is the likelihood
-integrated over parameters, movement and noise. The outcome is the mean over all of them, and its covariance that of their
-mixture, with the movement itself; so the errors that the residuals leave open are in it. Residuals are `left + slopes x + moving
-h`, linear in the parameters x and a movement h; with `h ~ N(0, noise^2 size^2)` all integrals are closed.
+A test finds a movement or doesn't; one too small for it still makes errors. Here nothing moved, the probe did, or the wires
+did, evenly or all at once after any frame. Half of a movement, six numbers of the probe or three of the wires, is normal, with
+its size as standard deviation. Size and noise aren't known: each course and size is weighed by its evidence, which is the
+likelihood integrated over parameters, movement and noise. The outcome is the mean over all of them, and its covariance that of
+their mixture, with the movement itself; so the errors that the residuals leave open are in it. Residuals are left + slopes x +
+moving h, linear in the parameters x and a movement h; with h ~ N(0, noise^2 size^2) all integrals are closed.
 
 Sources: evidence of a size: MacKay 1992; unknown noise: Gelman 2013; mean over models: Hoeting 1999.
 """
