@@ -62,7 +62,7 @@ def adjusted(equations: Equations, used: Mask, frames: Mask, noise: float = 1.0)
     frames : (n,)
         Frames to adjust: these, and others that are as right if something moved.
     noise : float
-        Standard deviation of the equations' residuals, roughly: the sizes are in units of the noise.
+        Standard deviation of the equations' residuals, roughly, by which sizes in mm and deg become those in units of it.
 
     Returns
     -------

@@ -92,8 +92,7 @@ def skins(setup: Setup) -> list[Row]:
     """Row k: breasts of which light spreads beneath the skin, and some is wet, beside what noise leaves of such fringes."""
     scene, patterns = build_scene({"kind": "breast"}), setup.sequences["paper_surface"]
     found = [experiment(setup.rig, scene, patterns, seed, conditions=Conditions(skin=SKIN)).metrics for seed in SEEDS]
-    ratios, spreads = ([one[name] for one in found] for name in ("surface_rms_mm", "z_std"))
-    ratios = [rms_mm / one["limit_rms_mm"] for rms_mm, one in zip(ratios, found, strict=True)]
+    ratios, spreads = [one["surface_rms_mm"] / one["limit_rms_mm"] for one in found], [one["z_std"] for one in found]
     what = f"{len(found)} breasts, light spread by {SKIN.spread_mm:g} mm, {100 * SKIN.wet:g} % wet"
     return [
         Row(
