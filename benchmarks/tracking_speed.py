@@ -20,8 +20,9 @@ from recon.tracking.tracker import Tracker
 from sonotwin.config import folder
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.accuracy.tracking_frames import study
+from twin.shooting import Quality
 from twin.tracking.mesh_bank import build_bank
-from twin.tracking.rendered_views import Quality, render_views
+from twin.tracking.rendered_views import render_views
 from twin.tracking.samples import draw
 from twin.tracking.sampling_ranges import DataRanges
 

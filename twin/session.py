@@ -2,7 +2,7 @@
 
 OUT/capture/ may hold several parts, and OUT/truth/ then holds the truth of each:
 
-- `surface/`, `board.npz`, `sweep/`: arrays and images of the part of that name;
+- `surface/`, `board.npz`, `sweep/` or `sweep/NAME/`: arrays and images of the part of that name;
 - `calibration/optics.yaml`: the true cameras and projector, one for all parts;
 - `scene.json` and `settings.json`: the scene, and all that the part was rendered from; those of the part that was written first
   lie in `truth/` itself, those of a part that was added to it in `truth/PART/`.
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.capture import calibration_files
-from recon.capture.manifest import MANIFEST, OPTICS, PartName, read_manifest
+from recon.capture.manifest import MANIFEST, OPTICS, SWEEP, PartName, Purpose, is_sweep, read_manifest
 from recon.capture.writer import CaptureWriter, check_kept
 from recon.errors import InputError
 from recon.files import atomic, npz
@@ -42,8 +42,13 @@ class TruthFolder:
     @property
     def described(self) -> Path:
         """The folder of the part's `scene.json` and `settings.json`."""
-        own = self.folder / self.part
+        own = self.own
         return own if (own / SCENE).is_file() else self.folder
+
+    @property
+    def own(self) -> Path:
+        """The part's own folder."""
+        return self.folder / self.part
 
     def scene(self) -> dict:
         """Read the description of the scene; InputError if it is missing or damaged."""
@@ -67,7 +72,7 @@ class TruthFolder:
 
     def write_arrays(self, name: str, arrays: Mapping[str, NDArray]) -> None:
         """Write arrays into a file in the folder."""
-        (self.folder / name).parent.mkdir(exist_ok=True)
+        (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
         np.savez(self.folder / name, **arrays)
 
     def write_optics(self, optics: Calibration) -> None:
@@ -84,6 +89,7 @@ class Session:
     settings: Mapping[str, object]  # that it is rendered from
     add: bool = False  # to the capture that is there, in place of its part of that name; else only such a part may be there
     devices: tuple[str, ...] = ()  # of a sweep: those whose images it has
+    purpose: Purpose | None = None  # of a sweep
 
     @property
     def capture(self) -> Path:
@@ -115,12 +121,16 @@ class Session:
             return
         read = read_manifest(self.capture)
         held = read.contents
-        mine = {self.part} if self.part != "sweep" or set(held.get("sweep", self.devices)) == set(self.devices) else set()
+        same = not is_sweep(self.part) or set(held.get(self.part, self.devices)) == set(self.devices)
+        mine = {self.part} if same else set()
         others = [part for part in held if part not in mine]
-        refused = [part for part in others if not self.add or part == self.part]
+        unnamed = SWEEP in (self.part, *held) and is_sweep(self.part)  # beside which no other sweep has a place
+        refused = [part for part in others if not self.add or part == self.part or (unnamed and is_sweep(part))]
         if refused:
-            found = " and ".join(_label(part, held[part]) for part in refused)
+            found = " and a ".join(_label(part, held[part]) for part in refused)
+            named = self.add and unnamed and self.part not in refused
             way = "choose another out" if self.add or self.part in refused else "choose another out, or give add=true"
+            way = "choose another out, or give all sweeps names" if named else way
             wanted = _label(self.part, self.devices)
             raise InputError(f"{self.capture}: expected nothing or an earlier {wanted}, found a {found}; {way}")
         if others:
@@ -149,7 +159,7 @@ class Session:
             writer, truth = CaptureWriter(capture, str(scene["name"])), TruthFolder(folder, self.part)
             kept = writer.keep(self.capture, self.part) if self.add and (self.capture / MANIFEST).is_file() else ()
             place = self._keep_truth(folder, kept) if kept else folder
-            place.mkdir(exist_ok=True)
+            place.mkdir(parents=True, exist_ok=True)
             write_json(place / SETTINGS, self.settings)
             write_json(place / SCENE, scene)
             yield writer, truth
@@ -208,4 +218,5 @@ def first_difference(wanted: Any, found: Any, name: str = "") -> tuple[str, Any,
 
 def _label(part: PartName, devices: tuple[str, ...]) -> str:
     """A part's name in messages; of a sweep with its devices."""
-    return f"sweep of {' and '.join(devices)}" if part == "sweep" else part
+    own = part.partition("/")[2]
+    return f"sweep {own} of {' and '.join(devices)}".replace("  ", " ") if is_sweep(part) else part

@@ -1,6 +1,6 @@
 """`manifest.json`, the list of what is in a capture folder: devices, patterns, and which image belongs to which.
 
-A capture holds one part or several: a surface, a board, a sweep. Parts stand side by side in the manifest and share the devices.
+A capture holds one part or several: a surface, a board, a sweep or several with names. Parts share the devices.
 
 Everything is checked on load; a fault is an `InputError` of one line that names the file, what was expected and what was found.
 """
@@ -24,13 +24,15 @@ SCHEMA: Literal["sonotwin-capture/1"] = "sonotwin-capture/1"
 MANIFEST = "manifest.json"
 OPTICS = "calibration/optics.yaml"
 PROBE = "calibration/probe.yaml"
-TRACK = "sweep/track.csv"
+TRACK = "track.csv"  # in the folder of a sweep
 STAMPS = "timestamps.csv"  # in each device's folder of a sweep
 CAMERAS = ("cam1", "cam2")
 SCANNER = "us"
 
-PartName = Literal["surface", "board", "sweep"]
-PARTS: tuple[PartName, ...] = ("surface", "board", "sweep")
+PartName = str  # "surface", "board", "sweep", or "sweep/NAME": the folder of the part's images
+SWEEP: PartName = "sweep"
+SweepName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,63}$")]
+Purpose = Literal["probe", "latency", "volume"]  # of a sweep: crossed wires at rest, a flat bottom, or what is to be seen
 
 
 class Record(BaseModel):
@@ -120,6 +122,7 @@ class SweepPart(Part):
     Paths are relative to the manifest's root.
     """
 
+    purpose: Purpose | None = None
     images: Annotated[dict[str, str], Field(min_length=1)]  # device: folder of its images and timestamps.csv
     track: str | None = None  # path of the poses; none if they are still to be found in the cameras' images
 
@@ -141,25 +144,32 @@ class Manifest(Record):
     probe: str | None = None  # the ultrasound probe's calibration; relative to the manifest's folder
     surface: SurfacePart | None = None
     board: BoardPart | None = None
-    sweep: SweepPart | None = None
+    sweep: SweepPart | None = None  # the only one
+    sweeps: dict[SweepName, SweepPart] = {}  # or several, in the order in which they were taken
+
+    @model_validator(mode="after")
+    def _one_or_named(self) -> "Manifest":
+        if self.sweep is not None and self.sweeps:
+            raise ValueError(f"sweep: expected none beside sweeps, which are {', '.join(self.sweeps)}, found one")
+        return self
 
     @model_validator(mode="after")
     def _known_cameras(self) -> "Manifest":
         for part, field, cameras in self._places():
             for camera in cameras:
                 if camera not in self.devices:
-                    raise ValueError(
-                        f"{part}.{field}.{camera}: expected one of the devices {', '.join(self.devices)}, found {camera}"
-                    )
+                    expected = f"one of the devices {', '.join(self.devices)}"
+                    raise ValueError(f"{field_of(part)}.{field}.{camera}: expected {expected}, found {camera}")
         return self
 
     @model_validator(mode="after")
     def _one_size_a_device(self) -> "Manifest":
         for part in self.contents:
-            for name, device in (getattr(self, part).devices or {}).items():
+            for name, device in (self.part(part).devices or {}).items():
                 if name not in self.devices or device.size != self.devices[name].size:
                     found = "x".join(map(str, device.size))
-                    raise ValueError(f"{part}.devices.{name}: expected one of the devices, of the same size, found {found}")
+                    expected = "one of the devices, of the same size"
+                    raise ValueError(f"{field_of(part)}.devices.{name}: expected {expected}, found {found}")
         return self
 
     @model_validator(mode="after")
@@ -179,14 +189,43 @@ class Manifest(Record):
     @property
     def contents(self) -> dict[PartName, tuple[str, ...]]:
         """The parts that are there, each with the devices whose images it holds."""
-        found: dict[PartName, dict[str, None]] = {part: {} for part in PARTS if getattr(self, part) is not None}
+        parts = [part for part in ("surface", "board", SWEEP) if getattr(self, part) is not None]
+        found: dict[PartName, dict[str, None]] = {part: {} for part in (*parts, *map(sweep_part, self.sweeps))}
         for place, _, devices in self._places():
             found[place].update(dict.fromkeys(devices))
         return {part: tuple(devices) for part, devices in found.items()}
 
+    def part(self, name: PartName) -> SurfacePart | BoardPart | SweepPart:
+        """A part that is there."""
+        folder, _, own = name.partition("/")
+        return self.sweeps[own] if own else getattr(self, folder)
+
     def devices_of(self, part: PartName) -> dict[str, Device]:
         """All devices, as they were set for a part."""
-        return self.devices | (getattr(self, part).devices or {})
+        return self.devices | (self.part(part).devices or {})
+
+    def sweep_of(self, path: Path, holds: str, name: str = "", purpose: Purpose | None = None) -> tuple[PartName, SweepPart]:
+        """The sweep of a name; of none the only one, or the only one that is for a purpose.
+
+        Parameters
+        ----------
+        path, holds : of the manifest, and the sweep's expected content, for messages.
+
+        Raises
+        ------
+        InputError
+            If there is none, or more than one.
+        """
+        there = {sweep_part(own): part for own, part in self.sweeps.items()} | ({SWEEP: self.sweep} if self.sweep else {})
+        wanted = {part: one for part, one in there.items() if not name or part == sweep_part(name)}
+        fitting = {part: one for part, one in wanted.items() if one.purpose == purpose} if len(wanted) > 1 else wanted
+        if len(fitting) == 1:
+            return next(iter(fitting.items()))
+        if not there:
+            raise InputError(f"{path}: expected sweep, {holds}, found none")
+        names = ", ".join(self.sweeps) or "one without a name"
+        found = f"{name}, which isn't among them" if name else f"{len(fitting) or 'none'} for this"
+        raise InputError(f"{path}: sweeps: expected the name of one of {names}, found {found}; give sweep=NAME")
 
     def _places(self) -> Iterator[tuple[PartName, str, Iterable[str]]]:
         """Parts and their fields in which devices are named, and these names."""
@@ -196,7 +235,25 @@ class Manifest(Record):
             yield "board", f"poses.{number}.lit", pose.lit
             yield "board", f"poses.{number}.fringes", pose.fringes
         if self.sweep is not None:
-            yield "sweep", "images", self.sweep.images
+            yield SWEEP, "images", self.sweep.images
+        for name, sweep in self.sweeps.items():
+            yield sweep_part(name), "images", sweep.images
+
+
+def sweep_part(name: str) -> PartName:
+    """The part that is the sweep of a name."""
+    return f"{SWEEP}/{name}" if name else SWEEP
+
+
+def is_sweep(part: PartName) -> bool:
+    """Whether a part is a sweep."""
+    return part.partition("/")[0] == SWEEP
+
+
+def field_of(part: PartName) -> str:
+    """The manifest's field of a part, for messages: `surface`, `sweeps.NAME`."""
+    folder, _, own = part.partition("/")
+    return f"{folder}s.{own}" if own else folder
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -219,7 +276,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the manifest into a capture folder."""
-    text = manifest.model_dump_json(indent=2, by_alias=True, exclude_none=True)
+    text = manifest.model_dump_json(indent=2, by_alias=True, exclude_none=True, exclude=None if manifest.sweeps else {"sweeps"})
     (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
 
 

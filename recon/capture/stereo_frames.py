@@ -62,8 +62,12 @@ class Film:
         return mapped(read, self.paths(), most=AT_ONCE)
 
 
-def read_film(folder: Path, calibration_file: Path | None = None) -> Film:
+def read_film(folder: Path, calibration_file: Path | None = None, sweep: str = "") -> Film:
     """Open the film of a capture folder, with a calibration from elsewhere if one is given.
+
+    Parameters
+    ----------
+    sweep : name of one of several.
 
     Raises
     ------
@@ -73,21 +77,20 @@ def read_film(folder: Path, calibration_file: Path | None = None) -> Film:
     folder = Path(folder)
     read = manifest.read_manifest(folder)
     listed, root = folder / MANIFEST, folder / read.root
-    if read.sweep is None:
-        raise InputError(f"{listed}: expected sweep, with frames of {' and '.join(CAMERAS)}, found none")
+    place, part = read.sweep_of(listed, f"with frames of {' and '.join(CAMERAS)}", sweep)
     for name in CAMERAS:
-        if name not in read.sweep.images:
-            raise InputError(f"{listed}: sweep.images.{name}: expected a path, found none")
+        if name not in part.images:
+            raise InputError(f"{listed}: {manifest.field_of(place)}.images.{name}: expected a path, found none")
     if calibration_file is None and read.calibration is None:
         raise InputError(f"{listed}: expected calibration, the path of a calibration file, found none")
-    devices = [read.devices_of("sweep")[name] for name in CAMERAS]
+    devices = [read.devices_of(place)[name] for name in CAMERAS]
     depths = devices[0].bits, devices[1].bits
     if min(depths) > 8 and depths[0] != depths[1]:
         raise InputError(f"{listed}: devices.cam2.bits: expected {depths[0]}, as of cam1, found {depths[1]}")
     sizes = {name: device.size for name, device in zip(CAMERAS, devices, strict=True)}
     known = calibration_files.read_for(Path(calibration_file or folder / str(read.calibration)), sizes)
     cameras = known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]
-    places = [root / read.sweep.images[name] for name in CAMERAS]
+    places = [root / part.images[name] for name in CAMERAS]
     tables = [sweep_tables.read_stamps(place / STAMPS) for place in places]
     first, second = _partners(places, tables)
     frames = np.column_stack([tables[0][0][first], tables[1][0][second]])

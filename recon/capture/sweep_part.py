@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon.capture import manifest, probe_files, sweep_tables
 from recon.capture.images import Size, read_image
-from recon.capture.manifest import MANIFEST, SCANNER, STAMPS, image_name
+from recon.capture.manifest import MANIFEST, SCANNER, STAMPS, Purpose, image_name
 from recon.errors import InputError
 from recon.files.regular import check_there
 from recon.model import tracks
@@ -77,28 +77,27 @@ class SweepCapture:
         return np.where((share >= 0) & (share <= 1), (1 - share) ** 2 * known[after - 1] + share**2 * known[after], np.nan)
 
 
-def read_sweep(folder: Path) -> SweepCapture:
-    """Open the sweep part of a capture folder.
+def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None) -> SweepCapture:
+    """Open a sweep of a capture folder: that of a name, else the only one, else the only one that is for a purpose.
 
     Raises
     ------
     InputError
-        If the manifest is wrong or has no sweep, a table or the probe's calibration is wrong, or an image is not there.
+        If the manifest is wrong or has no such sweep, a table or the probe's calibration is wrong, or an image is not there.
     """
     folder = Path(folder)
     read = manifest.read_manifest(folder)
-    part, root = read.sweep, folder / read.root
-    if part is None:
-        raise InputError(f"{folder / MANIFEST}: expected sweep, B-scans and the poses of the probe, found none")
-    for name, found in ((f"sweep.images.{SCANNER}", part.images.get(SCANNER)), ("sweep.track", part.track)):
+    place, part = read.sweep_of(folder / MANIFEST, "B-scans and the poses of the probe", name, purpose)
+    root, entry = folder / read.root, manifest.field_of(place)
+    for field, found in ((f"images.{SCANNER}", part.images.get(SCANNER)), ("track", part.track)):
         if found is None:
-            raise InputError(f"{folder / MANIFEST}: {name}: expected a path, found none")
-    device = read.devices_of("sweep")[SCANNER]
+            raise InputError(f"{folder / MANIFEST}: {entry}.{field}: expected a path, found none")
+    device = read.devices_of(place)[SCANNER]
     if device.bits != 8:
         raise InputError(f"{folder / MANIFEST}: devices.{SCANNER}.bits: expected 8, found {device.bits}")
-    place = root / part.images[SCANNER]
-    frames, times = sweep_tables.read_stamps(place / STAMPS)
-    paths = tuple(place / image_name(frame) for frame in frames.tolist())
+    scans = root / part.images[SCANNER]
+    frames, times = sweep_tables.read_stamps(scans / STAMPS)
+    paths = tuple(scans / image_name(frame) for frame in frames.tolist())
     check_there(paths)
     track = sweep_tables.read_track(root / str(part.track))
     probe = None if read.probe is None else probe_files.read(folder / read.probe)

@@ -13,7 +13,18 @@ from numpy.typing import NDArray
 
 from recon.capture import calibration_files, manifest, probe_files, sweep_tables
 from recon.capture.images import Images, write_images
-from recon.capture.manifest import BoardPart, BoardPose, Device, Manifest, Part, PartName, SurfacePart, SweepPart, image_name
+from recon.capture.manifest import (
+    BoardPart,
+    BoardPose,
+    Device,
+    Manifest,
+    Part,
+    PartName,
+    Purpose,
+    SurfacePart,
+    SweepPart,
+    image_name,
+)
 from recon.errors import InputError
 from recon.files import atomic
 from recon.model.calibration import Calibration
@@ -49,7 +60,7 @@ class CaptureWriter:
         check_kept(source, read, replaced)
         atomic.link_tree(source, self.folder, leave_out={manifest.MANIFEST, replaced})
         self._change(name=read.name, calibration=read.calibration, probe=read.probe)
-        if replaced == "sweep":
+        if replaced == manifest.SWEEP:
             (self.folder / manifest.PROBE).unlink(missing_ok=True)
             self._change(probe=None)
         in_use = {name for used in read.contents.values() for name in used}
@@ -57,7 +68,7 @@ class CaptureWriter:
         for part, used in kept.items():
             devices = read.devices_of(part)
             here = {name: devices[name] for name in (*used, "projector") if name in devices}
-            self._add(part, getattr(read, part).model_copy(update={"devices": None}), here)
+            self._add(part, read.part(part).model_copy(update={"devices": None}), here)
         return tuple(kept)
 
     def add_calibration(self, optics: Calibration) -> None:
@@ -110,6 +121,8 @@ class CaptureWriter:
         images: Iterable[tuple[str, Images]],
         devices: Mapping[str, Device],
         track: Track | None = None,
+        name: str = "",
+        purpose: Purpose | None = None,
     ) -> None:
         """Write B-scans, frames of the tracking cameras, or both, each device's with its own time stamps.
 
@@ -120,6 +133,7 @@ class CaptureWriter:
         images : of (device, (h, w) uint8 or uint16)
             Taken one by one; those of a device in the order of its times, the devices in any order.
         track : poses of the probe's target; None where they are still to be found in the cameras' frames
+        name : of one of several sweeps; of the only one none is needed
 
         Raises
         ------
@@ -130,8 +144,10 @@ class CaptureWriter:
         for moments in (*times.values(), *([track.times] if track is not None else [])):
             if (np.diff(moments) <= 0).any():
                 raise ValueError("times: expected them strictly increasing")
-        part = SweepPart(images={device: f"sweep/{device}" for device in times}, track=None if track is None else manifest.TRACK)
-        self._add("sweep", part, devices)
+        place = manifest.sweep_part(name)
+        poses = None if track is None else f"{place}/{manifest.TRACK}"
+        part = SweepPart(purpose=purpose, images={device: f"{place}/{device}" for device in times}, track=poses)
+        self._add(place, part, devices)
         counts = dict.fromkeys(times, 0)
         for device, image in images:
             _check_images(f"image {counts[device]} of {device}", image[None], devices[device])
@@ -142,7 +158,7 @@ class CaptureWriter:
                 raise ValueError(f"images of {device}: expected {len(moments)}, one a time, found {counts[device]}")
             sweep_tables.write_stamps(self.folder / part.images[device] / manifest.STAMPS, moments)
         if track is not None:
-            sweep_tables.write_track(self.folder / manifest.TRACK, track)
+            sweep_tables.write_track(self.folder / place / manifest.TRACK, track)
 
     def finish(self) -> None:
         """Write the manifest."""
@@ -153,7 +169,9 @@ class CaptureWriter:
         there = self._manifest.devices
         own = {device: setting for device, setting in devices.items() if there.get(device, setting) != setting}
         part = part.model_copy(update={"devices": own}) if own else part
-        self._change(**{name: part, "devices": {**there, **devices, **there}})
+        folder, _, named = name.partition("/")
+        entry = {"sweeps": self._manifest.sweeps | {named: part}} if named else {folder: part}
+        self._change(**entry, devices={**there, **devices, **there})
 
     def _change(self, **fields: object) -> None:
         """Change fields of the manifest; ValueError if they don't fit together."""
@@ -255,14 +273,13 @@ def check_kept(source: Path, read: Manifest, replaced: PartName) -> None:
         if there is not None and os.path.normpath(there) != os.path.normpath(here):
             raise InputError(f"{path}: {field}: expected {here}, as in a capture that holds all its files, found {there}")
     for part in sorted(read.contents.keys() - {replaced}):
-        for name in getattr(read, part).paths():
-            first = Path(os.path.normpath(name)).as_posix().partition("/")[0]
-            if Path(name).is_absolute() or first == "..":
-                raise InputError(f"{path}: {part}: expected a capture that holds all its files, found {name}")
-            if first == replaced:
-                raise InputError(
-                    f"{path}: {part}: expected none of its files in {replaced}/, which is written anew, found {name}"
-                )
+        for name in read.part(part).paths():
+            inside = Path(os.path.normpath(name))
+            if inside.is_absolute() or inside.parts[0] == "..":
+                raise InputError(f"{path}: {manifest.field_of(part)}: expected a capture that holds all its files, found {name}")
+            if inside.is_relative_to(replaced):
+                expected = f"none of its files in {replaced}/, which is written anew"
+                raise InputError(f"{path}: {manifest.field_of(part)}: expected {expected}, found {name}")
 
 
 def _check_images(what: str, images: Images, device: Device) -> None:

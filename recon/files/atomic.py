@@ -125,7 +125,7 @@ def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> No
 
     Parameters
     ----------
-    leave_out : names at the top of `source`
+    leave_out : files and folders in `source`, as paths relative to it
     """
 
     def link(file: str, name: str) -> None:
@@ -134,13 +134,11 @@ def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> No
         except OSError:
             shutil.copy2(file, name)
 
-    for entry in source.iterdir():
-        if entry.name in leave_out:
-            continue
-        if entry.is_dir():
-            shutil.copytree(entry, target / entry.name, copy_function=link, dirs_exist_ok=True)
-        else:
-            link(str(entry), str(target / entry.name))
+    def left_out(folder: str, names: list[str]) -> list[str]:
+        here = Path(folder).relative_to(source)
+        return [name for name in names if (here / name).as_posix() in leave_out]
+
+    shutil.copytree(source, target, copy_function=link, ignore=left_out, dirs_exist_ok=True)
 
 
 def remove_leftovers(path: Path) -> None:

@@ -110,7 +110,7 @@ def overlay_name(number: int) -> str:
     return image_name(number).replace(".png", ".jpg")
 
 
-def hand_on(folder: Path, source: Path, out: Path, optics: Path | None = None) -> bool:
+def hand_on(folder: Path, source: Path, out: Path, optics: Path | None = None, sweep: str = "") -> bool:
     """Make a folder of poses a capture: the one that they were found in, with them as its track. Only if it has B-scans.
 
     Parameters
@@ -119,18 +119,21 @@ def hand_on(folder: Path, source: Path, out: Path, optics: Path | None = None) -
     source : the capture.
     out : where the folder is going to be.
     optics : the calibration that they were found with, if it isn't the capture's own.
+    sweep : name of the sweep that was tracked, of several; the others are left out.
     """
     read = manifest.read_manifest(source)
-    if read.sweep is None or SCANNER not in read.sweep.images:
+    place, part = read.sweep_of(source / manifest.MANIFEST, "tracked", sweep)
+    if SCANNER not in part.images:
         return False
     source, out = source.resolve(), out.resolve()
     root = source / read.root
     files = {name: os.path.relpath(source / path, out) for name in ("calibration", "probe") if (path := getattr(read, name))}
     if optics is not None:
         files["calibration"] = os.path.relpath(optics.resolve(), out)
-    sweep = read.sweep.model_copy(update={"track": os.path.relpath(out / POSES, root)})
-    change = {"root": os.path.relpath(root, out), "sweep": sweep, **files}
-    manifest.write_manifest(folder, read.model_copy(update=change))
+    tracked = part.model_copy(update={"track": os.path.relpath(out / POSES, root)})
+    own = place.partition("/")[2]
+    parts = {"sweeps": {own: tracked}} if own else {"sweep": tracked}
+    manifest.write_manifest(folder, read.model_copy(update={"root": os.path.relpath(root, out), **parts, **files}))
     return True
 
 

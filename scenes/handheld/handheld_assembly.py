@@ -1,27 +1,31 @@
 """The handheld assembly: the target's board, its bracket, the probe with its cable, and a hand or a robot that holds it.
 
 Everything is in the target's frame: c0 at the origin, c1 on x, c2 on y, z to the viewer, the board's front exactly in z = 0. The
-probe stands beside the board along z and points away from the viewer, as on the rig of Meza et al. 2021.
+probe stands beside the board along z and points away from the viewer, as on the rig of Meza et al. 2021. `held` draws all of it,
+for training; `as_designed` builds the body of a rig, whose array lies where its B-scans begin.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
+from recon.errors import InputError
 from recon.geometry import rigid
-from recon.model.rig import Target
-from scenes.handheld import hand as hands
+from recon.model.circle_layout import circle_centres
+from recon.model.rig import Probe, Target
 from scenes.handheld import lofts
+from scenes.handheld.holders import grip, pinch, robot
 from scenes.handheld.mesh_parts import Part
-from scenes.handheld.probe_bodies import Body, body, parts_of
+from scenes.handheld.probe_bodies import LENS_MM, Body, body, lens, parts_of, scaled
+from scenes.handheld.target_board import CLEAR_MM, Board, build_board, covers, draw_front, hides, pierces, to_edge
 
 Array = NDArray[np.float64]
 
-MARGIN_MM = 3.0  # of white around each disc, at least
-SHEET_MM = 0.05  # the print lies this far in front of the board's body, so that no two surfaces coincide
-TRIES = 40  # of a pose for the hand that covers no circle
+TRIES = 40  # of a housing that stands clear of the board
+GRIPS = 160  # of a hand that leaves the circles free
+ANY_GRIP = (0.15, 0.85)  # levels at which a probe close beside its board can be held, too
+IMAGE_FROM_BODY = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the body's z is against the image's depth
 
 
 @dataclass(frozen=True)
@@ -39,25 +43,6 @@ class Ranges:
     finger_in_front: float = 0.13
 
 
-@dataclass(frozen=True)
-class Board:
-    """The white front: a rectangle in z = 0."""
-
-    low: tuple[float, float]  # smallest x, y, mm
-    high: tuple[float, float]
-    thickness: float  # mm, with the plate behind it
-
-    @property
-    def middle(self) -> Array:
-        """The middle of the front : (2,) mm."""
-        return (np.array(self.low) + np.array(self.high)) / 2
-
-    @property
-    def size(self) -> Array:
-        """Width and height : (2,) mm."""
-        return np.array(self.high) - np.array(self.low)
-
-
 def held(rng: np.random.Generator, target: Target, ranges: Ranges | None = None) -> tuple[Part, ...]:
     """One variant of all that moves rigidly with the target.
 
@@ -66,20 +51,74 @@ def held(rng: np.random.Generator, target: Target, ranges: Ranges | None = None)
     ranges = ranges or Ranges()
     board_rng, probe_rng, bracket_rng, holder_rng, cable_rng, choice_rng = rng.spawn(6)
     holder, cable_in_front = _choices(choice_rng, ranges)
-    board, parts = _board(board_rng, target, ranges)
+    board, parts = build_board(board_rng, *draw_front(board_rng, target, ranges.board), ranges.thickness_mm)
     target_from_body, probe, beside = _probe_pose(probe_rng, board, ranges)
-    parts += [_moved(part, target_from_body) for part in parts_of(probe, probe_rng)]
+    parts += [_moved(part, target_from_body) for part in parts_of(probe, lens(probe_rng), probe_rng)]
     parts += _bracket(bracket_rng, board, probe, target_from_body)
     discs = np.array([[0, 0], [target.c1_mm, 0], [0, target.c2_mm]])
     if holder == "hand":
-        parts += _grip(holder_rng, board, probe, target_from_body, beside)
+        parts += grip(holder_rng, probe, target_from_body, beside, lambda balls: covers(balls, board))
     elif holder == "pinch":
-        parts += _pinch(holder_rng, board, discs, target.outer_diameter_mm / 2, beside)
+        parts += pinch(holder_rng, board, discs, target.outer_diameter_mm / 2, beside)
     elif holder == "robot":
-        parts += _robot(holder_rng, probe, target_from_body, beside)
+        parts += robot(holder_rng, probe, target_from_body, beside)
     covered = discs[cable_rng.integers(3)] if cable_in_front else None
     parts += _cable(cable_rng, probe, target_from_body, beside, covered, target.outer_diameter_mm / 2)
     return tuple(parts)
+
+
+def as_designed(rng: np.random.Generator, target: Target, probe: Probe, eyes: Array) -> tuple[Part, ...]:
+    """A body that a rig describes: its board about the circles' middle, its array at the B-scan's top line, held by a hand.
+
+    Housing, bracket, hand and cable are drawn. Where no hand is found that leaves the circles free, there is none.
+
+    Parameters
+    ----------
+    eyes : (n, 3) mm
+        Places in the target's frame from which the circles are looked at.
+
+    Raises
+    ------
+    InputError
+        If no housing for such an array stands clear of the board.
+    """
+    board_rng, probe_rng, bracket_rng, holder_rng, cable_rng = rng.spawn(5)
+    middle, half = np.array([target.c1_mm, target.c2_mm]) / 2, np.array(target.board_mm) / 2
+    board, parts = build_board(board_rng, middle - half, middle + half, Ranges.thickness_mm)
+    array_mm = probe.scale_mm_per_px[0] * (probe.image_size[0] - 1)
+    face = rigid.transform(IMAGE_FROM_BODY, [array_mm / 2, 0, 0])
+    target_from_body = probe.target_from_image.matrix() @ face @ rigid.transform(np.eye(3), [0, 0, LENS_MM])
+    housing = _clear_of(board, probe_rng, target_from_body, array_mm)
+    aside = target_from_body[:2, 3] - board.middle
+    beside = np.append(lofts.unit(aside), 0.0)
+    lens_mm = np.array([array_mm + 2, lens(probe_rng)[1]])
+    parts += [_moved(part, target_from_body) for part in parts_of(housing, lens_mm, probe_rng)]
+    parts += _bracket(bracket_rng, board, housing, target_from_body)
+    discs = circle_centres(target)[:, :2]
+
+    def in_the_way(balls: Array) -> bool:
+        return pierces(balls, board) or any(hides(balls, eye, discs, target.outer_diameter_mm / 2) for eye in eyes)
+
+    parts += grip(holder_rng, housing, target_from_body, beside, in_the_way, ANY_GRIP, GRIPS)
+    parts += _cable(cable_rng, housing, target_from_body, beside, None, target.outer_diameter_mm / 2)
+    return tuple(parts)
+
+
+def _clear_of(board: Board, rng: np.random.Generator, target_from_body: Array, array_mm: float) -> Body:
+    """A housing for an array that doesn't pierce the board; InputError if none is found."""
+    for _ in range(TRIES):
+        housing = scaled(body(rng), array_mm)
+        levels = np.linspace(0, 1, 40)
+        rings = np.concatenate([housing.outline_at(level) + np.array([0, 0, level * housing.length]) for level in levels])
+        points = rigid.apply(target_from_body, rings)
+        over = ((points[:, :2] > np.array(board.low) - CLEAR_MM) & (points[:, :2] < np.array(board.high) + CLEAR_MM)).all(axis=1)
+        if not (over & (points[:, 2] > -board.thickness - CLEAR_MM)).any():
+            return housing
+    x, y, z = target_from_body[:3, 3]
+    raise InputError(
+        f"rig.probe.target_from_image: expected an array beside or behind the target's board, whose housing stands clear of it, "
+        f"found its middle at ({x:.0f}, {y:.0f}, {z:.0f}) mm in the target's frame"
+    )
 
 
 def _choices(rng: np.random.Generator, ranges: Ranges) -> tuple[str, bool]:
@@ -93,31 +132,6 @@ def _choices(rng: np.random.Generator, ranges: Ranges) -> tuple[str, bool]:
 
 def _moved(part: Part, to_from: Array) -> Part:
     return Part(part.slot, lofts.placed(part.mesh, to_from), part.smooth)
-
-
-def _board(rng: np.random.Generator, target: Target, ranges: Ranges) -> tuple[Board, list[Part]]:
-    """The print, the board's body behind it, and perhaps a mount plate that stands out all round."""
-    room = target.outer_diameter_mm / 2 + MARGIN_MM
-    needed_low, needed_high = -room * np.ones(2), np.array([target.c1_mm, target.c2_mm]) + room
-    size = np.maximum(np.array(target.board_mm) * rng.uniform(1 - ranges.board, 1 + ranges.board, 2), needed_high - needed_low)
-    low = needed_high - size + rng.beta(1.5, 1.5, 2) * (needed_low - needed_high + size)
-    high = low + size
-    thickness = rng.uniform(*ranges.thickness_mm)
-    x, y = np.array([low[0], high[0], high[0], low[0]]), np.array([low[1], low[1], high[1], high[1]])
-    front = trimesh.Trimesh(np.column_stack([x, y, np.zeros(4)]), [[0, 1, 2], [0, 2, 3]], process=False)
-    middle = np.append((low + high) / 2, 0)
-    solid = lofts.box([*size, thickness - SHEET_MM], middle - [0, 0, (thickness + SHEET_MM) / 2])
-    parts = [Part("target", front, False), Part("board", solid, False)]
-    total = thickness
-    if rng.uniform() < 0.45:
-        plate = rng.uniform(1.5, 5.0)
-        grown = size + 2 * rng.uniform(-4, 4) * (rng.uniform() < 0.8)
-        outline = lofts.rounded(grown, rng.uniform(0.3, 4))
-        mesh = lofts.prism(outline, plate, 0.4)
-        shift = middle - [0, 0, thickness + plate + 0.02] + np.append(rng.normal(0, 0.6, 2), 0)
-        parts.append(Part("bracket", lofts.placed(mesh, rigid.transform(np.eye(3), shift)), False))
-        total += plate
-    return Board((low[0], low[1]), (high[0], high[1]), total), parts
 
 
 def _probe_pose(rng: np.random.Generator, board: Board, ranges: Ranges) -> tuple[Array, Body, Array]:
@@ -180,7 +194,7 @@ def _bracket(rng: np.random.Generator, board: Board, probe: Body, target_from_bo
     parts.append(Part("bracket", lofts.placed(end_block, lofts.frame(end - [0, 0, 4], [0, 0, 1], inward)), False))
     parts += _screws(rng, outline, level, height, target_from_body)
     if rng.uniform() < 0.5:  # a block that stands up beside the board's edge, with a screw in it
-        edge = _to_edge(board, -inward)
+        edge = to_edge(board, -inward)
         foot = np.append(board.middle - inward[:2] * (edge + rng.uniform(9, 12)), -board.thickness - 8)
         to_block = lofts.frame(foot, [0, 0, 1], inward)
         tall = board.thickness + 8 + rng.uniform(-6, 3)
@@ -188,11 +202,6 @@ def _bracket(rng: np.random.Generator, board: Board, probe: Body, target_from_bo
         screw = lofts.rod(rng.uniform(2.5, 4), 2.5, 20)
         parts.append(Part("metal", lofts.placed(screw, to_block @ rigid.transform(np.eye(3), [0, 0, tall - 0.5])), True))
     return parts
-
-
-def _to_edge(board: Board, way: Array) -> float:
-    """Distance from the board's middle to its edge along a direction in its plane, mm."""
-    return float((board.size / 2 / np.maximum(np.abs(way[:2]), 1e-6)).min())
 
 
 def _screws(rng: np.random.Generator, outline: Array, level: float, height: float, target_from_body: Array) -> list[Part]:
@@ -209,75 +218,6 @@ def _screws(rng: np.random.Generator, outline: Array, level: float, height: floa
         head = lofts.placed(lofts.prism(lofts.superellipse((2 * radius, 2 * radius), 2, 6), 2.5), to_screw)
         parts += [Part("metal", shank, True), Part("metal", head, False)]
     return parts
-
-
-def _covers(points: Array, board: Board, margin: float = 1.0) -> bool:
-    """Whether any ball : (n, 4) of x, y, z, radius lies over the board's front, or pierces the board."""
-    x, y, z, radius = points.T
-    low, high = np.array(board.low) - margin, np.array(board.high) + margin
-    over = (x > low[0] - radius) & (x < high[0] + radius) & (y > low[1] - radius) & (y < high[1] + radius)
-    return bool((over & (z > -board.thickness - radius - 1)).any())
-
-
-def _grip(rng: np.random.Generator, board: Board, probe: Body, target_from_body: Array, beside: Array) -> list[Part]:
-    """A hand around the probe, its forearm leading away from the board."""
-    skeleton = None
-    left = bool(rng.uniform() < 0.4)
-    for _ in range(TRIES):
-        level = probe.length * rng.uniform(0.3, 0.68)
-        away = np.arctan2(*(target_from_body[:3, :3].T @ beside)[[1, 0]])
-        outline = probe.outline_at(level / probe.length)[:, :2]
-        grip = hands.gripping(rng, outline, left, away + rng.normal(0, 0.9))
-        to_grip = target_from_body @ rigid.transform(np.eye(3), [0, 0, level])
-        skeleton = hands.turned(grip, to_grip[:3, :3], to_grip[:3, 3])
-        arm = skeleton.wrist + np.linspace(0, 300, 20)[:, None] * skeleton.forearm
-        balls = np.concatenate([skeleton.points(), np.column_stack([arm, np.full(20, 45.0)])])
-        if not _covers(balls, board) and skeleton.forearm[2] < 0.75:
-            return hands.clothed(rng, skeleton)
-    return []
-
-
-def _pinch(rng: np.random.Generator, board: Board, discs: Array, radius: float, beside: Array) -> list[Part]:
-    """A hand that holds the board by an edge, its thumb over a part of a circle."""
-    edges = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], float)
-    edges = edges[edges @ beside[:2] < 0.5]
-    way = edges[rng.integers(len(edges))]
-    reach = [_beyond(board, disc, way) for disc in discs]
-    disc = discs[int(np.argmin(reach))] if rng.uniform() < 0.8 else discs[rng.integers(3)]
-    tip = disc + way * radius * rng.uniform(-0.6, 0.85) + rng.uniform(-0.5, 0.5) * radius * np.array([-way[1], way[0]])
-    pinch = hands.pinching(rng, bool(rng.uniform() < 0.5), board.thickness)
-    turn = np.arctan2(way[1], way[0]) + np.pi / 2 + rng.normal(0, 0.25)
-    cos, sin = np.cos(turn), np.sin(turn)
-    rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    return hands.clothed(rng, hands.turned(pinch, rotation, [*tip, 0.0]))
-
-
-def _beyond(board: Board, disc: Array, way: Array) -> float:
-    """Distance from a disc's centre to the board's edge along an axis, mm."""
-    corner = np.where(way > 0, board.high, board.low)
-    return float(abs((corner - disc) @ way))
-
-
-def _robot(rng: np.random.Generator, probe: Body, target_from_body: Array, beside: Array) -> list[Part]:
-    """A robot's flange behind the probe and two links that lead away from the board."""
-    axis = target_from_body[:3, 2]
-    back = target_from_body[:3, 3] + 0.9 * probe.length * axis
-    radius, slot = rng.uniform(26, 40), rng.choice(["metal", "bracket", "thing_a"])
-    out = lofts.unit(beside + rng.normal(0, 0.25) * np.cross(axis, beside) + rng.uniform(0.0, 0.45) * axis)
-    start = back + (radius - 0.5 * np.abs(probe.outline_at(0.9)).max()) * beside * 0.8
-    flange = lofts.placed(lofts.rod(radius, 14, 48, 1.5), lofts.frame(start, axis))
-    wrist = lofts.placed(lofts.rod(0.92 * radius, rng.uniform(50, 80), 48, 6), lofts.frame(start + 13 * axis, axis))
-    joint = start + 50 * axis
-    link = lofts.placed(lofts.rod(rng.uniform(0.75, 0.95) * radius, rng.uniform(250, 400), 48, 4), lofts.frame(joint, out))
-    ring = lofts.placed(lofts.rod(radius * 1.02, 8, 48, 1), lofts.frame(joint + rng.uniform(60, 110) * out, out))
-    bolts = []
-    for turn in np.arange(6) * np.pi / 3 + rng.uniform(0, 1):
-        to_flange = lofts.frame(start, axis)
-        bolt = lofts.prism(lofts.superellipse((2.6, 2.6), 2, 12), 4, 0.5)
-        spot = [0.84 * radius * np.cos(turn), 0.84 * radius * np.sin(turn), -3]
-        bolts.append(lofts.placed(bolt, to_flange @ rigid.transform(np.eye(3), spot)))
-    shell = lofts.joined([wrist, link])
-    return [Part("metal", lofts.joined([flange, *bolts]), True), Part(str(slot), shell, True), Part("thing_b", ring, True)]
 
 
 def _cable(

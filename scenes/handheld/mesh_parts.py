@@ -43,6 +43,7 @@ class Part:
     slot: str
     mesh: trimesh.Trimesh  # mm, normals outwards
     smooth: bool  # interpolated vertex normals (curved), or flat faces
+    albedo: NDArray[np.float32] | None = None  # (vertices,) its reflectance, where that isn't drawn by its slot
 
     def __post_init__(self) -> None:
         if self.slot not in SLOTS:
@@ -57,27 +58,31 @@ class Merged:
     normals: NDArray[np.float32]  # (n, 3), unit, outwards
     faces: NDArray[np.uint32]  # (m, 3)
     slot: NDArray[np.uint8]  # (n,), index into SLOTS; the three vertices of a face agree
+    albedo: NDArray[np.float32]  # (n,), 0 where the slot's reflectance holds
 
 
 def merged(parts: Sequence[Part]) -> Merged:
     """Join parts: smooth ones keep their vertices, flat ones get three of their own a face, with the face's normal."""
-    vertices, normals, faces, slots, count = [], [], [], [], 0
+    vertices, normals, faces, slots, albedos, count = [], [], [], [], [], 0
     for part in parts:
         mesh = part.mesh
+        albedo = np.zeros(len(mesh.vertices)) if part.albedo is None else part.albedo
         if part.smooth:
             points, directions, triangles = mesh.vertices, mesh.vertex_normals, mesh.faces
         else:
-            points = mesh.vertices[mesh.faces].reshape(-1, 3)
+            points, albedo = mesh.vertices[mesh.faces].reshape(-1, 3), albedo[mesh.faces].ravel()
             directions = np.repeat(face_normals(mesh), 3, axis=0)
             triangles = np.arange(len(points)).reshape(-1, 3)
         vertices.append(np.asarray(points, np.float32))
         normals.append(np.asarray(directions, np.float32))
         faces.append(np.asarray(triangles + count, np.uint32))
         slots.append(np.full(len(points), SLOTS.index(part.slot), np.uint8))
+        albedos.append(np.asarray(albedo, np.float32))
         count += len(points)
     if not parts:
-        return Merged(np.zeros((0, 3), "f4"), np.zeros((0, 3), "f4"), np.zeros((0, 3), "u4"), np.zeros(0, "u1"))
-    return Merged(np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces), np.concatenate(slots))
+        none = np.zeros((0, 3), np.float32)
+        return Merged(none, none, np.zeros((0, 3), np.uint32), np.zeros(0, np.uint8), np.zeros(0, np.float32))
+    return Merged(*(np.concatenate(blocks) for blocks in (vertices, normals, faces, slots, albedos)))
 
 
 def face_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:

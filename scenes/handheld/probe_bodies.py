@@ -3,7 +3,7 @@
 Body frame: z along the probe from the array's face at z = 0 to the back, x along the array.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from scenes.handheld.mesh_parts import Part
 Array = NDArray[np.float64]
 
 SIDES = 48  # of a cross-section
+LENS_MM = 1.8  # by which the acoustic lens stands out of the housing
+ARRAY_MM = 39.5  # for which bodies are drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,17 @@ def body(rng: np.random.Generator) -> Body:
     return Body(length, np.array(levels), np.array(half), rng.uniform(2.3, 4.2), neck)
 
 
-def parts_of(probe: Body, rng: np.random.Generator) -> list[Part]:
+def scaled(probe: Body, array_mm: float) -> Body:
+    """A body as wide as an array of a length demands."""
+    return replace(probe, half=probe.half * [array_mm / ARRAY_MM, 1.0])
+
+
+def lens(rng: np.random.Generator) -> Array:
+    """Size of a random acoustic lens : (2,) mm, along the array and across it."""
+    return np.array([rng.uniform(38, 48), rng.uniform(9, 13)])
+
+
+def parts_of(probe: Body, lens_mm: Array, rng: np.random.Generator) -> list[Part]:
     """Housing, acoustic lens, and small marks upon it, in the body's frame."""
     levels = np.unique(np.concatenate([probe.levels, np.linspace(0.06, 0.94, 22)]))
     half = PchipInterpolator(probe.levels, probe.half)(levels)
@@ -58,8 +70,8 @@ def parts_of(probe: Body, rng: np.random.Generator) -> list[Part]:
         for h, level in zip(half, levels, strict=True)
     ]
     parts = [Part("probe", lofts.loft(rings), True)]
-    lens = lofts.prism(lofts.rounded([rng.uniform(38, 48), rng.uniform(9, 13)], 3), 3.0, 1.2)
-    parts.append(Part("marking", lofts.placed(lens, rigid.transform(np.eye(3), [0, 0, -1.8])), True))
+    face = lofts.prism(lofts.rounded(lens_mm, 3), 3.0, 1.2)
+    parts.append(Part("marking", lofts.placed(face, rigid.transform(np.eye(3), [0, 0, -LENS_MM])), True))
     for _ in range(rng.integers(1, 5)):
         parts.append(_mark(probe, rng))
     return parts

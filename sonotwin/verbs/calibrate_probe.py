@@ -42,6 +42,7 @@ class Config(Settings):
     rig: Rig
     out: Path
     capture: Path | None = None
+    sweep: str = ""
     pairs: Path | None = None
     earlier: Path | None = None
     lag_s: LagSeconds = 0.0
@@ -93,7 +94,7 @@ def look(config: Config, console: Console) -> CrossingFrames:
     if config.pairs is not None:
         return crossing_frames.of_pairs(str(config.pairs), config.rig.probe.image_size, *sweep_tables.read_pairs(config.pairs))
     assert config.capture is not None
-    sweep = sweep_part.read_sweep(config.capture)
+    sweep = sweep_part.read_sweep(config.capture, config.sweep, "probe")
     poses, covariance = sweep.poses(config.lag_s), sweep.pose_covariance(config.lag_s)
     with console.status("") as status:
 

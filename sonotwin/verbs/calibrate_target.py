@@ -39,6 +39,7 @@ class Config(BaseModel):
 
     rig: Rig
     capture: Path
+    sweep: str = ""
     out: Path
     calibration: Path | None = None
     drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
@@ -60,7 +61,7 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     inputs = [path for path in (config.capture, config.calibration, config.networks) if path is not None]
     atomic.check_folder(config.out, TARGET, inputs=inputs)
-    film = stereo_frames.read_film(config.capture, config.calibration)
+    film = stereo_frames.read_film(config.capture, config.calibration, config.sweep)
     design = config.rig.target
     optics = with_drift(film.optics, CAMERAS, config.drift_px)
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)

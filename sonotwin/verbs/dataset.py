@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon.model.rig import Rig
+from twin.shooting import Quality
 from twin.tracking.dataset_shards import Place, Settings, generate, prepare, write_index
-from twin.tracking.rendered_views import Quality
 from twin.tracking.sampling_ranges import DataRanges
 
 

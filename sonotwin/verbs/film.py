@@ -21,13 +21,14 @@ from pydantic import ConfigDict, Field
 from rich.console import Console
 from rich.progress import Progress
 
-from recon.capture.manifest import CAMERAS
+from recon.capture.manifest import CAMERAS, SweepName, sweep_part
 from recon.model.rig import Rig
 from sonotwin.config import folder as conf
 from twin.conditions import Conditions, drifted, printed
 from twin.session import Session
+from twin.shooting import Quality
 from twin.tracking import film_session
-from twin.tracking.rendered_views import Frames, Quality
+from twin.tracking.rendered_views import Frames
 from twin.tracking.sampling_ranges import DataRanges
 
 
@@ -40,6 +41,7 @@ class Config(film_session.Filming):
     conditions: Conditions = Conditions()
     out: Path
     add: bool = False
+    name: Literal[""] | SweepName = ""
     pixels: Literal["sketch", "full"] = "sketch"
     quality: Quality = Quality(window=8)
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
@@ -54,7 +56,9 @@ def run(config: Config) -> None:
         If `out` holds anything but what was rendered.
     """
     console = Console(soft_wrap=True, highlight=False)
-    session = Session(config.out, "sweep", config.model_dump(mode="json", exclude={"out", "add"}), config.add, CAMERAS)
+    session = Session(
+        config.out, sweep_part(config.name), config.model_dump(mode="json", exclude={"out", "add"}), config.add, CAMERAS
+    )
     session.check()
     rig = drifted(config.rig, config.conditions.drift, config.seed)
     rig = rig.model_copy(update={"target": printed(rig.target, config.conditions.target, config.seed)})

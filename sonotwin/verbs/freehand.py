@@ -41,6 +41,7 @@ class Config(BaseModel):
 
     out: Path
     capture: Path | None = None
+    sweep: str = ""
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
     tissue_m_s: Speed | None = None
@@ -110,7 +111,7 @@ def read(config: Config) -> tuple[SweepCapture | None, Scans]:
     if config.capture is None:
         assert config.sequence is not None
         return None, freehand_scans.of_sequence(config.sequence, config.probe, config.config, config.tissue_m_s)
-    sweep = sweep_part.read_sweep(config.capture)
+    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
     return sweep, freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
 

@@ -42,6 +42,7 @@ class Config(BaseModel):
 
     capture: Path
     out: Path
+    sweep: str = ""
     search_s: tuple[Finite, Finite] = latency.SEARCH_S
     top_px: Annotated[int, Field(ge=0)] = 40
 
@@ -65,7 +66,7 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     atomic.check_folder(config.out, LAG, inputs=[config.capture])
-    sweep = sweep_part.read_sweep(config.capture)
+    sweep = sweep_part.read_sweep(config.capture, config.sweep, "latency")
     start = perf_counter()
     with console.status("looking for the bottom"):
         depths = np.array([latency.bottom_depth(image, config.top_px) for image in sweep.images()])

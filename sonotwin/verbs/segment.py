@@ -44,6 +44,7 @@ class Config(BaseModel):
     out: Path
     kind: Literal["masses", "tube"] = "masses"
     capture: Path | None = None
+    sweep: str = ""
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
     sequence: Path | None = None
@@ -114,7 +115,7 @@ def read(config: Config) -> Scans:
     if config.capture is None:
         assert config.sequence is not None
         return freehand_scans.of_sequence(config.sequence, config.probe, None, config.tissue_m_s)
-    sweep = sweep_part.read_sweep(config.capture)
+    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
     return freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
 

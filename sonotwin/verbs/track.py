@@ -43,6 +43,7 @@ class Config(BaseModel):
 
     rig: Rig
     capture: Path
+    sweep: str = ""
     out: Path
     calibration: Path | None = None
     drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
@@ -63,7 +64,7 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     inputs = [path for path in (config.capture, config.calibration, config.target, config.networks) if path is not None]
     atomic.check_folder(config.out, results.POSES, inputs=inputs)
-    film = stereo_frames.read_film(config.capture, config.calibration)
+    film = stereo_frames.read_film(config.capture, config.calibration, config.sweep)
     optics = with_drift(film.optics, CAMERAS, config.drift_px)
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
     design = config.rig.target
@@ -81,7 +82,7 @@ def run(config: Config) -> None:
             console.print(line, markup=False)
         results.write_poses(folder, film, steps)
         metrics.write(folder / metrics.FILE, figures | {"seconds_track": round(perf_counter() - start, 3)})
-        results.hand_on(folder, config.capture, config.out, config.calibration)
+        results.hand_on(folder, config.capture, config.out, config.calibration, config.sweep)
         written = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
 

@@ -10,7 +10,7 @@ import pytest
 
 from recon.capture import manifest
 from recon.capture.images import read_image
-from recon.capture.manifest import CAMERAS, SCANNER, SCHEMA, BoardPart, Device, Manifest, SweepPart
+from recon.capture.manifest import CAMERAS, SCANNER, SCHEMA, BoardPart, Device, Manifest, SweepPart, is_sweep
 from recon.capture.writer import CaptureWriter, write_pose
 from recon.errors import InputError
 from recon.files.npz import Form
@@ -47,7 +47,7 @@ def render(
     out: Path, part: str, seed: int, add: bool = False, rig: object = "ours", devices: tuple[str, ...] = (SCANNER,)
 ) -> None:
     """Write a part whose capture and truth hold the seed."""
-    session = Session(out, part, {"rig": rig, "seed": seed}, add, devices if part == "sweep" else ())
+    session = Session(out, part, {"rig": rig, "seed": seed}, add, devices if is_sweep(part) else ())
     with session.write(describe(scene(part), things=["ball"])) as (capture, truth):
         camera = Device(size=SIZE, exposure_s=0.01 * seed)
         truth.write_optics(optics("cam1", "projector"))
@@ -60,10 +60,10 @@ def render(
             pose = write_pose(capture.folder, "00", {"cam1": noise(1, seed)[0]}, {})
             capture.add_board(BoardPart(board=design, poses=(pose,)), {"cam1": camera})
         else:
-            truth.write_arrays("sweep/sweep.npz", {"seed": np.array(seed)})
+            truth.write_arrays(f"{part}/sweep.npz", {"seed": np.array(seed)})
             times = dict.fromkeys(devices, np.arange(1, 3))
             images = ((device, image) for device in devices for image in noise(2, seed))
-            capture.add_sweep(times, images, dict.fromkeys(devices, camera))
+            capture.add_sweep(times, images, dict.fromkeys(devices, camera), name=part.partition("/")[2])
 
 
 IMAGES = {"surface": "surface/cam1/0000.png", "board": "board/00/cam1/lit.png", "sweep": "sweep/us/0000.png"}
@@ -77,10 +77,11 @@ def seeds(out: Path) -> dict[str, int]:
     for part, held in read.contents.items():
         truth = TruthFolder(out / "truth", part)
         seed = truth.settings()["seed"]
-        assert int(truth.arrays(ARRAYS[part], {"seed": Form("fiu", ())})["seed"]) == seed
+        arrays = ARRAYS.get(part, f"{part}/sweep.npz")
+        assert int(truth.arrays(arrays, {"seed": Form("fiu", ())})["seed"]) == seed
         assert truth.scene()["name"] == part
         assert read.devices_of(part)[held[0]].exposure_s == 0.01 * seed
-        image = read_image(out / "capture" / IMAGES[part], SIZE, 8)
+        image = read_image(out / "capture" / IMAGES.get(part, f"{part}/us/0000.png"), SIZE, 8)
         assert np.array_equal(image, noise(1 if part == "board" else 2, seed)[0] if part != "surface" else noise(5, seed)[0])
         found[part] = seed
     return found
@@ -305,3 +306,18 @@ def test_settings_are_written_as_json(tmp_path):
     render(tmp_path, "surface", 1)
     text = (tmp_path / "truth" / "settings.json").read_text()
     assert text == json.dumps({"rig": "ours", "seed": 1}, indent=2) + "\n"
+
+
+def test_sweeps_with_names_stand_side_by_side(tmp_path):
+    """Each keeps its images, truth, settings and scene when another is added, or rendered anew."""
+    for part, seed in (("sweep/wires", 1), ("sweep/scan", 2), ("surface", 3), ("sweep/wires", 4)):
+        render(tmp_path, part, seed, add=True)
+    assert seeds(tmp_path) == {"surface": 3, "sweep/scan": 2, "sweep/wires": 4}
+
+
+def test_a_sweep_without_a_name_is_refused_beside_named_ones_and_the_other_way_round(tmp_path):
+    render(tmp_path / "named", "sweep/wires", 1)
+    render(tmp_path / "one", "sweep", 1)
+    for out, part, found in (("named", "sweep", "sweep wires of us"), ("one", "sweep/wires", "sweep of us")):
+        with pytest.raises(InputError, match=f"found a {found}; choose another out, or give all sweeps names"):
+            Session(tmp_path / out, part, {}, True, (SCANNER,)).check()

@@ -5,8 +5,9 @@ from functools import lru_cache
 
 from recon.model.rig import Target
 from twin.accuracy.table_rows import Setup
+from twin.shooting import Quality
 from twin.tracking.mesh_bank import Bank, build_bank
-from twin.tracking.rendered_views import Frames, Quality, render_full, render_sketches
+from twin.tracking.rendered_views import Frames, render_full, render_sketches
 from twin.tracking.samples import Take, draw
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.study_samples import study_take

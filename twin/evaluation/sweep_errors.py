@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 
-from recon.capture.manifest import image_name
+from recon.capture.manifest import image_name, sweep_part
 from recon.errors import InputError, one_line
 from recon.files import npz
 from recon.files.metrics import Metrics
@@ -73,15 +73,19 @@ class Finding:
         return np.nan if self.found is None else float(np.linalg.norm(self.found.center_mass - self.true.center_mass))
 
 
-def read_truth(folder: Path) -> SweepTruth:
+def read_truth(folder: Path, name: str = "") -> SweepTruth:
     """Read the ground truth of a sweep from the `truth/` folder that it was rendered to, and build its scene again.
+
+    Parameters
+    ----------
+    name : of one of several sweeps.
 
     Raises
     ------
     InputError
         If a file is missing or damaged, or the scene hides nothing.
     """
-    kept = TruthFolder(Path(folder), "sweep")
+    kept = TruthFolder(Path(folder), sweep_part(name))
     path, settings = kept.described / SETTINGS, kept.settings()
     try:
         rig, clocks = Rig.model_validate(settings["rig"]), Clocks.model_validate(settings["clocks"])
@@ -91,8 +95,9 @@ def read_truth(folder: Path) -> SweepTruth:
         raise InputError(f"{path}: {one_line(error)}") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: expected the settings of a rendered sweep, found them damaged at {error}") from None
-    poses = kept.arrays(sweep_session.POSES, {"world_from_image": npz.Form("f", (None, 4, 4))})["world_from_image"]
-    labels = tuple(kept.folder / sweep_session.LABELS / image_name(number) for number in range(len(poses)))
+    forms = {"world_from_image": npz.Form("f", (None, 4, 4))}
+    poses = kept.arrays(f"{kept.part}/{sweep_session.POSES}", forms)["world_from_image"]
+    labels = tuple(kept.own / sweep_session.LABELS / image_name(number) for number in range(len(poses)))
     if missing := [path for path in labels if not path.is_file()]:
         raise InputError(f"{missing[0]}: expected an image of labels, found none")
     scene = build_scene(wanted)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from recon.capture import sweep_tables
+from recon.capture.manifest import sweep_part
 from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.files.npz import Form
@@ -48,8 +49,12 @@ class Errors:
         return np.isfinite(self.shift_mm)
 
 
-def read_truth(folder: Path) -> FilmTruth:
+def read_truth(folder: Path, name: str = "") -> FilmTruth:
     """Read a film's truth folder.
+
+    Parameters
+    ----------
+    name : of one of several sweeps.
 
     Raises
     ------
@@ -63,7 +68,8 @@ def read_truth(folder: Path) -> FilmTruth:
         "visible": Form("f", (None, 2, 3)),
         "inside": Form("b", (None, 2, 3)),
     }
-    content = TruthFolder(folder, "sweep").arrays(TRUTH, forms)
+    part = sweep_part(name)
+    content = TruthFolder(folder, part).arrays(f"{part}/{TRUTH}", forms)
     return FilmTruth(*(content[name] for name in forms))
 
 

@@ -27,8 +27,9 @@ from recon.errors import InputError
 from recon.files import atomic
 from recon.model.rig import Rig
 from twin.session import first_difference
+from twin.shooting import Quality
 from twin.tracking.mesh_bank import Bank, build_bank
-from twin.tracking.rendered_views import Frames, Quality, render_full, render_sketches, render_views
+from twin.tracking.rendered_views import Frames, render_full, render_sketches, render_views
 from twin.tracking.samples import Take, draw
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import ViewTruth, disc_masks

@@ -8,8 +8,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
@@ -25,22 +23,24 @@ from recon.model.rig import Finite, NotNegative, Part, Positive, Rig, Target, Ve
 from scenes.scene_types import Scene
 from twin import conditions
 from twin.session import Session, describe
-from twin.tracking.mesh_bank import Bank, build_bank
-from twin.tracking.rendered_views import Frames, Quality, render_full, render_sketches, white_radiance
+from twin.shooting import Quality, Shooting
+from twin.tracking.mesh_bank import Bank, build_bank, uncovered
+from twin.tracking.rendered_views import Frames, render_full, render_sketches, white_radiance
 from twin.tracking.samples import Motion, Take, draw
 from twin.tracking.sampling_ranges import DataRanges
-from twin.tracking.target_truth import outline
+from twin.tracking.target_truth import ViewTruth
 from twin.tremor import Tremor
 
 Array = NDArray[np.float64]
 
-TRUTH = "sweep/film.npz"
+TRUTH = "film.npz"  # in the sweep's own folder of truth
 STILL = conditions.Motion()
 BODIES = 4  # of which the one is taken whose fingers and cable cover least of the circles
 LOOKS = 8  # frames in which that is looked at
 NEAREST_MM = 100.0  # of a circle before a camera, along its axis
-LIFT_MM = 0.2  # of the rays off the target's face
 BATCH = 3  # frames traced in one launch; doesn't change them
+
+Views = tuple[ViewTruth, ViewTruth]
 
 
 class HandPath(Part):
@@ -53,14 +53,11 @@ class HandPath(Part):
     unsteady_mm: NotNegative = 1.0  # of the places
 
 
-class Filming(Part):
+class Filming(Shooting):
     """Settings of a film."""
 
     frames: Annotated[int, Field(ge=1, le=100_000)] = 30
     camera_hz: Positive = 30.0
-    exposure_s: Positive = 0.01
-    white_dn: Annotated[float, Field(gt=0, le=1000)] = 65.0  # brightness of the target's white, on the whole
-    gain: Positive = 1.0  # linear
     path: HandPath
 
     @model_validator(mode="after")
@@ -160,36 +157,32 @@ def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int,
     moved = _farthest(filming.path) - drawn.motion.world_from_target[:3, 3]
     lamps = drawn.lighting.lamps.copy()
     lamps[:, :3] += moved
-    same = replace(
-        drawn,
-        cameras=(rig.cam1, rig.cam2),
-        present=True,
-        body=int(np.argmax([uncovered(bank, body, rig.target, eyes) for body in range(BODIES)])),
-        lighting=replace(drawn.lighting, lamps=lamps),
-        scene_from_world=drawn.scene_from_world @ rigid.transform(np.eye(3), -moved),
-        gain=filming.gain,
-    )
-    noise = np.random.default_rng([seed, 3]).integers(2**31, size=filming.frames).tolist()
-    late = conditions.triggered(errors, filming.frames, seed) / filming.exposure_s
+    same = {
+        "cameras": (rig.cam1, rig.cam2),
+        "present": True,
+        "body": int(np.argmax([uncovered(bank, body, rig.target, eyes) for body in range(BODIES)])),
+        "lighting": replace(drawn.lighting, lamps=lamps),
+        "scene_from_world": drawn.scene_from_world @ rigid.transform(np.eye(3), -moved),
+    }
+    return in_a_row(replace(drawn, **same), motions, rig, filming, seed, errors)
+
+
+def in_a_row(
+    same: Take, motions: Sequence[Motion], rig: Rig, shooting: Shooting, seed: int, errors: conditions.Motion = STILL
+) -> list[Take]:
+    """Takes that differ by motion and noise alone, under one exposure: as bright on the whole as asked for, and in each frame as
+    the light falls.
+    """
+    noise = np.random.default_rng([seed, 3]).integers(2**31, size=len(motions)).tolist()
+    late = conditions.triggered(errors, len(motions), seed) / shooting.exposure_s
     made = [
-        replace(same, k=k, motion=motion, noise_seed=noise[k], late=tuple(late[k].tolist())) for k, motion in enumerate(motions)
+        replace(same, k=k, motion=motion, noise_seed=noise[k], late=tuple(late[k].tolist()), gain=shooting.gain)
+        for k, motion in enumerate(motions)
     ]
     falls = np.array([white_radiance(take, rig) for take in made])
-    # one exposure: as bright on the whole as asked for, and in each frame as the light falls
     return [
-        replace(take, white_dn=filming.white_dn * part) for take, part in zip(made, (falls / falls.mean()).tolist(), strict=True)
+        replace(take, white_dn=shooting.white_dn * part) for take, part in zip(made, (falls / falls.mean()).tolist(), strict=True)
     ]
-
-
-def uncovered(bank: Bank, body: int, target: Target, eyes: Array) -> float:
-    """Share of the circles' rims that eyes : (n, 3) mm in the target's frame see past a body."""
-    rims = outline(circle_centres(target) + np.array([0, 0, LIFT_MM]), target.outer_diameter_mm / 2).reshape(-1, 3)
-    start = np.tile(rims, (len(eyes), 1))
-    ways = np.repeat(eyes, len(rims), axis=0) - start
-    distance = np.linalg.norm(ways, axis=1)
-    ray = mi.Ray3f(mi.Point3f(*np.float32(start + bank.body_at[body]).T), mi.Vector3f(*np.float32(ways / distance[:, None]).T))
-    ray.maxt = mi.Float(np.float32(distance))
-    return 1 - float(np.mean(np.array(bank.bodies.ray_test(ray, dr.full(mi.Bool, True, len(start))))))
 
 
 def _farthest(path: HandPath) -> Array:
@@ -216,35 +209,45 @@ def write_session(
 
     A calibration that has been measured for a capture that is added to stays in it.
     """
-    devices = {
-        name: Device(size=getattr(rig, name).optics.size, exposure_s=filming.exposure_s, gain=filming.gain) for name in CAMERAS
-    }
     with session.write(describe(Scene("film", ()), labels=[])) as (capture, truth):
-        truth.write_optics(_cameras(rig))
-        seen = []
+        truth.write_optics(cameras_of(rig))
+        seen: list[Views] = []
+        capture.complete_calibration(cameras_of(calibrated))
+        capture.add_sweep(
+            dict.fromkeys(CAMERAS, filming.times),
+            images(frames, seen),
+            devices(rig, filming),
+            name=session.part.partition("/")[2],
+        )
+        truth.write_arrays(f"{session.part}/{TRUTH}", truth_arrays(filming.times, made, seen))
 
-        def images() -> Iterator[tuple[str, NDArray]]:
-            for one in frames:
-                seen.append(one.truth)
-                yield from zip(CAMERAS, one.views, strict=True)
 
-        capture.complete_calibration(_cameras(calibrated))
-        capture.add_sweep(dict.fromkeys(CAMERAS, filming.times), images(), devices)
-        truth.write_arrays(TRUTH, _truth_arrays(filming, made, seen))
+def devices(rig: Rig, shooting: Shooting) -> dict[str, Device]:
+    """Both cameras as they are set."""
+    sizes = {name: getattr(rig, name).optics.size for name in CAMERAS}
+    return {name: Device(size=size, exposure_s=shooting.exposure_s, gain=shooting.gain) for name, size in sizes.items()}
 
 
-def _cameras(rig: Rig) -> Calibration:
+def images(frames: Iterable[Frames], seen: list[Views]) -> Iterator[tuple[str, NDArray]]:
+    """Images of both cameras, pair by pair, each with its camera's name; the truth of the views is noted."""
+    for one in frames:
+        seen.append(one.truth)
+        yield from zip(CAMERAS, one.views, strict=True)
+
+
+def cameras_of(rig: Rig) -> Calibration:
+    """The rig's own cameras, as a calibration."""
     return Calibration({name: getattr(rig, name).optics.camera() for name in CAMERAS})
 
 
-def _truth_arrays(filming: Filming, made: Sequence[Take], seen: Sequence) -> dict[str, NDArray]:
+def truth_arrays(times: NDArray[np.int64], made: Sequence[Take], seen: Sequence[Views]) -> dict[str, NDArray]:
     """By name: (n, ...) of each frame, (n, 2, ...) of each view; lengths in mm and px."""
     views = {
         name: np.array([[getattr(view, name) for view in both] for both in seen])
         for name in ("centres", "ellipses", "inside", "blur_px", "visible", "white_dn")
     }
     return {
-        "times_ns": filming.times,
+        "times_ns": times,
         "world_from_target": np.array([take.motion.world_from_target for take in made]),
         "shift_mm": np.array([take.motion.shift_mm for take in made]),
         "turn_rad": np.array([take.motion.turn_rad for take in made]),

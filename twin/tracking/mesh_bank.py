@@ -6,21 +6,25 @@ A sample picks its variants by their places; nothing is built or torn down betwe
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry import rigid
+from recon.model.circle_layout import circle_centres
 from recon.model.rig import Target
 from scenes.handheld.handheld_assembly import held
 from scenes.handheld.mesh_parts import Merged, Part, merged
-from scenes.handheld.surroundings import surroundings
+from scenes.handheld.surroundings import Surroundings, surroundings
 from twin.tracking.surface_prints import STRIDE_MM
+from twin.tracking.target_truth import outline
 
 Array = NDArray[np.float64]
 
 BODY_PITCH_MM = 2500.0  # more than a body's size and ROOM_MM beyond it, so that variants don't see each other
 SCENE_PITCH_MM = 14000.0
+LIFT_MM = 0.2  # of the rays off the target's face
 
 
 @dataclass(frozen=True)
@@ -37,10 +41,14 @@ class Bank:
 def build_bank(target: Target, variants: int, seed: int) -> Bank:
     """Make the variants of a data set, by its seed alone."""
     streams = [np.random.default_rng([seed, 1 << 32, kind]) for kind in (0, 1)]
-    body_at, scene_at = _places(variants, BODY_PITCH_MM), _places(variants, SCENE_PITCH_MM)
-    body_parts = [held(streams[0], target) for _ in range(variants)]
-    around = [surroundings(streams[1]) for _ in range(variants)]
-    body = _shifted_mesh("bodies", [merged(parts) for parts in body_parts], body_at)
+    bodies = [held(streams[0], target) for _ in range(variants)]
+    return bank_of(bodies, [surroundings(streams[1]) for _ in range(variants)])
+
+
+def bank_of(bodies: Sequence[Sequence[Part]], around: Sequence[Surroundings]) -> Bank:
+    """Set up bodies, each of the parts that move with the target, and surroundings."""
+    body_at, scene_at = _places(len(bodies), BODY_PITCH_MM), _places(len(around), SCENE_PITCH_MM)
+    body = _shifted_mesh("bodies", [merged(parts) for parts in bodies], body_at)
     plain = [merged([part for part in one.parts if part.slot != "poster"]) for one in around]
     scene = _shifted_mesh("scenes", plain, scene_at)
     sheets = [
@@ -51,8 +59,19 @@ def build_bank(target: Target, variants: int, seed: int) -> Bank:
     posters = _poster_mesh(sheets) if sheets else None
     scenes = mi.load_dict({"type": "scene", "a": scene} | ({} if posters is None else {"b": posters}))
     # on a GPU one kernel can trace rays in two worlds only if one is loaded as the other's child: OptiX has one table of shaders
-    bodies = mi.load_dict({"type": "scene", "a": body, "parent_scene": scenes})
-    return Bank(bodies, scenes, mi.ShapePtr(posters), body_at, scene_at)
+    loaded = mi.load_dict({"type": "scene", "a": body, "parent_scene": scenes})
+    return Bank(loaded, scenes, mi.ShapePtr(posters), body_at, scene_at)
+
+
+def uncovered(bank: Bank, body: int, target: Target, eyes: Array) -> float:
+    """Share of the circles' rims that eyes : (n, 3) mm in the target's frame see past a body."""
+    rims = outline(circle_centres(target) + np.array([0, 0, LIFT_MM]), target.outer_diameter_mm / 2).reshape(-1, 3)
+    start = np.tile(rims, (len(eyes), 1))
+    ways = np.repeat(eyes, len(rims), axis=0) - start
+    distance = np.linalg.norm(ways, axis=1)
+    ray = mi.Ray3f(mi.Point3f(*np.float32(start + bank.body_at[body]).T), mi.Vector3f(*np.float32(ways / distance[:, None]).T))
+    ray.maxt = mi.Float(np.float32(distance))
+    return 1 - float(np.mean(np.array(bank.bodies.ray_test(ray, dr.full(mi.Bool, True, len(start))))))
 
 
 def _places(count: int, pitch: float) -> Array:
@@ -63,13 +82,13 @@ def _places(count: int, pitch: float) -> Array:
 
 
 def _shifted_mesh(name: str, variants: Sequence[Merged], places: Array) -> mi.Mesh:
-    """One mesh of all variants, at their places; the number of a vertex's surface is its first texture coordinate."""
+    """One mesh of all variants, at their places; a vertex's texture coordinates are the number of its surface and its albedo."""
     first = np.cumsum([0, *(len(one.vertices) for one in variants)])[:-1]
     vertices = np.concatenate([one.vertices + place for one, place in zip(variants, places, strict=True)])
     faces = np.concatenate([one.faces + start for one, start in zip(variants, first, strict=True)])
     normals = np.concatenate([one.normals for one in variants])
-    slots = np.concatenate([one.slot for one in variants])
-    return _mesh(name, vertices, faces, normals, np.column_stack([slots, np.zeros(len(slots))]))
+    texture = np.concatenate([np.column_stack([one.slot, one.albedo]) for one in variants])
+    return _mesh(name, vertices, faces, normals, texture)
 
 
 def _poster_mesh(sheets: Sequence[tuple[Part, Array, Array]]) -> mi.Mesh:

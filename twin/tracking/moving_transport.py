@@ -235,6 +235,7 @@ class _Path:
         normal = dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
         poster = scene.is_valid() & ~held & (scene.shape == self.bank.posters)
         uv = dr.select(held, body.uv.x, dr.select(poster, float(POSTER), scene.uv.x))
+        albedo = dr.select(held, body.uv.y, dr.select(poster, 0, scene.uv.y))
         slot = mi.UInt32(dr.clip(dr.select(nothing, 0, dr.floor(uv + 0.5)), 0, len(SLOTS) - 1))
         on_face = held & (slot == TARGET)
         row = self.rows.chosen("surfaces", slot, 6)
@@ -242,7 +243,7 @@ class _Path:
         seed = mi.UInt32(slot) * 77 + mi.UInt32(self.texture_shift.x * 100 + 1e6)
         texture = relief(row, place, seed)
         printed = self.face.reflectance(self._covered(x, y), texture, x, y)
-        reflectance = dr.select(on_face, printed, textured(row, texture))
+        reflectance = dr.select(on_face, printed, dr.select(albedo > 0, albedo, textured(row, texture)))
         sheet = poster_reflectance(self.target, reflectance, scene.uv.x, scene.uv.y, mi.UInt32(self.texture_shift.y * 100 + 1e6))
         reflectance = dr.select(poster, sheet, reflectance)
         return mi.Vector3f(ray(distance)), normal, (reflectance, row[4], row[5]), on_face, nothing

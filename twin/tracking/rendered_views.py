@@ -7,11 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from recon.geometry import rigid
 from recon.model.rig import CameraDevice, Rig, Target
 from twin.sensor import Exposure, digitise, number_per_electron, read_out
+from twin.shooting import Quality
 from twin.tracking.mesh_bank import Bank
 from twin.tracking.moving_transport import NO_CIRCLE, Lanes, Light, render
 from twin.tracking.pixel_selection import HALF, PATCH, VIEW, Picture, Sketch, View, Window, full_frame, joined
@@ -23,23 +23,6 @@ Grey = NDArray[np.uint8]
 
 AROUND = 24  # px of a sketch's window about the target's board
 DARKEST = 0.15  # of the light that falls on a face at right angles: what an exposure is set by is never less
-
-
-class Quality(BaseModel):
-    """Rays a pixel, powers of two."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    view: int = Field(default=1, ge=1, le=256)  # of each of the four camera pixels that make a view's pixel
-    patch: int = Field(default=4, ge=2, le=1024)
-    window: int = Field(default=4, ge=2, le=1024)  # of full frames, and of what a sketch shows in full
-
-    @field_validator("view", "patch", "window")
-    @classmethod
-    def _power_of_two(cls, value: int) -> int:
-        if value & (value - 1):
-            raise ValueError(f"expected a power of two, found {value}")
-        return value
 
 
 @dataclass(frozen=True)

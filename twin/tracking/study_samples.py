@@ -22,6 +22,7 @@ TILT_DEG = 45.0  # most, of the target's normal from the way to the cameras
 MARGIN_PX = 12.0  # of the board from the images' borders
 TRIES = 200
 GAIN = 1.0
+CLEAN = Print(0.04, 0.8, 0.01, 0.03, np.zeros((SCRATCHES, 6)), np.zeros((SPOTS, 4)))  # a print without flaws
 TURN_SHARE = 0.3  # of the path in the image, what the target's turn adds on the way
 
 
@@ -43,7 +44,7 @@ def study_take(rig: Rig, ranges: DataRanges, seed: int, k: int, white_dn: float,
         motion=motion,
         scene_from_world=scene,
         lighting=_lighting(pose, rng),
-        face=Print(0.04, 0.8, 0.01, 0.03, np.zeros((SCRATCHES, 6)), np.zeros((SPOTS, 4))),
+        face=CLEAN,
         white_dn=white_dn,
         gain=GAIN,
     )

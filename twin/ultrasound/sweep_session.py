@@ -1,14 +1,15 @@
 """The sweep part of a session: B-scans along a path through a scene, image by image, and the truth about them."""
 
 from collections.abc import Iterable, Iterator
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.capture.images import write_images
-from recon.capture.manifest import SCANNER, Device, image_name
+from recon.capture.manifest import SCANNER, Device, Purpose, image_name
+from recon.capture.writer import CaptureWriter
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
@@ -16,7 +17,7 @@ from recon.model.rig import Rig
 from recon.model.tracks import Track
 from scenes.scene_types import Scene
 from twin import conditions
-from twin.session import Session, describe
+from twin.session import Session, TruthFolder, describe
 from twin.ultrasound import bscan_truth
 from twin.ultrasound.bscan import Scan
 from twin.ultrasound.echo_solids import Body, Solid, label_at
@@ -26,8 +27,9 @@ from twin.ultrasound.transducer import Transducer
 
 AnyPath = Annotated[SurfacePath | Bob | WirePath, Field(discriminator="kind")]
 
-POSES = "sweep/sweep.npz"
-LABELS = "sweep/labels"
+POSES = "sweep.npz"  # in the sweep's own folder of truth
+LABELS = "labels"
+PURPOSES: dict[str, Purpose] = {"wire": "probe", "bob": "latency", "stroke": "volume"}  # by the path's kind
 SUPPORTS = ("table", "tank")  # what things lie on or in
 GIVES_MM = 5.0  # by which a surface gives way to the probe, at most
 
@@ -109,6 +111,28 @@ def calibration_of(rig: Rig, transducer: Transducer) -> ProbeCalibration:
     return ProbeCalibration(rig.probe.target_from_image.matrix(), scale, speed_m_s=transducer.assumed_speed)
 
 
+class FilmPart(Protocol):
+    """Frames of both cameras, which see the target of a sweep."""
+
+    @property
+    def times(self) -> NDArray[np.int64]:
+        """Of the pairs : (m,) ns."""
+        ...
+
+    @property
+    def devices(self) -> dict[str, Device]:
+        """Both cameras as they are set."""
+        ...
+
+    def images(self) -> Iterator[tuple[str, NDArray]]:
+        """Render the images, each with its camera's name."""
+        ...
+
+    def finish(self, capture: CaptureWriter, truth: TruthFolder) -> None:
+        """Write what else belongs to them."""
+        ...
+
+
 def write_session(
     session: Session,
     scene: Scene,
@@ -117,23 +141,36 @@ def write_session(
     planned: Plan,
     scans: Iterable[Scan],
     probe: ProbeCalibration | None,
+    film: FilmPart | None = None,
 ) -> None:
-    """Write a sweep and its truth, taking the scans one by one.
+    """Write a sweep and its truth, taking the scans one by one, and then the frames.
 
     Parameters
     ----------
     probe : of the capture; None where it is still to be calibrated.
+    film : of the cameras, in which the poses are then still to be found; None where the poses are given.
     """
     with session.write(describe_sound(scene, body)) as (capture, truth):
-        truth.write_arrays(POSES, {"world_from_image": planned.truth.poses, "times_ns": planned.truth.times})
+        own = truth.own.relative_to(truth.folder)
+        truth.write_arrays(str(own / POSES), {"world_from_image": planned.truth.poses, "times_ns": planned.truth.times})
 
         def images() -> Iterator[tuple[str, NDArray[np.uint8]]]:
             for number, one in enumerate(scans):
                 labels = bscan_truth.labels(one.paths, transducer)
-                write_images([truth.folder / LABELS / image_name(number)], labels[None])
+                write_images([truth.own / LABELS / image_name(number)], labels[None])
                 yield SCANNER, one.image
+            if film is not None:
+                yield from film.images()
 
-        capture.add_sweep({SCANNER: planned.times}, images(), {SCANNER: Device(size=transducer.image_size)}, planned.track)
+        times, devices = {SCANNER: planned.times}, {SCANNER: Device(size=transducer.image_size)}
+        if film is not None:
+            times |= dict.fromkeys(film.devices, film.times)
+            devices |= film.devices
+        name = session.part.partition("/")[2]
+        track = planned.track if film is None else None
+        capture.add_sweep(times, images(), devices, track, name, session.purpose)
+        if film is not None:
+            film.finish(capture, truth)
         if probe is not None:
             capture.add_probe(probe)
 

@@ -39,12 +39,28 @@ class PoseNoise(Part):
 
 
 @dataclass(frozen=True, eq=False)
+class TargetMotion:
+    """The target's true motion at the cameras' m moments."""
+
+    path: Track  # world_from_image
+    times: NDArray[np.int64]  # (m,) ns
+    target_from_image: Array  # (m, 4, 4); a bracket may give
+
+    def poses(self, later_s: float = 0.0) -> Array:
+        """Poses `world_from_target` : (m, 4, 4) somewhat later than the moments; at them where the path has none any more."""
+        at_once, shifted = (tracks.at(self.path, self.times + round(step * 1e9)) for step in (0.0, later_s))
+        led = np.where(np.isfinite(shifted), shifted, at_once)
+        return np.stack([pose @ rigid.invert(held) for pose, held in zip(led, self.target_from_image, strict=True)])
+
+
+@dataclass(frozen=True, eq=False)
 class Plan:
     """Plan of a sweep: true times and poses of its n images, and both clocks' stamps and the tracked poses."""
 
     times: NDArray[np.int64]  # (n,) ns, the scanner's stamps
     track: Track  # world_from_target by the cameras
     truth: Track  # world_from_image at the moments when the images are taken
+    target: TargetMotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,14 +125,12 @@ def plan(
         raise InputError(f"path: expected one that lasts two images, found {length:.3f} s")
     stamps = _stamped(taken, clocks.lag_s, clocks.scanner_jitter_s, rng)
     tracked = moments(path, clocks.camera_hz)
-    poses = tracks.at(path, tracked)
-    known = np.isfinite(poses).all(axis=(1, 2))
-    tracked, poses = tracked[known], poses[known]
+    tracked = tracked[np.isfinite(tracks.at(path, tracked)).all(axis=(1, 2))]
     design, given = probe.target_from_image.matrix(), conditions.given(errors, tracked, seed)
-    held = [pose @ rigid.invert(rigid.moved(design, step)) for pose, step in zip(poses, given, strict=True)]
-    seen = _noisy(np.stack(held), pose_noise, rng)
+    target = TargetMotion(path, tracked, np.stack([rigid.moved(design, step) for step in given]))
+    seen = _noisy(target.poses(), pose_noise, rng)
     track = Track(_stamped(tracked, 0.0, clocks.camera_jitter_s, rng), seen)
-    return Plan(stamps, track, Track(taken, tracks.at(path, taken)))
+    return Plan(stamps, track, Track(taken, tracks.at(path, taken)), target)
 
 
 def _stamped(moments: NDArray[np.int64], lag_s: float, jitter_s: float, rng: np.random.Generator) -> NDArray[np.int64]:

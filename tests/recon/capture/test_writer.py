@@ -312,3 +312,44 @@ def test_images_must_be_those_of_the_times(tmp_path):
         with pytest.raises(ValueError, match=complaint):
             write(times, images)
     assert not list(tmp_path.iterdir())
+
+
+def named(capture: CaptureWriter, name: str, purpose: str, seed: int) -> None:
+    devices = {SCANNER: Device(size=SCAN)}
+    images = ((SCANNER, scan) for scan in noise(5, SCAN, seed))
+    capture.add_sweep({SCANNER: TIMES[SCANNER]}, images, devices, track(), name, purpose)
+
+
+def test_a_capture_holds_several_sweeps_by_name(tmp_path):
+    """Each is read by its name, or by what it is for; a new one stands beside the others, or in the place of its namesake."""
+    with new_capture(tmp_path / "capture") as capture:
+        named(capture, "wires", "probe", 1)
+        named(capture, "scan", "volume", 2)
+    with new_capture(tmp_path / "capture", add="sweep/again") as capture:
+        named(capture, "again", "volume", 3)
+    with new_capture(tmp_path / "capture", add="sweep/scan") as capture:
+        named(capture, "scan", "volume", 4)
+    assert sorted(read_manifest(tmp_path / "capture").contents) == ["sweep/again", "sweep/scan", "sweep/wires"]
+    for name, seed in (("wires", 1), ("again", 3), ("scan", 4)):
+        assert np.array_equal(np.stack(list(read_sweep(tmp_path / "capture", name).images())), noise(5, SCAN, seed))
+    assert np.array_equal(read_sweep(tmp_path / "capture", purpose="probe").image(0), noise(5, SCAN, 1)[0])
+
+
+@pytest.mark.parametrize(("name", "purpose", "found"), [
+    ("", "volume", "found 2 for this; give sweep=NAME"),
+    ("", "latency", "found none for this; give sweep=NAME"),
+    ("phantom", "volume", "found phantom, which isn't among them"),
+])  # fmt: skip
+def test_a_sweep_that_isn_t_meant_is_not_guessed(tmp_path, name, purpose, found):
+    with new_capture(tmp_path / "capture") as capture:
+        for number, (own, meant) in enumerate({"wires": "probe", "scan": "volume", "again": "volume"}.items()):
+            named(capture, own, meant, number)
+    with pytest.raises(InputError, match=f"sweeps: expected the name of one of wires, scan, again, {found}"):
+        read_sweep(tmp_path / "capture", name, purpose)
+
+
+def test_a_sweep_without_a_name_has_no_place_beside_named_ones(tmp_path):
+    with new_capture(tmp_path / "capture") as capture:
+        named(capture, "wires", "probe", 1)
+        with pytest.raises(ValueError, match="sweep: expected none beside sweeps, which are wires, found one"):
+            scans_alone(capture)

@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+import trimesh
 
-from scenes.handheld.handheld_assembly import Ranges, held
+from recon.errors import InputError
+from recon.geometry import rigid
+from scenes.handheld.handheld_assembly import Ranges, as_designed, held
 from scenes.handheld.mesh_parts import merged
 from tests.scenes.handheld.closed_parts import check_closed
 
@@ -107,3 +110,67 @@ def test_the_same_seed_gives_the_same_bytes(rig):
     once, twice = (merged(held(np.random.default_rng(3), rig.target)) for _ in range(2))
     for name in ("vertices", "normals", "faces", "slot"):
         assert getattr(once, name).tobytes() == getattr(twice, name).tobytes()
+
+
+EYES = np.array([[60.0, -40, 600], [-120, 30, 600], [0, 250, 520]])  # in the target's frame
+
+
+@pytest.fixture(scope="module")
+def designed(rig):
+    return [as_designed(np.random.default_rng([7, k]), rig.target, rig.probe, EYES) for k in range(6)]
+
+
+def test_the_array_s_face_lies_where_the_b_scan_begins(designed, rig):
+    """Depth is counted from the face of the acoustic lens: it reaches the image's top line to 0.1 mm over the whole array."""
+    image_from_target = rigid.invert(rig.probe.target_from_image.matrix())
+    width = rig.probe.scale_mm_per_px[0] * (rig.probe.image_size[0] - 1)
+    for parts in designed:
+        body = [part.mesh for part in parts if part.slot in ("probe", "marking")]
+        points = rigid.apply(image_from_target, np.concatenate([mesh.vertices for mesh in body]))
+        assert points[:, 1].max() == pytest.approx(0.0, abs=0.1), "nothing of the probe reaches into the image"
+        face = points[points[:, 1] > -0.1]
+        assert face[:, 0].min() < 1.0 and face[:, 0].max() > width - 1.0
+        assert face[:, 2].mean() == pytest.approx(0.0, abs=0.1), "the image plane is in the middle of the lens"
+
+
+def test_a_designed_body_has_the_board_of_the_rig_behind_it(designed, rig):
+    middle = np.array([rig.target.c1_mm, rig.target.c2_mm]) / 2
+    for parts in designed:
+        low, high = parts[0].mesh.bounds[:, :2]
+        assert high - low == pytest.approx(rig.target.board_mm) and (low + high) / 2 == pytest.approx(middle)
+        check_closed(parts, "target")
+
+
+def blocked(mesh, starts, ends):
+    """Whether a segment meets a triangle : (n,) [Moller & Trumbore 1997]."""
+    corner, first, second = mesh.triangles[:, 0], *(mesh.triangles[:, k] - mesh.triangles[:, 0] for k in (1, 2))
+    hit = []
+    for start, way in zip(starts, ends - starts, strict=True):
+        across = np.cross(way, second)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1 / (across * first).sum(axis=1)
+            away = start - corner
+            u = (away * across).sum(axis=1) * inverse
+            turned = np.cross(away, first)
+            v, t = turned @ way * inverse, (turned * second).sum(axis=1) * inverse
+        hit.append(bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 1)).any()))
+    return np.array(hit)
+
+
+def test_a_designed_body_is_mostly_in_a_hand_and_no_circle_is_covered(designed, rig):
+    rims = discs(rig.target)[:, None] + 9.0 * np.stack([np.cos(DIRECTIONS), np.sin(DIRECTIONS)], axis=-1)
+    rims = np.column_stack([rims.reshape(-1, 2), np.full(rims.size // 2, 0.2)])
+    for parts in designed:
+        hands = trimesh.util.concatenate([part.mesh for part in parts if part.slot not in ("target", "cable")])
+        for eye in EYES:
+            assert not blocked(hands, rims, np.tile(eye, (len(rims), 1))).any()
+    assert np.mean([any(part.slot == "skin" for part in parts) for parts in designed]) >= 0.5
+
+
+def test_a_probe_that_would_pierce_its_board_is_refused(rig):
+    near = rig.probe.target_from_image.model_copy(update={"translation_mm": (-20.0, 16.5, -48.0)})
+    probe = rig.probe.model_copy(update={"target_from_image": near})
+    with pytest.raises(
+        InputError, match=r"rig.probe.target_from_image: .* clear of it, found its middle at \(-?0, 15, -4\d\) mm"
+    ):
+        as_designed(np.random.default_rng(0), rig.target, probe, EYES)

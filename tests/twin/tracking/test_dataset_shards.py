@@ -12,10 +12,10 @@ import pytest
 
 from recon.errors import InputError
 from tests.twin.tracking.takes import ranges, rig
+from twin.shooting import Quality
 from twin.tracking import dataset_shards
 from twin.tracking.dataset_shards import Place, Settings, generate, prepare, write_index
 from twin.tracking.mesh_bank import build_bank
-from twin.tracking.rendered_views import Quality
 
 QUALITY = Quality(view=1, patch=2, window=2)
 

@@ -21,6 +21,7 @@ from twin.conditions import Motion
 from twin.evaluation import track_errors
 from twin.session import Session
 from twin.tracking import film_session
+from twin.tracking.mesh_bank import uncovered
 from twin.tracking.rendered_views import Frames, white_radiance
 from twin.tracking.target_truth import view_truth
 
@@ -115,9 +116,9 @@ def test_fingers_leave_the_circles_free(bank, made, config):
     """Eyes in front see the body that was chosen best; eyes behind the board see nothing through it."""
     target = config.rig.target
     front, behind = np.array([[0, 0, 600.0], [150, 0, 600]]), np.array([[10.0, 15, -600]])
-    seen = [film_session.uncovered(bank, body, target, front) for body in range(film_session.BODIES)]
+    seen = [uncovered(bank, body, target, front) for body in range(film_session.BODIES)]
     assert seen[made[0].body] == max(seen) == 1.0
-    assert film_session.uncovered(bank, 0, target, behind) == 0
+    assert uncovered(bank, 0, target, behind) == 0
 
 
 def blanks(made, size=(1280, 1024)):

@@ -1,0 +1,81 @@
+"""Frames of a sweep show the scene with its own reflectances, and the target where the path leads it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.geometry import rigid
+from scenes.kinds import breast
+from scenes.scene_types import Material, Scene, Thing
+from scenes.solid_meshes import grid, slab
+from tests.twin.tracking.takes import facing, plain_take, ranges, rig
+from twin.conditions import Motion as Errors
+from twin.shooting import FrameShooting, Quality
+from twin.tracking import scene_frames
+from twin.tracking.rendered_views import render_views, white_radiance
+
+RIG = rig()
+PALE, DARK = 0.6, 0.2
+
+
+def plate() -> Scene:
+    """A plate at 700 mm, dark on the left and pale on the right."""
+    points, triangles = grid((900.0, 900.0), (30, 30))
+    mesh = slab(points, triangles, 10.0)
+    mesh.apply_translation([0, 0, 700.0])
+    albedo = np.where(mesh.vertices[:, 0] < 0, DARK, PALE).astype(np.float32)
+    return Scene("plate", (Thing("plate", mesh, Material(0.5), albedo, smooth=False),))
+
+
+def led(count: int = 3) -> list:
+    poses = np.stack([facing(10.0, (20.0 + 8 * k, -20.0, 590.0)) for k in range(count)])
+    return scene_frames.motions(poses, poses, poses)
+
+
+def test_things_keep_their_reflectance():
+    """In light that comes evenly from all around, radiance is in proportion to it, whatever the slot would have drawn."""
+    bank = scene_frames.make_bank(plate(), RIG, led(), 0)
+    take = replace(plain_take(facing()), present=False, scene_from_world=np.eye(4), surroundings=0, body=0)
+    take = replace(take, surfaces=take.surfaces * [1, 1, 1, 1, 0, 1])  # no gloss
+    view = render_views(bank, RIG, [take], Quality(view=4, patch=2), 1)[0].views[0].astype(float) - 2.0
+    left, right = view[60:180, 40:120].mean(), view[60:180, 200:280].mean()
+    assert right / left == pytest.approx(PALE / DARK, rel=0.03)
+
+
+def test_the_phantom_and_its_table_are_seen_and_tumours_are_not():
+    parts = scene_frames.parts_of(breast.build(breast.Config()))
+    assert [part.slot for part in parts] == ["phantom", "table", "bench"]
+    assert parts[0].albedo is not None and np.ptp(parts[0].albedo) > 0.1, "the areola is darker"
+    assert parts[2].mesh.bounds[0, 2] > parts[1].mesh.bounds[1, 2], "the bench lies under the table"
+
+
+def test_motions_are_those_of_the_poses_over_the_exposure():
+    begin, middle, end = (facing(10.0 + k, (20.0 + k, -20.0, 590.0)) for k in (-1, 0, 1))
+    (motion,) = scene_frames.motions(middle[None], begin[None], end[None])
+    assert motion.at(0.0) == pytest.approx(middle)
+    assert motion.at(0.5) == pytest.approx(end, abs=2e-3) and motion.at(-0.5) == pytest.approx(begin, abs=2e-3)
+
+
+@pytest.mark.parametrize("light", ["room", "projector"])
+def test_one_light_and_one_exposure(light):
+    """The target's white is as bright as asked for on the whole, by one light; triggers may be late, frame by frame."""
+    shooting = FrameShooting(white_dn=80.0, light=light)
+    motions = led(6)
+    bank = scene_frames.make_bank(plate(), RIG, motions, 0)
+    made = scene_frames.takes(bank, RIG, ranges(), shooting, motions, 3, Errors(trigger_s=1e-4))
+    assert np.mean([take.white_dn for take in made]) == pytest.approx(80.0)
+    falls = [white_radiance(take, RIG) for take in made]
+    assert np.allclose(np.ptp([take.white_dn / fall for take, fall in zip(made, falls, strict=True)]), 0, atol=1e-6)
+    assert all(take.lighting is made[0].lighting and take.body == made[0].body for take in made)
+    assert len({take.noise_seed for take in made}) == len(made) and np.std([take.late for take in made]) > 0
+    assert (made[0].lighting.projector[0] > 0) == (light == "projector")
+
+
+def test_the_chosen_body_covers_no_circle():
+    motions = led(6)
+    bank = scene_frames.make_bank(plate(), RIG, motions, 1)
+    made = scene_frames.takes(bank, RIG, ranges(), FrameShooting(), motions, 1)
+    centres = [device.optics.camera().centre for device in (RIG.cam1, RIG.cam2)]
+    eyes = np.array([rigid.apply(rigid.invert(take.motion.world_from_target), eye) for take in made for eye in centres])
+    assert scene_frames.uncovered(bank, made[0].body, RIG.target, eyes) > 0.99

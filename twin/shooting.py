@@ -1,0 +1,39 @@
+"""How the tracking cameras are set, and how finely their frames are rendered. No renderer."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from recon.model.rig import Part, Positive
+
+
+class Quality(BaseModel):
+    """Rays a pixel, powers of two."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    view: int = Field(default=1, ge=1, le=256)  # of each of the four camera pixels that make a view's pixel
+    patch: int = Field(default=4, ge=2, le=1024)
+    window: int = Field(default=4, ge=2, le=1024)  # of full frames, and of what a sketch shows in full
+
+    @field_validator("view", "patch", "window")
+    @classmethod
+    def _power_of_two(cls, value: int) -> int:
+        if value & (value - 1):
+            raise ValueError(f"expected a power of two, found {value}")
+        return value
+
+
+class Shooting(Part):
+    """Exposure of the tracking cameras."""
+
+    exposure_s: Positive = 0.01
+    white_dn: Annotated[float, Field(gt=0, le=1000)] = 65.0  # brightness of the target's white, on the whole
+    gain: Positive = 1.0  # linear
+
+
+class FrameShooting(Shooting):
+    """Exposure, light and rendering of a sweep's frames."""
+
+    light: Literal["room", "projector"] = "room"  # lamps of a dim room, or the projector, fully on, in the dark
+    quality: Quality = Quality(window=8)
