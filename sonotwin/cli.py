@@ -46,6 +46,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("track", "track the probe's target through the frames of two cameras"),
     Verb("freehand", "put tracked B-scans into a volume, for 3D Slicer too"),
     Verb("segment", "find masses or a tube in tracked B-scans, as closed surfaces in the world"),
+    Verb("reconstruct", "reconstruct all that a capture holds: calibrations, skin, volumes, masses"),
     Verb("evaluate", "compare a surface with a rendered capture's ground truth"),
     Verb("accuracy", "measure errors of the twin's rig and compare with the paper's figures"),
     Verb("train", "train a network of the tracker with a data set"),

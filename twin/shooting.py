@@ -36,4 +36,4 @@ class FrameShooting(Shooting):
     """Exposure, light and rendering of a sweep's frames."""
 
     light: Literal["room", "projector"] = "room"  # lamps of a dim room, or the projector, fully on, in the dark
-    quality: Quality = Quality(window=8)
+    quality: Quality = Quality()

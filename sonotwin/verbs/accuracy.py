@@ -3,7 +3,7 @@
 Reads the rig and the pattern sequences from conf/, and real recordings where `real` names their folder. Writes GROUP.json into
 the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}, and figures; and the tables of the Markdown page
 that `document` names. Takes some minutes a group, and about an hour for tracking, for which a thousand pairs of frames are
-rendered. Exit status 1 if a bar is missed.
+rendered, and three hours for sessions. Exit status 1 if a bar is missed.
 
     sonotwin accuracy only=optics
 """
@@ -25,7 +25,8 @@ from twin.conditions import Conditions
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
-Group = Literal["optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking"]
+Group = Literal["optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking", "session"]
+MODULES = {"session": "sonotwin.session_accuracy"}  # of the others twin.accuracy.GROUP_accuracy
 
 
 class Config(BaseModel):
@@ -60,7 +61,7 @@ def run(config: Config) -> int:
     met = True
     for group in groups:
         measured = []
-        for row in table_rows.measure(import_module(f"twin.accuracy.{group}_accuracy").measurements(setup)):
+        for row in table_rows.measure(import_module(MODULES.get(group, f"twin.accuracy.{group}_accuracy")).measurements(setup)):
             verdict = "    " if row.bar is None else "ok  " if row.ok else "MISS"
             asked = "" if row.bar is None else f" (bar {row.bar:.4g})"
             console.print(f"{verdict} {row.id:3}{row.what}: {row.measured:.4g} {row.unit}{asked}", markup=False)

@@ -1,0 +1,253 @@
+"""Reconstruct all that a capture holds, from its images to masses under the skin, in one frame.
+
+Reads a capture folder, recorded or rendered, and uses each part that is there: the board for the optics, fringes for the skin,
+frames of both cameras for the poses of its sweeps, a flat bottom for the scanner's latency, crossed wires for the probe, B-scans
+for volumes and masses. What is missing is taken from the calibrations given here or in the capture, or left out by name.
+
+Writes into the folder `out`, each step in a folder of its own as its verb would: optics/, surface/, poses/NAME/, latency/,
+probe/, volume/NAME/ and masses/NAME/ (of a sweep without a name poses/, volume/, masses/); and metrics.json, the figures of all
+steps. A step whose result is there, made of the same, isn't done again, so a run that was killed is simply started again. Takes
+minutes. Exit status 1 if a part that is there could not be used.
+
+    sonotwin reconstruct capture=session/capture out=result
+    sonotwin reconstruct capture=session/capture tissue_m_s=1450 temperature_c=22 out=result
+    sonotwin reconstruct capture=session/capture calibration=optics.yaml probe=probe.yaml lag_s=0.05 out=result
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
+from rich.console import Console
+
+from recon.capture import manifest
+from recon.capture.manifest import CAMERAS, SCANNER, Manifest, SweepPart, is_sweep
+from recon.errors import InputError
+from recon.files import metrics
+from recon.model.calibration import DRIFT_PX
+from recon.model.probe import Speed
+from recon.model.rig import Positive, Rig
+from recon.model.tracks import LagSeconds
+from recon.tracking.results import POSES
+from sonotwin.kept_steps import KeptSteps, files_of
+from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, measure_lag, surface
+
+Drift = Annotated[float, Field(ge=0, le=10)]
+NO_OPTICS = "no calibration of the cameras: no board, and none given"
+
+
+class Config(BaseModel):
+    """Fields of `conf/reconstruct.yaml`: source, target, and what is known beforehand."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rig: Rig
+    capture: Path
+    out: Path
+    camera: str = "cam1"
+    calibration: Path | None = None
+    drift_px: Drift = DRIFT_PX
+    target: Path | None = None
+    networks: Path | None = None
+    probe: Path | None = None
+    lag_s: LagSeconds | None = None
+    temperature_c: float | None = None
+    tissue_m_s: Speed | None = None
+    spacing_mm: Positive = 0.5
+    find: Literal["masses", "tube", "nothing"] = "masses"
+    overlays: bool = False
+    _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
+
+    def model_post_init(self, context: Any) -> None:
+        """Keep the overrides, of which the rig's are passed on to the steps."""
+        if context:
+            self._overrides = context["overrides"]
+
+    @property
+    def rig_fields(self) -> list[str]:
+        """Overrides of the rig."""
+        return [each for each in self._overrides if each.lstrip("+~").partition("=")[0].partition(".")[0] == "rig"]
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What all steps read: the settings, and the capture's parts."""
+
+    config: Config
+    held: Manifest
+
+    @property
+    def sweeps(self) -> dict[str, SweepPart]:
+        """Sweeps by name; one without a name under none."""
+        return {"": self.held.sweep} if self.held.sweep else dict(self.held.sweeps)
+
+    def files(self, *parts: str) -> dict[str, object]:
+        """Files of some parts, by which a step's inputs are known."""
+        root = self.config.capture / self.held.root
+        paths = [root / name for part in parts for name in self.held.part(part).paths()]
+        folders = sorted({path if is_sweep(part) else path.parent for part in parts for path in paths})
+        described = {part: self.held.part(part).model_dump(mode="json") for part in parts}
+        return {"files": files_of(folders), "parts": described, "devices": self.held.model_dump(mode="json")["devices"]}
+
+
+def run(config: Config) -> int:
+    """Do all steps that the capture allows; returns 1 if a part could not be used.
+
+    Raises
+    ------
+    InputError
+        If the manifest is wrong, a given file is missing, or `out` can't be written to.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    sources = Sources(config, manifest.read_manifest(config.capture))
+    steps = KeptSteps(config.out, lambda line: console.print(line, style="bold cyan", markup=False))
+    given = [path for path in (config.calibration, config.target, config.probe, config.networks) if path is not None]
+    for path in given:
+        if not path.exists():
+            raise InputError(f"{path}: expected a calibration or networks as given, found nothing there")
+    steps.open([config.capture, *given])
+    optics = calibrated_optics(steps, sources)
+    skin = measured_skin(steps, sources, optics)
+    tracked = {name: tracked_sweep(steps, sources, name, optics) for name in sources.sweeps}
+    lag_s = measured_latency(steps, sources, tracked)
+    probe = calibrated_probe(steps, sources, tracked, lag_s)
+    for name, part in sources.sweeps.items():
+        placed = tracked[name]
+        if part.purpose in (None, "volume") and SCANNER in part.images and placed is not None:
+            look_inside(steps, sources, name, placed, probe, lag_s, skin)
+    metrics.write(config.out / metrics.FILE, figures(config.out, steps))
+    console.print(f"wrote       {config.out}/{{{','.join([*steps.done, metrics.FILE])}}}", markup=False)
+    return 1 if steps.failed else 0
+
+
+def calibrated_optics(steps: KeptSteps, sources: Sources) -> Path | None:
+    """The calibration of cameras and projector: the one given, the board's, or the capture's own."""
+    config, held = sources.config, sources.held
+    if config.calibration is not None:
+        return config.calibration
+    if held.board is not None:
+        fields = [f"capture={config.capture}"]
+        made = steps.do(
+            "optics",
+            "cameras and projector, from the board",
+            "calibrate-optics",
+            fields,
+            calibrate_optics.PAGE,
+            sources.files("board"),
+        )
+        return None if made is None else made / calibrate_optics.OPTICS
+    return None if held.calibration is None else config.capture / held.calibration
+
+
+def measured_skin(steps: KeptSteps, sources: Sources, optics: Path | None) -> Path | None:
+    """The surface by light."""
+    config = sources.config
+    if sources.held.surface is None:
+        return None
+    if optics is None:
+        return steps.leave_out("surface", NO_OPTICS)
+    fields = [f"capture={config.capture}", f"calibration={optics}", f"camera={config.camera}"]
+    made_of = sources.files("surface") | _of(steps, "optics", optics)
+    made = steps.do("surface", "the surface, from fringes", "surface", fields, surface.POINTS, made_of)
+    return None if made is None else made / "surface.ply"
+
+
+def tracked_sweep(steps: KeptSteps, sources: Sources, name: str, optics: Path | None) -> Path | None:
+    """A capture in which the sweep has poses: made of the cameras' frames, or the capture itself, where it has a track."""
+    config, part, step = sources.config, sources.sweeps[name], _named("poses", name)
+    if not set(CAMERAS) <= part.images.keys():
+        if part.track is not None:
+            return config.capture
+        return steps.leave_out(step, f"neither frames of {' and '.join(CAMERAS)} nor a track")
+    if optics is None:
+        return steps.leave_out(step, NO_OPTICS)
+    given = {"target": config.target, "networks": config.networks}
+    fields = [f"capture={config.capture}", f"sweep={name}", f"calibration={optics}", f"drift_px={config.drift_px:.15g}"]
+    fields += [f"{field}={path}" for field, path in given.items() if path is not None]
+    fields += [f"overlays={str(config.overlays).lower()}", *config.rig_fields]
+    made_of = sources.files(manifest.sweep_part(name)) | _of(steps, "optics", optics, *filter(None, given.values()))
+    return steps.do(step, "poses of the probe, from frames", "track", fields, POSES, made_of)
+
+
+def measured_latency(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None]) -> float:
+    """The lag of the scanner's images, s: the one given, the one of the last sweep over a flat bottom, or none."""
+    config = sources.config
+    if config.lag_s is not None:
+        return config.lag_s
+    name = _last(sources, "latency", tracked)
+    if name is None:
+        steps.leave_out("latency", "no sweep over a flat bottom and no lag_s; the B-scans' time stamps are taken as they are")
+        return 0.0
+    fields = [f"capture={tracked[name]}", f"sweep={name}"]
+    does, made_of = "the scanner's lag, from a flat bottom", _scans(steps, sources, name)
+    made = steps.do("latency", does, "measure-lag", fields, measure_lag.LAG, made_of)
+    return 0.0 if made is None else json.loads((made / measure_lag.LAG).read_text(encoding="utf-8"))["lag_s"]
+
+
+def calibrated_probe(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None], lag_s: float) -> Path | None:
+    """The probe's calibration: the one given, the one of the last sweep over crossed wires, or the capture's own."""
+    config = sources.config
+    if config.probe is not None:
+        return config.probe
+    name = _last(sources, "probe", tracked)
+    if name is None:
+        return None if sources.held.probe is None else config.capture / sources.held.probe
+    fields = [f"capture={tracked[name]}", f"sweep={name}", f"lag_s={lag_s:.15g}", *config.rig_fields]
+    fields += [] if config.temperature_c is None else [f"temperature_c={config.temperature_c:.15g}"]
+    does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
+    made = steps.do("probe", does, "calibrate-probe", fields, calibrate_probe.FRAMES, made_of)
+    return None if made is None else made / calibrate_probe.PROBE
+
+
+def look_inside(
+    steps: KeptSteps, sources: Sources, name: str, capture: Path, probe: Path | None, lag_s: float, skin: Path | None
+) -> None:
+    """The volume of a sweep, and what is found in its B-scans."""
+    config = sources.config
+    if probe is None:
+        return steps.leave_out(_named("volume", name), "no calibration of the probe: no sweep over crossed wires, and none given")
+    fields = [f"capture={capture}", f"sweep={name}", f"probe={probe}", f"lag_s={lag_s:.15g}"]
+    fields += [] if config.tissue_m_s is None else [f"tissue_m_s={config.tissue_m_s:.15g}"]
+    made_of = _scans(steps, sources, name) | _of(steps, "probe", probe)
+    spacing = f"spacing_mm={config.spacing_mm:.15g}"
+    steps.do(_named("volume", name), "B-scans in a volume", "freehand", [*fields, spacing], freehand.VOLUME, made_of)
+    if config.find == "nothing":
+        return None
+    if skin is not None and config.find == "masses":
+        fields, made_of = [*fields, f"surface={skin}"], made_of | {"skin": steps.digest("surface")}
+    does = f"{'masses' if config.find == 'masses' else 'a tube'} in the B-scans"
+    steps.do(_named(config.find, name), does, "segment", [*fields, f"kind={config.find}"], metrics.FILE, made_of)
+    return None
+
+
+def figures(out: Path, steps: KeptSteps) -> metrics.Metrics:
+    """Figures of all steps that are done, less those of the clock, by the step's name."""
+    found: metrics.Metrics = {}
+    for name in steps.done:
+        read = metrics.read(out / name / metrics.FILE)
+        timeless = {key: value for key, value in read.items() if not key.startswith("seconds_") and key != "frames_per_s"}
+        found |= {f"{name.replace('/', '_')}_{key}": value for key, value in timeless.items()}
+    return found
+
+
+def _named(step: str, sweep: str) -> str:
+    return f"{step}/{sweep}" if sweep else step
+
+
+def _last(sources: Sources, purpose: str, tracked: Mapping[str, Path | None]) -> str | None:
+    """The last sweep for a purpose that has B-scans and poses; None without one."""
+    fitting = [name for name, part in sources.sweeps.items() if part.purpose == purpose and SCANNER in part.images]
+    return next((name for name in reversed(fitting) if tracked[name] is not None), None)
+
+
+def _scans(steps: KeptSteps, sources: Sources, name: str) -> dict[str, object]:
+    """What a step that reads a sweep's B-scans and poses is made of."""
+    return sources.files(manifest.sweep_part(name)) | {"poses": steps.digest(_named("poses", name))}
+
+
+def _of(steps: KeptSteps, step: str, *files: Path) -> dict[str, object]:
+    """What a calibration that is given, or made by an earlier step, is known by."""
+    return {step: [steps.digest(step), files_of(files)]}

@@ -1,0 +1,128 @@
+"""`sonotwin reconstruct`: each part that a capture holds is used, what is missing is named, and nothing is done twice."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.capture import manifest, probe_files
+from recon.capture.manifest import Manifest
+from recon.files import metrics, volumes
+from sonotwin.cli import main
+from tests.recon import probe_motions, sweep_sets
+from tests.recon.tracking import films
+
+LAG_S = 0.06
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def tank(tmp_path_factory, rig) -> Path:
+    """A session in a tank: crossed wires and a flat bottom, tracked by another tracker."""
+    folder = tmp_path_factory.mktemp("tank")
+    rng = np.random.default_rng(5)
+    made = {"wires": sweep_sets.wires(folder / "a", rig, rng, LAG_S), "bottom": sweep_sets.bottom(folder / "b", rng, LAG_S)}
+    sweeps = {}
+    for (name, source), purpose in zip(made.items(), ("probe", "latency"), strict=True):
+        read = manifest.read_manifest(source)
+        shutil.copytree(source / "sweep", folder / "capture" / "sweep" / name)
+        images = {device: f"sweep/{name}/{device}" for device in read.sweep.images}
+        sweeps[name] = read.sweep.model_copy(update={"purpose": purpose, "images": images, "track": f"sweep/{name}/track.csv"})
+    manifest.write_manifest(folder / "capture", Manifest(schema=manifest.SCHEMA, devices=read.devices, sweeps=sweeps))
+    return folder / "capture"
+
+
+@pytest.fixture(scope="module")
+def result(tank, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("result") / "out"
+    assert main(["reconstruct", f"capture={tank}", f"temperature_c={sweep_sets.WATER_C}", f"out={out}"]) == 0
+    return out
+
+
+def test_wires_are_calibrated_with_the_lag_of_the_bottom(result, rig):
+    found = metrics.read(result / "metrics.json")
+    assert found["latency_lag_ms"] == pytest.approx(1e3 * LAG_S, abs=2.0)
+    probe, true = probe_files.read(result / "probe" / "probe.yaml"), probe_motions.true_probe(rig)
+    corners = np.array([[0, 0], [320, 0], [0, 407], [320, 407], [160, 203]])
+    assert np.linalg.norm(probe.to_target(corners) - true.to_target(corners), axis=1).max() < 0.5
+    assert not any("seconds" in name for name in found)
+
+
+def test_nothing_is_done_twice(result, tank, capsys):
+    before = contents(result)
+    assert main(["reconstruct", f"capture={tank}", f"temperature_c={sweep_sets.WATER_C}", f"out={result}"]) == 0
+    said = capsys.readouterr().out
+    assert "kept        latency" in said and "kept        probe" in said
+    assert contents(result) == before
+
+
+def test_a_lost_step_is_done_again_with_the_same_outcome(result, tank, capsys):
+    before = contents(result)
+    shutil.rmtree(result / "latency")
+    assert main(["reconstruct", f"capture={tank}", f"temperature_c={sweep_sets.WATER_C}", f"out={result}"]) == 0
+    assert "kept        probe" in capsys.readouterr().out
+    timed = {name for name in before if name.endswith("metrics.json")}
+    assert {name: data for name, data in contents(result).items() if name not in timed} == {
+        name: data for name, data in before.items() if name not in timed
+    }
+
+
+def test_a_sweep_alone_becomes_a_volume(rig, tmp_path, capsys):
+    """Its own track, the capture's calibration of the probe and the lag that is given are enough."""
+    capture = sweep_sets.ball(tmp_path / "ball", rig, lag_s=0.05)
+    fields = [f"capture={capture}", "lag_s=0.05", "find=nothing", f"out={tmp_path / 'out'}"]
+    assert main(["reconstruct", *fields]) == 0
+    volume = volumes.read_volume(tmp_path / "out" / "volume" / "volume.nrrd")
+    bright = np.argwhere(volume.voxels > 150)[:, ::-1]
+    middle = volume.world_from_voxel @ np.append(bright.mean(axis=0), 1)
+    assert middle[:3] == pytest.approx(sweep_sets.BALL, abs=0.3)
+    assert "left out" not in capsys.readouterr().out
+
+
+def test_what_is_missing_is_named(rig, tmp_path, capsys):
+    """Without a probe's calibration B-scans have no place; without a flat bottom their time stamps count as they are."""
+    capture = sweep_sets.ball(tmp_path / "ball", rig, with_probe=False)
+    assert main(["reconstruct", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("left out")]
+    assert lines[0].startswith("left out    latency: no sweep over a flat bottom and no lag_s")
+    assert lines[1].startswith("left out    volume: no calibration of the probe") and len(lines) == 2
+
+
+def test_frames_alone_become_poses(rig, tmp_path):
+    films.film(tmp_path / "film", rig, np.random.default_rng(4), count=2)
+    assert main(["reconstruct", f"capture={tmp_path / 'film'}", "lag_s=0", f"out={tmp_path / 'out'}"]) == 0
+    assert metrics.read(tmp_path / "out" / "metrics.json")["poses_frames_found"] == 2
+
+
+def test_a_part_that_can_t_be_used_is_named_and_the_others_are_used(tank, tmp_path, capsys):
+    """Exit status 1 then; what was done stays, and is kept by the next run."""
+    capture = shutil.copytree(tank, tmp_path / "capture")
+    (capture / "sweep" / "wires" / "us" / "0003.png").write_bytes(b"no image")
+    assert main(["reconstruct", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 1
+    said = capsys.readouterr().out
+    assert "left out    probe:" in said and "0003.png" in said
+    assert metrics.read(tmp_path / "out" / "metrics.json")["latency_lag_ms"] == pytest.approx(1e3 * LAG_S, abs=2.0)
+
+
+@pytest.mark.parametrize(("fields", "complaint"), [
+    (["probe=nowhere.yaml"], "nowhere.yaml: expected a calibration or networks as given, found nothing there"),
+    (["lag_s=nan"], "reconstruct: lag_s: expected"),
+    (["find=cysts"], "reconstruct: find: expected"),
+    (["spacing_mm=0"], "reconstruct: spacing_mm: expected"),
+])  # fmt: skip
+def test_bad_input_is_one_line(tank, tmp_path, capsys, fields, complaint):
+    assert main(["reconstruct", f"capture={tank}", f"out={tmp_path / 'out'}", *fields]) == 2
+    said = capsys.readouterr().err
+    assert complaint in said and said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_something_else_is_refused(tank, tmp_path, capsys):
+    (tmp_path / "thesis.txt").write_text("mine")
+    assert main(["reconstruct", f"capture={tank}", f"out={tmp_path}"]) == 2
+    assert "expected a new or empty folder or one with reconstruct.json" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]

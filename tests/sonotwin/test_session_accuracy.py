@@ -1,0 +1,80 @@
+"""Rows of whole sessions: the worst counts, a mass that is missed fails, and what was measured is kept."""
+
+import numpy as np
+import pytest
+
+from sonotwin import session_accuracy, session_steps
+from sonotwin.config import load
+from sonotwin.verbs import reconstruct, render, sweep
+
+MODELS = {"render": render.Config, "sweep": sweep.Config, "reconstruct": reconstruct.Config}
+
+
+FILM = {"frames": 100, "visible": 95, "visible_found": 95, "false": 0, "shift_median_mm": 0.02, "turn_median_deg": 0.04}
+SCAN = {
+    "lag_error_ms": -0.5, "lag_covered": 1.0, "probe_worst_error_mm": 0.1, "probe_worst_sigma_mm": 0.1, "contact_bias_mm": -0.02,
+    "tumours_found": 3, "tumours_false": 0,
+}  # fmt: skip
+TUMOUR = {
+    "true_extent_mm": 20.0, "centre_error_mm": 0.2, "volume_mm3": 1030.0, "true_volume_mm3": 1000.0, "under_skin_mm": 8.1,
+    "true_under_skin_mm": 8.0, "inside": 1,
+}  # fmt: skip
+
+
+def figures(**changes) -> dict:
+    """Of a session that meets all bars."""
+    films = {f"{name}_track_{key}": value for name in ("wires", "bottom", "scan") for key, value in FILM.items()}
+    scan = {f"scan_{key}": value for key, value in SCAN.items()}
+    tumours = {f"scan_tumour{k}_{key}": value for k in range(3) for key, value in TUMOUR.items()}
+    return films | scan | tumours | changes
+
+
+def missed(found) -> set[str]:
+    return {row.what.partition(": ")[2] for row in session_accuracy.rows("ideal", found) if not row.ok}
+
+
+def test_good_sessions_meet_all_bars():
+    assert missed([figures(), figures()]) == set()
+
+
+@pytest.mark.parametrize(("changes", "row"), [
+    ({"scan_track_visible": 80, "scan_track_visible_found": 80}, "frames that show the whole target to both"),
+    ({"wires_track_visible_found": 90}, "found, of pairs that show the target whole"),
+    ({"bottom_track_false": 1}, "wrong poses in all sweeps"),
+    ({"scan_lag_error_ms": -2.0}, "latency"),
+    ({"scan_probe_worst_error_mm": 0.3}, "probe, the worst of five pixels"),
+    ({"scan_tumours_false": 1}, "tumours found inside the skin, less false ones, of 3"),
+    ({"scan_tumour1_inside": 0}, "tumours found inside the skin, less false ones, of 3"),
+    ({"scan_tumour2_volume_mm3": 1100.0}, "tumours' volumes"),
+    ({"scan_tumour0_under_skin_mm": 8.4}, "least tissue over tumours"),
+    ({"scan_contact_bias_mm": 0.2}, "array's face from the skin by light, mean"),
+])  # fmt: skip
+def test_one_bad_session_is_enough(changes, row):
+    assert missed([figures(), figures(**changes)]) == {row}
+
+
+def test_a_missed_mass_fails_its_rows():
+    names = ("centre_error_mm", "volume_mm3", "under_skin_mm", "inside")
+    lost = figures(scan_tumours_found=2, **{f"scan_tumour2_{name}": np.nan for name in names})
+    assert {"tumours found inside the skin, less false ones, of 3", "tumours' volumes", "least tissue over tumours"} <= missed(
+        [lost]
+    )
+
+
+def test_what_was_measured_is_kept(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(session_accuracy, "session", lambda work, kind, seed: made.append(seed) or {"figure": float(seed)})
+    for _ in range(2):
+        assert session_accuracy.measured(tmp_path, "ideal", 7) == {"figure": 7.0}
+    assert made == [7]
+
+
+@pytest.mark.parametrize("kind", ["ideal", "lifelike"])
+def test_the_verbs_of_a_session_are_valid(tmp_path, kind):
+    """All write into one capture, by one seed and under the same conditions; its sweeps have the names that rows go by."""
+    steps = list(session_steps.rendering(tmp_path, [f"conditions={kind}", "seed=3"]))
+    read = [load(verb, fields, MODELS[verb]) for verb, fields in steps]
+    assert {each.seed for each in read} == {3} and all(each.add for each in read)
+    assert [each.name for each in read[2:]] == ["wires", "bottom", "scan"] and all(each.filmed for each in read[2:])
+    verb, fields = session_steps.reconstruction(tmp_path, tmp_path / "out")
+    assert load(verb, fields, MODELS[verb]).capture == tmp_path / "capture"

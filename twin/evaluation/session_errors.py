@@ -1,0 +1,100 @@
+"""Errors of a whole session: what `sonotwin reconstruct` made of a rendered capture, against what it was rendered from."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from recon.capture import manifest, probe_files, sweep_part
+from recon.capture.manifest import CAMERAS, SCANNER
+from recon.files import metrics
+from recon.files.metrics import Metrics
+from recon.freehand import sequences
+from recon.geometry.surface_tree import surface_tree
+from recon.probe_calibration import sound_in_water
+from recon.probe_calibration.repeatability import five_points
+from twin.evaluation import sweep_errors, track_errors
+from twin.evaluation.sweep_errors import SweepTruth
+
+Array = NDArray[np.float64]
+
+FACE_POINTS = 9  # along the array
+
+
+def measure(result: Path, capture: Path, truth: Path) -> Metrics:
+    """Figures of each step that has a truth, each named with its unit and, of a sweep, beginning with its name.
+
+    Parameters
+    ----------
+    result, capture, truth : folders, as of `sonotwin reconstruct` and of the twin
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged.
+    """
+    figures: Metrics = {}
+    for name, part in manifest.read_manifest(capture).sweeps.items():
+        poses = result / "poses" / name
+        if poses.is_dir() and set(CAMERAS) <= part.images.keys():
+            expected = track_errors.read_truth(truth, name)
+            errors = track_errors.compare(track_errors.read_track(poses / "poses.csv", expected), expected)
+            figures |= {f"{name}_{key}": value for key, value in track_errors.measure(errors, expected).items()}
+        if part.purpose == "volume" and SCANNER in part.images and (result / "masses" / name).is_dir():
+            figures |= {f"{name}_{key}": value for key, value in inside(result, truth, name).items()}
+    return figures
+
+
+def inside(result: Path, truth: Path, name: str) -> Metrics:
+    """Figures of a sweep: latency, probe, places of its pixels, masses, and where the array's face met the skin."""
+    true = sweep_errors.read_truth(truth, name)
+    lag = json.loads((result / "latency" / "lag.json").read_text(encoding="utf-8"))
+    probe = probe_files.read(result / "probe" / "probe.yaml")
+    error, sigma = sweep_errors.probe_errors(probe, true, five_points(true.transducer.image_size))
+    sweep = sweep_part.read_sweep(result / "poses" / name, name)
+    shown = sweep.poses(lag["lag_s"]) @ sequences.target_from_pixel(
+        sound_in_water.for_tissue(probe, true.transducer.assumed_speed)
+    )
+    folder = result / "masses" / name
+    found = metrics.read(folder / metrics.FILE)
+    meshes = [trimesh.load_mesh(folder / f"mass{number}.ply", process=False) for number in range(int(found["masses"]))]
+    figures: Metrics = {
+        "lag_error_ms": 1e3 * (lag["lag_s"] - true.lag_s),
+        "lag_covered": float(lag["interval_s"][0] <= true.lag_s <= lag["interval_s"][1]),
+        "probe_worst_error_mm": float(error.max()),
+        "probe_worst_sigma_mm": float(sigma[error.argmax()]),
+        "placement_rms_mm": float(np.sqrt(np.nanmean(sweep_errors.placement(shown, true) ** 2))),
+        **sweep_errors.measure(sweep_errors.compare(meshes, true), true, found),
+    }
+    skin = result / "surface" / "surface.ply"
+    return figures | ({"contact_bias_mm": contact_bias(shown, true, skin)} if skin.is_file() else {})
+
+
+def contact_bias(world_from_pixel: Array, true: SweepTruth, surface: Path) -> float:
+    """Median distance, mm, by which the array's face seems to stand off the measured skin, less that by which it did.
+
+    The face is known by ultrasound and tracking, the skin by light: a bias says that both don't share a frame.
+
+    Parameters
+    ----------
+    world_from_pixel : (n, 4, 4)
+        By the estimated calibrations and tracked poses; NaN without a pose.
+    """
+    measured = trimesh.load_mesh(surface, process=False)
+    flat = np.zeros((FACE_POINTS, 4))
+    flat[:, 0], flat[:, 3] = np.linspace(0, true.transducer.image_size[0] - 1, FACE_POINTS), 1
+    placed = np.isfinite(world_from_pixel).all(axis=(1, 2))
+    shown = (world_from_pixel[placed] @ flat.T)[:, :3].transpose(0, 2, 1)
+    scale = np.diag([*true.transducer.scale_mm_per_px, 1.0, 1.0])
+    stood = (true.world_from_image[placed] @ scale @ flat.T)[:, :3].transpose(0, 2, 1)
+    return float(np.median(_standoff(shown, measured) - _standoff(stood, true.skin)))
+
+
+def _standoff(faces: Array, skin: trimesh.Trimesh) -> Array:
+    """Least signed distance : (n,) mm of faces : (n, m, 3) to a skin, positive outside, by its nearest vertices' normals."""
+    points = faces.reshape(-1, 3)
+    _, nearest = surface_tree(skin.vertices).query(points)
+    distance = ((points - skin.vertices[nearest]) * skin.vertex_normals[nearest]).sum(axis=1)
+    return distance.reshape(faces.shape[:2]).min(axis=1)
