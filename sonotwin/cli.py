@@ -47,6 +47,8 @@ VERBS = (  # in the order in which a person meets them
     Verb("freehand", "put tracked B-scans into a volume, for 3D Slicer too"),
     Verb("segment", "find masses or a tube in tracked B-scans, as closed surfaces in the world"),
     Verb("reconstruct", "reconstruct all that a capture holds: calibrations, skin, volumes, masses"),
+    Verb("import", "read another group's data set into a capture"),
+    Verb("export", "write a capture in another group's layout"),
     Verb("evaluate", "compare a surface with a rendered capture's ground truth"),
     Verb("accuracy", "measure errors of the twin's rig and compare with the paper's figures"),
     Verb("train", "train a network of the tracker with a data set"),

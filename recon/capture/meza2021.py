@@ -1,9 +1,12 @@
 """The layout of the rig authors' public program: `SLdata/images`, `SLdata/mask.png` and the files of pairs of devices.
 
-The images in natural order are the centre line, the eight fringe images and, last, the fully lit one; others in between are
-left out. Pitch 12 projector px, phase shifts 2 pi k / 8 for k = 1 to 8, projector column (width - 1) / 2 at phase zero.
+The images in natural order are the centre line, the eight fringe images and, last, perhaps the fully lit one; others in between
+are left out. They may be of any kind that OpenCV reads, in colour too. Pitch 12 projector px, phase shifts 2 pi k / 8 for k = 1
+to 8, projector column (width - 1) / 2 at phase zero.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -11,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.capture import calibration_files
-from recon.capture.images import Size, image_size, natural_key, read_image, read_images, write_images
+from recon.capture.foreign_images import image_files, read_grey
+from recon.capture.images import Size, write_images
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError
 from recon.files import atomic
@@ -26,12 +30,14 @@ PROJECTOR_SIZE = (1280, 800)  # px; their files don't store it
 PARAMETERS = "cam1_proj_params.npz"
 STEREO_PARAMETERS = "cam1_cam2_params.npz"
 STEREO_XML = "StereoParams.xml"  # the same, as OpenCV FileStorage
+MARKER = "sonotwin-export.json"  # by which a folder of ours is known; theirs is never replaced
 
 
-def patterns(projector_size: Size = PROJECTOR_SIZE) -> Patterns:
-    """Their sequence, as far as it is decoded: centre line, fringes, fully lit."""
+def patterns(projector_size: Size = PROJECTOR_SIZE, lit: bool = True) -> Patterns:
+    """Their sequence, as far as it is decoded: centre line, fringes, and perhaps fully lit."""
     fringes = Fringes(pitch=PITCH, steps=STEPS, first=1)
-    return Patterns(projector_size=projector_size, unwrap="centre_line", parts=(CentreLine(), fringes, Uniform()))
+    parts = (CentreLine(), fringes, Uniform()) if lit else (CentreLine(), fringes)
+    return Patterns(projector_size=projector_size, unwrap="centre_line", parts=parts)
 
 
 def read(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[SurfaceCapture, NDArray[np.bool_]]:
@@ -53,38 +59,56 @@ def read(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[SurfaceCa
         If images or calibration are missing, too few, or damaged.
     """
     folder = Path(folder)
-    sequence = patterns(projector_size)
     images_dir = folder / "SLdata" / "images"
-    paths = sorted(images_dir.glob("*.png"), key=natural_key)
-    if len(paths) < sequence.count:
-        raise InputError(f"{images_dir}: expected at least {sequence.count} PNG images, found {len(paths)}")
-    paths = paths[: sequence.count - 1] + paths[-1:]
-    size = image_size(paths[0])
-    images = read_images(paths, size, bits=8)
+    paths = image_files(images_dir)
+    fringes = patterns(lit=False).count
+    if len(paths) < fringes:
+        raise InputError(f"{images_dir}: expected at least {fringes} images, found {len(paths)}")
+    sequence = patterns(projector_size, lit=len(paths) > fringes)
+    paths = paths[:fringes] + paths[fringes:][-1:]
+    height, width = read_grey(paths[0]).shape
+    size = width, height
+    images = np.stack([read_grey(path, size) for path in paths])
     mask = np.ones(images.shape[1:], bool)
     if (folder / "SLdata" / "mask.png").exists():
-        mask = read_image(folder / "SLdata" / "mask.png", size, bits=8) > 0
+        mask = read_grey(folder / "SLdata" / "mask.png", size) > 0
     optics = calibration_files.read(folder / PARAMETERS, sizes={"cam1": size, "projector": projector_size})
     return SurfaceCapture(images, sequence, 8, optics, folder.resolve().name), mask
 
 
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Give a folder to be filled in their layout, which appears whole or not at all, and replaces such a one of ours alone.
+
+    Raises
+    ------
+    InputError
+        If the place is taken by something else, a folder of theirs included, or can't be written to.
+    """
+    with atomic.new_folder(folder, MARKER) as temporary:
+        (temporary / MARKER).write_text('{"layout": "meza2021"}\n', encoding="utf-8")
+        yield temporary
+
+
+def is_theirs(surface: SurfaceCapture) -> bool:
+    """Whether a capture is of 8 bits, and of their patterns, with or without the fully lit one."""
+    return surface.bits == 8 and surface.patterns in [patterns(surface.patterns.projector_size, lit) for lit in (True, False)]
+
+
 def write(folder: Path, surface: SurfaceCapture, mask: NDArray[np.bool_]) -> None:
-    """Write a surface capture of camera 1 in their layout, whole or not at all.
+    """Write a surface capture of camera 1 into a folder that is there.
 
     Raises
     ------
     ValueError
         If the capture is not 8-bit or its patterns are not theirs.
-    InputError
-        If the place is taken by something else, or can't be written to.
     """
-    if surface.bits != 8 or surface.patterns != patterns(surface.patterns.projector_size):
+    if not is_theirs(surface):
         raise ValueError("expected an 8-bit capture of the authors' patterns")
-    with atomic.new_folder(folder, PARAMETERS) as temporary:
-        structured_light = temporary / "SLdata"
-        write_images([structured_light / "images" / f"{i}.png" for i in range(len(surface.images))], surface.images)
-        write_images([structured_light / "mask.png"], np.where(mask, 255, 0).astype(np.uint8)[None])
-        np.savez(temporary / PARAMETERS, **parameters(surface.calibration))
+    structured_light = folder / "SLdata"
+    write_images([structured_light / "images" / f"{i}.png" for i in range(len(surface.images))], surface.images)
+    write_images([structured_light / "mask.png"], np.where(mask, 255, 0).astype(np.uint8)[None])
+    np.savez(folder / PARAMETERS, **parameters(surface.calibration))
 
 
 def write_parameters(folder: Path, optics: Calibration) -> list[str]:

@@ -3,20 +3,25 @@
 - own: OpenCV FileStorage YAML with `schema`, `target_from_image` (4x4, mm), `scale` (sx, sy in mm/px), `speed_m_s`, the speed of
   sound for which sy holds (1540 if it is missing), and, if known, `parameters`, their names as in `recon.model.probe`, and
   `covariance`.
-- the authors': npz with sx, sy and T_I_T, which is `target_from_image`; no speed, so that 1540 m/s is taken.
+- the authors': npz with sx, sy and T_I_T, which is `target_from_image`; no speed, so that 1540 m/s is taken. A rotation that is
+  off by up to 2 % is taken as the nearest one, and a negative scale as the same map with that axis turned round.
 """
 
+import logging
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.capture import meza2021_sweep
 from recon.errors import InputError
 from recon.files import atomic, npz, opencv_storage
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import SCANNER_SPEED, SPEEDS, ProbeCalibration
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -64,7 +69,13 @@ def _authors(path: Path) -> ProbeCalibration:
         if values[name].size != 1:
             raise InputError(f"{path}: {name}: expected one number, found {values[name].size}")
     scale = np.array([values["sx"].item(), values["sy"].item()], float)
-    return _checked(path, "T_I_T", values["T_I_T"].astype(float), scale, None, SCANNER_SPEED)
+    pose = meza2021_sweep.mended(f"{path}: T_I_T", values["T_I_T"].astype(float))
+    for axis in np.flatnonzero(scale < 0):
+        turned = np.diag([1.0, 1.0, -1.0, 1.0])  # the frame stays right-handed
+        turned[axis, axis] = -1.0
+        pose, scale[axis] = pose @ turned, -scale[axis]
+        log.warning("%s: %s is negative, and is taken as positive with the image's axis turned round", path, ("sx", "sy")[axis])
+    return _checked(path, "T_I_T", pose, scale, None, SCANNER_SPEED)
 
 
 def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:

@@ -5,7 +5,7 @@ The crossing's place in the world is the same in all frames (equation 1 of Meza 
 of `target_from_image`, sx, sy and the wire's three. Written with the columns `sx x`, `sy y` and the image's origin it is linear,
 which gives a start in closed form; Levenberg and Marquardt do the rest.
 
-**Which motion is best.** An error of the tracked angle moves the wire by the lever, here 140 mm, so 0.08 degrees are 0.2 mm: far
+**Which motion is best.** An error of the tracked angle moves the wire by the lever, here 94 mm, so 0.08 degrees are 0.13 mm: far
 more than the errors of position or pixel. Frames are therefore weighted by their covariance, which has this lever in it. Turns
 separate the image's place from the wire's: roll the probe about its depth axis as far as the tracking allows, tilt
 it 35 degrees to all sides, mostly forward and backward, and bring the crossing near all corners of the image in turn. `motion`
@@ -13,11 +13,11 @@ lists such frames. Predicted errors (1 sigma, of the place in space) of 30 frame
 for the rig of the paper:
 
     roll both ways     centre     corners
-    180 degrees        0.07       0.11 to 0.12 mm
-    90 degrees         0.08       0.11 to 0.13 mm
-    35 degrees         0.09       0.12 to 0.14 mm
+    180 degrees        0.07       0.09 to 0.10 mm
+    90 degrees         0.07       0.09 to 0.11 mm
+    35 degrees         0.09       0.10 to 0.12 mm
 
-With the crossing spread evenly over the image the corners are some 10 % worse; with 0.3 mm of slice thickness all are 50 % worse.
+With the crossing at random places of the image the corners are half as bad again; so they are with 0.3 mm of slice thickness.
 """
 
 from collections.abc import Iterable

@@ -26,9 +26,14 @@ def surface() -> SurfaceCapture:
     return SurfaceCapture(images, meza2021.patterns(), 8, optics, "rig")
 
 
+def write(folder, surface, mask) -> None:
+    with meza2021.new_folder(folder) as temporary:
+        meza2021.write(temporary, surface, mask)
+
+
 def test_it_comes_back(surface, tmp_path):
     mask = np.random.default_rng(0).random((24, 1280)) > 0.5
-    meza2021.write(tmp_path / "rig", surface, mask)
+    write(tmp_path / "rig", surface, mask)
     found, found_mask = meza2021.read(tmp_path / "rig")
     assert np.array_equal(found.images, surface.images) and np.array_equal(found_mask, mask)
     assert found.patterns == surface.patterns and found.name == "rig"
@@ -48,7 +53,7 @@ def test_their_formula_finds_the_column(surface):
 
 def test_images_between_are_left_out_and_order_is_natural(surface, tmp_path):
     """Their folders hold further images between the fringes and the fully lit one, without a mask."""
-    meza2021.write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
+    write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
     images = tmp_path / "rig" / "SLdata" / "images"
     (images / "9.png").rename(images / "12.png")
     for extra in (9, 10, 11):
@@ -59,10 +64,41 @@ def test_images_between_are_left_out_and_order_is_natural(surface, tmp_path):
 
 
 def test_missing_images_are_named(surface, tmp_path):
-    meza2021.write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
-    (tmp_path / "rig" / "SLdata" / "images" / "3.png").unlink()
-    with pytest.raises(InputError, match="images: expected at least 10 PNG images, found 9"):
+    write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
+    for number in (3, 4):
+        (tmp_path / "rig" / "SLdata" / "images" / f"{number}.png").unlink()
+    with pytest.raises(InputError, match="images: expected at least 9 images, found 8"):
         meza2021.read(tmp_path / "rig")
+
+
+def test_the_lit_image_may_be_missing(surface, tmp_path):
+    """Nine images are the centre line and the fringes."""
+    write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
+    (tmp_path / "rig" / "SLdata" / "images" / "9.png").unlink()
+    found, _ = meza2021.read(tmp_path / "rig")
+    assert found.patterns == meza2021.patterns(lit=False) and np.array_equal(found.images, surface.images[:9])
+    assert meza2021.is_theirs(found)
+
+
+@pytest.mark.parametrize(("suffix", "off"), [(".bmp", 0), (".tiff", 0), (".jpg", 6)])
+def test_other_kinds_of_images_count_in_colour_too(surface, tmp_path, suffix, off):
+    """JPEG is not exact."""
+    write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
+    for path in (tmp_path / "rig" / "SLdata" / "images").iterdir():
+        cv2.imwrite(str(path.with_suffix(suffix)), cv2.cvtColor(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), cv2.COLOR_GRAY2BGR))
+        path.unlink()
+    found, _ = meza2021.read(tmp_path / "rig")
+    assert np.abs(found.images.astype(int) - surface.images).max() <= off
+
+
+def test_a_folder_of_theirs_is_never_replaced(surface, tmp_path):
+    """It has the same files as ours, but for the marker."""
+    write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
+    (tmp_path / "rig" / meza2021.MARKER).unlink()
+    before = {path: path.read_bytes() for path in (tmp_path / "rig").rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=r"expected a new or empty folder or one with sonotwin-export.json to replace"):
+        write(tmp_path / "rig", surface, np.zeros((24, 1280), bool))
+    assert {path: path.read_bytes() for path in (tmp_path / "rig").rglob("*") if path.is_file()} == before
 
 
 def test_a_mask_that_cannot_be_written_leaves_nothing(surface, tmp_path, monkeypatch):
@@ -74,14 +110,14 @@ def test_a_mask_that_cannot_be_written_leaves_nothing(surface, tmp_path, monkeyp
     monkeypatch.setattr(cv2, "imencode", all_but_masks)
     monkeypatch.setattr(cv2, "imwrite", lambda *_: False)
     with pytest.raises(OSError, match=r"mask.png: the PNG encoder failed"):
-        meza2021.write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
+        write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
     assert not list(tmp_path.iterdir())
 
 
 def test_other_patterns_are_not_theirs(surface, tmp_path):
     other = SurfaceCapture(surface.images, surface.patterns, 10, surface.calibration, "rig")
     with pytest.raises(ValueError, match="8-bit capture of the authors' patterns"):
-        meza2021.write(tmp_path / "rig", other, np.ones((24, 1280), bool))
+        write(tmp_path / "rig", other, np.ones((24, 1280), bool))
     assert not (tmp_path / "rig").exists()
 
 

@@ -76,7 +76,7 @@ def test_a_bad_file_is_refused(probe, tmp_path, old, new, named):
         ({"T_I_T": np.diag([1.0, 1, -1, 1])}, "T_I_T: .*right-handed frame, in mm, found a left-handed frame"),
         ({"T_I_T": np.eye(3)}, "T_I_T"),
         ({"T_I_T": np.full((4, 4), np.nan)}, "T_I_T"),
-        ({"sx": -0.1}, "scale"),
+        ({"sx": 0.0}, "scale"),
         ({"sy": [0.1, 0.2]}, "sy: expected one number"),
     ],
 )

@@ -1,0 +1,141 @@
+"""The sweep in the layout of the rig authors' public programs: `USdata/`, and the files of the probe's calibration.
+
+Frame k of `L`, `R` (cameras 1 and 2), `US` (the scanner) and `USmasks` belongs together, taken at one moment; there are no time
+stamps. `target_pose.npy` holds `world_from_target` of each frame, `cross_point.npy` the pixel of the wires' crossing.
+"""
+
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.capture.foreign_images import image_files, read_grey
+from recon.capture.images import write_images
+from recon.errors import InputError
+from recon.files.regular import read_bytes
+from recon.geometry import rigid
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+FOLDER = "USdata"
+POSES, CROSSINGS = "target_pose.npy", "cross_point.npy"
+FOLDERS = {"cam1": "L", "cam2": "R", "us": "US"}  # of each device's images
+MASKS = ("USmasks", "masks")  # folders of masks; the second in some versions of their program
+LOOSE = 0.04  # of a rotation's products: triangulated axes are off by up to 2 %
+
+
+@dataclass(frozen=True)
+class AuthorsSweep:
+    """n frames of their layout; images are listed and not read yet."""
+
+    images: dict[str, list[Path]]  # device: n paths, of those that are there
+    sizes: dict[str, tuple[int, int]]  # width, height, px
+    masks: list[Path]
+    poses: Array | None  # (n, 4, 4) world_from_target, mm
+    crossings: Array | None  # (n, 2) px
+
+    @property
+    def count(self) -> int:
+        """Number of frames."""
+        return len(next(iter(self.images.values())))
+
+
+def read_sweep(folder: Path) -> AuthorsSweep | None:
+    """Read the sweep of their folder; None without one.
+
+    Rotations that are off by up to 2 % are made orthonormal, with a warning.
+
+    Raises
+    ------
+    InputError
+        If folders, poses or crossings are of different numbers of frames, a file is damaged, or a pose is none.
+    """
+    place = Path(folder) / FOLDER
+    listed = {device: image_files(place / name) for device, name in FOLDERS.items()}
+    images = {device: paths for device, paths in listed.items() if paths}
+    if not images:
+        return None
+    first, count = next((FOLDERS[device], len(paths)) for device, paths in images.items())
+    masks = next((found for name in MASKS if (found := image_files(place / name))), [])
+    counts = {f"{FOLDERS[device]}/": len(paths) for device, paths in images.items()}
+    counts |= {f"{MASKS[0]}/": len(masks)} if masks else {}
+    poses, crossings = _rows(place / POSES, (4, 4)), _rows(place / CROSSINGS, (2,))
+    counts |= {name: len(rows) for name, rows in ((POSES, poses), (CROSSINGS, crossings)) if rows is not None}
+    for name, found in counts.items():
+        if found != count:
+            raise InputError(f"{place / name}: expected {count} frames, as in {first}/, found {found}")
+    sizes = {device: read_grey(paths[0]).shape[::-1] for device, paths in images.items()}
+    return AuthorsSweep(images, sizes, masks, None if poses is None else _rigid(place / POSES, poses), crossings)
+
+
+def write_sweep(folder: Path, images: Iterable[tuple[str, int, Grey]], masks: Iterable[Grey], poses: Array) -> None:
+    """Write a sweep into a folder that is there.
+
+    Parameters
+    ----------
+    images : of (device, number of the frame, (h, w))
+        Taken one by one.
+    masks : n of (h, w)
+        What is shown in space; empty for none.
+    poses : (n, 4, 4) mm
+    """
+    for device, number, image in images:
+        write_images([folder / FOLDER / FOLDERS[device] / f"{number}.png"], image[None])
+    for number, mask in enumerate(masks):
+        write_images([folder / FOLDER / MASKS[0] / f"{number}.png"], mask[None])
+    (folder / FOLDER).mkdir(exist_ok=True)
+    np.save(folder / FOLDER / POSES, poses)
+
+
+def mended(place: str, pose: Array) -> Array:
+    """A pose : (4, 4) whose rotation is off by up to 2 %, made rigid with a warning.
+
+    Parameters
+    ----------
+    place : file and field, for messages
+
+    Raises
+    ------
+    InputError
+        If it is none even so.
+    """
+    if found := rigid.fault(pose, LOOSE):
+        raise InputError(f"{place}: expected {rigid.RIGID}, in mm, found {found}")
+    if rigid.fault(pose):
+        off = 100 * np.abs(np.linalg.svd(pose[:3, :3], compute_uv=False) - 1).max()
+        log.warning("%s: axes are up to %.2g %% off a rotation, and are taken as the nearest one", place, off)
+        return rigid.nearest(pose)
+    return pose
+
+
+def _rigid(path: Path, poses: Array) -> Array:
+    """All poses as rigid transforms, with one warning for all."""
+    for k, pose in enumerate(poses):
+        if found := rigid.fault(pose, LOOSE):
+            raise InputError(f"{path}: frame {k}: expected {rigid.RIGID}, in mm, found {found}")
+    loose = [k for k, pose in enumerate(poses) if rigid.fault(pose)]
+    if loose:
+        log.warning("%s: axes of %d poses are up to 2 %% off a rotation, and are taken as the nearest one", path, len(loose))
+    return np.stack([rigid.nearest(pose) for pose in poses])
+
+
+def _rows(path: Path, shape: tuple[int, ...]) -> Array | None:
+    """Numbers : (n, *shape) of an npy file; None without one."""
+    if not path.exists():
+        return None
+    read_bytes(path)  # a regular file
+    try:
+        rows = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise InputError(f"{path}: expected an array of numbers, found {' '.join(str(error).split())}") from None
+    fitting = rows.ndim == 1 + len(shape) and rows.shape[1:] == shape and rows.dtype.kind in "fiu"
+    if not fitting or not np.isfinite(rows).all():
+        expected = f"finite numbers of shape (n, {', '.join(map(str, shape))})"
+        raise InputError(f"{path}: expected {expected}, found {rows.dtype} of shape {rows.shape}")
+    return rows.astype(float)

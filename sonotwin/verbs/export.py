@@ -1,0 +1,162 @@
+"""Write a capture in another group's layout, for their programs.
+
+`layout=meza2021` is that of the rig's authors: SLdata/images and mask.png, USdata/L, R, US and USmasks with target_pose.npy, and
+the files of all calibrations, US_params.npz for a chosen speed of sound. Reads a capture folder, of a sweep with poses, as
+`sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs for what a capture doesn't hold. B-scans without
+a pose are left out. Writes into the folder `out`; an earlier export there is replaced, and nothing else ever is. Takes seconds.
+
+    sonotwin export capture=session/capture out=dataset
+    sonotwin export capture=result/poses/scan probe=result/probe/probe.yaml lag_s=0.05 tissue_m_s=1450 out=dataset
+    sonotwin export capture=result/poses/scan surface=result/surface masses=result/masses/scan lag_s=0.05 out=dataset
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+from rich.console import Console
+
+from recon.capture import (
+    calibration_files,
+    manifest,
+    meza2021,
+    meza2021_sweep,
+    probe_files,
+    stereo_frames,
+    surface_part,
+    sweep_part,
+)
+from recon.capture.images import read_image
+from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
+from recon.capture.stereo_frames import Film
+from recon.capture.sweep_part import SweepCapture
+from recon.errors import InputError
+from recon.files import atomic, npz
+from recon.freehand import scans as freehand_scans
+from recon.model.probe import Speed
+from recon.model.tracks import LagSeconds
+from recon.probe_calibration import sound_in_water
+from recon.segmentation.scan_masks import mask_of
+from sonotwin.verbs.surface import POINTS
+
+
+class Config(BaseModel):
+    """Fields of `conf/export.yaml`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    layout: Literal["meza2021"] = "meza2021"
+    capture: Path
+    out: Path
+    calibration: Path | None = None
+    surface: Path | None = None
+    sweep: str = ""
+    probe: Path | None = None
+    lag_s: LagSeconds = 0.0
+    tissue_m_s: Speed | None = None
+    masses: Path | None = None
+
+
+def run(config: Config) -> None:
+    """Read the parts, and write them as far as the layout has a place for them.
+
+    Raises
+    ------
+    InputError
+        If the capture is incomplete or damaged, has nothing for the layout, or `out` can't be written to.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    given = (config.calibration, config.surface, config.probe, config.masses)
+    atomic.check_folder(config.out, meza2021.MARKER, inputs=[config.capture, *(path for path in given if path is not None)])
+    held = manifest.read_manifest(config.capture)
+    written = []
+    with console.status("writing"), meza2021.new_folder(config.out) as folder:
+        if held.surface is not None and "cam1" in held.surface.images:
+            written += [write_surface(folder, config)]
+        if held.sweep is not None or held.sweeps:
+            written += write_sweep(folder, config, held)
+        written += write_optics(folder, config, held)
+        if not written:
+            raise InputError(f"{config.capture / MANIFEST}: expected a surface of cam1, a sweep or a calibration, found none")
+    for line in written:
+        console.print(line, markup=False)
+    console.print(f"wrote       {config.out}", markup=False)
+
+
+def write_surface(folder: Path, config: Config) -> str:
+    """Write the fringe images and the mask; returns a line about them."""
+    surface = surface_part.read_surface(config.capture, "cam1", config.calibration)
+    if not meza2021.is_theirs(surface):
+        return "left out    surface: expected 8 bits, a centre line and 8 fringes of 12 px, whose shifts are numbered from one"
+    mask = np.ones(surface.images.shape[1:], bool)
+    if config.surface is not None:
+        shape = (*mask.shape, 3)
+        mask = np.isfinite(npz.read(config.surface / POINTS, {"points": npz.Form("f", shape)})["points"]).all(axis=-1)
+    meza2021.write(folder, surface, mask)
+    return f"surface     {len(surface.images)} images, {100 * mask.mean():.1f} % of the pixels in the mask"
+
+
+def write_sweep(folder: Path, config: Config, held: Manifest) -> list[str]:
+    """Write the B-scans with their poses, frames and masks, and the probe's file; returns lines about them."""
+    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
+    poses = sweep.poses(config.lag_s)
+    placed = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
+    _, part = held.sweep_of(config.capture / MANIFEST, "a sweep", config.sweep, "volume")
+    filmed = set(CAMERAS) <= part.images.keys()
+    film = stereo_frames.read_film(config.capture, config.calibration, config.sweep) if filmed else None
+    masks: Iterator[NDArray[np.uint8]] = iter(())
+    frames = ", with frames of both cameras" if film else ""
+    lines = [f"sweep       {len(placed)} of {len(poses)} B-scans, those with a pose{frames}"]
+    probe = None if config.probe is None and sweep.probe is None else freehand_scans.probe_of(sweep, config.capture, config.probe)
+    if probe is not None:
+        converted = sound_in_water.for_tissue(probe, config.tissue_m_s)
+        probe_files.write_authors(folder / probe_files.AUTHORS, converted)
+        lines.append(f"probe       {probe_files.AUTHORS}, right where sound makes {converted.speed_m_s:.0f} m/s")
+    if config.masses is not None and probe is not None:
+        scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
+        masks = _masks(read_masses(config.masses), scans.world_from_pixel[placed], sweep.size)
+    elif config.masses is not None:
+        raise InputError(f"{config.masses}: expected probe, the calibration by which masses lie in B-scans, found none")
+    meza2021_sweep.write_sweep(folder, _frames(sweep, film, placed, config.lag_s), masks, poses[placed])
+    return lines
+
+
+def write_optics(folder: Path, config: Config, held: Manifest) -> list[str]:
+    """Write the files of all pairs of cameras; returns a line about them."""
+    own = None if held.calibration is None else config.capture / held.calibration
+    path = config.calibration or own
+    if path is None:
+        return []
+    sizes = {name: device.size for name, device in held.devices.items() if name != SCANNER}
+    return [f"optics      {', '.join(meza2021.write_parameters(folder, calibration_files.read(path, sizes)))}"]
+
+
+def read_masses(folder: Path) -> list[trimesh.Trimesh]:
+    """The meshes that `sonotwin segment` left; InputError if there are none."""
+    paths = sorted(folder.glob("mass*.ply"))
+    if not paths:
+        raise InputError(f"{folder}: expected mass0.ply ..., as of `sonotwin segment`, found none")
+    return [trimesh.load_mesh(path, process=False) for path in paths]
+
+
+def _frames(sweep: SweepCapture, film: Film | None, placed: NDArray[np.intp], lag_s: float) -> Iterator[tuple[str, int, NDArray]]:
+    """B-scans, and the frames that were taken nearest to each."""
+    for number, k in enumerate(placed.tolist()):
+        yield SCANNER, number, sweep.image(k)
+        if film is not None:
+            taken = sweep.times[k] - round(lag_s * 1e9)
+            nearest = int(np.abs(film.times - taken).argmin())
+            both = next(path for row, path in enumerate(film.paths()) if row == nearest)
+            for device, path, camera, bits in zip(CAMERAS, both, film.cameras, film.depths, strict=True):
+                image = read_image(path, camera.size, bits)
+                yield device, number, (image >> (bits - 8)).astype(np.uint8)
+
+
+def _masks(masses: list[trimesh.Trimesh], world_from_pixel: NDArray, size: tuple[int, int]) -> Iterator[NDArray[np.uint8]]:
+    """A mask a B-scan, 255 inside a mass."""
+    for placed in world_from_pixel:
+        yield np.where(mask_of(masses, placed, size), 255, 0).astype(np.uint8)
