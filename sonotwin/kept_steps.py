@@ -1,19 +1,21 @@
 """Steps that are done once: each is a verb that writes a folder, which is kept as long as nothing that it was made of changes.
 
-A record in the folder of all steps says what each was made of. It is written after the step's folder has appeared whole, so a run
-that was killed anywhere goes on where it was.
+A record in the folder of all steps holds a digest of each step's inputs: its verb's settings, files and earlier steps. A step is
+taken out of the record before it is done again and entered after its folder has appeared whole, so a run that was stopped
+anywhere goes on where it was.
 """
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
 from recon.errors import InputError
-from recon.files import atomic
+from recon.files import atomic, metrics
 from sonotwin.config import load
 
 RECORD = "reconstruct.json"  # by which the folder of all steps is known
@@ -21,34 +23,39 @@ RECORD = "reconstruct.json"  # by which the folder of all steps is known
 
 @dataclass
 class KeptSteps:
-    """Steps in one folder. Its state is the record, and what wasn't done."""
+    """Steps in one folder. Its state is the record, and the names of the steps of this run."""
 
     folder: Path
     say: Callable[[str], None]
-    record: dict[str, str] = field(default_factory=dict)  # name of a step -> digest of all that it was made of
-    done: list[str] = field(default_factory=list)  # names of steps whose result is there
-    failed: list[str] = field(default_factory=list)  # of those that were tried in vain
+    record: dict[str, str] = field(default_factory=dict)  # name of a step -> digest of its inputs
+    done: list[str] = field(default_factory=list)  # steps whose result is there
+    failed: list[str] = field(default_factory=list)  # steps that could not be done
 
-    def open(self, inputs: Iterable[Path]) -> None:
-        """Take up the record of an earlier run, or begin one.
+    @contextmanager
+    def opened(self, inputs: Iterable[Path]) -> Iterator[None]:
+        """Take up the record of an earlier run, or begin one; another run on the same folder waits until this one has ended.
+
+        In the end, results of earlier runs that are no part of this one leave the record, and are named.
 
         Raises
         ------
         InputError
             If something else is there, or the folder can't be written to.
         """
+        path = self.folder / RECORD
+        self._forget_stopped_beginning(path)
         atomic.check_folder(self.folder, RECORD, inputs)
         self.folder.mkdir(parents=True, exist_ok=True)
-        path = self.folder / RECORD
-        try:
-            content = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-            self.record = {name: str(digest) for name, digest in content.items()}
-        except (ValueError, AttributeError):
-            self.record = {}  # a damaged one costs work, and no more
-        self._write()
+        with atomic.alone(self.folder):
+            self.record = _read(path)
+            self._write()
+            yield
+            for name in [name for name in self.record if name not in self.done]:
+                self.say(f"stale       {name}: of an earlier run, and no part of this result")
+                self._change(name, None)
 
     def do(
-        self, name: str, does: str, verb: str, fields: Sequence[str], marker: str, made_of: Mapping[str, object]
+        self, name: str, does: str, verb: str, fields: Sequence[str], files: Sequence[str], made_of: Mapping[str, object]
     ) -> Path | None:
         """Do a step, unless its result of before is there; returns its folder, None if it can't be done.
 
@@ -57,41 +64,69 @@ class KeptSteps:
         name : of the step, and of its folder
         does : for people
         verb, fields : the command line, less `out`
-        marker : file by which the folder's kind is known
-        made_of : all that decides the result beside the fields: digests of files and of earlier steps
+        files : that the step hands on; all must be there for it to be kept
+        made_of : inputs beside the settings: digests of files and of earlier steps
         """
         place = self.folder / name
-        digest = digest_of({"version": version("sonotwin"), "verb": verb, "fields": list(fields), **made_of})
-        if self.record.get(name) == digest and (place / marker).is_file():
-            self.say(f"kept        {name}: {does}, as before")
-            self.done.append(name)
-            return place
-        self.say(f"{name}: {does}")
         module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
         try:
-            module.run(load(verb, [*fields, f"out={place}"], module.Config))
+            config = load(verb, [*fields, f"out={place}"], module.Config)
+            digest = digest_of([version("sonotwin"), verb, config.model_dump(mode="json", exclude={"out"}), made_of])
+            if self.record.get(name) == digest and all((place / file).is_file() for file in (*files, metrics.FILE)):
+                self.say(f"kept        {name}: {does}, as before")
+                self.done.append(name)
+                return place
+            self.say(f"{name}: {does}")
+            self._change(name, None)
+            module.run(config)
         except InputError as error:
-            self.failed.append(name)
-            self.leave_out(name, str(error))
+            self.fail(name, str(error))
             return None
-        self.record[name] = digest
         self.done.append(name)
-        self._write()
+        self._change(name, digest)
         return place
 
     def leave_out(self, name: str, reason: str) -> None:
-        """Note, in one line, that a step isn't done; its result of an earlier run doesn't count any more."""
+        """Say, in one line, that a step isn't done."""
         self.say(f"left out    {name}: {reason}")
-        if self.record.pop(name, None) is not None:
-            self._write()
+        self._change(name, None)
+
+    def fail(self, name: str, reason: str) -> None:
+        """Say, in one line, that a step could not be done though its part is there."""
+        self.failed.append(name)
+        self.leave_out(name, reason)
 
     def digest(self, *names: str) -> dict[str, str]:
         """Digests of steps that are done, for those that build on them."""
-        return {name: self.record[name] for name in names if name in self.record}
+        return {name: self.record[name] for name in names if name in self.done}
+
+    def _change(self, name: str, digest: str | None) -> None:
+        """Enter a step in the record, or take it out."""
+        if digest is not None:
+            self.record[name] = digest
+        elif self.record.pop(name, None) is None:
+            return
+        self._write()
 
     def _write(self) -> None:
         with atomic.new_file(self.folder / RECORD) as temporary:
-            temporary.write_text(json.dumps(self.record, indent=2) + "\n", encoding="utf-8")
+            temporary.write_text(json.dumps(self.record, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+
+    def _forget_stopped_beginning(self, path: Path) -> None:
+        """Remove what a run that was killed while it wrote its first record has left: hidden files of the record's name."""
+        entries = list(self.folder.iterdir()) if self.folder.is_dir() else []
+        if entries and all(entry.is_file() and entry.name.startswith(f".{path.stem}") for entry in entries):
+            for entry in entries:
+                entry.unlink()
+
+
+def _read(path: Path) -> dict[str, str]:
+    """A record; an empty one where none is there, or a damaged one, which costs work and no more."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        return {name: str(digest) for name, digest in content.items()}
+    except (ValueError, AttributeError):
+        return {}
 
 
 def digest_of(content: object) -> str:

@@ -1,105 +1,122 @@
 """Accuracy of whole sessions: rendered, reconstructed from their images alone, and compared with the truth.
 
-Each seed draws hand, light, speckle, noise and conditions anew. The figures of a seed are kept beside the tables, so that a
-measurement that was stopped goes on where it was.
+Each seed draws hand, light, speckle, noise and conditions anew. The figures of a seed are kept beside the tables, with a digest
+of the code and the settings that made them, so that a measurement that was stopped goes on where it was, and no figure of other
+code stands in a table.
 """
 
+import hashlib
+import json
 import shutil
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
 
 import numpy as np
+from numpy.typing import NDArray
 
+from recon.errors import InputError
 from recon.files import metrics
 from recon.files.metrics import Metrics
-from sonotwin import session_steps
+from sonotwin import config, session_steps
+from sonotwin.choices import read_rig
 from sonotwin.session_steps import BOTTOM, SCAN, WIRES
 from twin.accuracy.table_rows import Measurement, Row, Setup
-from twin.evaluation import session_errors, sweep_errors
+from twin.evaluation import session_errors
+
+Array = NDArray[np.float64]
 
 SEEDS = tuple(range(701, 711))
 WIDER = {"ideal": 1.0, "lifelike": 1.7}  # bars of each kind of conditions
+RIG = "meza2021"
+MARK = "_true_extent_mm"  # of a tumour's figures, one a tumour
+PACKAGES = ("recon", "scenes", "twin", "sonotwin")
 
 
 def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group: ten sessions under each kind of conditions."""
+    """The rows of the group: ten sessions under each kind of conditions.
+
+    Raises
+    ------
+    InputError
+        For another rig than the default one: sessions are rendered by verbs, which read theirs from conf/rig.
+    """
+    if setup.rig != read_rig(RIG):
+        raise InputError(f"accuracy: rig: expected {RIG} for only=session, found another")
     return [lambda kind=kind: rows(kind, [measured(setup.out, kind, seed) for seed in SEEDS]) for kind in WIDER]
 
 
 def measured(kept: Path | None, conditions: str, seed: int) -> Metrics:
-    """Figures of one session, by estimated calibrations and tracked poses; from a folder of those kept, if they are there."""
-    path = None if kept is None else kept / "session" / f"{conditions}_{seed}.json"
+    """Figures of one session, by estimated calibrations and tracked poses; those kept in a folder, if they are of this code."""
+    path = None if kept is None else kept / "session" / f"{conditions}_{seed}_{code()}.json"
     if path is not None and path.is_file():
         return metrics.read(path)
     work = Path(mkdtemp(prefix="session"))
     try:
-        figures = session(work, conditions, seed)
+        whole, figures = session(work, conditions, seed)
     finally:
         shutil.rmtree(work)
-    if path is not None:
+    if path is not None and whole:
         path.parent.mkdir(parents=True, exist_ok=True)
         metrics.write(path, figures)
     return figures
 
 
-def session(work: Path, conditions: str, seed: int) -> Metrics:
-    """Render a session, take its truth away, reconstruct, and compare."""
+def session(work: Path, conditions: str, seed: int) -> tuple[bool, Metrics]:
+    """Render a session, take its truth away, reconstruct, and compare; returns whether all steps were done, and the figures."""
     given = [f"conditions={conditions}", f"seed={seed}"]
     for verb, fields in session_steps.rendering(work / "session", given):
         session_steps.do(verb, fields)
     truth = (work / "session" / "truth").rename(work / "truth")
-    session_steps.do(*session_steps.reconstruction(work / "session", work / "result"))
-    return session_errors.measure(work / "result", work / "session" / "capture", truth)
+    status = session_steps.do(*session_steps.reconstruction(work / "session", work / "result"))
+    return status == 0, session_errors.measure(work / "result", work / "session" / "capture", truth)
+
+
+@cache
+def code() -> str:
+    """Digest of the code and the settings that sessions are made by."""
+    root, conf = config.folder().parent, config.folder()
+    files = [*(path for package in PACKAGES for path in sorted((root / package).rglob("*.py"))), *sorted(conf.rglob("*.yaml"))]
+    content = [(str(path.relative_to(root)), path.read_text(encoding="utf-8")) for path in files]
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
 
 
 def rows(conditions: str, found: Sequence[Metrics]) -> list[Row]:
-    """Rows of some sessions: the worst of them, unless it says otherwise."""
+    """Rows of some sessions: the worst of them, unless it says otherwise; NaN, which misses its bar, of what is missing."""
     wider, name = WIDER[conditions], f"{conditions}, {len(found)} sessions"
-    seen = [one[f"{SCAN}_track_visible"] / one[f"{SCAN}_track_frames"] for one in found]
-    films = [(one, f"{sweep}_track") for one in found for sweep in (WIRES, BOTTOM, SCAN)]
-    tracked = [one[f"{film}_visible_found"] / one[f"{film}_visible"] for one, film in films]
-    false = sum(one[f"{film}_false"] for one, film in films)
-    probe = np.array([one[f"{SCAN}_probe_worst_error_mm"] for one in found])
-    sigma = np.array([one[f"{SCAN}_probe_worst_sigma_mm"] for one in found])
-    masses = [one[f"{SCAN}_tumours_found"] - one[f"{SCAN}_tumours_false"] - _each(one, "inside").count(0) for one in found]
-    volumes, depths = _pairs(found, "volume_mm3"), _pairs(found, "under_skin_mm")
-    contact = abs(float(np.mean([one[f"{SCAN}_contact_bias_mm"] for one in found])))
+    films = [f"{sweep}_track" for sweep in (WIRES, BOTTOM, SCAN)]
+    seen = each(found, f"{SCAN}_track_visible") / each(found, f"{SCAN}_track_frames")
+    tracked = np.array([each(found, f"{film}_visible_found") / each(found, f"{film}_visible") for film in films])
+    false = np.sum([each(found, f"{film}_false") for film in films])
+    probe, sigma = each(found, f"{SCAN}_probe_worst_error_mm"), each(found, f"{SCAN}_probe_worst_sigma_mm")
+    names = sorted({key.removesuffix(MARK) for one in found for key in one if key.endswith(MARK)})
+    inside = np.sum([each(found, f"{name}_inside") == 1 for name in names], axis=0) - each(found, f"{SCAN}_tumours_false")
+    centres = np.array([each(found, f"{name}_centre_error_mm") for name in names])
+    volumes = np.array([each(found, f"{name}_volume_mm3") / each(found, f"{name}_true_volume_mm3") - 1 for name in names])
+    depths = np.array([each(found, f"{name}_under_skin_mm") - each(found, f"{name}_true_under_skin_mm") for name in names])
+    contact, lag = each(found, f"{SCAN}_contact_bias_mm"), each(found, f"{SCAN}_lag_error_ms")
+    shift, turn = each(found, f"{SCAN}_track_shift_median_mm"), each(found, f"{SCAN}_track_turn_median_deg")
+    covered = 100 * each(found, f"{SCAN}_lag_covered").mean()
     return [
-        Row("a", f"{name}: frames that show the whole target to both", 100 * min(seen), 90.0, None, "%", at_least=True),
-        Row("b", f"{name}: found, of pairs that show the target whole", 100 * min(tracked), 99.0, None, "%", at_least=True),
-        Row("b", f"{name}: wrong poses in all sweeps", false, 0.0, 0.0, "poses"),
-        Row("b", f"{name}: translation in the scan, median", _worst(found, "track_shift_median_mm"), 0.03 * wider, None, "mm"),
-        Row("b", f"{name}: rotation in the scan, median", _worst(found, "track_turn_median_deg"), 0.05 * wider, None, "deg"),
-        Row("c", f"{name}: latency", _worst(found, "lag_error_ms"), 1.5 * wider, None, "ms"),
-        Row("c", f"{name}: latency within its 95 % interval", 100 * _mean(found, "lag_covered"), 80.0, 95.0, "%", at_least=True),
+        Row("a", f"{name}: frames that show the whole target to both", 100 * seen.min(), 90.0, None, "%", at_least=True),
+        Row("b", f"{name}: found, of pairs that show the target whole", 100 * tracked.min(), 99.0, None, "%", at_least=True),
+        Row("b", f"{name}: wrong poses in all sweeps", float(false), 0.0, 0.0, "poses"),
+        Row("b", f"{name}: translation in the scan, median", shift.max(), 0.03 * wider, None, "mm"),
+        Row("b", f"{name}: rotation in the scan, median", turn.max(), 0.05 * wider, None, "deg"),
+        Row("c", f"{name}: latency", np.abs(lag).max(), 1.5 * wider, None, "ms"),
+        Row("c", f"{name}: latency within its 95 % interval", covered, 80.0, 95.0, "%", at_least=True),
         Row("d", f"{name}: probe, the worst of five pixels", probe.max(), 0.20 * wider, None, "mm"),
-        Row("d", f"{name}: the same over its predicted sigma, RMS", float(np.sqrt(np.mean((probe / sigma) ** 2))), None, 1.0, ""),
-        Row("f", f"{name}: tumours found inside the skin, less false ones, of 3", min(masses), 3.0, 3.0, "", at_least=True),
-        Row("f", f"{name}: tumours' centres", max(max(_each(one, "centre_error_mm")) for one in found), 0.35 * wider, None, "mm"),
-        Row("f", f"{name}: tumours' volumes", np.max([100 * abs(a / b - 1) for a, b in volumes]), 6.0 * wider, None, "%"),
-        Row("f", f"{name}: least tissue over tumours", np.max([abs(a - b) for a, b in depths]), 0.25 * wider, None, "mm"),
-        Row("g", f"{name}: array's face from the skin by light, mean", contact, 0.05 * wider, None, "mm"),
-        Row("g", f"{name}: the same, worst", _worst(found, "contact_bias_mm"), None, None, "mm"),
+        Row("d", f"{name}: the same over its predicted sigma, RMS", np.sqrt(np.mean((probe / sigma) ** 2)), None, 1.0, ""),
+        Row("f", f"{name}: tumours found inside the skin, less false ones, of 3", inside.min(), 3.0, 3.0, "", at_least=True),
+        Row("f", f"{name}: tumours' centres", np.max(centres, initial=0.0), 0.35 * wider, None, "mm"),
+        Row("f", f"{name}: tumours' volumes", 100 * np.max(np.abs(volumes), initial=0.0), 6.0 * wider, None, "%"),
+        Row("f", f"{name}: least tissue over tumours", np.max(np.abs(depths), initial=0.0), 0.25 * wider, None, "mm"),
+        Row("g", f"{name}: array's face from the skin by light, mean", abs(contact.mean()), 0.05 * wider, None, "mm"),
+        Row("g", f"{name}: the same, worst", np.abs(contact).max(), None, None, "mm"),
     ]  # fmt: skip
 
 
-def _pairs(found: Sequence[Metrics], figure: str) -> list[tuple[float, float]]:
-    """A figure of all tumours beside the true one; NaN of those that weren't found."""
-    mark = "_true_extent_mm"
-    names = [(one, key.removesuffix(mark)) for one in found for key in one if key.endswith(mark)]
-    return [(one[f"{name}_{figure}"], one[f"{name}_true_{figure}"]) for one, name in names]
-
-
-def _each(one: Metrics, figure: str) -> list[float]:
-    """A figure of all tumours that were found."""
-    own = {key.removeprefix(f"{SCAN}_"): value for key, value in one.items() if key.startswith(f"{SCAN}_")}
-    return sweep_errors.of_each(own, figure)
-
-
-def _worst(found: Sequence[Metrics], figure: str) -> float:
-    return max(abs(one[f"{SCAN}_{figure}"]) for one in found)
-
-
-def _mean(found: Sequence[Metrics], figure: str) -> float:
-    return float(np.mean([one[f"{SCAN}_{figure}"] for one in found]))
+def each(found: Sequence[Metrics], figure: str) -> Array:
+    """A figure of all sessions : (n,); NaN where one lacks it."""
+    return np.array([one.get(figure, np.nan) for one in found], float)

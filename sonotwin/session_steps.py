@@ -5,8 +5,8 @@ from importlib import import_module
 from pathlib import Path
 
 from sonotwin.config import load
+from sonotwin.demo_config import BOARD_PATTERNS, WATER_C
 
-WATER_C = 22.0  # of the tank, as `scenes.acoustics` has it
 TISSUE_M_S = 1450.0  # of the phantom's silicone
 WIRES, BOTTOM, SCAN = "wires", "bottom", "scan"
 TANK = ["ultrasound=water"]
@@ -15,7 +15,7 @@ TANK = ["ultrasound=water"]
 def rendering(out: Path, given: Sequence[str] = ()) -> Iterator[tuple[str, list[str]]]:
     """Verbs and their fields, in order; fields that are given go to all of them."""
     place = [f"out={out}", "add=true", *given]
-    yield "render", ["scene=board", "poses=demo", "patterns=paper_calibration", "cameras=[cam1,cam2]", *place]
+    yield "render", ["scene=board", "poses=demo", f"patterns={BOARD_PATTERNS}", "cameras=[cam1,cam2]", *place]
     yield "render", ["scene=breast", *place]
     wires = ["scene=crosswire", *TANK, "path=wire", "path.count=40", "clocks.camera_hz=5"]
     yield "sweep", [*wires, "filmed=true", f"name={WIRES}", *place]

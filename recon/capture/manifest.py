@@ -32,6 +32,7 @@ SCANNER = "us"
 PartName = str  # "surface", "board", "sweep", or "sweep/NAME": the folder of the part's images
 SWEEP: PartName = "sweep"
 SweepName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,63}$")]
+SweepNameOrNone = Annotated[str, Field(pattern=r"^([a-z][a-z0-9_-]{0,63})?$")]  # "" of the only one
 Purpose = Literal["probe", "latency", "volume"]  # of a sweep: crossed wires at rest, a flat bottom, or what is to be seen
 
 
@@ -218,12 +219,17 @@ class Manifest(Record):
         """
         there = {sweep_part(own): part for own, part in self.sweeps.items()} | ({SWEEP: self.sweep} if self.sweep else {})
         wanted = {part: one for part, one in there.items() if not name or part == sweep_part(name)}
-        fitting = {part: one for part, one in wanted.items() if one.purpose == purpose} if len(wanted) > 1 else wanted
+        fitting = wanted
+        if len(wanted) > 1 and purpose is not None:
+            own = {part: one for part, one in wanted.items() if one.purpose == purpose}
+            fitting = own or {part: one for part, one in wanted.items() if one.purpose is None and purpose == "volume"}
         if len(fitting) == 1:
             return next(iter(fitting.items()))
         if not there:
             raise InputError(f"{path}: expected sweep, {holds}, found none")
-        names = ", ".join(self.sweeps) or "one without a name"
+        if self.sweep:
+            raise InputError(f"{path}: sweep: expected no name, as it is the only one, found {name}; leave sweep={name} out")
+        names = ", ".join(self.sweeps)
         found = f"{name}, which isn't among them" if name else f"{len(fitting) or 'none'} for this"
         raise InputError(f"{path}: sweeps: expected the name of one of {names}, found {found}; give sweep=NAME")
 

@@ -275,7 +275,7 @@ def check_kept(source: Path, read: Manifest, replaced: PartName) -> None:
     for part in sorted(read.contents.keys() - {replaced}):
         for name in read.part(part).paths():
             inside = Path(os.path.normpath(name))
-            if inside.is_absolute() or inside.parts[0] == "..":
+            if inside.is_absolute() or inside.parts[:1] == ("..",):
                 raise InputError(f"{path}: {manifest.field_of(part)}: expected a capture that holds all its files, found {name}")
             if inside.is_relative_to(replaced):
                 expected = f"none of its files in {replaced}/, which is written anew"

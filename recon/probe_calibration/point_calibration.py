@@ -17,7 +17,7 @@ for the rig of the paper:
     90 degrees         0.07       0.09 to 0.11 mm
     35 degrees         0.09       0.10 to 0.12 mm
 
-With the crossing at random places of the image the corners are half as bad again; so they are with 0.3 mm of slice thickness.
+With the crossing at random places of the image, or with 0.3 mm of slice thickness, the corners are 50 % worse.
 """
 
 from collections.abc import Iterable

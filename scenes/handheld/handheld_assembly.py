@@ -23,6 +23,7 @@ from scenes.handheld.target_board import CLEAR_MM, Board, build_board, covers, d
 Array = NDArray[np.float64]
 
 TRIES = 40  # of a housing that stands clear of the board
+BEHIND_MM = 1e-3  # from the board's middle: a probe behind it is beside it in no direction
 GRIPS = 160  # of a hand that leaves the circles free
 ANY_GRIP = (0.15, 0.85)  # levels at which a probe close beside its board can be held, too
 IMAGE_FROM_BODY = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the body's z is against the image's depth
@@ -90,7 +91,7 @@ def as_designed(rng: np.random.Generator, target: Target, probe: Probe, eyes: Ar
     target_from_body = probe.target_from_image.matrix() @ face @ rigid.transform(np.eye(3), [0, 0, LENS_MM])
     housing = _clear_of(board, probe_rng, target_from_body, array_mm)
     aside = target_from_body[:2, 3] - board.middle
-    beside = np.append(lofts.unit(aside), 0.0)
+    beside = np.append(lofts.unit(aside), 0.0) if np.linalg.norm(aside) > BEHIND_MM else np.array([1.0, 0.0, 0.0])
     lens_mm = np.array([array_mm + 2, lens(probe_rng)[1]])
     parts += [_moved(part, target_from_body) for part in parts_of(housing, lens_mm, probe_rng)]
     parts += _bracket(bracket_rng, board, housing, target_from_body)
@@ -172,7 +173,7 @@ def _bracket(rng: np.random.Generator, board: Board, probe: Body, target_from_bo
 
     inward = np.append(board.middle, 0) - (origin + level * axis)
     inward[2] = 0
-    inward = lofts.unit(inward)
+    inward = lofts.unit(inward) if np.linalg.norm(inward) > BEHIND_MM else np.array([1.0, 0.0, 0.0])
     reach = (rigid.rotate(target_from_body, np.column_stack([outline, np.zeros(len(outline))])) @ inward).max()
     start = origin + level * axis + (reach - 3) * inward
     end = np.append(board.middle, 0) - 0.25 * board.size.min() * inward * rng.uniform(0, 1)

@@ -1,4 +1,4 @@
-"""What holds the probe: a hand around it, a hand that pinches the board, or a robot."""
+"""Holders of the probe: a hand around it, a hand that pinches the board, a robot."""
 
 from collections.abc import Callable
 
@@ -30,15 +30,14 @@ def grip(
 
     refused : whether a hand of balls : (n, 4) of x, y, z, radius is in the way.
     """
-    skeleton = None
     left = bool(rng.uniform() < 0.4)
     for _ in range(tries):
         level = probe.length * rng.uniform(*levels)
         away = np.arctan2(*(target_from_body[:3, :3].T @ beside)[[1, 0]])
         outline = probe.outline_at(level / probe.length)[:, :2]
-        grip = hands.gripping(rng, outline, left, away + rng.normal(0, 0.9))
+        closed = hands.gripping(rng, outline, left, away + rng.normal(0, 0.9))
         to_grip = target_from_body @ rigid.transform(np.eye(3), [0, 0, level])
-        skeleton = hands.turned(grip, to_grip[:3, :3], to_grip[:3, 3])
+        skeleton = hands.turned(closed, to_grip[:3, :3], to_grip[:3, 3])
         arm = skeleton.wrist + np.linspace(0, 300, 20)[:, None] * skeleton.forearm
         balls = np.concatenate([skeleton.points(), np.column_stack([arm, np.full(20, 45.0)])])
         if not refused(balls) and skeleton.forearm[2] < 0.75:
@@ -54,11 +53,11 @@ def pinch(rng: np.random.Generator, board: Board, discs: Array, radius: float, b
     reach = [beyond(board, disc, way) for disc in discs]
     disc = discs[int(np.argmin(reach))] if rng.uniform() < 0.8 else discs[rng.integers(3)]
     tip = disc + way * radius * rng.uniform(-0.6, 0.85) + rng.uniform(-0.5, 0.5) * radius * np.array([-way[1], way[0]])
-    pinch = hands.pinching(rng, bool(rng.uniform() < 0.5), board.thickness)
+    closed = hands.pinching(rng, bool(rng.uniform() < 0.5), board.thickness)
     turn = np.arctan2(way[1], way[0]) + np.pi / 2 + rng.normal(0, 0.25)
     cos, sin = np.cos(turn), np.sin(turn)
     rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    return hands.clothed(rng, hands.turned(pinch, rotation, [*tip, 0.0]))
+    return hands.clothed(rng, hands.turned(closed, rotation, [*tip, 0.0]))
 
 
 def robot(rng: np.random.Generator, probe: Body, target_from_body: Array, beside: Array) -> list[Part]:

@@ -21,7 +21,7 @@ from pydantic import ConfigDict, Field
 from rich.console import Console
 from rich.progress import Progress
 
-from recon.capture.manifest import CAMERAS, SweepName, sweep_part
+from recon.capture.manifest import CAMERAS, SweepNameOrNone, sweep_part
 from recon.model.rig import Rig
 from sonotwin.config import folder as conf
 from twin.conditions import Conditions, drifted, printed
@@ -41,7 +41,7 @@ class Config(film_session.Filming):
     conditions: Conditions = Conditions()
     out: Path
     add: bool = False
-    name: Literal[""] | SweepName = ""
+    name: SweepNameOrNone = ""
     pixels: Literal["sketch", "full"] = "sketch"
     quality: Quality = Quality(window=8)
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0

@@ -7,7 +7,7 @@ for volumes and masses. What is missing is taken from the calibrations given her
 Writes into the folder `out`, each step in a folder of its own as its verb would: optics/, surface/, poses/NAME/, latency/,
 probe/, volume/NAME/ and masses/NAME/ (of a sweep without a name poses/, volume/, masses/); and metrics.json, the figures of all
 steps. A step whose result is there, made of the same, isn't done again, so a run that was killed is simply started again. Takes
-minutes. Exit status 1 if a part that is there could not be used.
+minutes. Exit status 1 if a step failed; those that build on it are left out.
 
     sonotwin reconstruct capture=session/capture out=result
     sonotwin reconstruct capture=session/capture tissue_m_s=1450 temperature_c=22 out=result
@@ -24,19 +24,23 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 from rich.console import Console
 
 from recon.capture import manifest
-from recon.capture.manifest import CAMERAS, SCANNER, Manifest, SweepPart, is_sweep
+from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPart, is_sweep, sweep_part
 from recon.errors import InputError
 from recon.files import metrics
 from recon.model.calibration import DRIFT_PX
 from recon.model.probe import Speed
 from recon.model.rig import Positive, Rig
 from recon.model.tracks import LagSeconds
+from recon.tracking import networks
 from recon.tracking.results import POSES
 from sonotwin.kept_steps import KeptSteps, files_of
 from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, measure_lag, surface
 
 Drift = Annotated[float, Field(ge=0, le=10)]
 NO_OPTICS = "no calibration of the cameras: no board, and none given"
+NO_PROBE = "no calibration of the probe: no sweep over crossed wires, and none given"
+NO_LAG = "latency failed; give lag_s"
+SKIN = "surface.ply"
 
 
 class Config(BaseModel):
@@ -108,17 +112,16 @@ def run(config: Config) -> int:
     for path in given:
         if not path.exists():
             raise InputError(f"{path}: expected a calibration or networks as given, found nothing there")
-    steps.open([config.capture, *given])
-    optics = calibrated_optics(steps, sources)
-    skin = measured_skin(steps, sources, optics)
-    tracked = {name: tracked_sweep(steps, sources, name, optics) for name in sources.sweeps}
-    lag_s = measured_latency(steps, sources, tracked)
-    probe = calibrated_probe(steps, sources, tracked, lag_s)
-    for name, part in sources.sweeps.items():
-        placed = tracked[name]
-        if part.purpose in (None, "volume") and SCANNER in part.images and placed is not None:
-            look_inside(steps, sources, name, placed, probe, lag_s, skin)
-    metrics.write(config.out / metrics.FILE, figures(config.out, steps))
+    with steps.opened([config.capture, *given]):
+        optics = calibrated_optics(steps, sources)
+        skin = measured_skin(steps, sources, optics)
+        tracked = {name: tracked_sweep(steps, sources, name, optics) for name in sources.sweeps}
+        lag_s = measured_latency(steps, sources, tracked)
+        probe = calibrated_probe(steps, sources, tracked, lag_s)
+        for name, part in sources.sweeps.items():
+            if part.purpose in (None, "volume") and SCANNER in part.images:
+                look_inside(steps, sources, name, tracked[name], probe, lag_s, skin)
+        metrics.write(config.out / metrics.FILE, figures(config.out, steps))
     console.print(f"wrote       {config.out}/{{{','.join([*steps.done, metrics.FILE])}}}", markup=False)
     return 1 if steps.failed else 0
 
@@ -126,20 +129,17 @@ def run(config: Config) -> int:
 def calibrated_optics(steps: KeptSteps, sources: Sources) -> Path | None:
     """The calibration of cameras and projector: the one given, the board's, or the capture's own."""
     config, held = sources.config, sources.held
+    own = None if held.calibration is None else config.capture / held.calibration
     if config.calibration is not None:
         return config.calibration
-    if held.board is not None:
-        fields = [f"capture={config.capture}"]
-        made = steps.do(
-            "optics",
-            "cameras and projector, from the board",
-            "calibrate-optics",
-            fields,
-            calibrate_optics.PAGE,
-            sources.files("board"),
-        )
-        return None if made is None else made / calibrate_optics.OPTICS
-    return None if held.calibration is None else config.capture / held.calibration
+    if held.board is None:
+        return own
+    if held.board.patterns is None and held.surface is not None and own is not None:
+        steps.leave_out("optics", f"the board was seen without fringes, and so not by the projector; {own} is used")
+        return own
+    fields, files = [f"capture={config.capture}"], (calibrate_optics.OPTICS, calibrate_optics.PAGE)
+    made = steps.do("optics", "cameras and projector, from the board", "calibrate-optics", fields, files, sources.files("board"))
+    return None if made is None else made / calibrate_optics.OPTICS
 
 
 def measured_skin(steps: KeptSteps, sources: Sources, optics: Path | None) -> Path | None:
@@ -148,78 +148,94 @@ def measured_skin(steps: KeptSteps, sources: Sources, optics: Path | None) -> Pa
     if sources.held.surface is None:
         return None
     if optics is None:
-        return steps.leave_out("surface", NO_OPTICS)
+        return steps.leave_out("surface", _no(steps, "optics", NO_OPTICS))
     fields = [f"capture={config.capture}", f"calibration={optics}", f"camera={config.camera}"]
-    made_of = sources.files("surface") | _of(steps, "optics", optics)
-    made = steps.do("surface", "the surface, from fringes", "surface", fields, surface.POINTS, made_of)
-    return None if made is None else made / "surface.ply"
+    made_of = sources.files("surface") | _known_by(steps, "optics", optics)
+    made = steps.do("surface", "the surface, from fringes", "surface", fields, (surface.POINTS, SKIN), made_of)
+    return None if made is None else made / SKIN
 
 
 def tracked_sweep(steps: KeptSteps, sources: Sources, name: str, optics: Path | None) -> Path | None:
     """A capture in which the sweep has poses: made of the cameras' frames, or the capture itself, where it has a track."""
-    config, part, step = sources.config, sources.sweeps[name], _named("poses", name)
-    if not set(CAMERAS) <= part.images.keys():
-        if part.track is not None:
-            return config.capture
+    config, part, step = sources.config, sources.sweeps[name], _step_of("poses", name)
+    filmed = set(CAMERAS) <= part.images.keys()
+    if part.track is not None and (optics is None or not filmed):
+        return config.capture
+    if not filmed:
         return steps.leave_out(step, f"neither frames of {' and '.join(CAMERAS)} nor a track")
     if optics is None:
-        return steps.leave_out(step, NO_OPTICS)
+        return steps.leave_out(step, _no(steps, "optics", NO_OPTICS))
     given = {"target": config.target, "networks": config.networks}
     fields = [f"capture={config.capture}", f"sweep={name}", f"calibration={optics}", f"drift_px={config.drift_px:.15g}"]
     fields += [f"{field}={path}" for field, path in given.items() if path is not None]
     fields += [f"overlays={str(config.overlays).lower()}", *config.rig_fields]
-    made_of = sources.files(manifest.sweep_part(name)) | _of(steps, "optics", optics, *filter(None, given.values()))
-    return steps.do(step, "poses of the probe, from frames", "track", fields, POSES, made_of)
+    weights = config.networks or networks.WEIGHTS
+    made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *filter(None, [config.target]))
+    files = (POSES, MANIFEST) if SCANNER in part.images else (POSES,)
+    return steps.do(step, "poses of the probe, from frames", "track", fields, files, made_of)
 
 
-def measured_latency(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None]) -> float:
-    """The lag of the scanner's images, s: the one given, the one of the last sweep over a flat bottom, or none."""
-    config = sources.config
+def measured_latency(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None]) -> float | None:
+    """The lag of the scanner's images, s: the one given, that of the last sweep over a flat bottom, or 0 without one."""
+    config, name = sources.config, _last(sources, "latency")
     if config.lag_s is not None:
         return config.lag_s
-    name = _last(sources, "latency", tracked)
     if name is None:
         steps.leave_out("latency", "no sweep over a flat bottom and no lag_s; the B-scans' time stamps are taken as they are")
         return 0.0
+    if tracked[name] is None:
+        return steps.fail("latency", f"no poses of the sweep {name}")
     fields = [f"capture={tracked[name]}", f"sweep={name}"]
     does, made_of = "the scanner's lag, from a flat bottom", _scans(steps, sources, name)
-    made = steps.do("latency", does, "measure-lag", fields, measure_lag.LAG, made_of)
-    return 0.0 if made is None else json.loads((made / measure_lag.LAG).read_text(encoding="utf-8"))["lag_s"]
+    made = steps.do("latency", does, "measure-lag", fields, (measure_lag.LAG,), made_of)
+    return None if made is None else json.loads((made / measure_lag.LAG).read_text(encoding="utf-8"))["lag_s"]
 
 
-def calibrated_probe(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None], lag_s: float) -> Path | None:
-    """The probe's calibration: the one given, the one of the last sweep over crossed wires, or the capture's own."""
-    config = sources.config
+def calibrated_probe(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None], lag_s: float | None) -> Path | None:
+    """The probe's calibration: the one given, that of the last sweep over crossed wires, or without one the capture's."""
+    config, name = sources.config, _last(sources, "probe")
     if config.probe is not None:
         return config.probe
-    name = _last(sources, "probe", tracked)
     if name is None:
         return None if sources.held.probe is None else config.capture / sources.held.probe
+    if tracked[name] is None or lag_s is None:
+        return steps.fail("probe", NO_LAG if lag_s is None else f"no poses of the sweep {name}")
     fields = [f"capture={tracked[name]}", f"sweep={name}", f"lag_s={lag_s:.15g}", *config.rig_fields]
     fields += [] if config.temperature_c is None else [f"temperature_c={config.temperature_c:.15g}"]
     does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
-    made = steps.do("probe", does, "calibrate-probe", fields, calibrate_probe.FRAMES, made_of)
+    files = (calibrate_probe.PROBE, calibrate_probe.FRAMES)
+    made = steps.do("probe", does, "calibrate-probe", fields, files, made_of)
     return None if made is None else made / calibrate_probe.PROBE
 
 
 def look_inside(
-    steps: KeptSteps, sources: Sources, name: str, capture: Path, probe: Path | None, lag_s: float, skin: Path | None
+    steps: KeptSteps,
+    sources: Sources,
+    name: str,
+    capture: Path | None,
+    probe: Path | None,
+    lag_s: float | None,
+    skin: Path | None,
 ) -> None:
     """The volume of a sweep, and what is found in its B-scans."""
-    config = sources.config
+    config, volume = sources.config, _step_of("volume", name)
+    if capture is None:
+        return steps.leave_out(volume, f"no poses of the sweep {name}".rstrip())
+    if lag_s is None:
+        return steps.leave_out(volume, NO_LAG)
     if probe is None:
-        return steps.leave_out(_named("volume", name), "no calibration of the probe: no sweep over crossed wires, and none given")
+        return steps.leave_out(volume, _no(steps, "probe", NO_PROBE))
     fields = [f"capture={capture}", f"sweep={name}", f"probe={probe}", f"lag_s={lag_s:.15g}"]
     fields += [] if config.tissue_m_s is None else [f"tissue_m_s={config.tissue_m_s:.15g}"]
-    made_of = _scans(steps, sources, name) | _of(steps, "probe", probe)
+    made_of = _scans(steps, sources, name) | _known_by(steps, "probe", probe)
     spacing = f"spacing_mm={config.spacing_mm:.15g}"
-    steps.do(_named("volume", name), "B-scans in a volume", "freehand", [*fields, spacing], freehand.VOLUME, made_of)
+    steps.do(volume, "B-scans in a volume", "freehand", [*fields, spacing], (freehand.VOLUME,), made_of)
     if config.find == "nothing":
         return None
     if skin is not None and config.find == "masses":
         fields, made_of = [*fields, f"surface={skin}"], made_of | {"skin": steps.digest("surface")}
     does = f"{'masses' if config.find == 'masses' else 'a tube'} in the B-scans"
-    steps.do(_named(config.find, name), does, "segment", [*fields, f"kind={config.find}"], metrics.FILE, made_of)
+    steps.do(_step_of(config.find, name), does, "segment", [*fields, f"kind={config.find}"], (), made_of)
     return None
 
 
@@ -233,21 +249,27 @@ def figures(out: Path, steps: KeptSteps) -> metrics.Metrics:
     return found
 
 
-def _named(step: str, sweep: str) -> str:
-    return f"{step}/{sweep}" if sweep else step
+def _step_of(kind: str, sweep: str) -> str:
+    """Name of the step of a kind that a sweep has to itself."""
+    return f"{kind}/{sweep}" if sweep else kind
 
 
-def _last(sources: Sources, purpose: str, tracked: Mapping[str, Path | None]) -> str | None:
-    """The last sweep for a purpose that has B-scans and poses; None without one."""
+def _no(steps: KeptSteps, step: str, reason: str) -> str:
+    """The reason for what is missing: the step that should have made it failed, or there was none."""
+    return f"{step} failed" if step in steps.failed else reason
+
+
+def _last(sources: Sources, purpose: str) -> str | None:
+    """The last sweep for a purpose that has B-scans; None without one."""
     fitting = [name for name, part in sources.sweeps.items() if part.purpose == purpose and SCANNER in part.images]
-    return next((name for name in reversed(fitting) if tracked[name] is not None), None)
+    return fitting[-1] if fitting else None
 
 
 def _scans(steps: KeptSteps, sources: Sources, name: str) -> dict[str, object]:
-    """What a step that reads a sweep's B-scans and poses is made of."""
-    return sources.files(manifest.sweep_part(name)) | {"poses": steps.digest(_named("poses", name))}
+    """Inputs of a step that reads a sweep's B-scans and poses."""
+    return sources.files(sweep_part(name)) | {"poses": steps.digest(_step_of("poses", name))}
 
 
-def _of(steps: KeptSteps, step: str, *files: Path) -> dict[str, object]:
-    """What a calibration that is given, or made by an earlier step, is known by."""
+def _known_by(steps: KeptSteps, step: str, *files: Path) -> dict[str, object]:
+    """Digest of an earlier step, and of the files that it made or that stand in its place."""
     return {step: [steps.digest(step), files_of(files)]}

@@ -2,7 +2,7 @@
 
 Reads the rig, the scene, the transducer and the probe's path from conf/. Writes OUT/capture/, which calibrate-probe, measure-lag
 and freehand read like any hardware's: B-scans and tracked poses by their own clocks, and the probe's calibration, except with
-path=wire, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times, and labels of what
+path=wire alone, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times, and labels of what
 each pixel shows. Takes about a tenth of a second a B-scan on two cores, a quarter of a minute for the default stroke, and a
 minute more when it first compiles. With `add=true` other parts of a capture in OUT stay; without it they are refused. A capture
 holds several sweeps if each has a `name`.
@@ -20,14 +20,14 @@ are then in these frames, for `sonotwin track`, and nowhere else. Takes about a 
 from collections.abc import Iterator
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
-from recon.capture.manifest import CAMERAS, SCANNER, SweepName, sweep_part
+from recon.capture.manifest import CAMERAS, SCANNER, SweepNameOrNone, sweep_part
 from recon.model.rig import Rig
 from scenes.catalogue import build_scene
 from scenes.scene_types import Scene
@@ -60,10 +60,25 @@ class Config(BaseModel):
     conditions: Conditions = Conditions()
     clocks: Clocks = Clocks()
     pose_noise: PoseNoise = PoseNoise()
-    name: Literal[""] | SweepName = ""
+    name: SweepNameOrNone = ""
     filmed: bool = False
     frames: FrameShooting = FrameShooting()
     seed: Annotated[int, Field(ge=0)] = 0
+
+    @property
+    def own_seed(self) -> int:
+        """Of hand, clocks and noise: one for each of several sweeps, which share prints, drift and speeds of sound by `seed`."""
+        letters = self.name.encode()
+        return int(np.random.SeedSequence([self.seed, *letters]).generate_state(1)[0]) if letters else self.seed
+
+    @model_validator(mode="after")
+    def _frames_one_after_the_other(self) -> "Config":
+        if self.filmed and self.frames.exposure_s * self.clocks.camera_hz > 1:
+            expected = f"at most 1 / clocks.camera_hz = {1 / self.clocks.camera_hz:.4g}"
+            raise ValueError(f"frames.exposure_s: expected {expected}, found {self.frames.exposure_s:g}")
+        if self.filmed and self.seed >= 2**32:
+            raise ValueError(f"seed: expected less than 2^32 with filmed=true, found {self.seed}")
+        return self
 
     @field_validator("path", mode="before")
     @classmethod
@@ -97,7 +112,7 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     settings = config.model_dump(mode="json", exclude={"out", "add"})
     devices = (SCANNER, *(CAMERAS if config.filmed else ()))
-    purpose = sweep_session.PURPOSES[config.path.kind]
+    purpose = sweep_session.PURPOSES[config.path.kind] if config.name else None
     session = Session(config.out, sweep_part(config.name), settings, config.add, devices, purpose)
     session.check()
     with console.status("setting up the scene"):
@@ -110,7 +125,7 @@ def run(config: Config) -> None:
             config.ultrasound,
             config.clocks,
             config.pose_noise,
-            config.seed,
+            config.own_seed,
             config.conditions.motion,
         )
         film = filming(config, scene, planned, console) if config.filmed else None
@@ -136,13 +151,13 @@ def filming(config: Config, scene: Scene, planned: Plan, console: Console) -> "S
     rig = rig.model_copy(update={"target": printed(rig.target, config.conditions.target, config.seed)})
     target, half = planned.target, config.frames.exposure_s / 2
     led = scene_frames.motions(target.poses(), target.poses(-half), target.poses(half))
-    bank = scene_frames.make_bank(scene, rig, led, config.seed)
+    bank = scene_frames.make_bank(scene, rig, led, config.seed)  # the same hand and probe in all sweeps
     motion = config.conditions.motion
-    made = scene_frames.takes(bank, rig, ranges(), config.frames, led, config.seed, motion)
+    made = scene_frames.takes(bank, rig, ranges(), config.frames, led, config.own_seed, motion)
 
     def frames() -> Iterator["Frames"]:
         with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-            shot = film_session.shoot(bank, rig, made, config.frames.quality, config.seed)
+            shot = film_session.shoot(bank, rig, made, config.frames.quality, config.own_seed)
             yield from progress.track(shot, total=len(made), description="rendering frames")
 
     return scene_frames.SceneFilm(rig, config.rig, config.frames, planned.track.times, made, frames)
@@ -150,7 +165,7 @@ def filming(config: Config, scene: Scene, planned: Plan, console: Console) -> "S
 
 def shown(scanned: Body, config: Config, planned: Plan, console: Console) -> Iterator[Scan]:
     """Take the images, in order, and show how far it is."""
-    scan_seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
+    scan_seed = int(np.random.SeedSequence([config.own_seed, 1]).generate_state(1)[0])
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         taken = scans(scanned, config.ultrasound, planned.truth.poses, scan_seed)
         yield from progress.track(taken, total=len(planned.times), description="rendering B-scans")

@@ -6,94 +6,119 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from pydantic import BaseModel
 
 from recon.errors import InputError
 from sonotwin import kept_steps
 from sonotwin.kept_steps import RECORD, KeptSteps, files_of
 
 
+class Settings(BaseModel):
+    """Of a verb with one field."""
+
+    value: str
+    out: Path
+
+
 @pytest.fixture
 def verb(monkeypatch):
-    """A verb that writes its field into a file; it notes its calls, and fails or is interrupted as told."""
+    """A verb that writes its field into a file; it notes its calls, and fails or is interrupted after that as told."""
     calls, fault = [], []
 
-    def run(fields):
-        calls.append(fields["value"])
+    def run(config):
+        calls.append(config.value)
+        config.out.mkdir(parents=True, exist_ok=True)
+        for name in ("result.txt", "metrics.json"):
+            (config.out / name).write_text(config.value)
         if fault:
             raise fault.pop()
-        place = Path(fields["out"])
-        place.mkdir(parents=True, exist_ok=True)
-        (place / "result.txt").write_text(fields["value"])
 
-    monkeypatch.setattr(kept_steps, "import_module", lambda name: SimpleNamespace(run=run, Config=dict))
-    monkeypatch.setattr(kept_steps, "load", lambda verb, fields, model: dict(field.split("=", 1) for field in fields))
+    monkeypatch.setattr(kept_steps, "import_module", lambda name: SimpleNamespace(run=run, Config=Settings))
+    monkeypatch.setattr(kept_steps, "load", lambda verb, fields, model: model(**dict(field.split("=", 1) for field in fields)))
     return SimpleNamespace(calls=calls, fault=fault)
 
 
-def opened(folder: Path) -> KeptSteps:
-    steps = KeptSteps(folder, lambda line: None)
-    steps.open([])
+def done(folder: Path, value: str = "1", source: Path | None = None, say=lambda line: None) -> KeptSteps:
+    """A run of one step."""
+    steps = KeptSteps(folder, say)
+    with steps.opened([]):
+        made_of = {"files": files_of([source] if source else [])}
+        steps.do("part", "a part", "verb", [f"value={value}"], ("result.txt",), made_of)
     return steps
 
 
-def do(steps: KeptSteps, value: str = "1", source: Path | None = None) -> Path | None:
-    return steps.do("part", "a part", "verb", [f"value={value}"], "result.txt", {"files": files_of([source] if source else [])})
-
-
 def test_a_step_is_done_once(tmp_path, verb):
-    assert do(opened(tmp_path)) == tmp_path / "part" == do(opened(tmp_path))
+    assert done(tmp_path).done == ["part"] == done(tmp_path).done
     assert verb.calls == ["1"]
 
 
-def test_a_step_is_done_again_for_another_field_a_changed_file_or_a_lost_result(tmp_path, verb):
+def test_a_step_is_done_again_for_another_setting_a_changed_file_or_a_lost_one(tmp_path, verb):
     source = tmp_path / "source.txt"
     source.write_text("a")
     out = tmp_path / "out"
-    do(opened(out), "1", source)
-    do(opened(out), "2", source)
+    done(out, "1", source)
+    done(out, "2", source)
     os.utime(source, ns=(1, 1))
-    do(opened(out), "2", source)
-    (out / "part" / "result.txt").unlink()
-    do(opened(out), "2", source)
-    assert verb.calls == ["1", "2", "2", "2"]
+    done(out, "2", source)
+    for name in ("result.txt", "metrics.json"):
+        (out / "part" / name).unlink()
+        done(out, "2", source)
+    assert verb.calls == ["1", "2", "2", "2", "2"]
 
 
 def test_a_step_that_fails_is_left_out_in_one_line_and_tried_again(tmp_path, verb):
     lines = []
-    do(opened(tmp_path))
-    steps = KeptSteps(tmp_path, lines.append)
-    steps.open([])
+    done(tmp_path)
     verb.fault.append(InputError("capture: expected frames, found none"))
-    assert do(steps, "2") is None and steps.failed == ["part"] and steps.digest("part") == {}
+    steps = done(tmp_path, "2", say=lines.append)
+    assert steps.failed == ["part"] and steps.digest("part") == {} and steps.done == []
     assert lines[-1] == "left out    part: capture: expected frames, found none"
-    assert do(opened(tmp_path), "1") is not None
+    done(tmp_path, "1")
     assert verb.calls == ["1", "2", "1"], "the result of before no longer counts"
 
 
-def test_an_interrupted_step_is_done_by_the_next_run(tmp_path, verb):
+@pytest.mark.parametrize("before", [None, "1"])
+def test_an_interrupted_step_is_done_by_the_next_run(tmp_path, verb, before):
+    """Also where the run was stopped after the folder had been replaced: what is there is of other settings then."""
+    if before:
+        done(tmp_path, before)
     verb.fault.append(KeyboardInterrupt())
     with pytest.raises(KeyboardInterrupt):
-        do(opened(tmp_path))
+        done(tmp_path, "2")
     assert json.loads((tmp_path / RECORD).read_text()) == {}
-    assert do(opened(tmp_path)) is not None and verb.calls == ["1", "1"]
+    assert done(tmp_path, "1").done == ["part"] and verb.calls[-1] == "1"
+    assert (tmp_path / "part" / "result.txt").read_text() == "1"
 
 
 def test_what_builds_on_a_step_changes_with_it(tmp_path, verb):
-    steps = opened(tmp_path)
-    do(steps, "1")
-    first = steps.digest("part", "another")
-    do(steps, "2")
-    assert list(first) == ["part"] and steps.digest("part") != first
+    first, second = (done(tmp_path, value).digest("part", "another") for value in "12")
+    assert list(first) == ["part"] and second != first
+
+
+def test_results_that_are_no_part_of_a_run_are_named_once(tmp_path, verb):
+    lines = []
+    done(tmp_path)
+    for _ in range(2):
+        with KeptSteps(tmp_path, lines.append).opened([]):
+            pass
+    assert lines == ["stale       part: of an earlier run, and no part of this result"]
+
+
+def test_a_beginning_that_was_killed_is_no_obstacle(tmp_path, verb):
+    """Its record was not yet there, but the hidden files by which it is written."""
+    for name in (".reconstruct.json.lock", ".reconstruct.77.new.json"):
+        (tmp_path / name).write_text("")
+    assert done(tmp_path).done == ["part"]
 
 
 @pytest.mark.parametrize("content", ["not JSON", "[1, 2]", ""])
 def test_a_damaged_record_costs_work_alone(tmp_path, verb, content):
-    do(opened(tmp_path))
+    done(tmp_path)
     (tmp_path / RECORD).write_text(content)
-    assert do(opened(tmp_path)) is not None and verb.calls == ["1", "1"]
+    assert done(tmp_path).done == ["part"] and verb.calls == ["1", "1"]
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match=r"expected a new or empty folder or one with reconstruct.json"):
-        opened(tmp_path)
+        done(tmp_path)

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from recon.errors import InputError
 from sonotwin import session_accuracy, session_steps
 from sonotwin.config import load
 from sonotwin.verbs import reconstruct, render, sweep
+from twin.accuracy.table_rows import Setup
 
 MODELS = {"render": render.Config, "sweep": sweep.Config, "reconstruct": reconstruct.Config}
 
@@ -61,12 +63,35 @@ def test_a_missed_mass_fails_its_rows():
     )
 
 
-def test_what_was_measured_is_kept(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("whole", "times"), [(True, 1), (False, 2)])
+def test_what_was_measured_is_kept_if_no_step_failed(tmp_path, monkeypatch, whole, times):
     made = []
-    monkeypatch.setattr(session_accuracy, "session", lambda work, kind, seed: made.append(seed) or {"figure": float(seed)})
+    monkeypatch.setattr(
+        session_accuracy, "session", lambda work, kind, seed: made.append(seed) or (whole, {"figure": float(seed)})
+    )
     for _ in range(2):
         assert session_accuracy.measured(tmp_path, "ideal", 7) == {"figure": 7.0}
-    assert made == [7]
+    assert made == [7] * times
+
+
+def test_figures_of_other_code_are_not_used(tmp_path, monkeypatch):
+    monkeypatch.setattr(session_accuracy, "session", lambda work, kind, seed: (True, {"figure": 1.0}))
+    session_accuracy.measured(tmp_path, "ideal", 7)
+    monkeypatch.setattr(session_accuracy, "code", lambda: "other")
+    monkeypatch.setattr(session_accuracy, "session", lambda work, kind, seed: (True, {"figure": 2.0}))
+    assert session_accuracy.measured(tmp_path, "ideal", 7) == {"figure": 2.0}
+
+
+def test_a_session_of_which_a_step_failed_misses_its_bars(rig):
+    """What is missing is NaN, wherever in the list of sessions it stands."""
+    for found in ([{}, figures()], [figures(), {}]):
+        assert {"latency", "probe, the worst of five pixels", "translation in the scan, median"} <= missed(found)
+
+
+def test_another_rig_is_refused(rig):
+    target = rig.target.model_copy(update={"c1_mm": 30.0})
+    with pytest.raises(InputError, match="rig: expected meza2021 for only=session"):
+        session_accuracy.measurements(Setup(rig.model_copy(update={"target": target}), {}))
 
 
 @pytest.mark.parametrize("kind", ["ideal", "lifelike"])

@@ -12,7 +12,6 @@ from recon.capture.manifest import CAMERAS, SCANNER
 from recon.files import metrics
 from recon.files.metrics import Metrics
 from recon.freehand import sequences
-from recon.geometry.surface_tree import surface_tree
 from recon.probe_calibration import sound_in_water
 from recon.probe_calibration.repeatability import five_points
 from twin.evaluation import sweep_errors, track_errors
@@ -93,8 +92,5 @@ def contact_bias(world_from_pixel: Array, true: SweepTruth, surface: Path) -> fl
 
 
 def _standoff(faces: Array, skin: trimesh.Trimesh) -> Array:
-    """Least signed distance : (n,) mm of faces : (n, m, 3) to a skin, positive outside, by its nearest vertices' normals."""
-    points = faces.reshape(-1, 3)
-    _, nearest = surface_tree(skin.vertices).query(points)
-    distance = ((points - skin.vertices[nearest]) * skin.vertex_normals[nearest]).sum(axis=1)
-    return distance.reshape(faces.shape[:2]).min(axis=1)
+    """Least signed distance : (n,) mm of faces : (n, m, 3) to a skin, positive outside."""
+    return sweep_errors.signed_distances(faces.reshape(-1, 3), skin).reshape(faces.shape[:2]).min(axis=1)

@@ -55,9 +55,9 @@ def test_nothing_moves_where_there_is_but_noise(rig):
     assert 0.6 < np.mean(errors) / 8 < 1.25
 
 
-@pytest.mark.parametrize("gives_mm", [0.15, 0.4])
+@pytest.mark.parametrize("gives_mm", [0.12, 0.25])
 def test_a_bracket_that_gives_too_little_to_be_found_is_in_the_covariance(rig, gives_mm):
-    """With 0.6 deg a mm; of 0.4 mm a rigid bracket would make squared errors at the end 3 times as large as predicted."""
+    """With 0.6 deg a mm, by which a rigid bracket would make squared errors at the end larger than predicted."""
     probe, errors, named = probe_motions.true_probe(rig), [], []
 
     def gives(rng):

@@ -31,7 +31,7 @@ def folders(tmp_path_factory):
     inside = np.ones((COUNT, 2, 3), bool)
     inside[list(LOST), 0, 0] = False
     np.savez(
-        film / "truth" / TRUTH,
+        film / "truth" / "sweep" / TRUTH,
         times_ns=times,
         world_from_target=poses,
         blur_px=blur,

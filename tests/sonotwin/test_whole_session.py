@@ -1,0 +1,87 @@
+"""A whole session, rendered small, from images to a volume with its truth taken away."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.capture import probe_files
+from recon.files import metrics
+from recon.probe_calibration.repeatability import five_points
+from sonotwin.cli import main
+from twin.evaluation import session_errors, sweep_errors, track_errors
+
+COARSE = ["filmed=true", "frames.quality.window=2", "frames.quality.patch=2"]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("session") / "out"
+    place = [f"out={out}", "add=true"]
+    board = ["scene=board", "poses=demo", "patterns=paper_calibration", "cameras=[cam1,cam2]", "engine.samples=4"]
+    assert main(["render", *board, *place]) == 0
+    assert main(["render", "scene=breast", "engine.samples=4", *place]) == 0
+    water = ["ultrasound=water", *COARSE]
+    wires = ["scene=crosswire", "path=wire", "path.count=20", "clocks.camera_hz=5", "name=wires"]
+    assert main(["sweep", *wires, *water, *place]) == 0
+    assert main(["sweep", "scene=tank", "path=bob", "path.seconds=4", "clocks.camera_hz=15", "name=bottom", *water, *place]) == 0
+    stroke = ["path.start_mm=[-18,-12]", "path.end_mm=[-18,8]", "path.speed_mm_s=20", "clocks.camera_hz=20"]
+    assert main(["sweep", *stroke, "name=scan", *COARSE, *place]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def result(session) -> Path:
+    """Made while the truth is elsewhere."""
+    (session / "truth").rename(session.parent / "truth")
+    out = session.parent / "result"
+    fields = [f"capture={session / 'capture'}", "temperature_c=22", "tissue_m_s=1450", "find=nothing", f"out={out}"]
+    assert main(["reconstruct", *fields]) == 0
+    (session.parent / "truth").rename(session / "truth")
+    return out
+
+
+@pytest.mark.slow
+def test_the_parts_are_measured_from_their_images_alone(session, result):
+    """Loose bars: the session is small and coarse; the accuracy of whole ones is measured elsewhere."""
+    figures = session_errors.measure(result, session / "capture", session / "truth")
+    for name in ("wires", "bottom", "scan"):
+        assert figures[f"{name}_track_visible_found"] == figures[f"{name}_track_visible"] > 0
+        assert figures[f"{name}_track_false"] == 0 and figures[f"{name}_track_shift_median_mm"] < 0.1
+    lag = json.loads((result / "latency" / "lag.json").read_text())
+    assert abs(lag["lag_s"] - 0.05) < 0.004
+    truth = sweep_errors.read_truth(session / "truth", "scan")
+    probe = probe_files.read(result / "probe" / "probe.yaml")
+    error, sigma = sweep_errors.probe_errors(probe, truth, five_points(truth.transducer.image_size))
+    assert error.max() < 0.6 and (error < 4 * sigma).all()
+    assert metrics.read(result / "metrics.json")["surface_points"] > 500_000
+    assert (result / "volume" / "scan" / "volume.nrrd").is_file()
+
+
+@pytest.mark.slow
+def test_a_lost_step_and_those_that_build_on_it_come_back_to_the_same_bytes(session, result, capsys):
+    """But for the seconds in metrics.json. Nothing else is done again."""
+
+    def contents() -> dict[str, bytes]:
+        files = (path for path in sorted(result.rglob("*")) if path.is_file() and path.name != metrics.FILE)
+        return {str(path.relative_to(result)): path.read_bytes() for path in files}
+
+    before = contents()
+    shutil.rmtree(result / "poses" / "wires")
+    fields = [f"capture={session / 'capture'}", "temperature_c=22", "tissue_m_s=1450", "find=nothing", f"out={result}"]
+    capsys.readouterr()
+    assert main(["reconstruct", *fields]) == 0
+    said = capsys.readouterr().out
+    assert all(f"kept        {name}" in said for name in ("optics", "surface", "poses/scan", "latency", "volume/scan"))
+    assert contents() == before
+
+
+@pytest.mark.slow
+def test_the_truth_of_the_frames_is_the_scene_s(session):
+    """The board is seen where the truth has it: whole in most frames, and moving as fast as the path says."""
+    truth = track_errors.read_truth(session / "truth", "scan")
+    steps = np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1) * 20
+    assert 10 < np.median(steps) < 45, "mm/s: the stroke's 20, and the turns of the probe with its board 70 mm aside"
+    assert track_errors.visible_whole(truth).mean() > 0.9
