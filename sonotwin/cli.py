@@ -46,6 +46,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("track", "track the probe's target through the frames of two cameras"),
     Verb("freehand", "put tracked B-scans into a volume, for 3D Slicer too"),
     Verb("segment", "find masses or a tube in tracked B-scans, as closed surfaces in the world"),
+    Verb("fuse", "put skin, masses and B-scans into one picture with layers"),
     Verb("reconstruct", "reconstruct all that a capture holds: calibrations, skin, volumes, masses"),
     Verb("import", "read another group's data set into a capture"),
     Verb("export", "write a capture in another group's layout"),

@@ -29,11 +29,22 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "calibrate-target": {"target.yaml"},
     "calibrate-probe": {"probe.yaml"},
     "freehand": {"sequence.igs.mha"},
+    "import": {""},
+    "reconstruct": {""},
 }
 WRITTEN = ("out", "document")  # fields that name what is written; other paths are read
 BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `make demo`
     "README.md": {"shots", "optics.yaml", "outputs/board/capture", "session/capture"},
-    "captures.md": {"capture", "session", "shots", "optics.yaml", "wrapped"},
+    "captures.md": {
+        "capture",
+        "session",
+        "shots",
+        "optics.yaml",
+        "wrapped",
+        "dataset",
+        "result/poses/scan",
+        "result/probe/probe.yaml",
+    },
     "freehand.md": {f"{folder}/capture" for folder in ("wires", "bottom", "sweep", "tank")}
     | {"pairs.csv", "sweep.igs.mha", "config.xml", "probe/probe.yaml", "surface/surface.ply"},
     "tracking.md": {"session", "probe.yaml"},

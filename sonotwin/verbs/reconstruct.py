@@ -5,9 +5,9 @@ frames of both cameras for the poses of its sweeps, a flat bottom for the scanne
 for volumes and masses. What is missing is taken from the calibrations given here or in the capture, or left out by name.
 
 Writes into the folder `out`, each step in a folder of its own as its verb would: optics/, surface/, poses/NAME/, latency/,
-probe/, volume/NAME/ and masses/NAME/ (of a sweep without a name poses/, volume/, masses/); and metrics.json, the figures of all
-steps. A step whose result is there, made of the same, isn't done again, so a run that was killed is simply started again. Takes
-minutes. Exit status 1 if a step failed; those that build on it are left out.
+probe/, volume/NAME/, masses/NAME/ and scene/NAME/ (of a sweep without a name poses/, volume/, masses/, scene/); and metrics.json,
+the figures of all steps. A step whose result is there, made of the same, isn't done again, so a run that was killed is simply
+started again. Takes minutes. Exit status 1 if a step failed; those that build on it are left out.
 
     sonotwin reconstruct capture=session/capture out=result
     sonotwin reconstruct capture=session/capture tissue_m_s=1450 temperature_c=22 out=result
@@ -34,7 +34,7 @@ from recon.model.tracks import LagSeconds
 from recon.tracking import networks
 from recon.tracking.results import POSES
 from sonotwin.kept_steps import KeptSteps, files_of
-from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, measure_lag, surface
+from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, fuse, measure_lag, surface
 
 Drift = Annotated[float, Field(ge=0, le=10)]
 NO_OPTICS = "no calibration of the cameras: no board, and none given"
@@ -120,7 +120,7 @@ def run(config: Config) -> int:
         probe = calibrated_probe(steps, sources, tracked, lag_s)
         for name, part in sources.sweeps.items():
             if part.purpose in (None, "volume") and SCANNER in part.images:
-                look_inside(steps, sources, name, tracked[name], probe, lag_s, skin)
+                look_inside(steps, sources, name, tracked[name], probe, lag_s, skin, optics)
         metrics.write(config.out / metrics.FILE, figures(config.out, steps))
     console.print(f"wrote       {config.out}/{{{','.join([*steps.done, metrics.FILE])}}}", markup=False)
     return 1 if steps.failed else 0
@@ -216,6 +216,7 @@ def look_inside(
     probe: Path | None,
     lag_s: float | None,
     skin: Path | None,
+    optics: Path | None,
 ) -> None:
     """The volume of a sweep, and what is found in its B-scans."""
     config, volume = sources.config, _step_of("volume", name)
@@ -234,8 +235,13 @@ def look_inside(
         return None
     if skin is not None and config.find == "masses":
         fields, made_of = [*fields, f"surface={skin}"], made_of | {"skin": steps.digest("surface")}
-    does = f"{'masses' if config.find == 'masses' else 'a tube'} in the B-scans"
-    steps.do(_step_of(config.find, name), does, "segment", [*fields, f"kind={config.find}"], (), made_of)
+    does, found = f"{'masses' if config.find == 'masses' else 'a tube'} in the B-scans", _step_of(config.find, name)
+    masses = steps.do(found, does, "segment", [*fields, f"kind={config.find}"], (), made_of)
+    if config.find == "masses":
+        fields += [] if masses is None else [f"masses={masses}"]
+        fields += [] if optics is None else [f"calibration={optics}"]
+        made_of |= {"masses": steps.digest(found), "optics": steps.digest("optics")}
+        steps.do(_step_of("scene", name), "all of it in one picture", "fuse", fields, (fuse.SCENE,), made_of)
     return None
 
 

@@ -2,10 +2,10 @@
 
 Reads the rig, the scene, the transducer and the probe's path from conf/. Writes OUT/capture/, which calibrate-probe, measure-lag
 and freehand read like any hardware's: B-scans and tracked poses by their own clocks, and the probe's calibration, except with
-path=wire alone, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times, and labels of what
-each pixel shows. Takes about a tenth of a second a B-scan on two cores, a quarter of a minute for the default stroke, and a
-minute more when it first compiles. With `add=true` other parts of a capture in OUT stay; without it they are refused. A capture
-holds several sweeps if each has a `name`.
+path=wire alone, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times, and labels
+of what each pixel shows. Takes about a tenth of a second a B-scan on two cores, a quarter of a minute for the default stroke,
+and a minute more when it first compiles. With `add=true` other parts of a capture in OUT stay; without it they are refused. A
+capture holds several sweeps if each has a `name`.
 
 With `filmed=true` both cameras film the sweep, too: the rig's board, bracket and probe in a hand, over the very scene. The poses
 are then in these frames, for `sonotwin track`, and nowhere else. Takes about a second a pair of frames more.

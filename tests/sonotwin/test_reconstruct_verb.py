@@ -126,3 +126,25 @@ def test_a_folder_of_something_else_is_refused(tank, tmp_path, capsys):
     assert main(["reconstruct", f"capture={tank}", f"out={tmp_path}"]) == 2
     assert "expected a new or empty folder or one with reconstruct.json" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_latency_that_fails_is_not_taken_for_none(tank, tmp_path, capsys):
+    """B-scans without a bottom: the probe is left out rather than calibrated 60 ms off, until a lag is given."""
+    capture = shutil.copytree(tank, tmp_path / "capture")
+    for path in (capture / "sweep" / "bottom" / "us").glob("*.png"):
+        path.write_bytes((capture / "sweep" / "bottom" / "us" / "0000.png").read_bytes())
+    fields = [f"capture={capture}", f"out={tmp_path / 'out'}"]
+    assert main(["reconstruct", *fields]) == 1
+    said = capsys.readouterr().out
+    assert "left out    latency: " in said and "left out    probe: latency failed; give lag_s" in said
+    assert main(["reconstruct", *fields, f"lag_s={LAG_S}"]) == 0
+    assert "probe: the ultrasound probe, from crossed wires" in capsys.readouterr().out
+
+
+def test_a_changed_rig_is_seen(result, tank, tmp_path, capsys):
+    """Steps are known by their settings: those of the rig count for the probe, and not for the latency."""
+    out = shutil.copytree(result, tmp_path / "out")
+    fields = [f"capture={tank}", f"temperature_c={sweep_sets.WATER_C}", "rig.target.c1_mm=25.5", f"out={out}"]
+    assert main(["reconstruct", *fields]) == 0
+    said = capsys.readouterr().out
+    assert "kept        latency" in said and "kept        probe" not in said

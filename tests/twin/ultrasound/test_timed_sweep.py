@@ -88,3 +88,15 @@ def test_a_probe_trembles_about_its_face(small):
     moves = [bobbing(bob, small, 1, trembling(Motion(tremor_mm=0.1, tremor_deg=0.5), seed)).poses for seed in range(8)]
     middle = np.array([rigid.apply(pose, [small.width_mm / 2, 0, 0]) for poses in moves for pose in poses])
     assert middle.std(axis=0) == pytest.approx(np.full(3, 0.1), rel=0.15)
+
+
+def test_the_target_moves_over_an_exposure_as_the_path_leads_it(rig):
+    """Later along the path, earlier before it, and nowhere beyond its ends."""
+    times = 10_000_000 * np.arange(50)
+    poses = np.stack([rigid.transform(np.eye(3), [0.2 * k, 0, 0]) for k in range(50)])  # 20 mm/s
+    planned = plan(rig.probe, tracks.Track(times, poses), times[5:40:5], Clocks(camera_hz=20), PoseNoise(), 0)
+    at_once, later, earlier = (planned.target.poses(step) for step in (0.0, 0.005, -0.005))
+    moved = later[:, :3, 3] - earlier[:, :3, 3]
+    assert moved[1:-1] == pytest.approx(np.tile([0.2, 0, 0], (len(moved) - 2, 1)))
+    assert moved[0] == pytest.approx([0.1, 0, 0]) and np.isfinite(moved).all(), "at the start it was at rest before"
+    assert at_once == pytest.approx((later + earlier)[:, :4, :4] / 2, abs=0.06)
