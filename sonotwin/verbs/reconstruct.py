@@ -29,7 +29,7 @@ from recon.errors import InputError
 from recon.files import metrics
 from recon.model.calibration import DRIFT_PX
 from recon.model.probe import Speed
-from recon.model.rig import Positive, Rig
+from recon.model.rig import Finite, Positive, Rig
 from recon.model.tracks import LagSeconds
 from recon.tracking import networks
 from recon.tracking.results import POSES
@@ -58,7 +58,7 @@ class Config(BaseModel):
     networks: Path | None = None
     probe: Path | None = None
     lag_s: LagSeconds | None = None
-    temperature_c: float | None = None
+    temperature_c: Finite | None = None
     tissue_m_s: Speed | None = None
     spacing_mm: Positive = 0.5
     find: Literal["masses", "tube", "nothing"] = "masses"

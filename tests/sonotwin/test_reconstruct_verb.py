@@ -1,6 +1,8 @@
 """`sonotwin reconstruct`: each part that a capture holds is used, what is missing is named, and nothing is done twice."""
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -148,3 +150,24 @@ def test_a_changed_rig_is_seen(result, tank, tmp_path, capsys):
     assert main(["reconstruct", *fields]) == 0
     said = capsys.readouterr().out
     assert "kept        latency" in said and "kept        probe" not in said
+
+
+@pytest.mark.slow
+def test_killed_anywhere_and_started_again_it_is_as_unbroken(result, tank, tmp_path):
+    """SIGKILL at six moments; the next run ends with the same bytes but for metrics.json, and leaves nothing behind."""
+    out = tmp_path / "out"
+    fields = [f"capture={tank}", f"temperature_c={sweep_sets.WATER_C}", f"out={out}"]
+    command = [sys.executable, "-m", "sonotwin", "reconstruct", *fields]
+    for wait in np.random.default_rng(3).uniform(1.0, 8.0, 6):
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
+            try:
+                running.wait(wait)
+            except subprocess.TimeoutExpired:
+                running.kill()
+        shutil.rmtree(out / "probe", ignore_errors=True)  # so that there is something to do for the next one
+    assert main(["reconstruct", *fields]) == 0
+    whole = {name for name in contents(result) if not name.endswith("metrics.json")}
+    timeless = {name: data for name, data in contents(out).items() if not name.endswith("metrics.json")}
+    assert timeless.keys() == whole
+    for name in whole - {"reconstruct.json"}:
+        assert timeless[name] == (result / name).read_bytes(), name
