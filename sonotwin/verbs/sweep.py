@@ -67,7 +67,7 @@ class Config(BaseModel):
 
     @property
     def own_seed(self) -> int:
-        """Of hand, clocks and noise: one for each of several sweeps, which share prints, drift and speeds of sound by `seed`."""
+        """Of hand, clocks and frames: one for each of several sweeps, which share tissue, prints, drift and speeds by `seed`."""
         letters = self.name.encode()
         return int(np.random.SeedSequence([self.seed, *letters]).generate_state(1)[0]) if letters else self.seed
 
@@ -151,7 +151,7 @@ def filming(config: Config, scene: Scene, planned: Plan, console: Console) -> "S
     rig = rig.model_copy(update={"target": printed(rig.target, config.conditions.target, config.seed)})
     target, half = planned.target, config.frames.exposure_s / 2
     led = scene_frames.motions(target.poses(), target.poses(-half), target.poses(half))
-    bank = scene_frames.make_bank(scene, rig, led, config.seed)  # the same hand and probe in all sweeps
+    bank = scene_frames.make_bank(scene, rig, led, config.seed)
     motion = config.conditions.motion
     made = scene_frames.takes(bank, rig, ranges(), config.frames, led, config.own_seed, motion)
 
@@ -165,7 +165,7 @@ def filming(config: Config, scene: Scene, planned: Plan, console: Console) -> "S
 
 def shown(scanned: Body, config: Config, planned: Plan, console: Console) -> Iterator[Scan]:
     """Take the images, in order, and show how far it is."""
-    scan_seed = int(np.random.SeedSequence([config.own_seed, 1]).generate_state(1)[0])
+    scan_seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         taken = scans(scanned, config.ultrasound, planned.truth.poses, scan_seed)
         yield from progress.track(taken, total=len(planned.times), description="rendering B-scans")
