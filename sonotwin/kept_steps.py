@@ -7,6 +7,7 @@ anywhere goes on where it was.
 
 import hashlib
 import json
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -77,6 +78,8 @@ class KeptSteps:
                 self.done.append(name)
                 return place
             self.say(f"{name}: {does}")
+            if name in self.record and not all((place / file).is_file() for file in files):
+                shutil.rmtree(place, ignore_errors=True)  # ours, and damaged
             self._change(name, None)
             module.run(config)
         except InputError as error:
@@ -87,8 +90,9 @@ class KeptSteps:
         return place
 
     def leave_out(self, name: str, reason: str) -> None:
-        """Say, in one line, that a step isn't done."""
-        self.say(f"left out    {name}: {reason}")
+        """Say, in one line, that a step isn't done, and whether a result of an earlier run stands in its place."""
+        stale = f"; {self.folder / name} is of an earlier run" if (self.folder / name).is_dir() else ""
+        self.say(f"left out    {name}: {reason}{stale}")
         self._change(name, None)
 
     def fail(self, name: str, reason: str) -> None:

@@ -41,7 +41,7 @@ def patterns(projector_size: Size = PROJECTOR_SIZE, lit: bool = True) -> Pattern
 
 
 def read(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[SurfaceCapture, NDArray[np.bool_]]:
-    """Read their folder.
+    """Read their folder, with the calibration of camera and projector.
 
     Parameters
     ----------
@@ -59,6 +59,14 @@ def read(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[SurfaceCa
         If images or calibration are missing, too few, or damaged.
     """
     folder = Path(folder)
+    images, sequence, mask = read_images(folder, projector_size)
+    sizes = {"cam1": images.shape[:0:-1], "projector": projector_size}
+    optics = calibration_files.read(folder / PARAMETERS, sizes=sizes)
+    return SurfaceCapture(images, sequence, 8, optics, folder.resolve().name), mask
+
+
+def read_images(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[NDArray[np.uint8], Patterns, NDArray[np.bool_]]:
+    """Read their fringe images : (n, h, w), with their patterns and the mask : (h, w); raises as `read` does."""
     images_dir = folder / "SLdata" / "images"
     paths = image_files(images_dir)
     fringes = patterns(lit=False).count
@@ -72,8 +80,7 @@ def read(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[SurfaceCa
     mask = np.ones(images.shape[1:], bool)
     if (folder / "SLdata" / "mask.png").exists():
         mask = read_grey(folder / "SLdata" / "mask.png", size) > 0
-    optics = calibration_files.read(folder / PARAMETERS, sizes={"cam1": size, "projector": projector_size})
-    return SurfaceCapture(images, sequence, 8, optics, folder.resolve().name), mask
+    return images, sequence, mask
 
 
 @contextmanager

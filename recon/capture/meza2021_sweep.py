@@ -134,8 +134,10 @@ def _rows(path: Path, shape: tuple[int, ...]) -> Array | None:
         rows = np.load(path, allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
         raise InputError(f"{path}: expected an array of numbers, found {' '.join(str(error).split())}") from None
-    fitting = rows.ndim == 1 + len(shape) and rows.shape[1:] == shape and rows.dtype.kind in "fiu"
-    if not fitting or not np.isfinite(rows).all():
-        expected = f"finite numbers of shape (n, {', '.join(map(str, shape))})"
+    if rows.ndim != 1 + len(shape) or rows.shape[1:] != shape or rows.dtype.kind not in "fiu":
+        expected = f"numbers of shape (n, {', '.join(map(str, shape))})"
         raise InputError(f"{path}: expected {expected}, found {rows.dtype} of shape {rows.shape}")
+    finite = np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
+    if not finite.all():
+        raise InputError(f"{path}: frame {int(np.argmin(finite))}: expected finite numbers, found some that aren't")
     return rows.astype(float)

@@ -3,7 +3,8 @@
 `layout=meza2021` is that of the rig's authors: SLdata/images and mask.png, USdata/L, R, US and USmasks with target_pose.npy, and
 the files of all calibrations, US_params.npz for a chosen speed of sound. Reads a capture folder, of a sweep with poses, as
 `sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs for what a capture doesn't hold. B-scans without
-a pose are left out. Writes into the folder `out`; an earlier export there is replaced, and nothing else ever is. Takes seconds.
+a pose are left out. Writes into the folder `out`; an earlier export there is replaced whole, and nothing else ever is. Takes
+seconds.
 
     sonotwin export capture=session/capture out=dataset
     sonotwin export capture=result/poses/scan probe=result/probe/probe.yaml lag_s=0.05 tissue_m_s=1450 out=dataset
@@ -35,7 +36,7 @@ from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
 from recon.capture.stereo_frames import Film
 from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
-from recon.files import atomic, npz
+from recon.files import atomic, metrics, npz
 from recon.freehand import scans as freehand_scans
 from recon.model.probe import Speed
 from recon.model.tracks import LagSeconds
@@ -77,6 +78,8 @@ def run(config: Config) -> None:
     with console.status("writing"), meza2021.new_folder(config.out) as folder:
         if held.surface is not None and "cam1" in held.surface.images:
             written += [write_surface(folder, config)]
+        elif config.surface is not None:
+            written += [f"left out    the mask by {config.surface}: the capture has no fringe images of cam1"]
         if held.sweep is not None or held.sweeps:
             written += write_sweep(folder, config, held)
         written += write_optics(folder, config, held)
@@ -136,9 +139,9 @@ def write_optics(folder: Path, config: Config, held: Manifest) -> list[str]:
 
 
 def read_masses(folder: Path) -> list[trimesh.Trimesh]:
-    """The meshes that `sonotwin segment` left; InputError if there are none."""
+    """The meshes that `sonotwin segment` left, which may be none; InputError if it left nothing there."""
     paths = sorted(folder.glob("mass*.ply"))
-    if not paths:
+    if not paths and not (folder / metrics.FILE).is_file():
         raise InputError(f"{folder}: expected mass0.ply ..., as of `sonotwin segment`, found none")
     return [trimesh.load_mesh(path, process=False) for path in paths]
 

@@ -12,27 +12,28 @@ wires are there, pairs.csv in it, for `calibrate-probe`. A capture that is there
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
 from recon.capture import calibration_files, manifest, meza2021, meza2021_sweep, probe_files, sweep_tables
 from recon.capture.foreign_images import read_grey
 from recon.capture.manifest import SCANNER, Device, Purpose
 from recon.capture.meza2021_sweep import AuthorsSweep
-from recon.capture.surface_part import SurfaceCapture
 from recon.capture.writer import CaptureWriter, new_capture
 from recon.errors import InputError
 from recon.files import atomic
 from recon.model.calibration import Calibration
+from recon.model.patterns import Patterns
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration, Speed
 from recon.model.rig import Positive
 from recon.model.tracks import Track
 
 PAIRS = "pairs.csv"
+Pixels = Annotated[int, Field(ge=8, le=20000)]
 
 
 class Config(BaseModel):
@@ -45,7 +46,7 @@ class Config(BaseModel):
     out: Path
     camera_hz: Positive = 30.0
     purpose: Purpose = "volume"
-    projector_size: tuple[int, int] = meza2021.PROJECTOR_SIZE
+    projector_size: tuple[Pixels, Pixels] = meza2021.PROJECTOR_SIZE
     speed_m_s: Speed = SCANNER_SPEED
 
 
@@ -59,17 +60,18 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     atomic.check_folder(config.out, manifest.MANIFEST, inputs=[config.folder])
-    surface = meza2021.read(config.folder, config.projector_size)[0] if (config.folder / "SLdata").is_dir() else None
+    fringes = meza2021.read_images(config.folder, config.projector_size) if (config.folder / "SLdata").is_dir() else None
     sweep = meza2021_sweep.read_sweep(config.folder)
-    if surface is None and sweep is None:
+    if fringes is None and sweep is None:
         raise InputError(f"{config.folder}: expected SLdata/images or USdata/US, as in the rig authors' data set, found neither")
-    optics, lines = cameras(config, surface, sweep)
+    images = None if fringes is None else fringes[0]
+    optics, lines = cameras(config, images, sweep)
     probe = read_probe(config)
     with console.status("writing"), new_capture(config.out, config.folder.resolve().name) as capture:
         if optics.cameras:
             capture.add_calibration(optics)
-        if surface is not None:
-            lines.append(add_surface(capture, surface))
+        if fringes is not None:
+            lines.append(add_surface(capture, *fringes[:2]))
         if sweep is not None:
             lines += add_sweep(capture, sweep, config)
         if probe is not None:
@@ -82,15 +84,16 @@ def run(config: Config) -> None:
     console.print(f"wrote       {config.out}", markup=False)
 
 
-def cameras(config: Config, surface: SurfaceCapture | None, sweep: AuthorsSweep | None) -> tuple[Calibration, list[str]]:
+def cameras(config: Config, fringes: NDArray | None, sweep: AuthorsSweep | None) -> tuple[Calibration, list[str]]:
     """All devices of both pairs in camera 1's frame, and lines about them; camera 1 is that of the pair with the projector."""
     found, lines = {}, []
     sizes = {} if sweep is None else {name: size for name, size in sweep.sizes.items() if name != SCANNER}
-    stereo = config.folder / meza2021.STEREO_PARAMETERS
+    stereo, projector = (config.folder / name for name in (meza2021.STEREO_PARAMETERS, meza2021.PARAMETERS))
     if stereo.exists() and {"cam1", "cam2"} <= sizes.keys():
         found |= calibration_files.read(stereo, sizes).cameras
-    if surface is not None:
-        pair = dict(surface.calibration.cameras)
+    if fringes is not None and projector.exists():
+        size = {"cam1": fringes.shape[:0:-1], "projector": config.projector_size}
+        pair = dict(calibration_files.read(projector, size).cameras)
         first = found.get("cam1")
         if first is not None and not np.allclose(first.matrix, pair["cam1"].matrix, rtol=1e-6):
             apart = np.abs(first.matrix - pair["cam1"].matrix).max()
@@ -102,12 +105,12 @@ def cameras(config: Config, surface: SurfaceCapture | None, sweep: AuthorsSweep 
     return Calibration(found), [f"optics      {', '.join(found) or 'none'}", *lines]
 
 
-def add_surface(capture: CaptureWriter, surface: SurfaceCapture) -> str:
+def add_surface(capture: CaptureWriter, images: NDArray, patterns: Patterns) -> str:
     """Write the fringe images; returns a line about them."""
-    height, width = surface.images.shape[1:]
-    devices = {"cam1": Device(size=(width, height)), "projector": Device(size=surface.patterns.projector_size)}
-    capture.add_surface({"cam1": surface.images}, surface.patterns, devices)
-    return f"surface     {len(surface.images)} images, {width}x{height}; mask.png is left out, as a surface finds its own"
+    height, width = images.shape[1:]
+    devices = {"cam1": Device(size=(width, height)), "projector": Device(size=patterns.projector_size)}
+    capture.add_surface({"cam1": images}, patterns, devices)
+    return f"surface     {len(images)} images, {width}x{height}; mask.png is left out, as a surface finds its own"
 
 
 def add_sweep(capture: CaptureWriter, sweep: AuthorsSweep, config: Config) -> list[str]:

@@ -31,6 +31,7 @@ from recon.model.calibration import DRIFT_PX
 from recon.model.probe import Speed
 from recon.model.rig import Finite, Positive, Rig
 from recon.model.tracks import LagSeconds
+from recon.probe_calibration import sound_in_water
 from recon.tracking import networks
 from recon.tracking.results import POSES
 from sonotwin.kept_steps import KeptSteps, files_of
@@ -112,6 +113,7 @@ def run(config: Config) -> int:
     for path in given:
         if not path.exists():
             raise InputError(f"{path}: expected a calibration or networks as given, found nothing there")
+    check(sources)
     with steps.opened([config.capture, *given]):
         optics = calibrated_optics(steps, sources)
         skin = measured_skin(steps, sources, optics)
@@ -124,6 +126,26 @@ def run(config: Config) -> int:
         metrics.write(config.out / metrics.FILE, figures(config.out, steps))
     console.print(f"wrote       {config.out}/{{{','.join([*steps.done, metrics.FILE])}}}", markup=False)
     return 1 if steps.failed else 0
+
+
+def check(sources: Sources) -> None:
+    """Check, before any long work, what can be known beforehand.
+
+    Raises
+    ------
+    InputError
+        If the capture has no part, its fringes are of another camera, or water has no such temperature.
+    """
+    config, held = sources.config, sources.held
+    path = config.capture / MANIFEST
+    if not held.contents:
+        raise InputError(f"{path}: expected a surface, a board or a sweep, found none of them")
+    if held.surface is not None and config.camera not in held.surface.images:
+        raise InputError(
+            f"{path}: surface.images: expected {config.camera}, found {', '.join(held.surface.images)}; give camera=..."
+        )
+    if config.temperature_c is not None:
+        sound_in_water.speed_of_sound(config.temperature_c)
 
 
 def calibrated_optics(steps: KeptSteps, sources: Sources) -> Path | None:
@@ -220,12 +242,13 @@ def look_inside(
 ) -> None:
     """The volume of a sweep, and what is found in its B-scans."""
     config, volume = sources.config, _step_of("volume", name)
-    if capture is None:
-        return steps.leave_out(volume, f"no poses of the sweep {name}".rstrip())
-    if lag_s is None:
-        return steps.leave_out(volume, NO_LAG)
-    if probe is None:
-        return steps.leave_out(volume, _no(steps, "probe", NO_PROBE))
+    if capture is None or lag_s is None or probe is None:
+        no_poses = f"no poses of the sweep {name}".rstrip()
+        reason = no_poses if capture is None else NO_LAG if lag_s is None else _no(steps, "probe", NO_PROBE)
+        wanted = {"masses": ("volume", "masses", "scene"), "tube": ("volume", "tube"), "nothing": ("volume",)}[config.find]
+        for kind in wanted:
+            steps.leave_out(_step_of(kind, name), reason)
+        return None
     fields = [f"capture={capture}", f"sweep={name}", f"probe={probe}", f"lag_s={lag_s:.15g}"]
     fields += [] if config.tissue_m_s is None else [f"tissue_m_s={config.tissue_m_s:.15g}"]
     made_of = _scans(steps, sources, name) | _known_by(steps, "probe", probe)

@@ -112,7 +112,7 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     settings = config.model_dump(mode="json", exclude={"out", "add"})
     devices = (SCANNER, *(CAMERAS if config.filmed else ()))
-    purpose = sweep_session.PURPOSES[config.path.kind] if config.name else None
+    purpose = sweep_session.PURPOSES[config.path.kind] if config.name or config.filmed else None
     session = Session(config.out, sweep_part(config.name), settings, config.add, devices, purpose)
     session.check()
     with console.status("setting up the scene"):

@@ -72,7 +72,7 @@ def test_a_step_that_fails_is_left_out_in_one_line_and_tried_again(tmp_path, ver
     verb.fault.append(InputError("capture: expected frames, found none"))
     steps = done(tmp_path, "2", say=lines.append)
     assert steps.failed == ["part"] and steps.digest("part") == {} and steps.done == []
-    assert lines[-1] == "left out    part: capture: expected frames, found none"
+    assert lines[-1] == f"left out    part: capture: expected frames, found none; {tmp_path / 'part'} is of an earlier run"
     done(tmp_path, "1")
     assert verb.calls == ["1", "2", "1"], "the result of before no longer counts"
 

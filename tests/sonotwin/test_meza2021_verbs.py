@@ -154,7 +154,7 @@ def save(name: str, rows):
     (lambda folder: (folder / "cam1_cam2_params.npz").write_bytes(b"PK"), "cam1_cam2_params.npz: expected"),
     (save("target_pose.npy", np.ones((12, 4, 4))), "target_pose.npy: frame 0: expected a rigid"),
     (save("target_pose.npy", np.array([{}])), "target_pose.npy: expected an array of numbers"),
-    (save("cross_point.npy", np.ones((12, 3))), "expected finite numbers of shape (n, 2)"),
+    (save("cross_point.npy", np.ones((12, 3))), "expected numbers of shape (n, 2), found float64 of shape (12, 3)"),
 ])  # fmt: skip
 def test_bad_folders_are_one_line(theirs, tmp_path, capsys, spoil, complaint):
     spoil(theirs)
