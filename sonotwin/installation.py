@@ -25,6 +25,7 @@ MODULES = {  # where a package isn't imported by the name that it is installed b
     "pynrrd": "nrrd",
     "simpleitk": "SimpleITK",
     "pytest-xdist": "xdist",
+    "pillow": "PIL",
     "pyyaml": "yaml",
     "scikit-image": "skimage",
 }
