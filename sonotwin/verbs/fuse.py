@@ -1,9 +1,10 @@
 """Put skin, masses, B-scans, the probe's path and the devices into one picture with layers, in the frame that they share.
 
-Reads a capture's sweep with poses, as `sonotwin track` leaves it, with the probe's calibration and the lag; the skin of `sonotwin
-surface`; and the masses of `sonotwin segment`, as far as each is given. Writes into the folder `out`: scene.glb (metres, y up, as
-glTF has it), with the layers skin, mass0 ..., scan0000 ... (some B-scans where they were taken), path, cam1, cam2 and projector,
-for any glTF viewer; and metrics.json. Nothing is registered: all of it is measured in the frame of camera 1. Takes seconds.
+Reads a capture's sweep with poses, as `sonotwin track` leaves it, with the probe's calibration and the lag; the skin of
+`sonotwin surface`; and the masses of `sonotwin segment`, as far as each is given. Writes into `out`: scene.glb (metres,
+y up, as glTF has it), with the layers skin, mass0 ..., scan0000 ... (some B-scans where they were taken), path, cam1, cam2 and
+projector, for any glTF viewer; and metrics.json. Nothing is registered: all of it is measured in the frame of camera 1. Takes
+seconds.
 
     sonotwin fuse capture=result/poses/scan probe=result/probe/probe.yaml lag_s=0.05 surface=result/surface/surface.ply out=scene
 """
