@@ -157,14 +157,15 @@ def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int,
     moved = _farthest(filming.path) - drawn.motion.world_from_target[:3, 3]
     lamps = drawn.lighting.lamps.copy()
     lamps[:, :3] += moved
-    same = {
-        "cameras": (rig.cam1, rig.cam2),
-        "present": True,
-        "body": int(np.argmax([uncovered(bank, body, rig.target, eyes) for body in range(BODIES)])),
-        "lighting": replace(drawn.lighting, lamps=lamps),
-        "scene_from_world": drawn.scene_from_world @ rigid.transform(np.eye(3), -moved),
-    }
-    return in_a_row(replace(drawn, **same), motions, rig, filming, seed, errors)
+    same = replace(
+        drawn,
+        cameras=(rig.cam1, rig.cam2),
+        present=True,
+        body=int(np.argmax([uncovered(bank, body, rig.target, eyes) for body in range(BODIES)])),
+        lighting=replace(drawn.lighting, lamps=lamps),
+        scene_from_world=drawn.scene_from_world @ rigid.transform(np.eye(3), -moved),
+    )
+    return in_a_row(same, motions, rig, filming, seed, errors)
 
 
 def in_a_row(
