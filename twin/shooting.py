@@ -7,6 +7,13 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from recon.model.rig import Part, Positive
 
 
+def power_of_two(value: int) -> int:
+    """Check a number of rays; ValueError if it is no power of two."""
+    if value & (value - 1):
+        raise ValueError(f"expected a power of two, found {value}")
+    return value
+
+
 class Quality(BaseModel):
     """Rays a pixel, powers of two."""
 
@@ -16,12 +23,19 @@ class Quality(BaseModel):
     patch: int = Field(default=4, ge=2, le=1024)
     window: int = Field(default=4, ge=2, le=1024)  # of full frames, and of what a sketch shows in full
 
-    @field_validator("view", "patch", "window")
-    @classmethod
-    def _power_of_two(cls, value: int) -> int:
-        if value & (value - 1):
-            raise ValueError(f"expected a power of two, found {value}")
-        return value
+    _power_of_two = field_validator("view", "patch", "window")(power_of_two)
+
+
+class FilmQuality(BaseModel):
+    """Rays a pixel of a film's frames, powers of two."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    view: int = Field(default=1, ge=1, le=256)  # of each cell
+    disc: int = Field(default=2, ge=1, le=256)  # of the circles' pixels
+    rim: int = Field(default=8, ge=2, le=1024)  # of those at their rims, and of all pixels of full frames
+
+    _power_of_two = field_validator("view", "disc", "rim")(power_of_two)
 
 
 class Shooting(Part):
@@ -36,4 +50,4 @@ class FrameShooting(Shooting):
     """Exposure, light and rendering of a sweep's frames."""
 
     light: Literal["room", "projector"] = "room"  # lamps of a dim room, or the projector, fully on, in the dark
-    quality: Quality = Quality()
+    quality: FilmQuality = FilmQuality()

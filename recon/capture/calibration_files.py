@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from recon.capture.manifest import SCANNER, read_manifest
 from recon.errors import InputError
 from recon.files import npz, opencv_storage
 from recon.geometry import rigid
@@ -53,6 +54,19 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
         if "M1" in keys or "M4" in keys:
             return _slmaster(path, _matrices(path, storage, SLMASTER_KEYS), sizes or {})
         raise InputError(f"{path}: expected schema, or M1 and M4, or K1 and K2, found {', '.join(keys) or 'no keys'}")
+
+
+def of_capture(folder: Path, given: Path | None = None) -> Calibration | None:
+    """The calibration in a file, if one is given, or else a capture's own; None where there is neither.
+
+    Raises
+    ------
+    InputError
+        As `read`; or if the capture's manifest is wrong.
+    """
+    held = read_manifest(folder)
+    path = given or (None if held.calibration is None else folder / held.calibration)
+    return None if path is None else read(path, {name: device.size for name, device in held.devices.items() if name != SCANNER})
 
 
 def read_for(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Calibration:

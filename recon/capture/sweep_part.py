@@ -67,14 +67,22 @@ class SweepCapture:
 
         A pose between two others shares the errors of both, taken as independent: halfway its variance is half of theirs.
         """
-        covariance = self.track.covariance
+        return self._between_poses(self.track.covariance, lag_s, 2)
+
+    def shared_covariance(self, lag_s: float = 0.0) -> Array | None:
+        """Covariance : (n, 6, 6) of what errs alike in all these poses; NaN where there is none. None if the track has none."""
+        return self._between_poses(self.track.shared, lag_s, 1)
+
+    def _between_poses(self, covariance: Array | None, lag_s: float, power: int) -> Array | None:
+        """Covariances of the poses before and after each B-scan, weighed by powers of their shares."""
         if covariance is None or self.track.found.sum() < 2:
             return None
         moments, known = self.track.times[self.track.found], covariance[self.track.found]
         wanted = self.times - round(lag_s * 1e9)
         after = np.clip(np.searchsorted(moments, wanted), 1, len(moments) - 1)
         share = ((wanted - moments[after - 1]) / (moments[after] - moments[after - 1]))[:, None, None]
-        return np.where((share >= 0) & (share <= 1), (1 - share) ** 2 * known[after - 1] + share**2 * known[after], np.nan)
+        weighed = (1 - share) ** power * known[after - 1] + share**power * known[after]
+        return np.where((share >= 0) & (share <= 1), weighed, np.nan)
 
 
 def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None) -> SweepCapture:

@@ -5,6 +5,7 @@ Numbers are written with as many digits as it takes to read the same ones back.
 
 import csv
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,8 @@ Times = NDArray[np.int64]
 STAMPS = ("frame", "time_ns")
 POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))  # of world_from_target, row by row; mm
 TRIANGLE = np.triu_indices(6)
-COVARIANCE = tuple(f"c{row}{column}" for row, column in zip(*TRIANGLE, strict=True))  # as of recon.model.tracks, upper triangle
+# covariances as of recon.model.tracks, upper triangle: by each pose's own noise, and by what errs alike in all
+COVARIANCE, SHARED = (tuple(f"{letter}{row}{column}" for row, column in zip(*TRIANGLE, strict=True)) for letter in "cs")
 TRACK = ("time_ns", "found", *POSE)
 PAIRS = (*POSE, "u", "v")
 LONGEST_NS = 1 << 63
@@ -52,7 +54,7 @@ def write_stamps(path: Path, times: Times) -> None:
 
 
 def read_track(path: Path) -> Track:
-    """Read poses over time: `time_ns`, `found` (1 or 0), 12 numbers of `world_from_target`, and perhaps 21 of the covariance.
+    """Read poses over time: `time_ns`, `found` (1 or 0), 12 numbers of `world_from_target`, and perhaps 21 of each covariance.
 
     Where the target was not found the numbers are left alone.
 
@@ -62,31 +64,35 @@ def read_track(path: Path) -> Track:
         If the file is missing or damaged, times don't increase, a pose has values that are not finite or no rotation, or a
         covariance is none.
     """
-    header, rows = _read(path, TRACK, COVARIANCE)
+    header, rows = _read(path, TRACK, COVARIANCE, SHARED)
     lines = [k for k, _ in rows]
     times = np.array([_whole(path, k, "time_ns", row[0]) for k, row in rows], np.int64)
     _increasing(path, lines, "time_ns", times)
     poses = np.full((len(rows), 4, 4), np.nan)
-    covariance = np.full((len(rows), 6, 6), np.nan) if len(header) > len(TRACK) else None
+    first = len(TRACK)
+    covariances = [np.full((len(rows), 6, 6), np.nan) for _ in range(first, len(header), len(COVARIANCE))]
     for i, (k, row) in enumerate(rows):
         if row[1] not in ("0", "1"):
             raise InputError(f"{path}: line {k}: found: expected 0 or 1, found {row[1]!r}")
         if row[1] == "0":
             continue
-        poses[i] = _pose(path, k, row[2 : len(TRACK)])
-        if covariance is not None:
-            covariance[i] = _covariance(path, k, row[len(TRACK) :])
-    return Track(times, poses, covariance)
+        poses[i] = _pose(path, k, row[2:first])
+        for number, each in enumerate(covariances):
+            start = first + number * len(COVARIANCE)
+            each[i] = _covariance(path, k, header[start : start + len(COVARIANCE)], row[start : start + len(COVARIANCE)])
+    return Track(times, poses, *covariances)
 
 
 def write_track(path: Path, track: Track) -> None:
-    """Write poses over time, with their covariance if the track has one; where the target was not found the fields are empty."""
-    header = TRACK if track.covariance is None else (*TRACK, *COVARIANCE)
+    """Write poses over time, with the covariances that the track has; where the target was not found the fields are empty."""
+    own = [] if track.covariance is None else [(COVARIANCE, track.covariance)]
+    known = own + ([(SHARED, track.shared)] if own and track.shared is not None else [])
+    header = (*TRACK, *(name for names, _ in known for name in names))
 
     def row(k: int, found: bool) -> list[int | float | str]:
         if not found:
             return [int(track.times[k]), 0, *[""] * (len(header) - 2)]
-        numbers = [] if track.covariance is None else track.covariance[k][TRIANGLE].tolist()
+        numbers = [number for _, matrices in known for number in matrices[k][TRIANGLE].tolist()]
         return [int(track.times[k]), 1, *track.poses[k, :3].ravel().tolist(), *numbers]
 
     write_rows(path, header, (row(k, bool(found)) for k, found in enumerate(track.found)))
@@ -114,16 +120,19 @@ def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object
         table.writerows(rows)
 
 
-def _read(path: Path, header: Sequence[str], optional: Sequence[str] = ()) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The header, and the rows with the numbers of their lines; at least one."""
+def _read(path: Path, header: Sequence[str], *optional: Sequence[str]) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The header, and the rows with the numbers of their lines; at least one.
+
+    optional : names that may follow, each group after those before it
+    """
     try:
         lines = read_bytes(path).decode("utf-8-sig").splitlines()
         rows = [(k, [word.strip() for word in row]) for k, row in enumerate(csv.reader(lines), start=1) if row]
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: expected a table as CSV text, found other or damaged data") from None
     found = rows[0][1] if rows else []
-    if found not in (list(header), [*header, *optional]):
-        expected = f"a header {_brief(header)}" + (f", perhaps followed by {_brief(optional)}" if optional else "")
+    if found not in [[*header, *chain(*optional[:count])] for count in range(len(optional) + 1)]:
+        expected = f"a header {_brief(header)}" + "".join(f", perhaps followed by {_brief(names)}" for names in optional)
         raise InputError(f"{path}: line 1: expected {expected}, found {_brief(found) or 'none'}")
     for k, row in rows[1:]:
         if len(row) != len(found):
@@ -172,9 +181,9 @@ def _pose(path: Path, line: int, words: Sequence[str]) -> Array:
     return pose
 
 
-def _covariance(path: Path, line: int, words: Sequence[str]) -> Array:
+def _covariance(path: Path, line: int, names: Sequence[str], words: Sequence[str]) -> Array:
     upper = np.zeros((6, 6))
-    upper[TRIANGLE] = _numbers(path, line, COVARIANCE, words)
+    upper[TRIANGLE] = _numbers(path, line, names, words)
     matrix = upper + np.triu(upper, 1).T
     sigma = np.sqrt(np.abs(np.diag(matrix)))
     unit = np.where(sigma > 0, sigma, 1.0)

@@ -25,11 +25,18 @@ def write_layers(path: Path, layers: Mapping[str, trimesh.Trimesh]) -> None:
         temporary.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True))
 
 
-def painted(mesh: trimesh.Trimesh, colour: tuple[int, int, int, int]) -> trimesh.Trimesh:
-    """A mesh of one colour: red, green, blue and opacity, 0 to 255 each; both of its sides are seen."""
+def painted(mesh: trimesh.Trimesh, colour: tuple[int, int, int, int], greys: NDArray[np.uint8] | None = None) -> trimesh.Trimesh:
+    """A mesh of one colour: red, green, blue and opacity, 0 to 255 each; both of its sides are seen.
+
+    greys : (n,)
+        Of the vertices, by which the colour is multiplied.
+    """
     mode = "OPAQUE" if colour[3] == 255 else "BLEND"
     material = PBRMaterial(baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True, alphaMode=mode)
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, visual=TextureVisuals(material=material))
+    visual = TextureVisuals(material=material)
+    if greys is not None:
+        visual.vertex_attributes["color"] = np.column_stack([greys, greys, greys, np.full_like(greys, 255)])
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, visual=visual)
 
 
 def pictured(corners: NDArray[np.float64], image: NDArray[np.uint8]) -> trimesh.Trimesh:

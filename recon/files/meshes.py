@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
+from trimesh.visual import ColorVisuals
 
 from recon.files import atomic
 
@@ -11,20 +13,38 @@ from recon.files import atomic
 GLTF_FROM_WORLD = np.diag([0.001, -0.001, -0.001, 1.0])
 
 
+def greys_of(mesh: trimesh.Trimesh) -> NDArray[np.uint8] | None:
+    """Grey levels : (n,) of the vertices; None where they have none."""
+    visual = mesh.visual
+    return np.asarray(visual.vertex_colors)[:, 0] if isinstance(visual, ColorVisuals) and visual.kind == "vertex" else None
+
+
+def set_greys(mesh: trimesh.Trimesh, greys: NDArray[np.uint8]) -> None:
+    """Give the vertices grey levels : (n,)."""
+    mesh.visual = ColorVisuals(mesh, vertex_colors=np.column_stack([greys, greys, greys, np.full_like(greys, 255)]))
+
+
 def write_ply(path: Path, mesh: trimesh.Trimesh) -> None:
-    """Write binary little-endian PLY in mm: x y z, nx ny nz, every vertex attribute (such as sigma_mm), and triangles."""
+    """Write binary little-endian PLY in mm: x y z, nx ny nz, every vertex attribute (such as sigma_mm), the vertices' grey, if
+    there is one, and triangles.
+    """
     columns = [("x y z", mesh.vertices), ("nx ny nz", mesh.vertex_normals)]
     columns += [(name, np.asarray(values).reshape(-1, 1)) for name, values in mesh.vertex_attributes.items()]
     names = [name for group, _ in columns for name in group.split()]
-    vertices = np.hstack([np.asarray(values, "<f4") for _, values in columns])
+    greys = greys_of(mesh)
+    table = np.empty(len(mesh.vertices), [("numbers", "<f4", (len(names),)), *([("grey", "u1", 3)] if greys is not None else [])])
+    table["numbers"] = np.hstack([np.asarray(values, "<f4") for _, values in columns])
+    if greys is not None:
+        table["grey"] = greys[:, None]
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, mesh.faces
-    header = ["ply", "format binary_little_endian 1.0", "comment unit mm", f"element vertex {len(vertices)}"]
+    header = ["ply", "format binary_little_endian 1.0", "comment unit mm", f"element vertex {len(table)}"]
     header += [f"property float {name}" for name in names]
+    header += [f"property uchar {name}" for name in (("red", "green", "blue") if greys is not None else ())]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
     with atomic.new_file(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode("ascii"))
-        file.write(vertices.tobytes())
+        file.write(table.tobytes())
         file.write(faces.tobytes())
 
 
@@ -37,5 +57,7 @@ def write_glb(path: Path, mesh: trimesh.Trimesh) -> None:
         process=False,
         validate=False,
     )
+    if (greys := greys_of(mesh)) is not None:
+        set_greys(turned, greys)
     with atomic.new_file(path) as temporary:
         temporary.write_bytes(trimesh.exchange.gltf.export_glb(trimesh.Scene(turned), include_normals=True))

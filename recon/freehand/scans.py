@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,11 @@ from recon.capture import probe_files
 from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
 from recon.files.metrics import Metrics
-from recon.freehand import hole_filling, plus_config, sequences, volume_compounding
+from recon.files.volumes import Volume
+from recon.freehand import hole_filling, place_uncertainty, plus_config, sequences, volume_compounding
+from recon.freehand.place_uncertainty import PlaceErrors
 from recon.freehand.volume_compounding import Clip, Grid, Reconstruction
+from recon.model import tracks
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration
 from recon.probe_calibration import sound_in_water
 
@@ -21,6 +24,14 @@ Array = NDArray[np.float64]
 Extent = Literal["aligned", "principal"]
 
 MOST_KEPT = 512 << 20  # bytes of images that are kept in memory
+STEP_S = 0.005  # of the poses' rates
+
+
+class Unsure(NamedTuple):
+    """Standard deviations of settings that are told."""
+
+    lag_s: float = 0.0
+    tissue_m_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -33,6 +44,7 @@ class Scans:
     speed_m_s: float  # of the sound for which the depths hold
     calibrated_m_s: float  # of that for which the calibration holds
     probe: ProbeCalibration | None = None  # converted likewise; None where the sequence has its own
+    errors: PlaceErrors | None = None  # of their places; None where nothing is known of them
 
     @property
     def placed(self) -> int:
@@ -55,11 +67,26 @@ def probe_of(sweep: SweepCapture, capture: Path, given: Path | None) -> ProbeCal
     return sweep.probe
 
 
-def of_sweep(sweep: SweepCapture, probe: ProbeCalibration, lag_s: float, tissue_m_s: float | None) -> Scans:
+def of_sweep(
+    sweep: SweepCapture, probe: ProbeCalibration, lag_s: float, tissue_m_s: float | None, sigmas: Unsure | None = None
+) -> Scans:
     """Place the B-scans of a capture in the world, with depths as of the tissue's speed of sound, if it is given."""
     converted = sound_in_water.for_tissue(probe, tissue_m_s)
-    world_from_pixel = sweep.poses(lag_s) @ sequences.target_from_pixel(converted)
-    return Scans(sweep.size[::-1], world_from_pixel, sweep.images, converted.speed_m_s, probe.speed_m_s, converted)
+    target_from_pixel, unsure = sequences.target_from_pixel(converted), sigmas or Unsure()
+    exact = np.zeros((len(sweep.paths), 6, 6))
+    own, shared = (exact if found is None else found for found in (sweep.pose_covariance(lag_s), sweep.shared_covariance(lag_s)))
+    rates = _rates(sweep, lag_s) @ target_from_pixel
+    errors = PlaceErrors(own, shared, rates, unsure.lag_s, unsure.tissue_m_s / converted.speed_m_s)
+    placed = sweep.poses(lag_s) @ target_from_pixel
+    return Scans(sweep.size[::-1], placed, sweep.images, converted.speed_m_s, probe.speed_m_s, converted, errors)
+
+
+def _rates(sweep: SweepCapture, lag_s: float) -> Array:
+    """Change of the poses : (n, 4, 4) per s, zero where there is none."""
+    before, at, after = (tracks.poses_at(sweep.track, sweep.times, lag_s + step) for step in (STEP_S, 0.0, -STEP_S))
+    rates = np.where(np.isfinite(before), at - before, after - at) / STEP_S
+    both = np.isfinite(before) & np.isfinite(after)
+    return np.nan_to_num(np.where(both, (after - before) / (2 * STEP_S), rates))
 
 
 def of_sequence(path: Path, probe: Path | None, config: Path | None, tissue_m_s: float | None) -> Scans:
@@ -111,6 +138,15 @@ def grid_around(scans: Scans, extent: Extent, spacing_mm: float, clip: Clip | No
     return grid_along(volume_compounding.corners(scans.world_from_pixel, scans.shape, clip), spacing_mm)
 
 
+def sigma_volume(scans: Scans, volume: Volume, clip: Clip | None = None) -> Volume | None:
+    """Standard deviations, mm over all directions, of the place of what each voxel shows; None where they aren't known."""
+    if scans.probe is None or scans.errors is None:
+        return None
+    forms = place_uncertainty.forms(scans.world_from_pixel, scans.probe, scans.errors)
+    grid = Grid(volume.voxels.shape[::-1], volume.origin, volume.spacing, volume.directions)
+    return place_uncertainty.sigma_volume(forms, scans.world_from_pixel, scans.shape, grid, clip)
+
+
 def filled(pasted: Reconstruction, most_voxels: int, sticks: int) -> Reconstruction:
     """A volume with its holes filled, or as it is where `most_voxels` is 0; see `recon.freehand.hole_filling`."""
     return hole_filling.fill_holes(pasted, most_voxels, sticks) if most_voxels else pasted
@@ -130,6 +166,14 @@ def measure(scans: Scans, pasted: Reconstruction, filled: Reconstruction) -> Met
         "filled_fraction": float(filled.filled.mean()),
         "mean_level": float(volume.voxels[filled.filled].mean()) if filled.filled.any() else np.nan,
     }
+
+
+def measure_sigma(sigma: Volume | None) -> Metrics:
+    """Figures of the places' standard deviations, as of `sigma_volume`."""
+    if sigma is None or not sigma.voxels.any():
+        return {}
+    seen = sigma.voxels[sigma.voxels > 0]
+    return {"place_sigma_median_mm": float(np.median(seen)), "place_sigma_most_mm": float(seen.max())}
 
 
 def write_sequence(path: Path, sweep: SweepCapture, probe: ProbeCalibration, lag_s: float) -> None:

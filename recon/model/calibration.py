@@ -31,6 +31,13 @@ class Uncertainty:
         k = self.names.index(name)
         return float(np.sqrt(self.covariance[k, k]))
 
+    def ordered(self, names: Sequence[str]) -> Array:
+        """Covariance : (n, n) of parameters in another order; zero of those that were held fixed."""
+        order = [names.index(name) for name in self.names]
+        covariance = np.zeros((len(names), len(names)))
+        covariance[np.ix_(order, order)] = self.covariance
+        return covariance
+
 
 @dataclass(frozen=True)
 class Calibration:

@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 
 SPEEDS = (300.0, 5000.0)  # m/s, of anything that is scanned
 Speed = Annotated[float, Field(ge=SPEEDS[0], le=SPEEDS[1], allow_inf_nan=False)]  # m/s; of a setting
+SpeedSigma = Annotated[float, Field(ge=0, le=500)]  # m/s; of a setting
 SCANNER_SPEED = 1540.0  # m/s, a mean of soft tissues, which scanners assume
 
 

@@ -21,6 +21,7 @@ class Track:
     times: NDArray[np.int64]  # (n,) ns, of the tracker's clock, strictly increasing
     poses: Array  # (n, 4, 4) mm; NaN where the target was not found
     covariance: Array | None = None  # (n, 6, 6) of a turn (rad) after the pose's own, and a shift (mm) in the world
+    shared: Array | None = None  # (n, 6, 6) the same by what errs alike in all poses: tolerances of target and cameras
 
     @property
     def found(self) -> NDArray[np.bool_]:

@@ -77,11 +77,7 @@ def compare(calibration: ProbeCalibration, earlier: ProbeCalibration) -> Metrics
 def _of_pose(calibration: ProbeCalibration) -> NDArray[np.float64]:
     """Covariance : (6, 6) of the turn and the shift; zero if there is none."""
     known = calibration.uncertainty
-    if known is None:
-        return np.zeros((6, 6))
-    covariance, order = np.zeros((8, 8)), [point_calibration.NAMES.index(name) for name in known.names]
-    covariance[np.ix_(order, order)] = known.covariance
-    return covariance[2:, 2:]
+    return np.zeros((6, 6)) if known is None else known.ordered(point_calibration.NAMES)[2:, 2:]
 
 
 def describe_frames(frames: CrossingFrames, seconds: float) -> Iterator[str]:

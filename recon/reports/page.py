@@ -89,7 +89,7 @@ def view(name: str, plotly_json: str, caption: str) -> str:
 
 
 def switch(name: str) -> str:
-    """Buttons for the colour of a `figures.surface_view` that stands on the page under this name: error, depth or plain."""
+    """Buttons for the colour of a `space_views.surface_view` that stands on the page under this name: error, depth or plain."""
     return _template("switch.html").substitute(name=name)
 
 

@@ -20,7 +20,9 @@ LEAST_COVERED = 0.5  # of a mesh's vertices, to call it inside
 class Containment:
     """Depths of a closed mesh under an open surface."""
 
-    depths: Array  # (n,) mm of the mesh's vertices, as of `depths`
+    depths: Array  # (n,) mm of the mesh's vertices, NaN where the nearest part of the surface is its rim
+    normals: Array  # (n, 3) of the surface over them, towards the camera
+    sigmas_mm: Array  # (n,) of the surface there; zero where it isn't known
 
     @property
     def covered(self) -> float:
@@ -31,6 +33,21 @@ class Containment:
     def least_mm(self) -> float:
         """Depth of the vertex nearest to the surface, or farthest outside; NaN if nothing is covered."""
         return float(np.nanmin(self.depths)) if self.covered > 0 else float("nan")
+
+    @property
+    def nearest(self) -> int:
+        """Number of that vertex."""
+        return int(np.nanargmin(self.depths))
+
+    @property
+    def normal(self) -> Array:
+        """The surface's normal : (3,) over that vertex."""
+        return self.normals[self.nearest]
+
+    @property
+    def sigma_mm(self) -> float:
+        """Standard deviation of the surface over that vertex."""
+        return float(self.sigmas_mm[self.nearest]) if self.covered > 0 else 0.0
 
     @property
     def inside(self) -> bool | None:
@@ -67,15 +84,18 @@ def contain(
     """Containment of each mesh in a surface as of `recon.structured_light.surface_mesh`, in the same world."""
     if not meshes:
         return []
-    found = depths(np.concatenate([mesh.vertices for mesh in meshes]), surface, camera)
-    ends = np.cumsum([len(mesh.vertices) for mesh in meshes])
-    return [Containment(part) for part in np.split(found, ends[:-1])]
+    found = below(np.concatenate([mesh.vertices for mesh in meshes]), surface, camera)
+    ends = np.cumsum([len(mesh.vertices) for mesh in meshes])[:-1]
+    return [Containment(*parts) for parts in zip(*(np.split(values, ends) for values in found), strict=True)]
 
 
-def depths(points: Array, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Distance : (n,) mm of points : (n, 3) to an open surface, positive behind it, as seen from the camera that measured it.
+def below(points: Array, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Array, Array, Array]:
+    """Depths : (n,) mm of points : (n, 3) under an open surface, positive behind it, as seen from the camera that measured it.
 
-    NaN where the nearest part of the surface is its rim.
+    Returns
+    -------
+    depths, normals, sigmas : (n,), (n, 3), (n,)
+        As of `Containment`.
     """
     points = np.asarray(points, float)
     _, nearest = surface_tree(surface.vertices).query(points, workers=-1)
@@ -83,7 +103,8 @@ def depths(points: Array, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.
     away = vertices - np.asarray(camera, float)
     normals = normals * np.where((normals * away).sum(axis=1) > 0, -1, 1)[:, None]  # towards the camera
     behind = -((points - vertices) * normals).sum(axis=1)  # from the tangent plane there
-    return np.where(_on_rim(surface, nearest), np.nan, behind)
+    sigmas = np.nan_to_num(np.asarray(surface.vertex_attributes.get("sigma_mm", np.zeros(len(surface.vertices))), float).ravel())
+    return np.where(_on_rim(surface, nearest), np.nan, behind), normals, sigmas[nearest]
 
 
 def _on_rim(surface: trimesh.Trimesh, chosen: NDArray[np.int64]) -> NDArray[np.bool_]:

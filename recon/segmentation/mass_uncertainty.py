@@ -1,107 +1,160 @@
-"""Uncertainty of a mass's place and volume by what all its B-scans share: the probe's calibration and the speeds of sound.
+"""Uncertainty of a mass's place, volume and depth below the skin, by what places its B-scans, by sound, and by its border.
 
-The eight parameters of the calibration move every B-scan, and with them the border that they show; where several B-scans show a
-point, it moves by the mean of theirs. Another speed in the tissue scales the depths of all that lies above a mass, so its front
-and all of it move along the beam. Its extent along the beam depends on the speed within, by which the border behind is placed
-(`recon.segmentation.refraction`). Refraction at its sides, which another speed changes too, is left out.
+The poses move B-scans one by one; the probe's calibration, the latency and tolerances of the tracking move all of them together,
+and with them the border that they show. Where several B-scans show a point, it moves by the mean of theirs. Another speed in the
+tissue scales the depths of all that lies above a mass, so its front and all of it move along the beam. Its extent along the beam
+depends on the speed within, by which the border behind is placed (`recon.segmentation.refraction`); refraction at its sides,
+which another speed changes too, is left out. Speckle blurs the border itself, by `BORDER_MM` as a whole.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.freehand import sequences
+from recon.freehand import place_uncertainty
 from recon.freehand.scans import Scans
 from recon.geometry import rigid
-from recon.model.calibration import Uncertainty
 from recon.probe_calibration.point_calibration import NAMES
-from recon.probe_calibration.point_equation import point_jacobian
+from recon.segmentation.containment import Containment
 from recon.segmentation.mass_surface import Mass
 
 Array = NDArray[np.float64]
 
-DEPTH = len(NAMES)  # column of the ratio of depths
 NEAR_MM = 1.0  # of a B-scan's plane: a point there is shown by it
+BORDER_MM = (
+    0.06  # standard deviation of a border's place as a whole, along each axis and outwards, by speckle; see docs/freehand.md
+)
 
 
 class Sigma(NamedTuple):
-    """Standard deviations of a mass's place and volume; NaN where the calibration's covariance isn't known."""
+    """Standard deviations of a mass; NaN where the calibration's covariance isn't known."""
 
     centre_mm: float  # as a distance in space
     volume_mm3: float
+    depth_mm: float = np.nan  # of its least depth below the skin; NaN without one
 
 
-def by_all(mass: Mass, scans: Scans, tissue: float, within: float) -> Sigma:
-    """By the calibration and the speeds of sound, see `by_speeds`, which err independently."""
-    slopes = point_slopes(np.asarray(mass.mesh.vertices), scans)
-    known = None if scans.probe is None else scans.probe.uncertainty
-    return Sigma(*np.hypot(by_calibration(mass, slopes, known), by_speeds(mass, slopes, tissue, within)).tolist())
+class Speeds(NamedTuple):
+    """Relative standard deviations of the speeds of sound."""
+
+    tissue: float
+    within: float  # in the mass
 
 
-def by_calibration(mass: Mass, slopes: Array, known: Uncertainty | None) -> Sigma:
-    """To first order in the errors of the calibration; slopes : (n, 3, 9) of the mesh's vertices, as of `point_slopes`."""
-    if known is None:
+@dataclass(frozen=True)
+class Shown:
+    """Vertices as B-scans show them: m pairs of both."""
+
+    vertex: NDArray[np.int64]  # (m,)
+    scan: NDArray[np.int64]  # (m,)
+    pixel: Array  # (m, 2) u, v
+    share: Array  # (m,) of the vertex, 1 in all for each
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Derivatives of a mass's figures by the places of its n vertices."""
+
+    centre: Array  # (n, 3, 3) of the centre of gravity, its axes before those of the vertex
+    volume: Array  # (n, 3) mm^2
+    depth: Array  # (n, 3) of the least depth below the skin, zero without one
+
+    @property
+    def rows(self) -> Array:
+        """All five figures, centre first : (n, 5, 3)."""
+        return np.concatenate([self.centre, self.volume[:, None], self.depth[:, None]], axis=1)
+
+
+def by_all(mass: Mass, scans: Scans, speeds: Speeds, under: Containment | None = None) -> Sigma:
+    """By all of these, which err independently; NaN without the calibration's covariance.
+
+    under : the mass's containment in the skin, if there is one.
+    """
+    if scans.probe is None or scans.probe.uncertainty is None:
         return Sigma(np.nan, np.nan)
-    moved = _at_faces(mass, slopes)[..., _order(known)]
-    centre, volume = _centre_slopes(mass, moved), _volume_slopes(mass, moved)
-    return Sigma(
-        float(np.sqrt(np.trace(centre @ known.covariance @ centre.T))), float(np.sqrt(volume @ known.covariance @ volume))
-    )
+    weights, shown = weights_of(mass, under), shown_by(np.asarray(mass.mesh.vertices), scans)
+    covariance = by_placing(weights, shown, scans) + by_speeds(mass, weights, shown, scans, speeds) + by_border(mass, under)
+    centre, volume, depth = np.trace(covariance[:3, :3]), covariance[3, 3], covariance[4, 4]
+    depth = np.nan if under is None or not np.isfinite(under.least_mm) else depth
+    return Sigma(*np.sqrt([centre, volume, depth]).tolist())
 
 
-def by_speeds(mass: Mass, slopes: Array, tissue: float, within: float) -> Sigma:
-    """To first order in the speeds of sound: the tissue's moves the front, that within the border behind.
+def weights_of(mass: Mass, under: Containment | None = None) -> Weights:
+    """To first order: a border's flow through the faces, and where it is."""
+    mesh, corners = mass.mesh, mass.mesh.faces.ravel()
+    through = np.repeat(mesh.face_normals * mesh.area_faces[:, None] / 3, 3, axis=0)  # a third of a face is each corner's
+    arms = np.repeat((mesh.triangles_center - mass.centre) / mass.volume, 3, axis=0)
+    centre, volume = np.zeros((len(mesh.vertices), 3, 3)), np.zeros((len(mesh.vertices), 3))
+    np.add.at(volume, corners, through)
+    np.add.at(centre, corners, arms[:, :, None] * through[:, None, :])
+    depth = np.zeros_like(volume)
+    if under is not None and np.isfinite(under.least_mm):
+        depth[under.nearest] = -under.normal
+    return Weights(centre, volume, depth)
 
-    tissue, within : standard deviations of the speeds in the tissue and in the mass, relative.
-    """
-    deeper = _centre_slopes(mass, _at_faces(mass, slopes[..., [DEPTH]]))[:, 0]
-    depth = np.linalg.norm(deeper)
-    half = np.ptp(np.asarray(mass.mesh.vertices) @ (deeper / depth)) / 2
-    return Sigma(float(np.hypot(tissue * (depth - half), within * half)), within * mass.volume)
 
-
-def point_slopes(points: Array, scans: Scans) -> Array:
-    """Derivatives : (n, 3, 9) of points : (n, 3) mm by NAMES' parameters, zero without a probe, and by the ratio of all depths.
-
-    A point that no B-scan shows moves as in the B-scan nearest to it.
-    """
-    size, probe = np.array(scans.shape[::-1]), scans.probe
-    total, count = np.zeros((len(points), 3, DEPTH + 1)), np.zeros(len(points))
-    next_to, nearest = np.full_like(total, np.nan), np.full(len(points), np.inf)
-    for world_from_pixel in scans.world_from_pixel[np.isfinite(scans.world_from_pixel).all(axis=(1, 2))]:
+def shown_by(points: Array, scans: Scans) -> Shown:
+    """B-scans that show points : (n, 3) mm, near their planes; one that none does counts as shown by the nearest."""
+    size = np.array(scans.shape[::-1])
+    pairs, pixels = [], []
+    nearest, closest, seen = np.full((len(points), 3), np.nan), np.full(len(points), np.inf), np.zeros(len(points), bool)
+    for k in np.flatnonzero(np.isfinite(scans.world_from_pixel).all(axis=(1, 2))).tolist():
+        world_from_pixel = scans.world_from_pixel[k]
         local = rigid.apply(np.linalg.inv(world_from_pixel), points)
         away = np.abs(local[:, 2]) * np.linalg.norm(world_from_pixel[:3, 2])
         beside = np.maximum(np.maximum(-0.5 - local[:, :2], local[:, :2] - (size - 0.5)), 0)
         away = np.hypot(away, np.linalg.norm(beside * np.linalg.norm(world_from_pixel[:3, :2], axis=0), axis=1))
-        shown, closer = (beside == 0).all(axis=1) & (away < NEAR_MM), away < nearest
-        slopes = np.zeros_like(total)
-        slopes[..., DEPTH] = local[:, 1:2] * world_from_pixel[:3, 1]
-        if probe is not None:
-            turn = (world_from_pixel @ np.linalg.inv(sequences.target_from_pixel(probe)))[:3, :3]
-            slopes[..., :DEPTH] = turn @ point_jacobian(probe.target_from_image, probe.scale, local[:, :2])
-        total[shown] += slopes[shown]
-        count[shown] += 1
-        next_to[closer], nearest[closer] = slopes[closer], away[closer]
-    return np.where((count > 0)[:, None, None], total / np.maximum(count, 1)[:, None, None], next_to)
+        shown, closer = (beside == 0).all(axis=1) & (away < NEAR_MM), away < closest
+        pairs.append(np.column_stack([np.flatnonzero(shown), np.full(shown.sum(), k)]))
+        pixels.append(local[shown, :2])
+        nearest[closer], closest[closer] = np.column_stack([np.full(closer.sum(), k), local[closer, :2]]), away[closer]
+        seen |= shown
+    unseen = np.flatnonzero(~seen)
+    vertex, scan = np.concatenate([*pairs, np.column_stack([unseen, nearest[unseen, 0].astype(int)])]).T
+    pixel = np.concatenate([*pixels, nearest[unseen, 1:]])
+    return Shown(vertex, scan, pixel, 1 / np.bincount(vertex, minlength=len(points))[vertex])
 
 
-def _at_faces(mass: Mass, slopes: Array) -> Array:
-    """Means : (f, 3, k) over the corners of a mesh's faces."""
-    return slopes[mass.mesh.faces].mean(axis=1)
+def by_placing(weights: Weights, shown: Shown, scans: Scans) -> Array:
+    """Covariance : (5, 5) of centre, volume and depth by what places the B-scans."""
+    probe, errors = scans.probe, scans.errors
+    assert probe is not None and probe.uncertainty is not None
+    moved = _moved(weights, shown, place_uncertainty.probe_slopes(scans.world_from_pixel, probe)).sum(axis=0)
+    covariance = moved @ probe.uncertainty.ordered(NAMES) @ moved.T
+    if errors is None:
+        return covariance
+    by_pose = _moved(weights, shown, place_uncertainty.pose_slopes(scans.world_from_pixel, probe))
+    used = np.unique(shown.scan)
+    covariance += np.einsum("nfk,nkl,ngl->fg", by_pose[used], errors.own[used], by_pose[used])
+    together = by_pose.sum(axis=0)
+    covariance += together @ errors.shared[used].mean(axis=0) @ together.T
+    by_lag = _moved(weights, shown, place_uncertainty.rate_slopes(errors.rates)).sum(axis=0)
+    return covariance + errors.lag_s**2 * by_lag @ by_lag.T
 
 
-def _volume_slopes(mass: Mass, moved: Array) -> Array:
-    """Of the volume : (k,), by the flow through the faces."""
-    return np.einsum("f,fi,fik->k", mass.mesh.area_faces, mass.mesh.face_normals, moved)
+def by_speeds(mass: Mass, weights: Weights, shown: Shown, scans: Scans, speeds: Speeds) -> Array:
+    """Covariance : (5, 5) of centre, volume and depth: the tissue's speed moves the front, that within the border behind."""
+    deeper = _moved(weights, shown, place_uncertainty.depth_slopes(scans.world_from_pixel)).sum(axis=0)[:, 0]
+    depth = np.linalg.norm(deeper[:3])
+    along = deeper[:3] / depth
+    half = np.ptp(np.asarray(mass.mesh.vertices) @ along) / 2
+    by_tissue = np.concatenate([along * (depth - half), [0.0], deeper[4:]])
+    by_within = np.concatenate([along * half, [mass.volume], [0.0]])
+    return np.outer(by_tissue, by_tissue) * speeds.tissue**2 + np.outer(by_within, by_within) * speeds.within**2
 
 
-def _centre_slopes(mass: Mass, moved: Array) -> Array:
-    """Of the centre of gravity : (3, k), by what the flow through the faces adds, and where."""
-    arms = (mass.mesh.triangles_center - mass.centre) / mass.volume
-    return np.einsum("f,fi,fik,fj->jk", mass.mesh.area_faces, mass.mesh.face_normals, moved, arms)
+def by_border(mass: Mass, under: Containment | None) -> Array:
+    """Covariance : (5, 5) of centre, volume and depth by the border's own scatter, and the skin's."""
+    skin_mm = 0.0 if under is None else under.sigma_mm
+    return np.diag([BORDER_MM, BORDER_MM, BORDER_MM, BORDER_MM * mass.mesh.area, np.hypot(BORDER_MM, skin_mm)]) ** 2
 
 
-def _order(known: Uncertainty) -> list[int]:
-    """Place among NAMES of each of its parameters."""
-    return [NAMES.index(name) for name in known.names]
+def _moved(weights: Weights, shown: Shown, slopes: Array) -> Array:
+    """Derivatives : (scans, 5, k) of the figures by errors of each B-scan; slopes : (scans, 3, 3, k), of the terms 1, u, v."""
+    terms = np.column_stack([np.ones(len(shown.pixel)), shown.pixel]) * shown.share[:, None]
+    at_vertex = np.einsum("mi,mixk->mxk", terms, slopes[shown.scan])
+    result = np.zeros((len(slopes), 5, slopes.shape[-1]))
+    np.add.at(result, shown.scan, weights.rows[shown.vertex] @ at_vertex)
+    return result

@@ -14,7 +14,7 @@ from recon.freehand.scans import Scans
 from recon.model.probe import SCANNER_SPEED
 from recon.segmentation import mass_uncertainty, masses, scan_overlays, tube_wall
 from recon.segmentation.containment import Containment, contain
-from recon.segmentation.mass_uncertainty import Sigma
+from recon.segmentation.mass_uncertainty import Sigma, Speeds
 from recon.segmentation.masses import Mass
 from recon.segmentation.refraction import Sound
 from recon.segmentation.scan_overlays import Overlay
@@ -61,7 +61,8 @@ def find_masses(
     lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {NONE_FOUND}"])]
     containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
     for number, (mass, under) in enumerate(zip(found, containments, strict=True)):
-        sigma = mass_uncertainty.by_all(mass, scans, speed_sigmas[0] / scans.speed_m_s, speed_sigmas[1] / mass_m_s)
+        speeds = Speeds(speed_sigmas[0] / scans.speed_m_s, speed_sigmas[1] / mass_m_s)
+        sigma = mass_uncertainty.by_all(mass, scans, speeds, under)
         figures |= measure(f"mass{number}", mass, sigma, under)
         lines.append(f"mass{number}       {describe(mass, sigma, under)}")
     drawn = scan_overlays.of_masks(scans.stream(), masses.shown(found, placed, scans.shape, sound), overlays)
@@ -69,7 +70,7 @@ def find_masses(
 
 
 def measure(name: str, mass: Mass, sigma: Sigma, under: Containment | None) -> Metrics:
-    """Figures of a mass, each named with its unit, with the uncertainty by the calibration and the speed of sound."""
+    """Figures of a mass, each named with its unit, with its uncertainty."""
     figures: Metrics = {
         f"{name}_volume_mm3": mass.volume,
         f"{name}_volume_sigma_mm3": sigma.volume_mm3,
@@ -80,22 +81,22 @@ def measure(name: str, mass: Mass, sigma: Sigma, under: Containment | None) -> M
     if under is not None:
         inside = np.nan if under.inside is None else int(under.inside)
         figures |= {f"{name}_inside": inside, f"{name}_covered": under.covered, f"{name}_depth_mm": under.least_mm}
+        figures[f"{name}_depth_sigma_mm"] = sigma.depth_mm
     return figures
 
 
 def describe(mass: Mass, sigma: Sigma, under: Containment | None) -> str:
     """One line: volume, centre and extent of a mass, and its depth below the skin."""
     centre = ", ".join(f"{value:.1f}" for value in mass.centre)
-    volume, away = (
-        f" ± {value:{how}}" if np.isfinite(value) else "" for value, how in ((sigma.volume_mm3, ".0f"), (sigma.centre_mm, ".1f"))
-    )
+    known = zip(sigma, (".1f", ".0f", ".2f"), strict=True)
+    away, volume, deep = (f" ± {value:{how}}" if np.isfinite(value) else "" for value, how in known)
     extent = " x ".join(f"{value:.1f}" for value in mass.mesh.extents)
     text = f"{mass.volume:.0f}{volume} mm3, centre {centre}{away} mm, {extent} mm"
     if under is None:
         return text
     if under.inside is None:
         return f"{text}, inside unknown: only {100 * under.covered:.0f} % lies under the surface"
-    return f"{text}, {'inside' if under.inside else 'not inside'}, {shown(under.least_mm, '.1f')} mm below the skin"
+    return f"{text}, {'inside' if under.inside else 'not inside'}, {shown(under.least_mm, '.2f')}{deep} mm below the skin"
 
 
 def find_tube(scans: Scans, look: Appearance | None = None, overlays: int = OVERLAYS) -> Segmented:

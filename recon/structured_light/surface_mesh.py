@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from recon.compiled import kernel, njit
+from recon.files import meshes
 from recon.geometry.camera import Camera
 from recon.structured_light.triangulate import Float32, PointMap
 from recon.threads import in_threads
@@ -23,6 +24,7 @@ Mask = NDArray[np.bool_]
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
+BRIGHTEST, WHITE = 99.5, 240  # percentile of the brightness, and the grey of 255 that it gets
 NOISE = 6.0  # standard deviations that the difference of two points has at most by noise
 
 
@@ -80,7 +82,9 @@ def clean(point_map: PointMap, camera: Camera, modulation: ArrayLike | None = No
     return PointMap(points, sigma)
 
 
-def mesh(point_map: PointMap, camera: Camera, max_slope: float = Limits.max_slope) -> trimesh.Trimesh:
+def mesh(
+    point_map: PointMap, camera: Camera, max_slope: float = Limits.max_slope, grey: ArrayLike | None = None
+) -> trimesh.Trimesh:
     """Join neighbouring pixels to triangles, two a square of four points, oriented towards the camera.
 
     Parameters
@@ -91,6 +95,8 @@ def mesh(point_map: PointMap, camera: Camera, max_slope: float = Limits.max_slop
         The camera whose pixels the map is organised by.
     max_slope : float
         Longest step along the ray that an edge may span, in sampling steps a pixel, beyond the noise.
+    grey : (h, w), any unit
+        Brightness under even light, such as the fringes' offset: the vertices get its grey, the brightest nearly white.
 
     Returns
     -------
@@ -106,6 +112,10 @@ def mesh(point_map: PointMap, camera: Camera, max_slope: float = Limits.max_slop
     vertices = point_map.points.reshape(-1, 3)[used].astype(float)
     result = trimesh.Trimesh(vertices, faces, vertex_normals=_normals(vertices, faces), process=False, validate=False)
     result.vertex_attributes["sigma_mm"] = point_map.sigma.ravel()[used]
+    if grey is not None and used.any():
+        shown = np.asarray(grey, np.float32).ravel()[used]
+        full = max(float(np.percentile(shown, BRIGHTEST)), 1e-6)
+        meshes.set_greys(result, np.uint8(np.clip(np.rint(WHITE * shown / full), 0, 255)))
     return result
 
 

@@ -74,6 +74,7 @@ def track_of(steps: Sequence[Step]) -> Track:
         np.array([step.time_ns for step in steps], np.int64),
         np.array([step.world_from_target for step in steps]).reshape(-1, 4, 4),
         np.array([step.covariance for step in steps]).reshape(-1, 6, 6),
+        np.array([step.shared for step in steps]).reshape(-1, 6, 6),
     )
 
 

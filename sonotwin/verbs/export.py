@@ -36,11 +36,12 @@ from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
 from recon.capture.stereo_frames import Film
 from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
-from recon.files import atomic, metrics, npz
+from recon.files import atomic, npz
 from recon.freehand import scans as freehand_scans
 from recon.model.probe import Speed
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
+from recon.segmentation import mass_files
 from recon.segmentation.scan_masks import mask_of
 from sonotwin.verbs.surface import POINTS
 
@@ -82,7 +83,7 @@ def run(config: Config) -> None:
             written += [f"left out    the mask by {config.surface}: the capture has no fringe images of cam1"]
         if held.sweep is not None or held.sweeps:
             written += write_sweep(folder, config, held)
-        written += write_optics(folder, config, held)
+        written += write_optics(folder, config)
         if not written:
             raise InputError(f"{config.capture / MANIFEST}: expected a surface of cam1, a sweep or a calibration, found none")
     for line in written:
@@ -121,29 +122,18 @@ def write_sweep(folder: Path, config: Config, held: Manifest) -> list[str]:
         lines.append(f"probe       {probe_files.AUTHORS}, right where sound makes {converted.speed_m_s:.0f} m/s")
     if config.masses is not None and probe is not None:
         scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
-        masks = _masks(read_masses(config.masses), scans.world_from_pixel[placed], sweep.size)
+        meshes = [mass.mesh for mass in mass_files.read_masses(config.masses).values()]
+        masks = _masks(meshes, scans.world_from_pixel[placed], sweep.size)
     elif config.masses is not None:
         raise InputError(f"{config.masses}: expected probe, the calibration by which masses lie in B-scans, found none")
     meza2021_sweep.write_sweep(folder, _frames(sweep, film, placed, config.lag_s), masks, poses[placed])
     return lines
 
 
-def write_optics(folder: Path, config: Config, held: Manifest) -> list[str]:
+def write_optics(folder: Path, config: Config) -> list[str]:
     """Write the files of all pairs of cameras; returns a line about them."""
-    own = None if held.calibration is None else config.capture / held.calibration
-    path = config.calibration or own
-    if path is None:
-        return []
-    sizes = {name: device.size for name, device in held.devices.items() if name != SCANNER}
-    return [f"optics      {', '.join(meza2021.write_parameters(folder, calibration_files.read(path, sizes)))}"]
-
-
-def read_masses(folder: Path) -> list[trimesh.Trimesh]:
-    """The meshes that `sonotwin segment` left, which may be none; InputError if it left nothing there."""
-    paths = sorted(folder.glob("mass*.ply"))
-    if not paths and not (folder / metrics.FILE).is_file():
-        raise InputError(f"{folder}: expected mass0.ply ..., as of `sonotwin segment`, found none")
-    return [trimesh.load_mesh(path, process=False) for path in paths]
+    optics = calibration_files.of_capture(config.capture, config.calibration)
+    return [] if optics is None else [f"optics      {', '.join(meza2021.write_parameters(folder, optics))}"]
 
 
 def _frames(sweep: SweepCapture, film: Film | None, placed: NDArray[np.intp], lag_s: float) -> Iterator[tuple[str, int, NDArray]]:

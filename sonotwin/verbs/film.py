@@ -26,7 +26,7 @@ from recon.model.rig import Rig
 from sonotwin.config import folder as conf
 from twin.conditions import Conditions, drifted, printed
 from twin.session import Session
-from twin.shooting import Quality
+from twin.shooting import FilmQuality
 from twin.tracking import film_session
 from twin.tracking.rendered_views import Frames
 from twin.tracking.sampling_ranges import DataRanges
@@ -43,7 +43,7 @@ class Config(film_session.Filming):
     add: bool = False
     name: SweepNameOrNone = ""
     pixels: Literal["sketch", "full"] = "sketch"
-    quality: Quality = Quality(window=8)
+    quality: FilmQuality = FilmQuality()
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
 

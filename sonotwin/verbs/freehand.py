@@ -2,9 +2,10 @@
 
 Reads the sweep part of a capture folder, with the probe's calibration and the lag between scanner and tracker; or a tracked
 sequence of the PLUS toolkit, reconstructed by the fields below or by its own configuration. Writes into the folder `out`:
-volume.nrrd (in the world's frame, mm); of a capture also sequence.igs.mha, the B-scans with their poses for PLUS and 3D Slicer;
-and metrics.json. Depths are as of the speed of sound that the probe's calibration holds for, unless tissue_m_s is given. Results
-that are there already are replaced. Takes a second for a hundred B-scans, and some seconds more when it first compiles.
+volume.nrrd (in the world's frame, mm); of a capture also sigma.nrrd, the standard deviation of the place, mm, of what each voxel
+shows, and sequence.igs.mha, the B-scans with their poses for PLUS and 3D Slicer; and metrics.json. Depths are as of the speed of
+sound that the probe's calibration holds for, unless tissue_m_s is given. Results that are there already are replaced. Takes a
+second for a hundred B-scans, and some seconds more when it first compiles.
 
     sonotwin freehand capture=outputs/sweep/capture probe=outputs/probe/probe.yaml lag_s=0.0503 out=outputs/volume
     sonotwin freehand capture=outputs/sweep/capture tissue_m_s=1450 spacing_mm=0.3 compounding=maximum out=outputs/volume
@@ -25,13 +26,14 @@ from recon.files import atomic, metrics, volumes
 from recon.files.metrics import Metrics
 from recon.freehand import hole_filling, plus_config, volume_compounding
 from recon.freehand import scans as freehand_scans
-from recon.freehand.scans import Extent, Scans
+from recon.freehand.scans import Extent, Scans, Unsure
 from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction
-from recon.model.probe import Speed
+from recon.model.probe import Speed, SpeedSigma
+from recon.model.rig import NotNegative
 from recon.model.tracks import LagSeconds
 
 VOLUME = "volume.nrrd"  # by which the folder of a volume is known
-SEQUENCE = "sequence.igs.mha"
+SIGMA, SEQUENCE = "sigma.nrrd", "sequence.igs.mha"
 
 
 class Config(BaseModel):
@@ -44,7 +46,9 @@ class Config(BaseModel):
     sweep: str = ""
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
+    lag_sigma_s: NotNegative = 0.0
     tissue_m_s: Speed | None = None
+    tissue_sigma_m_s: SpeedSigma = 25.0
     sequence: Path | None = None
     config: Path | None = None
     spacing_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.5
@@ -92,17 +96,20 @@ def run(config: Config) -> None:
     start = perf_counter()
     with console.status("putting B-scans into the volume"):
         pasted, filled = reconstruct(scans, config)
+        sigma = freehand_scans.sigma_volume(scans, filled.volume, None if config.clip is None else Clip(*config.clip))
     seconds = {"seconds_reconstruct": round(perf_counter() - start, 3)}
-    figures = freehand_scans.measure(scans, pasted, filled)
+    figures = freehand_scans.measure(scans, pasted, filled) | freehand_scans.measure_sigma(sigma)
     for line in describe(filled, figures, config):
         console.print(line, markup=False)
 
     with console.status("writing"), atomic.new_folder(config.out, VOLUME) as folder:
         volumes.write_volume(folder / VOLUME, filled.volume)
+        if sigma is not None:
+            volumes.write_volume(folder / SIGMA, sigma)
         if sweep is not None and scans.probe is not None:
             freehand_scans.write_sequence(folder / SEQUENCE, sweep, scans.probe, config.lag_s)
         metrics.write(folder / metrics.FILE, figures | seconds)
-        written = [name for name in (VOLUME, SEQUENCE, metrics.FILE) if (folder / name).exists()]
+        written = [name for name in (VOLUME, SIGMA, SEQUENCE, metrics.FILE) if (folder / name).exists()]
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
 
 
@@ -113,7 +120,8 @@ def read(config: Config) -> tuple[SweepCapture | None, Scans]:
         return None, freehand_scans.of_sequence(config.sequence, config.probe, config.config, config.tissue_m_s)
     sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
-    return sweep, freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
+    unsure = Unsure(config.lag_sigma_s, config.tissue_sigma_m_s)
+    return sweep, freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s, unsure)
 
 
 def reconstruct(scans: Scans, config: Config) -> tuple[Reconstruction, Reconstruction]:
@@ -137,3 +145,6 @@ def describe(filled: Reconstruction, figures: Metrics, config: Config) -> Iterat
     yield f"paste       {size} voxels of {spacing} mm, {how}: {100 * figures['pasted_fraction']:.1f} % seen"
     level = metrics.shown(figures["mean_level"], ".0f")
     yield f"fill        {100 * figures['filled_fraction']:.1f} % after filling holes, mean level {level}"
+    if "place_sigma_median_mm" in figures:
+        least, most = (figures[f"place_sigma_{name}_mm"] for name in ("median", "most"))
+        yield f"place       known to {least:.2f} mm in the median, {most:.2f} mm at most, by its own prediction"

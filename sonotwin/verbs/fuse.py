@@ -1,32 +1,39 @@
-"""Put skin, masses, B-scans, the probe's path and the devices into one picture with layers, in the frame that they share.
+"""Put skin, masses, B-scans, the probe's path and the devices into one picture, in the frame that they share.
 
 Reads a capture's sweep with poses, as `sonotwin track` leaves it, with the probe's calibration and the lag; the skin of
-`sonotwin surface`; and the masses of `sonotwin segment`, as far as each is given. Writes into `out`: scene.glb (metres,
-y up, as glTF has it), with the layers skin, mass0 ..., scan0000 ... (some B-scans where they were taken), path, cam1, cam2 and
-projector, for any glTF viewer; and metrics.json. Nothing is registered: all of it is measured in the frame of camera 1. Takes
-seconds.
+`sonotwin surface`; the masses of `sonotwin segment`, and the volume of `sonotwin freehand`, as far as each is given. The skin is
+parted from the table by a mask, or by the plane that it stands on. Writes into `out`: scene.html, a page with all in a view that
+one can turn, and a slider along the sweep; scene.glb (metres, y up, as glTF has it) with the layers skin, table, mass0 ...,
+scan0000 ... (some B-scans where they were taken), path, probe, circles, cam1, cam2 and projector, for any glTF viewer; slicer/, a
+folder for 3D Slicer; and metrics.json. Nothing is registered: all of it is measured in the frame of camera 1. Takes some seconds.
 
     sonotwin fuse capture=result/poses/scan probe=result/probe/probe.yaml lag_s=0.05 surface=result/surface/surface.ply out=scene
+    sonotwin fuse capture=result/poses/scan masses=result/masses/scan volume=result/volume/scan lag_s=0.05 out=scene
 """
 
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import trimesh
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
-from recon.capture import calibration_files, manifest, sweep_part
-from recon.capture.manifest import SCANNER
+from recon.capture import calibration_files, sweep_part
+from recon.capture.foreign_images import read_grey
 from recon.errors import InputError
 from recon.files import atomic, layers, metrics
 from recon.freehand import scans as freehand_scans
+from recon.fusion import fused_scene, scene_page, skin, slicer_folder
+from recon.fusion.fused_scene import FusedScene
+from recon.fusion.skin import Parted
+from recon.model.calibration import Calibration
 from recon.model.probe import Speed
+from recon.model.rig import Rig
 from recon.model.tracks import LagSeconds
-from recon.segmentation import containment, fused_scene
+from recon.segmentation import containment, mass_files
+from sonotwin.verbs import freehand
 
-SCENE = "scene.glb"  # by which the folder of a scene is known
+SCENE, PAGE, SLICER = "scene.glb", "scene.html", "slicer"  # the first is what the folder of a scene is known by
 
 
 class Config(BaseModel):
@@ -34,6 +41,7 @@ class Config(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    rig: Rig
     capture: Path
     out: Path
     sweep: str = ""
@@ -41,13 +49,17 @@ class Config(BaseModel):
     lag_s: LagSeconds = 0.0
     tissue_m_s: Speed | None = None
     surface: Path | None = None
+    mask: Path | None = None
+    camera: str = "cam1"
+    part_table: bool = True
     masses: Path | None = None
+    volume: Path | None = None
     calibration: Path | None = None
     scans: Annotated[int, Field(ge=0, le=1000)] = 12
 
 
 def run(config: Config) -> None:
-    """Read what is given, and write the layers.
+    """Read what is given, and write the page, the layers and the folder.
 
     Raises
     ------
@@ -55,49 +67,67 @@ def run(config: Config) -> None:
         If the capture is incomplete or damaged, a given file is missing, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    given = (config.probe, config.surface, config.masses, config.calibration)
+    given = (config.probe, config.surface, config.masses, config.calibration, config.volume, config.mask)
     atomic.check_folder(config.out, SCENE, inputs=[config.capture, *(path for path in given if path is not None)])
-    made = inside(config)
-    if config.surface is not None:
-        made = {"skin": fused_scene.skin_layer(containment.read_skin(config.surface))} | made
-    made |= devices(config)
+    voxels = volumes(config)
+    with console.status("putting it together"):
+        scene = read(config)
+        made = fused_scene.layers(scene, config.scans)
     with console.status("writing"), atomic.new_folder(config.out, SCENE) as folder:
         layers.write_layers(folder / SCENE, made)
-        counts = {"layers": len(made), "scans_shown": sum(name.startswith("scan") for name in made)}
-        metrics.write(folder / metrics.FILE, counts | {"masses": sum(name.startswith("mass") for name in made)})
+        scene_page.write(folder / PAGE, scene, config.capture.resolve().name)
+        slicer_folder.write(folder / SLICER, scene, voxels, config.scans)
+        counts = {"layers": len(made), "scans_shown": sum(name.startswith("scan") for name in made), "masses": len(scene.masses)}
+        metrics.write(folder / metrics.FILE, counts)
     console.print(f"layers      {', '.join(made)}", markup=False)
-    console.print(f"wrote       {config.out}/{{{SCENE},{metrics.FILE}}}", markup=False)
+    console.print(f"wrote       {config.out}/{{{PAGE},{SCENE},{SLICER},{metrics.FILE}}}", markup=False)
 
 
-def inside(config: Config) -> dict[str, trimesh.Trimesh]:
-    """Layers by ultrasound: masses, some B-scans, the path of the array's face."""
+def read(config: Config) -> FusedScene:
+    """All that is given, in the world."""
     sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
     scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
     placed = np.isfinite(scans.world_from_pixel).all(axis=(1, 2))
-    made = {path.stem: fused_scene.mass_layer(trimesh.load_mesh(path, process=False)) for path in masses(config.masses)}
-    for k in fused_scene.chosen(placed, config.scans):
-        made[f"scan{k:04d}"] = fused_scene.scan_layer(sweep.image(k), scans.world_from_pixel[k])
-    if placed.sum() > 1:
-        made["path"] = fused_scene.path_layer(fused_scene.faces_middle(scans.world_from_pixel[placed], sweep.size[0]))
-    return made
+    shown = fused_scene.chosen(placed, max(config.scans, scene_page.SLIDES))
+    optics = calibration_files.of_capture(config.capture, config.calibration)
+    surface = Parted(None, None) if config.surface is None else parted(config, config.surface, optics)
+    return FusedScene(
+        {k: sweep.image(k) for k in shown},
+        scans,
+        sweep.poses(config.lag_s),
+        config.rig.target,
+        surface.skin,
+        surface.rest,
+        {} if config.masses is None else mass_files.read_masses(config.masses),
+        {} if optics is None else optics.cameras,
+    )
 
 
-def masses(folder: Path | None) -> list[Path]:
-    """Files of masses, the largest first; InputError if the folder that is given has no figures of `sonotwin segment`."""
-    if folder is None:
-        return []
-    if not (folder / metrics.FILE).is_file():
-        raise InputError(f"{folder}: expected a folder of `sonotwin segment`, found no {metrics.FILE} in it")
-    return sorted(folder.glob("mass*.ply"))
+def parted(config: Config, surface: Path, optics: Calibration | None) -> Parted:
+    """The surface in skin and table: by the mask, or by the plane that things stand on.
+
+    Raises
+    ------
+    InputError
+        If the surface or the mask is missing or damaged, or the mask is of an unknown camera or of another size.
+    """
+    whole = containment.read_skin(surface)
+    if config.mask is None:
+        return skin.by_plane(whole) if config.part_table else Parted(whole, None)
+    if optics is None or config.camera not in optics.cameras:
+        found = "no calibration" if optics is None else ", ".join(optics.cameras)
+        raise InputError(f"{config.mask}: expected the calibration of {config.camera}, in whose image it is, found {found}")
+    camera = optics.cameras[config.camera]
+    return skin.by_mask(whole, read_grey(config.mask, camera.size) > 0, camera)
 
 
-def devices(config: Config) -> dict[str, trimesh.Trimesh]:
-    """Cameras and projector, where the capture or a given file has their calibration."""
-    held = manifest.read_manifest(config.capture)
-    path = config.calibration or (None if held.calibration is None else config.capture / held.calibration)
-    if path is None:
+def volumes(config: Config) -> dict[str, Path]:
+    """Files of voxels, by name; InputError if the folder that is given has none of `sonotwin freehand`."""
+    if config.volume is None:
         return {}
-    sizes = {name: device.size for name, device in held.devices.items() if name != SCANNER}
-    cameras = calibration_files.read(path, sizes).cameras
-    return {name: fused_scene.device_layer(camera) for name, camera in cameras.items()}
+    names = (freehand.VOLUME, freehand.SIGMA)
+    found = {Path(name).stem: config.volume / name for name in names if (config.volume / name).is_file()}
+    if Path(freehand.VOLUME).stem not in found:
+        raise InputError(f"{config.volume}: expected a folder of `sonotwin freehand`, found no {freehand.VOLUME} in it")
+    return found

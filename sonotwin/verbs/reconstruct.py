@@ -18,7 +18,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 from rich.console import Console
@@ -28,8 +28,8 @@ from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPa
 from recon.errors import InputError
 from recon.files import metrics
 from recon.model.calibration import DRIFT_PX
-from recon.model.probe import Speed
-from recon.model.rig import Finite, Positive, Rig
+from recon.model.probe import Speed, SpeedSigma
+from recon.model.rig import Finite, NotNegative, Positive, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.tracking import networks
@@ -59,8 +59,10 @@ class Config(BaseModel):
     networks: Path | None = None
     probe: Path | None = None
     lag_s: LagSeconds | None = None
+    lag_sigma_s: NotNegative = 0.0
     temperature_c: Finite | None = None
     tissue_m_s: Speed | None = None
+    tissue_sigma_m_s: SpeedSigma = 25.0
     spacing_mm: Positive = 0.5
     find: Literal["masses", "tube", "nothing"] = "masses"
     overlays: bool = False
@@ -118,11 +120,11 @@ def run(config: Config) -> int:
         optics = calibrated_optics(steps, sources)
         skin = measured_skin(steps, sources, optics)
         tracked = {name: tracked_sweep(steps, sources, name, optics) for name in sources.sweeps}
-        lag_s = measured_latency(steps, sources, tracked)
-        probe = calibrated_probe(steps, sources, tracked, lag_s)
+        lag = measured_latency(steps, sources, tracked)
+        probe = calibrated_probe(steps, sources, tracked, lag)
         for name, part in sources.sweeps.items():
             if part.purpose in (None, "volume") and SCANNER in part.images:
-                look_inside(steps, sources, name, tracked[name], probe, lag_s, skin, optics)
+                look_inside(steps, sources, name, tracked[name], probe, lag, skin, optics)
         metrics.write(config.out / metrics.FILE, figures(config.out, steps))
     console.print(f"wrote       {config.out}/{{{','.join([*steps.done, metrics.FILE])}}}", markup=False)
     return 1 if steps.failed else 0
@@ -197,32 +199,52 @@ def tracked_sweep(steps: KeptSteps, sources: Sources, name: str, optics: Path | 
     return steps.do(step, "poses of the probe, from frames", "track", fields, files, made_of)
 
 
-def measured_latency(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None]) -> float | None:
-    """The lag of the scanner's images, s: the one given, that of the last sweep over a flat bottom, or 0 without one."""
+class Latency(NamedTuple):
+    """The lag of the scanner's images, s, and its standard deviation."""
+
+    lag_s: float
+    sigma_s: float
+
+    @property
+    def field(self) -> str:
+        """The lag as a field of a verb."""
+        return f"lag_s={self.lag_s:.15g}"
+
+    @property
+    def fields(self) -> list[str]:
+        """Both as fields of a verb."""
+        return [self.field, f"lag_sigma_s={self.sigma_s:.15g}"]
+
+
+def measured_latency(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None]) -> Latency | None:
+    """The scanner's latency: the one given, that of the last sweep over a flat bottom, or 0 without one; None if it failed."""
     config, name = sources.config, _last(sources, "latency")
     if config.lag_s is not None:
-        return config.lag_s
+        return Latency(config.lag_s, config.lag_sigma_s)
     if name is None:
         steps.leave_out("latency", "no sweep over a flat bottom and no lag_s; the B-scans' time stamps are taken as they are")
-        return 0.0
+        return Latency(0.0, config.lag_sigma_s)
     if tracked[name] is None:
         return steps.fail("latency", f"no poses of the sweep {name}")
     fields = [f"capture={tracked[name]}", f"sweep={name}"]
     does, made_of = "the scanner's lag, from a flat bottom", _scans(steps, sources, name)
     made = steps.do("latency", does, "measure-lag", fields, (measure_lag.LAG,), made_of)
-    return None if made is None else json.loads((made / measure_lag.LAG).read_text(encoding="utf-8"))["lag_s"]
+    if made is None:
+        return None
+    found = json.loads((made / measure_lag.LAG).read_text(encoding="utf-8"))
+    return Latency(found["lag_s"], found["sigma_s"])
 
 
-def calibrated_probe(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None], lag_s: float | None) -> Path | None:
+def calibrated_probe(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None], lag: Latency | None) -> Path | None:
     """The probe's calibration: the one given, that of the last sweep over crossed wires, or without one the capture's."""
     config, name = sources.config, _last(sources, "probe")
     if config.probe is not None:
         return config.probe
     if name is None:
         return None if sources.held.probe is None else config.capture / sources.held.probe
-    if tracked[name] is None or lag_s is None:
-        return steps.fail("probe", NO_LAG if lag_s is None else f"no poses of the sweep {name}")
-    fields = [f"capture={tracked[name]}", f"sweep={name}", f"lag_s={lag_s:.15g}", *config.rig_fields]
+    if tracked[name] is None or lag is None:
+        return steps.fail("probe", NO_LAG if lag is None else f"no poses of the sweep {name}")
+    fields = [f"capture={tracked[name]}", f"sweep={name}", lag.field, *config.rig_fields]
     fields += [] if config.temperature_c is None else [f"temperature_c={config.temperature_c:.15g}"]
     does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
     files = (calibrate_probe.PROBE, calibrate_probe.FRAMES)
@@ -236,35 +258,38 @@ def look_inside(
     name: str,
     capture: Path | None,
     probe: Path | None,
-    lag_s: float | None,
+    lag: Latency | None,
     skin: Path | None,
     optics: Path | None,
 ) -> None:
     """The volume of a sweep, and what is found in its B-scans."""
     config, volume = sources.config, _step_of("volume", name)
-    if capture is None or lag_s is None or probe is None:
+    if capture is None or lag is None or probe is None:
         no_poses = f"no poses of the sweep {name}".rstrip()
-        reason = no_poses if capture is None else NO_LAG if lag_s is None else _no(steps, "probe", NO_PROBE)
+        reason = no_poses if capture is None else NO_LAG if lag is None else _no(steps, "probe", NO_PROBE)
         wanted = {"masses": ("volume", "masses", "scene"), "tube": ("volume", "tube"), "nothing": ("volume",)}[config.find]
         for kind in wanted:
             steps.leave_out(_step_of(kind, name), reason)
         return None
-    fields = [f"capture={capture}", f"sweep={name}", f"probe={probe}", f"lag_s={lag_s:.15g}"]
-    fields += [] if config.tissue_m_s is None else [f"tissue_m_s={config.tissue_m_s:.15g}"]
+    placing = [f"capture={capture}", f"sweep={name}", f"probe={probe}"]
+    placing += [] if config.tissue_m_s is None else [f"tissue_m_s={config.tissue_m_s:.15g}"]
+    fields = [*placing, *lag.fields, f"tissue_sigma_m_s={config.tissue_sigma_m_s:.15g}"]
     made_of = _scans(steps, sources, name) | _known_by(steps, "probe", probe)
     spacing = f"spacing_mm={config.spacing_mm:.15g}"
-    steps.do(volume, "B-scans in a volume", "freehand", [*fields, spacing], (freehand.VOLUME,), made_of)
+    voxels = steps.do(volume, "B-scans in a volume", "freehand", [*fields, spacing], (freehand.VOLUME,), made_of)
     if config.find == "nothing":
         return None
     if skin is not None and config.find == "masses":
         fields, made_of = [*fields, f"surface={skin}"], made_of | {"skin": steps.digest("surface")}
+        placing = [*placing, f"surface={skin}"]
     does, found = f"{'masses' if config.find == 'masses' else 'a tube'} in the B-scans", _step_of(config.find, name)
     masses = steps.do(found, does, "segment", [*fields, f"kind={config.find}"], (), made_of)
     if config.find == "masses":
-        fields += [] if masses is None else [f"masses={masses}"]
-        fields += [] if optics is None else [f"calibration={optics}"]
-        made_of |= {"masses": steps.digest(found), "optics": steps.digest("optics")}
-        steps.do(_step_of("scene", name), "all of it in one picture", "fuse", fields, (fuse.SCENE,), made_of)
+        shown = [*placing, lag.field, *([] if masses is None else [f"masses={masses}"])]
+        shown += [] if optics is None else [f"calibration={optics}"]
+        shown += [*([] if voxels is None else [f"volume={voxels}"]), *config.rig_fields]
+        made_of |= {"masses": steps.digest(found), "optics": steps.digest("optics"), "volume": steps.digest(volume)}
+        steps.do(_step_of("scene", name), "all of it in one picture", "fuse", shown, (fuse.SCENE,), made_of)
     return None
 
 

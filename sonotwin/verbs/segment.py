@@ -24,15 +24,14 @@ from recon.capture import sweep_part
 from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
 from recon.freehand import scans as freehand_scans
-from recon.freehand.scans import Scans
-from recon.model.probe import SCANNER_SPEED, Speed
-from recon.model.rig import Positive
+from recon.freehand.scans import Scans, Unsure
+from recon.model.probe import SCANNER_SPEED, Speed, SpeedSigma
+from recon.model.rig import NotNegative, Positive
 from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, segmented_scans
 from recon.segmentation.segmented_scans import Segmented
 from recon.segmentation.tube_wall import Appearance
 
-SpeedSigma = Annotated[float, Field(ge=0, le=500)]
 Spread = Annotated[float, Field(ge=0, le=5)]
 
 
@@ -47,6 +46,7 @@ class Config(BaseModel):
     sweep: str = ""
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
+    lag_sigma_s: NotNegative = 0.0
     sequence: Path | None = None
     surface: Path | None = None
     tissue_m_s: Speed | None = None
@@ -117,7 +117,8 @@ def read(config: Config) -> Scans:
         return freehand_scans.of_sequence(config.sequence, config.probe, None, config.tissue_m_s)
     sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
-    return freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
+    unsure = Unsure(config.lag_sigma_s, config.tissue_sigma_m_s)
+    return freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s, unsure)
 
 
 def found_in(scans: Scans, config: Config, skin: trimesh.Trimesh | None) -> Segmented:

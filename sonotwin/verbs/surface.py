@@ -1,9 +1,9 @@
 """Reconstruct the surface in the common view of a camera and the projector.
 
 Reads a capture folder, whether devices or the twin wrote it, or a bare folder of images with its patterns and calibration.
-Writes surface.ply (mm), surface.glb (metres, y up), points.npz (the point of every pixel, with its predicted sigma) and
-metrics.json into the folder `out`; results that are there already are replaced. Takes three seconds for nine images of
-1280x1024 and some seconds to start; the first run ever also compiles, for about a minute.
+Writes surface.ply (mm, with the surface's grey), surface.glb (metres, y up), points.npz (the point of every pixel, with its
+predicted sigma) and metrics.json into the folder `out`; results that are there already are replaced. Takes three seconds for
+nine images of 1280x1024 and some seconds to start; the first run ever also compiles, for about a minute.
 
     sonotwin surface capture=outputs/demo/capture out=outputs/demo/surface
     sonotwin surface capture=shots calibration=calibration/optics.yaml out=outputs/shots
@@ -86,7 +86,7 @@ def run(config: Config) -> None:
     if not np.isfinite(cleaned.points).any():
         raise InputError(f"{shots.name}: expected a surface that camera and projector both see, found no point of it")
     with watch.stage("mesh"):
-        mesh = surface_mesh.mesh(cleaned, camera, config.limits.max_slope)
+        mesh = surface_mesh.mesh(cleaned, camera, config.limits.max_slope, found.offset)
     predicted = {"predicted_rms_mm": surface_figures.predicted_rms(mesh, camera), "triangles": len(mesh.faces)}
     figures = surface_figures.measure(found, raw, cleaned) | predicted
     points, sigma = f"{figures['points']:,}".replace(",", " "), shown(figures["predicted_rms_mm"], ".3f", " mm")

@@ -68,7 +68,8 @@ def test_the_sequence_is_the_sweep_for_slicer(capture, reconstructed, rig):
     ours = sweep.poses(LAG_S) @ sequences.target_from_pixel(sweep.probe)
     np.testing.assert_allclose(sequences.poses(frames, "Reference", "Image"), ours, atol=1e-9)
     np.testing.assert_allclose(np.diff(frames.times_s), 0.05, atol=1e-6)
-    assert sorted(path.name for path in reconstructed.iterdir()) == ["metrics.json", "sequence.igs.mha", "volume.nrrd"]
+    names = ["metrics.json", "sequence.igs.mha", "sigma.nrrd", "volume.nrrd"]
+    assert sorted(path.name for path in reconstructed.iterdir()) == names
 
 
 def test_a_sequence_gives_the_same_volume(reconstructed, tmp_path):

@@ -37,12 +37,12 @@ def names(path: Path) -> list[str]:
 def test_layers_of_all_that_is_given(given, tmp_path):
     assert main(["fuse", *given, f"surface={tmp_path / 'skin.ply'}", f"masses={tmp_path / 'masses'}"]) == 0
     found = names(tmp_path / "out" / "scene.glb")
-    assert found == ["mass0", "path", "scan0000", "scan0020", "scan0040", "skin"]
+    assert found == ["circles", "mass0", "path", "probe", "scan0000", "scan0020", "scan0040", "skin"]
 
 
 def test_less_is_less(given, tmp_path):
     assert main(["fuse", *given]) == 0
-    assert names(tmp_path / "out" / "scene.glb") == ["path", "scan0000", "scan0020", "scan0040"]
+    assert names(tmp_path / "out" / "scene.glb") == ["circles", "path", "probe", "scan0000", "scan0020", "scan0040"]
 
 
 def test_the_same_input_gives_the_same_bytes(given, tmp_path):
@@ -54,12 +54,15 @@ def test_the_same_input_gives_the_same_bytes(given, tmp_path):
 
 @pytest.mark.parametrize(("field", "complaint"), [
     ("surface=none.ply", "none.ply: expected"),
-    ("masses=nowhere", "nowhere: expected a folder of `sonotwin segment`, found no metrics.json in it"),
+    ("masses=nowhere", "nowhere: expected a folder of `sonotwin segment`, found neither mass0.ply nor metrics.json in it"),
+    ("volume=nowhere", "nowhere: expected a folder of `sonotwin freehand`, found no volume.nrrd in it"),
+    ("mask=mask.png surface=skin.ply", "mask.png: expected the calibration of cam1, in whose image it is, found no calibration"),
     ("calibration=none.yaml", "none.yaml: expected"),
     ("scans=-1", "fuse: scans: expected"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(given, tmp_path, capsys, field, complaint):
-    assert main(["fuse", *given, field]) == 2
+    fields = field.replace("surface=skin", f"surface={tmp_path}/skin").split()
+    assert main(["fuse", *given, *fields]) == 2
     said = capsys.readouterr().err
     assert complaint in said and said.count("\n") == 1
     assert not (tmp_path / "out").exists()

@@ -96,7 +96,8 @@ def compare(track: Track, expected: FilmTruth) -> Errors:
         error = rigid.difference(expected.poses[k], track.poses[k])
         turn[k], shift[k] = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
         if track.covariance is not None:
-            bounds[:, k] = length_bound(track.covariance[k, 3:, 3:]), length_bound(track.covariance[k, :3, :3])
+            total = track.covariance[k] if track.shared is None else track.covariance[k] + track.shared[k]
+            bounds[:, k] = length_bound(total[3:, 3:]), length_bound(total[:3, :3])
     return Errors(shift, np.rad2deg(turn), bounds[0], np.rad2deg(bounds[1]))
 
 

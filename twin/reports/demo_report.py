@@ -15,7 +15,7 @@ from recon.capture.surface_part import SurfaceCapture
 from recon.files import atomic
 from recon.files.metrics import Metrics, shown
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Uniform
-from recon.reports import figures, page
+from recon.reports import figures, page, space_views
 from recon.reports.figures import CYCLIC, DIVERGING, SEQUENTIAL, Scale
 from recon.reports.page import Opening, Section
 from recon.structured_light import decode
@@ -149,7 +149,7 @@ def opening(measurement: Measurement, metrics: Metrics) -> Opening:
 
 def surface(measurement: Measurement) -> Section:
     """The surface in 3-D."""
-    drawn = figures.surface_view(
+    drawn = space_views.surface_view(
         measurement.points, measurement.comparison.error, _half_range(measurement.comparison.error, ERROR_MM)
     )
     caption = "Drag to turn, scroll to come nearer. Red lies outside the true surface, blue inside; equal scales on all axes."

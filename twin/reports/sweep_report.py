@@ -22,9 +22,10 @@ from recon.model import tracks
 from recon.model.probe import ProbeCalibration
 from recon.probe_calibration import sound_in_water
 from recon.probe_calibration.repeatability import five_points
-from recon.reports import figures, page
-from recon.reports.figures import SEQUENTIAL, Colours, Lines, Scale, Shape, Sheet
+from recon.reports import figures, page, space_views
+from recon.reports.figures import SEQUENTIAL, Colours, Scale
 from recon.reports.page import Section
+from recon.reports.space_views import Lines, Shape, Sheet
 from recon.segmentation import masses
 from twin.evaluation import sweep_errors
 from twin.evaluation.sweep_errors import Finding, SweepTruth
@@ -168,7 +169,7 @@ def too_deep(expected: SweepTruth, told: float) -> str:
 
 def view(story: Inside, points: NDArray[np.float32], skin: NDArray[np.bool_]) -> str:
     """The surface, the masses found under it, and the sweep, in space."""
-    shapes = [figures.surface_shape(points, skin, "measured surface", SKIN, 0.35)]
+    shapes = [space_views.surface_shape(points, skin, "measured surface", SKIN, 0.35)]
     for finding in story.findings:
         if finding.found is not None:
             shapes.append(Shape("tumours, found", finding.found.vertices, finding.found.faces, FOUND))
@@ -184,7 +185,7 @@ def view(story: Inside, points: NDArray[np.float32], skin: NDArray[np.bool_]) ->
     sheets = [
         Sheet("a B-scan", story.sweep.image(number), story.world_from_pixel[number]) for number in shown_at if number is not None
     ]
-    return figures.inside_view(shapes, lines, sheets[:1])
+    return space_views.inside_view(shapes, lines, sheets[:1])
 
 
 def centres(story: Inside) -> list[Array]:

@@ -29,7 +29,7 @@ from recon.model.rig import Rig
 from twin.session import first_difference
 from twin.shooting import Quality
 from twin.tracking.mesh_bank import Bank, build_bank
-from twin.tracking.rendered_views import Frames, render_full, render_sketches, render_views
+from twin.tracking.rendered_views import Sample, render_full, render_sketches, render_views
 from twin.tracking.samples import Take, draw
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import ViewTruth, disc_masks
@@ -164,7 +164,7 @@ def write_shard(place: Place, settings: Settings, bank: Bank, number: int) -> in
     return len(samples)
 
 
-def members(take: Take, frames: Frames, settings: Settings) -> dict[str, bytes]:
+def members(take: Take, frames: Sample, settings: Settings) -> dict[str, bytes]:
     """A sample's files."""
     files = {f"cam{number}.png": _png(view) for number, view in zip((1, 2), frames.views, strict=True)}
     if settings.frames == "views":
@@ -181,7 +181,7 @@ def _png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", image, PNG)[1].tobytes()
 
 
-def truth_record(take: Take, frames: Frames, seed: int) -> dict:
+def truth_record(take: Take, frames: Sample, seed: int) -> dict:
     """Ground truth of a sample, as in docs/training.md."""
     motion = take.motion
     return {

@@ -23,9 +23,9 @@ from recon.model.rig import Finite, NotNegative, Part, Positive, Rig, Target, Ve
 from scenes.scene_types import Scene
 from twin import conditions
 from twin.session import Session, describe
-from twin.shooting import Quality, Shooting
+from twin.shooting import FilmQuality, Quality, Shooting
 from twin.tracking.mesh_bank import Bank, build_bank, uncovered
-from twin.tracking.rendered_views import Frames, render_full, render_sketches, white_radiance
+from twin.tracking.rendered_views import Frames, render_film, render_full, white_radiance
 from twin.tracking.samples import Motion, Take, draw
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import ViewTruth
@@ -193,12 +193,15 @@ def _farthest(path: HandPath) -> Array:
 
 
 def shoot(
-    bank: Bank, rig: Rig, made: Sequence[Take], quality: Quality, seed: int, pixels: Literal["sketch", "full"] = "sketch"
+    bank: Bank, rig: Rig, made: Sequence[Take], quality: FilmQuality, seed: int, pixels: Literal["sketch", "full"] = "sketch"
 ) -> Iterator[Frames]:
     """Render the frames one after the other."""
-    render = render_sketches if pixels == "sketch" else render_full
     for first in range(0, len(made), BATCH):
-        yield from render(bank, rig, made[first : first + BATCH], quality, seed)
+        some = made[first : first + BATCH]
+        if pixels == "sketch":
+            yield from render_film(bank, rig, some, quality, seed)
+        else:
+            yield from render_full(bank, rig, some, Quality(window=quality.rim), seed)
 
 
 def write_session(

@@ -58,14 +58,26 @@ class Light:
     """Values received by the lanes, n each."""
 
     radiance: Floats  # mean over the rays; the target's white is about 1 / pi times its irradiance
+    plain: Floats  # the same without shadows
     disc: Floats  # rays towards the lane's circle, its outline filled, whatever stands before it
     seen: Floats  # of these, rays that reach it
     white: Floats  # rays that end on the target's paper
     white_radiance: Floats  # sum over these
 
+    def part(self, lanes: slice) -> "Light":
+        """Values of some lanes."""
+        return Light(*(getattr(self, name)[lanes] for name in Light.__dataclass_fields__))
+
 
 def render(
-    bank: Bank, rig: Rig, takes: Sequence[Take], lanes: Lanes, most_samples: int, seed: int, grid: BitGrid | None = None
+    bank: Bank,
+    rig: Rig,
+    takes: Sequence[Take],
+    lanes: Lanes,
+    most_samples: int,
+    seed: int,
+    grid: BitGrid | None = None,
+    shadows: int = SHADOWS,
 ) -> Light:
     """Trace the lanes' rays.
 
@@ -75,17 +87,19 @@ def render(
         Points of the largest set, a power of two.
     grid : BitGrid or None
         Print on the target's face instead of the circles.
+    shadows : int
+        Shadow rays a ray, a power of two.
     """
     first, step, end = _shares(lanes)
     take, camera = dr.gather(mi.UInt32, mi.UInt32(lanes.take), first), dr.gather(mi.UInt32, mi.UInt32(lanes.camera), first)
     rows = Rows.of(take_columns(takes, rig, bank.body_at, bank.scene_at), take)
     cameras = Rows.of(camera_columns(takes), take * 2 + camera)
-    path = _Path(bank, rig.target, rows, cameras, grid)
+    path = _Path(bank, rig.target, rows, cameras, grid, shadows)
     key = dr.gather(mi.UInt32, mi.UInt32([one.k for one in takes]), take) * 4 + camera
     seeds = mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed), 4)[0]
     u, v, sets, circles = mi.Float(lanes.u), mi.Float(lanes.v), mi.UInt32(lanes.set), mi.UInt32(lanes.circle)
     firsts, counts = mi.UInt32(lanes.first), mi.UInt32(lanes.samples)
-    results = [dr.zeros(mi.Float, len(lanes.u)) for _ in range(5)]
+    results = [dr.zeros(mi.Float, len(lanes.u)) for _ in range(6)]
 
     def body(pixel, k, *sums):
         """Ray k of a pixel; after the last one its sums are stored, and the next pixel's begin."""
@@ -94,9 +108,9 @@ def render(
             return dr.gather(type(column), column, pixel)
 
         points = PairedPoints(its(sets), its(firsts) + k, most_samples, seeds)
-        radiance, aims, reaches, on_paper = path.follow(its(u), its(v), its(circles), points)
+        radiance, plain, aims, reaches, on_paper = path.follow(its(u), its(v), its(circles), points)
         flags = (dr.select(one, 1.0, 0.0) for one in (aims, reaches, on_paper))
-        values = radiance, *flags, dr.select(on_paper, radiance, 0.0)
+        values = radiance, plain, *flags, dr.select(on_paper, radiance, 0.0)
         sums = [total + value for total, value in zip(sums, values, strict=True)]
         done = k + 1 >= its(counts)
         for result, total in zip(results, sums, strict=True):
@@ -105,8 +119,8 @@ def render(
 
     state = (first, mi.UInt32(0), *(mi.Float(0) for _ in results))
     dr.while_loop(state, lambda pixel, *_: pixel < end, body, label="rays")
-    radiance, disc, seen, white, white_radiance = (np.array(result) for result in results)
-    return Light(radiance / lanes.samples, disc, seen, white, white_radiance)
+    radiance, plain, *sums = (np.array(result) for result in results)
+    return Light(radiance / lanes.samples, plain / lanes.samples, *sums)
 
 
 def _shares(lanes: Lanes) -> mi.Vector3u:
@@ -133,8 +147,8 @@ class _Source(NamedTuple):
 class _Path:
     """Rays through the same takes, one after another; fetches constant parameters once."""
 
-    def __init__(self, bank: Bank, target: Target, rows: Rows, cameras: Rows, grid: BitGrid | None) -> None:
-        self.bank, self.target, self.rows, self.grid = bank, target, rows, grid
+    def __init__(self, bank: Bank, target: Target, rows: Rows, cameras: Rows, grid: BitGrid | None, shadows: int) -> None:
+        self.bank, self.target, self.rows, self.grid, self.shadows = bank, target, rows, grid, shadows
         self.world_from_camera = Turn.of(cameras, "world_from_camera")
         self.fx, self.fy, self.cx, self.cy = cameras.all("pinhole")
         self.k1, self.k2, self.p1, self.p2, self.k3 = cameras.all("distortion")
@@ -152,20 +166,21 @@ class _Path:
         self.projector, self.projector_matrix = rows.all("projector"), rows.all("projector_matrix")
 
     def follow(self, u, v, circle, points: PairedPoints) -> tuple:
-        """Radiance of one ray; whether it aims at the circle, reaches it, and ends on the target's paper."""
+        """Radiance of one ray, with shadows and without; whether it aims at the circle, reaches it, and ends on paper."""
         ray, cosine = self._ray(u, v, points)
         time = points.square().x - 0.5 + self.late  # not mirrored: a long blur wants as many times as there are rays
         turned = self._body_ray(ray, time)
         x, y, faces = self._on_face(turned)
         aims = faces & self._within_circle(x, y, circle)
         place, normal, surface, on_face, nothing = self._nearest(ray, turned, time, x, y)
-        light = self._reflected(place, normal, -ray.d, surface, time, points)
-        radiance = dr.select(nothing, self.ambient * self._share_from(ray.d), light)
+        light, plain = self._reflected(place, normal, -ray.d, surface, time, points)
         away = ((u - self.mid_u) ** 2 + (v - self.mid_v) ** 2) * self.corner
-        radiance *= (1 - self.vignetting * away) * cosine**4
+        falls = (1 - self.vignetting * away) * cosine**4
+        around = self.ambient * self._share_from(ray.d)
+        radiance, plain = (dr.select(nothing, around, value) * falls for value in (light, plain))
         paper = self.face.paint[1]
         on_paper = on_face & (surface[0] > 0.8 * paper) & (surface[0] < 1.25 * paper)
-        return radiance, aims, aims & on_face, on_paper
+        return radiance, plain, aims, aims & on_face, on_paper
 
     def _ray(self, u, v, points: PairedPoints) -> tuple[mi.Ray3f, mi.Float]:
         """Through a point of the pixel, spread by the lens, and a point of the pupil; and its cosine with the optical axis.
@@ -257,16 +272,19 @@ class _Path:
         """Light that comes from a direction, over the mean of all."""
         return 1 + dr.dot(self.gradient, direction)
 
-    def _reflected(self, place, normal, view, surface, time, points: PairedPoints) -> mi.Float:
-        """Radiance towards the viewer: of all sources without shadows, if one of them is seen; mean of the shadow rays."""
-        radiance = mi.Float(0)
-        for light in points.split(SHADOWS):
+    def _reflected(self, place, normal, view, surface, time, points: PairedPoints) -> tuple[mi.Float, mi.Float]:
+        """Radiance towards the viewer: of all sources without shadows, if one of them is seen, and in any case; mean of the
+        shadow rays.
+        """
+        radiance, plain = mi.Float(0), mi.Float(0)
+        for light in points.split(self.shadows):
             around, sources = self._sources(place, normal, view, surface, light)
             total = around + sum(source.value for source in sources)
             way, weight = self._towards_one(around, sources, light.square().x * total, normal, light.square())
             blocked = self._blocked(place + normal * LIFT_MM, way, time, total > 0)
             radiance += dr.select(blocked, 0, total * weight)
-        return radiance / SHADOWS
+            plain += total
+        return radiance / self.shadows, plain / self.shadows
 
     def _sources(self, place, normal, view, surface, points: PairedPoints) -> tuple[mi.Float, list["_Source"]]:
         """Unshadowed radiance from the surroundings' light, a point of each lamp, and the projector."""

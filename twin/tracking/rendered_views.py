@@ -4,20 +4,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry import rigid
 from recon.model.rig import CameraDevice, Rig, Target
+from recon.threads import mapped
 from twin.sensor import Exposure, digitise, number_per_electron, read_out
-from twin.shooting import Quality
+from twin.shooting import FilmQuality, Quality
+from twin.tracking.film_pictures import FilmPicture, film_picture, most_rays, visible_shares
 from twin.tracking.mesh_bank import Bank
 from twin.tracking.moving_transport import NO_CIRCLE, Lanes, Light, render
 from twin.tracking.pixel_selection import HALF, PATCH, VIEW, Picture, Sketch, View, Window, full_frame, joined
 from twin.tracking.samples import Take
 from twin.tracking.surface_prints import BitGrid
-from twin.tracking.target_truth import ViewTruth, inside_share, view_truth
+from twin.tracking.target_truth import ViewTruth, board_corners, inside_share, view_truth
 
 Grey = NDArray[np.uint8]
 
@@ -27,14 +30,38 @@ DARKEST = 0.15  # of the light that falls on a face at right angles: what an exp
 
 @dataclass(frozen=True)
 class Frames:
-    """One sample's images, with the truth of each view."""
+    """Images of both cameras, with the truth of each view."""
 
     views: tuple[Grey, Grey]  # (240, 320), or (h, w) full frames
-    patches: Grey  # (2, 3, 120, 120)
     truth: tuple[ViewTruth, ViewTruth]
 
 
-def render_views(bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int) -> list[Frames]:
+@dataclass(frozen=True)
+class Sample(Frames):
+    """One sample's images: of the views, too."""
+
+    patches: Grey  # (2, 3, 120, 120)
+
+
+class Shot(NamedTuple):
+    """One camera's part of a take."""
+
+    take: Take
+    camera: int  # 0 or 1
+    truth: ViewTruth
+
+    @property
+    def device(self) -> CameraDevice:
+        """The camera."""
+        return self.take.cameras[self.camera]
+
+    @property
+    def late(self) -> float:
+        """Share of the exposure by which it exposes later."""
+        return self.take.late[self.camera]
+
+
+def render_views(bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int) -> list[Sample]:
     """Views at the detector's size, and full-resolution patches."""
     pictures = [[View(device.optics.size, quality.view) for device in take.cameras] for take in takes]
     return _rendered(bank, rig, takes, pictures, quality, seed)
@@ -42,7 +69,7 @@ def render_views(bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, 
 
 def render_full(
     bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int, grid: BitGrid | None = None
-) -> list[Frames]:
+) -> list[Sample]:
     """Full camera images."""
     pictures = [[full_frame(device.optics.size, quality.window) for device in take.cameras] for take in takes]
     return _rendered(bank, rig, takes, pictures, quality, seed, grid)
@@ -50,12 +77,41 @@ def render_full(
 
 def render_sketches(
     bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int, grid: BitGrid | None = None
-) -> list[Frames]:
+) -> list[Sample]:
     """Full camera images of which the view and a window about the target are rendered; see `pictures.Sketch`."""
     pictures = [
         [_sketch(take, *seen, rig.target, quality) for seen in zip(take.cameras, take.late, strict=True)] for take in takes
     ]
     return _rendered(bank, rig, takes, pictures, quality, seed, grid)
+
+
+def render_film(bank: Bank, rig: Rig, takes: Sequence[Take], quality: FilmQuality, seed: int) -> list[Frames]:
+    """Full camera images of which some pixels are rendered and the others interpolated; see `film_pictures`."""
+    shots = [
+        Shot(take, camera, view_truth(take, device, take.late[camera], rig.target))
+        for take in takes
+        for camera, device in enumerate(take.cameras)
+    ]
+    pictures = [film_picture(shot.take, shot.device, shot.late, rig.target, shot.truth, quality) for shot in shots]
+    blocks = [picture.lanes(k // 2, shot.camera) for k, (picture, shot) in enumerate(zip(pictures, shots, strict=True))]
+    light = render(bank, rig, takes, joined(blocks), most_rays(quality), seed, shadows=1)
+    starts = np.cumsum([0, *(len(block.u) for block in blocks)])
+    parts = [light.part(slice(a, b)) for a, b in pairwise(starts)]
+
+    def finished(shot: Shot, picture: FilmPicture, block: Lanes, part: Light) -> tuple[Grey, ViewTruth]:
+        shares = visible_shares(block, part) * inside_share(shot.truth.ellipses, shot.device.optics.size)
+        truth = replace(shot.truth, visible=shares, white_dn=_white(part, [slice(None)], shot.take, shot.device, rig))
+        return _exposed(picture.radiance(part), shot, rig), truth
+
+    both = list(mapped(finished, shots, pictures, blocks, parts))
+    return [Frames((first[0], second[0]), (first[1], second[1])) for first, second in zip(both[::2], both[1::2], strict=True)]
+
+
+def _exposed(radiance: NDArray[np.float32], shot: "Shot", rig: Rig) -> Grey:
+    """Digital numbers of a whole image : (h, w)."""
+    electrons = radiance.ravel() * np.float32(_electrons(shot.take, shot.device, rig))
+    rng = np.random.default_rng([shot.take.noise_seed, shot.camera, 1])
+    return _read(electrons, slice(None), shot.device, shot.take, rng).reshape(radiance.shape)
 
 
 def _sketch(take: Take, device: CameraDevice, late: float, target: Target, quality: Quality) -> Sketch:
@@ -72,13 +128,6 @@ def _sketch(take: Take, device: CameraDevice, late: float, target: Target, quali
     return Sketch(View(size, quality.view), Window(size, first, extent, quality.window, sets=3))
 
 
-def board_corners(target: Target) -> NDArray[np.float64]:
-    """Corners : (4, 3) mm of the board's face, its middle at the circles' middle."""
-    half = np.array(target.board_mm) / 2
-    middle = np.array([target.c1_mm, target.c2_mm]) / 2
-    return np.column_stack([middle + half * [[-1, -1], [1, -1], [1, 1], [-1, 1]], np.zeros(4)])
-
-
 def _rendered(
     bank: Bank,
     rig: Rig,
@@ -87,7 +136,7 @@ def _rendered(
     quality: Quality,
     seed: int,
     grid: BitGrid | None = None,
-) -> list[Frames]:
+) -> list[Sample]:
     """One launch for all images and patches of all takes; then the sensors, image by image."""
     truths = [[view_truth(take, *seen, rig.target) for seen in zip(take.cameras, take.late, strict=True)] for take in takes]
     blocks, origins = [], []
@@ -121,7 +170,7 @@ def _rendered(
                     patch_origins=origins[2 * i + camera],
                 )
             )
-        result.append(Frames((views[0], views[1]), np.stack(patches), (told[0], told[1])))
+        result.append(Sample((views[0], views[1]), (told[0], told[1]), np.stack(patches)))
     return result
 
 
@@ -144,7 +193,8 @@ def _sensed(takes: Sequence[Take], rig: Rig, blocks: Sequence[Lanes], radiance: 
     for block, light in zip(blocks, radiance, strict=True):
         i, camera = int(block.take[0]), int(block.camera[0])
         device = takes[i].cameras[camera]
-        numbers.append(_read(light * _electrons(takes[i], device, rig), block, device, takes[i], streams[i, camera]))
+        pixel = block.v.astype(int) * device.optics.size[0] + block.u.astype(int)
+        numbers.append(_read(light * _electrons(takes[i], device, rig), pixel, device, takes[i], streams[i, camera]))
     return numbers
 
 
@@ -165,11 +215,11 @@ def white_radiance(take: Take, rig: Rig) -> float:
     return float(take.face.paper / np.pi * ((intensity * cosine / distance2).sum() + around))
 
 
-def _read(electrons, lanes: Lanes, device: CameraDevice, take: Take, rng: np.random.Generator) -> Grey:
+def _read(electrons, pixel: NDArray[np.int64] | slice, device: CameraDevice, take: Take, rng: np.random.Generator) -> Grey:
+    """Digital numbers of pixels, counted row by row, from mean numbers of electrons."""
     sensor = device.sensor
     width, height = device.optics.size
     response, offset = _unit_pattern(height, width, device.serial)
-    pixel = lanes.v.astype(int) * width + lanes.u.astype(int)
     mean = electrons * (1 + np.float32(sensor.prnu) * response[pixel])
     mean = np.float32(np.clip(mean, 0, 20 * sensor.saturation_e))
     read = read_out(mean[None], sensor.dark_noise_e, rng)[0] + np.float32(sensor.dsnu_e) * offset[pixel]

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from recon.geometry import rigid
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import Rig
-from twin.tracking.rendered_views import board_corners
 from twin.tracking.samples import LAMPS, SCRATCHES, SPOTS, Lighting, Motion, Print, Take, draw, facing
 from twin.tracking.sampling_ranges import DataRanges
+from twin.tracking.target_truth import board_corners
 
 Array = NDArray[np.float64]
 

@@ -53,6 +53,13 @@ def outline(centres: Array, radius: float) -> Array:
     return centres[:, None] + rim
 
 
+def board_corners(target: Target) -> Array:
+    """Corners : (4, 3) mm of the board's face, its middle at the circles' middle."""
+    half = np.array(target.board_mm) / 2
+    middle = np.array([target.c1_mm, target.c2_mm]) / 2
+    return np.column_stack([middle + half * [[-1, -1], [1, -1], [1, 1], [-1, 1]], np.zeros(4)])
+
+
 def inside_share(ellipses: Array, size: tuple[int, int], rings: int = 24) -> Array:
     """Part of each ellipse's area : (n,) that lies in an image of a size; ellipses : (n, 5) as of `ViewTruth`."""
     radius = np.sqrt((np.arange(rings) + 0.5) / rings)

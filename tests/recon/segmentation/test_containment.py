@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from recon.segmentation.containment import contain, depths
+from recon.segmentation.containment import below, contain
 
 DOME_MM, MIDDLE = 60.0, np.array([5.0, -3.0, 690.0])
 
@@ -24,9 +24,10 @@ def test_depth_is_the_distance_to_the_skin(dome, rng):
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     direction = direction[direction[:, 2] < -0.5]
     radius = rng.uniform(45, 70, len(direction))
-    found = depths(MIDDLE + radius[:, None] * direction, dome)
+    found, normals, _ = below(MIDDLE + radius[:, None] * direction, dome)
     assert np.abs(found - (DOME_MM - radius)).max() < 0.1
     assert np.isfinite(found).all()
+    assert (normals * direction).sum(axis=1).min() > 0.998, "towards the camera: outwards, on this side"
 
 
 def test_an_object_within_is_inside_and_one_that_pierces_the_skin_is_not(dome):
@@ -34,6 +35,7 @@ def test_an_object_within_is_inside_and_one_that_pierces_the_skin_is_not(dome):
     piercing = trimesh.creation.icosphere(radius=8).apply_translation(MIDDLE - [0, 0, 54])
     deep, through = contain([within, piercing], dome)
     assert deep.inside
+    assert -deep.normal @ (within.vertices[deep.nearest] - MIDDLE) < 0
     assert deep.least_mm == pytest.approx(DOME_MM - 8 - np.linalg.norm([10, 5, 35]), abs=0.15)
     assert through.inside is False
     assert through.least_mm == pytest.approx(-2, abs=0.1)

@@ -7,14 +7,19 @@ import pytest
 import trimesh
 
 from recon.freehand import sequences
+from recon.freehand.place_uncertainty import PlaceErrors
 from recon.freehand.scans import Scans
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
 from recon.probe_calibration.point_calibration import NAMES
 from recon.segmentation import mass_uncertainty
+from recon.segmentation.containment import contain
 from recon.segmentation.mass_surface import Mass
+from recon.segmentation.mass_uncertainty import Speeds
+from scenes.solid_meshes import grid
 
+STILL = Speeds(0.0, 0.0)
 SIZE, SCALE = (320, 400), np.array([0.12, 0.12])
 DEPTH_MM, RADIUS_MM = 30.0, 6.0
 
@@ -30,8 +35,17 @@ def sweep(probe):
     return Scans(SIZE[::-1], matrices, lambda: iter(()), 1540, 1540, probe), Mass(ball)
 
 
-def slopes_of(mass, scans):
-    return mass_uncertainty.point_slopes(np.asarray(mass.mesh.vertices), scans)
+def by_speeds(mass, scans, tissue, within):
+    """Standard deviations of centre and volume."""
+    shown = mass_uncertainty.shown_by(np.asarray(mass.mesh.vertices), scans)
+    found = mass_uncertainty.by_speeds(mass, mass_uncertainty.weights_of(mass), shown, scans, Speeds(tissue, within))
+    return np.sqrt(np.trace(found[:3, :3])), np.sqrt(found[3, 3])
+
+
+@pytest.fixture
+def sharp(monkeypatch):
+    """Borders without speckle."""
+    monkeypatch.setattr(mass_uncertainty, "BORDER_MM", 0.0)
 
 
 def probe_of(rig, covariance=None):
@@ -43,57 +57,57 @@ def test_a_speed_in_the_tissue_that_is_uncertain_by_2_percent(rig):
     """Then so is the depth of the front below the face, with a probe's calibration or without; the volume isn't."""
     scans, mass = sweep(probe_of(rig))
     for known in (scans, replace(scans, probe=None)):
-        sigma = mass_uncertainty.by_speeds(mass, slopes_of(mass, known), 0.02, 0.0)
-        assert sigma.centre_mm == pytest.approx(0.02 * (DEPTH_MM - RADIUS_MM), rel=0.01) and sigma.volume_mm3 == 0
+        centre, volume = by_speeds(mass, known, 0.02, 0.0)
+        assert centre == pytest.approx(0.02 * (DEPTH_MM - RADIUS_MM), rel=0.01) and volume == 0
 
 
 def test_a_speed_in_the_mass_that_is_uncertain_by_2_percent(rig):
     """Then so is its extent along the beam, and with it the volume; the middle moves by half of that."""
     scans, mass = sweep(probe_of(rig))
-    sigma = mass_uncertainty.by_speeds(mass, slopes_of(mass, scans), 0.0, 0.02)
-    assert sigma.volume_mm3 == pytest.approx(0.02 * mass.volume, rel=1e-6)
-    assert sigma.centre_mm == pytest.approx(0.02 * RADIUS_MM, rel=0.02)
+    centre, volume = by_speeds(mass, scans, 0.0, 0.02)
+    assert volume == pytest.approx(0.02 * mass.volume, rel=1e-6)
+    assert centre == pytest.approx(0.02 * RADIUS_MM, rel=0.02)
 
 
-def test_between_b_scans_that_are_far_apart_the_next_one_counts(rig):
+def test_between_b_scans_that_are_far_apart_the_next_one_counts(rig, sharp):
     """3 mm apart, a third of the border is near none: the volume's uncertainty by sy is that of all of it."""
     covariance = np.zeros((8, 8))
     covariance[1, 1] = (0.02 * SCALE[1]) ** 2
     scans, mass = sweep(probe_of(rig, covariance))
     few = replace(scans, world_from_pixel=scans.world_from_pixel[2::6])
-    sigma = mass_uncertainty.by_all(mass, few, 0.0, 0.0)
+    sigma = mass_uncertainty.by_all(mass, few, STILL)
     assert sigma.volume_mm3 == pytest.approx(0.02 * mass.volume, rel=0.1)
 
 
-def test_a_mass_at_the_edge_of_the_b_scans_has_an_uncertainty(rig):
+def test_a_mass_at_the_edge_of_the_b_scans_has_an_uncertainty(rig, sharp):
     """Half of it lies beside all of them, and moves as their edge does: by sy as deep, so as a whole one of that place."""
     covariance = np.zeros((8, 8))
     covariance[1, 1] = (0.02 * SCALE[1]) ** 2
     scans, mass = sweep(probe_of(rig, covariance))
     narrow = replace(scans, shape=(scans.shape[0], SIZE[0] // 2))
-    whole, cut = (mass_uncertainty.by_all(mass, one, 0.0, 0.0) for one in (scans, narrow))
+    whole, cut = (mass_uncertainty.by_all(mass, one, STILL)[:2] for one in (scans, narrow))
     assert np.allclose(cut, whole, rtol=0.02)
 
 
 def test_without_a_covariance_nothing_is_claimed(rig):
     """A part of an uncertainty isn't one."""
     scans, mass = sweep(probe_of(rig))
-    assert np.isnan(mass_uncertainty.by_all(mass, scans, 0.01, 0.01)).all()
+    assert np.isnan(mass_uncertainty.by_all(mass, scans, Speeds(0.01, 0.01))).all()
 
 
-def test_the_parts_add_up_as_independent_errors(rig):
+def test_the_parts_add_up_as_independent_errors(rig, sharp):
     covariance = np.diag([0, (0.01 * SCALE[1]) ** 2, 0, 0, 0, 0, 0, 0])
     scans, mass = sweep(probe_of(rig, covariance))
-    volume = mass_uncertainty.by_all(mass, scans, 0.0, 0.02).volume_mm3
+    volume = mass_uncertainty.by_all(mass, scans, Speeds(0.0, 0.02)).volume_mm3
     assert volume == pytest.approx(np.hypot(0.01, 0.02) * mass.volume, rel=0.01)
 
 
-def test_masses_placed_by_calibrations_drawn_from_the_covariance_scatter_as_predicted(rig, rng):
+def test_masses_placed_by_calibrations_drawn_from_the_covariance_scatter_as_predicted(rig, rng, sharp):
     """Each vertex is moved as the B-scan that shows it; 400 draws of eight parameters that go together."""
     half = np.diag([2e-4, 4e-4, 2e-3, 2e-3, 2e-3, 0.1, 0.1, 0.1]) @ (np.eye(8) + 0.3 * rng.standard_normal((8, 8)))
     probe = probe_of(rig, half @ half.T)
     scans, mass = sweep(probe)
-    sigma = mass_uncertainty.by_all(mass, scans, 0.0, 0.0)
+    sigma = mass_uncertainty.by_all(mass, scans, STILL)
     local = rigid.apply(rigid.invert(probe.target_from_image), np.asarray(mass.mesh.vertices))
     pixels, beside = local[:, :2] / SCALE, local[:, 2:] * probe.target_from_image[:3, 2]
     centres, volumes = [], []
@@ -104,3 +118,40 @@ def test_masses_placed_by_calibrations_drawn_from_the_covariance_scatter_as_pred
         volumes.append(mesh.volume)
     assert np.sqrt(np.trace(np.cov(np.array(centres).T))) == pytest.approx(sigma.centre_mm, rel=0.12)
     assert np.std(volumes) == pytest.approx(sigma.volume_mm3, rel=0.12)
+
+
+def placed(scans, turn_rad=0.0, shift_mm=0.0, rates=0.0, lag_s=0.0, shared=False):
+    """The B-scans with errors of their poses, of each or of all alike, or of the latency."""
+    each = np.tile(np.diag([turn_rad**2] * 3 + [shift_mm**2] * 3), (len(scans.world_from_pixel), 1, 1))
+    moving = np.zeros_like(scans.world_from_pixel)
+    moving[:, 0, 3] = rates
+    return replace(scans, errors=PlaceErrors(*((0 * each, each) if shared else (each, 0 * each)), moving, lag_s))
+
+
+def test_shifts_that_all_b_scans_share_move_a_mass_and_independent_ones_hardly(rig, sharp):
+    """Shared: as the shift itself, and the volume stays. Independent: the mean of the 25 B-scans that pass through the ball."""
+    scans, mass = sweep(probe_of(rig, np.zeros((8, 8))))
+    together, apart = (
+        mass_uncertainty.by_all(mass, placed(scans, shift_mm=0.1, shared=shared), STILL) for shared in (True, False)
+    )
+    assert together.centre_mm == pytest.approx(0.1 * np.sqrt(3), rel=0.01) and together.volume_mm3 < 1e-3 * mass.volume
+    assert 0.1 * np.sqrt(3 / 60) < apart.centre_mm < 0.1 * np.sqrt(3 / 15)
+
+
+def test_an_uncertain_latency_moves_a_mass_along_the_sweep(rig, sharp):
+    scans, mass = sweep(probe_of(rig, np.zeros((8, 8))))
+    sigma = mass_uncertainty.by_all(mass, placed(scans, rates=20.0, lag_s=0.002), STILL)
+    assert sigma.centre_mm == pytest.approx(20 * 0.002, rel=1e-3)
+
+
+def test_depth_below_the_skin_is_as_uncertain_as_skin_and_border(rig):
+    """All B-scans may lie 0.1 mm off: across the skin that counts, in addition to the border's and the skin's own errors."""
+    scans, mass = sweep(probe_of(rig, np.zeros((8, 8))))
+    centre = mass.centre
+    points, triangles = grid((60.0, 60.0), (120, 120))
+    skin = trimesh.Trimesh(np.column_stack([points, np.full(len(points), -9.0)]) + centre, triangles, process=False)
+    skin.vertex_attributes["sigma_mm"] = np.full(len(skin.vertices), 0.05)
+    (under,) = contain([mass.mesh], skin, centre - [0, 0, 500])
+    assert under.least_mm == pytest.approx(9 - RADIUS_MM, abs=0.05)
+    sigma = mass_uncertainty.by_all(mass, placed(scans, shift_mm=0.1, shared=True), STILL, under)
+    assert sigma.depth_mm == pytest.approx(np.sqrt(0.1**2 + 0.05**2 + mass_uncertainty.BORDER_MM**2), rel=0.02)

@@ -126,7 +126,7 @@ def blanks(made, size=(1280, 1024)):
     for take in made:
         first, second = (view_truth(take, device, 0.0, takes.rig().target) for device in take.cameras)
         image = np.full(size[::-1], take.k, np.uint8)
-        yield Frames((image, image), np.zeros((2, 3, 1, 1), np.uint8), (first, second))
+        yield Frames((image, image), (first, second))
 
 
 def test_what_is_written_is_what_was_made(config, made, tmp_path):
@@ -144,9 +144,7 @@ def test_what_is_written_is_what_was_made(config, made, tmp_path):
 
 def test_frames_are_rendered_as_they_are_asked_for(made, bank, config, monkeypatch):
     asked = []
-    monkeypatch.setattr(
-        film_session, "render_sketches", lambda bank, rig, batch, *_: asked.append(len(batch)) or list(blanks(batch))
-    )
+    monkeypatch.setattr(film_session, "render_film", lambda bank, rig, batch, *_: asked.append(len(batch)) or list(blanks(batch)))
     frames = film_session.shoot(bank, config.rig, made, config.quality, 0)
     assert not asked
     next(frames)

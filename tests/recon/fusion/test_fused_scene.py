@@ -8,9 +8,9 @@ import pytest
 import trimesh
 
 from recon.files import layers
+from recon.fusion import fused_scene
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.segmentation import fused_scene
 from scenes.solid_meshes import grid
 
 
@@ -27,7 +27,7 @@ def test_a_b_scan_lies_where_it_was_taken():
 def test_a_viewers_file_has_the_layers_by_name_in_metres_and_images_the_right_way_up(tmp_path):
     """In glTF, v of a texture grows downwards from the image's upper edge, as a B-scan's depth does."""
     scan = fused_scene.scan_layer(np.zeros((30, 20), np.uint8), np.diag([1.0, 1.0, 1.0, 1.0]))
-    mass = fused_scene.mass_layer(trimesh.creation.icosphere(radius=5.0))
+    mass = layers.painted(trimesh.creation.icosphere(radius=5.0), fused_scene.MASS)
     layers.write_layers(tmp_path / "scene.glb", {"scan0000": scan, "mass0": mass})
     data = (tmp_path / "scene.glb").read_bytes()
     length = struct.unpack_from("<I", data, 12)[0]

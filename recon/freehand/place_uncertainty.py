@@ -1,0 +1,135 @@
+"""Predicted errors of the places of a sweep's pixels: by each pose, and by what all B-scans share.
+
+A pixel (u, v) of B-scan k lies at `world_from_target @ target_from_pixel @ [u, v, 0, 1]`. To first order each of the errors moves
+it by `D0 + u D1 + v D2` times the error: the pose by its turn and shift, the probe's calibration by its eight parameters, the
+latency by the pixel's speed, the speed of sound by its depth. So the variance of its place, over all directions, is a quadratic
+form of [1, u, v] with six numbers a B-scan. The errors count as independent of each other.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.compiled import njit
+from recon.files.volumes import Volume
+from recon.freehand import sequences
+from recon.freehand.volume_compounding import Clip, Grid, Sums
+from recon.geometry import rigid
+from recon.model.probe import ProbeCalibration
+from recon.probe_calibration.point_calibration import NAMES
+
+Array = NDArray[np.float64]
+
+COLUMNS = (3, 0, 1)  # of a matrix from pixels: the origin, u, v
+
+
+@dataclass(frozen=True)
+class PlaceErrors:
+    """Standard deviations and covariances of what places n B-scans. What isn't known counts as exact."""
+
+    own: Array  # (n, 6, 6) of each pose, by the noise of its pair, as in recon.model.tracks
+    shared: Array  # (n, 6, 6) of each pose, by what errs alike in all of them
+    rates: Array  # (n, 4, 4) mm/s, of world_from_pixel
+    lag_s: float = 0.0  # of the latency
+    depth: float = 0.0  # of the ratio of all depths, by the speed of sound in the tissue
+
+
+def forms(world_from_pixel: Array, probe: ProbeCalibration, errors: PlaceErrors) -> Array:
+    """Variances of places : (n, 3, 3) mm^2, as forms of [1, u, v]; NaN without a pose.
+
+    Parameters
+    ----------
+    world_from_pixel : (n, 4, 4)
+        As of `probe`, with its depths.
+    """
+    by_pose = pose_slopes(world_from_pixel, probe)
+    total = _form(by_pose, errors.own + errors.shared)
+    total += _form(rate_slopes(errors.rates), np.array([[errors.lag_s**2]]))
+    total += _form(depth_slopes(world_from_pixel), np.array([[errors.depth**2]]))
+    if probe.uncertainty is not None:
+        total += _form(probe_slopes(world_from_pixel, probe), probe.uncertainty.ordered(NAMES))
+    return np.where(np.isfinite(world_from_pixel).all(axis=(1, 2))[:, None, None], total, np.nan)
+
+
+def pose_slopes(world_from_pixel: Array, probe: ProbeCalibration) -> Array:
+    """Coefficients : (n, 3, 3, 6) of places by the pose: of 1, u and v; mm; by a turn and a shift."""
+    turns = _world_from_target(world_from_pixel, probe)[:, :3, :3]
+    arms = turns @ sequences.target_from_pixel(probe)[:3, COLUMNS]
+    result = rigid.slopes(arms.transpose(0, 2, 1))
+    result[:, 1:, :, 3:] = 0  # the shift moves all pixels alike
+    return result
+
+
+def probe_slopes(world_from_pixel: Array, probe: ProbeCalibration) -> Array:
+    """Coefficients : (n, 3, 3, 8) of places by the probe's calibration, in the order of its NAMES."""
+    along = probe.target_from_image[:3, :2]
+    in_target = np.zeros((3, 3, len(NAMES)))
+    in_target[0, :, 5:] = np.eye(3)
+    for axis in (0, 1):
+        in_target[1 + axis, :, axis] = along[:, axis]
+        in_target[1 + axis, :, 2:5] = -rigid.cross(probe.scale[axis] * along[:, axis])
+    return _world_from_target(world_from_pixel, probe)[:, None, :3, :3] @ in_target
+
+
+def rate_slopes(rates: Array) -> Array:
+    """Coefficients : (n, 3, 3, 1) of places by the latency, from rates : (n, 4, 4) mm/s of their matrices."""
+    return rates[:, :3, COLUMNS].transpose(0, 2, 1)[..., None]
+
+
+def depth_slopes(world_from_pixel: Array) -> Array:
+    """Coefficients : (n, 3, 3, 1) of places by the ratio of all depths."""
+    result = np.zeros((len(world_from_pixel), 3, 3, 1))
+    result[:, 2, :, 0] = world_from_pixel[:, :3, 1]
+    return result
+
+
+def sigmas(form: Array, pixels: Array) -> Array:
+    """Standard deviations : (..., n) mm over all directions, of pixels : (n, 2) u, v, by forms : (..., 3, 3)."""
+    terms = np.column_stack([np.ones(len(pixels)), pixels])
+    return np.sqrt(np.einsum("ni,...ij,nj->...n", terms, form, terms))
+
+
+def sigma_volume(form: Array, world_from_pixel: Array, shape: tuple[int, int], grid: Grid, clip: Clip | None = None) -> Volume:
+    """Root mean square of the standard deviations of all pixels in a voxel, mm, float32; 0 in voxels that none falls into.
+
+    Parameters
+    ----------
+    form, world_from_pixel : (n, 3, 3) and (n, 4, 4)
+        As of `forms`; B-scans with a NaN are left out.
+    shape : (h, w)
+        Of the B-scans.
+    """
+    sums = Sums(np.zeros(grid.size[::-1], np.float32), np.zeros(grid.size[::-1], np.float32))
+    voxel_from_world = np.linalg.inv(Volume(sums.value, grid.origin, grid.spacing, grid.directions).world_from_voxel)
+    bounds = (clip or Clip(0, 0, shape[1], shape[0])).bounds(shape)
+    for one, matrix in zip(form, voxel_from_world @ world_from_pixel, strict=True):
+        if np.isfinite(one).all() and np.isfinite(matrix).all():
+            _paste_variance(one, bounds, matrix, sums)
+    voxels = np.sqrt(sums.value / np.maximum(sums.weight, 1))
+    return Volume(voxels, grid.origin, grid.spacing, grid.directions)
+
+
+@njit
+def _paste_variance(form, bounds, m, sums: Sums):
+    left, right, top, bottom = bounds
+    nz, ny, nx = sums.value.shape
+    for v in range(top, bottom + 1):
+        for u in range(left, right + 1):
+            i = int(np.floor(m[0, 0] * u + m[0, 1] * v + m[0, 3] + 0.5))
+            j = int(np.floor(m[1, 0] * u + m[1, 1] * v + m[1, 3] + 0.5))
+            k = int(np.floor(m[2, 0] * u + m[2, 1] * v + m[2, 3] + 0.5))
+            if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
+                by_u = form[0, 0] + 2 * form[0, 1] * u + form[1, 1] * u * u
+                sums.value[k, j, i] += by_u + 2 * v * (form[0, 2] + form[1, 2] * u) + form[2, 2] * v * v
+                sums.weight[k, j, i] += 1
+
+
+def _world_from_target(world_from_pixel: Array, probe: ProbeCalibration) -> Array:
+    return world_from_pixel @ np.linalg.inv(sequences.target_from_pixel(probe))
+
+
+def _form(slopes: Array, covariance: Array) -> Array:
+    """Traces over space : (n, 3, 3) of slopes : (n, 3, 3, k), of the terms 1, u, v, with covariances : (n or 1, k, k)."""
+    spread = np.einsum("nixk,...kl->nixl", slopes, covariance) if covariance.ndim == 2 else slopes @ covariance[:, None]
+    return np.einsum("nixk,njxk->nij", spread, slopes)

@@ -1,0 +1,142 @@
+"""Skin by light and B-scans, masses and the probe's path by ultrasound, with the devices, as layers of one scene in the world."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from recon.files import meshes
+from recon.files.layers import painted, pictured
+from recon.freehand.scans import Scans
+from recon.fusion import probe_shape
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.model.rig import Target
+from recon.segmentation.mass_files import FoundMass
+
+Array = NDArray[np.float64]
+
+SKIN, TABLE, MASS = (224, 187, 165, 150), (120, 105, 90, 255), (200, 60, 60, 255)  # colours
+PATH, DEVICE, BODY, INK = (60, 140, 220, 255), (90, 90, 90, 255), (235, 235, 235, 255), (20, 20, 20, 255)
+GREY_SKIN, GREY_TABLE = (255, 240, 230, 170), (255, 255, 255, 255)  # over which the surface's own grey is laid
+STEP_MM = 1.0  # of the surfaces' vertices, which are merged to that
+PATH_MM = 0.6  # radius of the path's tube
+DEVICE_MM = 40.0  # length of a device's pyramid
+
+
+@dataclass(frozen=True, eq=False)
+class FusedScene:
+    """All that was measured, in the frame of camera 1."""
+
+    images: Mapping[int, NDArray[np.uint8]]  # some B-scans (h, w) by their numbers
+    scans: Scans
+    world_from_target: Array  # (n, 4, 4) at the B-scans; NaN without a pose
+    target: Target
+    skin: trimesh.Trimesh | None = None
+    rest: trimesh.Trimesh | None = None  # table and background
+    masses: Mapping[str, FoundMass] = field(default_factory=dict)
+    devices: Mapping[str, Camera] = field(default_factory=dict)
+
+    @property
+    def middle(self) -> int | None:
+        """Number of the B-scan in the middle of those with images; None without."""
+        numbers = list(self.images)
+        return numbers[len(numbers) // 2] if numbers else None
+
+    @property
+    def path(self) -> Array:
+        """Middles of the array's face : (m, 3) mm, of the B-scans with a pose."""
+        placed = np.isfinite(self.scans.world_from_pixel).all(axis=(1, 2))
+        return faces_middle(self.scans.world_from_pixel[placed], self.scans.shape[1])
+
+
+def layers(scene: FusedScene, scans: int) -> dict[str, trimesh.Trimesh]:
+    """All of a scene, by the layers' names, with so many of its B-scans."""
+    made = {}
+    if scene.skin is not None:
+        made["skin"] = surface_layer(scene.skin, SKIN, GREY_SKIN)
+    if scene.rest is not None:
+        made["table"] = surface_layer(scene.rest, TABLE, GREY_TABLE)
+    made |= {name: painted(mass.mesh, MASS) for name, mass in scene.masses.items()}
+    for k in evenly(list(scene.images), scans):
+        made[f"scan{k:04d}"] = scan_layer(scene.images[k], scene.scans.world_from_pixel[k])
+    if len(scene.path) > 1:
+        made["path"] = path_layer(scene.path)
+    if scene.middle is not None and scene.scans.probe is not None:
+        body, rings = probe_shape.of(scene.target, scene.scans.probe, scene.scans.shape[1])
+        for name, mesh, colour in (("probe", body, BODY), ("circles", rings, INK)):
+            made[name] = painted(mesh.copy().apply_transform(scene.world_from_target[scene.middle]), colour)
+    return made | {name: device_layer(camera) for name, camera in scene.devices.items()}
+
+
+def surface_layer(
+    mesh: trimesh.Trimesh, plain: tuple[int, int, int, int], over_grey: tuple[int, int, int, int]
+) -> trimesh.Trimesh:
+    """A measured surface, coarser, in a colour: in its own grey under another colour, where it has one."""
+    coarse = merged(mesh, STEP_MM)
+    greys = meshes.greys_of(coarse)
+    return painted(coarse, plain) if greys is None else painted(coarse, over_grey, greys)
+
+
+def scan_layer(image: NDArray[np.uint8], world_from_pixel: Array) -> trimesh.Trimesh:
+    """A B-scan : (h, w) where it was taken, to the borders of its outer pixels."""
+    return pictured(scan_corners(image.shape[1], image.shape[0], world_from_pixel), image)
+
+
+def scan_corners(width: int, height: int, world_from_pixel: Array) -> Array:
+    """Outer corners : (4, 3) mm of a B-scan, from the upper left one on clockwise."""
+    u, v = np.array([-0.5, width - 0.5, width - 0.5, -0.5]), np.array([-0.5, -0.5, height - 0.5, height - 0.5])
+    return rigid.apply(world_from_pixel, np.column_stack([u, v, np.zeros(4)]))
+
+
+def path_layer(places: Array) -> trimesh.Trimesh:
+    """A tube along places : (n, 3) mm, n >= 2; where two coincide there is no piece."""
+    moved = np.linalg.norm(np.diff(places, axis=0), axis=1) > 1e-6
+    ends = zip(places[:-1][moved], places[1:][moved], strict=True)
+    pieces = [trimesh.creation.cylinder(PATH_MM, segment=both, sections=6) for both in ends]
+    whole = trimesh.util.concatenate(pieces)
+    assert isinstance(whole, trimesh.Trimesh)
+    return painted(whole, PATH)
+
+
+def device_layer(camera: Camera) -> trimesh.Trimesh:
+    """A camera or the projector as a pyramid: its centre, and its view some centimetres away."""
+    width, height = camera.size
+    corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
+    vertices = np.vstack([camera.centre, camera.centre + DEVICE_MM * camera.rays(corners)])
+    faces = [[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 3, 4]]
+    return painted(trimesh.Trimesh(vertices, faces, process=False), DEVICE)
+
+
+def merged(mesh: trimesh.Trimesh, step_mm: float) -> trimesh.Trimesh:
+    """A mesh whose vertices in the same cell of a grid are merged to their mean, in place and grey, for pictures."""
+    vertices, greys = np.asarray(mesh.vertices, float), meshes.greys_of(mesh)
+    _, cell, count = np.unique(np.floor(vertices / step_mm).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
+    cell = cell.ravel()
+    means = np.column_stack([np.bincount(cell, vertices[:, axis]) for axis in range(3)]) / count[:, None]
+    faces = cell[np.asarray(mesh.faces)]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    result = trimesh.Trimesh(means, faces[np.sort(first)], process=False)
+    if greys is not None:
+        meshes.set_greys(result, np.uint8(np.rint(np.bincount(cell, greys) / count)))
+    return result
+
+
+def chosen(placed: NDArray[np.bool_], count: int) -> list[int]:
+    """Numbers of `count` B-scans with a pose, evenly through the sweep."""
+    return evenly(np.flatnonzero(placed).tolist(), count)
+
+
+def evenly(numbers: list[int], count: int) -> list[int]:
+    """At most `count` of some numbers, evenly."""
+    return (
+        [numbers[k] for k in np.linspace(0, len(numbers) - 1, min(count, len(numbers))).astype(int).tolist()] if numbers else []
+    )
+
+
+def faces_middle(world_from_pixel: Array, width: int) -> Array:
+    """Middles of the array's face : (n, 3) mm, from matrices : (n, 4, 4) of B-scans as wide as some px."""
+    return world_from_pixel[:, :3, 0] * (width - 1) / 2 + world_from_pixel[:, :3, 3]

@@ -1,0 +1,117 @@
+"""The page of a fused scene: all in one view that one can turn, with a slider along the sweep, and the masses in numbers."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.files import atomic
+from recon.files.meshes import greys_of
+from recon.files.metrics import Metrics
+from recon.fusion import probe_shape
+from recon.fusion.fused_scene import FusedScene, evenly, merged
+from recon.reports import page, space_views, sweep_player
+from recon.reports.page import Opening, Section
+from recon.reports.space_views import Lines, Shape
+from recon.reports.sweep_player import Reel
+from recon.segmentation.mass_files import FoundMass
+
+Array = NDArray[np.float64]
+
+VIEW, SCAN = "scene", "B-scan"
+SKIN, TABLE, MASS, PATH, BODY, INK, DEVICE = "#f2e0d2", "#c9bfb2", "#c8553d", "#3c8cdc", "#d8d8d4", "#202020", "#5a5a5a"
+STEP_MM = 1.5  # of the surfaces' vertices in the view
+SLIDES = 60  # B-scans that the slider passes
+FOOTER = "Measured in the frame of camera 1; nothing is registered."
+RAY_MM = 60.0  # of a device, towards the corners of its view
+
+
+def write(path: Path, scene: FusedScene, title: str) -> None:
+    """Write the page."""
+    text = page.render(opening(scene, title), [in_space(scene), *numbers(scene)], FOOTER)
+    with atomic.new_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def opening(scene: FusedScene, title: str) -> Opening:
+    """The top of the page."""
+    count = len(scene.masses)
+    masses = f"{count} mass{'' if count == 1 else 'es'}" if count else "no masses"
+    parts = f"the skin by light and {masses}" if scene.skin is not None else masses
+    said = f"{parts[:1].upper()}{parts[1:]} by ultrasound lie in one frame, that of camera 1, as they were measured."
+    poses = ("B-scans with a pose", str(scene.scans.placed), f"of {len(scene.scans.world_from_pixel)}")
+    return Opening("sonotwin scene", title, said, [poses, ("masses", str(count), "")])
+
+
+def in_space(scene: FusedScene) -> Section:
+    """The view, and its slider."""
+    text = "Turn it with the mouse; a click in the legend shows or hides a part; the slider leads the probe along the sweep."
+    reel = reel_of(scene)
+    shapes, lines = list(bodies(scene)), list(wires(scene))
+    if reel is None:
+        return Section("All in one frame", [page.view(VIEW, space_views.inside_view(shapes, lines, []), text)])
+    first = len(reel.images) // 2
+    drawn = space_views.inside_view([*shapes, *reel.bodies_at(first)], lines, [reel.sheet_at(first)], reel.extent)
+    return Section("All in one frame", [page.view(VIEW, drawn, text), sweep_player.player(VIEW, reel, first)])
+
+
+def reel_of(scene: FusedScene) -> Reel | None:
+    """B-scans along the sweep, with the probe; None without any."""
+    numbers = evenly(list(scene.images), SLIDES)
+    if not numbers or scene.scans.probe is None:
+        return None
+    body, rings = probe_shape.of(scene.target, scene.scans.probe, scene.scans.shape[1])
+    parts = (("probe", body, BODY), ("circles", rings, INK))
+    moving = [Shape(name, mesh.vertices, mesh.faces, colour) for name, mesh, colour in parts]
+    labels = [f"B-scan {k} of {len(scene.scans.world_from_pixel)}" for k in numbers]
+    images = [scene.images[k] for k in numbers]
+    return Reel(SCAN, images, scene.scans.world_from_pixel[numbers], moving, scene.world_from_target[numbers], labels)
+
+
+def bodies(scene: FusedScene) -> Iterator[Shape]:
+    """Everything that has a surface and rests."""
+    for name, mesh, colour, opacity in (("skin", scene.skin, SKIN, 0.45), ("table", scene.rest, TABLE, 1.0)):
+        if mesh is not None:
+            coarse = merged(mesh, STEP_MM)
+            yield Shape(name, coarse.vertices, coarse.faces, colour, opacity, greys=greys_of(coarse))
+    for name, mass in scene.masses.items():
+        coarse = merged(mass.mesh, STEP_MM / 2)
+        yield Shape(name, coarse.vertices, coarse.faces, MASS)
+
+
+def wires(scene: FusedScene) -> Iterator[Lines]:
+    """The path of the array's face, and the devices' views."""
+    if len(scene.path) > 1:
+        yield Lines("path", scene.path[None], PATH)
+    for name, camera in scene.devices.items():
+        width, height = camera.size
+        corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
+        ends = camera.centre + RAY_MM * camera.rays(corners)
+        round_ = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
+        edges = np.stack([np.broadcast_to(camera.centre, ends.shape), ends], axis=1)
+        yield Lines(name, np.concatenate([edges, round_]), DEVICE, shown=False)  # far away
+
+
+def numbers(scene: FusedScene) -> Iterator[Section]:
+    """The masses in a table, if there are any."""
+    if scene.masses:
+        head = ("", "centre x, y, z, mm", "volume, mm³", "below the skin, mm")
+        rows = [(name, *row_of(mass)) for name, mass in scene.masses.items()]
+        caption = "± one standard deviation, by poses, probe, latency, speeds of sound and speckle; of centres in space."
+        yield Section("Masses", [page.table(head, rows, caption)])
+
+
+def row_of(mass: FoundMass) -> tuple[str, str, str]:
+    """Centre, volume and depth of a mass, each with its uncertainty, as text."""
+    figures = mass.figures
+    centre = ", ".join(f"{value:.2f}" for value in mass.mesh.center_mass) + _unsure(figures, "centre_sigma_mm", ".2f")
+    volume = f"{mass.mesh.volume:.0f}" + _unsure(figures, "volume_sigma_mm3", ".0f")
+    if not np.isfinite(figures.get("depth_mm", np.nan)):
+        return centre, volume, "unknown"
+    return centre, volume, f"{figures['depth_mm']:.2f}" + _unsure(figures, "depth_sigma_mm", ".2f")
+
+
+def _unsure(figures: Metrics, name: str, how: str) -> str:
+    value = figures.get(name, np.nan)
+    return f" ± {value:{how}}" if np.isfinite(value) else ""

@@ -1,0 +1,99 @@
+"""A folder that 3D Slicer shows in place: models, volumes, a transform and markups, all in the frame of camera 1.
+
+World coordinates are written as they are and declared LPS, as in all files of volumes; 3D Slicer turns LPS into its own RAS for
+models, volumes, markups and ITK's transforms alike, so what lies together in the world lies together there. Left, posterior and
+superior mean nothing here: x is to the right in camera 1's image, y down, z away from it.
+"""
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import SimpleITK as sitk
+import trimesh
+
+from recon.files import meshes, volumes
+from recon.files.volumes import Volume
+from recon.fusion import probe_shape
+from recon.fusion.fused_scene import STEP_MM, FusedScene, device_layer, evenly, merged, path_layer
+from recon.fusion.scene_page import row_of
+from recon.geometry import rigid
+from recon.segmentation.mass_files import FoundMass
+
+SCHEMA = (
+    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
+)
+MARKUPS, TRANSFORM, SCRIPT, README = "masses.mrk.json", "target_to_world.tfm", "show.py", "README.txt"
+TEMPLATES = Path(__file__).parent
+SLICE_MM = 0.5  # thickness of a B-scan as a volume of one slice
+
+
+def write(folder: Path, scene: FusedScene, voxels: Mapping[str, Path], scans: int) -> None:
+    """Write the folder, which must not be there yet.
+
+    voxels : volumes on disk, by the names that they are to have
+    scans : number of B-scans that are written
+    """
+    folder.mkdir()
+    for name, mesh in models(scene):
+        meshes.write_ply(folder / f"{name}.ply", mesh)
+    for name, path in voxels.items():
+        shutil.copyfile(path, folder / f"{name}.nrrd")
+    for k in evenly(list(scene.images), scans):
+        volumes.write_volume(folder / f"scan{k:04d}.nrrd", slice_of(scene, k))
+    if scene.middle is not None and scene.scans.probe is not None:
+        write_transform(folder / TRANSFORM, scene.world_from_target[scene.middle])
+        body, rings = probe_shape.of(scene.target, scene.scans.probe, scene.scans.shape[1])
+        for name, mesh in (("target_probe", body), ("target_circles", rings)):
+            meshes.write_ply(folder / f"{name}.ply", mesh)
+    if scene.masses:
+        (folder / MARKUPS).write_text(json.dumps(markups(scene.masses), indent=1) + "\n", encoding="utf-8")
+    for name in (SCRIPT, README):
+        shutil.copyfile(TEMPLATES / f"slicer_{name}.txt", folder / name)
+
+
+def models(scene: FusedScene) -> Iterator[tuple[str, trimesh.Trimesh]]:
+    """Models in the world, by the files' names."""
+    if scene.skin is not None:
+        yield "skin", scene.skin
+    if scene.rest is not None:
+        yield "table", merged(scene.rest, STEP_MM)
+    yield from ((name, mass.mesh) for name, mass in scene.masses.items())
+    if len(scene.path) > 1:
+        yield "path", path_layer(scene.path)
+    yield from ((name, device_layer(camera)) for name, camera in scene.devices.items())
+
+
+def slice_of(scene: FusedScene, k: int) -> Volume:
+    """B-scan k as a volume of one slice where it was taken."""
+    matrix = scene.scans.world_from_pixel[k]
+    lengths = np.linalg.norm(matrix[:3, :2], axis=0)
+    along = matrix[:3, :2] / lengths
+    directions = np.column_stack([along, np.cross(along[:, 0], along[:, 1])])
+    return Volume(scene.images[k][None], matrix[:3, 3], np.append(lengths, SLICE_MM), directions)
+
+
+def write_transform(path: Path, world_from_target: np.ndarray) -> None:
+    """Write where the target stands, as ITK has it: by the transform that takes points of the world to the target.
+
+    3D Slicer reads such a file as the transform of a node to its parent's frame, by its inverse.
+    """
+    inverse = rigid.invert(world_from_target)
+    transform = sitk.AffineTransform(3)
+    transform.SetMatrix(inverse[:3, :3].ravel().tolist())
+    transform.SetTranslation(inverse[:3, 3].tolist())
+    sitk.WriteTransform(transform, str(path))
+
+
+def markups(masses: Mapping[str, FoundMass]) -> dict[str, object]:
+    """Control points at the masses' centres, with their figures and uncertainties, as 3D Slicer's markups."""
+    points = []
+    for number, (name, mass) in enumerate(masses.items(), 1):
+        centre, volume, depth = row_of(mass)
+        told = f"centre {centre} mm; volume {volume} mm3; {depth} mm below the skin"
+        place = np.asarray(mass.mesh.center_mass).tolist()
+        points.append({"id": str(number), "label": name, "description": told, "position": place, "positionStatus": "defined"})
+    one = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
+    return {"@schema": SCHEMA, "markups": [one]}

@@ -1,0 +1,196 @@
+"""A frame of a film, rendered where it matters: one ray in many pixels at large, more about the target, most at its rims.
+
+Three layers lie on each other: cells of 4 px all over, cells of 2 px about the target's board, and every pixel of the circles as
+far out as a fit of their rims looks; the last with more rays at the rims, where a pixel's share of ink is the noise. Rays between
+are interpolated.
+
+How much of the unshadowed light arrives is smooth but for sharp shadows, and it is what few shadow rays know badly: on plain
+paper it would scatter by a tenth. So it is averaged over neighbours; what the surface reflects is not, and keeps its edges.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.geometry import rigid
+from recon.model.rig import CameraDevice, Target
+from twin.shooting import FilmQuality
+from twin.tracking.moving_transport import NO_CIRCLE, Lanes, Light
+from twin.tracking.pixel_selection import joined, lanes_of
+from twin.tracking.samples import Take
+from twin.tracking.target_truth import ViewTruth, board_corners
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+CELL_PX, NEAR_CELL_PX = 4, 2
+AROUND_PX = 24  # beyond the target's board
+BEYOND = 0.42  # radii beyond a circle's rim: a fit of the rim reaches to 0.37
+RIM_PX = 4.0  # on either side of a rim, and half of the motion's blur
+TILE = 4  # cells along each axis, among which the points of one set are dealt out: alike in all tiles, which leaves no noise
+SPREAD_PX = 4.0  # standard deviation over which the share of light that arrives is averaged between pixels
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A rectangle of the image in cells with one lane in the middle of each."""
+
+    first: tuple[int, int]  # its upper left pixel
+    extent: tuple[int, int]  # width, height, px
+    cell: int  # px
+    samples: int
+    number: int  # tells the sets of sample points of an image's layers apart
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of cells."""
+        width, height = self.extent
+        return -(-height // self.cell), -(-width // self.cell)
+
+    def lanes(self, take: int, camera: int) -> Lanes:
+        """Lanes, row by row."""
+        rows, columns = self.shape
+        v = self.first[1] + (np.arange(rows) + 0.5) * self.extent[1] / rows - 0.5
+        u = self.first[0] + (np.arange(columns) + 0.5) * self.extent[0] / columns - 0.5
+        v, u = np.broadcast_arrays(v[:, None], u)
+        row, column = np.indices(u.shape)
+        first = ((row % TILE) * TILE + column % TILE) * self.samples
+        return lanes_of(take, camera, u, v, self.samples, np.full(u.size, self.number << 24), first)
+
+    def lay(self, image: Image, light: Light) -> None:
+        """Interpolate the lanes' radiance into the rectangle of an image : (h, w)."""
+        settled = evened(light.radiance.reshape(self.shape), light.plain.reshape(self.shape), over_a_tile)
+        (u, v), (width, height) = self.first, self.extent
+        image[v : v + height, u : u + width] = cv2.resize(settled, self.extent, interpolation=cv2.INTER_LINEAR)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Pixels of an image, each with a lane."""
+
+    u: NDArray[np.int64]  # (n,)
+    v: NDArray[np.int64]
+    samples: NDArray[np.int64]
+    circle: NDArray[np.int64]  # the one that is nearest
+    number: int
+
+    def lanes(self, take: int, camera: int) -> Lanes:
+        """Lanes in the same order."""
+        lanes = lanes_of(take, camera, self.u, self.v, 1, self.number << 24 | np.arange(self.u.size))
+        return Lanes(**lanes.__dict__ | {"samples": np.uint32(self.samples), "circle": np.uint32(self.circle)})
+
+    def lay(self, image: Image, light: Light) -> None:
+        """Put the lanes' radiance into the image : (h, w)."""
+        if not len(self.u):
+            return
+        low_u, low_v = self.u.min(), self.v.min()
+        at = self.v - low_v, self.u - low_u
+        radiance, plain = np.zeros((2, at[0].max() + 1, at[1].max() + 1), np.float32)
+        radiance[at], plain[at] = light.radiance, light.plain
+        image[self.v, self.u] = evened(radiance, plain, over_pixels)[at]
+
+
+@dataclass(frozen=True)
+class FilmPicture:
+    """All layers of one camera's frame, from the one at the bottom up."""
+
+    size: tuple[int, int]  # width, height
+    layers: Sequence[Cells | Pixels]
+
+    def lanes(self, take: int, camera: int) -> Lanes:
+        """Lanes of all layers."""
+        return joined([layer.lanes(take, camera) for layer in self.layers])
+
+    def radiance(self, light: Light) -> Image:
+        """The image : (h, w), from the light of `lanes`."""
+        image = np.zeros(self.size[::-1], np.float32)
+        first = 0
+        for layer in self.layers:
+            count = len(layer.u) if isinstance(layer, Pixels) else layer.shape[0] * layer.shape[1]
+            layer.lay(image, light.part(slice(first, first + count)))
+            first += count
+        return image
+
+
+def film_picture(
+    take: Take, device: CameraDevice, late: float, target: Target, truth: ViewTruth, quality: FilmQuality
+) -> FilmPicture:
+    """Layers for a take's frame by one camera, which exposes later by a share of the exposure."""
+    size = device.optics.size
+    whole = Cells((0, 0), size, CELL_PX, quality.view, 0)
+    near = about_target(take, device, late, target)
+    if near is None:
+        return FilmPicture(size, [whole])
+    first, extent = near
+    return FilmPicture(size, [whole, Cells(first, extent, NEAR_CELL_PX, quality.view, 1), circles(truth, size, target, quality)])
+
+
+def about_target(take: Take, device: CameraDevice, late: float, target: Target) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """First pixel, and width and height, of the rectangle about the board on its way; None where the image shows none of it."""
+    motion, camera, size = take.motion.later(late), device.optics.camera(), np.array(device.optics.size)
+    places = np.concatenate([camera.project(rigid.apply(motion.at(time), board_corners(target))) for time in (-0.5, 0.5)])
+    if not np.isfinite(places).all():
+        return None
+    low = np.clip(np.floor(places.min(axis=0)) - AROUND_PX, 0, size)
+    extent = np.clip(np.ceil(places.max(axis=0)) + AROUND_PX + 1, 0, size) - low
+    return (tuple(low.astype(int).tolist()), tuple(extent.astype(int).tolist())) if extent.min() >= 2 else None
+
+
+def circles(truth: ViewTruth, size: tuple[int, int], target: Target, quality: FilmQuality) -> Pixels:
+    """Pixels of the circles, as far out as a fit of their rims looks, with more rays at outer and inner rims."""
+    ratio = target.inner_diameter_mm / target.outer_diameter_mm
+    found: list[Array] = []
+    for number, (row, path) in enumerate(zip(truth.ellipses, truth.blur_px, strict=True)):
+        reach = row[2] * (1 + BEYOND) + path
+        low = np.clip(np.floor(row[:2] - reach), 0, size).astype(int)
+        high = np.clip(np.ceil(row[:2] + reach) + 1, 0, size).astype(int)
+        v, u = np.mgrid[low[1] : high[1], low[0] : high[0]].reshape(2, -1)
+        radius = _radii(row, u, v)
+        beyond = (radius - 1) * row[3] - path / 2
+        at_rim = np.minimum(np.abs(radius - 1), np.abs(radius - ratio)) * row[3] < RIM_PX + path / 2
+        rays = np.where(at_rim, quality.rim, quality.disc)
+        found.append(np.column_stack([u, v, rays, np.full(u.size, number), radius])[beyond < BEYOND * row[3]])
+    table = np.concatenate(found)
+    table = table[np.argsort(table[:, 4], kind="stable")]  # of pixels that two circles share, those of the nearer
+    _, kept = np.unique(table[:, 1] * size[0] + table[:, 0], return_index=True)
+    u, v, rays, number = table[kept, :4].astype(np.int64).T
+    return Pixels(u, v, rays, number, 2)
+
+
+def most_rays(quality: FilmQuality) -> int:
+    """Points of the largest set."""
+    return max(TILE**2 * quality.view, quality.disc, quality.rim)
+
+
+def visible_shares(lanes: Lanes, light: Light) -> Array:
+    """Uncovered share of each disc's area within the image : (3,)."""
+    seen, disc = (np.bincount(lanes.circle, part / lanes.samples, NO_CIRCLE + 1)[:NO_CIRCLE] for part in (light.seen, light.disc))
+    return seen / np.maximum(disc, 1)
+
+
+def evened(radiance: Image, plain: Image, average: Callable[[Image], Image]) -> Image:
+    """Radiance : (h, w), whose share of the unshadowed radiance is averaged over neighbours; zero where that is zero."""
+    arrived, unshadowed = average(radiance), average(plain)
+    return np.where(plain > 0, plain * arrived / np.maximum(unshadowed, np.float32(1e-20)), np.float32(0))
+
+
+def over_a_tile(image: Image) -> Image:
+    """Mean of the cells about each, by a kernel in which each point of the tiles' set counts alike."""
+    box = np.full(TILE, 1 / TILE)
+    kernel = np.float32(np.convolve(box, box))
+    return cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
+
+
+def over_pixels(image: Image) -> Image:
+    """Mean of pixels about each."""
+    return cv2.GaussianBlur(image, (0, 0), SPREAD_PX, borderType=cv2.BORDER_REPLICATE)
+
+
+def _radii(ellipse: Array, u: NDArray, v: NDArray) -> Array:
+    """Distance of pixels from an ellipse's middle, 1 on the ellipse."""
+    du, dv = u - ellipse[0], v - ellipse[1]
+    cos, sin = np.cos(ellipse[4]), np.sin(ellipse[4])
+    return np.hypot((du * cos + dv * sin) / ellipse[2], (dv * cos - du * sin) / ellipse[3])
