@@ -114,8 +114,9 @@ def inside_view(shapes: Sequence[Shape], lines: Sequence[Lines], sheets: Sequenc
     for one in lines:
         joined = np.concatenate([np.vstack([line, np.full(3, np.nan)]) for line in np.asarray(one.points)]).astype(np.float32)
         visible = True if one.shown else "legendonly"
-        style = {"mode": "lines", "line": {"color": one.colour, "width": 2}, "hoverinfo": "skip"}
-        traces.append(graph_objects.Scatter3d(**dict(zip("xyz", joined.T, strict=True)), **style, **entry(one.name), visible=visible))
+        style = {"mode": "lines", "line": {"color": one.colour, "width": 2}, "hoverinfo": "skip", "visible": visible}
+        places = dict(zip("xyz", joined.T, strict=True))
+        traces.append(graph_objects.Scatter3d(**places, **style, **entry(one.name)))
     for shape in sorted(shapes, key=lambda shape: -shape.opacity):  # translucent parts last
         hover = f"{shape.name}<br>x %{{x:.1f}}<br>y %{{y:.1f}}<br>z %{{z:.1f}} mm<extra></extra>"
         look: dict[str, object] = {"color": shape.colour, "opacity": shape.opacity, "hovertemplate": hover}
