@@ -12,7 +12,7 @@ from scenes.acoustics import MADE_OF
 from sonotwin.verbs import render, sweep
 from twin.optics import surface_session
 from twin.ultrasound.sweep_session import AnyPath
-from twin.ultrasound.timed_sweep import Clocks, PoseNoise
+from twin.ultrasound.timed_sweep import Clocks
 from twin.ultrasound.transducer import Transducer
 
 CALIBRATION = "calibration"  # folder
@@ -30,10 +30,9 @@ class Config(render.Config):
     board: Path
     ultrasound: Transducer
     path: AnyPath | None
-    clocks: Clocks = Clocks()
-    pose_noise: PoseNoise = PoseNoise()
+    clocks: Clocks = Clocks(camera_hz=16.0)
     wires: Annotated[int, Field(ge=1, le=1000)] = 40
-    bottom_s: Positive = 6.0
+    bottom_s: Positive = 5.0
     tissue_m_s: Speed = 1450.0
     film_frames: Annotated[int, Field(ge=0, le=10_000)] = 24
     _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given

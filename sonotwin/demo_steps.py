@@ -6,6 +6,7 @@ import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 from recon.freehand import sequences
 from recon.probe_calibration import sound_in_water
+from recon.probe_calibration.repeatability import five_points
 from sonotwin.config import load
 from sonotwin.demo_config import BOARD_PATTERNS, CALIBRATION, WATER_C, Config
 from sonotwin.pipeline import Step
@@ -28,6 +30,7 @@ from twin.reports import track_report
 Figures = Mapping[str, float | int]
 
 MESHES = ("surface.ply", "surface.glb")
+RESTING = ("filmed=true", "clocks.camera_hz=5")  # the probe is held still for each B-scan of the wires
 LAG = "lag_s=MEASURED"  # stands for the lag that an earlier step measured
 
 
@@ -70,7 +73,8 @@ def verb_steps(folder: Path, config: Config, overrides: Sequence[str]) -> list[V
     given = [*_unless_given(overrides, "conditions", "lifelike"), *_given(overrides)]
     steps: list[VerbStep | Step] = [*(calibration_steps(folder, config, given) if config.poses else [])]
     steps += surface_steps(folder, config, given)
-    steps += sweep_steps(folder, config, given) if config.looks_inside else []
+    if config.looks_inside:
+        return steps + sweep_steps(folder, config, given)
     return steps + (film_steps(folder, config, given) if config.film_frames else [])
 
 
@@ -93,9 +97,8 @@ def calibration_steps(folder: Path, config: Config, given: Sequence[str]) -> lis
 def surface_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbStep]:
     """From a scene to the errors of its measured surface."""
     camera = f"camera={config.cameras[0]}"
-    optics = [f"calibration={folder / CALIBRATION / calibrate_optics.OPTICS}"] if config.poses else []
     rendering = [*_of(given, render.Config, without=("poses",)), f"out={folder}"]
-    measuring = [f"capture={folder / 'capture'}", *optics, camera, f"out={folder / 'surface'}"]
+    measuring = [f"capture={folder / 'capture'}", *_optics(folder, config), camera, f"out={folder / 'surface'}"]
     comparing = [f"surface={folder / 'surface'}", f"truth={folder / 'truth'}", camera, f"out={folder / 'evaluation'}"]
     images = f"render {config.patterns.count} images of the scene and its truth"
     return [
@@ -115,9 +118,10 @@ def surface_steps(folder: Path, config: Config, given: Sequence[str]) -> list[Ve
 
 
 def sweep_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbStep | Step]:
-    """From the probe's calibration to the tumours under the surface, and how far they are from the truth."""
+    """From frames and B-scans of crossed wires to the tumours under the surface, and how far they are from the truth."""
     scanner = config.ultrasound  # one in the tank and on the breast, set otherwise
     size, scale = (str(list(pair)).replace(" ", "") for pair in (scanner.image_size, scanner.scale_mm_per_px))
+    filmed = ["filmed=true", *_unless_given(given, "clocks.camera_hz", f"{config.clocks.camera_hz:.15g}")]
     tank = [
         "ultrasound=water",
         f"ultrasound.image_size={size}",
@@ -127,30 +131,54 @@ def sweep_steps(folder: Path, config: Config, given: Sequence[str]) -> list[Verb
     rig = [override for override in given if override.startswith("rig")]
     path = _unless_given(given, "path", "raster")
     probe = f"probe={folder / 'probe' / calibrate_probe.PROBE}"
-    placed = [f"capture={folder / 'sweep' / 'capture'}", probe, LAG, f"tissue_m_s={config.tissue_m_s:.15g}"]
-    wires = ["scene=crosswire", "path=wire", f"path.count={config.wires}", *tank, f"out={folder / 'wires'}"]
-    calibrating = [*rig, f"capture={folder / 'wires' / 'capture'}", f"temperature_c={WATER_C:.15g}", f"out={folder / 'probe'}"]
-    bottom = ["scene=tank", "path=bob", f"path.seconds={config.bottom_s:.15g}", *tank, f"out={folder / 'bottom'}"]
-    timing = [f"capture={folder / 'bottom' / 'capture'}", f"out={folder / 'lag'}"]
-    sweeping = [*path, *_of(given, sweep.Config), f"out={folder / 'sweep'}"]
-    finding = [*placed, f"surface={folder / 'surface' / 'surface.ply'}", f"out={folder / 'tumours'}"]
+    placed = [f"capture={poses_of(folder, 'sweep')}", probe, LAG, f"tissue_m_s={config.tissue_m_s:.15g}"]
+    wires = ["scene=crosswire", "path=wire", f"path.count={config.wires}", *tank, *RESTING, f"out={folder / 'wires'}"]
+    calibrating = [*rig, f"capture={poses_of(folder, 'wires')}", f"temperature_c={WATER_C:.15g}", f"out={folder / 'probe'}"]
+    bottom = ["scene=tank", "path=bob", f"path.seconds={config.bottom_s:.15g}", *tank, *filmed, f"out={folder / 'bottom'}"]
+    timing = [f"capture={poses_of(folder, 'bottom')}", f"out={folder / 'lag'}"]
+    sweeping = [*path, *_of(given, sweep.Config), *filmed, f"out={folder / 'sweep'}"]
+    skin = f"surface={folder / 'surface' / 'surface.ply'}"
+    fusing = [*rig, *placed, skin, *_optics(folder, config), f"masses={folder / 'tumours'}", f"volume={folder / 'volume'}"]
     return [
-        VerbStep("wires", f"render {config.wires} B-scans of crossed wires", "sweep", wires, makes=("wires",)),
+        VerbStep("wires", f"render {config.wires} B-scans of crossed wires, and frames of both cameras", "sweep", wires),
+        _tracking(folder, config, rig, "wires", "find the probe in these frames"),
         VerbStep("probe", "calibrate the ultrasound probe", "calibrate-probe", calibrating, _named("probe"), ("probe",)),
-        VerbStep("bottom", "render B-scans of a flat bottom, up and down", "sweep", bottom, makes=("bottom",)),
+        VerbStep("bottom", "render a flat bottom, up and down", "sweep", bottom),
+        _tracking(folder, config, rig, "bottom", "find the probe in these frames"),
         VerbStep("lag", "measure the scanner's lag behind the cameras", "measure-lag", timing, _named("lag"), ("lag",)),
-        VerbStep("sweep", "render a sweep over the scene and its truth", "sweep", sweeping, makes=("sweep",)),
-        VerbStep(
-            "volume",
-            "put its B-scans into a volume",
-            "freehand",
-            [*placed, f"out={folder / 'volume'}"],
-            _named("volume"),
-            ("volume",),
-        ),
-        VerbStep("tumours", "find tumours in its B-scans", "segment", finding, makes=("tumours",)),
-        Step("compare", "compare them with the truth", lambda folder, _: tumour_errors(folder)),
+        VerbStep("sweep", "render a sweep over the scene: B-scans, frames, and their truth", "sweep", sweeping),
+        _tracking(folder, config, rig, "sweep", "track the probe through the sweep, and compare with the truth"),
+        VerbStep("volume", "put its B-scans into a volume", "freehand", [*placed, f"out={folder / 'volume'}"], _named("volume")),
+        VerbStep("tumours", "find tumours in its B-scans", "segment", [*placed, skin, f"out={folder / 'tumours'}"]),
+        VerbStep("scene", "put all of it into one picture", "fuse", [*fusing, f"out={folder / 'scene'}"]),
+        Step("compare", "compare it with the truth", lambda folder, _: tumour_errors(folder)),
     ]
+
+
+def fusing_fields(folder: Path, config: Config, overrides: Sequence[str]) -> list[str]:
+    """Fields of the step that puts all into one picture, with the lag that was measured."""
+    (step,) = (step for step in verb_steps(folder, config, overrides) if isinstance(step, VerbStep) and step.name == "scene")
+    return step.words(measured_lag(folder))[1:]
+
+
+def poses_of(folder: Path, name: str) -> Path:
+    """The capture in which a filmed sweep has its poses."""
+    return folder / "poses" / name
+
+
+def _tracking(folder: Path, config: Config, rig: Sequence[str], name: str, does: str) -> VerbStep:
+    """The step that tracks the probe through a filmed sweep, by the estimated calibration of the cameras."""
+    fields = [*rig, f"capture={folder / name / 'capture'}", *_optics(folder, config)]
+    if name == "sweep":
+        figures: Callable[[Path], Figures] = partial(_pose_errors, swept=True)
+    else:
+        fields, figures = [*fields, "overlays=false"], lambda folder: {}
+    return VerbStep(f"track_{name}", does, "track", [*fields, f"out={poses_of(folder, name)}"], figures)
+
+
+def _optics(folder: Path, config: Config) -> list[str]:
+    """The calibration by the board, as a field; of a demonstration without one the capture's own is used."""
+    return [f"calibration={folder / CALIBRATION / calibrate_optics.OPTICS}"] if config.poses else []
 
 
 def film_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbStep]:
@@ -162,7 +190,12 @@ def film_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbS
     return [
         VerbStep("film", frames, "film", filming, makes=("film",)),
         VerbStep(
-            "track", "track the target through them, and compare with the truth", "track", tracking, _pose_errors, ("track",)
+            "track",
+            "track the target through them, and compare with the truth",
+            "track",
+            tracking,
+            partial(_pose_errors, swept=False),
+            ("track",),
         ),
     ]
 
@@ -170,12 +203,18 @@ def film_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbS
 def tumour_errors(folder: Path) -> Metrics:
     """Figures of the tumours found against the true ones, and of where the sweep's pixels are put."""
     findings, truth = compared(folder)
-    captured = sweep_part.read_sweep(folder / "sweep" / "capture")
+    captured = sweep_part.read_sweep(poses_of(folder, "sweep"))
     calibration = probe_files.read(folder / "probe" / calibrate_probe.PROBE)
     shown = sequences.target_from_pixel(sound_in_water.for_tissue(calibration, truth.transducer.assumed_speed))
     apart = sweep_errors.placement(captured.poses(measured_lag(folder)) @ shown, truth)
+    error, sigma = sweep_errors.probe_errors(calibration, truth, five_points(truth.transducer.image_size))
     figures = sweep_errors.measure(findings, truth, metrics.read(folder / "tumours" / metrics.FILE))
-    return figures | {"sweep_placement_rms_mm": float(np.sqrt(np.nanmean(apart**2)))}
+    return figures | {
+        "sweep_placement_rms_mm": float(np.sqrt(np.nanmean(apart**2))),
+        "probe_worst_mm": float(error.max()),
+        "probe_worst_sigma_mm": float(sigma[error.argmax()]),
+        "lag_true_ms": 1e3 * truth.lag_s,
+    }
 
 
 def compared(folder: Path) -> tuple[list[sweep_errors.Finding], sweep_errors.SweepTruth]:
@@ -212,9 +251,18 @@ def _with_meshes(folder: Path) -> Metrics:
     return _figures("surface")(folder)
 
 
-def _pose_errors(folder: Path) -> Metrics:
-    tracked = track_report.read(folder / "film", folder / "track")
-    return _named("track")(folder) | track_errors.measure(tracked.errors, tracked.truth)
+def _pose_errors(folder: Path, swept: bool) -> Metrics:
+    tracked = tracked_film(folder, swept)
+    read = metrics.read(tracked.folder / metrics.FILE)
+    figures = {f"track_{name}": value for name, value in read.items() if not name.startswith("seconds_")}
+    return figures | track_errors.measure(tracked.errors, tracked.truth)
+
+
+def tracked_film(folder: Path, swept: bool) -> track_report.Tracked:
+    """The tracked frames of the sweep, or of the film where there is none, with their truth."""
+    if swept:
+        return track_report.read(folder / "sweep", poses_of(folder, "sweep"))
+    return track_report.read(folder / "film", folder / "track")
 
 
 def _offer(source: Path, path: Path) -> None:

@@ -79,13 +79,16 @@ def test_a_small_demonstration_runs_through(tmp_path, capsys):
 def test_a_small_demonstration_looks_inside(tmp_path, capsys):
     """The tumour that is swept over is found where it is; the two others are told to be missing."""
     out = tmp_path / "demo"
-    assert main(["demo", *SMALL[:-2], *SMALL[-1:], *SWEPT, "poses=none", f"out={out}"]) == 0
+    assert main(["demo", "engine.samples=4", "scene.edge_mm=1.5", *SWEPT, "poses=none", f"out={out}"]) == 0
     made = (
         "report.html",
         "probe/probe.yaml",
         "lag/lag.json",
         "volume/volume.nrrd",
         "tumours/mass0.ply",
+        "poses/sweep/poses.csv",
+        "scene/scene.html",
+        "scene/slicer/masses.mrk.json",
         "sweep/truth/scene.json",
     )
     assert not [name for name in made if not (out / name).is_file()]
@@ -94,11 +97,33 @@ def test_a_small_demonstration_looks_inside(tmp_path, capsys):
     assert metrics["tumour0_centre_error_mm"] < 1 and metrics["tumour0_dice"] > 0.85 and metrics["tumour0_inside"] == 1
     assert metrics["lag_low_ms"] - 2 < 50 < metrics["lag_high_ms"] + 2
     assert metrics["sweep_placement_rms_mm"] < 1
-    steps = ("wires", "probe", "bottom", "lag", "sweep", "volume", "tumours", "compare")
+    steps = (
+        "wires",
+        "track_wires",
+        "probe",
+        "bottom",
+        "track_bottom",
+        "lag",
+        "sweep",
+        "track_sweep",
+        "volume",
+        "tumours",
+        "scene",
+    )
     assert all(f"seconds_{name}" in metrics for name in steps)
-    last = capsys.readouterr().out.splitlines()[-7:]
-    assert [line.split()[0] for line in last] == ["measured", "accuracy", "probe", "lag", "tumours", "coverage", "look"]
+    last = capsys.readouterr().out.splitlines()[-8:]
+    assert [line.split()[0] for line in last] == [
+        "measured",
+        "accuracy",
+        "probe",
+        "lag",
+        "tumours",
+        "tracked",
+        "coverage",
+        "look",
+    ]
     report = html.unescape((out / "report.html").read_text(encoding="utf-8"))
+    assert "From board to tumour" in report and 'data-slide="scene"' in report
     assert "sonotwin segment" in report and "tumours, found" in report and "not found" in report
 
 
@@ -204,7 +229,7 @@ def test_the_report_repeats_the_settings_that_were_given(tmp_path):
     overrides = ["scene=sphere", "out=elsewhere", "poses=paper"]
     config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
     lines = commands(tmp_path / "a b", config, overrides, 0.0)
-    verbs = ["demo", "render", "calibrate-optics", "render", "surface", "evaluate", "film", "track"]
+    verbs = ["demo", "render", "calibrate-optics", "render", "surface", "evaluate", "film", "track"]  # a sphere hides nothing
     assert [re.split(r"\s", line)[1] for line in lines] == verbs
     assert "scene=sphere" in lines[0] and "scene=sphere" in lines[3] and "elsewhere" not in "".join(lines)
     assert "scene=board" in lines[1] and "poses=paper" in lines[1] and "poses=paper" not in lines[3]
@@ -225,19 +250,18 @@ def test_the_commands_of_the_sweep_are_those_of_the_verbs(tmp_path):
     config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
     lines = [shlex.split(line)[1:] for line in commands(tmp_path, config, overrides, 0.0503)]
     verbs = [line[0] for line in lines]
-    inside = ["sweep", "calibrate-probe", "sweep", "measure-lag", "sweep", "freehand", "segment"]
-    assert verbs == ["demo", "render", "surface", "evaluate", *inside, "film", "track"]
+    inside = ["sweep", "track", "calibrate-probe", "sweep", "track", "measure-lag", "sweep", "track"]
+    assert verbs == ["demo", "render", "surface", "evaluate", *inside, "freehand", "segment", "fuse"]
     for verb, *fields in lines:
         module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
         assert load(verb, fields, module.Config), verb
-    assert all("tissue_m_s=1450" in line for line in lines[-4:-2]), "volume and masses at one speed"
-    assert "frames=24" in lines[-2] and f"capture={tmp_path}/film/capture" in lines[-1]
-    assert "lag_s=0.0503" in lines[-3] and "path=raster" in lines[8] and "clocks.lag_s=0.08" in lines[8]
+    assert all("tissue_m_s=1450" in line for line in lines[-3:]), "volume, masses and picture at one speed"
+    assert all("filmed=true" in line for line in lines if line[0] == "sweep"), "poses are found in frames"
+    assert all(f"capture={tmp_path}/poses/sweep" in line and "lag_s=0.0503" in line for line in lines[-3:])
+    assert "path=raster" in lines[10] and "clocks.lag_s=0.08" in lines[10] and "clocks.camera_hz=16" in lines[10]
 
 
-@pytest.mark.parametrize(
-    "overrides", [[], ["scene=two_objects", "poses.count=4", "shooting.gain=2", "seed=3", "pose_noise.turn_deg=0.1"]]
-)
+@pytest.mark.parametrize("overrides", [[], ["scene=two_objects", "poses.count=4", "shooting.gain=2", "seed=3"]])
 def test_each_verb_gets_the_demonstrations_settings(overrides, tmp_path):
     """The demonstration's fields reach each verb, whose own YAML has the same defaults, but for those that a step sets."""
     config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
@@ -246,7 +270,7 @@ def test_each_verb_gets_the_demonstrations_settings(overrides, tmp_path):
         "render": {"poses", "out"},
         "surface": {"patterns", "out"},
         "film": {"path", "out"},
-        "wires": {"scene", "path", "ultrasound", "out"},
+        "wires": {"scene", "path", "ultrasound", "clocks", "out"},
         "bottom": {"scene", "path", "ultrasound", "out"},
     }
     for step in verb_steps(tmp_path, config, overrides):

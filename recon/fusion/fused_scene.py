@@ -113,12 +113,15 @@ def device_layer(camera: Camera) -> trimesh.Trimesh:
 def merged(mesh: trimesh.Trimesh, step_mm: float) -> trimesh.Trimesh:
     """A mesh whose vertices in the same cell of a grid are merged to their mean, in place and grey, for pictures."""
     vertices, greys = np.asarray(mesh.vertices, float), meshes.greys_of(mesh)
-    _, cell, count = np.unique(np.floor(vertices / step_mm).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
-    cell = cell.ravel()
+    grid = np.floor(vertices / step_mm).astype(np.int64)
+    grid -= grid.min(axis=0)
+    number = np.ravel_multi_index(tuple(grid.T), tuple((grid.max(axis=0) + 1).tolist()))
+    _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
     means = np.column_stack([np.bincount(cell, vertices[:, axis]) for axis in range(3)]) / count[:, None]
     faces = cell[np.asarray(mesh.faces)]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    a, b, c = np.sort(faces, axis=1).T
+    _, first = np.unique((a * len(count) + b) * len(count) + c, return_index=True)
     result = trimesh.Trimesh(means, faces[np.sort(first)], process=False)
     if greys is not None:
         meshes.set_greys(result, np.uint8(np.rint(np.bincount(cell, greys) / count)))

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph
 
 from recon.files import meshes
 from recon.geometry.camera import Camera
@@ -77,10 +79,11 @@ def standing_plane(points: Array, seed: int = 0) -> Plane | None:
 
 def _largest_piece(surface: trimesh.Trimesh, chosen: Mask) -> Mask:
     """Of chosen vertices : (n,) those of the largest piece that is joined by triangles."""
-    edges = surface.edges_unique[chosen[surface.edges_unique].all(axis=1)]
-    labels = trimesh.graph.connected_component_labels(edges, node_count=len(chosen))
-    counts = np.bincount(labels[chosen], minlength=labels.max() + 1)
-    return chosen & (labels == counts.argmax())
+    corners = surface.faces[chosen[surface.faces].all(axis=1)]
+    ends = np.concatenate([corners[:, :2], corners[:, 1:]]).T  # two sides join all three
+    joined = sparse.coo_matrix((np.ones(ends.shape[1], bool), tuple(ends)), shape=2 * (len(chosen),))
+    _, labels = csgraph.connected_components(joined, directed=False)
+    return chosen & (labels == np.bincount(labels[chosen]).argmax())
 
 
 def _parted(surface: trimesh.Trimesh, chosen: Mask) -> Parted:

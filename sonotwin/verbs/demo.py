@@ -20,13 +20,14 @@ from rich.console import Console
 from recon.files.metrics import Metrics, shown
 from recon.tracking import networks
 from sonotwin import pipeline
+from sonotwin.config import load
 from sonotwin.demo_config import Config
-from sonotwin.demo_steps import Figures, commands, compared, verb_steps
+from sonotwin.demo_steps import Figures, commands, compared, fusing_fields, poses_of, tracked_film, verb_steps
 from sonotwin.pipeline import Step
-from sonotwin.verbs import surface
+from sonotwin.verbs import fuse, surface
 from twin.evaluation import sweep_errors
 from twin.evaluation.surface_errors import things
-from twin.reports import demo_report, sweep_report, track_report
+from twin.reports import demo_report, sweep_report
 
 OUTPUTS = (
     ("report.html", "this page"),
@@ -38,10 +39,19 @@ OUTPUTS = (
     ("tumours/", "what was found inside: a closed surface each, in mm"),
     ("probe/probe.yaml", "the calibration of the probe, with its covariance"),
     ("lag/lag.json", "the lag of the scanner behind the cameras"),
+    ("scene/scene.html", "all of it in one view that one can turn, with the probe and its B-scan along the sweep"),
+    ("scene/scene.glb, scene/slicer/", "the same as layers for any viewer, and a folder for 3D Slicer"),
+    (
+        "poses/",
+        "the probe's poses in each sweep's frames with their covariance, why some weren't found, and pictures",
+    ),
     ("track/", "the target's poses in the film with their covariance, why some weren't found, and pictures of all frames"),
     ("capture/", "the images, their manifest and the calibration, as a camera would have left them"),
     ("truth/", "what the images were rendered from: points, normals, projector coordinates, true calibration"),
-    ("sweep/, wires/, bottom/", "the B-scans and poses of the sweep, of crossed wires and of a flat bottom, and their truth"),
+    (
+        "sweep/, wires/, bottom/",
+        "B-scans and frames of the sweep, of crossed wires and of a flat bottom, and their truth",
+    ),
     ("film/", "frames of the moving target by both cameras, and their truth"),
     ("surface/points.npz", "the point of every pixel and its predicted sigma"),
     ("evaluation/error_map.png", "map of the errors"),
@@ -58,7 +68,7 @@ def run(config: Config) -> None:
         If a setting is wrong, the tracker's networks are missing, or `out` holds something else.
     """
     console = Console(soft_wrap=True, highlight=False)
-    if config.film_frames:
+    if config.looks_inside or config.film_frames:
         networks.load()  # before minutes of work
     steps = [each if isinstance(each, Step) else each.step() for each in verb_steps(config.out, config, config._overrides)]
     found = pipeline.play(
@@ -80,12 +90,14 @@ def telling_step(config: Config) -> Step:
         inside = None
         if config.looks_inside:
             findings, truth = compared(folder)
-            places = {name: folder / name for name in ("sweep", "bottom", "probe", "lag", "volume")}
+            places = {name: folder / name for name in ("probe", "lag", "volume")}
+            places |= {name: poses_of(folder, name) for name in ("sweep", "bottom")}
             inside = sweep_report.read(places, findings, truth)
-        tracked = track_report.read(folder / "film", folder / "track") if config.film_frames else None
+        tracked = tracked_film(folder, config.looks_inside) if config.looks_inside or config.film_frames else None
+        fused = fuse.read(load("fuse", fusing_fields(folder, config, config._overrides), fuse.Config)) if inside else None
         outputs = [(name, text) for name, text in OUTPUTS if (folder / name.partition(",")[0]).exists() or name == "report.html"]
         lines = commands(folder, config, config._overrides, inside.lag_s if inside else 0.0)
-        demo_report.write(folder / "report.html", story, dict(figures), outputs, lines, inside, tracked)
+        demo_report.write(folder / "report.html", story, dict(figures), outputs, lines, inside, tracked, fused)
         return {}
 
     return Step("report", "write the report", telling, ("report.html",))

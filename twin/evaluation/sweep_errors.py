@@ -34,6 +34,7 @@ from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
 
+SIGMAS = ("centre_sigma_mm", "volume_sigma_mm3", "depth_sigma_mm")  # of `sonotwin segment`, a mass each
 DICE_STEP_MM = 0.5  # of the grid on which volumes are laid over each other
 
 
@@ -197,6 +198,7 @@ def measure(findings: Sequence[Finding], truth: SweepTruth, segmented: Metrics) 
             **_figures_of(finding),
             "under_skin_mm": segmented.get(f"mass{finding.number}_depth_mm", np.nan),
             "inside": segmented.get(f"mass{finding.number}_inside", np.nan),
+            **{name: segmented.get(f"mass{finding.number}_{name}", np.nan) for name in SIGMAS},
         }
         metrics |= {f"{finding.name}_{name}": value for name, value in figures.items()}
     return metrics

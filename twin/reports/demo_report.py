@@ -14,6 +14,8 @@ from recon.capture.manifest import Manifest, read_manifest
 from recon.capture.surface_part import SurfaceCapture
 from recon.files import atomic
 from recon.files.metrics import Metrics, shown
+from recon.fusion import scene_page
+from recon.fusion.fused_scene import FusedScene
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Uniform
 from recon.reports import figures, page, space_views
 from recon.reports.figures import CYCLIC, DIVERGING, SEQUENTIAL, Scale
@@ -22,7 +24,7 @@ from recon.structured_light import decode
 from recon.structured_light.decode import ProjectorMap, Status
 from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import GROSS_MM, Comparison, Truth
-from twin.reports import sweep_report, track_report
+from twin.reports import chain_report, sweep_report, track_report
 from twin.reports.sweep_report import Inside
 from twin.reports.track_report import Tracked
 from twin.ultrasound.sweep_session import SUPPORTS
@@ -78,6 +80,7 @@ def write(
     commands: Sequence[str],
     inside: Inside | None = None,
     tracked: Tracked | None = None,
+    fused: FusedScene | None = None,
 ) -> None:
     """Write the report, one HTML file of about 8 MB that needs no other.
 
@@ -93,19 +96,23 @@ def write(
         What ultrasound adds.
     tracked : Tracked, optional
         What tracking adds.
+    fused : FusedScene, optional
+        All of it in one frame.
     """
     scanned, probe = [], []
     if inside is not None:
         scanned = [sweep_report.inside(inside, measurement.points, without_supports(measurement), metrics)]
         probe = [sweep_report.probe_and_clock(inside, metrics)]
+    whole = [] if fused is None else [scene_page.in_space(fused), *chain_report.sections(metrics)]
     sections = [
+        *whole,
         surface(measurement),
         *scanned,
         errors(measurement, metrics),
         images(measurement),
         decoding(measurement),
         *probe,
-        *([track_report.section(tracked, metrics)] if tracked is not None else []),
+        *([track_report.section(tracked, metrics, inside is not None)] if tracked is not None else []),
         beside_the_paper(metrics),
         settings(measurement, metrics),
         Section("Files, and how to make them again", [page.table(("file", "what is in it"), outputs), page.commands(commands)]),

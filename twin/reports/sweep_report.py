@@ -70,14 +70,14 @@ def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: Swe
 
     Parameters
     ----------
-    folders : of `sweep` and `bottom` (with capture/ and truth/), `probe`, `lag` and `volume`, by these names.
+    folders : captures of `sweep` and `bottom` with poses, and folders of `probe`, `lag` and `volume`, by these names.
 
     Raises
     ------
     InputError
         If one of them is missing or damaged.
     """
-    sweep = sweep_part.read_sweep(folders["sweep"] / "capture")
+    sweep = sweep_part.read_sweep(folders["sweep"])
     probe = probe_files.read(folders["probe"] / "probe.yaml")
     lag_s = float(json.loads((folders["lag"] / "lag.json").read_text(encoding="utf-8"))["lag_s"])
     rows = _rows(folders["lag"] / "depths.csv")
@@ -89,7 +89,7 @@ def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: Swe
         findings,
         expected,
         probe,
-        sweep_part.read_sweep(folders["bottom"] / "capture"),
+        sweep_part.read_sweep(folders["bottom"]),
         np.array([[float(row[name] or "nan") for name in ("depth_px", "residual_px")] for row in rows]),
         lag_s,
         told,

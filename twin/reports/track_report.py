@@ -26,6 +26,7 @@ NAMES = ("error", f"predicted: {100 * LEVEL:.0f} % lie below")
 class Tracked:
     """A film of n frames, its poses, and its truth."""
 
+    folder: Path  # of the poses
     errors: Errors
     truth: FilmTruth
     hows: tuple[str, ...]  # (n,) "" where the target was not found
@@ -48,7 +49,7 @@ def read(film: Path, track: Path) -> Tracked:
     if len(rows) != len(expected.times):
         raise InputError(f"{track / results.FRAMES}: expected {len(expected.times)} frames, found {len(rows)}")
     pictures = tuple(track / results.OVERLAYS / results.overlay_name(int(row["frame_cam1"])) for row in rows)
-    return Tracked(errors, expected, tuple(row["how"] for row in rows), tuple(row["reason"] for row in rows), pictures)
+    return Tracked(track, errors, expected, tuple(row["how"] for row in rows), tuple(row["reason"] for row in rows), pictures)
 
 
 def result(metrics: Metrics) -> str:
@@ -60,10 +61,15 @@ def result(metrics: Metrics) -> str:
     return f" The probe’s target was found in {seen}, off by {off} in the median."
 
 
-def section(story: Tracked, metrics: Metrics) -> Section:
-    """The tracker's frames, its errors, and the frames without a pose."""
+def section(story: Tracked, metrics: Metrics, swept: bool) -> Section:
+    """The tracker's frames, its errors, and the frames without a pose; of a sweep with B-scans, or of a film."""
     text = (
-        "A hand leads the target past the cameras, in light as dark as the real rig’s: slowly, then so fast that rims are "
+        "While the scanner records, both cameras see the board on the probe, held by a hand over the very phantom, in light as "
+        f"dark as the real rig’s; its circles move by up to {metrics['track_blur_most_px']:.1f} px in an exposure. Networks find "
+        "them; from then on their rims are fitted where the last poses let expect them. What the two views together don’t show "
+        "to be the target is not found, rather than found wrongly. A B-scan’s pose is taken between those of two frames."
+        if swept
+        else "A hand leads the target past the cameras, in light as dark as the real rig’s: slowly, then so fast that rims are "
         f"blurred by up to {metrics['track_blur_most_px']:.1f} px, then partly out of one camera’s view. Networks find its "
         "circles; from then on their rims are fitted where the last poses let expect them. What the two views "
         "together don’t show to be the target is not found, rather than found wrongly."
@@ -80,7 +86,7 @@ def section(story: Tracked, metrics: Metrics) -> Section:
         page.paragraph(text),
         page.grid([page.picture(*picture) for picture in pictures(story)], "two"),
         page.grid(drawings, "two"),
-        errors_table(metrics),
+        errors_table(metrics, "by the board" if swept and "point_sigma_mm" in metrics else "the true one here"),
         *failures(story),
     ]
     return Section("The tracker", blocks)
@@ -111,8 +117,8 @@ def chosen(errors: Errors, blur: np.ndarray) -> dict[int, str]:
     return frames
 
 
-def errors_table(metrics: Metrics) -> str:
-    """Detection rates and errors."""
+def errors_table(metrics: Metrics, calibrated: str) -> str:
+    """Detection rates and errors; calibrated : of the cameras, for the caption."""
     rows = []
     for what, kind, unit in (("Position of the target’s origin", "shift", "mm"), ("Orientation", "turn", "deg")):
         sign = "°" if unit == "deg" else " mm"
@@ -122,7 +128,7 @@ def errors_table(metrics: Metrics) -> str:
         f"Found: {metrics['track_found']} of {metrics['track_frames']} frames, and {metrics['track_visible_found']} of the "
         f"{metrics['track_visible']} that show all circles to both cameras; {metrics['track_false']} of them wrongly. "
         f"{100 * metrics['track_within_bound']:.0f} % of the errors lie below their {100 * LEVEL:.0f} % bounds. Predicted: one "
-        "standard deviation over all directions, the print known to its tolerance. The cameras’ calibration is the true one here."
+        f"standard deviation over all directions, the print known to its tolerance. The cameras’ calibration is {calibrated}."
     )
     return page.table(("", "predicted, median", "off by, median", "off by, 95th percentile"), rows, caption)
 

@@ -33,7 +33,7 @@ from twin.tracking.study_samples import CLEAN
 
 Array = NDArray[np.float64]
 
-BODIES, DRAWN = 2, 24  # bodies in a hand to choose from, and bodies that are drawn at most to have them
+BODIES, DRAWN = 2, 6  # bodies in a hand to choose from, and bodies that are drawn at most to have them
 AROUND = 0.1  # of the target's light, from all around, beside a projector in the dark
 
 

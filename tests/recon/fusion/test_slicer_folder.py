@@ -1,0 +1,114 @@
+"""Does 3D Slicer find everything where it was measured? Read with the formats' own libraries, turned to RAS as Slicer does."""
+
+import json
+import runpy
+import sys
+from types import SimpleNamespace
+
+import nrrd
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import trimesh
+
+from recon.files import volumes
+from recon.files.volumes import Volume
+from recon.freehand import sequences
+from recon.freehand.scans import Scans
+from recon.fusion import scene_page, slicer_folder
+from recon.fusion.fused_scene import FusedScene
+from recon.geometry import rigid
+from recon.model.probe import ProbeCalibration
+from recon.segmentation.mass_files import FoundMass
+
+RAS = np.array([-1, -1, 1.0])  # from LPS
+FIGURES = {"centre_sigma_mm": 0.21, "volume_sigma_mm3": 12.0, "depth_mm": 7.5, "depth_sigma_mm": 0.19}
+
+
+@pytest.fixture
+def scene(rig, rng) -> FusedScene:
+    probe = ProbeCalibration(rig.probe.target_from_image.matrix(), np.array(rig.probe.scale_mm_per_px))
+    poses = np.array([rigid.from_rotation_vector([0.2, -0.1, 1 + 0.01 * k], [10 + k, -20, 640]) for k in range(5)])
+    scans = Scans((40, 30), poses @ sequences.target_from_pixel(probe), lambda: iter(()), 1540, 1540, probe)
+    images = {k: rng.integers(0, 256, (40, 30), dtype=np.uint8) for k in (0, 2, 4)}
+    ball = trimesh.creation.icosphere(3, 5.0).apply_translation([10, -20, 660])
+    skin = trimesh.creation.icosphere(3, 50.0).apply_translation([0, 0, 690])
+    return FusedScene(images, scans, poses, rig.target, skin, None, {"mass0": FoundMass(ball, FIGURES)})
+
+
+@pytest.fixture
+def folder(scene, tmp_path):
+    volumes.write_volume(tmp_path / "volume.nrrd", Volume(np.zeros((3, 4, 5), np.uint8), np.array([1.0, 2, 3]), np.ones(3)))
+    slicer_folder.write(tmp_path / "slicer", scene, {"volume": tmp_path / "volume.nrrd"}, scans=2)
+    return tmp_path / "slicer"
+
+
+def test_everything_is_there(folder):
+    assert {path.name for path in folder.iterdir()} == {
+        "skin.ply", "mass0.ply", "path.ply", "volume.nrrd", "scan0000.nrrd", "scan0004.nrrd", "target_probe.ply",
+        "target_circles.ply", "target_to_world.tfm", "masses.mrk.json", "show.py", "README.txt",
+    }  # fmt: skip
+
+
+def test_a_b_scan_is_a_slice_where_it_was_taken(folder, scene):
+    """By ITK, as Slicer reads volumes: its pixel (u, v) has the grey level and the place that it was taken with."""
+    image = sitk.ReadImage(str(folder / "scan0004.nrrd"))
+    for u, v in ((0, 0), (29, 0), (7, 33)):
+        place = rigid.apply(scene.scans.world_from_pixel[4], np.array([u, v, 0.0]))
+        assert image.TransformIndexToPhysicalPoint((u, v, 0)) == pytest.approx(place, abs=1e-6)
+        assert image.GetPixel(u, v, 0) == scene.images[4][v, u]
+    _, header = nrrd.read(str(folder / "scan0004.nrrd"))
+    assert header["space"] == "left-posterior-superior"
+
+
+def test_the_probe_under_its_transform_is_where_its_array_met_the_skin(folder, scene):
+    """Slicer places a node by the inverse of ITK's transform; the face of the housing is the B-scan's first row."""
+    inverse = sitk.ReadTransform(str(folder / "target_to_world.tfm")).GetInverse()
+    probe = trimesh.load_mesh(folder / "target_probe.ply")
+    world = np.array([inverse.TransformPoint(vertex) for vertex in np.asarray(probe.vertices).tolist()])
+    matrix = scene.scans.world_from_pixel[2]
+    local = rigid.apply(np.linalg.inv(matrix), world)
+    below = local[:, 1] * np.linalg.norm(matrix[:3, 1])
+    assert below.max() == pytest.approx(0, abs=1e-3), "nothing of it reaches into the tissue"
+    at_face = local[np.abs(below) < 1e-3, 0]
+    assert at_face.min() < 0 and at_face.max() > 29
+
+
+def test_markups_lie_in_the_masses_and_hold_their_uncertainty(folder, scene):
+    (one,) = json.loads((folder / "masses.mrk.json").read_text())["markups"]
+    (point,) = one["controlPoints"]
+    model = trimesh.load_mesh(folder / "mass0.ply")
+    assert one["coordinateSystem"] == "LPS" and point["label"] == "mass0"
+    assert np.array(point["position"]) * RAS == pytest.approx(model.center_mass * RAS, abs=1e-3)
+    assert "± 0.21 mm" in point["description"] and "7.50 ± 0.19 mm below the skin" in point["description"]
+
+
+def test_the_script_loads_every_file_and_puts_the_probe_under_its_transform(folder, monkeypatch):
+    """In a stand-in for Slicer's Python, which notes what is asked of it."""
+    loaded, under = [], []
+
+    def load(path):
+        loaded.append(path.rpartition("/")[2])
+        display = SimpleNamespace(SetColor=lambda *colour: None, SetOpacity=lambda value: None)
+        placed = lambda node: under.append((loaded[-1], node))  # noqa: E731
+        return SimpleNamespace(GetDisplayNode=lambda: display, SetAndObserveTransformNodeID=placed, GetID=lambda: "transform")
+
+    util = SimpleNamespace(loadModel=load, loadVolume=load, loadTransform=load, loadMarkups=load)
+    monkeypatch.setitem(sys.modules, "slicer", SimpleNamespace(util=util))
+    runpy.run_path(str(folder / "show.py"))
+    assert set(loaded) == {path.name for path in folder.iterdir()} - {"show.py", "README.txt"}
+    assert under == [("target_circles.ply", "transform"), ("target_probe.ply", "transform")]
+
+
+def test_the_page_has_the_view_its_slider_and_the_masses(scene, tmp_path):
+    scene_page.write(tmp_path / "scene.html", scene, "a <title>")
+    page = (tmp_path / "scene.html").read_text(encoding="utf-8")
+    assert 'data-slide="scene"' in page and "7.50 ± 0.19" in page and "a &lt;title&gt;" in page
+    reel = scene_page.reel_of(scene)
+    assert [sheet.image is scene.images[k] for sheet, k in zip(map(reel.sheet_at, range(3)), (0, 2, 4), strict=True)] == [
+        True
+    ] * 3
+    low, high = reel.extent.min(axis=0), reel.extent.max(axis=0)
+    for k in range(3):
+        for body in reel.bodies_at(k):
+            assert (body.vertices > low - 1e-6).all() and (body.vertices < high + 1e-6).all()
