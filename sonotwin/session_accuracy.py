@@ -84,7 +84,7 @@ def code() -> str:
 
 def rows(conditions: str, found: Sequence[Metrics]) -> list[Row]:
     """Rows of some sessions: the worst of them, unless it says otherwise; NaN, which misses its bar, of what is missing."""
-    wider, name = WIDER[conditions], f"{conditions}, {len(found)} sessions"
+    wider, name = WIDER[conditions], f"{conditions}, {len(found)} session{'' if len(found) == 1 else 's'}"
     films = [f"{sweep}_track" for sweep in (WIRES, BOTTOM, SCAN)]
     seen = each(found, f"{SCAN}_track_visible") / each(found, f"{SCAN}_track_frames")
     tracked = np.array([each(found, f"{film}_visible_found") / each(found, f"{film}_visible") for film in films])
@@ -95,6 +95,10 @@ def rows(conditions: str, found: Sequence[Metrics]) -> list[Row]:
     centres = np.array([each(found, f"{name}_centre_error_mm") for name in names])
     volumes = np.array([each(found, f"{name}_volume_mm3") / each(found, f"{name}_true_volume_mm3") - 1 for name in names])
     depths = np.array([each(found, f"{name}_under_skin_mm") - each(found, f"{name}_true_under_skin_mm") for name in names])
+    placed = each(found, f"{SCAN}_placement_over_sigma")
+    sigmas = np.array([each(found, f"{name}_centre_sigma_mm") for name in names])
+    deep = np.array([each(found, f"{name}_depth_sigma_mm") for name in names])
+    swollen = np.array([each(found, f"{name}_volume_sigma_mm3") / each(found, f"{name}_true_volume_mm3") for name in names])
     contact, lag = each(found, f"{SCAN}_contact_bias_mm"), each(found, f"{SCAN}_lag_error_ms")
     shift, turn = each(found, f"{SCAN}_track_shift_median_mm"), each(found, f"{SCAN}_track_turn_median_deg")
     covered = 100 * each(found, f"{SCAN}_lag_covered").mean()
@@ -112,9 +116,18 @@ def rows(conditions: str, found: Sequence[Metrics]) -> list[Row]:
         Row("f", f"{name}: tumours' centres", np.max(centres, initial=0.0), 0.35 * wider, None, "mm"),
         Row("f", f"{name}: tumours' volumes", 100 * np.max(np.abs(volumes), initial=0.0), 6.0 * wider, None, "%"),
         Row("f", f"{name}: least tissue over tumours", np.max(np.abs(depths), initial=0.0), 0.25 * wider, None, "mm"),
+        Row("s", f"{name}: places of pixels over their predicted sigma, RMS", rms(placed), None, 1.0, ""),
+        Row("s", f"{name}: tumours' centres over their predicted sigma, RMS", rms(centres / sigmas), None, 1.0, ""),
+        Row("s", f"{name}: tumours' volumes over theirs, RMS", rms(volumes / swollen), None, 1.0, ""),
+        Row("s", f"{name}: least tissue over tumours over its, RMS", rms(depths / deep), None, 1.0, ""),
         Row("g", f"{name}: array's face from the skin by light, mean", abs(contact.mean()), 0.05 * wider, None, "mm"),
         Row("g", f"{name}: the same, worst", np.abs(contact).max(), None, None, "mm"),
     ]  # fmt: skip
+
+
+def rms(values: Array) -> float:
+    """Root mean square; NaN of none."""
+    return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("nan")
 
 
 def each(found: Sequence[Metrics], figure: str) -> Array:

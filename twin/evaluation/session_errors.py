@@ -11,8 +11,9 @@ from recon.capture import manifest, probe_files, sweep_part
 from recon.capture.manifest import CAMERAS, SCANNER
 from recon.files import metrics
 from recon.files.metrics import Metrics
-from recon.freehand import sequences
-from recon.probe_calibration import sound_in_water
+from recon.freehand import place_uncertainty
+from recon.freehand import scans as freehand_scans
+from recon.freehand.scans import Scans, Unsure
 from recon.probe_calibration.repeatability import five_points
 from twin.evaluation import sweep_errors, track_errors
 from twin.evaluation.sweep_errors import SweepTruth
@@ -53,9 +54,8 @@ def inside(result: Path, truth: Path, name: str) -> Metrics:
     probe = probe_files.read(result / "probe" / "probe.yaml")
     error, sigma = sweep_errors.probe_errors(probe, true, five_points(true.transducer.image_size))
     sweep = sweep_part.read_sweep(result / "poses" / name, name)
-    shown = sweep.poses(lag["lag_s"]) @ sequences.target_from_pixel(
-        sound_in_water.for_tissue(probe, true.transducer.assumed_speed)
-    )
+    scans = freehand_scans.of_sweep(sweep, probe, lag["lag_s"], true.transducer.assumed_speed, Unsure(lag["sigma_s"]))
+    shown, apart = scans.world_from_pixel, sweep_errors.placement(scans.world_from_pixel, true)
     folder = result / "masses" / name
     found = metrics.read(folder / metrics.FILE)
     meshes = [trimesh.load_mesh(folder / f"mass{number}.ply", process=False) for number in range(int(found["masses"]))]
@@ -64,11 +64,19 @@ def inside(result: Path, truth: Path, name: str) -> Metrics:
         "lag_covered": float(lag["interval_s"][0] <= true.lag_s <= lag["interval_s"][1]),
         "probe_worst_error_mm": float(error.max()),
         "probe_worst_sigma_mm": float(sigma[error.argmax()]),
-        "placement_rms_mm": float(np.sqrt(np.nanmean(sweep_errors.placement(shown, true) ** 2))),
+        "placement_rms_mm": float(np.sqrt(np.nanmean(apart**2))),
+        "placement_over_sigma": float(np.sqrt(np.nanmean((apart / place_sigmas(scans)) ** 2))),
         **sweep_errors.measure(sweep_errors.compare(meshes, true), true, found),
     }
     skin = result / "surface" / "surface.ply"
     return figures | ({"contact_bias_mm": contact_bias(shown, true, skin)} if skin.is_file() else {})
+
+
+def place_sigmas(scans: Scans) -> Array:
+    """Predicted standard deviations : (n, 5) mm of the places of centre and corners of each B-scan."""
+    assert scans.probe is not None and scans.errors is not None
+    forms = place_uncertainty.forms(scans.world_from_pixel, scans.probe, scans.errors)
+    return place_uncertainty.sigmas(forms, five_points(scans.shape[::-1]))
 
 
 def contact_bias(world_from_pixel: Array, true: SweepTruth, surface: Path) -> float:
