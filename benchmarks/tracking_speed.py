@@ -17,14 +17,19 @@ from recon.model.rig import Rig
 from recon.tracking import networks as nets
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
-from sonotwin.config import folder
+from scenes.catalogue import build_scene
+from sonotwin.config import folder, load
+from sonotwin.verbs import sweep
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.accuracy.tracking_frames import study
 from twin.shooting import Quality
+from twin.tracking import film_session, scene_frames
 from twin.tracking.mesh_bank import build_bank
-from twin.tracking.rendered_views import render_views
+from twin.tracking.rendered_views import render_full, render_views
 from twin.tracking.samples import draw
 from twin.tracking.sampling_ranges import DataRanges
+from twin.ultrasound import sweep_session
+from twin.ultrasound.echo_solids import at_speeds, body
 
 FRAMES, REPEATS = 4, 12
 BATCHES, BATCH = 8, 5
@@ -32,7 +37,7 @@ BATCHES, BATCH = 8, 5
 
 def measurements() -> list[Measurement]:
     """The rows of the group."""
-    return [tracked, published_shape, rendered]
+    return [tracked, published_shape, rendered, filmed]
 
 
 def settings() -> tuple[Rig, DataRanges]:
@@ -144,6 +149,28 @@ def eager(detector: str, segmenter: str) -> Networks:
             return modules[1](torch.from_numpy(patches)[:, None]).numpy()[:, 0]
 
     return Eager()
+
+
+def filmed() -> list[Row]:
+    """Row j: pairs of whole frames of a sweep over the breast a second, beside frames of which every pixel is rendered."""
+    fields = ["scene=breast", "path=raster", "filmed=true", "clocks.camera_hz=8", "name=scan", "out=unused"]
+    config = load("sweep", fields, sweep.Config)
+    scene = build_scene(config.scene)
+    scanned, seed = at_speeds(body(scene), config.conditions.sound, config.seed), config.own_seed
+    path, rig, scanner = config.path, config.rig, config.ultrasound
+    planned = sweep_session.plan_sweep(path, rig, scanned, scanner, config.clocks, config.pose_noise, seed)
+    led = scene_frames.motions(*[planned.target.poses(late) for late in (0.0, -0.005, 0.005)])
+    bank = scene_frames.make_bank(scene, rig, led, config.seed)
+    made = scene_frames.takes(bank, rig, settings()[1], config.frames, led, seed)
+    list(film_session.shoot(bank, rig, made[:BATCH], config.frames.quality, seed))
+    start = perf_counter()
+    list(film_session.shoot(bank, rig, made, config.frames.quality, seed))
+    seconds = (perf_counter() - start) / len(made)
+    whole = median_of(lambda: render_full(bank, rig, made[:1], Quality(window=2), seed), 1)
+    return [
+        Row("j", f"pairs of 1280x1024 frames of a sweep, {len(made)} of them", 1 / seconds, 3, None, "1/s", at_least=True),
+        Row("j", "times faster than two rays in every pixel", whole / seconds, 4, None, "x", at_least=True),
+    ]
 
 
 def rendered() -> list[Row]:

@@ -2,11 +2,11 @@
 
 Reads the same choices from conf/ as `sonotwin render`, `sonotwin sweep` and `sonotwin film`. Writes into the folder `out`:
 report.html and calibration/calibration.html (open them in a browser; they need no network), surface.ply (mm), surface.glb
-(metres, y up), metrics.json; of scenes with tumours volume/volume.nrrd and tumours/; track/, the tracker's poses in a film; the
-captures and their truth, and the folders of the steps between. Takes two to four minutes on two cores, half of that without
-ultrasound (path=none), and less than a minute less without the film (film_frames=0); the first run ever also compiles, for one or
-two. The board's images are kept and used again by all demonstrations of the same rig. A run that was interrupted is simply
-started again.
+(metres, y up), metrics.json; of scenes with tumours volume/, tumours/ and scene/, with poses/ of the probe in the frames of each
+sweep, of others track/, the tracker's poses in a film; the captures and their truth, and the folders of the steps between. Takes
+four to six minutes on two cores, half of that without ultrasound (path=none), and less without the film (film_frames=0); the
+first run ever also compiles, for one or two. The board's images are kept and used again by all demonstrations of the same rig. A
+run that was interrupted is simply started again.
 
     sonotwin demo
     sonotwin demo poses=paper path=none

@@ -13,7 +13,7 @@ from recon.probe_calibration.repeatability import five_points
 from sonotwin.cli import main
 from twin.evaluation import session_errors, sweep_errors, track_errors
 
-COARSE = ["filmed=true", "frames.quality.window=2", "frames.quality.patch=2"]
+COARSE = ["filmed=true", "frames.quality.disc=1", "frames.quality.rim=4"]
 
 
 @pytest.fixture(scope="module")

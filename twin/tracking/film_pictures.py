@@ -121,7 +121,7 @@ def film_picture(
     """Layers for a take's frame by one camera, which exposes later by a share of the exposure."""
     size = device.optics.size
     whole = Cells((0, 0), size, CELL_PX, quality.view, 0)
-    near = about_target(take, device, late, target)
+    near = about_target(take, device, late, target) if take.present else None
     if near is None:
         return FilmPicture(size, [whole])
     first, extent = near

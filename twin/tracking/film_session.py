@@ -38,7 +38,7 @@ STILL = conditions.Motion()
 BODIES = 4  # of which the one is taken whose fingers and cable cover least of the circles
 LOOKS = 8  # frames in which that is looked at
 NEAREST_MM = 100.0  # of a circle before a camera, along its axis
-BATCH = 3  # frames traced in one launch; doesn't change them
+BATCH = 6  # frames traced in one launch; doesn't change them
 
 Views = tuple[ViewTruth, ViewTruth]
 

@@ -11,10 +11,10 @@ PATTERNS = Path(__file__).resolve().parents[3] / "conf" / "patterns" / "paper_su
 
 
 def test_a_disturbed_plane_is_as_good_as_a_steady_one(rig, monkeypatch):
-    """Two of the ten planes, with the bars of all; without corrections their errors are 1.3 and 2.1 times as large."""
+    """Three planes twice, with the bars of all; without corrections their errors are 1.3 and 2.1 times as large."""
     monkeypatch.setattr(reality_accuracy, "SEEDS", range(102, 104))
     setup = Setup(rig, {"paper_surface": read_patterns(PATTERNS)})
-    rows = reality_accuracy.compared(setup, "planes", [plane.build(pose) for pose in plane.PAPER_POSES], "plane_plate_rms_mm")
+    rows = reality_accuracy.compared(setup, "planes", [plane.build(pose) for pose in plane.PAPER_POSES[:3]], "plane_plate_rms_mm")
     assert len(rows) == 5
     assert all(row.ok for row in rows), rows
 
