@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -17,21 +18,28 @@ from pydantic import BaseModel
 from recon.capture import probe_files, sweep_part
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
-from recon.freehand import sequences
-from recon.probe_calibration import sound_in_water
+from recon.freehand import scans as freehand_scans
+from recon.freehand.scans import Unsure
 from recon.probe_calibration.repeatability import five_points
 from sonotwin.config import load
 from sonotwin.demo_config import BOARD_PATTERNS, CALIBRATION, WATER_C, Config
 from sonotwin.pipeline import Step
 from sonotwin.verbs import calibrate_optics, calibrate_probe, film, measure_lag, render, sweep, track
-from twin.evaluation import sweep_errors, track_errors
+from twin.evaluation import session_errors, sweep_errors, track_errors
 from twin.reports import track_report
 
 Figures = Mapping[str, float | int]
 
 MESHES = ("surface.ply", "surface.glb")
 RESTING = ("filmed=true", "clocks.camera_hz=5")  # the probe is held still for each B-scan of the wires
-LAG = "lag_s=MEASURED"  # stands for the lag that an earlier step measured
+LAG, LAG_SIGMA = "lag_s=MEASURED", "lag_sigma_s=MEASURED"  # stand for what an earlier step measured
+
+
+class Lag(NamedTuple):
+    """The scanner's lag that was measured, and its standard deviation, s."""
+
+    lag_s: float
+    sigma_s: float
 
 
 @dataclass(frozen=True)
@@ -46,25 +54,26 @@ class VerbStep:
     makes: Sequence[str] = ()  # files and folders at the top of the folder
     refines: Sequence[str] = ()  # figures of earlier steps that it measures better
 
-    def words(self, lag_s: float) -> list[str]:
+    def words(self, lag: Lag | None) -> list[str]:
         """The command line after `sonotwin`."""
-        return [self.verb, *(f"lag_s={lag_s:.15g}" if each == LAG else each for each in self.fields)]
+        told = {} if lag is None else {LAG: f"lag_s={lag.lag_s:.15g}", LAG_SIGMA: f"lag_sigma_s={lag.sigma_s:.15g}"}
+        return [self.verb, *(told.get(each, each) for each in self.fields)]
 
     def step(self) -> Step:
         """The step for `pipeline.play`."""
         return Step(self.name, self.does, self._work, self.makes, self.refines)
 
     def _work(self, folder: Path, _: Figures) -> Figures:
-        verb, *fields = self.words(measured_lag(folder) if LAG in self.fields else np.nan)
+        verb, *fields = self.words(measured_lag(folder) if LAG in self.fields else None)
         module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
         module.run(load(verb, fields, module.Config))
         return self.figures(folder)
 
 
-def commands(folder: Path, config: Config, overrides: Sequence[str], lag_s: float) -> list[str]:
+def commands(folder: Path, config: Config, overrides: Sequence[str], lag: Lag | None) -> list[str]:
     """The command lines that do the same at once and step by step, with the settings that `sonotwin demo` was given."""
     at_once = ["demo", *_given(overrides), f"out={folder}"]
-    lines = [at_once, *(step.words(lag_s) for step in verb_steps(folder, config, overrides) if isinstance(step, VerbStep))]
+    lines = [at_once, *(step.words(lag) for step in verb_steps(folder, config, overrides) if isinstance(step, VerbStep))]
     return [shlex.join(["sonotwin", *line]) for line in lines]
 
 
@@ -137,6 +146,7 @@ def sweep_steps(folder: Path, config: Config, given: Sequence[str]) -> list[Verb
     bottom = ["scene=tank", "path=bob", f"path.seconds={config.bottom_s:.15g}", *tank, *filmed, f"out={folder / 'bottom'}"]
     timing = [f"capture={poses_of(folder, 'bottom')}", f"out={folder / 'lag'}"]
     sweeping = [*path, *_of(given, sweep.Config), *filmed, f"out={folder / 'sweep'}"]
+    filling = [*placed, LAG_SIGMA, f"out={folder / 'volume'}"]
     skin = f"surface={folder / 'surface' / 'surface.ply'}"
     fusing = [*rig, *placed, skin, *_optics(folder, config), f"masses={folder / 'tumours'}", f"volume={folder / 'volume'}"]
     return [
@@ -148,8 +158,8 @@ def sweep_steps(folder: Path, config: Config, given: Sequence[str]) -> list[Verb
         VerbStep("lag", "measure the scanner's lag behind the cameras", "measure-lag", timing, _named("lag"), ("lag",)),
         VerbStep("sweep", "render a sweep over the scene: B-scans, frames, and their truth", "sweep", sweeping),
         _tracking(folder, config, rig, "sweep", "track the probe through the sweep, and compare with the truth"),
-        VerbStep("volume", "put its B-scans into a volume", "freehand", [*placed, f"out={folder / 'volume'}"], _named("volume")),
-        VerbStep("tumours", "find tumours in its B-scans", "segment", [*placed, skin, f"out={folder / 'tumours'}"]),
+        VerbStep("volume", "put its B-scans into a volume", "freehand", filling, _named("volume")),
+        VerbStep("tumours", "find tumours in its B-scans", "segment", [*placed, LAG_SIGMA, skin, f"out={folder / 'tumours'}"]),
         VerbStep("scene", "put all of it into one picture", "fuse", [*fusing, f"out={folder / 'scene'}"]),
         Step("compare", "compare it with the truth", lambda folder, _: tumour_errors(folder)),
     ]
@@ -203,14 +213,15 @@ def film_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbS
 def tumour_errors(folder: Path) -> Metrics:
     """Figures of the tumours found against the true ones, and of where the sweep's pixels are put."""
     findings, truth = compared(folder)
-    captured = sweep_part.read_sweep(poses_of(folder, "sweep"))
+    captured, lag = sweep_part.read_sweep(poses_of(folder, "sweep")), measured_lag(folder)
     calibration = probe_files.read(folder / "probe" / calibrate_probe.PROBE)
-    shown = sequences.target_from_pixel(sound_in_water.for_tissue(calibration, truth.transducer.assumed_speed))
-    apart = sweep_errors.placement(captured.poses(measured_lag(folder)) @ shown, truth)
+    scans = freehand_scans.of_sweep(captured, calibration, lag.lag_s, truth.transducer.assumed_speed, Unsure(lag.sigma_s))
+    apart, sigmas = sweep_errors.placement(scans.world_from_pixel, truth), session_errors.place_sigmas(scans)
     error, sigma = sweep_errors.probe_errors(calibration, truth, five_points(truth.transducer.image_size))
     figures = sweep_errors.measure(findings, truth, metrics.read(folder / "tumours" / metrics.FILE))
     return figures | {
         "sweep_placement_rms_mm": float(np.sqrt(np.nanmean(apart**2))),
+        "sweep_placement_sigma_mm": float(np.sqrt(np.nanmean(sigmas**2))),
         "probe_worst_mm": float(error.max()),
         "probe_worst_sigma_mm": float(sigma[error.argmax()]),
         "lag_true_ms": 1e3 * truth.lag_s,
@@ -225,9 +236,10 @@ def compared(folder: Path) -> tuple[list[sweep_errors.Finding], sweep_errors.Swe
     return sweep_errors.compare(found, truth), truth
 
 
-def measured_lag(folder: Path) -> float:
-    """The scanner's lag, s, as a step before measured it."""
-    return json.loads((folder / "lag" / measure_lag.LAG).read_text(encoding="utf-8"))["lag_s"]
+def measured_lag(folder: Path) -> Lag:
+    """The scanner's lag, as a step before measured it."""
+    found = json.loads((folder / "lag" / measure_lag.LAG).read_text(encoding="utf-8"))
+    return Lag(found["lag_s"], found["sigma_s"])
 
 
 def _figures(part: str) -> Callable[[Path], Metrics]:

@@ -20,6 +20,7 @@ from recon.files import atomic, metrics
 from sonotwin.config import load
 
 RECORD = "reconstruct.json"  # by which the folder of all steps is known
+RESULTS = 2  # number of what verbs leave in their folders; another one does all steps anew
 
 
 @dataclass
@@ -72,7 +73,7 @@ class KeptSteps:
         module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
         try:
             config = load(verb, [*fields, f"out={place}"], module.Config)
-            digest = digest_of([version("sonotwin"), verb, config.model_dump(mode="json", exclude={"out"}), made_of])
+            digest = digest_of([version("sonotwin"), RESULTS, verb, config.model_dump(mode="json", exclude={"out"}), made_of])
             if self.record.get(name) == digest and all((place / file).is_file() for file in (*files, metrics.FILE)):
                 self.say(f"kept        {name}: {does}, as before")
                 self.done.append(name)

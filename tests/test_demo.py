@@ -15,7 +15,7 @@ from recon.tracking import networks
 from sonotwin import pipeline
 from sonotwin.cli import main
 from sonotwin.config import compose, load
-from sonotwin.demo_steps import VerbStep, verb_steps
+from sonotwin.demo_steps import Lag, VerbStep, verb_steps
 from sonotwin.pipeline import Step
 from sonotwin.verbs import sweep
 from sonotwin.verbs.demo import Config, commands, followed, looked_inside
@@ -132,7 +132,7 @@ def test_the_tank_is_seen_by_the_scanner_of_the_sweep():
     config = load("demo", COARSE, Config)
     steps = {step.name: step for step in verb_steps(Path("outputs/demo"), config, COARSE[:2]) if isinstance(step, VerbStep)}
     for name in ("wires", "bottom"):
-        verb, *fields = steps[name].words(0.0)
+        verb, *fields = steps[name].words(None)
         assert load(verb, fields, sweep.Config).ultrasound.image_size == (161, 272)
 
 
@@ -228,7 +228,7 @@ def test_other_peoples_files_are_left_alone(tmp_path):
 def test_the_report_repeats_the_settings_that_were_given(tmp_path):
     overrides = ["scene=sphere", "out=elsewhere", "poses=paper"]
     config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
-    lines = commands(tmp_path / "a b", config, overrides, 0.0)
+    lines = commands(tmp_path / "a b", config, overrides, None)
     verbs = ["demo", "render", "calibrate-optics", "render", "surface", "evaluate", "film", "track"]  # a sphere hides nothing
     assert [re.split(r"\s", line)[1] for line in lines] == verbs
     assert "scene=sphere" in lines[0] and "scene=sphere" in lines[3] and "elsewhere" not in "".join(lines)
@@ -240,7 +240,7 @@ def test_without_poses_nothing_is_calibrated(tmp_path):
     fields = ["poses=none", "path=none", "film_frames=0"]
     config = Config.model_validate(compose("demo", fields), context={"overrides": []})
     assert config.poses is None
-    lines = commands(tmp_path, config, [], 0.0)
+    lines = commands(tmp_path, config, [], None)
     assert [re.split(r"\s", line)[1] for line in lines] == ["demo", "render", "surface", "evaluate"]
 
 
@@ -248,7 +248,7 @@ def test_the_commands_of_the_sweep_are_those_of_the_verbs(tmp_path):
     """Each has the settings that its verb knows, and passes its verb's own checks."""
     overrides = ["poses=none", "clocks.lag_s=0.08", "scene.edge_mm=1.5", "engine.samples=4", f"board={tmp_path}", *COARSE]
     config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
-    lines = [shlex.split(line)[1:] for line in commands(tmp_path, config, overrides, 0.0503)]
+    lines = [shlex.split(line)[1:] for line in commands(tmp_path, config, overrides, Lag(0.0503, 0.001))]
     verbs = [line[0] for line in lines]
     inside = ["sweep", "track", "calibrate-probe", "sweep", "track", "measure-lag", "sweep", "track"]
     assert verbs == ["demo", "render", "surface", "evaluate", *inside, "freehand", "segment", "fuse"]
@@ -258,6 +258,7 @@ def test_the_commands_of_the_sweep_are_those_of_the_verbs(tmp_path):
     assert all("tissue_m_s=1450" in line for line in lines[-3:]), "volume, masses and picture at one speed"
     assert all("filmed=true" in line for line in lines if line[0] == "sweep"), "poses are found in frames"
     assert all(f"capture={tmp_path}/poses/sweep" in line and "lag_s=0.0503" in line for line in lines[-3:])
+    assert all("lag_sigma_s=0.001" in line for line in lines[-3:-1])
     assert "path=raster" in lines[10] and "clocks.lag_s=0.08" in lines[10] and "clocks.camera_hz=16" in lines[10]
 
 
@@ -276,7 +277,7 @@ def test_each_verb_gets_the_demonstrations_settings(overrides, tmp_path):
     for step in verb_steps(tmp_path, config, overrides):
         if not isinstance(step, VerbStep):
             continue
-        verb, *fields = step.words(0.05)
+        verb, *fields = step.words(Lag(0.05, 0.001))
         model = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}").Config
         given = load(verb, fields, model)
         shared = set(model.model_fields) & set(Config.model_fields) - own.get(step.name, {"out"})

@@ -41,5 +41,5 @@ def read_grey(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uin
         raise InputError(f"{path}: expected 8 bits a pixel, found {8 * image.dtype.itemsize}")
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     if size is not None and grey.shape != size[::-1]:
-        raise InputError(f"{path}: expected {size[0]}x{size[1]} like the first image, found {grey.shape[1]}x{grey.shape[0]}")
+        raise InputError(f"{path}: expected {size[0]}x{size[1]} as of its camera, found {grey.shape[1]}x{grey.shape[0]}")
     return grey

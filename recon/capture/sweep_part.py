@@ -67,22 +67,21 @@ class SweepCapture:
 
         A pose between two others shares the errors of both, taken as independent: halfway its variance is half of theirs.
         """
-        return self._between_poses(self.track.covariance, lag_s, 2)
+        covariance = self.track.covariance
+        if covariance is None or self.track.found.sum() < 2:
+            return None
+        return np.einsum("nm,mij->nij", self.pose_shares(lag_s) ** 2, covariance[self.track.found])
 
     def shared_covariance(self, lag_s: float = 0.0) -> Array | None:
         """Covariance : (n, 6, 6) of what errs alike in all these poses; NaN where there is none. None if the track has none."""
-        return self._between_poses(self.track.shared, lag_s, 1)
-
-    def _between_poses(self, covariance: Array | None, lag_s: float, power: int) -> Array | None:
-        """Covariances of the poses before and after each B-scan, weighed by powers of their shares."""
-        if covariance is None or self.track.found.sum() < 2:
+        shared = self.track.shared
+        if shared is None or self.track.found.sum() < 2:
             return None
-        moments, known = self.track.times[self.track.found], covariance[self.track.found]
-        wanted = self.times - round(lag_s * 1e9)
-        after = np.clip(np.searchsorted(moments, wanted), 1, len(moments) - 1)
-        share = ((wanted - moments[after - 1]) / (moments[after] - moments[after - 1]))[:, None, None]
-        weighed = (1 - share) ** power * known[after - 1] + share**power * known[after]
-        return np.where((share >= 0) & (share <= 1), weighed, np.nan)
+        return np.einsum("nm,mij->nij", self.pose_shares(lag_s), shared[self.track.found])
+
+    def pose_shares(self, lag_s: float = 0.0) -> Array:
+        """Weights : (n, m) of the m poses that were found in those of the n B-scans; see `recon.model.tracks.shares_at`."""
+        return tracks.shares_at(self.track, self.times, lag_s)
 
 
 def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None) -> SweepCapture:

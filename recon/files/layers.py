@@ -20,6 +20,9 @@ def write_layers(path: Path, layers: Mapping[str, trimesh.Trimesh]) -> None:
     for name, mesh in layers.items():
         turned = mesh.copy()
         turned.apply_transform(GLTF_FROM_WORLD)
+        if isinstance(mesh.visual, TextureVisuals) and isinstance(turned.visual, TextureVisuals):
+            for key, values in mesh.visual.vertex_attributes.items():  # which a copy leaves out
+                turned.visual.vertex_attributes[key] = values
         scene.add_geometry(turned, node_name=name, geom_name=name)
     with atomic.new_file(path) as temporary:
         temporary.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True))

@@ -7,21 +7,53 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.visual import ColorVisuals
 
+from recon.errors import InputError
 from recon.files import atomic
 
 # glTF is in metres with y up and the front towards +z; a camera's frame is in mm with y down and z away from it
+LUMA = np.array([0.299, 0.587, 0.114])  # BT.601
+PLACED = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha")  # of a vertex, for which meshes have their own places
 GLTF_FROM_WORLD = np.diag([0.001, -0.001, -0.001, 1.0])
 
 
 def greys_of(mesh: trimesh.Trimesh) -> NDArray[np.uint8] | None:
     """Grey levels : (n,) of the vertices; None where they have none."""
     visual = mesh.visual
-    return np.asarray(visual.vertex_colors)[:, 0] if isinstance(visual, ColorVisuals) and visual.kind == "vertex" else None
+    if not (isinstance(visual, ColorVisuals) and visual.kind == "vertex"):
+        return None
+    return np.uint8(np.rint(np.asarray(visual.vertex_colors)[:, :3] @ LUMA))
 
 
 def set_greys(mesh: trimesh.Trimesh, greys: NDArray[np.uint8]) -> None:
     """Give the vertices grey levels : (n,)."""
     mesh.visual = ColorVisuals(mesh, vertex_colors=np.column_stack([greys, greys, greys, np.full_like(greys, 255)]))
+
+
+def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
+    """Read triangles from PLY, as `write_ply` leaves them; every number a vertex beside place and normal is a vertex attribute.
+
+    expected : what the file is to be, for messages
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, of another kind, or holds no triangles.
+    """
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path}: expected {expected} as PLY, found {path.suffix or 'no suffix'}")
+    if not path.is_file():
+        raise InputError(f"{path}: expected {expected} as PLY, found none")
+    try:
+        mesh = trimesh.load(path, file_type="ply", process=False)
+    except (ValueError, IndexError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: expected {expected} as PLY, found a damaged one: {error}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{path}: expected {expected} of triangles, found none in it")
+    stored = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    names = getattr(getattr(stored, "dtype", None), "names", None) or ()
+    for name in (name for name in names if name not in PLACED):
+        mesh.vertex_attributes[name] = np.asarray(stored[name], float).ravel()
+    return mesh
 
 
 def write_ply(path: Path, mesh: trimesh.Trimesh) -> None:

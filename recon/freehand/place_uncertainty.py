@@ -26,13 +26,20 @@ COLUMNS = (3, 0, 1)  # of a matrix from pixels: the origin, u, v
 
 @dataclass(frozen=True)
 class PlaceErrors:
-    """Standard deviations and covariances of what places n B-scans. What isn't known counts as exact."""
+    """Standard deviations and covariances of what places n B-scans, by m poses of a track."""
 
-    own: Array  # (n, 6, 6) of each pose, by the noise of its pair, as in recon.model.tracks
-    shared: Array  # (n, 6, 6) of each pose, by what errs alike in all of them
+    poses: Array  # (m, 6, 6) of each pose, by the noise of its pair, as in recon.model.tracks
+    shares: Array  # (n, m) of the poses in those of the B-scans
+    shared: Array  # (n, 6, 6) of the B-scans' poses, by what errs alike in all of them
     rates: Array  # (n, 4, 4) mm/s, of world_from_pixel
     lag_s: float = 0.0  # of the latency
     depth: float = 0.0  # of the ratio of all depths, by the speed of sound in the tissue
+    known: bool = True  # whether the track had a covariance; without one its poses count as exact
+
+    @property
+    def own(self) -> Array:
+        """Covariance : (n, 6, 6) of the B-scans' poses by the noise of those that they lie between."""
+        return np.einsum("nm,mij->nij", self.shares**2, self.poses)
 
 
 def forms(world_from_pixel: Array, probe: ProbeCalibration, errors: PlaceErrors) -> Array:
@@ -91,7 +98,8 @@ def sigmas(form: Array, pixels: Array) -> Array:
 
 
 def sigma_volume(form: Array, world_from_pixel: Array, shape: tuple[int, int], grid: Grid, clip: Clip | None = None) -> Volume:
-    """Root mean square of the standard deviations of all pixels in a voxel, mm, float32; 0 in voxels that none falls into.
+    """Root mean square of the standard deviations of all pixels in a voxel, mm, float32; 0 in voxels that none falls into, filled
+    holes among them.
 
     Parameters
     ----------
@@ -106,8 +114,8 @@ def sigma_volume(form: Array, world_from_pixel: Array, shape: tuple[int, int], g
     for one, matrix in zip(form, voxel_from_world @ world_from_pixel, strict=True):
         if np.isfinite(one).all() and np.isfinite(matrix).all():
             _paste_variance(one, bounds, matrix, sums)
-    voxels = np.sqrt(sums.value / np.maximum(sums.weight, 1))
-    return Volume(voxels, grid.origin, grid.spacing, grid.directions)
+    np.divide(sums.value, sums.weight, out=sums.value, where=sums.weight > 0)
+    return Volume(np.sqrt(sums.value, out=sums.value), grid.origin, grid.spacing, grid.directions)
 
 
 @njit

@@ -73,10 +73,16 @@ def of_sweep(
     """Place the B-scans of a capture in the world, with depths as of the tissue's speed of sound, if it is given."""
     converted = sound_in_water.for_tissue(probe, tissue_m_s)
     target_from_pixel, unsure = sequences.target_from_pixel(converted), sigmas or Unsure()
-    exact = np.zeros((len(sweep.paths), 6, 6))
-    own, shared = (exact if found is None else found for found in (sweep.pose_covariance(lag_s), sweep.shared_covariance(lag_s)))
-    rates = _rates(sweep, lag_s) @ target_from_pixel
-    errors = PlaceErrors(own, shared, rates, unsure.lag_s, unsure.tissue_m_s / converted.speed_m_s)
+    covariance, shared, found = sweep.track.covariance, sweep.shared_covariance(lag_s), sweep.track.found
+    errors = PlaceErrors(
+        np.zeros((found.sum(), 6, 6)) if covariance is None else covariance[found],
+        sweep.pose_shares(lag_s),
+        np.zeros((len(sweep.paths), 6, 6)) if shared is None else shared,
+        _rates(sweep, lag_s) @ target_from_pixel,
+        unsure.lag_s,
+        unsure.tissue_m_s / converted.speed_m_s,
+        covariance is not None,
+    )
     placed = sweep.poses(lag_s) @ target_from_pixel
     return Scans(sweep.size[::-1], placed, sweep.images, converted.speed_m_s, probe.speed_m_s, converted, errors)
 
@@ -140,7 +146,7 @@ def grid_around(scans: Scans, extent: Extent, spacing_mm: float, clip: Clip | No
 
 def sigma_volume(scans: Scans, volume: Volume, clip: Clip | None = None) -> Volume | None:
     """Standard deviations, mm over all directions, of the place of what each voxel shows; None where they aren't known."""
-    if scans.probe is None or scans.errors is None:
+    if scans.probe is None or scans.probe.uncertainty is None or scans.errors is None or not scans.errors.known:
         return None
     forms = place_uncertainty.forms(scans.world_from_pixel, scans.probe, scans.errors)
     grid = Grid(volume.voxels.shape[::-1], volume.origin, volume.spacing, volume.directions)

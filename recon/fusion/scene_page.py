@@ -24,6 +24,7 @@ SKIN, TABLE, MASS, PATH, BODY, INK, DEVICE = "#f2e0d2", "#c9bfb2", "#c8553d", "#
 STEP_MM = 1.5  # of the surfaces' vertices in the view
 SLIDES = 60  # B-scans that the slider passes
 FOOTER = "Measured in the frame of camera 1; nothing is registered."
+UNKNOWN = "unknown"
 RAY_MM = 60.0  # of a device, towards the corners of its view
 
 
@@ -108,7 +109,7 @@ def row_of(mass: FoundMass) -> tuple[str, str, str]:
     centre = ", ".join(f"{value:.2f}" for value in mass.mesh.center_mass) + _unsure(figures, "centre_sigma_mm", ".2f")
     volume = f"{mass.mesh.volume:.0f}" + _unsure(figures, "volume_sigma_mm3", ".0f")
     if not np.isfinite(figures.get("depth_mm", np.nan)):
-        return centre, volume, "unknown"
+        return centre, volume, UNKNOWN
     return centre, volume, f"{figures['depth_mm']:.2f}" + _unsure(figures, "depth_sigma_mm", ".2f")
 
 

@@ -18,7 +18,7 @@ from recon.files import meshes, volumes
 from recon.files.volumes import Volume
 from recon.fusion import probe_shape
 from recon.fusion.fused_scene import STEP_MM, FusedScene, device_layer, evenly, merged, path_layer
-from recon.fusion.scene_page import row_of
+from recon.fusion.scene_page import UNKNOWN, row_of
 from recon.geometry import rigid
 from recon.segmentation.mass_files import FoundMass
 
@@ -92,7 +92,8 @@ def markups(masses: Mapping[str, FoundMass]) -> dict[str, object]:
     points = []
     for number, (name, mass) in enumerate(masses.items(), 1):
         centre, volume, depth = row_of(mass)
-        told = f"centre {centre} mm; volume {volume} mm3; {depth} mm below the skin"
+        told = f"centre {centre} mm; volume {volume} mm3"
+        told += f"; {depth} mm below the skin" if depth != UNKNOWN else ""
         place = np.asarray(mass.mesh.center_mass).tolist()
         points.append({"id": str(number), "label": name, "description": told, "position": place, "positionStatus": "defined"})
     one = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}

@@ -23,6 +23,10 @@ class Track:
     covariance: Array | None = None  # (n, 6, 6) of a turn (rad) after the pose's own, and a shift (mm) in the world
     shared: Array | None = None  # (n, 6, 6) the same by what errs alike in all poses: tolerances of target and cameras
 
+    def __post_init__(self) -> None:
+        if self.shared is not None and self.covariance is None:
+            raise ValueError("shared: expected with a covariance of each pose alone, found without")
+
     @property
     def found(self) -> NDArray[np.bool_]:
         """Where there is a pose : (n,)."""
@@ -47,6 +51,21 @@ def at(track: Track, times: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> 
     result[inside, :3, :3] = Slerp(seconds, Rotation.from_matrix(poses[:, :3, :3]))(wanted[inside]).as_matrix()
     result[inside, :3, 3] = np.column_stack([np.interp(wanted[inside], seconds, poses[:, axis, 3]) for axis in range(3)])
     return result
+
+
+def shares_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:
+    """Weights : (n, m) of the m poses that were found, of which `poses_at` makes those at n times; NaN outside of the track."""
+    moments = track.times[track.found]
+    wanted = np.asarray(times, np.int64) - np.int64(round(lag_s * 1e9))
+    shares = np.zeros((len(wanted), len(moments)))
+    if len(moments) < 2:
+        return np.full_like(shares, np.nan)
+    after = np.clip(np.searchsorted(moments, wanted), 1, len(moments) - 1)
+    share = (wanted - moments[after - 1]) / (moments[after] - moments[after - 1])
+    rows = np.arange(len(wanted))
+    shares[rows, after - 1], shares[rows, after] = 1 - share, share
+    shares[(share < 0) | (share > 1)] = np.nan
+    return shares
 
 
 def poses_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from recon.errors import InputError
+from recon.files import meshes as mesh_files
 from recon.geometry.surface_tree import surface_tree
 
 Array = NDArray[np.float64]
@@ -65,17 +65,7 @@ def read_skin(path: Path) -> trimesh.Trimesh:
     InputError
         If the file is missing or damaged, of another kind, or holds no triangles.
     """
-    if path.suffix.lower() != ".ply":
-        raise InputError(f"{path}: expected a surface as PLY, found {path.suffix or 'no suffix'}")
-    if not path.is_file():
-        raise InputError(f"{path}: expected a surface as PLY, found none")
-    try:
-        mesh = trimesh.load(path, file_type="ply", process=False)
-    except (ValueError, IndexError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: expected a surface as PLY, found a damaged one: {error}") from None
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError(f"{path}: expected a surface of triangles, found none in it")
-    return mesh
+    return mesh_files.read_ply(path, "a surface")
 
 
 def contain(

@@ -7,7 +7,7 @@ import trimesh
 
 from recon.capture.images import natural_key
 from recon.errors import InputError
-from recon.files import metrics
+from recon.files import meshes, metrics
 from recon.files.metrics import Metrics
 
 
@@ -25,13 +25,13 @@ def read_masses(folder: Path) -> dict[str, FoundMass]:
     Raises
     ------
     InputError
-        If the folder has neither masses nor figures of `sonotwin segment`.
+        If the folder has neither masses nor figures of `sonotwin segment`, or a mass is damaged.
     """
     paths, told = sorted(folder.glob("mass*.ply"), key=natural_key), folder / metrics.FILE
     if not paths and not told.is_file():
         raise InputError(f"{folder}: expected a folder of `sonotwin segment`, found neither mass0.ply nor {metrics.FILE} in it")
     figures = metrics.read(told) if told.is_file() else {}
-    return {path.stem: FoundMass(trimesh.load_mesh(path, process=False), _of(path.stem, figures)) for path in paths}
+    return {path.stem: FoundMass(meshes.read_ply(path, "a mass"), _of(path.stem, figures)) for path in paths}
 
 
 def _of(name: str, figures: Metrics) -> Metrics:

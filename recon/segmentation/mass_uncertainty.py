@@ -1,10 +1,11 @@
 """Uncertainty of a mass's place, volume and depth below the skin, by what places its B-scans, by sound, and by its border.
 
-The poses move B-scans one by one; the probe's calibration, the latency and tolerances of the tracking move all of them together,
-and with them the border that they show. Where several B-scans show a point, it moves by the mean of theirs. Another speed in the
-tissue scales the depths of all that lies above a mass, so its front and all of it move along the beam. Its extent along the beam
-depends on the speed within, by which the border behind is placed (`recon.segmentation.refraction`); refraction at its sides,
-which another speed changes too, is left out. Speckle blurs the border itself, by `BORDER_MM` as a whole.
+The poses of the track move the B-scans that lie beside them; the probe's calibration, the latency and tolerances of the tracking
+move all of them together, and with them the border that they show. Where several B-scans show a point, it moves by the mean of
+theirs. Another speed in the tissue scales the depths of all that lies above a mass, so its front and all of it move along the
+beam. Its extent along the beam depends on the speed within, by which the border behind is placed
+(`recon.segmentation.refraction`); refraction at its sides, which another speed changes too, is left out. Speckle blurs the border
+itself, by `BORDER_MM` as a whole.
 """
 
 from dataclasses import dataclass
@@ -127,7 +128,8 @@ def by_placing(weights: Weights, shown: Shown, scans: Scans) -> Array:
         return covariance
     by_pose = _moved(weights, shown, place_uncertainty.pose_slopes(scans.world_from_pixel, probe))
     used = np.unique(shown.scan)
-    covariance += np.einsum("nfk,nkl,ngl->fg", by_pose[used], errors.own[used], by_pose[used])
+    by_each = np.einsum("nm,nfk->mfk", errors.shares[used], by_pose[used])  # neighbours lie between the same poses of the track
+    covariance += np.einsum("mfk,mkl,mgl->fg", by_each, errors.poses, by_each)
     together = by_pose.sum(axis=0)
     covariance += together @ errors.shared[used].mean(axis=0) @ together.T
     by_lag = _moved(weights, shown, place_uncertainty.rate_slopes(errors.rates)).sum(axis=0)

@@ -22,7 +22,7 @@ from recon.tracking import networks
 from sonotwin import pipeline
 from sonotwin.config import load
 from sonotwin.demo_config import Config
-from sonotwin.demo_steps import Figures, commands, compared, fusing_fields, poses_of, tracked_film, verb_steps
+from sonotwin.demo_steps import Figures, commands, compared, fusing_fields, measured_lag, poses_of, tracked_film, verb_steps
 from sonotwin.pipeline import Step
 from sonotwin.verbs import fuse, surface
 from twin.evaluation import sweep_errors
@@ -57,6 +57,9 @@ OUTPUTS = (
     ("evaluation/error_map.png", "map of the errors"),
     ("demo.json", "every setting"),
 )
+
+
+FILMED, SWEPT = ("film", "track"), ("volume", "tumours", "probe", "lag", "scene", "poses", "sweep")  # of which only one is made
 
 
 def run(config: Config) -> None:
@@ -95,8 +98,10 @@ def telling_step(config: Config) -> Step:
             inside = sweep_report.read(places, findings, truth)
         tracked = tracked_film(folder, config.looks_inside) if config.looks_inside or config.film_frames else None
         fused = fuse.read(load("fuse", fusing_fields(folder, config, config._overrides), fuse.Config)) if inside else None
-        outputs = [(name, text) for name, text in OUTPUTS if (folder / name.partition(",")[0]).exists() or name == "report.html"]
-        lines = commands(folder, config, config._overrides, inside.lag_s if inside else 0.0)
+        unmade = FILMED if config.looks_inside else SWEPT
+        listed = [(name, text) for name, text in OUTPUTS if name.partition("/")[0] not in unmade]
+        outputs = [(name, text) for name, text in listed if (folder / name.partition(",")[0]).exists() or name == "report.html"]
+        lines = commands(folder, config, config._overrides, measured_lag(folder) if inside else None)
         demo_report.write(folder / "report.html", story, dict(figures), outputs, lines, inside, tracked, fused)
         return {}
 

@@ -66,8 +66,9 @@ class Config(BaseModel):
             raise ValueError(f"expected capture or sequence, found {'neither' if self.capture is None else 'both'}")
         if self.capture is not None and self.config is not None:
             raise ValueError("config: expected a configuration with a sequence only, found one with a capture")
-        if self.sequence is not None and self.lag_s != 0:
-            raise ValueError(f"lag_s: expected none with a sequence, whose poses are those of its images, found {self.lag_s:g}")
+        for name, value in (("lag_s", self.lag_s), ("lag_sigma_s", self.lag_sigma_s)):
+            if self.sequence is not None and value != 0:
+                raise ValueError(f"{name}: expected none with a sequence, whose poses are those of its images, found {value:g}")
         if self.config is not None and self.probe is not None:
             raise ValueError("probe: expected none with a config, which has the calibration, found one")
         if self.config is not None and self.tissue_m_s is not None:
@@ -146,5 +147,5 @@ def describe(filled: Reconstruction, figures: Metrics, config: Config) -> Iterat
     level = metrics.shown(figures["mean_level"], ".0f")
     yield f"fill        {100 * figures['filled_fraction']:.1f} % after filling holes, mean level {level}"
     if "place_sigma_median_mm" in figures:
-        least, most = (figures[f"place_sigma_{name}_mm"] for name in ("median", "most"))
-        yield f"place       known to {least:.2f} mm in the median, {most:.2f} mm at most, by its own prediction"
+        median, most = (figures[f"place_sigma_{name}_mm"] for name in ("median", "most"))
+        yield f"place       known to {median:.2f} mm in the median, {most:.2f} mm at most, by its own prediction"

@@ -12,10 +12,10 @@ folder for 3D Slicer; and metrics.json. Nothing is registered: all of it is meas
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 
 from recon.capture import calibration_files, sweep_part
@@ -50,12 +50,18 @@ class Config(BaseModel):
     tissue_m_s: Speed | None = None
     surface: Path | None = None
     mask: Path | None = None
-    camera: str = "cam1"
+    camera: Literal["cam1", "cam2"] = "cam1"
     part_table: bool = True
     masses: Path | None = None
     volume: Path | None = None
     calibration: Path | None = None
     scans: Annotated[int, Field(ge=0, le=1000)] = 12
+
+    @model_validator(mode="after")
+    def _mask_of_a_surface(self) -> "Config":
+        if self.mask is not None and self.surface is None:
+            raise ValueError("mask: expected with a surface, which it parts, found without")
+        return self
 
 
 def run(config: Config) -> None:
@@ -119,7 +125,10 @@ def parted(config: Config, surface: Path, optics: Calibration | None) -> Parted:
         found = "no calibration" if optics is None else ", ".join(optics.cameras)
         raise InputError(f"{config.mask}: expected the calibration of {config.camera}, in whose image it is, found {found}")
     camera = optics.cameras[config.camera]
-    return skin.by_mask(whole, read_grey(config.mask, camera.size) > 0, camera)
+    made = skin.by_mask(whole, read_grey(config.mask, camera.size) > 0, camera)
+    if made.skin is None:
+        raise InputError(f"{config.mask}: expected some of the surface in it, found none: is it of another camera?")
+    return made
 
 
 def volumes(config: Config) -> dict[str, Path]:

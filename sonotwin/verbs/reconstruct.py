@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 from rich.console import Console
 
 from recon.capture import manifest
@@ -67,6 +67,12 @@ class Config(BaseModel):
     find: Literal["masses", "tube", "nothing"] = "masses"
     overlays: bool = False
     _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
+
+    @model_validator(mode="after")
+    def _sigma_of_a_lag(self) -> "Config":
+        if self.lag_sigma_s and self.lag_s is None:
+            raise ValueError(f"lag_sigma_s: expected with a lag_s that is given, found {self.lag_sigma_s:g} without")
+        return self
 
     def model_post_init(self, context: Any) -> None:
         """Keep the overrides, of which the rig's are passed on to the steps."""
@@ -223,7 +229,7 @@ def measured_latency(steps: KeptSteps, sources: Sources, tracked: Mapping[str, P
         return Latency(config.lag_s, config.lag_sigma_s)
     if name is None:
         steps.leave_out("latency", "no sweep over a flat bottom and no lag_s; the B-scans' time stamps are taken as they are")
-        return Latency(0.0, config.lag_sigma_s)
+        return Latency(0.0, 0.0)
     if tracked[name] is None:
         return steps.fail("latency", f"no poses of the sweep {name}")
     fields = [f"capture={tracked[name]}", f"sweep={name}"]

@@ -64,8 +64,9 @@ class Config(BaseModel):
     def _one_source(self) -> "Config":
         if (self.capture is None) == (self.sequence is None):
             raise ValueError(f"expected capture or sequence, found {'neither' if self.capture is None else 'both'}")
-        if self.sequence is not None and self.lag_s != 0:
-            raise ValueError(f"lag_s: expected none with a sequence, whose poses are those of its images, found {self.lag_s:g}")
+        for name, value in (("lag_s", self.lag_s), ("lag_sigma_s", self.lag_sigma_s)):
+            if self.sequence is not None and value != 0:
+                raise ValueError(f"{name}: expected none with a sequence, whose poses are those of its images, found {value:g}")
         if self.kind == "tube" and self.surface is not None:
             raise ValueError("surface: expected none with kind=tube, found one")
         if self.diameter_mm[0] >= self.diameter_mm[1]:

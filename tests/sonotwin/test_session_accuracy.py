@@ -14,12 +14,13 @@ MODELS = {"render": render.Config, "sweep": sweep.Config, "reconstruct": reconst
 
 FILM = {"frames": 100, "visible": 95, "visible_found": 95, "false": 0, "shift_median_mm": 0.02, "turn_median_deg": 0.04}
 SCAN = {
+    "placement_over_sigma": 1.0,
     "lag_error_ms": -0.5, "lag_covered": 1.0, "probe_worst_error_mm": 0.1, "probe_worst_sigma_mm": 0.1, "contact_bias_mm": -0.02,
     "tumours_found": 3, "tumours_false": 0,
 }  # fmt: skip
 TUMOUR = {
     "true_extent_mm": 20.0, "centre_error_mm": 0.2, "volume_mm3": 1030.0, "true_volume_mm3": 1000.0, "under_skin_mm": 8.1,
-    "true_under_skin_mm": 8.0, "inside": 1,
+    "true_under_skin_mm": 8.0, "inside": 1, "centre_sigma_mm": 0.3, "volume_sigma_mm3": 30.0, "depth_sigma_mm": 0.2,
 }  # fmt: skip
 
 

@@ -29,16 +29,16 @@ def lines(metrics: Metrics) -> Iterator[Line]:
         poses = f"from {metrics['poses']:.0f} poses of the board"
         yield "Cameras and projector", poses, _mm(metrics, "point_sigma_mm"), _mm(metrics, "point_error_rms_mm")
     points = f"{page.count(metrics['points'])} points"
-    yield "Surface", points, _mm(metrics, "predicted_rms_mm"), _mm(metrics, "surface_rms_mm")
+    noise = np.hypot(metrics["predicted_rms_mm"], metrics.get("point_sigma_mm", 0.0))  # and the calibration's part
+    yield "Surface", points, shown(float(noise), ".3f", " mm"), _mm(metrics, "surface_rms_mm")
     found = f"{metrics['track_found']} of {metrics['track_frames']} frames"
     yield "Probe’s places, median", found, _mm(metrics, "track_sigma_median_mm"), _mm(metrics, "track_shift_median_mm")
-    half = (metrics["lag_high_ms"] - metrics["lag_low_ms"]) / 2 / 1.96
-    late = f"{metrics['lag_ms']:.1f} ms"
-    yield "Scanner’s lag", late, f"{half:.1f} ms", f"{abs(metrics['lag_ms'] - metrics['lag_true_ms']):.1f} ms"
+    late, sigma = (f"{metrics[name]:.1f} ms" for name in ("lag_ms", "lag_sigma_ms"))
+    yield "Scanner’s lag", late, sigma, f"{abs(metrics['lag_ms'] - metrics['lag_true_ms']):.1f} ms"
     used = f"from {metrics['probe_frames_used']} B-scans of wires"
     yield "Probe’s calibration, worst of five pixels", used, _mm(metrics, "probe_worst_sigma_mm"), _mm(metrics, "probe_worst_mm")
-    median = _mm(metrics, "volume_place_sigma_median_mm", ".2f")
-    yield "Pixels of the sweep", "B-scans in space", median, _mm(metrics, "sweep_placement_rms_mm", ".2f")
+    predicted, off = (_mm(metrics, f"sweep_placement_{name}_mm", ".2f") for name in ("sigma", "rms"))
+    yield "Pixels of the sweep, but for sound", "B-scans in space", predicted, off
     yield from of_tumours(metrics)
 
 

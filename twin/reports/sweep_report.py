@@ -119,8 +119,8 @@ def inside(story: Inside, points: NDArray[np.float32], skin: NDArray[np.bool_], 
         Which of them to show.
     """
     text = (
-        "The B-scans lie in the frame of the cameras, because the cameras track the probe: nothing is registered. Here the poses "
-        "are the true ones with a tracker's errors. Tumours are found without any knowledge of the truth, and meet the measured "
+        "The B-scans lie in the frame of the cameras, because the cameras track the probe: nothing is registered. "
+        "Tumours are found without any knowledge of the truth, and meet the measured "
         "surface in one coordinate system."
     )
     caption = (

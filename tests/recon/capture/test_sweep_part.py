@@ -232,3 +232,17 @@ def test_pairs_come_back(tmp_path):
     found = sweep_tables.read_pairs(tmp_path / "pairs.csv")
     np.testing.assert_array_equal(found[0], poses)
     np.testing.assert_array_equal(found[1], pixels)
+
+
+def test_what_errs_alike_in_all_poses_comes_back_and_does_not_average_out(tmp_path):
+    """Halfway between two poses it is as large as on them."""
+    own, shared = (np.tile(np.diag([1e-6] * 3 + [size] * 3), (POSES, 1, 1)) for size in (0.01, 0.04))
+    poses = Track(track().times, track().poses, own, shared)
+    captures.write_sweep(tmp_path / "capture", images()[:2], START_NS + np.array([25_000_000, 37_500_000]), poses, SIZE)
+    found = sweep_part.read_sweep(tmp_path / "capture")
+    known = found.track.found
+    np.testing.assert_allclose(found.track.shared[known], shared[known], rtol=1e-15)
+    np.testing.assert_allclose(found.shared_covariance(), shared[:2], atol=1e-15)
+    np.testing.assert_allclose(found.pose_covariance()[1], own[0] / 2, atol=1e-15)
+    with pytest.raises(ValueError, match="shared: expected with a covariance"):
+        Track(track().times, track().poses, None, shared)

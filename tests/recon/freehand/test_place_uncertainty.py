@@ -27,14 +27,14 @@ def probe_of(rig, half):
 
 
 def test_places_scatter_as_predicted(rig, pose, rng):
-    """4000 draws of all errors together, each part of which counts: to 3 %, four standard deviations of the draws' own."""
+    """4000 draws of all errors together, each part of which counts: to 4 %, four standard deviations of the draws' own."""
     half = np.diag([2e-4, 3e-4, 2e-3, 2e-3, 2e-3, 0.05, 0.05, 0.05]) @ (np.eye(8) + 0.3 * rng.standard_normal((8, 8)))
     own, shared = (np.diag([size] * 3 + [0.04] * 3) @ (np.eye(6) + 0.3 * rng.standard_normal((6, 6))) for size in (4e-4, 7e-4))
     probe, velocity = probe_of(rig, half), np.array([8.0, -15.0, 4.0])
     placed = pose @ sequences.target_from_pixel(probe)
     rates = np.zeros((1, 4, 4))
     rates[0, :3, 3] = velocity
-    errors = PlaceErrors((own @ own.T)[None], (shared @ shared.T)[None], rates, lag_s=0.003, depth=0.004)
+    errors = PlaceErrors((own @ own.T)[None], np.eye(1), (shared @ shared.T)[None], rates, lag_s=0.003, depth=0.004)
     predicted = place_uncertainty.sigmas(place_uncertainty.forms(placed[None], probe, errors)[0], PIXELS)
     places = []
     for step in rng.standard_normal((4000, 22)):
@@ -57,7 +57,12 @@ def test_each_part_grows_the_prediction(rig, pose, part):
     rates = np.zeros((1, 4, 4))
     rates[0, 0, 3] = 10.0
     made = PlaceErrors(
-        errors * (part == "own"), errors * (part == "shared"), rates, 0.002 * (part == "lag"), 0.01 * (part == "depth")
+        errors * (part == "own"),
+        np.eye(1),
+        errors * (part == "shared"),
+        rates,
+        0.002 * (part == "lag"),
+        0.01 * (part == "depth"),
     )
     found = place_uncertainty.sigmas(place_uncertainty.forms(placed, probe, made)[0], PIXELS)
     assert found[2] > 0.01
@@ -69,7 +74,7 @@ def test_a_volume_of_sigmas_shows_those_of_its_pixels(rig, pose):
     probe = probe_of(rig, np.zeros((8, 8)))
     placed = np.stack(2 * [np.diag([1.0, 1.0, 1.0, 1.0])])
     errors = np.stack([np.diag([0, 0, 0, s**2, 0, 0]) for s in (0.1, 0.2)])
-    made = PlaceErrors(errors, 0 * errors, np.zeros((2, 4, 4)))
+    made = PlaceErrors(errors, np.eye(2), 0 * errors, np.zeros((2, 4, 4)))
     grid = Grid((60, 60, 2), np.zeros(3), np.ones(3), np.eye(3))
     volume = place_uncertainty.sigma_volume(place_uncertainty.forms(placed, probe, made), placed, (40, 50), grid)
     assert volume.voxels[0, :40, :50] == pytest.approx(np.sqrt((0.1**2 + 0.2**2) / 2), rel=1e-6)
@@ -80,5 +85,5 @@ def test_a_b_scan_without_a_pose_has_no_prediction(rig, pose):
     probe = probe_of(rig, np.zeros((8, 8)))
     placed = np.stack([pose @ sequences.target_from_pixel(probe), np.full((4, 4), np.nan)])
     nothing = np.zeros((2, 6, 6))
-    found = place_uncertainty.forms(placed, probe, PlaceErrors(nothing, nothing, np.zeros((2, 4, 4))))
+    found = place_uncertainty.forms(placed, probe, PlaceErrors(nothing, np.eye(2), nothing, np.zeros((2, 4, 4))))
     assert np.isfinite(found[0]).all() and np.isnan(found[1]).all()

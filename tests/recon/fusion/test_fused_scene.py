@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from recon.files import layers
+from recon.files import layers, meshes
 from recon.fusion import fused_scene
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
@@ -77,3 +77,14 @@ def test_b_scans_are_chosen_evenly_from_those_with_a_pose(count, expected):
     placed = np.isin(np.arange(10), [2, 3, 5, 9])
     assert fused_scene.chosen(placed, count) == expected
     assert fused_scene.chosen(np.zeros(4, bool), count) == []
+
+
+def test_a_viewers_file_has_the_skins_grey(tmp_path):
+    ball = trimesh.creation.icosphere(4, 30.0)
+    meshes.set_greys(ball, np.full(len(ball.vertices), 90, np.uint8))
+    layers.write_layers(
+        tmp_path / "scene.glb", {"skin": fused_scene.surface_layer(ball, fused_scene.SKIN, fused_scene.GREY_SKIN)}
+    )
+    data = (tmp_path / "scene.glb").read_bytes()
+    content = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+    assert "COLOR_0" in content["meshes"][0]["primitives"][0]["attributes"]

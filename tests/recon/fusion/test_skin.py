@@ -51,6 +51,14 @@ def test_without_a_table_all_is_skin(rng, kind):
     assert parted.skin is mesh and parted.rest is None
 
 
+def test_a_mask_without_surface_leaves_no_skin(rng):
+    """Nor does one at whose border the surface goes on beside the image."""
+    mesh, _ = scene(rng)
+    camera = Camera((640, 480), np.array([[1600.0, 0, -900], [0, 1600, 240], [0, 0, 1]]), np.zeros(5), np.eye(4))
+    for mask in (np.zeros((480, 640), bool), np.ones((480, 640), bool)):
+        assert skin.by_mask(mesh, mask, camera).skin is None
+
+
 def test_a_mask_parts_in_the_cameras_image(rng):
     mesh, _ = scene(rng)
     camera = Camera((640, 480), np.array([[1600.0, 0, 320], [0, 1600, 240], [0, 0, 1]]), np.zeros(5), np.eye(4))

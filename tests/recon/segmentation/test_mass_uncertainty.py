@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from recon.files import meshes
 from recon.freehand import sequences
 from recon.freehand.place_uncertainty import PlaceErrors
 from recon.freehand.scans import Scans
@@ -14,7 +15,7 @@ from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
 from recon.probe_calibration.point_calibration import NAMES
 from recon.segmentation import mass_uncertainty
-from recon.segmentation.containment import contain
+from recon.segmentation.containment import contain, read_skin
 from recon.segmentation.mass_surface import Mass
 from recon.segmentation.mass_uncertainty import Speeds
 from scenes.solid_meshes import grid
@@ -125,7 +126,7 @@ def placed(scans, turn_rad=0.0, shift_mm=0.0, rates=0.0, lag_s=0.0, shared=False
     each = np.tile(np.diag([turn_rad**2] * 3 + [shift_mm**2] * 3), (len(scans.world_from_pixel), 1, 1))
     moving = np.zeros_like(scans.world_from_pixel)
     moving[:, 0, 3] = rates
-    return replace(scans, errors=PlaceErrors(*((0 * each, each) if shared else (each, 0 * each)), moving, lag_s))
+    return replace(scans, errors=PlaceErrors(each * (not shared), np.eye(len(each)), each * shared, moving, lag_s))
 
 
 def test_shifts_that_all_b_scans_share_move_a_mass_and_independent_ones_hardly(rig, sharp):
@@ -144,14 +145,26 @@ def test_an_uncertain_latency_moves_a_mass_along_the_sweep(rig, sharp):
     assert sigma.centre_mm == pytest.approx(20 * 0.002, rel=1e-3)
 
 
-def test_depth_below_the_skin_is_as_uncertain_as_skin_and_border(rig):
+def test_depth_below_the_skin_is_as_uncertain_as_skin_and_border(rig, tmp_path):
     """All B-scans may lie 0.1 mm off: across the skin that counts, in addition to the border's and the skin's own errors."""
     scans, mass = sweep(probe_of(rig, np.zeros((8, 8))))
     centre = mass.centre
     points, triangles = grid((60.0, 60.0), (120, 120))
     skin = trimesh.Trimesh(np.column_stack([points, np.full(len(points), -9.0)]) + centre, triangles, process=False)
     skin.vertex_attributes["sigma_mm"] = np.full(len(skin.vertices), 0.05)
+    meshes.write_ply(tmp_path / "skin.ply", skin)
+    skin = read_skin(tmp_path / "skin.ply")
     (under,) = contain([mass.mesh], skin, centre - [0, 0, 500])
     assert under.least_mm == pytest.approx(9 - RADIUS_MM, abs=0.05)
     sigma = mass_uncertainty.by_all(mass, placed(scans, shift_mm=0.1, shared=True), STILL, under)
     assert sigma.depth_mm == pytest.approx(np.sqrt(0.1**2 + 0.05**2 + mass_uncertainty.BORDER_MM**2), rel=0.02)
+
+
+def test_b_scans_between_the_same_poses_err_together(rig, sharp):
+    """All 41 B-scans lie between two poses, half way: a mass moves by the mean of these two's errors, however many show it."""
+    scans, mass = sweep(probe_of(rig, np.zeros((8, 8))))
+    count = len(scans.world_from_pixel)
+    poses, nothing = np.tile(np.diag([0, 0, 0, 0.01, 0.01, 0.01]), (2, 1, 1)), np.zeros((count, 6, 6))
+    errors = PlaceErrors(poses, np.full((count, 2), 0.5), nothing, np.zeros((count, 4, 4)))
+    sigma = mass_uncertainty.by_all(mass, replace(scans, errors=errors), STILL)
+    assert sigma.centre_mm == pytest.approx(0.1 * np.sqrt(3 / 2), rel=0.01)
