@@ -59,10 +59,14 @@ def figures(folders):
 
 
 def test_the_section_tells_what_was_found_and_what_not(folders, figures):
-    section = track_report.section(track_report.read(*folders), figures)
+    section = track_report.section(track_report.read(*folders), figures, swept=False)
     text = html.unescape("".join(section.blocks))
     assert "5 of 8 frames, and 5 of the 5" in text and "0 of them wrongly" in text
     assert "4 to 5" in text and "only camera 2 sees the target" in text and "no rim" in text
+    swept = track_report.section(track_report.read(*folders), figures | {"point_sigma_mm": 0.02}, swept=True)
+    told = html.unescape("".join(swept.blocks))
+    assert "While the scanner records" in told and "calibration is by the board" in told and "partly out of" not in told
+    assert "calibration is the true one here" in text
     assert "<b>.</b>" not in text and "&lt;b&gt;" in "".join(section.blocks), "what others wrote is text"
     assert text.count("<img") == 4 and text.count("<svg") == 2
     assert "off by 0.020 mm; blurred by 9.0 px" in text
@@ -86,7 +90,7 @@ def test_a_track_without_pictures_is_told_without(folders, figures, tmp_path):
     bare.mkdir()
     for name in (results.POSES, results.FRAMES):
         (bare / name).write_bytes((track / name).read_bytes())
-    assert "<img" not in "".join(track_report.section(track_report.read(film, bare), figures).blocks)
+    assert "<img" not in "".join(track_report.section(track_report.read(film, bare), figures, swept=False).blocks)
 
 
 def test_tables_that_dont_fit_are_refused(folders, tmp_path):
