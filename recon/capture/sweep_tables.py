@@ -85,8 +85,8 @@ def read_track(path: Path) -> Track:
 
 def write_track(path: Path, track: Track) -> None:
     """Write poses over time, with the covariances that the track has; where the target was not found the fields are empty."""
-    own = [] if track.covariance is None else [(COVARIANCE, track.covariance)]
-    known = own + ([(SHARED, track.shared)] if own and track.shared is not None else [])
+    both = ((COVARIANCE, track.covariance), (SHARED, track.shared))
+    known = [(names, matrices) for names, matrices in both if matrices is not None]
     header = (*TRACK, *(name for names, _ in known for name in names))
 
     def row(k: int, found: bool) -> list[int | float | str]:

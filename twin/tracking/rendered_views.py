@@ -107,7 +107,7 @@ def render_film(bank: Bank, rig: Rig, takes: Sequence[Take], quality: FilmQualit
     return [Frames((first[0], second[0]), (first[1], second[1])) for first, second in zip(both[::2], both[1::2], strict=True)]
 
 
-def _exposed(radiance: NDArray[np.float32], shot: "Shot", rig: Rig) -> Grey:
+def _exposed(radiance: NDArray[np.float32], shot: Shot, rig: Rig) -> Grey:
     """Digital numbers of a whole image : (h, w)."""
     electrons = radiance.ravel() * np.float32(_electrons(shot.take, shot.device, rig))
     rng = np.random.default_rng([shot.take.noise_seed, shot.camera, 1])
