@@ -27,7 +27,7 @@ from twin.evaluation import session_errors
 
 Array = NDArray[np.float64]
 
-SEEDS = tuple(range(701, 711))
+SEEDS = tuple(range(721, 731))
 WIDER = {"ideal": 1.0, "lifelike": 1.7}  # bars of each kind of conditions
 RIG = "meza2021"
 MARK = "_true_extent_mm"  # of a tumour's figures, one a tumour
