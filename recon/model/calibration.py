@@ -9,6 +9,7 @@ from recon.geometry import camera_jacobian
 from recon.geometry.camera import Array, Camera
 
 DRIFT_PX = 0.05  # usual standard deviation of cameras' principal points since their calibration
+PRINT_SCALE = 3.0e-4  # usual relative standard deviation of the scale of a board printed on paper, which takes up moisture
 WORLD = "cam1"  # the device whose frame the world is: it has no pose
 
 

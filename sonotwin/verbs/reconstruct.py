@@ -27,7 +27,7 @@ from recon.capture import manifest
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPart, is_sweep, sweep_part
 from recon.errors import InputError
 from recon.files import metrics
-from recon.model.calibration import DRIFT_PX
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE
 from recon.model.probe import Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Positive, Rig
 from recon.model.tracks import LagSeconds
@@ -55,6 +55,7 @@ class Config(BaseModel):
     camera: str = "cam1"
     calibration: Path | None = None
     drift_px: Drift = DRIFT_PX
+    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
     target: Path | None = None
     networks: Path | None = None
     probe: Path | None = None
@@ -197,6 +198,7 @@ def tracked_sweep(steps: KeptSteps, sources: Sources, name: str, optics: Path | 
         return steps.leave_out(step, _no(steps, "optics", NO_OPTICS))
     given = {"target": config.target, "networks": config.networks}
     fields = [f"capture={config.capture}", f"sweep={name}", f"calibration={optics}", f"drift_px={config.drift_px:.15g}"]
+    fields.append(f"board_scale={config.board_scale:.15g}")
     fields += [f"{field}={path}" for field, path in given.items() if path is not None]
     fields += [f"overlays={str(config.overlays).lower()}", *config.rig_fields]
     weights = config.networks or networks.WEIGHTS

@@ -29,7 +29,7 @@ from recon.capture import stereo_frames, target_files
 from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
-from recon.model.calibration import DRIFT_PX, with_drift
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, with_drift
 from recon.model.rig import Rig
 from recon.tracking import networks, results, track_figures
 from recon.tracking.results import Step
@@ -47,6 +47,7 @@ class Config(BaseModel):
     out: Path
     calibration: Path | None = None
     drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
+    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
     target: Path | None = None
     networks: Path | None = None
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
@@ -69,7 +70,7 @@ def run(config: Config) -> None:
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
     design = config.rig.target
     target = design if config.target is None else target_files.read(config.target, design)
-    tracker = Tracker(film.cameras, target, loaded, film.bits, optics)
+    tracker = Tracker(film.cameras, target, loaded, film.bits, optics, config.board_scale)
     rate = f", {film.rate_hz:.4g} a second" if np.isfinite(film.rate_hz) else ""
     sizes = " and ".join(dict.fromkeys("x".join(map(str, camera.size)) for camera in film.cameras))
     console.print(f"read        {len(film.times)} pairs of frames, {sizes}{rate}", markup=False)
