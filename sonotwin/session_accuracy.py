@@ -19,17 +19,27 @@ from numpy.typing import NDArray
 from recon.errors import InputError
 from recon.files import metrics
 from recon.files.metrics import Metrics
+from recon.probe_calibration import repeatability
 from sonotwin import config, session_steps
 from sonotwin.choices import read_rig
-from sonotwin.session_steps import BOTTOM, SCAN, WIRES
+from sonotwin.session_steps import BOTTOM, SCAN, TUBE, WIRES
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation import session_errors
 
 Array = NDArray[np.float64]
 
 SEEDS = tuple(range(721, 731))
+BOARD_SCALE = {"ideal": 0.0, "lifelike": 3.0e-4}  # as a lab knows its board's print: exact, and of conf/conditions/lifelike.yaml
 WIDER = {"ideal": 1.0, "lifelike": 1.7}  # bars of each kind of conditions
 RIG = "meza2021"
+CR1_MM, CR2_MM = (0.12, 0.16, 0.15), (0.08, 0.11, 0.10)  # bars: centre, corners, mean
+CYLINDERS = {"tube_diameter_error_mm": 0.06, "cover_diameter_error_mm": 0.03, "cover_wall_error_mm": 0.06}  # bars
+LENGTHS = {
+    "tube_diameter_error_mm": "inner cylinder's diameter by ultrasound",
+    "cover_diameter_error_mm": "outer cylinder's diameter by light",
+    "cover_wall_error_mm": "distance of their walls by both",
+}
+PAPER_MM = {"tube_diameter_error_mm": 0.72, "cover_diameter_error_mm": 0.10, "cover_wall_error_mm": 0.12}  # its errors
 MARK = "_true_extent_mm"  # of a tumour's figures, one a tumour
 PACKAGES = ("recon", "scenes", "twin", "sonotwin")
 
@@ -64,13 +74,29 @@ def measured(kept: Path | None, conditions: str, seed: int) -> Metrics:
 
 
 def session(work: Path, conditions: str, seed: int) -> tuple[bool, Metrics]:
-    """Render a session, take its truth away, reconstruct, and compare; returns whether all steps were done, and the figures."""
-    given = [f"conditions={conditions}", f"seed={seed}"]
+    """Render a session, take its truth away, reconstruct, and compare; then the cylinders by its calibrations.
+
+    Returns whether all steps were done, and the figures.
+    """
+    given, known = [f"conditions={conditions}", f"seed={seed}"], [f"board_scale={BOARD_SCALE[conditions]:g}"]
     for verb, fields in session_steps.rendering(work / "session", given):
         session_steps.do(verb, fields)
     truth = (work / "session" / "truth").rename(work / "truth")
-    status = session_steps.do(*session_steps.reconstruction(work / "session", work / "result"))
-    return status == 0, session_errors.measure(work / "result", work / "session" / "capture", truth)
+    status = session_steps.do(*session_steps.reconstruction(work / "session", work / "result", known))
+    figures = session_errors.measure(work / "result", work / "session" / "capture", truth)
+    if status:
+        return False, figures
+    status, of_cylinders = cylinders(work / "cylinders", work / "result", given, known)
+    return status == 0, figures | of_cylinders
+
+
+def cylinders(work: Path, calibrated: Path, given: Sequence[str], known: Sequence[str]) -> tuple[int, Metrics]:
+    """The paper's cylinders by the calibrations of a session; returns the exit status of `reconstruct`, and the figures."""
+    for verb, fields in session_steps.rendering_cylinders(work / "session", given):
+        session_steps.do(verb, fields)
+    truth = (work / "session" / "truth").rename(work / "truth")
+    status = session_steps.do(*session_steps.reconstruction_of_cylinders(work / "session", calibrated, work / "result", known))
+    return status, {} if status else session_errors.cylinders(work / "result", truth, TUBE)
 
 
 @cache
@@ -102,6 +128,8 @@ def rows(conditions: str, found: Sequence[Metrics]) -> list[Row]:
     contact, lag = each(found, f"{SCAN}_contact_bias_mm"), each(found, f"{SCAN}_lag_error_ms")
     shift, turn = each(found, f"{SCAN}_track_shift_median_mm"), each(found, f"{SCAN}_track_turn_median_deg")
     covered = 100 * each(found, f"{SCAN}_lag_covered").mean()
+    apart = np.array([each(found, f"{SCAN}_{figure}") for figure in session_errors.PROBE_ERRORS]).T.reshape(-1, 5, 3)
+    several, none = len(found) > 1, np.full(5, np.nan)
     return [
         Row("a", f"{name}: frames that show the whole target to both", 100 * seen.min(), 90.0, None, "%", at_least=True),
         Row("b", f"{name}: found, of pairs that show the target whole", 100 * tracked.min(), 99.0, None, "%", at_least=True),
@@ -112,6 +140,9 @@ def rows(conditions: str, found: Sequence[Metrics]) -> list[Row]:
         Row("c", f"{name}: latency within its 95 % interval", covered, 80.0, 95.0, "%", at_least=True),
         Row("d", f"{name}: probe, the worst of five pixels", probe.max(), 0.20 * wider, None, "mm"),
         Row("d", f"{name}: the same over its predicted sigma, RMS", np.sqrt(np.mean((probe / sigma) ** 2)), None, 1.0, ""),
+        *repeated("CR1", name, repeatability.between_pairs(apart) if several else none, CR1_MM, wider),
+        *repeated("CR2", name, repeatability.from_mean(apart) if several else none, CR2_MM, wider),
+        *[cylinder(figure, name, each(found, figure), bar * wider) for figure, bar in CYLINDERS.items()],
         Row("f", f"{name}: tumours found inside the skin, less false ones, of 3", inside.min(), 3.0, 3.0, "", at_least=True),
         Row("f", f"{name}: tumours' centres", np.max(centres, initial=0.0), 0.35 * wider, None, "mm"),
         Row("f", f"{name}: tumours' volumes", 100 * np.max(np.abs(volumes), initial=0.0), 6.0 * wider, None, "%"),
@@ -123,6 +154,22 @@ def rows(conditions: str, found: Sequence[Metrics]) -> list[Row]:
         Row("g", f"{name}: array's face from the skin by light, mean", abs(contact.mean()), 0.05 * wider, None, "mm"),
         Row("g", f"{name}: the same, worst", np.abs(contact).max(), None, None, "mm"),
     ]  # fmt: skip
+
+
+def repeated(measure: str, name: str, mm: Array, bars: tuple[float, float, float], wider: float) -> list[Row]:
+    """Repeatability over sessions : (5,) mm, at the centre, the worst corner, and in the mean."""
+    found = {"centre": mm[0], "worst corner": mm[1:].max(), "mean of five pixels": mm.mean()}
+    return [
+        Row("d", f"{name}: probe, {measure}, {place}", float(value), bar * wider, None, "mm")
+        for (place, value), bar in zip(found.items(), bars, strict=True)
+    ]
+
+
+def cylinder(figure: str, name: str, errors: Array, bar: float) -> Row:
+    """Errors of a length of the cylinders over sessions : (n,) mm: the worst, with mean and spread."""
+    spread = errors.std(ddof=1) if len(errors) > 1 else np.nan
+    text = f"{name}: {LENGTHS[figure]} (mean {errors.mean():+.3f}, spread {spread:.3f}; paper: {PAPER_MM[figure]:.2f})"
+    return Row("e", text, float(np.abs(errors).max()), bar, None, "mm")
 
 
 def rms(values: Array) -> float:

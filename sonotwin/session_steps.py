@@ -1,15 +1,21 @@
 """The verbs that render a whole session into one capture: board, fringes, filmed sweeps over wires, a bottom and the phantom."""
 
+import json
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 
+from recon.probe_calibration.sound_in_water import speed_of_sound
 from sonotwin.config import load
 from sonotwin.demo_config import BOARD_PATTERNS, WATER_C
+from sonotwin.verbs import calibrate_optics, calibrate_probe, measure_lag
 
 TISSUE_M_S = 1450.0  # of the phantom's silicone
-WIRES, BOTTOM, SCAN = "wires", "bottom", "scan"
+WATER_SIGMA_M_S = 1.5  # of a tank whose temperature is known to half a degree
+WIRES, BOTTOM, SCAN, TUBE = "wires", "bottom", "scan", "tube"
 TANK = ["ultrasound=water"]
+INNER = ["scene=inner_cylinder", "scene.centre_mm=[4.0,-2.0,670.29]"]  # where conf/scene/cylinders.yaml has it
+ALONG = ["path.start_mm=[-19.35,-2]", "path.end_mm=[27.35,-2]", "path.turn_deg=90", "path.standoff_mm=17"]
 
 
 def rendering(out: Path, given: Sequence[str] = ()) -> Iterator[tuple[str, list[str]]]:
@@ -24,10 +30,30 @@ def rendering(out: Path, given: Sequence[str] = ()) -> Iterator[tuple[str, list[
     yield "sweep", ["scene=breast", "path=raster", "filmed=true", f"name={SCAN}", *place]
 
 
-def reconstruction(session: Path, out: Path) -> tuple[str, list[str]]:
-    """The verb that reconstructs a session, and its fields."""
+def reconstruction(session: Path, out: Path, given: Sequence[str] = ()) -> tuple[str, list[str]]:
+    """The verb that reconstructs a session, and its fields, with those that are given."""
     capture = f"capture={session / 'capture'}"
-    return "reconstruct", [capture, f"temperature_c={WATER_C:g}", f"tissue_m_s={TISSUE_M_S:g}", f"out={out}"]
+    return "reconstruct", [capture, f"temperature_c={WATER_C:g}", f"tissue_m_s={TISSUE_M_S:g}", f"out={out}", *given]
+
+
+def rendering_cylinders(out: Path, given: Sequence[str] = ()) -> Iterator[tuple[str, list[str]]]:
+    """Verbs and their fields for the paper's cylinders, in another capture of the same rig.
+
+    Light measures the outer one; then that is taken away, and ultrasound measures the inner one, which stays where it is, in
+    water, in 94 B-scans as in Meza et al. 2021.
+    """
+    place = [f"out={out}", "add=true", *given]
+    yield "render", ["scene=cylinders", *place]
+    yield "sweep", [*INNER, *TANK, "path=stroke", *ALONG, "clocks.camera_hz=20", "filmed=true", f"name={TUBE}", *place]
+
+
+def reconstruction_of_cylinders(session: Path, calibrated: Path, out: Path, given: Sequence[str] = ()) -> tuple[str, list[str]]:
+    """The verb that reconstructs the cylinders by the calibrations of a session's reconstruction, and its fields."""
+    lag = json.loads((calibrated / "latency" / measure_lag.LAG).read_text(encoding="utf-8"))
+    optics, probe = calibrated / "optics" / calibrate_optics.OPTICS, calibrated / "probe" / calibrate_probe.PROBE
+    known = [f"calibration={optics}", f"probe={probe}", f"lag_s={lag['lag_s']}", f"lag_sigma_s={lag['sigma_s']}"]
+    known += [f"tissue_m_s={speed_of_sound(WATER_C)}", f"tissue_sigma_m_s={WATER_SIGMA_M_S}"]
+    return "reconstruct", [f"capture={session / 'capture'}", "find=tube", *known, f"out={out}", *given]
 
 
 def do(verb: str, fields: Sequence[str]) -> int:

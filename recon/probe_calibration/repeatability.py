@@ -25,14 +25,22 @@ def five_points(size: Size) -> Array:
 
 def cr1(calibrations: Sequence[ProbeCalibration], pixels: ArrayLike) -> Array:
     """Repeatability CR1 : (k,) mm: mean distance, over all pairs of calibrations, of the places of pixels : (k, 2)."""
-    points = np.stack([calibration.to_target(pixels) for calibration in calibrations])
-    first, second = np.triu_indices(len(points), 1)
-    return np.linalg.norm(points[first] - points[second], axis=-1).mean(axis=0)
+    return between_pairs(np.stack([calibration.to_target(pixels) for calibration in calibrations]))
 
 
 def cr2(calibrations: Sequence[ProbeCalibration], pixels: ArrayLike) -> Array:
     """Repeatability CR2 : (k,) mm: mean distance of the places of pixels : (k, 2) by each calibration from the mean place."""
-    points = np.stack([calibration.to_target(pixels) for calibration in calibrations])
+    return from_mean(np.stack([calibration.to_target(pixels) for calibration in calibrations]))
+
+
+def between_pairs(points: Array) -> Array:
+    """Mean distance : (k,) over all pairs of n sets of points : (n, k, 3)."""
+    first, second = np.triu_indices(len(points), 1)
+    return np.linalg.norm(points[first] - points[second], axis=-1).mean(axis=0)
+
+
+def from_mean(points: Array) -> Array:
+    """Mean distance : (k,) of n sets of points : (n, k, 3) from the mean of the sets."""
     return np.linalg.norm(points - points.mean(axis=0), axis=-1).mean(axis=0)
 
 

@@ -1,7 +1,7 @@
 """Masses, or a tube, in the B-scans of a sweep: closed surfaces, their figures, and B-scans with the outlines drawn over."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -11,13 +11,15 @@ from recon.errors import InputError
 from recon.files.metrics import Metrics, shown
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans
+from recon.geometry.primitives import Cylinder
 from recon.model.probe import SCANNER_SPEED
-from recon.segmentation import mass_uncertainty, masses, scan_overlays, tube_wall
+from recon.segmentation import mass_uncertainty, masses, scan_overlays, tube_cover, tube_wall
 from recon.segmentation.containment import Containment, contain
 from recon.segmentation.mass_uncertainty import Sigma, Speeds
 from recon.segmentation.masses import Mass
 from recon.segmentation.refraction import Sound
 from recon.segmentation.scan_overlays import Overlay
+from recon.segmentation.tube_cover import Cover
 from recon.segmentation.tube_wall import Appearance, Ring, Tube
 
 Array = NDArray[np.float64]
@@ -99,8 +101,10 @@ def describe(mass: Mass, sigma: Sigma, under: Containment | None) -> str:
     return f"{text}, {'inside' if under.inside else 'not inside'}, {shown(under.least_mm, '.2f')}{deep} mm below the skin"
 
 
-def find_tube(scans: Scans, look: Appearance | None = None, overlays: int = OVERLAYS) -> Segmented:
-    """Find a tube, and its wall in the B-scans.
+def find_tube(
+    scans: Scans, look: Appearance | None = None, overlays: int = OVERLAYS, surface: trimesh.Trimesh | None = None
+) -> Segmented:
+    """Find a tube, and its wall in the B-scans; with a surface by light, the round body about it, too.
 
     Raises
     ------
@@ -122,7 +126,25 @@ def find_tube(scans: Scans, look: Appearance | None = None, overlays: int = OVER
     line = f"tube        {diameter:.3f} mm in diameter, sigma {sigma:.3f} mm, {used} B-scans, RMS {tube.rms:.3f} mm"
     outlines = {int(k): rings[k].pixels for k in np.unique(tube.frames)}
     drawn = scan_overlays.of_outlines(scans.stream(), outlines, overlays)
-    return Segmented({"tube": tube_mesh(tube, rings, matrices)}, figures, [line], drawn)
+    ends = ends_of(tube, rings, matrices)
+    inner = Segmented({"tube": between(tube.shape, ends)}, figures, [line], drawn)
+    if surface is None:
+        return inner
+    try:
+        return covered(inner, tube_cover.fit_cover(surface, tube.shape, ends), ends)
+    except InputError as error:
+        return replace(inner, lines=[*inner.lines, f"cover       none: {error}"])
+
+
+def covered(inner: Segmented, cover: Cover, ends: Array) -> Segmented:
+    """The tube with the body about it, between the same ends."""
+    figures = inner.figures | {
+        "cover_diameter_mm": 2 * cover.shape.radius,
+        "cover_rms_mm": cover.rms_mm,
+        "cover_wall_mm": cover.wall_mm,
+    }
+    line = f"cover       {2 * cover.shape.radius:.3f} mm in diameter, RMS {cover.rms_mm:.3f} mm, wall {cover.wall_mm:.3f} mm"
+    return Segmented(inner.meshes | {"cover": between(cover.shape, ends)}, figures, [*inner.lines, line], inner.overlays)
 
 
 def measure_tube(tube: Tube, of_scale_mm: float) -> Metrics:
@@ -137,9 +159,14 @@ def measure_tube(tube: Tube, of_scale_mm: float) -> Metrics:
     }
 
 
-def tube_mesh(tube: Tube, rings: Sequence[Ring], matrices: Array) -> trimesh.Trimesh:
-    """The cylinder, between the farthest points of the wall along its axis."""
+def ends_of(tube: Tube, rings: Sequence[Ring], matrices: Array) -> Array:
+    """Ends : (2, 3) mm of the measured part of a tube, on its axis."""
     points = np.concatenate([tube_wall.in_world(rings[k].pixels, matrices[k]) for k in np.unique(tube.frames)])
     along = (points - tube.shape.point) @ tube.shape.axis
-    ends = tube.shape.point + np.outer([along.min(), along.max()], tube.shape.axis)
-    return trimesh.creation.cylinder(tube.shape.radius, segment=ends, sections=96)
+    return tube.shape.point + np.outer([along.min(), along.max()], tube.shape.axis)
+
+
+def between(shape: Cylinder, ends: Array) -> trimesh.Trimesh:
+    """A cylinder, between the feet of points : (2, 3) mm on its axis."""
+    feet = shape.point + np.outer((ends - shape.point) @ shape.axis, shape.axis)
+    return trimesh.creation.cylinder(shape.radius, segment=feet, sections=96)

@@ -287,7 +287,7 @@ def look_inside(
     voxels = steps.do(volume, "B-scans in a volume", "freehand", [*fields, spacing], (freehand.VOLUME,), made_of)
     if config.find == "nothing":
         return None
-    if skin is not None and config.find == "masses":
+    if skin is not None:
         fields, made_of = [*fields, f"surface={skin}"], made_of | {"skin": steps.digest("surface")}
         placing = [*placing, f"surface={skin}"]
     does, found = f"{'masses' if config.find == 'masses' else 'a tube'} in the B-scans", _step_of(config.find, name)

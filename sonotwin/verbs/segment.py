@@ -1,10 +1,10 @@
 """Find masses, or a tube, in the B-scans of a freehand sweep, as closed surfaces in the world.
 
 Reads the sweep part of a capture folder, with the probe's calibration and the lag between scanner and tracker, or a tracked
-sequence of the PLUS toolkit; and, to check that masses lie inside, the skin as of `sonotwin surface`, a PLY. Writes into the
-folder `out`: mass0.ply, mass1.ply ... from the largest on, or tube.ply, in the world's frame, mm; the same as .glb; some B-scans
-with the outline, overlay0.png ...; and metrics.json. Results that are there already are replaced. Takes a quarter of a minute
-for 150 B-scans, a tube some seconds.
+sequence of the PLUS toolkit; and the skin as of `sonotwin surface`, a PLY, to check that masses lie inside, or to fit the round
+body about a tube, with the wall between both. Writes into the folder `out`: mass0.ply, mass1.ply ... from the largest on, or
+tube.ply and cover.ply, in the world's frame, mm; the same as .glb; some B-scans with the outline, overlay0.png ...; and
+metrics.json. Results that are there already are replaced. Takes a quarter of a minute for 150 B-scans, a tube some seconds.
 
     sonotwin segment capture=outputs/sweep/capture lag_s=0.05 tissue_m_s=1450 out=outputs/masses
     sonotwin segment capture=outputs/sweep/capture lag_s=0.05 surface=outputs/surface/surface.ply out=outputs/masses
@@ -67,8 +67,6 @@ class Config(BaseModel):
         for name, value in (("lag_s", self.lag_s), ("lag_sigma_s", self.lag_sigma_s)):
             if self.sequence is not None and value != 0:
                 raise ValueError(f"{name}: expected none with a sequence, whose poses are those of its images, found {value:g}")
-        if self.kind == "tube" and self.surface is not None:
-            raise ValueError("surface: expected none with kind=tube, found one")
         if self.diameter_mm[0] >= self.diameter_mm[1]:
             raise ValueError(f"diameter_mm: expected the least before the most, found {list(self.diameter_mm)}")
         return self
@@ -126,7 +124,7 @@ def found_in(scans: Scans, config: Config, skin: trimesh.Trimesh | None) -> Segm
     """The masses, or the tube; a fault's message starts with its source."""
     try:
         if config.kind == "tube":
-            return segmented_scans.find_tube(scans, config.tube, config.overlays)
+            return segmented_scans.find_tube(scans, config.tube, config.overlays, skin)
         sigmas = config.tissue_sigma_m_s, config.mass_sigma_m_s
         return segmented_scans.find_masses(scans, skin, config.mass_m_s, config.dynamic_range_db, config.overlays, sigmas)
     except InputError as error:

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from recon.errors import InputError
+from scenes.catalogue import build_scene
 from sonotwin import session_accuracy, session_steps
 from sonotwin.config import load
 from sonotwin.verbs import reconstruct, render, sweep
 from twin.accuracy.table_rows import Setup
+from twin.evaluation import session_errors
 
 MODELS = {"render": render.Config, "sweep": sweep.Config, "reconstruct": reconstruct.Config}
 
@@ -16,8 +18,9 @@ FILM = {"frames": 100, "visible": 95, "visible_found": 95, "false": 0, "shift_me
 SCAN = {
     "placement_over_sigma": 1.0,
     "lag_error_ms": -0.5, "lag_covered": 1.0, "probe_worst_error_mm": 0.1, "probe_worst_sigma_mm": 0.1, "contact_bias_mm": -0.02,
-    "tumours_found": 3, "tumours_false": 0,
+    "tumours_found": 3, "tumours_false": 0, **dict.fromkeys(session_errors.PROBE_ERRORS, 0.02),
 }  # fmt: skip
+CYLINDERS = {"tube_diameter_error_mm": -0.04, "cover_diameter_error_mm": 0.004, "cover_wall_error_mm": 0.016}
 TUMOUR = {
     "true_extent_mm": 20.0, "centre_error_mm": 0.2, "volume_mm3": 1030.0, "true_volume_mm3": 1000.0, "under_skin_mm": 8.1,
     "true_under_skin_mm": 8.0, "inside": 1, "centre_sigma_mm": 0.3, "volume_sigma_mm3": 30.0, "depth_sigma_mm": 0.2,
@@ -29,7 +32,7 @@ def figures(**changes) -> dict:
     films = {f"{name}_track_{key}": value for name in ("wires", "bottom", "scan") for key, value in FILM.items()}
     scan = {f"scan_{key}": value for key, value in SCAN.items()}
     tumours = {f"scan_tumour{k}_{key}": value for k in range(3) for key, value in TUMOUR.items()}
-    return films | scan | tumours | changes
+    return films | scan | tumours | CYLINDERS | changes
 
 
 def missed(found) -> set[str]:
@@ -46,6 +49,7 @@ def test_good_sessions_meet_all_bars():
     ({"bottom_track_false": 1}, "wrong poses in all sweeps"),
     ({"scan_lag_error_ms": -2.0}, "latency"),
     ({"scan_probe_worst_error_mm": 0.3}, "probe, the worst of five pixels"),
+    ({f"scan_probe_error0_{axis}_mm": 0.1 for axis in "xyz"}, "probe, CR1, centre"),
     ({"scan_tumours_false": 1}, "tumours found inside the skin, less false ones, of 3"),
     ({"scan_tumour1_inside": 0}, "tumours found inside the skin, less false ones, of 3"),
     ({"scan_tumour2_volume_mm3": 1100.0}, "tumours' volumes"),
@@ -54,6 +58,15 @@ def test_good_sessions_meet_all_bars():
 ])  # fmt: skip
 def test_one_bad_session_is_enough(changes, row):
     assert missed([figures(), figures(**changes)]) == {row}
+
+
+@pytest.mark.parametrize("figure", CYLINDERS)
+def test_a_wrong_length_of_the_cylinders_fails_its_row(figure):
+    """And mean and spread stand beside the worst."""
+    found = [figures(), figures(**{figure: -0.07})]
+    rows = [row for row in session_accuracy.rows("ideal", found) if not row.ok]
+    assert len(rows) == 1 and rows[0].measured == 0.07
+    assert f"(mean {(CYLINDERS[figure] - 0.07) / 2:+.3f}, " in rows[0].what
 
 
 def test_a_missed_mass_fails_its_rows():
@@ -102,5 +115,11 @@ def test_the_verbs_of_a_session_are_valid(tmp_path, kind):
     read = [load(verb, fields, MODELS[verb]) for verb, fields in steps]
     assert {each.seed for each in read} == {3} and all(each.add for each in read)
     assert [each.name for each in read[2:]] == ["wires", "bottom", "scan"] and all(each.filmed for each in read[2:])
+    read = [
+        load(verb, fields, MODELS[verb]) for verb, fields in session_steps.rendering_cylinders(tmp_path, [f"conditions={kind}"])
+    ]
+    assert read[1].name == "tube" and read[1].filmed
+    inner, outer = (build_scene(dict(each.scene)).shapes[-1] for each in read)
+    assert np.allclose(inner.point, outer.point) and inner.radius == outer.radius
     verb, fields = session_steps.reconstruction(tmp_path, tmp_path / "out")
     assert load(verb, fields, MODELS[verb]).capture == tmp_path / "capture"

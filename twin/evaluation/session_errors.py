@@ -8,19 +8,26 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.capture import manifest, probe_files, sweep_part
-from recon.capture.manifest import CAMERAS, SCANNER
+from recon.capture.manifest import CAMERAS, SCANNER, PartName
+from recon.capture.manifest import sweep_part as sweep_path
 from recon.files import metrics
 from recon.files.metrics import Metrics
 from recon.freehand import place_uncertainty
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans, Unsure
+from recon.geometry.primitives import Cylinder
 from recon.probe_calibration.repeatability import five_points
+from recon.segmentation import tube_cover
+from scenes.catalogue import build_scene
 from twin.evaluation import sweep_errors, track_errors
 from twin.evaluation.sweep_errors import SweepTruth
+from twin.session import TruthFolder
 
 Array = NDArray[np.float64]
 
 FACE_POINTS = 9  # along the array
+# figures of centre and corners, in the target's frame
+PROBE_ERRORS = [f"probe_error{point}_{axis}_mm" for point in range(5) for axis in "xyz"]
 
 
 def measure(result: Path, capture: Path, truth: Path) -> Metrics:
@@ -52,7 +59,9 @@ def inside(result: Path, truth: Path, name: str) -> Metrics:
     true = sweep_errors.read_truth(truth, name)
     lag = json.loads((result / "latency" / "lag.json").read_text(encoding="utf-8"))
     probe = probe_files.read(result / "probe" / "probe.yaml")
-    error, sigma = sweep_errors.probe_errors(probe, true, five_points(true.transducer.image_size))
+    pixels = five_points(true.transducer.image_size)
+    error, sigma = sweep_errors.probe_errors(probe, true, pixels)
+    apart_by_probe = probe.to_target(pixels) - true.probe.to_target(pixels)
     sweep = sweep_part.read_sweep(result / "poses" / name, name)
     scans = freehand_scans.of_sweep(sweep, probe, lag["lag_s"], true.transducer.assumed_speed, Unsure(lag["sigma_s"]))
     shown, apart = scans.world_from_pixel, sweep_errors.placement(scans.world_from_pixel, true)
@@ -64,12 +73,43 @@ def inside(result: Path, truth: Path, name: str) -> Metrics:
         "lag_covered": float(lag["interval_s"][0] <= true.lag_s <= lag["interval_s"][1]),
         "probe_worst_error_mm": float(error.max()),
         "probe_worst_sigma_mm": float(sigma[error.argmax()]),
+        **dict(zip(PROBE_ERRORS, apart_by_probe.ravel().tolist(), strict=True)),
         "placement_rms_mm": float(np.sqrt(np.nanmean(apart**2))),
         "placement_over_sigma": float(np.sqrt(np.nanmean((apart / place_sigmas(scans)) ** 2))),
         **sweep_errors.measure(sweep_errors.compare(meshes, true), true, found),
     }
     skin = result / "surface" / "surface.ply"
     return figures | ({"contact_bias_mm": contact_bias(shown, true, skin)} if skin.is_file() else {})
+
+
+def cylinders(result: Path, truth: Path, name: str) -> Metrics:
+    """Errors, mm, of both cylinders' diameters and of the wall between them.
+
+    Parameters
+    ----------
+    result, truth : folders, as of `sonotwin reconstruct find=tube` and of the twin; the outer cylinder in the surface, the inner
+        one in the sweep of that name.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged.
+    """
+    found = metrics.read(result / "tube" / name / metrics.FILE)
+    outer, inner = _cylinder(truth, "surface", "outer"), _cylinder(truth, sweep_path(name), "inner")
+    true = {
+        "tube_diameter_mm": 2 * inner.radius,
+        "cover_diameter_mm": 2 * outer.radius,
+        "cover_wall_mm": tube_cover.wall_between(outer, inner),
+    }
+    errors: Metrics = {f"{figure[:-3]}_error_mm": found.get(figure, np.nan) - value for figure, value in true.items()}
+    return errors | {"tube_diameter_sigma_mm": found.get("tube_diameter_sigma_mm", np.nan)}
+
+
+def _cylinder(truth: Path, part: PartName, name: str) -> Cylinder:
+    """A cylinder of a part's scene."""
+    scene = build_scene(TruthFolder(truth, part).settings()["scene"])
+    return next(shape for shape in scene.shapes if isinstance(shape, Cylinder) and shape.name == name)
 
 
 def place_sigmas(scans: Scans) -> Array:

@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 import trimesh
 
+from recon.geometry.primitives import Cylinder
 from recon.segmentation import segmented_scans
 from recon.segmentation.containment import Containment
 from recon.segmentation.mass_uncertainty import Sigma
 from recon.segmentation.masses import Mass
+from recon.segmentation.segmented_scans import Segmented
+from recon.segmentation.tube_cover import Cover
 
 
 def test_whether_a_mass_is_inside_may_be_unknown():
@@ -21,3 +24,15 @@ def test_whether_a_mass_is_inside_may_be_unknown():
     assert figures["mass0_depth_sigma_mm"] == 0.3
     assert figures["mass0_volume_sigma_mm3"] == 10.0 and figures["mass0_centre_sigma_mm"] == 0.5
     assert np.isnan(figures["mass0_inside"]) and figures["mass0_covered"] == pytest.approx(0.48, abs=0.01)
+
+
+def test_a_cover_stands_beside_its_tube():
+    """Both over the same length, with the wall in figures and on the console."""
+    axis, ends = np.array([1.0, 0, 0]), np.array([[-20.0, 0, 600], [20, 0, 600]])
+    tube = Cylinder("", np.array([0.0, 0, 600]), axis, 8.0)
+    inner = Segmented({"tube": segmented_scans.between(tube, ends)}, {"tube_diameter_mm": 16.0}, ["tube"], [])
+    cover = Cover(Cylinder("", np.array([5.0, 0, 601]), axis, 30.0), 0.02, 21.0)
+    found = segmented_scans.covered(inner, cover, ends)
+    assert found.figures == {"tube_diameter_mm": 16.0, "cover_diameter_mm": 60.0, "cover_rms_mm": 0.02, "cover_wall_mm": 21.0}
+    assert np.allclose(found.meshes["cover"].bounds[:, 0], [-20, 20]) and "wall 21.000 mm" in found.lines[-1]
+    assert np.allclose(found.meshes["cover"].bounds[:, 2], [571, 631], atol=0.05)
