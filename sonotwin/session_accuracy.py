@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.files import metrics
-from recon.files.metrics import Metrics
+from recon.files.metrics import Metrics, shown
 from recon.probe_calibration import repeatability
 from sonotwin import config, session_steps
 from sonotwin.choices import read_rig
@@ -168,7 +168,7 @@ def repeated(measure: str, name: str, mm: Array, bars: tuple[float, float, float
 def cylinder(figure: str, name: str, errors: Array, bar: float) -> Row:
     """Errors of a length of the cylinders over sessions : (n,) mm: the worst, with mean and spread."""
     spread = errors.std(ddof=1) if len(errors) > 1 else np.nan
-    text = f"{name}: {LENGTHS[figure]} (mean {errors.mean():+.3f}, spread {spread:.3f}; paper: {PAPER_MM[figure]:.2f})"
+    text = f"{name}: {LENGTHS[figure]} (mean {errors.mean():+.3f}, spread {shown(spread, '.3f')}; paper: {PAPER_MM[figure]:.2f})"
     return Row("e", text, float(np.abs(errors).max()), bar, None, "mm")
 
 

@@ -66,6 +66,29 @@ def with_drift(known: Uncertainty | None, devices: Sequence[str], drift_px: floa
     return Uncertainty(extended, covariance)
 
 
+def with_scale(known: Uncertainty | None, cameras: Mapping[str, Camera], sigma: float) -> Uncertainty | None:
+    """Make the scale of all places at least as uncertain as the print of the board that gave it.
+
+    A board's aspect and shear, which images show, say little of its scale, which they don't. All translations grow or shrink
+    together by it, and with them all that the devices measure.
+
+    sigma : relative standard deviation of the print's scale.
+    """
+    moved = [f"{device}.{name}" for device in cameras if device != WORLD for name in ("tx", "ty", "tz")]
+    shift = np.concatenate([camera.camera_from_world[:3, 3] for device, camera in cameras.items() if device != WORLD])
+    names = () if known is None else known.names
+    extended = (*names, *(name for name in moved if name not in names))
+    covariance = np.zeros((len(extended), len(extended)))
+    if known is not None:
+        covariance[: len(names), : len(names)] = known.covariance
+    order = [extended.index(name) for name in moved]
+    found = shift @ covariance[np.ix_(order, order)] @ shift / (shift @ shift) ** 2
+    if sigma**2 <= found:
+        return known
+    covariance[np.ix_(order, order)] += (sigma**2 - found) * np.outer(shift, shift)
+    return Uncertainty(extended, covariance)
+
+
 def projection_slopes(cameras: Mapping[str, Camera], points: Sequence[Array], names: Sequence[str]) -> Array:
     """Derivatives : (m, g) px of all devices' projections, x and y of point after point, by the calibration's parameters.
 

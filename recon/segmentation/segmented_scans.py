@@ -25,6 +25,7 @@ from recon.segmentation.tube_wall import Appearance, Ring, Tube
 Array = NDArray[np.float64]
 
 OVERLAYS = 4
+COVER = ("cover_diameter_mm", "cover_rms_mm", "cover_wall_mm")  # figures
 NONE_FOUND = "none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"
 
 
@@ -133,16 +134,14 @@ def find_tube(
     try:
         return covered(inner, tube_cover.fit_cover(surface, tube.shape, ends), ends)
     except InputError as error:
-        return replace(inner, lines=[*inner.lines, f"cover       none: {error}"])
+        unknown: Metrics = dict.fromkeys(COVER, float("nan"))
+        return replace(inner, figures=inner.figures | unknown, lines=[*inner.lines, f"cover       none: {error}"])
 
 
 def covered(inner: Segmented, cover: Cover, ends: Array) -> Segmented:
     """The tube with the body about it, between the same ends."""
-    figures = inner.figures | {
-        "cover_diameter_mm": 2 * cover.shape.radius,
-        "cover_rms_mm": cover.rms_mm,
-        "cover_wall_mm": cover.wall_mm,
-    }
+    values = 2 * cover.shape.radius, cover.rms_mm, cover.wall_mm
+    figures = inner.figures | dict(zip(COVER, values, strict=True))
     line = f"cover       {2 * cover.shape.radius:.3f} mm in diameter, RMS {cover.rms_mm:.3f} mm, wall {cover.wall_mm:.3f} mm"
     return Segmented(inner.meshes | {"cover": between(cover.shape, ends)}, figures, [*inner.lines, line], inner.overlays)
 

@@ -12,7 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.errors import InputError
-from recon.geometry.primitives import Cylinder, fit_cylinder
+from recon.geometry.primitives import Cylinder, Fit, fit_cylinder
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,9 @@ MOST_POINTS = 100_000  # evenly chosen; more would change the radius by less tha
 OUTLIER = 4.0  # standard deviations, by the median absolute deviation
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 ROUNDS = 3
-ROUND = 0.02  # of the radius, RMS: what is less round is no cylinder
+LEAST_ARC_DEG = 70.0  # of the surface about the fitted axis; less leaves the radius to chance
+MOST_TURN_DEG = 20.0  # between both axes
+MOST_RMS_MM = 0.3  # of the points about the cylinder: light is ten times as exact
 
 
 @dataclass(frozen=True)
@@ -52,14 +54,30 @@ def fit_cover(surface: trimesh.Trimesh, tube: Cylinder, ends: Array) -> Cover:
     if len(points) < LEAST_POINTS:
         raise InputError(f"surface: expected {LEAST_POINTS} points before the tube, found {len(points)}; another session?")
     points = points[:: -(-len(points) // MOST_POINTS)]
+    try:
+        fit, points = _robust(points)
+    except (ValueError, np.linalg.LinAlgError):
+        raise InputError("surface: expected a round body about the tube, found no cylinder through it") from None
+    turn = np.rad2deg(np.arccos(min(1.0, abs(float(fit.shape.axis @ tube.axis)))))
+    wrong = {
+        f"{fit.rms:.2g} mm RMS off a cylinder": fit.rms > MOST_RMS_MM,
+        f"a cylinder turned by {turn:.0f} deg against the tube": turn > MOST_TURN_DEG,
+        f"an arc of {arc_deg(points, fit.shape):.0f} deg": arc_deg(points, fit.shape) < LEAST_ARC_DEG,
+    }
+    found = [text for text, holds in wrong.items() if holds]
+    if found:
+        raise InputError(f"surface: expected a round body about the tube, found {', '.join(found)}")
+    return Cover(fit.shape, fit.rms, wall_between(fit.shape, tube))
+
+
+def _robust(points: Array) -> tuple[Fit[Cylinder], Array]:
+    """Cylinder through points : (n, 3) mm, and those near it."""
     fit = fit_cylinder(points)
     for _ in range(ROUNDS):
         away = np.abs(fit.residuals - np.median(fit.residuals))
         points = points[away < OUTLIER * NORMAL_MAD * np.median(away) + 1e-9]
         fit = fit_cylinder(points)
-    if fit.rms > ROUND * fit.shape.radius:
-        raise InputError(f"surface: expected a round body about the tube, found {fit.rms:.2g} mm RMS off a cylinder")
-    return Cover(fit.shape, fit.rms, wall_between(fit.shape, tube))
+    return fit, points
 
 
 def before(points: Array, tube: Cylinder, ends: Array) -> Array:
@@ -69,6 +87,16 @@ def before(points: Array, tube: Cylinder, ends: Array) -> Array:
     across = local - np.outer(along, tube.axis)
     facing = across @ to_camera(tube) > np.cos(np.deg2rad(HALF_ARC_DEG)) * np.linalg.norm(across, axis=1)
     return points[facing & (along > first) & (along < last)]
+
+
+def arc_deg(points: Array, shape: Cylinder) -> float:
+    """Angle, deg, that points : (n, 3) mm span about a cylinder's axis, less their outer hundredths."""
+    middle = points.mean(axis=0) - shape.point
+    up = middle - (middle @ shape.axis) * shape.axis
+    up /= np.linalg.norm(up)
+    local = points - shape.point
+    angle = np.arctan2(local @ np.cross(shape.axis, up), local @ up)
+    return float(np.rad2deg(np.ptp(np.percentile(angle, [1, 99]))))
 
 
 def to_camera(tube: Cylinder) -> Array:
@@ -83,7 +111,7 @@ def wall_between(outer: Cylinder, tube: Cylinder) -> float:
     Raises
     ------
     InputError
-        If the tube's axis isn't within the outer one.
+        If the tube isn't within the outer one.
     """
     offset = (np.eye(3) - np.outer(outer.axis, outer.axis)) @ np.column_stack([tube.point - outer.point, to_camera(tube)])
     start, step = offset.T
@@ -91,4 +119,7 @@ def wall_between(outer: Cylinder, tube: Cylinder) -> float:
     if inside <= 0:
         raise InputError("surface: expected a round body about the tube, found its axis beside the body; another session?")
     towards = (start @ step) / (step @ step)
-    return float(np.sqrt(towards**2 + inside / (step @ step)) - towards - tube.radius)
+    wall = float(np.sqrt(towards**2 + inside / (step @ step)) - towards - tube.radius)
+    if wall <= 0:
+        raise InputError(f"surface: expected a round body about the tube, found its wall {-wall:.1f} mm outside")
+    return wall

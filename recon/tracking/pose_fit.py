@@ -120,13 +120,6 @@ class TargetPose:
         """Whether there is a pose."""
         return self.reason is None
 
-    def at_scale(self, sigma: float) -> "TargetPose":
-        """The same pose, of cameras whose scale has a relative standard deviation: all places move along their rays alike."""
-        place = sigma * self.world_from_target[:3, 3]
-        moved = np.zeros((PARAMETERS, PARAMETERS))
-        moved[3:, 3:] = np.outer(place, place)
-        return replace(self, shared=self.shared + moved)
-
     @property
     def total(self) -> Array:
         """Covariance : (6, 6) of the whole error, by noise and by tolerances."""

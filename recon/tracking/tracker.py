@@ -64,7 +64,6 @@ class Tracker:
     networks: Networks | None = None  # without them it only follows from a pose that it is given by `remember`
     bits: int | None = None  # of frames deeper than 8 bits, see `frames.grey`
     optics: Uncertainty | None = None  # of the cameras' calibration; None where it isn't known, or exact
-    scale_sigma: float = 0.0  # relative standard deviation of the cameras' scale: of the board's print that gave it
     _past: list[tuple[float, Array]] = field(default_factory=list, init=False)  # times and poses, the last one last, two at most
     _clock: float = field(default=0.0, init=False)  # counts frames that come without a time
 
@@ -171,7 +170,6 @@ class Tracker:
         if not found.found:
             both = all(view.found for view in seen)
             return Tracking(found, views.doubted(seen, found.reason) if both else self._unconfirmed(seen))
-        found = found.at_scale(self.scale_sigma)
         if not found.used.all():
             one, other = self._expected(0, found.world_from_target), self._expected(1, found.world_from_target)
             seen = views.with_predicted(seen[0], one, found.used[0]), views.with_predicted(seen[1], other, found.used[1])

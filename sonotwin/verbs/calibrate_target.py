@@ -21,7 +21,7 @@ from recon.capture import stereo_frames, target_files
 from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
-from recon.model.calibration import DRIFT_PX, with_drift
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, with_drift, with_scale
 from recon.model.rig import Rig
 from recon.target_calibration import target_bundle, target_figures, target_poses
 from recon.target_calibration.target_poses import Seen
@@ -43,6 +43,7 @@ class Config(BaseModel):
     out: Path
     calibration: Path | None = None
     drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
+    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
     networks: Path | None = None
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
     most_poses: Annotated[int, Field(ge=target_poses.LEAST, le=10_000)] = 100
@@ -63,7 +64,8 @@ def run(config: Config) -> None:
     atomic.check_folder(config.out, TARGET, inputs=inputs)
     film = stereo_frames.read_film(config.capture, config.calibration, config.sweep)
     design = config.rig.target
-    optics = with_drift(film.optics, CAMERAS, config.drift_px)
+    scaled = with_scale(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale)
+    optics = with_drift(scaled, CAMERAS, config.drift_px)
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
     tracker = Tracker(film.cameras, design, loaded, film.bits, optics)
     seen = collect(film, tracker, console)

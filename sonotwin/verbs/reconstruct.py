@@ -5,9 +5,9 @@ frames of both cameras for the poses of its sweeps, a flat bottom for the scanne
 for volumes and masses. What is missing is taken from the calibrations given here or in the capture, or left out by name.
 
 Writes into the folder `out`, each step in a folder of its own as its verb would: optics/, surface/, poses/NAME/, latency/,
-probe/, volume/NAME/, masses/NAME/ and scene/NAME/ (of a sweep without a name poses/, volume/, masses/, scene/); and metrics.json,
-the figures of all steps. A step whose result is there, made of the same, isn't done again, so a run that was killed is simply
-started again. Takes minutes. Exit status 1 if a step failed; those that build on it are left out.
+probe/, volume/NAME/, masses/NAME/ or tube/NAME/, and scene/NAME/ (of a sweep without a name poses/, volume/ ...); and
+metrics.json, the figures of all steps. A step whose result is there, made of the same, isn't done again, so a run that was killed
+is simply started again. Takes minutes. Exit status 1 if a step failed; those that build on it are left out.
 
     sonotwin reconstruct capture=session/capture out=result
     sonotwin reconstruct capture=session/capture tissue_m_s=1450 temperature_c=22 out=result

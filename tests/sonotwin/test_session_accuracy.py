@@ -121,5 +121,11 @@ def test_the_verbs_of_a_session_are_valid(tmp_path, kind):
     assert read[1].name == "tube" and read[1].filmed
     inner, outer = (build_scene(dict(each.scene)).shapes[-1] for each in read)
     assert np.allclose(inner.point, outer.point) and inner.radius == outer.radius
+    (tmp_path / "latency").mkdir()
+    (tmp_path / "latency" / "lag.json").write_text('{"lag_s": 0.05, "sigma_s": 0.001}')
+    verb, fields = session_steps.reconstruction_of_cylinders(tmp_path, tmp_path, tmp_path / "out", ["board_scale=0"])
+    by_session = load(verb, fields, MODELS[verb])
+    assert (by_session.find, by_session.lag_s, by_session.board_scale) == ("tube", 0.05, 0.0)
+    assert by_session.tissue_m_s == pytest.approx(1488.3, abs=0.2)
     verb, fields = session_steps.reconstruction(tmp_path, tmp_path / "out")
     assert load(verb, fields, MODELS[verb]).capture == tmp_path / "capture"

@@ -67,5 +67,17 @@ def test_what_is_no_round_body_about_the_tube_is_refused(rng):
         tube_cover.fit_cover(surface(outer, rng), TUBE, ENDS + 300 * AXIS)
     with pytest.raises(InputError, match=r"expected a round body about the tube, found .* mm RMS off a cylinder"):
         tube_cover.fit_cover(surface(outer, rng, waves_mm=3.0), TUBE, ENDS)
+    flat = np.column_stack([rng.uniform(-60, 60, (20_000, 2)), 630 + rng.normal(0, 0.02, 20_000)])
+    with pytest.raises(InputError, match="expected a round body about the tube, found"):
+        tube_cover.fit_cover(trimesh.Trimesh(flat, np.zeros((0, 3), int), process=False), TUBE, ENDS)
+    dome = rng.normal(size=(60_000, 3))
+    dome = MIDDLE + 60 * dome / np.linalg.norm(dome, axis=1, keepdims=True)
+    with pytest.raises(InputError, match=r"expected a round body about the tube, found .* mm RMS off a cylinder"):
+        tube_cover.fit_cover(trimesh.Trimesh(dome, np.zeros((0, 3), int), process=False), TUBE, ENDS)
+    crossing = Cylinder("", MIDDLE, np.cross(AXIS, tube_cover.to_camera(TUBE)), 30.0)
+    with pytest.raises(InputError, match="turned by 90 deg"):
+        tube_cover.fit_cover(surface(crossing, rng), TUBE, ENDS)
+    with pytest.raises(InputError, match=r"found its wall 2\.0 mm outside"):
+        tube_cover.wall_between(outer, Cylinder("", MIDDLE + 24.09 * tube_cover.to_camera(TUBE), AXIS, 7.91))
     with pytest.raises(InputError, match="found its axis beside the body"):
         tube_cover.wall_between(outer, Cylinder("", MIDDLE + np.array([0.0, 31.0, 0.0]), AXIS, 7.91))

@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from recon.capture.manifest import CAMERAS
 from recon.geometry import camera_jacobian, rigid
 from recon.geometry.circle_projection import centre_offsets
 from recon.model import circle_layout
-from recon.model.calibration import Uncertainty, with_drift
+from recon.model.calibration import Uncertainty, with_drift, with_scale
 from recon.tracking import pose, pose_fit
 from recon.tracking.pose_fit import Sighting
 from tests.recon.tracking import drawings
@@ -400,3 +401,22 @@ def test_nonsense_is_not_found(cameras, target):
     assert not pose.estimate(view, replace(view, camera=cameras[1]), target).found
     same = replace(view, centres=np.full((3, 2), 500.0))
     assert not pose.estimate(same, replace(same, camera=cameras[1]), target).found
+
+
+def test_the_scale_of_the_board_moves_poses_as_predicted(cameras, rig, rng):
+    """Along the ray from camera 1, by its share of the distance; the target, known to 0.1 mm of 40, says next to nothing."""
+    ratio = 1 + 3e-4
+    scaled = with_scale(None, dict(zip(CAMERAS, cameras, strict=True)), 3e-4)
+    moved = cameras[1].camera_from_world.copy()
+    moved[:3, 3] *= ratio
+    for _ in range(10):
+        true = drawings.facing(rng)
+        views = seen(cameras, rig.target, true)
+        right = pose.estimate(*views, rig.target)
+        views[1] = replace(views[1], camera=replace(cameras[1], camera_from_world=moved))
+        found, distance = pose.estimate(*views, rig.target, scaled), np.linalg.norm(true[:3, 3])
+        shift = error(found.world_from_target, right.world_from_target)[3:]
+        assert np.allclose(shift, (ratio - 1) * true[:3, 3], atol=0.03 * 3e-4 * distance)
+        by_scale = (found.shared - right.shared)[3:, 3:]
+        ray = true[:3, 3] / distance
+        assert np.sqrt(ray @ by_scale @ ray) == pytest.approx(3e-4 * distance, rel=0.03)

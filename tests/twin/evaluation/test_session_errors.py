@@ -1,5 +1,7 @@
 """Errors of a session: a face that stands off the skin by light is found, whatever the hand did."""
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
@@ -49,3 +51,18 @@ def test_scans_without_a_pose_are_left_out(tmp_path, rng):
     placed[:5] = np.nan
     placed[5:, 2, 3] -= 0.3  # towards the cameras
     assert session_errors.contact_bias(placed, truth, tmp_path / "surface.ply") == pytest.approx(0.3, abs=1e-3)
+
+
+def test_errors_of_the_cylinders(tmp_path):
+    """Found less true; the wall is that between the outer one of the surface and the inner one of the sweep."""
+    parts = {"surface": {"kind": "cylinders"}, "sweep/tube": {"kind": "inner_cylinder", "centre_mm": [4.0, -2.0, 670.29]}}
+    for part, scene in parts.items():
+        (tmp_path / "truth" / part).mkdir(parents=True)
+        for name, content in (("scene.json", {}), ("settings.json", {"scene": scene})):
+            (tmp_path / "truth" / part / name).write_text(json.dumps(content))
+    found = {"tube_diameter_mm": 15.8, "cover_diameter_mm": 60.01, "cover_wall_mm": 22.4, "tube_diameter_sigma_mm": 0.03}
+    (tmp_path / "tube" / "tube").mkdir(parents=True)
+    (tmp_path / "tube" / "tube" / "metrics.json").write_text(json.dumps(found))
+    errors = session_errors.cylinders(tmp_path, tmp_path / "truth", "tube")
+    assert errors["tube_diameter_error_mm"] == pytest.approx(-0.02) and errors["cover_diameter_error_mm"] == pytest.approx(0.01)
+    assert errors["cover_wall_error_mm"] == pytest.approx(0.02, abs=2e-3)
