@@ -55,15 +55,11 @@ def with_drift(known: Uncertainty | None, devices: Sequence[str], drift_px: floa
     """
     if drift_px == 0:
         return known
-    names = () if known is None else known.names
     moved = [f"{device}.{name}" for device in devices for name in ("cx", "cy")]
-    extended = (*names, *(name for name in moved if name not in names))
-    covariance = np.zeros((len(extended), len(extended)))
-    if known is not None:
-        covariance[: len(names), : len(names)] = known.covariance
-    drifts = np.isin(extended, moved)
-    covariance[drifts, drifts] += drift_px**2
-    return Uncertainty(extended, covariance)
+    wider = _extended(known, moved)
+    drifts = np.isin(wider.names, moved)
+    wider.covariance[drifts, drifts] += drift_px**2
+    return wider
 
 
 def with_scale(known: Uncertainty | None, cameras: Mapping[str, Camera], sigma: float) -> Uncertainty | None:
@@ -76,17 +72,21 @@ def with_scale(known: Uncertainty | None, cameras: Mapping[str, Camera], sigma: 
     """
     moved = [f"{device}.{name}" for device in cameras if device != WORLD for name in ("tx", "ty", "tz")]
     shift = np.concatenate([camera.camera_from_world[:3, 3] for device, camera in cameras.items() if device != WORLD])
-    names = () if known is None else known.names
-    extended = (*names, *(name for name in moved if name not in names))
-    covariance = np.zeros((len(extended), len(extended)))
-    if known is not None:
-        covariance[: len(names), : len(names)] = known.covariance
-    order = [extended.index(name) for name in moved]
-    found = shift @ covariance[np.ix_(order, order)] @ shift / (shift @ shift) ** 2
+    wider = _extended(known, moved)
+    order = [wider.names.index(name) for name in moved]
+    translations = np.ix_(order, order)
+    found = shift @ wider.covariance[translations] @ shift / (shift @ shift) ** 2
     if sigma**2 <= found:
         return known
-    covariance[np.ix_(order, order)] += (sigma**2 - found) * np.outer(shift, shift)
-    return Uncertainty(extended, covariance)
+    wider.covariance[translations] += (sigma**2 - found) * np.outer(shift, shift)
+    return wider
+
+
+def _extended(known: Uncertainty | None, names: Sequence[str]) -> Uncertainty:
+    """A copy that has parameters of these names, too; without error where they were held fixed."""
+    own = () if known is None else known.names
+    every = (*own, *(name for name in names if name not in own))
+    return Uncertainty(every, np.zeros((len(every), len(every))) if known is None else known.ordered(every))
 
 
 def projection_slopes(cameras: Mapping[str, Camera], points: Sequence[Array], names: Sequence[str]) -> Array:

@@ -59,10 +59,11 @@ def fit_cover(surface: trimesh.Trimesh, tube: Cylinder, ends: Array) -> Cover:
     except (ValueError, np.linalg.LinAlgError):
         raise InputError("surface: expected a round body about the tube, found no cylinder through it") from None
     turn = np.rad2deg(np.arccos(min(1.0, abs(float(fit.shape.axis @ tube.axis)))))
+    arc = arc_deg(points, fit.shape)
     wrong = {
         f"{fit.rms:.2g} mm RMS off a cylinder": fit.rms > MOST_RMS_MM,
         f"a cylinder turned by {turn:.0f} deg against the tube": turn > MOST_TURN_DEG,
-        f"an arc of {arc_deg(points, fit.shape):.0f} deg": arc_deg(points, fit.shape) < LEAST_ARC_DEG,
+        f"an arc of {arc:.0f} deg": arc < LEAST_ARC_DEG,
     }
     found = [text for text, holds in wrong.items() if holds]
     if found:
