@@ -7,9 +7,18 @@ from pathlib import Path
 
 import pytest
 
+from sonotwin import installation
+
 ROOT = Path(__file__).resolve().parent.parent
 OURS = {"recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks", "tests"}
 RENDERER = {"mitsuba", "drjit"}
+NEEDS = {  # parts of the requirements, as they stand in pyproject.toml
+    "recon": {"core"},
+    "sonotwin": {"core", "train"},
+    "scenes": {"core"},
+    "twin": {"core", "twin"},
+    "trainers": {"core", "train"},
+}
 MAY_IMPORT = {
     "recon": {"recon"},
     "scenes": {"scenes", "recon"},
@@ -37,6 +46,14 @@ def test_imports_go_one_way(package):
     forbidden = (OURS | RENDERER) - MAY_IMPORT[package]
     offences = {str(path): bad for path in (ROOT / package).rglob("*.py") if (bad := imported(path) & forbidden)}
     assert not offences
+
+
+@pytest.mark.parametrize("package", NEEDS)
+def test_what_is_imported_is_required(package):
+    """A package of the development tools alone is missing where `make demo` has set up."""
+    files = (ROOT / package).rglob("*.py")
+    foreign = {name for path in files for name in imported(path)} - OURS - set(sys.stdlib_module_names)
+    assert not {name for name in foreign if installation.extra_of(name) not in NEEDS[package]}
 
 
 def test_recon_runs_where_the_rest_is_missing():
