@@ -1,6 +1,5 @@
 """The steps of a demonstration: each a verb with its overrides, so that running it and printing its command line are one."""
 
-import json
 import os
 import shlex
 import shutil
@@ -9,7 +8,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -21,10 +19,12 @@ from recon.files.metrics import Metrics
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Unsure
 from recon.probe_calibration.repeatability import five_points
+from sonotwin import latency_fields
 from sonotwin.config import load
 from sonotwin.demo_config import BOARD_PATTERNS, CALIBRATION, WATER_C, Config
+from sonotwin.latency_fields import Latency
 from sonotwin.pipeline import Step
-from sonotwin.verbs import calibrate_optics, calibrate_probe, film, measure_lag, render, sweep, track
+from sonotwin.verbs import calibrate_optics, calibrate_probe, film, render, sweep, track
 from twin.evaluation import session_errors, sweep_errors, track_errors
 from twin.reports import track_report
 
@@ -33,13 +33,6 @@ Figures = Mapping[str, float | int]
 MESHES = ("surface.ply", "surface.glb")
 RESTING = ("filmed=true", "clocks.camera_hz=5")  # the probe is held still for each B-scan of the wires
 LAG, LAG_SIGMA = "lag_s=MEASURED", "lag_sigma_s=MEASURED"  # stand for what an earlier step measured
-
-
-class Lag(NamedTuple):
-    """The scanner's lag that was measured, and its standard deviation, s."""
-
-    lag_s: float
-    sigma_s: float
 
 
 @dataclass(frozen=True)
@@ -54,9 +47,9 @@ class VerbStep:
     makes: Sequence[str] = ()  # files and folders at the top of the folder
     refines: Sequence[str] = ()  # figures of earlier steps that it measures better
 
-    def words(self, lag: Lag | None) -> list[str]:
+    def words(self, lag: Latency | None) -> list[str]:
         """The command line after `sonotwin`."""
-        told = {} if lag is None else {LAG: f"lag_s={lag.lag_s:.15g}", LAG_SIGMA: f"lag_sigma_s={lag.sigma_s:.15g}"}
+        told = {} if lag is None else dict(zip((LAG, LAG_SIGMA), lag.fields, strict=True))
         return [self.verb, *(told.get(each, each) for each in self.fields)]
 
     def step(self) -> Step:
@@ -64,13 +57,13 @@ class VerbStep:
         return Step(self.name, self.does, self._work, self.makes, self.refines)
 
     def _work(self, folder: Path, _: Figures) -> Figures:
-        verb, *fields = self.words(measured_lag(folder) if LAG in self.fields else None)
+        verb, *fields = self.words(latency_fields.measured(folder / "lag") if LAG in self.fields else None)
         module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
         module.run(load(verb, fields, module.Config))
         return self.figures(folder)
 
 
-def commands(folder: Path, config: Config, overrides: Sequence[str], lag: Lag | None) -> list[str]:
+def commands(folder: Path, config: Config, overrides: Sequence[str], lag: Latency | None) -> list[str]:
     """The command lines that do the same at once and step by step, with the settings that `sonotwin demo` was given."""
     at_once = ["demo", *_given(overrides), f"out={folder}"]
     lines = [at_once, *(step.words(lag) for step in verb_steps(folder, config, overrides) if isinstance(step, VerbStep))]
@@ -168,7 +161,7 @@ def sweep_steps(folder: Path, config: Config, given: Sequence[str]) -> list[Verb
 def fusing_fields(folder: Path, config: Config, overrides: Sequence[str]) -> list[str]:
     """Fields of the step that puts all into one picture, with the lag that was measured."""
     (step,) = (step for step in verb_steps(folder, config, overrides) if isinstance(step, VerbStep) and step.name == "scene")
-    return step.words(measured_lag(folder))[1:]
+    return step.words(latency_fields.measured(folder / "lag"))[1:]
 
 
 def poses_of(folder: Path, name: str) -> Path:
@@ -213,7 +206,7 @@ def film_steps(folder: Path, config: Config, given: Sequence[str]) -> list[VerbS
 def tumour_errors(folder: Path) -> Metrics:
     """Figures of the tumours found against the true ones, and of where the sweep's pixels are put."""
     findings, truth = compared(folder)
-    captured, lag = sweep_part.read_sweep(poses_of(folder, "sweep")), measured_lag(folder)
+    captured, lag = sweep_part.read_sweep(poses_of(folder, "sweep")), latency_fields.measured(folder / "lag")
     calibration = probe_files.read(folder / "probe" / calibrate_probe.PROBE)
     scans = freehand_scans.of_sweep(captured, calibration, lag.lag_s, truth.transducer.assumed_speed, Unsure(lag.sigma_s))
     apart, sigmas = sweep_errors.placement(scans.world_from_pixel, truth), session_errors.place_sigmas(scans)
@@ -234,12 +227,6 @@ def compared(folder: Path) -> tuple[list[sweep_errors.Finding], sweep_errors.Swe
     count = int(metrics.read(folder / "tumours" / metrics.FILE)["masses"])
     found = [trimesh.load_mesh(folder / "tumours" / f"mass{number}.ply", process=False) for number in range(count)]
     return sweep_errors.compare(found, truth), truth
-
-
-def measured_lag(folder: Path) -> Lag:
-    """The scanner's lag, as a step before measured it."""
-    found = json.loads((folder / "lag" / measure_lag.LAG).read_text(encoding="utf-8"))
-    return Lag(found["lag_s"], found["sigma_s"])
 
 
 def _figures(part: str) -> Callable[[Path], Metrics]:

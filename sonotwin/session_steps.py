@@ -1,14 +1,14 @@
 """The verbs that render a whole session into one capture: board, fringes, filmed sweeps over wires, a bottom and the phantom."""
 
-import json
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 
 from recon.probe_calibration.sound_in_water import speed_of_sound
+from sonotwin import latency_fields
 from sonotwin.config import load
 from sonotwin.demo_config import BOARD_PATTERNS, WATER_C
-from sonotwin.verbs import calibrate_optics, calibrate_probe, measure_lag
+from sonotwin.verbs import calibrate_optics, calibrate_probe
 
 TISSUE_M_S = 1450.0  # of the phantom's silicone
 WATER_SIGMA_M_S = 1.5  # of a tank whose temperature is known to half a degree
@@ -49,9 +49,8 @@ def rendering_cylinders(out: Path, given: Sequence[str] = ()) -> Iterator[tuple[
 
 def reconstruction_of_cylinders(session: Path, calibrated: Path, out: Path, given: Sequence[str] = ()) -> tuple[str, list[str]]:
     """The verb that reconstructs the cylinders by the calibrations of a session's reconstruction, and its fields."""
-    lag = json.loads((calibrated / "latency" / measure_lag.LAG).read_text(encoding="utf-8"))
     optics, probe = calibrated / "optics" / calibrate_optics.OPTICS, calibrated / "probe" / calibrate_probe.PROBE
-    known = [f"calibration={optics}", f"probe={probe}", f"lag_s={lag['lag_s']}", f"lag_sigma_s={lag['sigma_s']}"]
+    known = [f"calibration={optics}", f"probe={probe}", *latency_fields.measured(calibrated / "latency").fields]
     known += [f"tissue_m_s={speed_of_sound(WATER_C)}", f"tissue_sigma_m_s={WATER_SIGMA_M_S}"]
     return "reconstruct", [f"capture={session / 'capture'}", "find=tube", *known, f"out={out}", *given]
 

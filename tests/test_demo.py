@@ -15,7 +15,8 @@ from recon.tracking import networks
 from sonotwin import pipeline
 from sonotwin.cli import main
 from sonotwin.config import compose, load
-from sonotwin.demo_steps import Lag, VerbStep, verb_steps
+from sonotwin.demo_steps import VerbStep, verb_steps
+from sonotwin.latency_fields import Latency
 from sonotwin.pipeline import Step
 from sonotwin.verbs import sweep
 from sonotwin.verbs.demo import Config, commands, followed, looked_inside
@@ -248,7 +249,7 @@ def test_the_commands_of_the_sweep_are_those_of_the_verbs(tmp_path):
     """Each has the settings that its verb knows, and passes its verb's own checks."""
     overrides = ["poses=none", "clocks.lag_s=0.08", "scene.edge_mm=1.5", "engine.samples=4", f"board={tmp_path}", *COARSE]
     config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
-    lines = [shlex.split(line)[1:] for line in commands(tmp_path, config, overrides, Lag(0.0503, 0.001))]
+    lines = [shlex.split(line)[1:] for line in commands(tmp_path, config, overrides, Latency(0.0503, 0.001))]
     verbs = [line[0] for line in lines]
     inside = ["sweep", "track", "calibrate-probe", "sweep", "track", "measure-lag", "sweep", "track"]
     assert verbs == ["demo", "render", "surface", "evaluate", *inside, "freehand", "segment", "fuse"]
@@ -277,7 +278,7 @@ def test_each_verb_gets_the_demonstrations_settings(overrides, tmp_path):
     for step in verb_steps(tmp_path, config, overrides):
         if not isinstance(step, VerbStep):
             continue
-        verb, *fields = step.words(Lag(0.05, 0.001))
+        verb, *fields = step.words(Latency(0.05, 0.001))
         model = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}").Config
         given = load(verb, fields, model)
         shared = set(model.model_fields) & set(Config.model_fields) - own.get(step.name, {"out"})

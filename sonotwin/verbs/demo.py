@@ -19,10 +19,10 @@ from rich.console import Console
 
 from recon.files.metrics import Metrics, shown
 from recon.tracking import networks
-from sonotwin import pipeline
+from sonotwin import latency_fields, pipeline
 from sonotwin.config import load
 from sonotwin.demo_config import Config
-from sonotwin.demo_steps import Figures, commands, compared, fusing_fields, measured_lag, poses_of, tracked_film, verb_steps
+from sonotwin.demo_steps import Figures, commands, compared, fusing_fields, poses_of, tracked_film, verb_steps
 from sonotwin.pipeline import Step
 from sonotwin.verbs import fuse, surface
 from twin.evaluation import sweep_errors
@@ -101,7 +101,7 @@ def telling_step(config: Config) -> Step:
         unmade = FILMED if config.looks_inside else SWEPT
         listed = [(name, text) for name, text in OUTPUTS if name.partition("/")[0] not in unmade]
         outputs = [(name, text) for name, text in listed if (folder / name.partition(",")[0]).exists() or name == "report.html"]
-        lines = commands(folder, config, config._overrides, measured_lag(folder) if inside else None)
+        lines = commands(folder, config, config._overrides, latency_fields.measured(folder / "lag") if inside else None)
         demo_report.write(folder / "report.html", story, dict(figures), outputs, lines, inside, tracked, fused)
         return {}
 

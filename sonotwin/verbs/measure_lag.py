@@ -8,7 +8,6 @@ depth in each B-scan; and metrics.json. Results that are there already are repla
     sonotwin freehand capture=outputs/sweep/capture lag_s=0.0503 out=outputs/volume
 """
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
@@ -19,7 +18,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from rich.console import Console
 
-from recon.capture import sweep_part, sweep_tables
+from recon.capture import lag_files, sweep_part, sweep_tables
+from recon.capture.lag_files import LagFile
 from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
 from recon.files import atomic, metrics
@@ -28,7 +28,7 @@ from recon.model.rig import Finite
 from recon.probe_calibration import latency
 from recon.probe_calibration.latency import Lag
 
-LAG = "lag.json"  # by which the folder of a lag is known
+LAG = lag_files.FILE  # by which the folder of a lag is known
 DEPTHS = "depths.csv"
 HEADER = ("frame", "time_ns", "depth_px", "residual_px", "used")
 
@@ -94,14 +94,9 @@ def describe(figures: Metrics) -> Iterator[str]:
 
 def write(out: Path, sweep: SweepCapture, depths: Array, found: Lag, figures: Metrics) -> list[str]:
     """Write all files, whole or not at all; returns their names."""
-    content = {
-        "lag_s": found.seconds,
-        "sigma_s": found.sigma_s,
-        "interval_s": list(found.interval_s),
-        "coverage": latency.COVERAGE,
-    }
+    lag = LagFile(lag_s=found.seconds, sigma_s=found.sigma_s, interval_s=found.interval_s, coverage=latency.COVERAGE)
     with atomic.new_folder(out, LAG) as folder:
-        (folder / LAG).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        lag_files.write(folder / LAG, lag)
         sweep_tables.write_rows(folder / DEPTHS, HEADER, rows(sweep, depths, found))
         metrics.write(folder / metrics.FILE, figures)
     return [LAG, DEPTHS, metrics.FILE]

@@ -14,11 +14,10 @@ is simply started again. Takes minutes. Exit status 1 if a step failed; those th
     sonotwin reconstruct capture=session/capture calibration=optics.yaml probe=probe.yaml lag_s=0.05 out=result
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 from rich.console import Console
@@ -34,7 +33,9 @@ from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.tracking import networks
 from recon.tracking.results import POSES
+from sonotwin import latency_fields
 from sonotwin.kept_steps import KeptSteps, files_of
+from sonotwin.latency_fields import Latency
 from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, fuse, measure_lag, surface
 
 Drift = Annotated[float, Field(ge=0, le=10)]
@@ -207,23 +208,6 @@ def tracked_sweep(steps: KeptSteps, sources: Sources, name: str, optics: Path | 
     return steps.do(step, "poses of the probe, from frames", "track", fields, files, made_of)
 
 
-class Latency(NamedTuple):
-    """The lag of the scanner's images, s, and its standard deviation."""
-
-    lag_s: float
-    sigma_s: float
-
-    @property
-    def field(self) -> str:
-        """The lag as a field of a verb."""
-        return f"lag_s={self.lag_s:.15g}"
-
-    @property
-    def fields(self) -> list[str]:
-        """Both as fields of a verb."""
-        return [self.field, f"lag_sigma_s={self.sigma_s:.15g}"]
-
-
 def measured_latency(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None]) -> Latency | None:
     """The scanner's latency: the one given, that of the last sweep over a flat bottom, or 0 without one; None if it failed."""
     config, name = sources.config, _last(sources, "latency")
@@ -237,10 +221,7 @@ def measured_latency(steps: KeptSteps, sources: Sources, tracked: Mapping[str, P
     fields = [f"capture={tracked[name]}", f"sweep={name}"]
     does, made_of = "the scanner's lag, from a flat bottom", _scans(steps, sources, name)
     made = steps.do("latency", does, "measure-lag", fields, (measure_lag.LAG,), made_of)
-    if made is None:
-        return None
-    found = json.loads((made / measure_lag.LAG).read_text(encoding="utf-8"))
-    return Latency(found["lag_s"], found["sigma_s"])
+    return None if made is None else latency_fields.measured(made)
 
 
 def calibrated_probe(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None], lag: Latency | None) -> Path | None:

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from recon.capture import lag_files
+from recon.capture.lag_files import LagFile
 from recon.errors import InputError
 from scenes.catalogue import build_scene
 from sonotwin import session_accuracy, session_steps
@@ -122,7 +124,8 @@ def test_the_verbs_of_a_session_are_valid(tmp_path, kind):
     inner, outer = (build_scene(dict(each.scene)).shapes[-1] for each in read)
     assert np.allclose(inner.point, outer.point) and inner.radius == outer.radius
     (tmp_path / "latency").mkdir()
-    (tmp_path / "latency" / "lag.json").write_text('{"lag_s": 0.05, "sigma_s": 0.001}')
+    lag = LagFile(lag_s=0.05, sigma_s=0.001, interval_s=(0.048, 0.052), coverage=0.95)
+    lag_files.write(tmp_path / "latency" / lag_files.FILE, lag)
     verb, fields = session_steps.reconstruction_of_cylinders(tmp_path, tmp_path, tmp_path / "out", ["board_scale=0"])
     by_session = load(verb, fields, MODELS[verb])
     assert (by_session.find, by_session.lag_s, by_session.board_scale) == ("tube", 0.05, 0.0)

@@ -1,13 +1,12 @@
 """Errors of a whole session: what `sonotwin reconstruct` made of a rendered capture, against what it was rendered from."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from recon.capture import manifest, probe_files, sweep_part
+from recon.capture import lag_files, manifest, probe_files, sweep_part
 from recon.capture.manifest import CAMERAS, SCANNER, PartName
 from recon.capture.manifest import sweep_part as sweep_path
 from recon.files import metrics
@@ -57,20 +56,20 @@ def measure(result: Path, capture: Path, truth: Path) -> Metrics:
 def inside(result: Path, truth: Path, name: str) -> Metrics:
     """Figures of a sweep: latency, probe, places of its pixels, masses, and where the array's face met the skin."""
     true = sweep_errors.read_truth(truth, name)
-    lag = json.loads((result / "latency" / "lag.json").read_text(encoding="utf-8"))
+    lag = lag_files.read(result / "latency" / lag_files.FILE)
     probe = probe_files.read(result / "probe" / "probe.yaml")
     pixels = five_points(true.transducer.image_size)
     error, sigma = sweep_errors.probe_errors(probe, true, pixels)
     apart_by_probe = probe.to_target(pixels) - true.probe.to_target(pixels)
     sweep = sweep_part.read_sweep(result / "poses" / name, name)
-    scans = freehand_scans.of_sweep(sweep, probe, lag["lag_s"], true.transducer.assumed_speed, Unsure(lag["sigma_s"]))
+    scans = freehand_scans.of_sweep(sweep, probe, lag.lag_s, true.transducer.assumed_speed, Unsure(lag.sigma_s))
     shown, apart = scans.world_from_pixel, sweep_errors.placement(scans.world_from_pixel, true)
     folder = result / "masses" / name
     found = metrics.read(folder / metrics.FILE)
     meshes = [trimesh.load_mesh(folder / f"mass{number}.ply", process=False) for number in range(int(found["masses"]))]
     figures: Metrics = {
-        "lag_error_ms": 1e3 * (lag["lag_s"] - true.lag_s),
-        "lag_covered": float(lag["interval_s"][0] <= true.lag_s <= lag["interval_s"][1]),
+        "lag_error_ms": 1e3 * (lag.lag_s - true.lag_s),
+        "lag_covered": float(lag.interval_s[0] <= true.lag_s <= lag.interval_s[1]),
         "probe_worst_error_mm": float(error.max()),
         "probe_worst_sigma_mm": float(sigma[error.argmax()]),
         **dict(zip(PROBE_ERRORS, apart_by_probe.ravel().tolist(), strict=True)),

@@ -1,7 +1,6 @@
 """Ultrasound's sections of the report: masses inside the measured surface, the probe's calibration and its sweep."""
 
 import csv
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.capture import probe_files, sweep_part
+from recon.capture import lag_files, probe_files, sweep_part
 from recon.capture.sweep_part import SweepCapture
 from recon.files import volumes
 from recon.files.metrics import FILE, Metrics, shown
@@ -79,7 +78,7 @@ def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: Swe
     """
     sweep = sweep_part.read_sweep(folders["sweep"])
     probe = probe_files.read(folders["probe"] / "probe.yaml")
-    lag_s = float(json.loads((folders["lag"] / "lag.json").read_text(encoding="utf-8"))["lag_s"])
+    lag_s = lag_files.read(folders["lag"] / lag_files.FILE).lag_s
     rows = _rows(folders["lag"] / "depths.csv")
     told = float(read_figures(folders["volume"] / FILE)["speed_m_per_s"])
     return Inside(
