@@ -32,6 +32,7 @@ SEEDS = tuple(range(721, 731))
 BOARD_SCALE = {"ideal": 0.0, "lifelike": 3.0e-4}  # as a lab knows its board's print: exact, and of conf/conditions/lifelike.yaml
 WIDER = {"ideal": 1.0, "lifelike": 1.7}  # bars of each kind of conditions
 RIG = "meza2021"
+POSES = "paper"  # of the board: 34, as in Meza et al. 2021
 CR1_MM, CR2_MM = (0.12, 0.16, 0.15), (0.08, 0.11, 0.10)  # bars: centre, corners, mean
 CYLINDERS = {"tube_diameter_error_mm": 0.06, "cover_diameter_error_mm": 0.03, "cover_wall_error_mm": 0.06}  # bars
 LENGTHS = {
@@ -79,7 +80,7 @@ def session(work: Path, conditions: str, seed: int) -> tuple[bool, Metrics]:
     Returns whether all steps were done, and the figures.
     """
     given, known = [f"conditions={conditions}", f"seed={seed}"], [f"board_scale={BOARD_SCALE[conditions]:g}"]
-    for verb, fields in session_steps.rendering(work / "session", given):
+    for verb, fields in session_steps.rendering(work / "session", given, POSES):
         session_steps.do(verb, fields)
     truth = (work / "session" / "truth").rename(work / "truth")
     status = session_steps.do(*session_steps.reconstruction(work / "session", work / "result", known))

@@ -18,10 +18,13 @@ INNER = ["scene=inner_cylinder", "scene.centre_mm=[4.0,-2.0,670.29]"]  # where c
 ALONG = ["path.start_mm=[-19.35,-2]", "path.end_mm=[27.35,-2]", "path.turn_deg=90", "path.standoff_mm=17"]
 
 
-def rendering(out: Path, given: Sequence[str] = ()) -> Iterator[tuple[str, list[str]]]:
-    """Verbs and their fields, in order; fields that are given go to all of them."""
+def rendering(out: Path, given: Sequence[str] = (), poses: str = "demo") -> Iterator[tuple[str, list[str]]]:
+    """Verbs and their fields, in order; fields that are given go to all of them.
+
+    poses : of the board, as in conf/poses
+    """
     place = [f"out={out}", "add=true", *given]
-    yield "render", ["scene=board", "poses=demo", f"patterns={BOARD_PATTERNS}", "cameras=[cam1,cam2]", *place]
+    yield "render", ["scene=board", f"poses={poses}", f"patterns={BOARD_PATTERNS}", "cameras=[cam1,cam2]", *place]
     yield "render", ["scene=breast", *place]
     wires = ["scene=crosswire", *TANK, "path=wire", "path.count=40", "clocks.camera_hz=5"]
     yield "sweep", [*wires, "filmed=true", f"name={WIRES}", *place]

@@ -19,7 +19,7 @@ from recon.geometry import rigid
 
 Array = NDArray[np.float64]
 
-EVEN_MM = 0.5  # standard deviation; a voxel
+EVEN_MM = 0.3  # standard deviation; takes folds off, and little of lobes
 LEVELLINGS = 4  # Newton's steps to the level that holds the volume
 NEAR_MM = 1.5  # of a vertex, within which distances come from the surface itself
 NEIGHBOURS = 6  # vertices that the distance to a surface is taken from
@@ -44,7 +44,7 @@ class Mass:
 
 
 def evened(mass: Mass, lattice: Volume) -> Mass:
-    """The same mass without folds and spikes finer than a voxel, of the same volume.
+    """The same mass without folds and spikes finer than `EVEN_MM`, of the same volume.
 
     Moved vertices can cross each other; the smoothed distance to them has a clean surface, taken at the level of the same volume.
     """
@@ -57,6 +57,12 @@ def evened(mass: Mass, lattice: Volume) -> Mass:
         mesh = meshed(field, level, whole, near, outside=FAR_MM)
         level += (volume - enclosed(np.asarray(mesh.vertices), mesh.faces).sum()) / mesh.area
     return Mass(meshed(field, level, whole, near, outside=FAR_MM))
+
+
+def grid_of(volume: Volume) -> Grid:
+    """The voxels of a volume."""
+    nz, ny, nx = volume.voxels.shape
+    return Grid((nx, ny, nz), volume.origin, volume.spacing, volume.directions)
 
 
 def around(mass: Mass, lattice: Volume, margin_mm: float = FAR_MM) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,6 +1,7 @@
 """Masses darker than the tissue around them, in tracked B-scans: each a closed surface in the world."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,7 +12,8 @@ from recon import threads
 from recon.errors import InputError
 from recon.freehand.volume_compounding import Clip
 from recon.geometry import rigid
-from recon.segmentation import border_fit, echo_power
+from recon.segmentation import blur_correction, border_fit, echo_power
+from recon.segmentation.blur_correction import Blur, Planes
 from recon.segmentation.echo_power import EchoPower, pixel_mm
 from recon.segmentation.mass_surface import Mass, distances, evened, meshed
 from recon.segmentation.refraction import Sound, follow
@@ -48,6 +50,7 @@ def from_scans(
     sound: Sound | None = None,
     dynamic_range_db: float = 60.0,
     grey: float | None = None,
+    blur: Blur | None = None,
 ) -> list[Mass]:
     """Find masses in B-scans, largest first.
 
@@ -60,6 +63,7 @@ def from_scans(
         are left out.
     grey : float
         Of tissue, by default that of `tissue_grey`.
+    blur : of the B-scans, which is corrected for
 
     Raises
     ------
@@ -77,6 +81,9 @@ def from_scans(
         if masses:
             power = cleared(recording, grid, masses, sound)
             masses = refined([mass for mass in masses if is_dark(mass, power)], power, times)
+    if masses:
+        planes = Planes(world_from_pixel, range(clip.v, clip.height), clip.width, blur or Blur())
+        masses = blur_correction.corrected(masses, power, planes, partial(refined, times=REFINEMENTS[-1]))
     return sorted(masses, key=lambda mass: -mass.volume)
 
 

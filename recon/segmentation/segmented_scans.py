@@ -14,6 +14,7 @@ from recon.freehand.scans import Scans
 from recon.geometry.primitives import Cylinder
 from recon.model.probe import SCANNER_SPEED
 from recon.segmentation import mass_uncertainty, masses, scan_overlays, tube_cover, tube_wall
+from recon.segmentation.blur_correction import Blur
 from recon.segmentation.containment import Containment, contain
 from recon.segmentation.mass_uncertainty import Sigma, Speeds
 from recon.segmentation.masses import Mass
@@ -46,10 +47,12 @@ def find_masses(
     dynamic_range_db: float = 60.0,
     overlays: int = OVERLAYS,
     speed_sigmas: tuple[float, float] = (0.0, 0.0),
+    blur: Blur | None = None,
 ) -> Segmented:
     """Find masses; with a skin, whether they lie under it.
 
     speed_sigmas : m/s, standard deviations of the speeds of sound in the tissue and in masses.
+    blur : of the B-scans.
 
     Raises
     ------
@@ -59,7 +62,7 @@ def find_masses(
     scans = freehand_scans.in_memory(scans)  # they are read five times and more
     sound, placed = Sound(scans.speed_m_s, mass_m_s), scans.world_from_pixel
     grey = masses.tissue_grey(scans.stream(), scans.shape, placed)
-    found = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey)
+    found = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur)
     figures: Metrics = {"tissue_grey": grey, "masses": len(found)}
     lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {NONE_FOUND}"])]
     containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)

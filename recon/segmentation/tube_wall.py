@@ -49,7 +49,7 @@ class Appearance:
     """Appearance of a tube on a scanner."""
 
     diameter_mm: tuple[float, float] = (5.0, 36.0)  # least and most
-    spread_mm: tuple[float, float] = (0.25, 0.08)  # sigma of an echo's power, along the array and in depth
+    spread_mm: tuple[float, float] = (0.2, 0.063)  # sigma of an echo's power, along the array and in depth
     dynamic_range_db: float = 60.0  # from black to white
     min_contrast_db: float = 15.0  # of the wall above the water
     top_mm: float = 2.5  # ringing at the probe's face, left out

@@ -11,6 +11,7 @@ metrics.json. Results that are there already are replaced. Takes a quarter of a 
     sonotwin segment kind=tube capture=outputs/tank/capture probe=outputs/probe/probe.yaml lag_s=0.05 out=outputs/tube
 """
 
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Literal
@@ -29,6 +30,7 @@ from recon.model.probe import SCANNER_SPEED, Speed, SpeedSigma
 from recon.model.rig import NotNegative, Positive
 from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, segmented_scans
+from recon.segmentation.blur_correction import SLICE_MM, Blur
 from recon.segmentation.segmented_scans import Segmented
 from recon.segmentation.tube_wall import Appearance
 
@@ -55,7 +57,8 @@ class Config(BaseModel):
     mass_sigma_m_s: SpeedSigma = 20.0
     dynamic_range_db: Annotated[float, Field(ge=20, le=120)] = 60.0
     diameter_mm: tuple[Positive, Positive] = (5.0, 36.0)
-    spread_mm: tuple[Spread, Spread] = (0.25, 0.08)
+    spread_mm: tuple[Spread, Spread] = Appearance().spread_mm
+    slice_mm: tuple[tuple[NotNegative, Spread], ...] = SLICE_MM
     min_contrast_db: Annotated[float, Field(ge=0, le=120)] = 15.0
     top_mm: Annotated[float, Field(ge=0, le=100)] = 2.5
     overlays: Annotated[int, Field(ge=0, le=100)] = segmented_scans.OVERLAYS
@@ -69,7 +72,15 @@ class Config(BaseModel):
                 raise ValueError(f"{name}: expected none with a sequence, whose poses are those of its images, found {value:g}")
         if self.diameter_mm[0] >= self.diameter_mm[1]:
             raise ValueError(f"diameter_mm: expected the least before the most, found {list(self.diameter_mm)}")
+        depths = [depth for depth, _ in self.slice_mm]
+        if any(second <= first for first, second in pairwise(depths)):
+            raise ValueError(f"slice_mm: expected rising depths, found {depths}")
         return self
+
+    @property
+    def blur(self) -> Blur:
+        """Blur of the B-scans."""
+        return Blur(self.spread_mm[0], self.slice_mm)
 
     @property
     def tube(self) -> Appearance:
@@ -126,7 +137,9 @@ def found_in(scans: Scans, config: Config, skin: trimesh.Trimesh | None) -> Segm
         if config.kind == "tube":
             return segmented_scans.find_tube(scans, config.tube, config.overlays, skin)
         sigmas = config.tissue_sigma_m_s, config.mass_sigma_m_s
-        return segmented_scans.find_masses(scans, skin, config.mass_m_s, config.dynamic_range_db, config.overlays, sigmas)
+        return segmented_scans.find_masses(
+            scans, skin, config.mass_m_s, config.dynamic_range_db, config.overlays, sigmas, config.blur
+        )
     except InputError as error:
         source = str(config.capture or config.sequence)
         raise error if str(error).startswith(source) else InputError(f"{source}: {error}") from None

@@ -26,7 +26,7 @@ from twin.ultrasound.timed_sweep import Clocks, PoseNoise
 from twin.ultrasound.transducer import Transducer
 
 # as of conf/path/raster.yaml
-PATH = SurfacePath(start_mm=(-22.0, -31.0), end_mm=(-22.0, 37.5), strokes=2, stroke_step_mm=44.0, speed_mm_s=21.0)
+PATH = SurfacePath(start_mm=(-22.0, -31.0), end_mm=(-22.0, 36.0), strokes=2, stroke_step_mm=44.0, speed_mm_s=21.0)
 SOUND = Sound(tissue=TISSUES["silicone"].speed)  # a phantom's is known; that of masses isn't
 SEEDS = (11, 12)  # of the sweeps
 CENTRE_MM, VOLUME_PERCENT = 0.5, 8.0  # what is asked

@@ -15,6 +15,7 @@ from recon.freehand import place_uncertainty
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans, Unsure
 from recon.geometry.primitives import Cylinder
+from recon.geometry.surface_tree import signed_distances
 from recon.probe_calibration.repeatability import five_points
 from recon.segmentation import tube_cover
 from scenes.catalogue import build_scene
@@ -140,4 +141,4 @@ def contact_bias(world_from_pixel: Array, true: SweepTruth, surface: Path) -> fl
 
 def _standoff(faces: Array, skin: trimesh.Trimesh) -> Array:
     """Least signed distance : (n,) mm of faces : (n, m, 3) to a skin, positive outside."""
-    return sweep_errors.signed_distances(faces.reshape(-1, 3), skin).reshape(faces.shape[:2]).min(axis=1)
+    return signed_distances(faces.reshape(-1, 3), skin).reshape(faces.shape[:2]).min(axis=1)

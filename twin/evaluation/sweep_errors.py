@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 
@@ -16,7 +16,7 @@ from recon.errors import InputError, one_line
 from recon.files import npz
 from recon.files.metrics import Metrics
 from recon.geometry import rigid
-from recon.geometry.surface_tree import surface_tree
+from recon.geometry.surface_tree import signed_distances
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import Rig
 from recon.probe_calibration import point_calibration
@@ -210,13 +210,6 @@ def of_each(metrics: Metrics, figure: str) -> list[float]:
     names = [key.removesuffix(mark) for key in metrics if key.endswith(mark)]
     values = [metrics[f"{name}_{figure}"] for name in names]
     return [value for value in values if np.isfinite(value)]
-
-
-def signed_distances(points: ArrayLike, mesh: trimesh.Trimesh) -> Array:
-    """Distance : (n,) mm of points : (n, 3) to the tangent plane at a dense closed mesh's nearest vertex, positive outside."""
-    points = np.asarray(points, float)
-    _, nearest = surface_tree(mesh.vertices).query(points)
-    return ((points - mesh.vertices[nearest]) * mesh.vertex_normals[nearest]).sum(axis=1)
 
 
 def dice(first: trimesh.Trimesh, second: trimesh.Trimesh) -> float:

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 SPACING_MM = (0.5, 1.0)  # of the grids, of small and of large solids
 LARGE_MM = 60.0  # greatest extent of a small one
 MARGIN_MM = 3.0  # of the grids, around the solid
+SAG_MM = 0.001  # by which a rod's wall lies within the true one: of a chord between the points of its grid
 BAND_MM = 3.0  # from a mesh, beyond which only the sign of its distance counts
 THIN_MM = 0.5  # radius, below which a rod is a wire
 
@@ -150,27 +151,32 @@ def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
     bounds = thing.mesh.bounds
     if shape is not None:
         along = (thing.mesh.vertices - shape.point) @ shape.axis
-        return _sampled(thing, tissue, lambda points: _in_rod(points, shape, along.min(), along.max()))
+        step = min(_spacing(thing), float(np.sqrt(8 * shape.radius * SAG_MM)))
+        return _sampled(thing, tissue, lambda points: _in_rod(points, shape, along.min(), along.max()), step)
     if thing.primitive is not None:
-        return _sampled(thing, tissue, thing.primitive.distance)
+        return _sampled(thing, tissue, thing.primitive.distance, _spacing(thing))
     if np.isclose(thing.mesh.volume, np.prod(thing.mesh.extents), rtol=1e-6):
         distance, steps = _box(bounds)
         return Solid(thing.name, tissue, distance, bounds[0] - MARGIN_MM, steps, thing.mesh)
-    points, low, step = _grid(thing)
+    step = _spacing(thing)
+    points, low = _grid(thing, step)
     return Solid(thing.name, tissue, _from_mesh(thing.mesh, points, step), low, np.full(3, step), thing.mesh)
 
 
-def _grid(thing: Thing) -> tuple[Array, Array, float]:
-    """Points : (nx, ny, nz, 3) around a thing, the first of them, and their spacing."""
+def _spacing(thing: Thing) -> float:
+    return SPACING_MM[int(thing.mesh.extents.max() > LARGE_MM)]
+
+
+def _grid(thing: Thing, step: float) -> tuple[Array, Array]:
+    """Points : (nx, ny, nz, 3) around a thing, and the first of them."""
     low, high = thing.mesh.bounds[0] - MARGIN_MM, thing.mesh.bounds[1] + MARGIN_MM
-    step = SPACING_MM[int(thing.mesh.extents.max() > LARGE_MM)]
     counts = np.ceil((high - low) / step).astype(int) + 1
     axes = [low[k] + step * np.arange(counts[k]) for k in range(3)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), low, step
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), low
 
 
-def _sampled(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array]) -> Solid:
-    points, low, step = _grid(thing)
+def _sampled(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array], step: float) -> Solid:
+    points, low = _grid(thing, step)
     values = np.stack([distance(sheet.reshape(-1, 3)).reshape(sheet.shape[:-1]) for sheet in points])
     return Solid(thing.name, tissue, values.astype(np.float32), low, np.full(3, step), thing.mesh)
 

@@ -1,0 +1,158 @@
+"""Correction of masses' surfaces for blur: of beam and slice, of the B-scans' spacing, and of the fit itself.
+
+A blur of covariance S moves the border of a body with curvature tensor K inwards by `trace(S K) / 2`, so lobes come out flat. Its
+extent at a surface like the one that was found is measured on that one: B-scans of it are made, as blurred as the scanner's and
+in the same places, its surface is found in them again, and what that differs by is taken off (Van Cittert's iteration).
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from recon import threads
+from recon.compiled import kernel, njit
+from recon.files.volumes import Volume
+from recon.freehand.volume_compounding import Grid
+from recon.geometry.surface_tree import signed_distances
+from recon.segmentation import echo_power
+from recon.segmentation.echo_power import EchoPower, pixel_mm
+from recon.segmentation.mass_surface import Mass, distances, grid_of
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+Fit = Callable[[Sequence[Mass], EchoPower], Sequence[Mass]]  # masses again, their surfaces moved to the borders in the power
+
+SLICE_MM = (
+    (4.0, 0.91),
+    (8.0, 0.63),
+    (12.0, 0.37),
+    (15.0, 0.24),
+    (20.0, 0.24),
+    (30.0, 0.37),
+    (40.0, 0.56),
+)  # of conf/ultrasound/linear.yaml
+ROUNDS = 2
+EDGE_MM = 0.15  # sigma of the border in the B-scans that are made: of a pulse
+NEAR_MM = 3.0  # of a border: farther pixels show one tissue only
+NODES = (-math.sqrt(3), 0.0, math.sqrt(3))  # standard deviations, and
+SHARES = (1 / 6, 2 / 3, 1 / 6)  # weights: a Gaussian mean, exact for polynomials of the fifth degree
+
+
+@dataclass(frozen=True)
+class Blur:
+    """Standard deviations of an echo's power, off the middle of its beam."""
+
+    lateral_mm: float = 0.2  # along the array
+    slice_mm: tuple[tuple[float, float], ...] = SLICE_MM  # depth, rising, and across the image plane there; none: a thin slice
+
+    def across(self, depths: Array) -> Array:
+        """Standard deviation across the image plane, mm, at depths, mm."""
+        if not self.slice_mm:
+            return np.zeros_like(depths)
+        return np.interp(depths, *np.transpose(self.slice_mm))
+
+
+class Beams(NamedTuple):
+    """Beams of a B-scan in a lattice of voxels."""
+
+    voxel_from_pixel: Array  # (4, 4)
+    aside: Array  # (3,) voxels, a standard deviation along the array
+    across: Array  # (rows, 3) voxels, a standard deviation across the plane
+
+
+@dataclass(frozen=True)
+class Planes:
+    """B-scans in space, and how blurred they are."""
+
+    world_from_pixel: Array  # (n, 4, 4), NaN where there is no pose
+    rows: range  # that are used
+    columns: int
+    blur: Blur
+
+
+def corrected(masses: Sequence[Mass], power: EchoPower, planes: Planes, fit: Fit) -> list[Mass]:
+    """Masses without what blur and fit do to their surfaces; `power` is that in which they were found."""
+    restored = list(masses)
+    for _ in range(ROUNDS):
+        again = fit(masses, EchoPower(echoes(restored, grid_of(power.volume), planes), power.weight))
+        restored = [_moved(*three) for three in zip(restored, again, masses, strict=True)]
+    return restored
+
+
+def _moved(mass: Mass, again: Mass, found: Mass) -> Mass:
+    """A mass less the difference between what is found of it and what was found."""
+    vertices = np.asarray(mass.mesh.vertices)
+    off = signed_distances(vertices, again.mesh) - signed_distances(vertices, found.mesh)
+    return Mass(trimesh.Trimesh(vertices + off[:, None] * mass.mesh.vertex_normals, mass.mesh.faces, process=False))
+
+
+def echoes(masses: Sequence[Mass], grid: Grid, planes: Planes) -> Volume:
+    """Mean power on a grid, in B-scans of masses without echoes in tissue of power 1."""
+    field, (across, down) = distances(masses, grid), pixel_mm(planes.world_from_pixel)
+    slices = planes.blur.across(down * np.arange(planes.rows.stop))
+    v, u = np.mgrid[planes.rows.start : planes.rows.stop, : planes.columns].astype(np.float32)
+    voxel_from_world = np.linalg.inv(field.world_from_voxel)
+
+    def images() -> Iterator[tuple[Map, Map, Map]]:
+        for matrix in planes.world_from_pixel:
+            image = np.ones((planes.rows.stop, planes.columns), np.float32)
+            if np.isfinite(matrix).all():
+                pixels = voxel_from_world @ matrix
+                aside, through = pixels[:3, 0] / across, pixels[:3, 2] / np.linalg.norm(matrix[:3, 2])
+                beams = Beams(pixels, planes.blur.lateral_mm * aside, np.outer(slices, through))
+                threads.in_threads(_fill_echoes, len(image), field.voxels, beams, image)
+            yield image[planes.rows.start :], u, v
+
+    return echo_power.accumulated(images(), planes.world_from_pixel, grid).volume
+
+
+@kernel
+def _fill_echoes(first, end, field, beams, image):
+    """Power of each pixel in some rows: the mean of the beam's, of 0 within the masses and of 1 around them."""
+    for row in range(first, end):
+        for column in range(image.shape[1]):
+            x, y, z = _place(beams.voxel_from_pixel, column, row)
+            away = _distance(field, x, y, z)
+            if away > NEAR_MM:
+                continue
+            total = 0.0
+            for i in range(3):
+                for j in range(3):
+                    near = _distance(
+                        field,
+                        x + NODES[i] * beams.aside[0] + NODES[j] * beams.across[row, 0],
+                        y + NODES[i] * beams.aside[1] + NODES[j] * beams.across[row, 1],
+                        z + NODES[i] * beams.aside[2] + NODES[j] * beams.across[row, 2],
+                    )
+                    total += SHARES[i] * SHARES[j] * 0.5 * (1 + math.erf(near / (EDGE_MM * math.sqrt(2.0))))
+            image[row, column] = total
+
+
+@njit(inline="always")
+def _place(matrix, u, v):
+    """A pixel's place, in voxels."""
+    x = matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 3]
+    y = matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 3]
+    z = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 3]
+    return x, y, z
+
+
+@njit(inline="always")
+def _distance(field, x, y, z):
+    """Signed distance to the masses, mm, by trilinear interpolation; far outside beyond the lattice."""
+    nz, ny, nx = field.shape
+    if not (0 <= x < nx - 1 and 0 <= y < ny - 1 and 0 <= z < nz - 1):
+        return 2 * NEAR_MM
+    i, j, k = np.uint64(x), np.uint64(y), np.uint64(z)
+    s, t, w = x - i, y - j, z - k
+    one = np.uint64(1)
+    near = (1 - t) * ((1 - s) * field[k, j, i] + s * field[k, j, i + one])
+    near += t * ((1 - s) * field[k, j + one, i] + s * field[k, j + one, i + one])
+    far = (1 - t) * ((1 - s) * field[k + one, j, i] + s * field[k + one, j, i + one])
+    far += t * ((1 - s) * field[k + one, j + one, i] + s * field[k + one, j + one, i + one])
+    return (1 - w) * near + w * far
