@@ -204,7 +204,7 @@ def errors(measurement: Measurement, metrics: Metrics) -> Section:
         compared = page.paragraph(f"No point is both within {GROSS_MM:g} mm of the truth and has a prediction to compare with.")
     text = (
         "The error of a point is its distance from the plane that touches the true surface where the pixel’s ray meets it. "
-        "If the light is well modelled, it is noise, and the points know how much of it they carry."
+        "The calibration’s errors are a bias that neighbours share; the rest is noise, whose size is predicted for each point."
     )
     return Section("Errors", [page.paragraph(text), page.grid(maps), compared])
 
