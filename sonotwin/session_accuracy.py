@@ -34,13 +34,11 @@ WIDER = {"ideal": 1.0, "lifelike": 1.7}  # bars of each kind of conditions
 RIG = "meza2021"
 POSES = "paper"  # of the board: 34, as in Meza et al. 2021
 CR1_MM, CR2_MM = (0.12, 0.16, 0.15), (0.08, 0.11, 0.10)  # bars: centre, corners, mean
-CYLINDERS = {"tube_diameter_error_mm": 0.06, "cover_diameter_error_mm": 0.03, "cover_wall_error_mm": 0.06}  # bars
-LENGTHS = {
-    "tube_diameter_error_mm": "inner cylinder's diameter by ultrasound",
-    "cover_diameter_error_mm": "outer cylinder's diameter by light",
-    "cover_wall_error_mm": "distance of their walls by both",
+LENGTHS = {  # of the cylinders: figure, what it is the error of, its bar and the paper's, mm
+    "tube_diameter_error_mm": ("inner cylinder's diameter by ultrasound", 0.06, 0.72),
+    "cover_diameter_error_mm": ("outer cylinder's diameter by light", 0.03, 0.10),
+    "cover_wall_error_mm": ("distance of their walls by both", 0.06, 0.12),
 }
-PAPER_MM = {"tube_diameter_error_mm": 0.72, "cover_diameter_error_mm": 0.10, "cover_wall_error_mm": 0.12}  # its errors
 MARK = "_true_extent_mm"  # of a tumour's figures, one a tumour
 PACKAGES = ("recon", "scenes", "twin", "sonotwin")
 
@@ -143,7 +141,7 @@ def rows(conditions: str, found: Sequence[Metrics]) -> list[Row]:
         Row("d", f"{name}: the same over its predicted sigma, RMS", np.sqrt(np.mean((probe / sigma) ** 2)), None, 1.0, ""),
         *repeated("CR1", name, repeatability.between_pairs(apart) if several else none, CR1_MM, wider),
         *repeated("CR2", name, repeatability.from_mean(apart) if several else none, CR2_MM, wider),
-        *[cylinder(figure, name, each(found, figure), bar * wider) for figure, bar in CYLINDERS.items()],
+        *[cylinder(figure, name, each(found, figure), wider) for figure in LENGTHS],
         Row("f", f"{name}: tumours found inside the skin, less false ones, of 3", inside.min(), 3.0, 3.0, "", at_least=True),
         Row("f", f"{name}: tumours' centres", np.max(centres, initial=0.0), 0.35 * wider, None, "mm"),
         Row("f", f"{name}: tumours' volumes", 100 * np.max(np.abs(volumes), initial=0.0), 6.0 * wider, None, "%"),
@@ -166,11 +164,12 @@ def repeated(measure: str, name: str, mm: Array, bars: tuple[float, float, float
     ]
 
 
-def cylinder(figure: str, name: str, errors: Array, bar: float) -> Row:
+def cylinder(figure: str, name: str, errors: Array, wider: float) -> Row:
     """Errors of a length of the cylinders over sessions : (n,) mm: the worst, with mean and spread."""
+    what, bar, paper = LENGTHS[figure]
     spread = errors.std(ddof=1) if len(errors) > 1 else np.nan
-    text = f"{name}: {LENGTHS[figure]} (mean {errors.mean():+.3f}, spread {shown(spread, '.3f')}; paper: {PAPER_MM[figure]:.2f})"
-    return Row("e", text, float(np.abs(errors).max()), bar, None, "mm")
+    text = f"{name}: {what} (mean {errors.mean():+.3f}, spread {shown(spread, '.3f')}; paper: {paper:.2f})"
+    return Row("e", text, float(np.abs(errors).max()), bar * wider, None, "mm")
 
 
 def rms(values: Array) -> float:

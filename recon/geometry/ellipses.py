@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.geometry.order_statistics import NORMAL_MAD
+
 Array = NDArray[np.float64]
 
 STEPS = 12  # of Gauss and Newton; from a rough start three or four do
@@ -168,4 +170,4 @@ def _moved(ellipses: Ellipses, step: Array) -> Ellipses:
 def _tukey(z: Array, finite: NDArray[np.bool_]) -> Array:
     """Tukey's weights for absolute residuals over sigma; the scale is 1, or that of the residuals where they scatter more."""
     typical = np.nanmedian(np.where(finite | ~finite.any(axis=1, keepdims=True), z, np.nan), axis=1)
-    return np.clip(1 - (z / (TUKEY * np.maximum(1, 1.4826 * typical)[:, None])) ** 2, 0, 1) ** 2
+    return np.clip(1 - (z / (TUKEY * np.maximum(1, NORMAL_MAD * typical)[:, None])) ** 2, 0, 1) ** 2

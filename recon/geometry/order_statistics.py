@@ -1,8 +1,10 @@
-"""Quantiles in compiled code: `numpy.median` and its kin compile for seconds in each kernel that calls them."""
+"""Quantiles, also in compiled code: `numpy.median` and its kin compile for seconds in each kernel that calls them."""
 
 import numpy as np
 
 from recon.compiled import njit
+
+NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 @njit(error_model="numpy")

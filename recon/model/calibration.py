@@ -48,6 +48,11 @@ class Calibration:
     uncertainty: Uncertainty | None = None
 
 
+def in_use(known: Uncertainty | None, cameras: Mapping[str, Camera], scale: float, drift_px: float) -> Uncertainty | None:
+    """Uncertainty of cameras that are used some time after they were calibrated: `with_scale` and `with_drift`."""
+    return with_drift(with_scale(known, cameras, scale), list(cameras), drift_px)
+
+
 def with_drift(known: Uncertainty | None, devices: Sequence[str], drift_px: float) -> Uncertainty | None:
     """Add that devices have warmed, or turned on their mounts, since they were calibrated.
 

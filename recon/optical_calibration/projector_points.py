@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon.compiled import njit
 from recon.errors import InputError
 from recon.geometry.cholesky import solve_and_invert
-from recon.geometry.order_statistics import quantile
+from recon.geometry.order_statistics import NORMAL_MAD, quantile
 from recon.structured_light.decode import ProjectorMap
 from recon.threads import in_threads
 
@@ -271,7 +271,7 @@ def _inliers(design, measured, deviation):
     for _ in range(ROUNDS):
         for i in range(m):
             z[i] = abs(measured[i] - _at(design, i, beta)) / deviation[i]
-        clip = CLIP * max(1.4826 * quantile(z.copy(), 0.5), 1.0)
+        clip = CLIP * max(NORMAL_MAD * quantile(z.copy(), 0.5), 1.0)
         settled = True
         for i in range(m):
             settled &= kept[i] == (z[i] < clip)

@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from recon.geometry.order_statistics import NORMAL_MAD
+
 Array = NDArray[np.float64]
 
 MATCHED_PX = (3.0, 1.5)  # along the array, in depth: smoothing before the search, somewhat narrower than a spot
@@ -93,7 +95,7 @@ def _spot(level: NDArray[np.float32], look: Appearance) -> Crossing:
     grey = 255 / look.dynamic_range_db  # levels a dB
     smooth = cv2.GaussianBlur(level, (0, 0), sigmaX=MATCHED_PX[0], sigmaY=MATCHED_PX[1], borderType=cv2.BORDER_REPLICATE)
     relief = smooth - np.median(smooth, axis=1, keepdims=True)  # rows bright along the whole array are no spots
-    noise = 1.4826 * np.median(np.abs(relief - np.median(relief)))
+    noise = NORMAL_MAD * np.median(np.abs(relief - np.median(relief)))
     peaks = _peaks(relief, max(NOISE * noise, look.min_contrast_db * grey), look.top_px)
     if not len(peaks):
         return _none("no echo stands out")
@@ -213,7 +215,7 @@ def _arms(level: NDArray[np.float32], look: Appearance) -> tuple[Array, Array, A
     smooth[: look.top_px] = 0
     v, u = np.unravel_index(smooth.argmax(), smooth.shape)
     background = np.median(smooth)
-    noise = 1.4826 * np.median(np.abs(smooth - background))
+    noise = NORMAL_MAD * np.median(np.abs(smooth - background))
     drop = min(ARMS_DB, smooth[v, u] - background - NOISE * noise)
     if drop <= 0:
         return np.zeros((0, 2)), np.zeros(0), np.zeros(2)

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.files.metrics import Metrics
+from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model import tracks
 from recon.model.tracks import Track
 
@@ -226,7 +227,7 @@ def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, sta
         predicted = line[0] + spline(seconds - lag) @ line[1:]
         residuals = np.where(inside, depths - predicted, np.nan)
         rates = (speed(seconds - lag) @ line[1:]) ** 2
-        spread = 1.4826 * np.nanmedian(np.abs(residuals))
+        spread = NORMAL_MAD * np.nanmedian(np.abs(residuals))
         near = inside & (np.abs(residuals) < (8 * spread if round_ < 3 else GATE * np.sqrt(variance)))
         depth_variance, jitter = _two_variances(residuals[near], rates[near], spread)
         variance = depth_variance + jitter**2 * rates

@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.errors import InputError
+from recon.geometry.order_statistics import NORMAL_MAD
 from recon.geometry.primitives import Cylinder, Fit, fit_cylinder
 
 Array = NDArray[np.float64]
@@ -20,7 +21,6 @@ HALF_ARC_DEG = 75.0  # about the tube's axis, on either side of the direction to
 LEAST_POINTS = 1000
 MOST_POINTS = 100_000  # evenly chosen; more would change the radius by less than a micrometre
 OUTLIER = 4.0  # standard deviations, by the median absolute deviation
-NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 ROUNDS = 3
 LEAST_ARC_DEG = 70.0  # of the surface about the fitted axis; less leaves the radius to chance
 MOST_TURN_DEG = 20.0  # between both axes

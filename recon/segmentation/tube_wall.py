@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.geometry.order_statistics import NORMAL_MAD
 from recon.geometry.primitives import Cylinder, fit_cylinder
 from recon.model.probe import ProbeCalibration
 
@@ -276,7 +277,7 @@ def _smooth_outline(angle: Array, radius: Array, extent: Array) -> tuple[Array, 
     design = np.column_stack(harmonics) / extent[:, None]
     result = least_squares(lambda p: design @ p - radius / extent, np.eye(5)[0] * np.median(radius), loss="soft_l1", f_scale=0.1)
     misfit = result.fun
-    return radius + misfit * extent, float(1.4826 * np.median(np.abs(misfit)))
+    return radius + misfit * extent, float(NORMAL_MAD * np.median(np.abs(misfit)))
 
 
 def _turned(covariance: Array, world_from_pixel: Array) -> Array:

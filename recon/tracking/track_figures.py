@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.files.metrics import Metrics, shown
+from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model import circle_layout
 from recon.model.circle_layout import LENGTHS
 from recon.model.rig import Target
@@ -90,7 +91,7 @@ def causes(steps: Sequence[Step], target: Target) -> Iterator[str]:
 def _middle(values: Array) -> tuple[Array, Array]:
     """Medians over the first axis, and standard deviations by the median deviation."""
     middle = np.median(values, axis=0)
-    return middle, 1.4826 * np.median(np.abs(values - middle), axis=0)
+    return middle, NORMAL_MAD * np.median(np.abs(values - middle), axis=0)
 
 
 def kinds(reasons: Sequence[str | None]) -> list[tuple[str, int]]:

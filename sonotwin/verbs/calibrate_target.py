@@ -21,7 +21,7 @@ from recon.capture import stereo_frames, target_files
 from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, with_drift, with_scale
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
 from recon.model.rig import Rig
 from recon.target_calibration import target_bundle, target_figures, target_poses
 from recon.target_calibration.target_poses import Seen
@@ -64,8 +64,7 @@ def run(config: Config) -> None:
     atomic.check_folder(config.out, TARGET, inputs=inputs)
     film = stereo_frames.read_film(config.capture, config.calibration, config.sweep)
     design = config.rig.target
-    scaled = with_scale(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale)
-    optics = with_drift(scaled, CAMERAS, config.drift_px)
+    optics = in_use(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale, config.drift_px)
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
     tracker = Tracker(film.cameras, design, loaded, film.bits, optics)
     seen = collect(film, tracker, console)

@@ -29,7 +29,7 @@ from recon.capture import stereo_frames, target_files
 from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, with_drift, with_scale
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
 from recon.model.rig import Rig
 from recon.tracking import networks, results, track_figures
 from recon.tracking.results import Step
@@ -66,8 +66,7 @@ def run(config: Config) -> None:
     inputs = [path for path in (config.capture, config.calibration, config.target, config.networks) if path is not None]
     atomic.check_folder(config.out, results.POSES, inputs=inputs)
     film = stereo_frames.read_film(config.capture, config.calibration, config.sweep)
-    scaled = with_scale(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale)
-    optics = with_drift(scaled, CAMERAS, config.drift_px)
+    optics = in_use(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale, config.drift_px)
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
     design = config.rig.target
     target = design if config.target is None else target_files.read(config.target, design)

@@ -18,6 +18,7 @@ from recon.files.metrics import Metrics
 from recon.files.npz import Form
 from recon.geometry import primitives
 from recon.geometry.camera import Array, Camera
+from recon.geometry.order_statistics import NORMAL_MAD
 from recon.geometry.primitives import Cylinder, Plane, Shape, Sphere
 from twin.session import SCENE, TruthFolder
 
@@ -31,7 +32,6 @@ DIFFERENCE_MM = 0.5  # half of the central difference along the ray
 ON_SHAPE_MM = 0.1  # truth nearer than this to a shape is of that shape; meshes of it are finer
 LEAST_FITTED = 100  # points; fewer say nothing about a shape
 MOST_FITTED = 100_000  # points, evenly chosen; more would change a radius by less than 1e-4 mm and take long
-NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 FITTED = {  # figures of a fit
     "plane": ("rms_mm", "angle_error_deg"),
     "sphere": ("rms_mm", "radius_error_mm", "centre_error_mm"),

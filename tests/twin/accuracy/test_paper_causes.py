@@ -14,6 +14,7 @@ from twin.conditions import Conditions, Frames
 PATTERNS = Path(__file__).resolve().parents[3] / "conf" / "patterns" / "paper_surface.yaml"
 
 
+@pytest.mark.slow
 def test_flicker_stays_in_the_published_decoding_alone(rig, monkeypatch):
     """Under a steady lamp both decodings give the same; flicker of 3 % adds 0.02 mm or more to the published one. Two planes."""
     monkeypatch.setattr(plane, "PAPER_POSES", plane.PAPER_POSES[:2])

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from recon.capture.surface_part import read_patterns
 from scenes.kinds import plane
 from twin.accuracy import reality_accuracy
@@ -10,6 +12,7 @@ from twin.accuracy.table_rows import Setup
 PATTERNS = Path(__file__).resolve().parents[3] / "conf" / "patterns" / "paper_surface.yaml"
 
 
+@pytest.mark.slow
 def test_a_disturbed_plane_is_as_good_as_a_steady_one(rig, monkeypatch):
     """Three planes twice, with the bars of all; without corrections their errors are 1.3 and 2.1 times as large."""
     monkeypatch.setattr(reality_accuracy, "SEEDS", range(102, 104))
