@@ -3,10 +3,11 @@
 import json
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from recon.errors import InputError, one_line
 from recon.files import atomic
+from recon.files.regular import read_bytes
 from recon.model.rig import Finite, NotNegative
 
 FILE = "lag.json"
@@ -21,6 +22,13 @@ class LagFile(BaseModel):
     sigma_s: NotNegative
     interval_s: tuple[Finite, Finite]  # low, high
     coverage: NotNegative  # of the interval
+
+    @field_validator("interval_s")
+    @classmethod
+    def _in_order(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] > value[1]:
+            raise ValueError(f"expected low, then high, found {value[0]:g} and {value[1]:g}")
+        return value
 
 
 def write(path: Path, lag: LagFile) -> None:
@@ -38,10 +46,6 @@ def read(path: Path) -> LagFile:
         If the file is missing or damaged.
     """
     try:
-        return LagFile.model_validate_json(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a measured lag, found no file; sonotwin measure-lag writes it") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected a measured lag, found {error}") from None
+        return LagFile.model_validate_json(read_bytes(path))
     except ValidationError as error:
         raise InputError(f"{path}: {one_line(error)}") from None

@@ -16,39 +16,36 @@ from numpy.typing import NDArray
 
 from recon import threads
 from recon.compiled import kernel, njit
-from recon.files.volumes import Volume
 from recon.freehand.volume_compounding import Grid
 from recon.geometry.surface_tree import signed_distances
 from recon.segmentation import echo_power
-from recon.segmentation.echo_power import EchoPower, pixel_mm
+from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM, EchoPower, pixel_mm
 from recon.segmentation.mass_surface import Mass, distances, grid_of
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Fit = Callable[[Sequence[Mass], EchoPower], Sequence[Mass]]  # masses again, their surfaces moved to the borders in the power
 
-SLICE_MM = (
-    (4.0, 0.91),
-    (8.0, 0.63),
-    (12.0, 0.37),
-    (15.0, 0.24),
-    (20.0, 0.24),
-    (30.0, 0.37),
-    (40.0, 0.56),
-)  # of conf/ultrasound/linear.yaml
 ROUNDS = 2
-EDGE_MM = 0.15  # sigma of the border in the B-scans that are made: of a pulse
-NEAR_MM = 3.0  # of a border: farther pixels show one tissue only
-NODES = (-math.sqrt(3), 0.0, math.sqrt(3))  # standard deviations, and
-SHARES = (1 / 6, 2 / 3, 1 / 6)  # weights: a Gaussian mean, exact for polynomials of the fifth degree
+EDGE_MM = 0.15  # sigma of the border in the B-scans that are made, or its steps would alias in the voxels
+MOST_MM = 1.2  # standard deviation of a beam or a slice; borders that are wider aren't fitted, see `border_fit.BLURS_MM`
+OUTSIDE_MM = 4.0  # farther from a border pixels show tissue only, by `MOST_MM` along the array and across
+NODES = (-math.sqrt(3), 0.0, math.sqrt(3))  # places, in standard deviations, of a mean over a Gaussian
+SHARES = (1 / 6, 2 / 3, 1 / 6)  # their weights; exact for polynomials of the fifth degree
 
 
 @dataclass(frozen=True)
 class Blur:
-    """Standard deviations of an echo's power, off the middle of its beam."""
+    """Standard deviations of an echo's power, off the middle of its beam; by default those of the default array."""
 
-    lateral_mm: float = 0.2  # along the array
+    lateral_mm: float = SPREAD_MM[0]  # along the array
     slice_mm: tuple[tuple[float, float], ...] = SLICE_MM  # depth, rising, and across the image plane there; none: a thin slice
+
+    def __str__(self) -> str:
+        """In words, for a console."""
+        thick = [f"{sigma:g} mm {depth:g} mm deep" for depth, sigma in self.slice_mm[:: max(1, len(self.slice_mm) - 1)]]
+        slices = f"across the plane {', '.join(thick)}" if thick else "none across the plane"
+        return f"of an echo's power, sigma: {self.lateral_mm:g} mm along the array, {slices}; lobes are corrected for it"
 
     def across(self, depths: Array) -> Array:
         """Standard deviation across the image plane, mm, at depths, mm."""
@@ -79,7 +76,8 @@ def corrected(masses: Sequence[Mass], power: EchoPower, planes: Planes, fit: Fit
     """Masses without what blur and fit do to their surfaces; `power` is that in which they were found."""
     restored = list(masses)
     for _ in range(ROUNDS):
-        again = fit(masses, EchoPower(echoes(restored, grid_of(power.volume), planes), power.weight))
+        made = echoes(restored, grid_of(power.volume), planes)
+        again = fit(masses, EchoPower(made.volume, np.where(made.seen, power.weight, 0)))
         restored = [_moved(*three) for three in zip(restored, again, masses, strict=True)]
     return restored
 
@@ -91,7 +89,7 @@ def _moved(mass: Mass, again: Mass, found: Mass) -> Mass:
     return Mass(trimesh.Trimesh(vertices + off[:, None] * mass.mesh.vertex_normals, mass.mesh.faces, process=False))
 
 
-def echoes(masses: Sequence[Mass], grid: Grid, planes: Planes) -> Volume:
+def echoes(masses: Sequence[Mass], grid: Grid, planes: Planes) -> EchoPower:
     """Mean power on a grid, in B-scans of masses without echoes in tissue of power 1."""
     field, (across, down) = distances(masses, grid), pixel_mm(planes.world_from_pixel)
     slices = planes.blur.across(down * np.arange(planes.rows.stop))
@@ -108,7 +106,7 @@ def echoes(masses: Sequence[Mass], grid: Grid, planes: Planes) -> Volume:
                 threads.in_threads(_fill_echoes, len(image), field.voxels, beams, image)
             yield image[planes.rows.start :], u, v
 
-    return echo_power.accumulated(images(), planes.world_from_pixel, grid).volume
+    return echo_power.accumulated(images(), planes.world_from_pixel, grid)
 
 
 @kernel
@@ -118,7 +116,7 @@ def _fill_echoes(first, end, field, beams, image):
         for column in range(image.shape[1]):
             x, y, z = _place(beams.voxel_from_pixel, column, row)
             away = _distance(field, x, y, z)
-            if away > NEAR_MM:
+            if away > OUTSIDE_MM:
                 continue
             total = 0.0
             for i in range(3):
@@ -147,7 +145,7 @@ def _distance(field, x, y, z):
     """Signed distance to the masses, mm, by trilinear interpolation; far outside beyond the lattice."""
     nz, ny, nx = field.shape
     if not (0 <= x < nx - 1 and 0 <= y < ny - 1 and 0 <= z < nz - 1):
-        return 2 * NEAR_MM
+        return 2.0 * OUTSIDE_MM
     i, j, k = np.uint64(x), np.uint64(y), np.uint64(z)
     s, t, w = x - i, y - j, z - k
     one = np.uint64(1)

@@ -20,6 +20,11 @@ from recon.freehand.volume_compounding import Clip, Grid
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
+SPREAD_MM = (0.2, 0.063)  # sigma of an echo's power along the array and in depth, of the default array 20 mm deep
+SLICE_MM = (  # the same across the image plane, at some depths: (depth, sigma)
+    *((4.0, 0.91), (8.0, 0.63), (12.0, 0.37), (15.0, 0.24), (20.0, 0.24)),
+    *((30.0, 0.37), (40.0, 0.56), (50.0, 0.8)),
+)
 BRIGHTEST = 10**0.8  # times tissue: brighter echoes count as 8 dB above it, such as those of walls square to the beam
 MEDIAN_OF_MEAN = np.log(2)  # of the power of speckle, which is exponentially distributed
 

@@ -63,7 +63,8 @@ def from_scans(
         are left out.
     grey : float
         Of tissue, by default that of `tissue_grey`.
-    blur : of the B-scans, which is corrected for
+    blur : of the B-scans
+        Lobes of masses are corrected for it, and for what the fit does to them; not at all by default.
 
     Raises
     ------
@@ -81,8 +82,8 @@ def from_scans(
         if masses:
             power = cleared(recording, grid, masses, sound)
             masses = refined([mass for mass in masses if is_dark(mass, power)], power, times)
-    if masses:
-        planes = Planes(world_from_pixel, range(clip.v, clip.height), clip.width, blur or Blur())
+    if masses and blur is not None:
+        planes = Planes(world_from_pixel, range(clip.v, shape[0]), shape[1], blur)
         masses = blur_correction.corrected(masses, power, planes, partial(refined, times=REFINEMENTS[-1]))
     return sorted(masses, key=lambda mass: -mass.volume)
 

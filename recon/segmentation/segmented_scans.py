@@ -52,7 +52,7 @@ def find_masses(
     """Find masses; with a skin, whether they lie under it.
 
     speed_sigmas : m/s, standard deviations of the speeds of sound in the tissue and in masses.
-    blur : of the B-scans.
+    blur : of the B-scans, which lobes of masses are corrected for; not at all by default.
 
     Raises
     ------
@@ -65,6 +65,7 @@ def find_masses(
     found = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur)
     figures: Metrics = {"tissue_grey": grey, "masses": len(found)}
     lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {NONE_FOUND}"])]
+    lines += [f"blur        {blur}"] if blur is not None and found else []
     containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
     for number, (mass, under) in enumerate(zip(found, containments, strict=True)):
         speeds = Speeds(speed_sigmas[0] / scans.speed_m_s, speed_sigmas[1] / mass_m_s)

@@ -23,6 +23,7 @@ from recon.geometry import rigid
 from recon.geometry.order_statistics import NORMAL_MAD
 from recon.geometry.primitives import Cylinder, fit_cylinder
 from recon.model.probe import ProbeCalibration
+from recon.segmentation.echo_power import SPREAD_MM
 
 Array = NDArray[np.float64]
 
@@ -38,7 +39,9 @@ WINDOW_SPREADS = 3.0  # times the spread along the array
 SAMPLE_MM = 0.02
 EDGE_DB = 10.0  # below the echo's top, where its two edges are taken
 OUTLIER = 3.5  # standard deviations from the smooth outline
-FADING_DEG = 6.0  # sigma of the window in which the brightness' slope along the wall is taken
+FADING_DEG = 2.0  # sigma of the window in which the brightness' slope along the wall is taken
+CLIPPED = 250.0  # grey level of 255, from which an echo's brightness isn't known
+UNSURE = 2.0  # times the correction for fading, which is its first order alone: standard deviation
 LEAST_EDGES = 40
 FLOOR_MM = 0.01  # no edge counts as more exact than this
 ROBUST = 3.0  # standard deviations, from which a point counts less in the cylinder's fit
@@ -50,7 +53,7 @@ class Appearance:
     """Appearance of a tube on a scanner."""
 
     diameter_mm: tuple[float, float] = (5.0, 36.0)  # least and most
-    spread_mm: tuple[float, float] = (0.2, 0.063)  # sigma of an echo's power, along the array and in depth
+    spread_mm: tuple[float, float] = SPREAD_MM  # sigma of an echo's power, along the array and in depth
     dynamic_range_db: float = 60.0  # from black to white
     min_contrast_db: float = 15.0  # of the wall above the water
     top_mm: float = 2.5  # ringing at the probe's face, left out
@@ -233,13 +236,14 @@ def _measured(level: NDArray[np.float32], scale: Array, circle: Array, look: App
     kept = np.abs(radius - outline) < OUTLIER * scatter * extent + FLOOR_MM
     if kept.sum() < LEAST_EDGES:
         return _none(f"too few edges: {kept.sum()} of {len(kept)} on a smooth outline")
-    nepers = np.log(10) / 10 * profiles[good][kept].max(axis=1) / grey  # of power
+    peaks = profiles[good][kept].max(axis=1)
     angle, rays, radius = angle[kept], rays[kept], radius[kept]
     wide, deep = np.square(look.spread_mm)  # variances
     bend = (wide * np.cos(angle) ** 2 + deep * np.sin(angle) ** 2) / (2 * radius)
-    fading = _slopes(angle, nepers) / radius * (wide - deep) * np.sin(angle) * np.cos(angle)
+    growth = np.log(10) / 10 / grey * _slopes(angle, peaks) / radius  # of power, nepers a mm
+    fading = growth * (wide - deep) * np.sin(angle) * np.cos(angle)
     radius = radius + bend + fading
-    sigma = np.hypot(scatter * extent[kept], FLOOR_MM)
+    sigma = np.sqrt((scatter * extent[kept]) ** 2 + FLOOR_MM**2 + (UNSURE * fading) ** 2)
     across = rays / scale  # px for 1 mm
     covariance = sigma[:, None, None] ** 2 * across[:, :, None] * across[:, None, :]
     return Ring((circle[:2] + radius[:, None] * rays) / scale, covariance)
@@ -263,12 +267,19 @@ def _echo_middles(profiles: Array, drop: float, contrast: float) -> tuple[Array,
     return middle, extent
 
 
-def _slopes(angle: Array, value: Array) -> Array:
-    """Slopes : (n,) of a value over the angle, of lines fitted in a Gaussian window around each."""
-    weight = np.exp(-0.5 * ((angle[:, None] - angle) / np.deg2rad(FADING_DEG)) ** 2)
+def _slopes(angle: Array, peaks: Array) -> Array:
+    """Slopes : (n,) of an echo's grey level over the angle, of lines fitted in a Gaussian window around each.
+
+    Where levels are clipped the slope is taken to change evenly between both ends, as on the crest of a mirror's echo.
+    """
+    known = peaks < CLIPPED
+    if known.sum() < LEAST_EDGES:
+        return np.zeros_like(peaks)
+    at, level = angle[known], peaks[known]
+    weight = np.exp(-0.5 * ((at[:, None] - at) / np.deg2rad(FADING_DEG)) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
-    away = angle - (weight @ angle)[:, None]
-    return (weight * away) @ value / (weight * away**2).sum(axis=1)
+    away = at - (weight @ at)[:, None]
+    return np.interp(angle, at, (weight * away) @ level / np.maximum((weight * away**2).sum(axis=1), 1e-12))
 
 
 def _smooth_outline(angle: Array, radius: Array, extent: Array) -> tuple[Array, float]:

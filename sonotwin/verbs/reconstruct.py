@@ -14,6 +14,7 @@ is simply started again. Takes minutes. Exit status 1 if a step failed; those th
     sonotwin reconstruct capture=session/capture calibration=optics.yaml probe=probe.yaml lag_s=0.05 out=result
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,12 +32,13 @@ from recon.model.probe import Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Positive, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
+from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
 from recon.tracking import networks
 from recon.tracking.results import POSES
 from sonotwin import latency_fields
 from sonotwin.kept_steps import KeptSteps, files_of
 from sonotwin.latency_fields import Latency
-from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, fuse, measure_lag, surface
+from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, fuse, measure_lag, segment, surface
 
 Drift = Annotated[float, Field(ge=0, le=10)]
 NO_OPTICS = "no calibration of the cameras: no board, and none given"
@@ -67,6 +69,8 @@ class Config(BaseModel):
     tissue_sigma_m_s: SpeedSigma = 25.0
     spacing_mm: Positive = 0.5
     find: Literal["masses", "tube", "nothing"] = "masses"
+    spread_mm: segment.Spreads = SPREAD_MM
+    slice_mm: segment.Slice = SLICE_MM
     overlays: bool = False
     _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
 
@@ -272,7 +276,8 @@ def look_inside(
         fields, made_of = [*fields, f"surface={skin}"], made_of | {"skin": steps.digest("surface")}
         placing = [*placing, f"surface={skin}"]
     does, found = f"{'masses' if config.find == 'masses' else 'a tube'} in the B-scans", _step_of(config.find, name)
-    masses = steps.do(found, does, "segment", [*fields, f"kind={config.find}"], (), made_of)
+    blur = [f"spread_mm={json.dumps(config.spread_mm)}", f"slice_mm={json.dumps(config.slice_mm)}"]
+    masses = steps.do(found, does, "segment", [*fields, f"kind={config.find}", *blur], (), made_of)
     if config.find == "masses":
         shown = [*placing, lag.field, *([] if masses is None else [f"masses={masses}"])]
         shown += [] if optics is None else [f"calibration={optics}"]

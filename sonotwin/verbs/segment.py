@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 
 import cv2
 import trimesh
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 
 from recon.capture import sweep_part
@@ -30,11 +30,23 @@ from recon.model.probe import SCANNER_SPEED, Speed, SpeedSigma
 from recon.model.rig import NotNegative, Positive
 from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, segmented_scans
-from recon.segmentation.blur_correction import SLICE_MM, Blur
+from recon.segmentation.blur_correction import MOST_MM, Blur
+from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
 from recon.segmentation.segmented_scans import Segmented
 from recon.segmentation.tube_wall import Appearance
 
-Spread = Annotated[float, Field(ge=0, le=5)]
+Spread = Annotated[float, Field(ge=0, le=MOST_MM)]
+Spreads = tuple[Spread, Spread]  # along the array and in depth
+
+
+def _rising(value: tuple[tuple[float, float], ...] | None) -> tuple[tuple[float, float], ...] | None:
+    depths = [depth for depth, _ in value or ()]
+    if any(second <= first for first, second in pairwise(depths)):
+        raise ValueError(f"expected rising depths, found {depths}")
+    return value
+
+
+Slice = Annotated[tuple[tuple[NotNegative, Spread], ...] | None, AfterValidator(_rising)]  # depths, and across the plane there
 
 
 class Config(BaseModel):
@@ -57,8 +69,8 @@ class Config(BaseModel):
     mass_sigma_m_s: SpeedSigma = 20.0
     dynamic_range_db: Annotated[float, Field(ge=20, le=120)] = 60.0
     diameter_mm: tuple[Positive, Positive] = (5.0, 36.0)
-    spread_mm: tuple[Spread, Spread] = Appearance().spread_mm
-    slice_mm: tuple[tuple[NotNegative, Spread], ...] = SLICE_MM
+    spread_mm: Spreads = SPREAD_MM
+    slice_mm: Slice = SLICE_MM
     min_contrast_db: Annotated[float, Field(ge=0, le=120)] = 15.0
     top_mm: Annotated[float, Field(ge=0, le=100)] = 2.5
     overlays: Annotated[int, Field(ge=0, le=100)] = segmented_scans.OVERLAYS
@@ -72,15 +84,12 @@ class Config(BaseModel):
                 raise ValueError(f"{name}: expected none with a sequence, whose poses are those of its images, found {value:g}")
         if self.diameter_mm[0] >= self.diameter_mm[1]:
             raise ValueError(f"diameter_mm: expected the least before the most, found {list(self.diameter_mm)}")
-        depths = [depth for depth, _ in self.slice_mm]
-        if any(second <= first for first, second in pairwise(depths)):
-            raise ValueError(f"slice_mm: expected rising depths, found {depths}")
         return self
 
     @property
-    def blur(self) -> Blur:
-        """Blur of the B-scans."""
-        return Blur(self.spread_mm[0], self.slice_mm)
+    def blur(self) -> Blur | None:
+        """Blur of the B-scans that masses are corrected for."""
+        return None if self.slice_mm is None else Blur(self.spread_mm[0], self.slice_mm)
 
     @property
     def tube(self) -> Appearance:

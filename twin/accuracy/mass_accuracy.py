@@ -9,6 +9,7 @@ from recon.freehand import sequences
 from recon.model.tracks import poses_at
 from recon.probe_calibration import sound_in_water
 from recon.segmentation import masses
+from recon.segmentation.blur_correction import Blur
 from recon.segmentation.containment import contain
 from recon.segmentation.masses import Mass
 from recon.segmentation.refraction import Sound
@@ -75,7 +76,7 @@ def segmented(setup: Setup, seed: int) -> Sequence[Mass]:
     poses = poses_at(planned.track, planned.times, clocks.lag_s)
     calibration = sound_in_water.for_tissue(sweep_session.calibration_of(setup.rig, transducer), SOUND.tissue)
     world_from_pixel = poses @ sequences.target_from_pixel(calibration)
-    return masses.from_scans(lambda: iter(images), images.shape[1:], world_from_pixel, SOUND)
+    return masses.from_scans(lambda: iter(images), images.shape[1:], world_from_pixel, SOUND, blur=Blur())
 
 
 def measured_skin(setup: Setup) -> trimesh.Trimesh:

@@ -151,15 +151,16 @@ def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
     bounds = thing.mesh.bounds
     if shape is not None:
         along = (thing.mesh.vertices - shape.point) @ shape.axis
-        step = min(_spacing(thing), float(np.sqrt(8 * shape.radius * SAG_MM)))
-        return _sampled(thing, tissue, lambda points: _in_rod(points, shape, along.min(), along.max()), step)
+        across = min(_spacing(thing), float(np.sqrt(8 * shape.radius * SAG_MM)))
+        steps = np.where(np.abs(shape.axis) > 1 - 1e-9, _spacing(thing), across)  # along the axis the wall is straight
+        return _sampled(thing, tissue, lambda points: _in_rod(points, shape, along.min(), along.max()), steps)
     if thing.primitive is not None:
-        return _sampled(thing, tissue, thing.primitive.distance, _spacing(thing))
+        return _sampled(thing, tissue, thing.primitive.distance, np.full(3, _spacing(thing)))
     if np.isclose(thing.mesh.volume, np.prod(thing.mesh.extents), rtol=1e-6):
         distance, steps = _box(bounds)
         return Solid(thing.name, tissue, distance, bounds[0] - MARGIN_MM, steps, thing.mesh)
     step = _spacing(thing)
-    points, low = _grid(thing, step)
+    points, low = _grid(thing, np.full(3, step))
     return Solid(thing.name, tissue, _from_mesh(thing.mesh, points, step), low, np.full(3, step), thing.mesh)
 
 
@@ -167,18 +168,18 @@ def _spacing(thing: Thing) -> float:
     return SPACING_MM[int(thing.mesh.extents.max() > LARGE_MM)]
 
 
-def _grid(thing: Thing, step: float) -> tuple[Array, Array]:
+def _grid(thing: Thing, steps: Array) -> tuple[Array, Array]:
     """Points : (nx, ny, nz, 3) around a thing, and the first of them."""
     low, high = thing.mesh.bounds[0] - MARGIN_MM, thing.mesh.bounds[1] + MARGIN_MM
-    counts = np.ceil((high - low) / step).astype(int) + 1
-    axes = [low[k] + step * np.arange(counts[k]) for k in range(3)]
+    counts = np.ceil((high - low) / steps).astype(int) + 1
+    axes = [low[k] + steps[k] * np.arange(counts[k]) for k in range(3)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), low
 
 
-def _sampled(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array], step: float) -> Solid:
-    points, low = _grid(thing, step)
+def _sampled(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array], steps: Array) -> Solid:
+    points, low = _grid(thing, steps)
     values = np.stack([distance(sheet.reshape(-1, 3)).reshape(sheet.shape[:-1]) for sheet in points])
-    return Solid(thing.name, tissue, values.astype(np.float32), low, np.full(3, step), thing.mesh)
+    return Solid(thing.name, tissue, values.astype(np.float32), low, steps, thing.mesh)
 
 
 def _in_rod(points: Array, rod: Cylinder, first: float, last: float) -> Array:

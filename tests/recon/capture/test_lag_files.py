@@ -23,8 +23,9 @@ def test_a_lag_is_read_as_it_was_written(tmp_path):
         ('{"lag_s": NaN, "sigma_s": 0, "interval_s": [0, 1], "coverage": 0.95}', "lag_s"),
         ('{"lag_s": 0.05, "sigma_s": -1, "interval_s": [0, 1], "coverage": 0.95}', "sigma_s"),
         ('{"lag_s": 0.05, "sigma_s": 0, "interval_s": [0], "coverage": 0.95}', "interval_s"),
-        (b"\xff\xfe", "expected a measured lag"),
-        (None, "found no file"),
+        ('{"lag_s": 0.05, "sigma_s": 0, "interval_s": [0.06, 0.04], "coverage": 0.95}', "interval_s: .*low, then high"),
+        (b"\xff\xfe", "JSON"),
+        (None, "expected a file, found none"),
     ],
 )
 def test_a_bad_file_is_refused(tmp_path, text, said):

@@ -10,7 +10,6 @@ from recon.freehand.volume_compounding import Grid
 from recon.geometry.surface_tree import signed_distances
 from recon.segmentation import blur_correction, echo_power
 from recon.segmentation.blur_correction import Blur, Planes, corrected, echoes
-from recon.segmentation.echo_power import EchoPower
 from recon.segmentation.mass_surface import Mass, distances
 from recon.segmentation.masses import refined
 from twin.ultrasound import beam
@@ -51,7 +50,7 @@ def half_level(power, direction):
 
 def test_a_blurred_border_moves_by_half_of_its_curvature():
     """By trace(S K) / 2 more than an unblurred one in the same voxels."""
-    sharp, wide = (echoes([ball(5.0)], GRID, planes(Blur(*sigmas))).voxels for sigmas in ((0.0, ()), (0.4, ((0.0, 0.5),))))
+    sharp, wide = (echoes([ball(5.0)], GRID, planes(Blur(*sigmas))).volume.voxels for sigmas in ((0.0, ()), (0.4, ((0.0, 0.5),))))
     for direction, sigmas in (([0, -1, 0], (0.4, 0.5)), ([1, 0, 0], (0.0, 0.5))):
         moved = half_level(sharp, direction) - half_level(wide, direction)
         assert moved == pytest.approx(np.square(sigmas).sum() / (2 * 5.0), abs=0.012)
@@ -61,7 +60,7 @@ def test_echoes_are_those_of_a_plain_mean():
     """Of nine places of a beam, by SciPy."""
     blur = Blur(0.4, ((10.0, 0.3), (20.0, 0.9)))
     one = Planes(planes(blur).world_from_pixel[28:29], ROWS, COLUMNS, blur)
-    found = echoes([ball(5.0)], GRID, one).voxels
+    found = echoes([ball(5.0)], GRID, one).volume.voxels
     field, (v, u) = distances([ball(5.0)], GRID).voxels, np.mgrid[:100, :100]
     places = np.stack([u, v, 0 * u], axis=-1) * PIXEL_MM + [-15.0, 0.0, 0.0]
     across = np.interp(PIXEL_MM * v, [10, 20], [0.3, 0.9])
@@ -81,8 +80,7 @@ def test_lobes_are_as_high_as_they_are():
     """The fit alone takes a tenth of a millimetre off the tops of bumps that are blurred as in B-scans 1 mm apart."""
     true, blur = lobed(), Blur(0.2, ((8.0, 0.6), (25.0, 0.3)))
     scans = planes(blur, spacing_mm=1.0)
-    seen = echoes([true], GRID, scans)
-    power = EchoPower(seen, np.where(seen.voxels > 0, 1.0, 0.0).astype(np.float32))
+    power = echoes([true], GRID, scans)
     tops = np.linalg.norm(true.mesh.vertices - MIDDLE, axis=1) > 7.1
     found = refined([true], power, 3)
     better = corrected(found, power, scans, lambda masses, again: refined(masses, again, 3))
@@ -95,8 +93,18 @@ def test_lobes_are_as_high_as_they_are():
 
 def test_the_default_slice_is_that_of_the_default_array():
     """Its thickness at some depths, in power, by diffraction."""
-    depths = np.arange(4.0, 40.0, 2.0)
+    depths = np.arange(4.0, Transducer().depth_mm, 2.0)
     amplitude = beam._elevation(Transducer(), depths)[0]
     power, offsets = np.abs(amplitude) ** 2, beam.STEP_MM * np.arange(amplitude.shape[1])
     sigma = np.sqrt((power * offsets**2).sum(axis=1) / power.sum(axis=1))
     assert np.abs(Blur().across(depths) - sigma).max() < 0.04
+
+
+def test_a_border_beyond_the_images_end_stays():
+    """Where the scanner's pixels reached and the made ones don't, nothing is known of the blur."""
+    true, scans = ball(5.0), planes(Blur(0.2, ()))
+    ends = Planes(scans.world_from_pixel, range(68), COLUMNS, scans.blur)  # 0.1 mm below the ball
+    power = echoes([true], GRID, scans)
+    (found,) = corrected([true], power, ends, lambda masses, again: refined(masses, again, 3))
+    below = np.asarray(true.mesh.vertices)[:, 1] > 19.5
+    assert np.abs(signed_distances(true.mesh.vertices[below], found.mesh)).max() < 0.2
