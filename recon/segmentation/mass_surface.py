@@ -19,7 +19,7 @@ from recon.geometry import rigid
 
 Array = NDArray[np.float64]
 
-EVEN_MM = 0.3  # standard deviation; takes folds off, and little of lobes
+EVEN_MM = 0.5  # standard deviation; a voxel
 LEVELLINGS = 4  # Newton's steps to the level that holds the volume
 NEAR_MM = 1.5  # of a vertex, within which distances come from the surface itself
 NEIGHBOURS = 6  # vertices that the distance to a surface is taken from
