@@ -100,3 +100,20 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, tmp_p
     assert complaint(f"capture={capture}", "diameter_mm=[9,5]").startswith("segment: diameter_mm: expected the least before")
     assert complaint(f"capture={capture}", "kind=tube").startswith(f"{capture}: rings: expected at least three images")
     assert not out.exists()
+
+
+def test_lobes_are_corrected_for_blur_unless_it_is_unknown(capture, tmp_path, capsys):
+    """A larger blur flattens more, so more is given back; null leaves the border as it was found."""
+    volumes = {}
+    for name, blur in (("none", "null"), ("thin", "[]"), ("thick", "[[5,0.9]]")):
+        fields = [f"capture={capture}", f"lag_s={LAG_S}", f"slice_mm={blur}", f"out={tmp_path / name}"]
+        assert main(["segment", *fields]) == 0
+        volumes[name] = json.loads((tmp_path / name / "metrics.json").read_text())["mass0_volume_mm3"]
+        assert ("lobes are corrected" in capsys.readouterr().out) == (name != "none")
+    assert volumes["thick"] > volumes["thin"] * 1.005 and volumes["none"] != volumes["thin"]
+
+
+@pytest.mark.parametrize(("slices", "said"), [("[[8,0.5],[8,0.4]]", "slice_mm: expected rising depths"), ("[[8,3]]", "1.2")])
+def test_a_slice_that_cannot_be_is_refused(capture, tmp_path, capsys, slices, said):
+    assert main(["segment", f"capture={capture}", f"slice_mm={slices}", f"out={tmp_path / 'out'}"]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from recon.probe_calibration import sound_in_water
+from recon.segmentation.echo_power import SPREAD_MM
 from twin.accuracy import tube_accuracy
 from twin.ultrasound.transducer import Transducer
 
@@ -61,3 +62,8 @@ def test_the_spread_of_a_wires_echo_grows_with_the_f_numbers():
 def test_a_wider_beam_is_stood_with_its_spread(rig):
     row = tube_accuracy.wider(tube_accuracy.stroke(rig.probe, SLICES, 1, tube_accuracy.WIDER), rig.probe)
     assert row.ok and "0.29 and 0.06 mm" in row.what
+
+
+def test_the_default_spread_is_that_of_the_default_array():
+    """As a lab measures it, on the echo of a thin wire."""
+    assert tube_accuracy.spread(tube_accuracy.WATER) == pytest.approx(SPREAD_MM, abs=0.003)

@@ -32,6 +32,17 @@ def test_a_meshs_distance_is_that_of_the_shape(rng):
     assert (distances(made, 17.9 * way) > 0).all()
 
 
+def test_a_rods_wall_is_where_it_is(rng):
+    """To 2 µm between the points of its grid; a micrometre is an hundredth of a wavelength's phase there and back."""
+    scene = build_scene({"kind": "inner_cylinder"})
+    (inner,) = (one for one in body(scene).solids if one.name == "inner")
+    (rod,) = scene.shapes
+    angle, along = rng.uniform(0, 2 * np.pi, 400), rng.uniform(-40, 40, 400)
+    points = rod.point + np.column_stack([along, rod.radius * np.cos(angle), rod.radius * np.sin(angle)])
+    assert np.abs(distances(inner, points)).max() < 0.002
+    assert inner.distance.size < 1e6
+
+
 @pytest.fixture(scope="module")
 def breast():
     return body(build_scene({"kind": "breast"}))
