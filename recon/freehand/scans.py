@@ -15,7 +15,7 @@ from recon.files.metrics import Metrics
 from recon.files.volumes import Volume
 from recon.freehand import hole_filling, place_uncertainty, plus_config, sequences, volume_compounding
 from recon.freehand.place_uncertainty import PlaceErrors
-from recon.freehand.volume_compounding import Clip, Grid, Reconstruction
+from recon.freehand.volume_compounding import Clip, Grid, Reconstruction, grid_of
 from recon.model import tracks
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration
 from recon.probe_calibration import sound_in_water
@@ -149,8 +149,7 @@ def sigma_volume(scans: Scans, volume: Volume, clip: Clip | None = None) -> Volu
     if scans.probe is None or scans.probe.uncertainty is None or scans.errors is None or not scans.errors.known:
         return None
     forms = place_uncertainty.forms(scans.world_from_pixel, scans.probe, scans.errors)
-    grid = Grid(volume.voxels.shape[::-1], volume.origin, volume.spacing, volume.directions)
-    return place_uncertainty.sigma_volume(forms, scans.world_from_pixel, scans.shape, grid, clip)
+    return place_uncertainty.sigma_volume(forms, scans.world_from_pixel, scans.shape, grid_of(volume), clip)
 
 
 def filled(pasted: Reconstruction, most_voxels: int, sticks: int) -> Reconstruction:

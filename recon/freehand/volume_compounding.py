@@ -56,6 +56,12 @@ class Grid:
     directions: Array  # (3, 3), columns
 
 
+def grid_of(volume: Volume) -> Grid:
+    """The voxels of a volume."""
+    nz, ny, nx = volume.voxels.shape
+    return Grid((nx, ny, nz), volume.origin, volume.spacing, volume.directions)
+
+
 @dataclass(frozen=True)
 class Reconstruction:
     """A volume, and those of its voxels that pixels fell into."""

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from recon import threads
 from recon.compiled import kernel, njit
-from recon.freehand.volume_compounding import Grid
+from recon.freehand.volume_compounding import Grid, grid_of
 from recon.geometry.surface_tree import signed_distances
 from recon.segmentation import echo_power
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM, EchoPower, pixel_mm
-from recon.segmentation.mass_surface import Mass, distances, grid_of
+from recon.segmentation.mass_surface import Mass, distances
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]

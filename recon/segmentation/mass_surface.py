@@ -59,12 +59,6 @@ def evened(mass: Mass, lattice: Volume) -> Mass:
     return Mass(meshed(field, level, whole, near, outside=FAR_MM))
 
 
-def grid_of(volume: Volume) -> Grid:
-    """The voxels of a volume."""
-    nz, ny, nx = volume.voxels.shape
-    return Grid((nx, ny, nz), volume.origin, volume.spacing, volume.directions)
-
-
 def around(mass: Mass, lattice: Volume, margin_mm: float = FAR_MM) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First voxel and the one after the last : (3,) x, y, z, of the box around a mass, maybe beyond the lattice."""
     voxel = rigid.apply(np.linalg.inv(lattice.world_from_voxel), mass.mesh.vertices)
