@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Fit = Callable[[Sequence[Mass], EchoPower], Sequence[Mass]]  # masses again, their surfaces moved to the borders in the power
 
-ROUNDS = 2
+ROUNDS = 1  # another one changes depths by 0.03 mm, and makes them scatter more
 EDGE_MM = 0.15  # sigma of the border in the B-scans that are made, or its steps would alias in the voxels
 MOST_MM = 1.2  # standard deviation of a beam or a slice; borders that are wider aren't fitted, see `border_fit.BLURS_MM`
 OUTSIDE_MM = 4.0  # farther from a border pixels show tissue only, by `MOST_MM` along the array and across

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from recon import threads
 from recon.compiled import kernel, njit
@@ -47,8 +47,8 @@ def typical_grey(images: NDArray, rows: slice) -> float:
     return float(np.median(images[:, rows]))
 
 
-def beam_grid(world_from_pixel: Array, shape: tuple[int, int], spacing_mm: float, clip: Clip | None = None) -> Grid:
-    """The grid along the mean array (x) and beam (y) around all images (h, w) with poses : (n, 4, 4)."""
+def beam_grid(world_from_pixel: Array, shape: tuple[int, int], spacing_mm: ArrayLike, clip: Clip | None = None) -> Grid:
+    """The grid along the mean array (x) and beam (y) around images (h, w) with poses : (n, 4, 4); one spacing, or one an axis."""
     around = volume_compounding.corners(world_from_pixel, shape, clip)
     found = world_from_pixel[np.isfinite(world_from_pixel).all(axis=(1, 2))]
     axes = found[:, :3, :2] / np.linalg.norm(found[:, :3, :2], axis=1, keepdims=True)
@@ -60,8 +60,9 @@ def beam_grid(world_from_pixel: Array, shape: tuple[int, int], spacing_mm: float
     array = array / np.linalg.norm(array)
     directions = np.column_stack([array, beam, np.cross(array, beam)])
     low, high = (around @ directions).min(axis=0), (around @ directions).max(axis=0)
-    nx, ny, nz = np.ceil((high - low) / spacing_mm).astype(int) + 1
-    return Grid((int(nx), int(ny), int(nz)), directions @ low, np.full(3, float(spacing_mm)), directions)
+    spacing = np.broadcast_to(np.asarray(spacing_mm, float), 3)
+    nx, ny, nz = np.ceil((high - low) / spacing).astype(int) + 1
+    return Grid((int(nx), int(ny), int(nz)), directions @ low, spacing.copy(), directions)
 
 
 def averaged(

@@ -19,7 +19,8 @@ from recon.geometry import rigid
 
 Array = NDArray[np.float64]
 
-EVEN_MM = 0.5  # standard deviation; a voxel
+EVEN_MM = 0.5  # standard deviation
+MESH_MM = 0.5
 LEVELLINGS = 4  # Newton's steps to the level that holds the volume
 NEAR_MM = 1.5  # of a vertex, within which distances come from the surface itself
 NEIGHBOURS = 6  # vertices that the distance to a surface is taken from
@@ -43,15 +44,17 @@ class Mass:
         return np.asarray(self.mesh.center_mass)
 
 
-def evened(mass: Mass, lattice: Volume) -> Mass:
+def evened(mass: Mass, axes: Array) -> Mass:
     """The same mass without folds and spikes finer than `EVEN_MM`, of the same volume.
 
     Moved vertices can cross each other; the smoothed distance to them has a clean surface, taken at the level of the same volume.
+    Its vertices are `MESH_MM` apart along the axes : (3, 3), columns.
     """
-    low, high = around(mass, lattice, NEAR_MM + 3 * EVEN_MM)
-    origin = rigid.apply(lattice.world_from_voxel, low)
-    near = distances([mass], Grid(tuple(high - low), origin, lattice.spacing, lattice.directions))
-    field, whole = ndimage.gaussian_filter(near.voxels, EVEN_MM / lattice.spacing[::-1]), 3 * (slice(0, None),)
+    places, margin = mass.mesh.vertices @ axes, NEAR_MM + 3 * EVEN_MM
+    low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
+    nx, ny, nz = (np.ceil((high - low) / MESH_MM) + 1).astype(int).tolist()
+    near = distances([mass], Grid((nx, ny, nz), axes @ low, np.full(3, MESH_MM), axes))
+    field, whole = ndimage.gaussian_filter(near.voxels, EVEN_MM / MESH_MM), 3 * (slice(0, None),)
     level, volume = 0.0, enclosed(np.asarray(mass.mesh.vertices), mass.mesh.faces).sum()
     for _ in range(LEVELLINGS):
         mesh = meshed(field, level, whole, near, outside=FAR_MM)
@@ -59,10 +62,10 @@ def evened(mass: Mass, lattice: Volume) -> Mass:
     return Mass(meshed(field, level, whole, near, outside=FAR_MM))
 
 
-def around(mass: Mass, lattice: Volume, margin_mm: float = FAR_MM) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First voxel and the one after the last : (3,) x, y, z, of the box around a mass, maybe beyond the lattice."""
+def _around(mass: Mass, lattice: Volume) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First voxel and the one after the last : (3,) x, y, z, of the box `FAR_MM` around a mass, maybe beyond the lattice."""
     voxel = rigid.apply(np.linalg.inv(lattice.world_from_voxel), mass.mesh.vertices)
-    margin = margin_mm / lattice.spacing
+    margin = FAR_MM / lattice.spacing
     return np.floor(voxel.min(axis=0) - margin).astype(int), np.ceil(voxel.max(axis=0) + margin).astype(int) + 1
 
 
@@ -71,14 +74,14 @@ def distances(masses: Sequence[Mass], grid: Grid) -> Volume:
     field = np.full(grid.size[::-1], FAR_MM, np.float32)
     volume = Volume(field, grid.origin, grid.spacing, grid.directions)
     for mass in masses:
-        low, high = around(mass, volume)
+        low, high = _around(mass, volume)
         part = tuple(slice(max(a, 0), min(b, n)) for a, b, n in zip(low[::-1], high[::-1], field.shape, strict=True))
         near = _near_distance(mass.mesh, volume, part)
         apart, _ = ndimage.label(np.isnan(near))
         bodies, count = ndimage.label((apart != apart[0, 0, 0]) & ~(near >= 0))
         inside = bodies == np.bincount(bodies.ravel())[1:].argmax() + 1 if count else bodies > 0  # narrow hollows are unsure
         out, into = threads.mapped(lambda one: ndimage.distance_transform_edt(one, grid.spacing[::-1]), (~inside, inside))
-        whole = np.asarray(out) - np.asarray(into) - np.where(inside, -0.5, 0.5) * grid.spacing[0]
+        whole = np.asarray(out) - np.asarray(into) - np.where(inside, -0.5, 0.5) * grid.spacing.mean()
         signed = np.where(np.isfinite(near) & ((near < 0) == inside), near, whole)
         field[part] = np.minimum(field[part], np.clip(signed, -FAR_MM, FAR_MM))
     return volume

@@ -23,13 +23,13 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-SPACING_MM = 0.5
+SPACING_MM = (0.5, 0.25, 0.5)  # along the array, the beam and across; a border square to the beam is a line of its pulse
 SMOOTH_MM = 0.6  # standard deviation; speckle cells are smaller
 AROUND_MM = 6.0  # standard deviation over which tissue's level is taken
 DARK = 0.35  # of tissue's power around: 4.6 dB below it
 SEED = 0.12  # of tissue's power, above that of a mass's core: 9 dB
 RISE = 4.0  # of power from the darkest on: behind is no longer the mass but its shadow
-GROW = 4  # voxels from there to the border
+GROW_MM = 1.0  # from there to beyond the border, not far into the shadow behind
 OPEN_MM = 1.5  # radius: thinner parts are shadows of borders
 BESIDE_MM = 0.25  # half a voxel
 BLUR_REACH = 4  # standard deviations to which a blur reaches
@@ -75,7 +75,8 @@ def from_scans(
     clip = below_face(shape, world_from_pixel)
     grey = tissue_grey(images(), shape, world_from_pixel) if grey is None else grey
     grid = echo_power.beam_grid(world_from_pixel, shape, SPACING_MM, clip)
-    recording = Recording(images, world_from_pixel, echo_power.powers(grey, dynamic_range_db), clip)
+    spread_mm = (blur or Blur()).lateral_mm
+    recording = Recording(images, world_from_pixel, echo_power.powers(grey, dynamic_range_db), clip, spread_mm)
     power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
     masses = refined(rough(power), power, ROUGHLY)
     for times in REFINEMENTS:
@@ -141,7 +142,7 @@ def refined(masses: Sequence[Mass], power: EchoPower, times: int) -> list[Mass]:
 
     def refine(mass: Mass) -> Mass:
         for _ in range(times):
-            mass = evened(Mass(border_fit.refine(mass.mesh, power).mesh), power.volume)
+            mass = evened(Mass(border_fit.refine(mass.mesh, power).mesh), power.volume.directions)
         return mass
 
     return list(threads.mapped(refine, masses, most=len(masses)))
@@ -163,10 +164,10 @@ def rough(power: EchoPower) -> list[Mass]:
     body = _opened(dark, OPEN_MM, spacing)
     unknown = ~seen
     labels, count = ndimage.label(body)
-    parts = ndimage.find_objects(labels)
+    parts, around = ndimage.find_objects(labels), np.ceil(2 * GROW_MM / spacing).astype(int)
     result = []
     for number in range(1, count + 1):
-        part = tuple(slice(max(0, s.start - 8), s.stop + 8) for s in parts[number - 1])
+        part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(parts[number - 1], around, strict=True))
         inside = labels[part] == number
         volume = inside.sum() * float(np.prod(spacing))
         touches = (ndimage.binary_dilation(inside, iterations=2) & unknown[part]).any()
@@ -174,7 +175,7 @@ def rough(power: EchoPower) -> list[Mass]:
         core = np.median(ratio[part][inside])
         if volume < LEAST_MM3 or touches or edge or core > SEED:
             continue
-        field = np.where(ndimage.binary_dilation(inside, iterations=GROW), ratio[part], 1.0)
+        field = np.where(_widened(inside, GROW_MM, spacing), ratio[part], 1.0)
         result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))
     return result
 

@@ -11,11 +11,11 @@ from recon.segmentation import masses
 from recon.segmentation.echo_power import EchoPower
 from recon.segmentation.masses import refined, rough
 
-SPACING, SIZE = 0.5, (72, 72, 64)  # nx, ny, nz: 36 x 36 x 32 mm
+SPACING, SIZE = np.array(masses.SPACING_MM), (72, 144, 64)  # nx, ny, nz: 36 x 36 x 32 mm
 CENTRE, RADIUS = np.array([3.0, 698.0, 14.0]), 5.0
 ORIGIN = CENTRE - [18.0, 14.0, 16.0]
 DARK = 0.05  # of tissue's power
-LOOKS = 3  # independent cells of speckle in a voxel
+LOOKS = 1.5  # independent cells of speckle in a voxel
 
 
 def grid():
@@ -26,7 +26,7 @@ def grid():
 
 def speckled(mean, rng):
     voxels = (mean * rng.gamma(LOOKS, 1 / LOOKS, mean.shape)).astype(np.float32)
-    return EchoPower(Volume(voxels, ORIGIN, np.full(3, SPACING)), np.full(mean.shape, float(LOOKS), np.float32))
+    return EchoPower(Volume(voxels, ORIGIN, SPACING), np.full(mean.shape, LOOKS, np.float32))
 
 
 def ball():
