@@ -179,6 +179,13 @@ def _within(moments: Array, wanted: Array) -> NDArray[np.bool_]:
     return near & (wanted >= moments[0]) & (wanted <= moments[-1])
 
 
+def _rank_correlation(depths: Array, heights: Array) -> float:
+    """Spearman's, without its sign; 0 where either stays the same."""
+    if np.ptp(depths) == 0 or np.ptp(heights) == 0:
+        return 0.0
+    return abs(float(stats.spearmanr(depths, heights).statistic))
+
+
 def _search(seconds: Array, depths: Array, moments: Array, heights: Array, search_s: tuple[float, float]) -> float:
     """The lag of the greatest rank correlation of depth and height."""
     lags = np.arange(search_s[0], search_s[1] + STEP_S / 2, STEP_S)
@@ -188,8 +195,7 @@ def _search(seconds: Array, depths: Array, moments: Array, heights: Array, searc
         inside = _within(moments, seconds - lag)
         overlap[k] = inside.mean()
         if inside.sum() >= MIN_FRAMES and overlap[k] >= MIN_OVERLAP:
-            agreement[k] = abs(stats.spearmanr(depths[inside], np.interp(seconds[inside] - lag, moments, heights)).statistic)
-    agreement = np.nan_to_num(agreement)
+            agreement[k] = _rank_correlation(depths[inside], np.interp(seconds[inside] - lag, moments, heights))
     if overlap.max() < MIN_OVERLAP:
         found = f"{100 * overlap.max():.0f} % at most: are the clocks others?"
         raise InputError(f"times: expected poses at {100 * MIN_OVERLAP:.0f} % of the images or more, found {found}")

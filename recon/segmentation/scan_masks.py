@@ -18,22 +18,23 @@ def mask_of(meshes: Sequence[trimesh.Trimesh], world_from_pixel: Array, size: tu
         From px to mm; its third axis need not be of unit length.
     size : width, height, px
     """
-    inside = np.zeros((size[1], size[0]), bool)
+    u, v = np.arange(size[0], dtype=float), np.arange(size[1], dtype=float)
+    inside = np.zeros((len(v), len(u)), bool)
     to_pixels = np.linalg.inv(world_from_pixel)
     for mesh in meshes:
         vertices = np.asarray(mesh.vertices) @ to_pixels[:3, :3].T + to_pixels[:3, 3]
         placed = trimesh.Trimesh(vertices, mesh.faces, process=False)
         lines = trimesh.intersections.mesh_plane(placed, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
-        inside |= _filled(np.asarray(lines).reshape(-1, 2, 3)[..., :2], size)
+        inside |= within_lines(np.asarray(lines).reshape(-1, 2, 3)[..., :2], u, v)
     return inside
 
 
-def _filled(segments: Array, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels inside the closed lines that segments : (n, 2, 2) px make."""
-    crossings = np.zeros((size[1], size[0] + 1), np.int64)
+def within_lines(segments: Array, x: Array, y: Array) -> NDArray[np.bool_]:
+    """Places (x, y) of a grid : (ny, nx) inside the closed lines that segments : (n, 2, 2) make; x and y increase."""
+    crossings = np.zeros((len(y), len(x) + 1), np.int64)
     low, high = np.sort(segments[..., 1], axis=1).T[..., None]
-    number, row = np.nonzero((low <= np.arange(size[1])) & (np.arange(size[1]) < high))
+    number, row = np.nonzero((low <= y) & (y < high))
     start, end = segments[number, 0], segments[number, 1]
-    at = start[:, 0] + (row - start[:, 1]) / (end[:, 1] - start[:, 1]) * (end[:, 0] - start[:, 0])
-    np.add.at(crossings, (row, np.clip(np.ceil(at), 0, size[0]).astype(int)), 1)
+    at = start[:, 0] + (y[row] - start[:, 1]) / (end[:, 1] - start[:, 1]) * (end[:, 0] - start[:, 0])
+    np.add.at(crossings, (row, np.searchsorted(x, at)), 1)
     return crossings[:, :-1].cumsum(axis=1) % 2 == 1

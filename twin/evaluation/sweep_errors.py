@@ -22,6 +22,7 @@ from recon.model.rig import Rig
 from recon.probe_calibration import point_calibration
 from recon.probe_calibration.repeatability import five_points
 from recon.segmentation import containment
+from recon.segmentation.scan_masks import within_lines
 from scenes.catalogue import build_scene
 from scenes.scene_types import Thing
 from scenes.tumour import caliper
@@ -228,15 +229,8 @@ def filled(mesh: trimesh.Trimesh, axes: Sequence[Array]) -> NDArray[np.bool_]:
     axes : coordinates (nx,), (ny,), (nz,) mm, evenly increasing
     """
     x, y, z = axes
-    crossings = np.zeros((len(z), len(y), len(x) + 1), np.int64)
-    for level, height in enumerate(z):
-        segments = np.asarray(trimesh.intersections.mesh_plane(mesh, (0.0, 0.0, 1.0), (0.0, 0.0, height)))[..., :2]
-        low, high = np.sort(segments[..., 1], axis=1).T[..., None]
-        number, row = np.nonzero((low <= y) & (y < high))
-        start, end = segments[number, 0], segments[number, 1]
-        at = start[:, 0] + (y[row] - start[:, 1]) / (end[:, 1] - start[:, 1]) * (end[:, 0] - start[:, 0])
-        np.add.at(crossings[level], (row, np.searchsorted(x, at)), 1)
-    return crossings[..., :-1].cumsum(axis=-1) % 2 == 1
+    sections = (trimesh.intersections.mesh_plane(mesh, (0.0, 0.0, 1.0), (0.0, 0.0, height)) for height in z)
+    return np.stack([within_lines(np.asarray(lines).reshape(-1, 2, 3)[..., :2], x, y) for lines in sections])
 
 
 def _figures_of(finding: Finding) -> Metrics:
