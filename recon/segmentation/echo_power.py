@@ -6,9 +6,10 @@ small, by the width of pulse and beam spilling into it. So grey levels are turne
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from recon import threads
 from recon.compiled import kernel, njit
@@ -19,12 +20,14 @@ from recon.freehand.volume_compounding import Clip, Grid
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
+Spacing = tuple[float, float, float]
 
 SPREAD_MM = (0.2, 0.063)  # sigma of an echo's power along the array and in depth, of the default array 20 mm deep
 SLICE_MM = (  # the same across the image plane, at some depths: (depth, sigma)
     *((4.0, 0.91), (8.0, 0.63), (12.0, 0.37), (15.0, 0.24), (20.0, 0.24)),
     *((30.0, 0.37), (40.0, 0.56), (50.0, 0.8)),
 )
+VOXEL_BYTES = 48  # that finding masses takes a voxel, at most
 BRIGHTEST = 10**0.8  # times tissue: brighter echoes count as 8 dB above it, such as those of walls square to the beam
 MEDIAN_OF_MEAN = np.log(2)  # of the power of speckle, which is exponentially distributed
 
@@ -34,7 +37,7 @@ class EchoPower:
     """Mean power, relative to the tissue's typical one, and the number of pixels in it."""
 
     volume: Volume  # voxels (nz, ny, nx) float32; x along the array, y into the depth, z across the images
-    weight: Map  # (nz, ny, nx) pixels that a voxel is the mean of
+    weight: Map  # (nz, ny, nx) pixels that a voxel is the mean of, by their light
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -42,13 +45,28 @@ class EchoPower:
         return self.weight > 0
 
 
+class Placed(NamedTuple):
+    """Pixels of a B-scan, of one shape."""
+
+    power: Map  # NaN where it is left out
+    light: Map  # share of the sound that reaches a pixel, there and back
+    u: Map  # px, the echo's place in the image plane
+    v: Map
+
+
 def typical_grey(images: NDArray, rows: slice) -> float:
     """Median grey level of some rows of images : (n, h, w): that of tissue, where they show mostly tissue."""
     return float(np.median(images[:, rows]))
 
 
-def beam_grid(world_from_pixel: Array, shape: tuple[int, int], spacing_mm: ArrayLike, clip: Clip | None = None) -> Grid:
-    """The grid along the mean array (x) and beam (y) around images (h, w) with poses : (n, 4, 4); one spacing, or one an axis."""
+def beam_grid(world_from_pixel: Array, shape: tuple[int, int], spacing_mm: Spacing, clip: Clip | None = None) -> Grid:
+    """The grid along the mean array (x) and beam (y) around all images (h, w) with poses : (n, 4, 4).
+
+    Raises
+    ------
+    InputError
+        If arrays point all round, or the grid needs too much memory.
+    """
     around = volume_compounding.corners(world_from_pixel, shape, clip)
     found = world_from_pixel[np.isfinite(world_from_pixel).all(axis=(1, 2))]
     axes = found[:, :3, :2] / np.linalg.norm(found[:, :3, :2], axis=1, keepdims=True)
@@ -60,9 +78,14 @@ def beam_grid(world_from_pixel: Array, shape: tuple[int, int], spacing_mm: Array
     array = array / np.linalg.norm(array)
     directions = np.column_stack([array, beam, np.cross(array, beam)])
     low, high = (around @ directions).min(axis=0), (around @ directions).max(axis=0)
-    spacing = np.broadcast_to(np.asarray(spacing_mm, float), 3)
-    nx, ny, nz = np.ceil((high - low) / spacing).astype(int) + 1
-    return Grid((int(nx), int(ny), int(nz)), directions @ low, spacing.copy(), directions)
+    spacing = np.array(spacing_mm)
+    nx, ny, nz = (np.ceil((high - low) / spacing).astype(int) + 1).tolist()
+    most, needed = volume_compounding.MOST_BYTES / 2**30, nx * ny * nz * VOXEL_BYTES / 2**30
+    if needed > most:
+        raise InputError(
+            f"power: expected at most {most:.0f} GiB, found {needed:.0f} GiB for {nx} x {ny} x {nz} voxels; clip the images"
+        )
+    return Grid((nx, ny, nz), directions @ low, spacing, directions)
 
 
 def averaged(
@@ -79,10 +102,11 @@ def averaged(
     """
     table = powers(tissue_grey, dynamic_range_db)
 
-    def place(image: NDArray) -> tuple[Map, Map, Map]:
+    def place(image: NDArray) -> Placed:
         left, right, top, bottom = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
         v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
-        return table[image[top : bottom + 1, left : right + 1]], u, v
+        power = table[image[top : bottom + 1, left : right + 1]]
+        return Placed(power, np.ones_like(power), u, v)
 
     return accumulated(threads.mapped(place, images), world_from_pixel, grid)
 
@@ -95,37 +119,34 @@ def powers(tissue_grey: float, dynamic_range_db: float = 60.0) -> Map:
     return table.astype(np.float32)
 
 
-def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, grid: Grid) -> EchoPower:
-    """Average powers on a grid, each counting for the eight voxels around it by its distance.
+def accumulated(parts: Iterable[Placed], world_from_pixel: Array, grid: Grid) -> EchoPower:
+    """Power over light on a grid, of all pixels together, each counting for the eight voxels around it by its distance.
+
+    A sum over a sum, as speckle scatters by its own mean: a pixel in the dark counts as little as it shows.
 
     Parameters
     ----------
-    parts : n times (power, u, v), of one shape
-        Power, NaN where it is left out, and the places in the image.
+    parts : n times
     world_from_pixel : (n, 4, 4)
         Images with a NaN are left out.
 
     Raises
     ------
     InputError
-        If the grid needs too much memory, or there are more or fewer images than poses.
+        If there are more or fewer images than poses.
     """
     shape = grid.size[::-1]
-    if np.prod(grid.size, dtype=float) * 12 > volume_compounding.MOST_BYTES:
-        raise InputError(
-            f"power: expected at most {volume_compounding.MOST_BYTES / 2**30:.0f} GiB, found {' x '.join(map(str, shape))} voxels"
-        )
     value, weight = np.zeros((2, *(length + 2 for length in shape)), np.float32)  # a voxel more all round
     inner = 3 * (slice(1, -1),)
     voxel_from_world = np.linalg.inv(Volume(value[inner], grid.origin, grid.spacing, grid.directions).world_from_voxel)
     count = 0
-    for power, u, v in parts:
+    for part in parts:
         if count == len(world_from_pixel):
             raise InputError(f"images: expected as many as poses, {count}, found more")
         matrix = voxel_from_world @ world_from_pixel[count]
         count += 1
         if np.isfinite(matrix).all():
-            _add(power.ravel(), u.ravel(), v.ravel(), matrix, value, weight)
+            _add(*(field.ravel() for field in part), matrix, value, weight)
     if count < len(world_from_pixel):
         raise InputError(f"images: expected as many as poses, {len(world_from_pixel)}, found {count}")
     value, weight = value[inner], weight[inner]
@@ -134,8 +155,8 @@ def accumulated(parts: Iterable[tuple[Map, Map, Map]], world_from_pixel: Array, 
 
 
 @kernel
-def _add(power, u, v, voxel_from_pixel, value, weight):
-    """Add the finite powers of pixels to the eight voxels around each, in tables with a rim of one voxel."""
+def _add(power, light, u, v, voxel_from_pixel, value, weight):
+    """Add the finite powers of pixels and their light to the eight voxels around each, in tables with a rim of one voxel."""
     m = voxel_from_pixel
     nz, ny, nx = value.shape
     for n in range(power.size):
@@ -143,12 +164,12 @@ def _add(power, u, v, voxel_from_pixel, value, weight):
         y = m[1, 0] * u[n] + m[1, 1] * v[n] + m[1, 3] + 1
         z = m[2, 0] * u[n] + m[2, 1] * v[n] + m[2, 3] + 1
         if np.isfinite(power[n]) and 0 <= x < nx - 1 and 0 <= y < ny - 1 and 0 <= z < nz - 1:
-            _share_out(power[n], x, y, z, value, weight)
+            _share_out(power[n], light[n], x, y, z, value, weight)
 
 
 @njit(inline="always")
-def _share_out(power, x, y, z, value, weight):
-    """Add a power to the voxels around a place, in voxels, each weighed by its trilinear share."""
+def _share_out(power, light, x, y, z, value, weight):
+    """Add a power and its light to the voxels around a place, in voxels, each weighed by its trilinear share."""
     i, j, k = np.uint64(x), np.uint64(y), np.uint64(z)  # unsigned, or each access would look for a negative index
     across, down, aside = np.float32(x - i), np.float32(y - j), np.float32(z - k)
     one, after = np.float32(1), i + np.uint64(1)
@@ -159,8 +180,8 @@ def _share_out(power, x, y, z, value, weight):
             near, at, line = share - far, k + np.uint64(sheet), j + np.uint64(row)
             value[at, line, i] += near * power
             value[at, line, after] += far * power
-            weight[at, line, i] += near
-            weight[at, line, after] += far
+            weight[at, line, i] += near * light
+            weight[at, line, after] += far * light
 
 
 def pixel_mm(world_from_pixel: Array) -> tuple[float, float]:

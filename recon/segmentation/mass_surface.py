@@ -19,8 +19,8 @@ from recon.geometry import rigid
 
 Array = NDArray[np.float64]
 
-EVEN_MM = 0.5  # standard deviation
-MESH_MM = 0.5
+EVEN_MM = 0.5  # standard deviation; lobes of the blurred borders are wider
+MESH_MM = 0.5  # between vertices
 LEVELLINGS = 4  # Newton's steps to the level that holds the volume
 NEAR_MM = 1.5  # of a vertex, within which distances come from the surface itself
 NEIGHBOURS = 6  # vertices that the distance to a surface is taken from
@@ -81,7 +81,7 @@ def distances(masses: Sequence[Mass], grid: Grid) -> Volume:
         bodies, count = ndimage.label((apart != apart[0, 0, 0]) & ~(near >= 0))
         inside = bodies == np.bincount(bodies.ravel())[1:].argmax() + 1 if count else bodies > 0  # narrow hollows are unsure
         out, into = threads.mapped(lambda one: ndimage.distance_transform_edt(one, grid.spacing[::-1]), (~inside, inside))
-        whole = np.asarray(out) - np.asarray(into) - np.where(inside, -0.5, 0.5) * grid.spacing.mean()
+        whole = np.asarray(out) - np.asarray(into) - np.where(inside, -0.5, 0.5) * grid.spacing.min()
         signed = np.where(np.isfinite(near) & ((near < 0) == inside), near, whole)
         field[part] = np.minimum(field[part], np.clip(signed, -FAR_MM, FAR_MM))
     return volume

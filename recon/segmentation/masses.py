@@ -29,9 +29,10 @@ AROUND_MM = 6.0  # standard deviation over which tissue's level is taken
 DARK = 0.35  # of tissue's power around: 4.6 dB below it
 SEED = 0.12  # of tissue's power, above that of a mass's core: 9 dB
 RISE = 4.0  # of power from the darkest on: behind is no longer the mass but its shadow
-GROW_MM = 1.0  # from there to beyond the border, not far into the shadow behind
+GROW_MM = 1.0  # from a rough body, within which its border is searched; the shadow behind begins there too
+EDGE_MM = 1.0  # of what was scanned: bodies nearer to it are none
 OPEN_MM = 1.5  # radius: thinner parts are shadows of borders
-BESIDE_MM = 0.25  # half a voxel
+BESIDE_MM = 0.25  # half of the widest voxel
 BLUR_REACH = 4  # standard deviations to which a blur reaches
 LEAST_MM3 = 50.0
 TOP_MM = 3.0  # ringing at the face, left out
@@ -64,7 +65,8 @@ def from_scans(
     grey : float
         Of tissue, by default that of `tissue_grey`.
     blur : of the B-scans
-        Lobes of masses are corrected for it, and for what the fit does to them; not at all by default.
+        Lobes of masses are corrected for it, and for what the fit does to them; edges of shadows are as wide as the beam. Without
+        it neither is done.
 
     Raises
     ------
@@ -75,7 +77,7 @@ def from_scans(
     clip = below_face(shape, world_from_pixel)
     grey = tissue_grey(images(), shape, world_from_pixel) if grey is None else grey
     grid = echo_power.beam_grid(world_from_pixel, shape, SPACING_MM, clip)
-    spread_mm = (blur or Blur()).lateral_mm
+    spread_mm = blur.lateral_mm if blur else 0.0
     recording = Recording(images, world_from_pixel, echo_power.powers(grey, dynamic_range_db), clip, spread_mm)
     power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
     masses = refined(rough(power), power, ROUGHLY)
@@ -164,16 +166,17 @@ def rough(power: EchoPower) -> list[Mass]:
     body = _opened(dark, OPEN_MM, spacing)
     unknown = ~seen
     labels, count = ndimage.label(body)
-    parts, around = ndimage.find_objects(labels), np.ceil(2 * GROW_MM / spacing).astype(int)
+    parts = ndimage.find_objects(labels)
+    margin, edge = (np.ceil(one / spacing).astype(int) for one in (2 * GROW_MM, EDGE_MM))
     result = []
     for number in range(1, count + 1):
-        part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(parts[number - 1], around, strict=True))
+        part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(parts[number - 1], margin, strict=True))
         inside = labels[part] == number
         volume = inside.sum() * float(np.prod(spacing))
-        touches = (ndimage.binary_dilation(inside, iterations=2) & unknown[part]).any()
-        edge = any(s.start < 2 or s.stop > n - 2 for s, n in zip(parts[number - 1], dark.shape, strict=True))
+        touches = (_widened(inside, EDGE_MM, spacing) & unknown[part]).any()
+        cut = any(s.start < m or s.stop > n - m for s, m, n in zip(parts[number - 1], edge, dark.shape, strict=True))
         core = np.median(ratio[part][inside])
-        if volume < LEAST_MM3 or touches or edge or core > SEED:
+        if volume < LEAST_MM3 or touches or cut or core > SEED:
             continue
         field = np.where(_widened(inside, GROW_MM, spacing), ratio[part], 1.0)
         result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))

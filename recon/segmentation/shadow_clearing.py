@@ -5,7 +5,7 @@ masses, gives the loss of both.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from recon.files.volumes import Volume
 from recon.freehand.volume_compounding import Clip, Grid
 from recon.geometry import rigid
 from recon.segmentation import echo_power
-from recon.segmentation.echo_power import SPREAD_MM, EchoPower, pixel_mm
+from recon.segmentation.echo_power import EchoPower, Placed, pixel_mm
 from recon.segmentation.mass_surface import FAR_MM, Mass, distances
 from recon.segmentation.refraction import Sound, follow
 
@@ -25,8 +25,7 @@ Map = NDArray[np.float32]
 
 CLEAR_MM = 2.0  # from a border, where pixels show one tissue only
 MOST_BY_PATH = 0.25  # nepers a mm: 11 dB/cm more than tissue, there and back
-MOST_LOSS = 0.05  # of power left: darker pixels are left out rather than made as bright as they were
-INSET_MM = 0.3  # of surfaces that cast shadows; a flank too far out would hide the tissue that shows it
+MOST_LOSS = 0.05  # of power left: darker pixels are left out
 THINNED = 4  # pixels, columns and rows, of which one counts for the losses
 DEPTH_BINS, PATH_BINS = 60, 40  # of 1 mm
 
@@ -39,24 +38,23 @@ class Recording:
     world_from_pixel: Array  # (n, 4, 4), NaN where there is no pose
     table: Map  # (256,) power of each grey level
     clip: Clip
-    spread_mm: float = SPREAD_MM[0]  # sigma of an echo's power along the array
+    spread_mm: float  # sigma of an echo's power along the array; shadows have no sharper edges
 
 
 def cleared(recording: Recording, grid: Grid, masses: Sequence[Mass], sound: Sound) -> EchoPower:
     """Average power anew, with each pixel at the place of its echo, and as bright as without the masses' shadows."""
     inside, scale = distances(masses, grid), pixel_mm(recording.world_from_pixel)
     by_depth, by_path = losses(recording, inside, sound)
-    inset = replace(inside, voxels=inside.voxels + np.float32(INSET_MM))
     table, top = recording.table, recording.clip.v
 
-    def place(image: NDArray[np.uint8], matrix: Array) -> tuple[Map, Map, Map]:
+    def place(image: NDArray[np.uint8], matrix: Array) -> Placed:
         if not np.isfinite(matrix).all():
-            return table[image], table[image], table[image]
-        lines = follow(inset, scale, matrix, image.shape, sound)
+            return Placed(*4 * (table[image],))  # counts nothing
+        lines = follow(inside, scale, matrix, image.shape, sound)
         rows = np.arange(image.shape[0], dtype=np.float32)[:, None] * scale[1]
-        left = ndimage.gaussian_filter1d(lines.passed * np.exp(-by_path * lines.within), recording.spread_mm / scale[0])
-        power = np.where(left > MOST_LOSS, table[image] / np.maximum(left, MOST_LOSS), np.nan) * np.exp(by_depth * rows)
-        return power[top:].astype(np.float32), lines.u[top:], lines.v[top:]
+        light = ndimage.gaussian_filter(lines.passed * np.exp(-by_path * lines.within), (0, recording.spread_mm / scale[0]))
+        power = np.where(light > MOST_LOSS, table[image] * np.exp(by_depth * rows), np.nan)
+        return Placed(*(field[top:].astype(np.float32) for field in (power, light, lines.u, lines.v)))
 
     placed = threads.mapped(place, recording.images(), recording.world_from_pixel)
     return echo_power.accumulated(placed, recording.world_from_pixel, grid)

@@ -10,6 +10,7 @@ from recon.freehand.volume_compounding import Grid
 from recon.geometry.surface_tree import signed_distances
 from recon.segmentation import blur_correction, echo_power
 from recon.segmentation.blur_correction import Blur, Planes, corrected, echoes
+from recon.segmentation.echo_power import Placed
 from recon.segmentation.mass_surface import Mass, distances
 from recon.segmentation.masses import refined
 from twin.ultrasound import beam
@@ -71,7 +72,7 @@ def test_echoes_are_those_of_a_plain_mean():
             index = np.moveaxis((here - GRID.origin) / 0.5, -1, 0)[::-1]
             away = ndimage.map_coordinates(field, index, order=1, mode="constant", cval=6.0)
             mean += first * second * ndtr(away / blur_correction.EDGE_MM)
-    pixels = mean.astype(np.float32), u.astype(np.float32), v.astype(np.float32)
+    pixels = Placed(*(field.astype(np.float32) for field in (mean, np.ones_like(mean), u, v)))
     expected = echo_power.accumulated([pixels], one.world_from_pixel, GRID).volume.voxels
     assert np.abs(found - expected).max() < 1e-3 and 100 < (1 - expected[30]).sum() < 1000
 

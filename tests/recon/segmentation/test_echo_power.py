@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.segmentation import echo_power
+from recon.segmentation.echo_power import Placed
 
 SCALE = np.array([0.2, 0.15])
 SIZE = (150, 180)  # w, h: 30 x 27 mm
@@ -45,7 +46,7 @@ def recorded():
 def test_power_is_that_of_the_tissue(recorded):
     """The mean over some 30 000 cells of speckle. Clipping at 8 dB above tissue takes 0.2 % from it."""
     images, matrices = recorded
-    grid = echo_power.beam_grid(matrices, images.shape[1:], 0.4)
+    grid = echo_power.beam_grid(matrices, images.shape[1:], (0.4, 0.3, 0.5))
     power = echo_power.averaged(images, matrices, grid, echo_power.typical_grey(images, slice(0, 40)))
     k, j, i = np.nonzero(power.seen)
     points = rigid.apply(power.volume.world_from_voxel, np.column_stack([i, j, k]))
@@ -59,7 +60,7 @@ def test_grid_lies_along_the_beam_and_holds_all_pixels(recorded):
     _, matrices = recorded
     matrices = rigid.from_rotation_vector([0.4, 1.1, -0.3], [5, 6, 700]) @ matrices
     matrices[3] = np.nan
-    grid = echo_power.beam_grid(matrices, SIZE[::-1], 0.5)
+    grid = echo_power.beam_grid(matrices, SIZE[::-1], (0.5, 0.25, 0.4))
     beam = matrices[10, :3, 1] / np.linalg.norm(matrices[10, :3, 1])
     assert grid.directions[:, 1] @ beam > np.cos(np.deg2rad(5))
     assert np.linalg.det(grid.directions) == pytest.approx(1)
@@ -68,25 +69,33 @@ def test_grid_lies_along_the_beam_and_holds_all_pixels(recorded):
     assert (index >= 0).all() and (index <= np.array(grid.size) - 1).all()
 
 
+def test_a_grid_that_memory_does_not_hold_is_refused():
+    wide = np.tile(np.diag([1.0, 1.0, 1.0, 1.0]), (2, 1, 1))
+    wide[1, 2, 3] = 2000.0
+    with pytest.raises(InputError, match=r"power: expected at most 4 GiB, found \d+ GiB for 399 x 797 x 4001 voxels; clip"):
+        echo_power.beam_grid(wide, (200, 200), (0.5, 0.25, 0.5))
+
+
 def test_arrays_all_round_have_no_grid():
     turns = np.stack([rigid.from_rotation_vector([0, a, 0], [0, 0, 0]) for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)])
     with pytest.raises(InputError, match="about one way"):
-        echo_power.beam_grid(turns, (20, 20), 0.5)
+        echo_power.beam_grid(turns, (20, 20), 3 * (0.5,))
 
 
 def test_pixels_are_shared_out_by_their_distance(rng):
     """Pixel by pixel, to all voxels at once; those beside the grid and those that aren't to count left out."""
     grid = echo_power.Grid((7, 6, 5), np.zeros(3), np.full(3, 1.0), np.eye(3))
-    power = rng.uniform(0, 2, (9, 8)).astype(np.float32)
+    power, light = rng.uniform(0, 2, (2, 9, 8)).astype(np.float32)
     power[3, 4] = np.nan
     v, u = np.mgrid[:9, :8].astype(np.float32)
     pose = rigid.from_rotation_vector([0.3, 0.2, -0.1], [-0.8, 0.3, 1.2])
     voxels = np.stack(np.mgrid[:5, :6, :7], axis=-1)[..., ::-1]
     total, weight = np.zeros((2, 5, 6, 7))
-    for place, value in zip(rigid.apply(pose, np.stack([u, v, 0 * u], axis=-1)).reshape(-1, 3), power.ravel(), strict=True):
+    places = rigid.apply(pose, np.stack([u, v, 0 * u], axis=-1)).reshape(-1, 3)
+    for place, value, lit in zip(places, power.ravel(), light.ravel(), strict=True):
         share = np.clip(1 - np.abs(voxels - place), 0, None).prod(axis=-1)
         total += np.nan_to_num(share * value)
-        weight += share * np.isfinite(value)
-    found = echo_power.accumulated([(power, u, v)], pose[None], grid)
+        weight += share * lit * np.isfinite(value)
+    found = echo_power.accumulated([Placed(power, light, u, v)], pose[None], grid)
     np.testing.assert_allclose(found.weight, weight, atol=1e-5)
     np.testing.assert_allclose(found.volume.voxels[weight > 0.01], (total / np.maximum(weight, 1e-6))[weight > 0.01], rtol=1e-3)

@@ -11,11 +11,13 @@ from recon.segmentation import masses
 from recon.segmentation.echo_power import EchoPower
 from recon.segmentation.masses import refined, rough
 
-SPACING, SIZE = np.array(masses.SPACING_MM), (72, 144, 64)  # nx, ny, nz: 36 x 36 x 32 mm
+SPACING = np.array(masses.SPACING_MM)
+SIZE = (np.array([36, 36, 32]) / SPACING).astype(int)  # nx, ny, nz
 CENTRE, RADIUS = np.array([3.0, 698.0, 14.0]), 5.0
 ORIGIN = CENTRE - [18.0, 14.0, 16.0]
 DARK = 0.05  # of tissue's power
-LOOKS = 1.5  # independent cells of speckle in a voxel
+LOOKS = 24 * SPACING.prod()  # independent cells of speckle in a voxel
+PULSE_MM = 0.063  # sigma of an echo's power along the beam
 
 
 def grid():
@@ -24,9 +26,9 @@ def grid():
     return ORIGIN + SPACING * np.stack([i, j, k], axis=-1)
 
 
-def speckled(mean, rng):
-    voxels = (mean * rng.gamma(LOOKS, 1 / LOOKS, mean.shape)).astype(np.float32)
-    return EchoPower(Volume(voxels, ORIGIN, SPACING), np.full(mean.shape, LOOKS, np.float32))
+def speckled(mean, rng, looks=LOOKS):
+    voxels = (mean * rng.gamma(looks, 1 / looks, mean.shape)).astype(np.float32)
+    return EchoPower(Volume(voxels, ORIGIN, SPACING), np.full(mean.shape, looks, np.float32))
 
 
 def ball():
@@ -43,7 +45,7 @@ VOLUME = 4 / 3 * np.pi * RADIUS**3
 
 
 def test_a_ball_is_as_large_as_it_is(rng):
-    """A border of 314 mm2 in speckle of 58 % a voxel is known to some 0.02 mm, 1.2 % of the volume; 4 % is over 3 sigma."""
+    """A border of 314 mm2 in speckle of 82 % a voxel is known to some 0.02 mm, 1.2 % of the volume; 4 % is over 3 sigma."""
     (mass,) = find(speckled(ball()[0], rng))
     assert mass.mesh.is_watertight
     assert mass.volume == pytest.approx(VOLUME, rel=0.04)
@@ -58,6 +60,20 @@ def test_a_bright_wall_does_not_change_it(rng):
     (mass,) = find(speckled(mean + 5 * square**8 * np.exp(-((distance / 0.3) ** 2) / 2), rng))
     assert mass.volume == pytest.approx(VOLUME, rel=0.05)
     assert np.linalg.norm(mass.centre - CENTRE) < 0.2
+
+
+def test_a_line_as_thin_as_the_pulse_moves_the_front_little(rng):
+    """Thrice as bright as tissue it passes for a step nearby: 0.12 mm too deep, in voxels of 0.5 mm along the beam 0.20 mm."""
+    _, distance = ball()
+    places = grid() - CENTRE
+    outwards = places / np.maximum(np.linalg.norm(places, axis=-1, keepdims=True), 0.1)
+    width = np.sqrt(PULSE_MM**2 + outwards**2 @ SPACING**2 / 6)  # shared out to voxels
+    line = 3 * np.clip(-outwards[..., 1], 0, 1) ** 8 * PULSE_MM / width * np.exp(-((distance / width) ** 2) / 2)
+    border = DARK + (1 - DARK) * ndtr(distance / np.hypot(0.15, SPACING[0] / np.sqrt(6)))
+    (mass,) = find(speckled(border + line, rng, looks=1.7 * LOOKS))
+    out = np.asarray(mass.mesh.vertices) - CENTRE
+    radii = np.linalg.norm(out, axis=1)
+    assert radii[-out[:, 1] > 0.9 * radii].mean() == pytest.approx(RADIUS, abs=0.16)
 
 
 def test_what_reaches_the_images_end_is_no_mass(rng):

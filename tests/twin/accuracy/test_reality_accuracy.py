@@ -22,6 +22,7 @@ def test_a_disturbed_plane_is_as_good_as_a_steady_one(rig, monkeypatch):
     assert all(row.ok for row in rows), rows
 
 
+@pytest.mark.slow
 def test_skin_costs_modulation_and_nothing_else(rig, monkeypatch):
     """One of the ten breasts with light that spreads and with gel, with the bars of all; without, noise leaves 0.024 mm."""
     monkeypatch.setattr(reality_accuracy, "SEEDS", range(102, 103))
