@@ -96,6 +96,11 @@ class KeptSteps:
         self.say(f"left out    {name}: {reason}{stale}")
         self._change(name, None)
 
+    def take(self, name: str, path: Path, reason: str) -> Path:
+        """Say, in one line, that a file that is there stands in a step's place; returns it."""
+        self.say(f"taken       {name}: {path}, {reason}")
+        return path
+
     def fail(self, name: str, reason: str) -> None:
         """Say, in one line, that a step could not be done though its part is there."""
         self.failed.append(name)

@@ -8,21 +8,24 @@ to 8, projector column (width - 1) / 2 at phase zero.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from recon.capture import calibration_files
 from recon.capture.foreign_images import image_files, read_grey
 from recon.capture.images import Size, write_images
 from recon.capture.surface_part import SurfaceCapture
-from recon.errors import InputError
+from recon.errors import InputError, one_line
 from recon.files import atomic
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
 from recon.model.calibration import Calibration
 from recon.model.patterns import CentreLine, Fringes, Patterns, Uniform
+from recon.model.probe import Speed
 
 STEPS = 8
 PITCH = 12.0  # projector px
@@ -83,6 +86,15 @@ def read_images(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[ND
     return images, sequence, mask
 
 
+class Mark(BaseModel):
+    """Content of `MARKER`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    layout: Literal["meza2021"] = "meza2021"
+    speed_m_s: Speed | None = None
+
+
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
     """Give a folder to be filled in their layout, which appears whole or not at all, and replaces such a one of ours alone.
@@ -93,8 +105,28 @@ def new_folder(folder: Path) -> Iterator[Path]:
         If the place is taken by something else, a folder of theirs included, or can't be written to.
     """
     with atomic.new_folder(folder, MARKER) as temporary:
-        (temporary / MARKER).write_text('{"layout": "meza2021"}\n', encoding="utf-8")
+        mark(temporary)
         yield temporary
+
+
+def mark(folder: Path, speed_m_s: float | None = None) -> None:
+    """Write what makes a folder one of ours, with the speed of sound that its `US_params.npz` is right for."""
+    (folder / MARKER).write_text(Mark(speed_m_s=speed_m_s).model_dump_json(exclude_none=True) + "\n", encoding="utf-8")
+
+
+def speed_of(folder: Path) -> float | None:
+    """The speed of sound, m/s, that a folder's `US_params.npz` is right for, if it is one of ours; theirs don't say.
+
+    Raises
+    ------
+    InputError
+        If our file is damaged.
+    """
+    path = folder / MARKER
+    try:
+        return Mark.model_validate_json(path.read_bytes()).speed_m_s if path.is_file() else None
+    except ValidationError as error:
+        raise InputError(f"{path}: {one_line(error)}") from None
 
 
 def is_theirs(surface: SurfaceCapture) -> bool:

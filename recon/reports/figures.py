@@ -38,7 +38,7 @@ class Scale:
 
     def __call__(self, values: Map) -> Colours:
         """Colour values : (h, w); NaN becomes transparent."""
-        lookup = np.uint8(255 * matplotlib.colormaps[self.colours](np.arange(256)))
+        lookup = np.uint8(np.rint(255 * matplotlib.colormaps[self.colours](np.linspace(0, 1, 256))))
         scaled = (np.nan_to_num(values, nan=self.low) - self.low) / (self.high - self.low)
         coloured = lookup[np.uint8(np.clip(np.rint(255 * scaled), 0, 255))]
         coloured[np.isnan(values), 3] = 0

@@ -47,7 +47,7 @@ class Config(BaseModel):
     camera_hz: Positive = 30.0
     purpose: Purpose = "volume"
     projector_size: tuple[Pixels, Pixels] = meza2021.PROJECTOR_SIZE
-    speed_m_s: Speed = SCANNER_SPEED
+    speed_m_s: Speed | None = None
 
 
 def run(config: Config) -> None:
@@ -77,7 +77,7 @@ def run(config: Config) -> None:
         if probe is not None:
             capture.add_probe(probe)
             lines.append(
-                f"probe       {probe_files.AUTHORS}, taken as right where sound makes {config.speed_m_s:g} m/s (speed_m_s)"
+                f"probe       {probe_files.AUTHORS}, taken as right where sound makes {probe.speed_m_s:g} m/s{_known(config)}"
             )
     for line in lines:
         console.print(line, markup=False)
@@ -136,7 +136,15 @@ def read_probe(config: Config) -> ProbeCalibration | None:
     if not path.exists():
         return None
     read = probe_files.read(path)
-    return ProbeCalibration(read.target_from_image, read.scale, read.uncertainty, config.speed_m_s)
+    speed = config.speed_m_s or meza2021.speed_of(config.folder) or SCANNER_SPEED
+    return ProbeCalibration(read.target_from_image, read.scale, read.uncertainty, speed)
+
+
+def _known(config: Config) -> str:
+    """Where the speed is from, for a console."""
+    if config.speed_m_s is None and meza2021.speed_of(config.folder) is not None:
+        return f", as {meza2021.MARKER} says"
+    return " (speed_m_s)"
 
 
 def _images(sweep: AuthorsSweep) -> Iterator[tuple[str, NDArray]]:

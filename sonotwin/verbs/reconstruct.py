@@ -124,9 +124,6 @@ def run(config: Config) -> int:
     sources = Sources(config, manifest.read_manifest(config.capture))
     steps = KeptSteps(config.out, lambda line: console.print(line, style="bold cyan", markup=False))
     given = [path for path in (config.calibration, config.target, config.probe, config.networks) if path is not None]
-    for path in given:
-        if not path.exists():
-            raise InputError(f"{path}: expected a calibration or networks as given, found nothing there")
     check(sources)
     with steps.opened([config.capture, *given]):
         optics = calibrated_optics(steps, sources)
@@ -151,6 +148,12 @@ def check(sources: Sources) -> None:
         If the capture has no part, its fringes are of another camera, or water has no such temperature.
     """
     config, held = sources.config, sources.held
+    for key in ("calibration", "target", "probe"):
+        given: Path | None = getattr(config, key)
+        if given is not None and not given.is_file():
+            raise InputError(f"{key}: expected a file, found {'a folder' if given.is_dir() else 'nothing'} at {given}")
+    if config.networks is not None and not config.networks.exists():
+        raise InputError(f"networks: expected a folder or a file, found nothing at {config.networks}")
     path = config.capture / MANIFEST
     if not held.contents:
         raise InputError(f"{path}: expected a surface, a board or a sweep, found none of them")
@@ -167,9 +170,9 @@ def calibrated_optics(steps: KeptSteps, sources: Sources) -> Path | None:
     config, held = sources.config, sources.held
     own = None if held.calibration is None else config.capture / held.calibration
     if config.calibration is not None:
-        return config.calibration
+        return steps.take("optics", config.calibration, "as given")
     if held.board is None:
-        return own
+        return None if own is None else steps.take("optics", own, "the capture's own, as it has no board")
     if held.board.patterns is None and held.surface is not None and own is not None:
         steps.leave_out("optics", f"the board was seen without fringes, and so not by the projector; {own} is used")
         return own
@@ -232,17 +235,23 @@ def calibrated_probe(steps: KeptSteps, sources: Sources, tracked: Mapping[str, P
     """The probe's calibration: the one given, that of the last sweep over crossed wires, or without one the capture's."""
     config, name = sources.config, _last(sources, "probe")
     if config.probe is not None:
-        return config.probe
+        return steps.take("probe", config.probe, "as given")
     if name is None:
-        return None if sources.held.probe is None else config.capture / sources.held.probe
+        return None if sources.held.probe is None else _own_probe(steps, config, config.capture / sources.held.probe)
     if tracked[name] is None or lag is None:
-        return steps.fail("probe", NO_LAG if lag is None else f"no poses of the sweep {name}")
+        return steps.fail("probe", NO_LAG if lag is None else f"no poses of the sweep {name}; give probe=...")
     fields = [f"capture={tracked[name]}", f"sweep={name}", lag.field, *config.rig_fields]
     fields += [] if config.temperature_c is None else [f"temperature_c={config.temperature_c:.15g}"]
     does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
     files = (calibrate_probe.PROBE, calibrate_probe.FRAMES)
     made = steps.do("probe", does, "calibrate-probe", fields, files, made_of)
     return None if made is None else made / calibrate_probe.PROBE
+
+
+def _own_probe(steps: KeptSteps, config: Config, own: Path) -> Path:
+    """The calibration that the capture has, as it has no wires."""
+    unused = "" if config.temperature_c is None else "; temperature_c is for wires, and isn't used"
+    return steps.take("probe", own, f"the capture's own, as it has no sweep over crossed wires{unused}")
 
 
 def look_inside(

@@ -16,6 +16,7 @@ from recon.geometry.camera import Camera
 from recon.model.calibration import Calibration
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
+from recon.probe_calibration import sound_in_water
 from sonotwin.cli import main
 
 SIZE, SCAN, COUNT = (64, 48), (40, 30), 6
@@ -79,6 +80,21 @@ def test_what_is_exported_comes_back(capture, tmp_path):
     for name, camera in optics().cameras.items():
         found = after.calibration.cameras[name]
         assert found.matrix == pytest.approx(camera.matrix) and found.camera_from_world == pytest.approx(camera.camera_from_world)
+
+
+def test_the_speed_of_sound_comes_back(capture, tmp_path, capsys):
+    """Converted to tissue, out and in again: a pixel lies where it lay, unless another speed is given."""
+    theirs, fields = tmp_path / "theirs", [f"capture={capture}", f"lag_s={LAG_S}", "tissue_m_s=1450"]
+    assert main(["export", *fields, f"out={theirs}"]) == 0
+    for given, speed, why in (([], 1450, "as sonotwin-export.json says"), (["speed_m_s=1500"], 1500, "(speed_m_s)")):
+        assert main(["import", f"folder={theirs}", *given, f"out={tmp_path / 'back'}"]) == 0
+        back = sweep_part.read_sweep(tmp_path / "back").probe
+        assert back is not None and back.speed_m_s == speed and why in capsys.readouterr().out
+        if not given:
+            assert sound_in_water.for_tissue(back, 1540.0).scale == pytest.approx(probe().scale)
+    (theirs / "sonotwin-export.json").write_text('{"layout": "meza2021", "speed_m_s": -3}')
+    assert main(["import", f"folder={theirs}", f"out={tmp_path / 'other'}"]) == 2
+    assert "sonotwin-export.json: speed_m_s: expected" in capsys.readouterr().err
 
 
 def test_their_program_finds_its_files(capture, tmp_path):

@@ -82,7 +82,11 @@ def test_a_sweep_alone_becomes_a_volume(rig, tmp_path, capsys):
     bright = np.argwhere(volume.voxels > 150)[:, ::-1]
     middle = volume.world_from_voxel @ np.append(bright.mean(axis=0), 1)
     assert middle[:3] == pytest.approx(sweep_sets.BALL, abs=0.3)
-    assert "left out" not in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "left out" not in said
+    assert (
+        f"taken       probe: {capture}/calibration/probe.yaml, the capture's own, as it has no sweep over crossed wires\n" in said
+    )
 
 
 def test_what_is_missing_is_named(rig, tmp_path, capsys):
@@ -112,7 +116,9 @@ def test_a_part_that_can_t_be_used_is_named_and_the_others_are_used(tank, tmp_pa
 
 
 @pytest.mark.parametrize(("fields", "complaint"), [
-    (["probe=nowhere.yaml"], "nowhere.yaml: expected a calibration or networks as given, found nothing there"),
+    (["probe=nowhere.yaml"], "probe: expected a file, found nothing at nowhere.yaml"),
+    (["calibration=."], "calibration: expected a file, found a folder at ."),
+    (["networks=nowhere"], "networks: expected a folder or a file, found nothing at nowhere"),
     (["lag_s=nan"], "reconstruct: lag_s: expected"),
     (["find=cysts"], "reconstruct: find: expected"),
     (["spacing_mm=0"], "reconstruct: spacing_mm: expected"),
