@@ -125,7 +125,7 @@ def describe_comparison(figures: Metrics, earlier: object) -> str:
 
 def _describe_sound(figures: Metrics, design: Probe, settings: Settings) -> Iterator[str]:
     speed, sigma = figures["implied_speed_m_per_s"], figures["implied_speed_sigma_m_per_s"]
-    implied = f"{speed:.0f} ± {sigma:.0f} m/s by sy, if the scanner's is {design.scale_mm_per_px[1]:g} mm/px"
+    implied = f"{speed:.1f} ± {sigma:.1f} m/s by sy, if the scanner's is {design.scale_mm_per_px[1]:g} mm/px"
     yield f"sound       {implied} for {settings.assumed_speed:g} m/s"
     if settings.temperature_c is None:
         same = f"as in the medium of the calibration, {figures['speed_m_per_s']:.0f} m/s, right for sweeps through the same"
