@@ -21,6 +21,7 @@ from recon.capture.images import Size, write_images
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError, one_line
 from recon.files import atomic
+from recon.files.regular import read_bytes
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
 from recon.model.calibration import Calibration
@@ -120,11 +121,11 @@ def speed_of(folder: Path) -> float | None:
     Raises
     ------
     InputError
-        If our file is damaged.
+        If our file is damaged, or can't be read.
     """
     path = folder / MARKER
     try:
-        return Mark.model_validate_json(path.read_bytes()).speed_m_s if path.is_file() else None
+        return Mark.model_validate_json(read_bytes(path)).speed_m_s if path.is_file() else None
     except ValidationError as error:
         raise InputError(f"{path}: {one_line(error)}") from None
 

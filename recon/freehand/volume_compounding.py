@@ -56,6 +56,14 @@ class Grid:
     directions: Array  # (3, 3), columns
 
 
+def grid_over(points: Array, directions: Array, spacing: Array, margin_mm: float = 0.0) -> Grid:
+    """The grid along some axes, the columns of `directions`, that holds points : (n, 3) and a margin around them."""
+    along = points @ directions
+    low, high = along.min(axis=0) - margin_mm, along.max(axis=0) + margin_mm
+    nx, ny, nz = (np.ceil((high - low) / spacing).astype(int) + 1).tolist()
+    return Grid((nx, ny, nz), directions @ low, spacing, directions)
+
+
 def grid_of(volume: Volume) -> Grid:
     """The voxels of a volume."""
     nz, ny, nx = volume.voxels.shape

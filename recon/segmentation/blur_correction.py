@@ -91,7 +91,7 @@ def echoes(masses: Sequence[Mass], grid: Grid, planes: Planes) -> EchoPower:
     field, (across, down) = distances(masses, grid), pixel_mm(planes.world_from_pixel)
     slices = planes.blur.across(down * np.arange(planes.rows.stop))
     v, u = np.mgrid[planes.rows.start : planes.rows.stop, : planes.columns].astype(np.float32)
-    voxel_from_world = np.linalg.inv(field.world_from_voxel)
+    voxel_from_world, light = np.linalg.inv(field.world_from_voxel), np.ones_like(u)
 
     def images() -> Iterator[Placed]:
         for matrix in planes.world_from_pixel:
@@ -101,7 +101,7 @@ def echoes(masses: Sequence[Mass], grid: Grid, planes: Planes) -> EchoPower:
                 aside, through = pixels[:3, 0] / across, pixels[:3, 2] / np.linalg.norm(matrix[:3, 2])
                 beams = Beams(pixels, planes.blur.lateral_mm * aside, np.outer(slices, through))
                 threads.in_threads(_fill_echoes, len(image), field.voxels, beams, image)
-            yield Placed(image[planes.rows.start :], np.ones_like(u), u, v)
+            yield Placed(image[planes.rows.start :], light, u, v)
 
     return echo_power.accumulated(images(), planes.world_from_pixel, grid)
 

@@ -4,6 +4,7 @@ Speckle's power averages to the tissue's backscatter, its grey levels don't: the
 small, by the width of pulse and beam spilling into it. So grey levels are turned back into power before they are averaged.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -77,15 +78,12 @@ def beam_grid(world_from_pixel: Array, shape: tuple[int, int], spacing_mm: Spaci
         raise InputError("poses: expected arrays that point about one way, found them all round")
     array = array / np.linalg.norm(array)
     directions = np.column_stack([array, beam, np.cross(array, beam)])
-    low, high = (around @ directions).min(axis=0), (around @ directions).max(axis=0)
-    spacing = np.array(spacing_mm)
-    nx, ny, nz = (np.ceil((high - low) / spacing).astype(int) + 1).tolist()
-    most, needed = volume_compounding.MOST_BYTES / 2**30, nx * ny * nz * VOXEL_BYTES / 2**30
+    grid = volume_compounding.grid_over(around, directions, np.array(spacing_mm))
+    most, needed = volume_compounding.MOST_BYTES / 2**30, math.prod(grid.size) * VOXEL_BYTES / 2**30
     if needed > most:
-        raise InputError(
-            f"power: expected at most {most:.0f} GiB, found {needed:.0f} GiB for {nx} x {ny} x {nz} voxels; clip the images"
-        )
-    return Grid((nx, ny, nz), directions @ low, spacing, directions)
+        found = f"{needed:.0f} GiB for {' x '.join(map(str, grid.size))} voxels; clip the images"
+        raise InputError(f"power: expected at most {most:.0f} GiB, found {found}")
+    return grid
 
 
 def averaged(

@@ -14,7 +14,7 @@ from skimage.measure import marching_cubes
 
 from recon import threads
 from recon.files.volumes import Volume
-from recon.freehand.volume_compounding import Grid
+from recon.freehand.volume_compounding import Grid, grid_over
 from recon.geometry import rigid
 
 Array = NDArray[np.float64]
@@ -50,10 +50,7 @@ def evened(mass: Mass, axes: Array) -> Mass:
     Moved vertices can cross each other; the smoothed distance to them has a clean surface, taken at the level of the same volume.
     Its vertices are `MESH_MM` apart along the axes : (3, 3), columns.
     """
-    places, margin = mass.mesh.vertices @ axes, NEAR_MM + 3 * EVEN_MM
-    low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
-    nx, ny, nz = (np.ceil((high - low) / MESH_MM) + 1).astype(int).tolist()
-    near = distances([mass], Grid((nx, ny, nz), axes @ low, np.full(3, MESH_MM), axes))
+    near = distances([mass], grid_over(mass.mesh.vertices, axes, np.full(3, MESH_MM), NEAR_MM + 3 * EVEN_MM))
     field, whole = ndimage.gaussian_filter(near.voxels, EVEN_MM / MESH_MM), 3 * (slice(0, None),)
     level, volume = 0.0, enclosed(np.asarray(mass.mesh.vertices), mass.mesh.faces).sum()
     for _ in range(LEVELLINGS):

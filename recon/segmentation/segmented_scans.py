@@ -52,7 +52,7 @@ def find_masses(
     """Find masses; with a skin, whether they lie under it.
 
     speed_sigmas : m/s, standard deviations of the speeds of sound in the tissue and in masses.
-    blur : of the B-scans, which lobes of masses are corrected for; not at all by default.
+    blur : of the B-scans, as of `masses.from_scans`.
 
     Raises
     ------

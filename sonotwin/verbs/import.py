@@ -75,10 +75,10 @@ def run(config: Config) -> None:
         if sweep is not None:
             lines += add_sweep(capture, sweep, config)
         if probe is not None:
-            capture.add_probe(probe)
-            lines.append(
-                f"probe       {probe_files.AUTHORS}, taken as right where sound makes {probe.speed_m_s:g} m/s{_known(config)}"
-            )
+            calibration, known = probe
+            capture.add_probe(calibration)
+            speed = f"{calibration.speed_m_s:g} m/s{known}"
+            lines.append(f"probe       {probe_files.AUTHORS}, taken as right where sound makes {speed}")
     for line in lines:
         console.print(line, markup=False)
     console.print(f"wrote       {config.out}", markup=False)
@@ -130,21 +130,16 @@ def add_sweep(capture: CaptureWriter, sweep: AuthorsSweep, config: Config) -> li
     return lines
 
 
-def read_probe(config: Config) -> ProbeCalibration | None:
-    """The probe's calibration, right for the speed that was given; None without one."""
+def read_probe(config: Config) -> tuple[ProbeCalibration, str] | None:
+    """The probe's calibration, and where its speed of sound is from, for a console; None without one."""
     path = config.folder / probe_files.AUTHORS
     if not path.exists():
         return None
     read = probe_files.read(path)
-    speed = config.speed_m_s or meza2021.speed_of(config.folder) or SCANNER_SPEED
-    return ProbeCalibration(read.target_from_image, read.scale, read.uncertainty, speed)
-
-
-def _known(config: Config) -> str:
-    """Where the speed is from, for a console."""
-    if config.speed_m_s is None and meza2021.speed_of(config.folder) is not None:
-        return f", as {meza2021.MARKER} says"
-    return " (speed_m_s)"
+    exported = None if config.speed_m_s else meza2021.speed_of(config.folder)
+    known = f", as {meza2021.MARKER} says" if exported else " (speed_m_s)"
+    speed = config.speed_m_s or exported or SCANNER_SPEED
+    return ProbeCalibration(read.target_from_image, read.scale, read.uncertainty, speed), known
 
 
 def _images(sweep: AuthorsSweep) -> Iterator[tuple[str, NDArray]]:

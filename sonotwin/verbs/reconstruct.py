@@ -145,7 +145,7 @@ def check(sources: Sources) -> None:
     Raises
     ------
     InputError
-        If the capture has no part, its fringes are of another camera, or water has no such temperature.
+        If a given file is missing, the capture has no part, its fringes are of another camera, or water has no such temperature.
     """
     config, held = sources.config, sources.held
     for key in ("calibration", "target", "probe"):
