@@ -11,7 +11,7 @@ from scenes.catalogue import build_scene
 from sonotwin.config import compose
 from twin.accuracy.table_rows import Measurement, Row
 from twin.optics.instruments import CameraOptics, ProjectorOptics
-from twin.optics.light_transport import Engine, render
+from twin.optics.light_transport import Tracing, render
 from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_pattern
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world
@@ -42,11 +42,11 @@ def one_pass_against_many() -> list[Row]:
     def ours(count: int) -> float:
         light = Light.of(sequence(count), rig.projector)
         optics = CameraOptics.of(rig.cam1), ProjectorOptics.of(rig.projector)
-        render(world, *optics, light, Engine(samples=SAMPLES), seed=0)  # compiles
+        render(world, *optics, light, Tracing(samples=SAMPLES), seed=0)  # compiles
         times = []
         for seed in range(3):
             start = perf_counter()
-            render(world, *optics, light, Engine(samples=SAMPLES), seed=seed)
+            render(world, *optics, light, Tracing(samples=SAMPLES), seed=seed)
             times.append(perf_counter() - start)
         return float(np.median(times))
 

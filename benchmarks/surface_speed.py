@@ -13,7 +13,7 @@ from recon.structured_light.surface_mesh import clean
 from recon.structured_light.triangulate import Triangulator
 from scenes.catalogue import build_scene
 from sonotwin.config import compose, folder
-from twin.accuracy.surface_accuracy import ENGINE
+from twin.accuracy.surface_accuracy import TRACING
 from twin.accuracy.table_rows import Measurement, Row
 from twin.optics.surface_session import Shooting, calibration_of, shoot
 
@@ -29,7 +29,7 @@ def nine_images() -> list[Row]:
     """Row h: the paper's sequence of the breast, 1280x1024. Both have the calibrated camera's rays in a table."""
     rig = Rig.model_validate(compose("render", ["out=unused"])["rig"])
     patterns = read_patterns(folder() / "patterns" / "paper_surface.yaml")
-    images = shoot(rig, build_scene({"kind": "breast"}), patterns, "cam1", ENGINE, Shooting(), seed=1).images
+    images = shoot(rig, build_scene({"kind": "breast"}), patterns, "cam1", TRACING, Shooting(), seed=1).images
     cameras = calibration_of(rig).cameras
     camera, projector = cameras["cam1"], cameras["projector"]
     triangulate = Triangulator(camera, projector)

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from recon.tracking.tracker import Tracker
     from scenes.catalogue import build_scene
     from sonotwin.choices import read_patterns, read_rig
-    from twin.optics.light_transport import Engine
+    from twin.optics.light_transport import Tracing
     from twin.optics.surface_session import Shooting
     from twin.optics.surface_session import shoot as render
 
@@ -50,7 +50,6 @@ __all__ = [
     "Camera",
     "Crossings",
     "Device",
-    "Engine",
     "InputError",
     "Patterns",
     "ProbeCalibration",
@@ -58,6 +57,7 @@ __all__ = [
     "Shooting",
     "Track",
     "Tracker",
+    "Tracing",
     "build_scene",
     "calibrate_optics",
     "calibrate_probe",
@@ -89,7 +89,6 @@ PLACES = {  # of the public names: module, and name in it where that differs
     "Camera": "recon.geometry.camera",
     "Crossings": "recon.probe_calibration.point_calibration:Sightings",
     "Device": "recon.capture.manifest",
-    "Engine": "twin.optics.light_transport",
     "InputError": "recon.errors",
     "Patterns": "recon.model.patterns",
     "ProbeCalibration": "recon.model.probe",
@@ -97,6 +96,7 @@ PLACES = {  # of the public names: module, and name in it where that differs
     "Shooting": "twin.optics.surface_session",
     "Track": "recon.model.tracks",
     "Tracker": "recon.tracking.tracker",
+    "Tracing": "twin.optics.light_transport",
     "build_scene": "scenes.catalogue",
     "calibrate_optics": "recon.optical_calibration.joint_calibration:calibrate",
     "calibrate_probe": "recon.probe_calibration.point_calibration:calibrate",

@@ -30,7 +30,7 @@ SMALL = (  # cameras at half their size: fringes of ten pixels a period
     "rig.cam2.optics.focal_px=[1659.0,1664.5]",
     "rig.cam2.optics.centre_px=[305.75,258.75]",
     "rig.cam2.sensor.pixel_um=9.6",
-    "engine.samples=4",
+    "tracing.samples=4",
     "scene.edge_mm=1.5",
     "poses.count=4",
     "film_frames=0",  # a camera of half the size shows the tracker half a target
@@ -80,7 +80,7 @@ def test_a_small_demonstration_runs_through(tmp_path, capsys):
 def test_a_small_demonstration_looks_inside(tmp_path, capsys):
     """The tumour that is swept over is found where it is; the two others are told to be missing."""
     out = tmp_path / "demo"
-    assert main(["demo", "engine.samples=4", "scene.edge_mm=1.5", *SWEPT, "poses=none", f"out={out}"]) == 0
+    assert main(["demo", "tracing.samples=4", "scene.edge_mm=1.5", *SWEPT, "poses=none", f"out={out}"]) == 0
     made = (
         "report.html",
         "probe/probe.yaml",
@@ -247,7 +247,7 @@ def test_without_poses_nothing_is_calibrated(tmp_path):
 
 def test_the_commands_of_the_sweep_are_those_of_the_verbs(tmp_path):
     """Each has the settings that its verb knows, and passes its verb's own checks."""
-    overrides = ["poses=none", "clocks.lag_s=0.08", "scene.edge_mm=1.5", "engine.samples=4", f"board={tmp_path}", *COARSE]
+    overrides = ["poses=none", "clocks.lag_s=0.08", "scene.edge_mm=1.5", "tracing.samples=4", f"board={tmp_path}", *COARSE]
     config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
     lines = [shlex.split(line)[1:] for line in commands(tmp_path, config, overrides, Latency(0.0503, 0.001))]
     verbs = [line[0] for line in lines]

@@ -100,14 +100,14 @@ def test_examples_of_a_verb_are_valid(verb):
 def test_the_readme_runs(tmp_path, monkeypatch):
     """Its recipes, one after the other, on images like those that a reader would have."""
     monkeypatch.chdir(tmp_path)
-    assert main(["render", "engine.samples=2", "out=made"]) == 0
+    assert main(["render", "tracing.samples=2", "out=made"]) == 0
     shutil.copytree("made/capture/surface/cam1", "shots")
     shutil.copy("made/capture/calibration/optics.yaml", "optics.yaml")
     recipes = commands((ROOT / "README.md").read_text(encoding="utf-8"), fence="```")
     assert len(recipes) >= 5
     few = {  # rays, poses and frames: as they stand the recipes take ten minutes
-        "demo": ["poses.count=3", "film_frames=0", "engine.samples=2"],
-        "render": ["engine.samples=2"],
+        "demo": ["poses.count=3", "film_frames=0", "tracing.samples=2"],
+        "render": ["tracing.samples=2"],
         "film": ["frames=6"],
         "sweep": ["path.speed_mm_s=80"],
     }

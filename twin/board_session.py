@@ -26,7 +26,7 @@ from scenes.scene_types import Scene, Thing
 from twin.conditions import IDEAL, Conditions, draw, flexed, printed_board
 from twin.optics.disturbed_light import emitted, with_stray
 from twin.optics.instruments import CameraOptics, ProjectorOptics
-from twin.optics.light_transport import Engine, Images, meets_something, render_pixels
+from twin.optics.light_transport import Images, Tracing, meets_something, render_pixels
 from twin.optics.printed_edges import compute_edges
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, is_convex, move_things
@@ -66,7 +66,7 @@ class Settings:
     poses: board_poses.Config
     patterns: Patterns
     cameras: tuple[CameraName, ...]
-    engine: Engine
+    tracing: Tracing
     shooting: Shooting
     seed: int
     conditions: Conditions = IDEAL
@@ -121,7 +121,7 @@ def set_exposures(stage: Stage, settings: Settings) -> dict[CameraName, Exposure
         time_s = shooting.exposure_s
         if time_s is None:
             move_things(stage.world, stage.things, closest_pose(settings))
-            radiance = trace_near(stage, optics, fully_on(stage.patterns), settings.engine, 0)
+            radiance = trace_near(stage, optics, fully_on(stage.patterns), settings.tracing, 0)
             time_s = auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
         exposures[camera] = Exposure(time_s, shooting.gain, shooting.bits)
     return exposures
@@ -159,13 +159,13 @@ def shoot_pose(
     for camera, optics in stage.cameras.items():
         key = [settings.seed, number, CAMERAS.index(camera)]
         light_seed, edge_seed, sensor_seed = np.random.SeedSequence(key).generate_state(3).tolist()
-        light, engine, stray_dn = with_fully_on(shown), settings.engine, np.append(frames.stray_dn, 0.0)
+        light, tracing, stray_dn = with_fully_on(shown), settings.tracing, np.append(frames.stray_dn, 0.0)
         if camera != FRINGE_CAMERA:
-            light, engine = fully_on(stage.patterns), engine.model_copy(update={"samples": EVEN_SAMPLES})
+            light, tracing = fully_on(stage.patterns), tracing.model_copy(update={"samples": EVEN_SAMPLES})
             stray_dn = stray_dn[-1:]
-        radiance = trace_near(stage, optics, light, engine, light_seed)
+        radiance = trace_near(stage, optics, light, tracing, light_seed)
         on = radiance[-1]
-        refine_edges(on, stage, optics, settings.engine, world_from_board, edge_seed)
+        refine_edges(on, stage, optics, settings.tracing, world_from_board, edge_seed)
         radiance.near[-1] = on.ravel()[radiance.pixels]
         device, wavelength = getattr(settings.rig, camera), settings.rig.projector.wavelength_nm
         seen = with_stray(radiance, stray_dn, device, wavelength, exposures[camera])
@@ -198,7 +198,7 @@ class NearBoard:
         return len(self.near), *self.room.shape
 
 
-def trace_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine, seed: int) -> NearBoard:
+def trace_near(stage: Stage, optics: CameraOptics, light: Light, tracing: Tracing, seed: int) -> NearBoard:
     """As `light_transport.render`, but only the board and what is near are traced; the rest of an image shows the room."""
     box = stage.world.bbox()
     corners = np.array([box.corner(k) for k in range(8)]).reshape(8, 3)
@@ -209,18 +209,18 @@ def trace_near(stage: Stage, optics: CameraOptics, light: Light, engine: Engine,
     pixels = np.flatnonzero(seen).astype(np.uint32)
     near = np.empty((len(light.profiles), 0), np.float32)
     if len(pixels):
-        near = render_pixels(stage.world, optics, stage.projector, light, engine, seed, pixels, convex=stage.convex)
-    return NearBoard(optics.transmission * np.float32(engine.room_radiance), pixels, near)
+        near = render_pixels(stage.world, optics, stage.projector, light, tracing, seed, pixels, convex=stage.convex)
+    return NearBoard(optics.transmission * np.float32(tracing.room_radiance), pixels, near)
 
 
 def refine_edges(
-    radiance: Images, stage: Stage, optics: CameraOptics, engine: Engine, world_from_board: rigid.Array, seed: int
+    radiance: Images, stage: Stage, optics: CameraOptics, tracing: Tracing, world_from_board: rigid.Array, seed: int
 ) -> None:
     """Compute the pixels at edges of discs in a lit image : (h, w), in place; trace the rest of them, and the sides, anew."""
     left = compute_edges(radiance, optics, stage.print, world_from_board, seed)
     for pixels, samples in ((left.edges, EDGE_SAMPLES), (left.sides, SIDE_SAMPLES)):
         if len(pixels):
-            finer = engine.model_copy(update={"samples": max(engine.samples, samples)})
+            finer = tracing.model_copy(update={"samples": max(tracing.samples, samples)})
             light = fully_on(stage.patterns)
             found = render_pixels(stage.world, optics, stage.projector, light, finer, seed, pixels, convex=stage.convex)
             radiance.ravel()[pixels] = found[0]

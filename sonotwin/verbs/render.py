@@ -1,6 +1,6 @@
 """Render a capture of a scene, as the rig's cameras would have taken it, with its ground truth.
 
-Reads the rig, the scene, the patterns and the engine's settings from conf/. Writes OUT/capture/, which the pipeline reads like
+Reads the rig, the scene, the patterns and settings of light from conf/. Writes OUT/capture/, which the pipeline reads like
 any hardware's, and OUT/truth/, which only evaluation opens: points, normals, projector coordinates, the true calibration.
 Takes about five seconds a camera for nine patterns on two cores, and once ten seconds more to compile.
 
@@ -31,7 +31,7 @@ from scenes.catalogue import build_scene, parse_scene
 from twin import board_session
 from twin.conditions import IDEAL, Conditions, check_board, drifted
 from twin.optics import surface_session
-from twin.optics.light_transport import Engine
+from twin.optics.light_transport import Tracing
 from twin.session import Session
 
 
@@ -43,7 +43,7 @@ class Config(BaseModel):
     rig: Rig
     scene: dict
     patterns: Patterns
-    engine: Engine
+    tracing: Tracing
     out: Path
     add: bool = False
     cameras: Annotated[list[surface_session.CameraName], Field(min_length=1)]
@@ -100,7 +100,7 @@ def render_board(config: Config, chosen: BoardPoses, session: Session, console: 
         chosen,
         config.patterns,
         tuple(dict.fromkeys(config.cameras)),
-        config.engine,
+        config.tracing,
         config.shooting,
         config.seed,
         config.conditions,
@@ -129,7 +129,7 @@ def render_poses(settings: board_session.Settings, placed: Array, session: Sessi
             board_session.write_pose(session, number, *images)
     board_session.finish(session, settings, exposures, placed)
     seconds = perf_counter() - start
-    patterns, samples = settings.patterns.count, settings.engine.samples
+    patterns, samples = settings.patterns.count, settings.tracing.samples
     console.print(f"render      {len(missing)} poses, {patterns} patterns, {samples} samples/px, {seconds:.1f} s")
 
 
@@ -142,11 +142,11 @@ def render_surface(config: Config, session: Session, console: Console) -> None:
         start = perf_counter()
         with console.status(f"rendering {config.patterns.count} patterns for {camera}"):
             view = surface_session.shoot(
-                rig, scene, config.patterns, camera, config.engine, config.shooting, config.seed, config.conditions
+                rig, scene, config.patterns, camera, config.tracing, config.shooting, config.seed, config.conditions
             )
         views[camera] = view
         console.print(
-            f"render      {camera}, {config.patterns.count} patterns, {config.engine.samples} samples/px, "
+            f"render      {camera}, {config.patterns.count} patterns, {config.tracing.samples} samples/px, "
             f"exposure {view.exposure.time_s * 1e3:.2f} ms, {perf_counter() - start:.1f} s"
         )
     surface_session.write_session(session, rig, config.rig, scene, config.patterns, views)

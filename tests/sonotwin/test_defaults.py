@@ -11,7 +11,7 @@ from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import parse_scene
 from sonotwin.cli import VERBS
 from sonotwin.config import compose, folder
-from twin.optics.light_transport import Engine
+from twin.optics.light_transport import Tracing
 from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.transducer import Transducer
 
@@ -52,7 +52,7 @@ def test_a_verbs_defaults_are_its_models(verb):
 CHOICES = [
     *[("scene", path.stem, lambda content: parse_scene(content)[1]) for path in sorted((folder() / "scene").glob("*.yaml"))],
     *[("path", name, lambda content: TypeAdapter(AnyPath).validate_python(content)) for name in ("bob", "stroke", "wire")],
-    ("engine", "default", Engine.model_validate),
+    ("tracing", "default", Tracing.model_validate),
     ("poses", "paper", BoardPoses.model_validate),
     ("ultrasound", "linear", Transducer.model_validate),
 ]

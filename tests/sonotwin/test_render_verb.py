@@ -35,7 +35,7 @@ HALF = [  # both cameras at half their size
             "rig.cam1.sensor.quantum_efficiency: expected less than or equal to 1, found 1.4",
         ),
         (["rig.cam1.optics.distortion=[0.1]"], "rig.cam1.optics.distortion: expected 0, 4, 5, 8, 12 or 14 coefficients, found 1"),
-        (["engine.samples=12"], "engine.samples: expected a power of two, found 12"),
+        (["tracing.samples=12"], "tracing.samples: expected a power of two, found 12"),
         (["shooting.bits=12"], "shooting.bits: expected at most the 10 of cam1's ADC, found 12"),
         (["cameras=[cam3]"], "cameras.0: expected 'cam1' or 'cam2', found 'cam3'"),
         (["poses=paper"], "poses: expected scene=board with them, found scene.kind breast"),
@@ -78,7 +78,7 @@ def test_a_place_that_is_taken_is_refused_before_rendering(tmp_path, capsys):
 
 def test_both_cameras(tmp_path, capsys):
     """Each camera has its images and its truth; 10-bit images are announced as such."""
-    fields = [*HALF, "scene=plane", "engine.samples=2", "cameras=[cam1,cam2]", "shooting.bits=10", "shooting.exposure_s=0.02"]
+    fields = [*HALF, "scene=plane", "tracing.samples=2", "cameras=[cam1,cam2]", "shooting.bits=10", "shooting.exposure_s=0.02"]
     assert main(["render", f"out={tmp_path / 'out'}", *fields]) == 0
     manifest = json.loads((tmp_path / "out" / "capture" / "manifest.json").read_text())
     assert sorted(manifest["surface"]["images"]) == ["cam1", "cam2"]
@@ -90,7 +90,7 @@ def test_both_cameras(tmp_path, capsys):
 def test_a_board_in_poses(tmp_path, capsys):
     """Two poses with warp and print errors: what the reader finds, and the truth beside it."""
     fields = ["scene=board", "poses=demo", "poses.count=2", "patterns=paper_calibration", "cameras=[cam1,cam2]"]
-    fields += [*HALF, "engine.samples=2", "scene.warp_mm=0.2", "scene.print_error_mm=0.02"]
+    fields += [*HALF, "tracing.samples=2", "scene.warp_mm=0.2", "scene.print_error_mm=0.02"]
     assert main(["render", f"out={tmp_path / 'out'}", *fields]) == 0
     found = read_board(tmp_path / "out" / "capture")
     assert (found.poses, found.cameras) == (("00", "01"), ("cam1", "cam2"))

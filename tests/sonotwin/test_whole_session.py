@@ -20,9 +20,9 @@ COARSE = ["filmed=true", "frames.quality.disc=1", "frames.quality.rim=4"]
 def session(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("session") / "out"
     place = [f"out={out}", "add=true"]
-    board = ["scene=board", "poses=demo", "patterns=paper_calibration", "cameras=[cam1,cam2]", "engine.samples=4"]
+    board = ["scene=board", "poses=demo", "patterns=paper_calibration", "cameras=[cam1,cam2]", "tracing.samples=4"]
     assert main(["render", *board, *place]) == 0
-    assert main(["render", "scene=breast", "engine.samples=4", *place]) == 0
+    assert main(["render", "scene=breast", "tracing.samples=4", *place]) == 0
     water = ["ultrasound=water", *COARSE]
     wires = ["scene=crosswire", "path=wire", "path.count=20", "clocks.camera_hz=5", "name=wires"]
     assert main(["sweep", *wires, *water, *place]) == 0

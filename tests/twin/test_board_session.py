@@ -21,7 +21,7 @@ from scenes.kinds import board
 from twin import board_session
 from twin.board_session import Settings
 from twin.conditions import BoardPrint, Conditions
-from twin.optics.light_transport import Engine, render
+from twin.optics.light_transport import Tracing, render
 from twin.optics.printed_edges import compute_edges
 from twin.optics.ray_world import is_convex
 from twin.optics.surface_session import Shooting, calibration_of
@@ -59,8 +59,8 @@ def shrunk(device, times: int):
 def settings(rig) -> Settings:
     small = rig.model_copy(update={"cam1": shrunk(rig.cam1, 4), "cam2": shrunk(rig.cam2, 4)})
     chosen = board_poses.Config(count=3, margin_px=4, seed=6)
-    engine, shooting = Engine(samples=4, room_lux=20.0), Shooting()
-    return Settings(small, board.Config(), chosen, PATTERNS, ("cam1", "cam2"), engine, shooting, seed=3)
+    tracing, shooting = Tracing(samples=4, room_lux=20.0), Shooting()
+    return Settings(small, board.Config(), chosen, PATTERNS, ("cam1", "cam2"), tracing, shooting, seed=3)
 
 
 def run(out: Path, settings: Settings, stop_after: int | None = None) -> list[int]:
@@ -165,8 +165,8 @@ def test_what_is_far_from_the_board_is_the_room(settings, aperture_mm):
     board_session.move_things(stage.world, stage.things, board_session.place_all(settings)[0])
     light = board_session.with_fully_on(stage.patterns)
     optics = replace(stage.cameras["cam1"], aperture_mm=aperture_mm, focus_mm=400.0)
-    near = traced(stage, optics, light, settings.engine, 5)
-    whole = render(stage.world, optics, stage.projector, light, settings.engine, 5)
+    near = traced(stage, optics, light, settings.tracing, 5)
+    whole = render(stage.world, optics, stage.projector, light, settings.tracing, 5)
     assert near.shape == whole.shape and (whole[-1] < whole[-1].max() / 50).mean() > 0.3
     np.testing.assert_allclose(near, whole, rtol=1e-5)
 
@@ -178,7 +178,9 @@ def test_a_flat_board_throws_no_shadow(settings):
     assert not is_convex(board.things(board.Config(warp_mm=0.1)))
     board_session.move_things(stage.world, stage.things, board_session.place_all(settings)[0])
     light = board_session.fully_on(stage.patterns)
-    images = [traced(replace(stage, convex=convex), stage.cameras["cam1"], light, settings.engine, 5) for convex in (True, False)]
+    images = [
+        traced(replace(stage, convex=convex), stage.cameras["cam1"], light, settings.tracing, 5) for convex in (True, False)
+    ]
     np.testing.assert_array_equal(*images)
 
 
@@ -203,8 +205,8 @@ def test_a_board_out_of_sight_leaves_the_room(settings):
     stage = board_session.set_up(settings)
     board_session.move_things(stage.world, stage.things, rigid.transform(np.eye(3), [5000.0, 0.0, 600.0]))
     optics = stage.cameras["cam1"]
-    image = traced(stage, optics, board_session.fully_on(stage.patterns), settings.engine, 5)[0]
-    np.testing.assert_allclose(image, optics.transmission * settings.engine.room_radiance, rtol=1e-6)
+    image = traced(stage, optics, board_session.fully_on(stage.patterns), settings.tracing, 5)[0]
+    np.testing.assert_allclose(image, optics.transmission * settings.tracing.room_radiance, rtol=1e-6)
 
 
 def test_a_board_does_not_take_the_place_of_a_film(settings, tmp_path):
@@ -229,7 +231,7 @@ def test_rendering_noise_at_edges_is_that_of_the_sensor(rig, settings):
     optics, light = stage.cameras["cam1"], board_session.fully_on(stage.patterns)
     images = []
     for seed in (1, 2):
-        traced = render(stage.world, optics, stage.projector, light, full.engine, seed)[0]
+        traced = render(stage.world, optics, stage.projector, light, full.tracing, seed)[0]
         image = traced.copy()
         compute_edges(image, optics, stage.print, pose, seed)
         images.append(image)

@@ -49,12 +49,12 @@ from twin.accuracy.calibration_errors import (
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import Metrics
-from twin.optics.light_transport import Engine, render
+from twin.optics.light_transport import Tracing, render
 from twin.optics.ray_world import move_things
 from twin.optics.surface_session import Shooting, calibration_of
 from twin.sensor import Exposure, auto_exposure, expose
 
-ENGINE = Engine(samples=16, room_lux=20)
+TRACING = Tracing(samples=16, room_lux=20)
 PAPER_RMS_PX = {"cam1": 0.138, "cam2": 0.151, "projector": 0.131}
 DIAMETERS_MM, TILTS_DEG = (6.0, 9.0, 12.0), (0.0, 20.0, 40.0)
 QUIET = {"cam1": 1e-4, "cam2": 1e-4, "projector": 1e-4}  # px, where noise is not the question
@@ -93,7 +93,7 @@ def session(setup: Setup, design: board.Config | None = None, poses: Poses | Non
     patterns: Patterns = setup.sequences["paper_calibration"]
     cameras = board_session.CAMERAS
     return board_session.Settings(
-        setup.rig, design or board.Config(), poses or Poses(), patterns, cameras, ENGINE, Shooting(), seed=1
+        setup.rig, design or board.Config(), poses or Poses(), patterns, cameras, TRACING, Shooting(), seed=1
     )
 
 
@@ -157,12 +157,12 @@ def lit_board(rig: Rig, config: board.Config) -> tuple[np.ndarray, Exposure]:
             "parts": [{"kind": "centre_line"}, {"kind": "fringes", "pitch": 12, "steps": 8}],
         }
     )
-    settings = board_session.Settings(rig, config, Poses(), patterns, ("cam1",), ENGINE, Shooting(), seed=1)
+    settings = board_session.Settings(rig, config, Poses(), patterns, ("cam1",), TRACING, Shooting(), seed=1)
     stage = board_session.set_up(settings)
     move_things(stage.world, stage.things, board.world_from_board(config))
     optics, light = stage.cameras["cam1"], board_session.fully_on(stage.patterns)
-    radiance = render(stage.world, optics, stage.projector, light, ENGINE, seed=1)
-    board_session.refine_edges(radiance[0], stage, optics, ENGINE, board.world_from_board(config), seed=2)
+    radiance = render(stage.world, optics, stage.projector, light, TRACING, seed=1)
+    board_session.refine_edges(radiance[0], stage, optics, TRACING, board.world_from_board(config), seed=2)
     wavelength = rig.projector.wavelength_nm
     exposure = Exposure(auto_exposure(radiance, rig.cam1, wavelength, level=Shooting().level), 1.0, 8)
     return expose(radiance, rig.cam1, wavelength, exposure, seed=3)[0], exposure

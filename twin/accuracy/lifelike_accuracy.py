@@ -104,7 +104,7 @@ def session(setup: Setup, seed: int) -> board_session.Settings:
         Poses(count=COUNT, seed=seed),
         setup.sequences["paper_calibration"],
         board_session.CAMERAS,
-        surface_accuracy.ENGINE,
+        surface_accuracy.TRACING,
         Shooting(),
         seed,
         conditions_of(setup),

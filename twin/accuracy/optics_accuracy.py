@@ -13,7 +13,7 @@ from scenes.catalogue import build_scene
 from scenes.scene_types import Scene
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.optics.instruments import CameraOptics, ProjectorOptics
-from twin.optics.light_transport import Engine, Images, render
+from twin.optics.light_transport import Images, Tracing, render
 from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_shown, show_pattern
 from twin.optics.raster import OVERSAMPLING, Light
 from twin.optics.ray_world import build_world
@@ -63,8 +63,8 @@ def both_renders(
     camera, projector = ideal_rig(rig, scale)
     light = Light.of(paper_surface(projector.camera.size), rig.projector)
     ours_world, peer_world = build_world(scene), mitsuba_scene(scene, camera, projector, OVERSAMPLING)
-    optics, engine = CameraOptics.pinhole(camera), Engine(samples=samples)
-    ours = [block_means(render(ours_world, optics, projector, light, engine, seed))[list(patterns)] for seed in range(repeats)]
+    optics, tracing = CameraOptics.pinhole(camera), Tracing(samples=samples)
+    ours = [block_means(render(ours_world, optics, projector, light, tracing, seed))[list(patterns)] for seed in range(repeats)]
     peer = []
     for pattern in patterns:
         show_pattern(peer_world, light, pattern)
@@ -92,7 +92,7 @@ def phase_error(rig: Rig, samples: int) -> Row:
     patterns = paper_surface(rig.projector.optics.size)
     world = build_world(build_scene({"kind": "plane", "tilt_deg": [3.0, 12.0]}))
     light = Light.of(patterns, rig.projector)
-    images = render(world, CameraOptics.of(rig.cam1), ProjectorOptics.of(rig.projector), light, Engine(samples=samples), seed=1)
+    images = render(world, CameraOptics.of(rig.cam1), ProjectorOptics.of(rig.projector), light, Tracing(samples=samples), seed=1)
     fringes = patterns.parts[1]
     assert isinstance(fringes, Fringes)
     phase = wrapped_phase(images[1:] * np.float32(200 / images.max()), fringes.shifts, noise=Noise(0, 0), saturation=np.inf).phase

@@ -19,11 +19,11 @@ from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.conditions import IDEAL, Conditions
 from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import Comparison, Metrics, Truth
-from twin.optics.light_transport import Engine
+from twin.optics.light_transport import Tracing
 from twin.optics.ray_world import visible
 from twin.optics.surface_session import Shooting, View, calibration_of, shoot
 
-ENGINE, SHOOTING = Engine(samples=16, room_lux=20), Shooting()
+TRACING, SHOOTING = Tracing(samples=16, room_lux=20), Shooting()
 PAPER_SPHERE_RADIUS_MM, PAPER_SPHERE_RMS_MM = 0.045, 0.040
 REAL_DEPTH_MM = (690.0, 780.0)
 WINDOW = 9  # px; patches of the real surface in which noise is told from shape by a quadratic fit
@@ -46,12 +46,12 @@ def experiment(
     scene: Scene,
     patterns: Patterns,
     seed: int = 1,
-    engine: Engine = ENGINE,
+    tracing: Tracing = TRACING,
     shooting: Shooting = SHOOTING,
     conditions: Conditions = IDEAL,
 ) -> Experiment:
     """Render, decode, triangulate, clean and compare, as the commands do, without the files between."""
-    view = shoot(rig, scene, patterns, "cam1", engine, shooting, seed, conditions)
+    view = shoot(rig, scene, patterns, "cam1", tracing, shooting, seed, conditions)
     cameras = calibration_of(rig).cameras
     found = decode(view.images, patterns, name=scene.name)
     points = clean(triangulate(found, cameras["cam1"], cameras["projector"]), cameras["cam1"], found.modulation)

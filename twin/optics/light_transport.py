@@ -22,7 +22,7 @@ Images = NDArray[np.float32]
 LUMENS_PER_WATT = 542.0  # photopic efficacy at 525 nm (683 lm/W, CIE V = 0.793), to turn room light in lux into W/mm^2
 
 
-class Engine(BaseModel):
+class Tracing(BaseModel):
     """Settings of the path tracer."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -49,7 +49,7 @@ def render(
     camera: CameraOptics,
     projector: ProjectorOptics,
     light: Light,
-    engine: Engine,
+    tracing: Tracing,
     seed: int,
     translucent: Translucent = (),
 ) -> Images:
@@ -73,7 +73,7 @@ def render(
     """
     width, height = camera.camera.size
     everywhere = np.arange(width * height, dtype=np.uint32)
-    return render_pixels(scene, camera, projector, light, engine, seed, everywhere, translucent=translucent).reshape(
+    return render_pixels(scene, camera, projector, light, tracing, seed, everywhere, translucent=translucent).reshape(
         -1, height, width
     )
 
@@ -83,7 +83,7 @@ def render_pixels(
     camera: CameraOptics,
     projector: ProjectorOptics,
     light: Light,
-    engine: Engine,
+    tracing: Tracing,
     seed: int,
     pixels: NDArray[np.uint32],
     *,
@@ -99,18 +99,18 @@ def render_pixels(
     centre, across, down = camera.tables
     tables = dr.gather(mi.Point2f, centre, pixel), dr.gather(mi.Vector2f, across, pixel), dr.gather(mi.Vector2f, down, pixel)
     seed_word = dr.opaque(mi.UInt32, seed)
-    samples = dr.opaque(mi.UInt32, engine.samples)
+    samples = dr.opaque(mi.UInt32, tracing.samples)
 
     def body(index: mi.UInt32, sums: list[mi.Float], room: mi.Float) -> tuple:
-        points = PairedPoints(pixel, index, engine.samples, seed_word)
+        points = PairedPoints(pixel, index, tracing.samples, seed_word)
         ray = sample_rays(camera, tables, pixel_offset(camera, points), points.mirrored_disc())
-        values, from_room = trace(scene, projector, (table, spread), engine, points, ray, convex)
+        values, from_room = trace(scene, projector, (table, spread), tracing, points, ray, convex)
         return index + 1, [total + value for total, value in zip(sums, values, strict=True)], room + from_room
 
     state = (mi.UInt32(0), [dr.zeros(mi.Float, len(pixels)) for _ in range(table.count)], dr.zeros(mi.Float, len(pixels)))
     _, sums, room = dr.while_loop(state, lambda index, sums, room: index < samples, body, label="samples")
     dr.eval(sums, room)
-    scale = camera.transmission.ravel()[pixels] / np.float32(engine.samples)
+    scale = camera.transmission.ravel()[pixels] / np.float32(tracing.samples)
     radiance = np.empty((table.count, len(pixels)), np.float32)
     for total, values in zip(sums, radiance, strict=True):
         np.add(np.asarray(total), np.asarray(room), out=values)
@@ -134,7 +134,7 @@ def trace(
     scene: mi.Scene,
     projector: ProjectorOptics,
     light: tuple[LightTable, LightSpread | None],
-    engine: Engine,
+    tracing: Tracing,
     points: PairedPoints,
     ray: mi.Ray3f,
     convex: bool,
@@ -143,10 +143,10 @@ def trace(
     (table, spread), context = light, mi.BSDFContext()
     sums = [mi.Float(0)] * table.count
     room, throughput, active = mi.Float(0), mi.Float(1), mi.Bool(True)
-    for bounce in range(engine.bounces):
+    for bounce in range(tracing.bounces):
         hit = scene.ray_intersect(ray, active)
-        if engine.room_radiance > 0:
-            room += dr.select(active & ~hit.is_valid(), throughput * engine.room_radiance, 0)
+        if tracing.room_radiance > 0:
+            room += dr.select(active & ~hit.is_valid(), throughput * tracing.room_radiance, 0)
         active &= hit.is_valid()
         bsdf = hit.bsdf(ray)
 
@@ -167,8 +167,8 @@ def trace(
             after = spread.lookup(projector, hit, projector_pixel, soft)
             sums = [total + weight * (late - value) for total, late, value in zip(sums, after, values, strict=True)]
 
-        last = convex or bounce + 1 == engine.bounces
-        if last and engine.room_radiance == 0:
+        last = convex or bounce + 1 == tracing.bounces
+        if last and tracing.room_radiance == 0:
             break
         sample, factor = bsdf.sample(context, hit, points.square().x, points.square(), active)
         throughput *= dr.select(active, factor[0], 0)
@@ -176,6 +176,6 @@ def trace(
         active &= throughput > 0
         if last:
             free = active if convex else active & ~scene.ray_test(ray, active)
-            room += dr.select(free, throughput * engine.room_radiance, 0)
+            room += dr.select(free, throughput * tracing.room_radiance, 0)
             break
     return sums, room

@@ -17,7 +17,7 @@ from scenes.scene_types import Scene
 from twin.conditions import IDEAL, Conditions, as_skin, draw
 from twin.optics.disturbed_light import emitted, with_stray
 from twin.optics.instruments import CameraOptics, ProjectorOptics
-from twin.optics.light_transport import Engine, Images, render
+from twin.optics.light_transport import Images, Tracing, render
 from twin.optics.ray_world import build_world, translucent, visible
 from twin.optics.surface_truth import SurfaceTruth, surface_truth
 from twin.sensor import Exposure, Numbers, auto_exposure, electrons_per_radiance, expose, noise_dn, number_per_electron
@@ -52,7 +52,7 @@ def shoot(
     scene: Scene,
     patterns: Patterns,
     camera: CameraName,
-    engine: Engine,
+    tracing: Tracing,
     shooting: Shooting,
     seed: int,
     conditions: Conditions = IDEAL,
@@ -69,7 +69,7 @@ def shoot(
     world, projector = build_world(scene), ProjectorOptics.of(rig.projector)
     frames = draw(conditions.frames, patterns.count, seed)
     light = emitted(patterns, rig.projector, frames)
-    radiance = render(world, optics, projector, light, engine, light_seed, translucent(scene, world))
+    radiance = render(world, optics, projector, light, tracing, light_seed, translucent(scene, world))
     wavelength = rig.projector.wavelength_nm
     time_s = shooting.exposure_s or auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
     exposure = Exposure(time_s, shooting.gain, shooting.bits)

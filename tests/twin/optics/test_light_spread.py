@@ -14,7 +14,7 @@ from recon.model.patterns import CentreLine, Fringes, Patterns
 from scenes.scene_types import Material, Scene, Thing
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_spread import REACH, blurred, modulation_transfer
-from twin.optics.light_transport import Engine, render
+from twin.optics.light_transport import Tracing, render
 from twin.optics.raster import OVERSAMPLING, Light
 from twin.optics.ray_world import build_world, translucent
 
@@ -47,7 +47,7 @@ def plate(spread_mm: float, material: Material | None = None, tilt_deg: float = 
 
 def shown(scene: Scene) -> np.ndarray:
     world, projector = build_world(scene), ProjectorOptics(PROJECTOR, 0.0, 1.0, 0.0, 1.0)
-    images = render(world, CameraOptics.pinhole(CAMERA), projector, LIGHT, Engine(samples=16), 3, translucent(scene, world))
+    images = render(world, CameraOptics.pinhole(CAMERA), projector, LIGHT, Tracing(samples=16), 3, translucent(scene, world))
     assert (images[1:].sum(axis=0) > 0).all()
     return images.astype(float)
 

@@ -13,7 +13,7 @@ from scenes.catalogue import build_scene
 from scenes.scene_types import Material, Scene, Thing
 from twin.accuracy import optics_accuracy
 from twin.optics.instruments import CameraOptics, ProjectorOptics
-from twin.optics.light_transport import LUMENS_PER_WATT, Engine, render
+from twin.optics.light_transport import LUMENS_PER_WATT, Tracing, render
 from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_shown, show_pattern
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world
@@ -47,7 +47,9 @@ def uniform_light(blur_px: float = 0.0) -> Light:
 def test_plate_has_the_radiance_of_the_formula():
     """A Lambertian plate shows albedo/pi times the irradiance T / (z^2) cos(theta) ... of a pinhole projector, everywhere."""
     projector = ProjectorOptics(PROJECTOR, 0.0, 1.0, 0.0, 2.0)
-    image = render(build_world(plate(500)), CameraOptics.pinhole(SMALL), projector, uniform_light(), Engine(samples=4), seed=0)[0]
+    image = render(build_world(plate(500)), CameraOptics.pinhole(SMALL), projector, uniform_light(), Tracing(samples=4), seed=0)[
+        0
+    ]
     x, y = np.moveaxis((SMALL.pixel_grid() - 31.5) / 400, -1, 0)
     cosine = 1 / np.sqrt(1 + x * x + y * y)  # at the projector and at the plate: both look along z from the origin
     irradiance = 2.0 / (cosine * 500**2) * cosine  # T / (cos^3 d^2) with d = z / cos, times the plate's cosine
@@ -57,8 +59,8 @@ def test_plate_has_the_radiance_of_the_formula():
 def test_room_light_on_a_plate():
     """A plate in an even room of E lux shows albedo * E / pi; every sample has that value, so it is exact."""
     projector = ProjectorOptics(PROJECTOR, 0.0, 1.0, 0.0, 1e-12)
-    engine = Engine(samples=4, room_lux=100)
-    image = render(build_world(plate(500)), CameraOptics.pinhole(SMALL), projector, uniform_light(), engine, seed=0)[0]
+    tracing = Tracing(samples=4, room_lux=100)
+    image = render(build_world(plate(500)), CameraOptics.pinhole(SMALL), projector, uniform_light(), tracing, seed=0)[0]
     np.testing.assert_allclose(image, 0.6 * 100 / LUMENS_PER_WATT * 1e-6 / np.pi, rtol=1e-4)
 
 
@@ -71,7 +73,7 @@ def test_gel_is_glossy_where_it_is():
     dry = replace(dry, mesh=mesh, material=Material(0.05, roughness=0.4, ior=1.36))
     without, under = (
         render(
-            build_world(Scene("plate", (thing,))), CameraOptics.pinhole(SMALL), projector, uniform_light(), Engine(samples=4), 0
+            build_world(Scene("plate", (thing,))), CameraOptics.pinhole(SMALL), projector, uniform_light(), Tracing(samples=4), 0
         )[0]
         for thing in (dry, replace(dry, wet=wet))
     )
@@ -90,7 +92,7 @@ def test_defocus_lowers_the_modulation_as_a_disc_does(depth):
 
     def modulation(diameter: float) -> float:
         projector = ProjectorOptics(PROJECTOR, diameter, focus, 0.0, 1.0)
-        i = render(world, CameraOptics.pinhole(SMALL), projector, light, Engine(samples=256), seed=2)[1:].astype(float)
+        i = render(world, CameraOptics.pinhole(SMALL), projector, light, Tracing(samples=256), seed=2)[1:].astype(float)
         return float(np.mean(np.hypot(i[0] - i[2], i[1] - i[3]) / i.sum(axis=0)))
 
     x = np.pi * aperture * 400 * abs(1 / focus - 1 / depth) / pitch
@@ -126,9 +128,9 @@ def test_interreflection_matches_mitsuba(rig):
     camera, projector = ideal_rig(rig, 0.125)
     light = Light.of(optics_accuracy.paper_surface(projector.camera.size), rig.projector)
     world, peer_world = build_world(groove()), mitsuba_scene(groove(), camera, projector, 16)
-    direct = render(world, CameraOptics.pinhole(camera), projector, light, Engine(samples=64), 0)[3].mean()
+    direct = render(world, CameraOptics.pinhole(camera), projector, light, Tracing(samples=64), 0)[3].mean()
     ours = [
-        render(world, CameraOptics.pinhole(camera), projector, light, Engine(samples=64, bounces=4), k)[3].mean()
+        render(world, CameraOptics.pinhole(camera), projector, light, Tracing(samples=64, bounces=4), k)[3].mean()
         for k in range(6)
     ]
     show_pattern(peer_world, light, 3)
@@ -150,6 +152,6 @@ def test_seed_decides(rig):
     camera, projector = ideal_rig(rig, 0.125)
     light = Light.of(optics_accuracy.paper_surface(projector.camera.size), rig.projector)
     world = build_world(build_scene({"kind": "sphere"}))
-    first, again, other = (render(world, CameraOptics.pinhole(camera), projector, light, Engine(), seed) for seed in (5, 5, 6))
+    first, again, other = (render(world, CameraOptics.pinhole(camera), projector, light, Tracing(), seed) for seed in (5, 5, 6))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()

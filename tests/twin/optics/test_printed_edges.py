@@ -10,7 +10,7 @@ from recon.model.patterns import Patterns
 from scenes import board_poses
 from scenes.kinds import board
 from twin import board_session
-from twin.optics.light_transport import Engine, render_pixels
+from twin.optics.light_transport import Tracing, render_pixels
 from twin.optics.printed_edges import compute_edges
 from twin.optics.surface_session import Shooting
 
@@ -36,7 +36,7 @@ def patterns() -> Patterns:
 def test_edges_are_those_of_very_many_paths(rig, patterns, design, aperture, rng):
     """In focus, bowed and out of focus, and glossy with a pinhole: no bias, and less noise than 256 paths leave."""
     settings = board_session.Settings(
-        rig, design, board_poses.Config(), patterns, ("cam1",), Engine(samples=8), Shooting(), seed=1
+        rig, design, board_poses.Config(), patterns, ("cam1",), Tracing(samples=8), Shooting(), seed=1
     )
     stage = board_session.set_up(settings)
     optics = stage.cameras["cam1"]
@@ -44,13 +44,13 @@ def test_edges_are_those_of_very_many_paths(rig, patterns, design, aperture, rng
     pose = board_session.place_all(settings)[1]
     board_session.move_things(stage.world, stage.things, pose)
     light = board_session.fully_on(stage.patterns)
-    traced = board_session.trace_near(stage, optics, light, settings.engine, 1)[0]
+    traced = board_session.trace_near(stage, optics, light, settings.tracing, 1)[0]
     computed = traced.copy()
     left = compute_edges(computed, optics, stage.print, pose, 1)
     changed = np.flatnonzero(computed != traced)
     assert len(left.edges) < 0.001 * len(changed) and not np.isin(left.sides, changed).any()
     chosen = rng.choice(changed, PIXELS, replace=False).astype(np.uint32)
-    many = Engine(samples=PATHS)
+    many = Tracing(samples=PATHS)
     truth = render_pixels(stage.world, optics, stage.projector, light, many, 7, chosen, convex=stage.convex)[0]
     white = np.percentile(traced, 99)
     error = (computed.ravel()[chosen] - truth) / white

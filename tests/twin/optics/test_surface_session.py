@@ -17,7 +17,7 @@ from recon.structured_light.phase import Noise, wrapped_phase
 from scenes.catalogue import build_scene
 from twin.accuracy.optics_accuracy import paper_surface
 from twin.optics.instruments import CameraOptics, ProjectorOptics
-from twin.optics.light_transport import Engine, render
+from twin.optics.light_transport import Tracing, render
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world
 from twin.optics.surface_session import Shooting, noise_limit_px, shoot, write_session
@@ -44,7 +44,7 @@ def session(small_rig, tmp_path_factory) -> Path:
 
 def write(rig, out: Path, seed: int, add: bool = False) -> Path:
     scene, patterns = build_scene({"kind": "sphere"}), paper_surface((1280, 800))
-    view = shoot(rig, scene, patterns, "cam1", Engine(samples=4), Shooting(), seed)
+    view = shoot(rig, scene, patterns, "cam1", Tracing(samples=4), Shooting(), seed)
     write_session(Session(out, "surface", {"seed": seed}, add), rig, rig, scene, patterns, {"cam1": view})
     return out
 
@@ -103,7 +103,7 @@ def test_a_lens_that_leaves_pixels_dark_is_refused(small_rig):
     optics = small_rig.cam1.optics.model_copy(update={"focal_px": (200.0, 200.0), "distortion": (-0.35, 0.0, 0.0, 0.0)})
     rig = small_rig.model_copy(update={"cam1": small_rig.cam1.model_copy(update={"optics": optics})})
     with pytest.raises(InputError, match=r"rig.cam1.optics.distortion: expected a ray for every pixel, found \d+ px"):
-        shoot(rig, build_scene({"kind": "plane"}), paper_surface((1280, 800)), "cam1", Engine(samples=2), Shooting(), 1)
+        shoot(rig, build_scene({"kind": "plane"}), paper_surface((1280, 800)), "cam1", Tracing(samples=2), Shooting(), 1)
 
 
 def test_a_killed_session_does_not_mix_with_an_old_one(small_rig, tmp_path, monkeypatch):
@@ -125,7 +125,7 @@ def test_noise_limit_is_the_noise(small_rig):
     device, wavelength = small_rig.cam1, small_rig.projector.wavelength_nm
     radiance = render(
         build_world(scene), CameraOptics.of(device), ProjectorOptics.of(small_rig.projector),
-        Light.of(patterns, small_rig.projector), Engine(samples=4), light_seed,
+        Light.of(patterns, small_rig.projector), Tracing(samples=4), light_seed,
     )  # fmt: skip
     exposure = Exposure(auto_exposure(radiance, device, wavelength))
     limits = noise_limit_px(radiance, patterns, device, wavelength, exposure)
