@@ -52,6 +52,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("export", "write a capture in another group's layout"),
     Verb("evaluate", "compare a surface with a rendered capture's ground truth"),
     Verb("accuracy", "measure errors of the twin's rig and compare with the paper's figures"),
+    Verb("study", "repeat an experiment over settings and seeds: tables, plots, limits"),
     Verb("train", "train a network of the tracker with a data set"),
 )
 

@@ -5,11 +5,8 @@ of the code and the settings that made them, so that a measurement that was stop
 code stands in a table.
 """
 
-import hashlib
-import json
 import shutil
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -18,6 +15,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.files import metrics
+from recon.files.code_digest import code_digest
 from recon.files.metrics import Metrics, shown
 from recon.probe_calibration import repeatability
 from sonotwin import config, session_steps
@@ -98,13 +96,9 @@ def cylinders(work: Path, calibrated: Path, given: Sequence[str], known: Sequenc
     return status, {} if status else session_errors.cylinders(work / "result", truth, TUBE)
 
 
-@cache
 def code() -> str:
     """Digest of the code and the settings that sessions are made by."""
-    root, conf = config.folder().parent, config.folder()
-    files = [*(path for package in PACKAGES for path in sorted((root / package).rglob("*.py"))), *sorted(conf.rglob("*.yaml"))]
-    content = [(str(path.relative_to(root)), path.read_text(encoding="utf-8")) for path in files]
-    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
+    return code_digest(*PACKAGES, config.folder())
 
 
 def rows(conditions: str, found: Sequence[Metrics]) -> list[Row]:

@@ -169,6 +169,8 @@ def prepare() -> str:
 def load_mitsuba() -> ModuleType:
     """Import Mitsuba with a working LLVM or a GPU, and set its variant; the first call does the work.
 
+    DrJit takes as many threads as there are cores, or `SONOTWIN_THREADS`, by which `twin.engine` shares them.
+
     Raises
     ------
     InputError
@@ -181,6 +183,10 @@ def load_mitsuba() -> ModuleType:
     import mitsuba
 
     mitsuba.set_variant(variant)
+    if threads := os.environ.get("SONOTWIN_THREADS"):
+        import drjit
+
+        drjit.set_thread_count(int(threads))
     if not any((Path.home() / ".drjit").glob("*.bin")):
         logging.getLogger("recon.compiled").info("compiling %s.%s, once", "twin.optics", "kernels")
     return mitsuba

@@ -89,14 +89,14 @@ def histogram(values: NDArray, expected: Curve, unit: str, half_range: float) ->
     bins = np.linspace(-half_range, half_range, 101)
     density = np.histogram(values, bins)[0] / (len(values) * np.diff(bins))
     highest = max(density.max(), expected.density.max())
-    figure, axes = _drawing(5.2, 3.1)
+    figure, axes = blank(5.2, 3.1)
     axes.stairs(density, bins, fill=True, color=BARS, alpha=0.55, label="measured")
     axes.plot(expected.x, expected.density, color=LINE, linewidth=1.6, label=expected.label)
     axes.set(xlabel=unit, xlim=(-half_range, half_range), ylim=(0, 1.15 * highest), yticks=[])
     axes.locator_params(axis="x", nbins=6)
     axes.legend(frameon=False, labelcolor=TEXT, fontsize=9)
     axes.spines[["left", "top", "right"]].set_visible(False)
-    return _inline_svg(figure)
+    return inline_svg(figure)
 
 
 def arrows(starts: NDArray, vectors: NDArray, size: tuple[int, int], magnification: float, colour: str = LINE) -> str:
@@ -111,7 +111,7 @@ def arrows(starts: NDArray, vectors: NDArray, size: tuple[int, int], magnificati
     ends = starts + magnification * vectors
     _strokes(axes, np.stack([starts, ends], axis=1), color=colour, linewidth=0.8)
     _strokes(axes, _dotted(starts), color=TEXT, linewidth=1.3)
-    return _inline_svg(figure)
+    return inline_svg(figure)
 
 
 def magnification(size: tuple[int, int], length: float) -> float:
@@ -130,7 +130,7 @@ def dots(places: NDArray, values: NDArray, scale: Scale, size: tuple[int, int]) 
         chosen = places[level == k]
         colour = matplotlib.colormaps[scale.colours]((k + 0.5) / steps)
         _strokes(axes, _dotted(chosen), color=colour, linewidth=2.2)
-    return _inline_svg(figure)
+    return inline_svg(figure)
 
 
 def slope(x: NDArray, y: NDArray, steepness: float, labels: tuple[str, str], names: tuple[str, str]) -> str:
@@ -141,7 +141,7 @@ def slope(x: NDArray, y: NDArray, steepness: float, labels: tuple[str, str], nam
     labels : of the two axes, with units.
     names : of points and line, for the legend.
     """
-    figure, axes = _drawing(3.8, 3.6)
+    figure, axes = blank(3.8, 3.6)
     across = 1.08 * float(np.abs(x).max())
     ends = np.array([-across, across])
     axes.plot(ends, steepness * ends, color=LINE, linewidth=1.6, label=names[1])
@@ -150,12 +150,12 @@ def slope(x: NDArray, y: NDArray, steepness: float, labels: tuple[str, str], nam
     axes.locator_params(nbins=7)
     axes.legend(frameon=False, labelcolor=TEXT, fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
-    return _inline_svg(figure)
+    return inline_svg(figure)
 
 
 def course(values: NDArray, bounds: NDArray, labels: tuple[str, str], names: tuple[str, str]) -> str:
     """Values : (n,) in their order and the bounds : (n,) they are held against; shaded where NaN. Labels and names as `slope`."""
-    figure, axes = _drawing(5.2, 3.1)
+    figure, axes = blank(5.2, 3.1)
     axes.plot(bounds, color=LINE, linewidth=1.3, drawstyle="steps-mid", label=names[1])
     axes.plot(values, "o", color=BARS, markersize=3.6, label=names[0])
     for k in np.flatnonzero(np.isnan(values)):
@@ -163,14 +163,14 @@ def course(values: NDArray, bounds: NDArray, labels: tuple[str, str], names: tup
     axes.set(xlabel=labels[0], ylabel=labels[1], xlim=(-0.5, len(values) - 0.5), ylim=(0, 1.2 * axes.get_ylim()[1]))
     axes.legend(frameon=False, labelcolor=TEXT, fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
-    return _inline_svg(figure)
+    return inline_svg(figure)
 
 
 def outlines(shapes: NDArray, marks: Mapping[str, NDArray], labels: tuple[str, str]) -> str:
     """Outlines : (p, c, 2) mm and named marks : (2,) mm in one plane with equal scales, y down, as an SVG drawing."""
     everything = np.concatenate([np.reshape(shapes, (-1, 2)), *(np.reshape(mark, (1, 2)) for mark in marks.values())])
     low, high = everything.min(axis=0) - 40, everything.max(axis=0) + 40
-    figure, axes = _drawing(5.2, float(np.clip(5.2 * (high[1] - low[1]) / (high[0] - low[0]), 2.5, 9)))
+    figure, axes = blank(5.2, float(np.clip(5.2 * (high[1] - low[1]) / (high[0] - low[0]), 2.5, 9)))
     closed = np.concatenate([shapes, shapes[:, :1]], axis=1)
     _strokes(axes, closed, color=BARS, linewidth=0.8)
     for name, place in marks.items():
@@ -178,7 +178,7 @@ def outlines(shapes: NDArray, marks: Mapping[str, NDArray], labels: tuple[str, s
         axes.annotate(name, place, (7, 0), textcoords="offset points", va="center", color=TEXT, fontsize=9)
     axes.set(xlabel=labels[0], ylabel=labels[1], xlim=(low[0], high[0]), ylim=(high[1], low[1]), aspect="equal")
     axes.spines[["top", "right"]].set_visible(False)
-    return _inline_svg(figure)
+    return inline_svg(figure)
 
 
 def standard_normal(half_range: float) -> Curve:
@@ -199,7 +199,7 @@ def noise_mixture(sigma: NDArray, half_range: float, label: str) -> Curve:
     return Curve(x, (np.exp(-((x / levels[:, None]) ** 2) / 2) / (levels[:, None] * np.sqrt(2 * np.pi))).mean(axis=0), label)
 
 
-def _drawing(width: float, height: float) -> tuple[Figure, Axes]:
+def blank(width: float, height: float) -> tuple[Figure, Axes]:
     """Empty axes whose lines and letters take the colour of the text around them; width and height in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.add_subplot()
@@ -214,7 +214,7 @@ def _drawing(width: float, height: float) -> tuple[Figure, Axes]:
 def _image_plane(size: tuple[int, int]) -> tuple[Figure, Axes]:
     """Axes over an image of a size (width, height) px, v down."""
     width, height = size
-    figure, axes = _drawing(5.2, 5.2 * height / width)
+    figure, axes = blank(5.2, 5.2 * height / width)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
     axes.set(xticks=[0, width // 2, width - 1], yticks=[0, height // 2, height - 1])
     return figure, axes
@@ -234,7 +234,8 @@ def _strokes(axes: Axes, lines: NDArray, **style: object) -> None:
     axes.add_patch(PathPatch(path, fill=False, capstyle="round", joinstyle="round", **style))
 
 
-def _inline_svg(figure: Figure) -> str:
+def inline_svg(figure: Figure) -> str:
+    """A figure as an SVG drawing for a page."""
     file = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "sonotwin", "font.size": 10}):
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})

@@ -2,9 +2,9 @@
 
 Reads the ranges of what is drawn at random from conf/dataset.yaml. Writes OUT/shard-*.tar (WebDataset), OUT/index.parquet and
 OUT/dataset.json; docs/training.md says what is in them. About two stereo samples a second on two cores, after a minute in which
-it compiles. A run that was stopped goes on where it was when started again; the same seed gives the same bytes.
+it compiles. A run that was stopped goes on where it was when started again; the same seed gives the same bytes, on any engine.
 
-    sonotwin dataset out=outputs/data samples=3000
+    sonotwin dataset out=outputs/data samples=3000 engine.workers=2
     sonotwin dataset out=outputs/test samples=1000 seed=1
     sonotwin dataset out=outputs/full samples=20 frames=full
 """
@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon.model.rig import Rig
+from twin.engine import Engine
 from twin.shooting import Quality
 from twin.tracking.dataset_shards import Place, Settings, generate, prepare, write_index
 from twin.tracking.sampling_ranges import DataRanges
@@ -32,15 +33,15 @@ class Config(BaseModel):
     out: Path
     samples: Annotated[int, Field(ge=1, le=10_000_000)]
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    workers: Annotated[int, Field(ge=1, le=256)] = 1
     frames: Literal["views", "sketches", "full"] = "views"
     shard: Annotated[int, Field(ge=1, le=10_000)] = 50
     quality: Quality = Quality()
     ranges: DataRanges
+    engine: Engine = Engine()
 
     def settings(self) -> Settings:
         """Settings that the bytes depend on."""
-        return Settings(**self.model_dump(exclude={"out", "workers"}))
+        return Settings(**self.model_dump(exclude={"out", "engine"}))
 
 
 def run(config: Config) -> None:
@@ -60,7 +61,7 @@ def run(config: Config) -> None:
     start = perf_counter()
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("rendering samples", total=total)
-        for count in generate(place, settings, missing, config.workers):
+        for count in generate(place, settings, missing, config.engine):
             progress.advance(task, count)
     if total:
         seconds = perf_counter() - start

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from time import perf_counter
 
 import numpy as np
@@ -53,7 +53,7 @@ class BoardSet:
         return replace(self, sightings=self.sightings[:count], poses=self.poses[:count], lit=self.lit[:count])
 
 
-@cache
+@lru_cache(maxsize=3)
 def rendered(settings: board_session.Settings) -> BoardSet:
     """Render a session pose by pose and find the board in each; of the images only the lit ones are kept."""
     stage = board_session.set_up(settings)

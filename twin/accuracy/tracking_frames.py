@@ -1,12 +1,10 @@
 """Frames for measurements of tracking, rendered on demand: unseen ones like training data, and studies."""
 
 from collections.abc import Iterator
-from functools import lru_cache
 
-from recon.model.rig import Target
 from twin.accuracy.table_rows import Setup
 from twin.shooting import Quality
-from twin.tracking.mesh_bank import Bank, build_bank
+from twin.tracking.mesh_bank import build_bank
 from twin.tracking.rendered_views import Frames, render_full, render_sketches
 from twin.tracking.samples import Take, draw
 from twin.tracking.sampling_ranges import DataRanges
@@ -28,7 +26,7 @@ def ranges_of(setup: Setup) -> DataRanges:
 def unseen(setup: Setup, seed: int, samples: int) -> Iterator[tuple[Take, Frames]]:
     """Samples as of a data set of another seed, so with other bodies and surroundings too."""
     ranges = ranges_of(setup)
-    bank = _bank(setup.rig.target, ranges.variants, seed)
+    bank = build_bank(setup.rig.target, ranges.variants, seed)
     for first in range(0, samples, BATCH):
         takes = [draw(ranges, setup.rig, seed, k) for k in range(first, min(first + BATCH, samples))]
         sketched = iter(render_sketches(bank, setup.rig, takes, Quality(), seed))
@@ -42,7 +40,7 @@ def study(
 ) -> Iterator[tuple[Take, Frames]]:
     """Samples of set light and blur, over the whole working volume; nothing covers the target, by a look at few rays."""
     ranges = ranges_of(setup).model_copy(update={"variants": STUDY_VARIANTS})
-    bank = _bank(setup.rig.target, STUDY_VARIANTS, seed)
+    bank = build_bank(setup.rig.target, STUDY_VARIANTS, seed)
     given, k = 0, 0
     while given < count:
         takes = [study_take(setup.rig, ranges, seed, number, white_dn, blur_px) for number in range(k, k + BATCH)]
@@ -53,8 +51,3 @@ def study(
         given += len(clear)
         if clear:
             yield from zip(clear, render_sketches(bank, setup.rig, clear, Quality(window=rays), seed, grid), strict=True)
-
-
-@lru_cache(maxsize=4)
-def _bank(target: Target, variants: int, seed: int) -> Bank:
-    return build_bank(target, variants, seed)

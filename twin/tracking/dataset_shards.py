@@ -5,18 +5,12 @@ goes on with the shards that are missing, and workers need no coordinator: the b
 """
 
 import json
-import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import wait
 from pathlib import Path
-from threading import Thread
 from typing import Literal
 
 import cv2
-import drjit as dr
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -26,9 +20,10 @@ from pydantic import BaseModel, ConfigDict
 from recon.errors import InputError
 from recon.files import atomic
 from recon.model.rig import Rig
+from twin.engine import Engine, results
 from twin.session import first_difference
 from twin.shooting import Quality
-from twin.tracking.mesh_bank import Bank, build_bank
+from twin.tracking.mesh_bank import build_bank
 from twin.tracking.rendered_views import Sample, render_full, render_sketches, render_views
 from twin.tracking.samples import Take, draw
 from twin.tracking.sampling_ranges import DataRanges
@@ -116,44 +111,14 @@ def _samples_in(path: Path) -> int:
     return sum(1 for _ in truths(path))
 
 
-def generate(place: Place, settings: Settings, missing: Sequence[int], workers: int) -> Iterator[int]:
+def generate(place: Place, settings: Settings, missing: Sequence[int], engine: Engine) -> Iterator[int]:
     """Make the missing shards; gives the number of samples as each shard is done."""
-    if workers == 1:
-        bank = build_bank(settings.rig.target, settings.ranges.variants, settings.seed)
-        for number in missing:
-            yield write_shard(place, settings, bank, number)
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start, initargs=(settings, workers)) as pool:
-        try:
-            for done in as_completed([pool.submit(_work, place, settings, number) for number in missing]):
-                yield done.result()
-        finally:
-            pool.shutdown(cancel_futures=True)  # stopped halfway, or one failed: the shards that wait are not begun
+    return results(engine, write_shard, ((place, settings, number) for number in missing))
 
 
-_BANK: dict[str, Bank] = {}  # of a worker process: made once, used by each of its shards
-
-
-def _start(settings: Settings, workers: int) -> None:
-    Thread(target=_end_with_parent, daemon=True).start()
-    dr.set_thread_count(max(dr.thread_count() // workers, 1))
-    _BANK["own"] = build_bank(settings.rig.target, settings.ranges.variants, settings.seed)
-
-
-def _end_with_parent() -> None:
-    """End a worker whose parent was killed; else it would render on until its shard is full."""
-    parent = parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-
-def _work(place: Place, settings: Settings, number: int) -> int:
-    return write_shard(place, settings, _BANK["own"], number)
-
-
-def write_shard(place: Place, settings: Settings, bank: Bank, number: int) -> int:
+def write_shard(place: Place, settings: Settings, number: int) -> int:
     """Render a shard's samples and write them; gives their number."""
+    bank = build_bank(settings.rig.target, settings.ranges.variants, settings.seed)
     samples = settings.shards()[number]
     with atomic.new_file(place.shard(number)) as path, wds.TarWriter(str(path), encoder=False, mtime=0, mode=0o644) as tar:
         for first in range(samples.start, samples.stop, BATCH):

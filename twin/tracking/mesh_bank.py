@@ -5,6 +5,7 @@ A sample picks its variants by their places; nothing is built or torn down betwe
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import drjit as dr
 import mitsuba as mi
@@ -38,8 +39,9 @@ class Bank:
     scene_at: Array
 
 
+@lru_cache(maxsize=4)
 def build_bank(target: Target, variants: int, seed: int) -> Bank:
-    """Make the variants of a data set, by its seed alone."""
+    """Make the variants of a data set, by its seed alone; once in a process."""
     streams = [np.random.default_rng([seed, 1 << 32, kind]) for kind in (0, 1)]
     bodies = [held(streams[0], target) for _ in range(variants)]
     return bank_of(bodies, [surroundings(streams[1]) for _ in range(variants)])

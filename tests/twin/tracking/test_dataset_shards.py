@@ -12,10 +12,10 @@ import pytest
 
 from recon.errors import InputError
 from tests.twin.tracking.takes import ranges, rig
+from twin.engine import Engine
 from twin.shooting import Quality
 from twin.tracking import dataset_shards
 from twin.tracking.dataset_shards import Place, Settings, generate, prepare, write_index
-from twin.tracking.mesh_bank import build_bank
 
 QUALITY = Quality(view=1, patch=2, window=2)
 
@@ -29,7 +29,7 @@ def settings(samples: int = 4, **changes) -> Settings:
 def made(tmp_path_factory):
     """A data set of two shards."""
     place = Place(tmp_path_factory.mktemp("data") / "set")
-    list(generate(place, settings(), prepare(place, settings()), 1))
+    list(generate(place, settings(), prepare(place, settings()), Engine()))
     write_index(place, settings())
     return place
 
@@ -52,14 +52,14 @@ def test_a_killed_run_goes_on_to_the_same_bytes(made, tmp_path, monkeypatch):
     write = dataset_shards.wds.TarWriter.write
     monkeypatch.setattr(dataset_shards.wds.TarWriter, "write", dies)
     with pytest.raises(KeyboardInterrupt):
-        list(generate(place, wanted, prepare(place, wanted), 1))
+        list(generate(place, wanted, prepare(place, wanted), Engine()))
     assert not list(place.folder.glob("*.tar"))
     monkeypatch.undo()
     missing = prepare(place, wanted)
     assert missing == [0, 1]
-    list(generate(place, wanted, missing[1:], 1))
+    list(generate(place, wanted, missing[1:], Engine()))
     assert prepare(place, wanted) == [0]
-    list(generate(place, wanted, [0], 1))
+    list(generate(place, wanted, [0], Engine()))
     for number in (0, 1):
         assert place.shard(number).read_bytes() == made.shard(number).read_bytes()
 
@@ -68,15 +68,17 @@ def test_a_sample_does_not_know_its_batch(made, monkeypatch, tmp_path):
     monkeypatch.setattr(dataset_shards, "BATCH", 1)
     place = Place(tmp_path / "set")
     place.folder.mkdir()
-    bank = build_bank(rig().target, ranges().variants, 5)
-    dataset_shards.write_shard(place, settings(), bank, 1)
+    dataset_shards.write_shard(place, settings(), 1)
     assert place.shard(1).read_bytes() == made.shard(1).read_bytes()
 
 
 @pytest.mark.slow
-def test_two_workers_write_the_same_bytes(made, tmp_path):
+@pytest.mark.parametrize("name", ["local", "dask"])
+def test_two_workers_write_the_same_bytes(made, tmp_path, name):
+    if name == "dask":
+        pytest.importorskip("distributed")
     place = Place(tmp_path / "set")
-    list(generate(place, settings(), prepare(place, settings()), 2))
+    list(generate(place, settings(), prepare(place, settings()), Engine(name=name, workers=2)))
     for number in (0, 1):
         assert place.shard(number).read_bytes() == made.shard(number).read_bytes()
 

@@ -1,0 +1,25 @@
+"""A digest of code, by which results of other code are known."""
+
+import hashlib
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+
+@cache
+def code_digest(*places: str | Path) -> str:
+    """Digest of all Python and YAML files of packages, by their names, and of folders: of the files' names and content."""
+    found = hashlib.sha256()
+    for root in map(_folder, places):
+        for path in sorted(path for path in root.rglob("*") if path.suffix in (".py", ".yaml")):
+            found.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes() + b"\0")
+    return found.hexdigest()[:12]
+
+
+def _folder(place: str | Path) -> Path:
+    if isinstance(place, Path):
+        return place
+    spec = find_spec(place)
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError(f"expected the package {place}, found none", name=place)
+    return Path(spec.origin).parent

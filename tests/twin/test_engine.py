@@ -1,0 +1,165 @@
+"""Tasks are done by any engine to the same results; a worker that dies costs the task that it was at."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from itertools import count, islice
+from pathlib import Path
+
+import pytest
+
+from recon.errors import InputError
+from twin.engine import Engine, results
+
+ENGINES = {
+    "this process": Engine(),
+    "two processes": Engine(workers=2, recycle=3),
+    "dask": Engine(name="dask", workers=2),
+}
+
+
+def square(k: int) -> tuple[int, int]:
+    return k, k * k
+
+
+def pid(_: int) -> int:
+    return os.getpid()
+
+
+def threads(_: int) -> tuple[int, str | None]:
+    import numba
+
+    return numba.config.NUMBA_NUM_THREADS, os.environ.get("OPENBLAS_NUM_THREADS")
+
+
+def dies_once(k: int, folder: str) -> int:
+    """The third task's process is killed, the first time."""
+    mark = Path(folder) / str(k)
+    tried = mark.exists()
+    mark.write_text("begun")
+    if k == 2 and not tried:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return k
+
+
+def dies(k: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def refuses(k: int) -> int:
+    if k == 3:
+        raise InputError("a field: expected this, found that")
+    return k
+
+
+@pytest.fixture(params=ENGINES, scope="module")
+def engine(request) -> Engine:
+    if ENGINES[request.param].name == "dask":
+        pytest.importorskip("distributed")
+    return ENGINES[request.param]
+
+
+def test_every_task_is_done_once(engine):
+    assert sorted(results(engine, square, ((k,) for k in range(20)))) == [(k, k * k) for k in range(20)]
+
+
+def test_no_tasks_are_no_work(engine):
+    assert list(results(engine, square, [])) == []
+
+
+def test_an_error_of_a_task_is_the_callers(engine):
+    with pytest.raises(InputError, match="a field: expected this"):
+        list(results(engine, refuses, ((k,) for k in range(6))))
+
+
+def test_tasks_are_taken_as_they_are_needed(engine):
+    """An endless stream of tasks: some results are given, and few tasks more are taken than those."""
+    taken = []
+    tasks = ((taken.append(k) or k,) for k in count())
+    assert len(list(islice(results(engine, square, tasks), 5))) == 5
+    assert len(taken) <= 5 + 8
+
+
+@pytest.mark.parametrize("name", ["two processes", "dask"])
+def test_a_dead_worker_costs_its_task(tmp_path, name):
+    if name == "dask":
+        pytest.importorskip("distributed")
+    done = list(results(ENGINES[name], dies_once, ((k, str(tmp_path)) for k in range(8))))
+    assert sorted(done) == list(range(8))
+
+
+@pytest.mark.parametrize("name", ["two processes", "dask"])
+def test_a_task_that_kills_its_workers_is_given_up(name):
+    if name == "dask":
+        pytest.importorskip("distributed")
+    few = ENGINES[name].model_copy(update={"retries": 1})
+    with pytest.raises(InputError, match="died 2 times, likely for want of memory"):
+        list(results(few, dies, [(1,)]))
+
+
+def test_processes_are_replaced_after_their_share():
+    used = list(results(Engine(workers=2, recycle=3), pid, ((k,) for k in range(12))))
+    assert len(set(used)) >= 4 and max(used.count(one) for one in used) <= 3 and os.getpid() not in used
+
+
+def test_workers_share_the_cores_and_leave_the_environment_alone():
+    before = dict(os.environ)
+    share = max((os.cpu_count() or 1) // 2, 1)
+    assert set(results(Engine(workers=2), threads, [(1,), (2,)])) == {(share, str(share))}
+    assert dict(os.environ) == before
+
+
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    program = f"""
+import os, time
+from tests.twin.test_engine import sleeps
+from twin.engine import Engine, results
+if __name__ == "__main__":
+    list(results(Engine(workers=2), sleeps, [({str(tmp_path)!r}, k) for k in range(2)]))
+"""
+    script = tmp_path / "program.py"
+    script.write_text(program)
+    root = Path(__file__).resolve().parents[2]
+    parent = subprocess.Popen([sys.executable, str(script)], cwd=root, env={**os.environ, "PYTHONPATH": str(root)})
+    marks = [tmp_path / f"pid{k}" for k in range(2)]
+    wait_until(lambda: all(mark.exists() and mark.read_text() for mark in marks))
+    parent.kill()
+    parent.wait()
+    wait_until(lambda: not any(alive(int(mark.read_text())) for mark in marks))
+
+
+def sleeps(folder: str, k: int) -> None:
+    (Path(folder) / f"pid{k}").write_text(str(os.getpid()))
+    time.sleep(600)
+
+
+def alive(process: int) -> bool:
+    stat = Path(f"/proc/{process}/stat")
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def wait_until(true, seconds: float = 30) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.05)
+
+
+def test_a_scheduler_belongs_to_dask():
+    with pytest.raises(ValueError, match=r"scheduler: expected engine.name=dask with it, found local"):
+        Engine(scheduler="tcp://host:8786")
+
+
+def test_a_scheduler_that_is_not_there_is_named():
+    pytest.importorskip("distributed")
+    import dask
+
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "0.5s"}),
+        pytest.raises(
+            InputError, match=r"engine.scheduler: expected the address of Dask's scheduler, found none at tcp://127.0.0.1:1:"
+        ),
+    ):
+        list(results(Engine(name="dask", scheduler="tcp://127.0.0.1:1"), square, [(1,)]))

@@ -1,0 +1,106 @@
+"""Closed forms of the errors that a rig can't do better than, from its description alone.
+
+Fringe projection: `sigma_phase = sqrt(2 / N) sigma / B`, `sigma_u = pitch / (2 pi) sigma_phase`, and a point's distance from its
+surface by the slope of the projector's column along the camera's ray. Tracking: the Cramer-Rao bound of the pose from the six
+circles' centres. Sources: Greivenkamp 1984; docs/physics-optics.md, docs/tracking.md.
+"""
+
+import numpy as np
+
+from recon.geometry import rigid
+from recon.geometry.camera import Array, Camera
+from recon.geometry.camera_jacobian import linearise
+from recon.geometry.primitives import Plane
+from recon.model import circle_layout
+from recon.model.patterns import Fringes, Patterns
+from recon.model.rig import CameraDevice, ProjectorDevice, Rig, Target
+from twin.sensor import Exposure, noise_dn, number_per_electron
+
+GRID = (9, 7)  # places over camera 1's image, across and down
+STEP_MM = 0.5  # of the central difference along a ray
+EXACT_MM2 = 1e-8  # variance of a length that is known
+WAVE = 4096  # steps of a period, of which the first harmonic is taken
+
+
+def fringes_of(patterns: Patterns) -> Fringes:
+    """The finest fringes along the columns, which measure."""
+    return min(
+        (part for part in patterns.parts if isinstance(part, Fringes) and part.axis == "columns"), key=lambda part: part.pitch
+    )
+
+
+def phase_sigma(steps: int, noise_dn: float, modulation_dn: float) -> float:
+    """Standard deviation of the least-squares phase of N steps, rad."""
+    return float(np.sqrt(2 / steps) * noise_dn / modulation_dn)
+
+
+def contrast(rig: Rig, fringes: Fringes, place: Array) -> float:
+    """Modulation of fringes over their mean brightness, B / A, in camera 1's images of a surface at a place : (3,) mm.
+
+    The first harmonic of the waveform behind the projector's gamma, less what blurs it: both lenses' point spreads and defocus,
+    the mirrors and the camera's pixels, by their variances: `exp(-2 pi^2 s^2 / pitch^2)`. The surface faces the devices.
+    """
+    turn = 2 * np.pi * np.arange(WAVE) / WAVE
+    shown = (np.cos(turn) >= 0).astype(float) if fringes.waveform == "binary" else ((1 + np.cos(turn)) / 2) ** rig.projector.gamma
+    black = 1 / rig.projector.contrast
+    light = black + (1 - black) * shown
+    first = 2 * np.mean(light * np.cos(turn))
+    (of_projector, at), (of_camera, before) = (_blur(device, place) for device in (rig.projector, rig.cam1))
+    variance = of_projector + of_camera * (at / before) ** 2
+    return float(first / light.mean() * np.exp(-2 * np.pi**2 * variance / fringes.pitch**2))
+
+
+def _blur(device: CameraDevice | ProjectorDevice, place: Array) -> tuple[float, float]:
+    """Variance of a device's blur along an axis, its own px^2, at a place, and its px for a mm there.
+
+    Point spread, pixel, and the disc of what is out of focus.
+    """
+    depth = float((device.optics.device_from_world.matrix() @ [*place, 1.0])[2])
+    disc = device.optics.focal_px[0] * device.lens.aperture_mm * abs(1 / depth - 1 / device.lens.focus_mm)
+    return device.lens.blur_px**2 + 1 / 12 + disc**2 / 16, device.optics.focal_px[0] / depth
+
+
+def plane_sigma(rig: Rig, plane: Plane, column_sigma: float) -> float:
+    """RMS distance of a plane's points from it, mm, for a standard deviation of the projector's column, px."""
+    camera, projector = rig.cam1.optics.camera(), rig.projector.optics.camera()
+    return float(column_sigma * np.sqrt(np.mean(np.square(_mm_a_column(camera, projector, plane)))))
+
+
+def _mm_a_column(camera: Camera, projector: Camera, plane: Plane) -> Array:
+    """Distance from a plane, mm, by which a point moves a column of the projector, over what both see of it."""
+    across, down = (np.linspace(0, length - 1, steps) for length, steps in zip(camera.size, GRID, strict=True))
+    rays = camera.rays(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
+    cosine = rays @ plane.normal
+    points = camera.centre + rays * (((plane.point - camera.centre) @ plane.normal) / cosine)[:, None]
+    columns = [projector.project(points + side * STEP_MM * rays) for side in (-1, 0, 1)]
+    seen = ((columns[1] > -0.5) & (columns[1] < np.array(projector.size) - 0.5)).all(axis=1)
+    slope = (columns[2] - columns[0])[:, 0] / (2 * STEP_MM)
+    return (np.abs(cosine) / np.abs(slope))[seen]
+
+
+def brightness_noise(camera: CameraDevice, brightness_dn: float, exposure: Exposure) -> float:
+    """Noise of an image, DN, at a brightness above black."""
+    electrons = np.float32(max(brightness_dn, 0.0) / number_per_electron(camera.sensor, exposure))
+    return float(noise_dn(electrons, camera.sensor, exposure))
+
+
+def pose_covariance(cameras: tuple[Camera, Camera], pose: Array, target: Target, sigma_px: Array) -> Array:
+    """Cramer-Rao bound of a target's pose : (6, 6), rad and mm, as of `rigid.difference`.
+
+    The lengths between the circles are unknown too, but for what the target's tolerance says of them.
+
+    Parameters
+    ----------
+    pose : (4, 4), world_from_target
+    sigma_px : (2, 3), standard deviation of a circle's centre in u and in v, in each camera
+    """
+    circles = circle_layout.circle_centres(target)
+    world = rigid.apply(pose, circles)
+    by_length = np.einsum("ij,njk->nik", pose[:3, :3], circle_layout.BY_LENGTH)
+    slopes = np.concatenate([rigid.slopes(world - pose[:3, 3]), by_length], axis=-1)
+    information = np.zeros((9, 9))
+    information[6:, 6:] = np.linalg.inv(circle_layout.length_covariance(target) + EXACT_MM2 * np.eye(3))
+    for camera, sigmas in zip(cameras, sigma_px, strict=True):
+        seen = linearise(camera, world, ()).by_point @ slopes / sigmas[:, None, None]
+        information += np.einsum("nij,nik->jk", seen, seen)
+    return np.linalg.inv(information)[:6, :6]

@@ -1,0 +1,115 @@
+"""Experiments that studies are made of: from settings and a seed to figures, on any machine the same.
+
+A trial is one run of an experiment. Each experiment reads some of the settings, so a factor among the others is refused, and a
+trial that is kept isn't done anew when these change.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Annotated, Any
+
+from pydantic import Field, field_validator, model_validator
+
+from recon.errors import InputError
+from recon.files.metrics import Metrics
+from recon.model.patterns import Patterns
+from recon.model.rig import Part, Positive, Rig
+from scenes.board_poses import Config as BoardPoses
+from scenes.kinds.board import Config as Board
+from twin.conditions import IDEAL, Conditions
+from twin.optics.light_transport import Tracing
+from twin.optics.surface_session import Shooting
+from twin.shooting import power_of_two
+from twin.studies.layout import Layout
+from twin.tracking.sampling_ranges import DataRanges
+from twin.ultrasound.transducer import Transducer
+
+MODULES = {  # where an experiment's EXPERIMENT is
+    "surface": "twin.studies.surface_trial",
+    "calibration": "twin.studies.calibration_trial",
+    "tracking": "twin.studies.tracking_trial",
+    "laboratory": "twin.studies.laboratory_trial",
+    "probe": "twin.studies.probe_trial",
+}
+
+
+class Film(Part):
+    """Frames of the tracked target."""
+
+    frames: Annotated[int, Field(ge=1, le=10_000)] = 12  # pairs, each in a pose of its own
+    white_dn: Positive = 65.0  # of 255, of the target's paper
+    blur_px: Annotated[float, Field(ge=0, le=100)] = 0.0  # by which the target's middle moves while a frame is exposed
+    rays: Annotated[int, Field(ge=2, le=1024)] = 64  # a pixel, a power of two; few leave noise of rendering
+
+    _power_of_two = field_validator("rays")(power_of_two)
+
+
+class Settings(Part):
+    """All that experiments are made from; as in `conf/study.yaml`."""
+
+    rig: Rig
+    layout: Layout = Layout()
+    patterns: Patterns  # over surfaces
+    board_patterns: Patterns
+    board: Board = Board()
+    poses: BoardPoses = BoardPoses()
+    conditions: Conditions = IDEAL
+    tracing: Tracing = Tracing()
+    shooting: Shooting = Shooting()
+    film: Film = Film()
+    ultrasound: Transducer = Transducer()
+    ranges: DataRanges
+
+    @model_validator(mode="after")
+    def _fit(self) -> "Settings":
+        raster = self.rig.projector.optics.size
+        for name in ("patterns", "board_patterns"):
+            if (shown := getattr(self, name).projector_size) != raster:
+                raise ValueError(f"{name}.projector_size: expected the rig's {list(raster)}, found {list(shown)}")
+        return self
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One kind of trial."""
+
+    reads: tuple[str, ...]  # fields of the settings
+    measure: Callable[[Settings, int], Metrics]  # figures by name, the unit in the name, of settings and a seed
+    limits: Mapping[str, str]  # figures that are plotted first, and the figure that is the closed form of each, or ""
+
+
+def experiment(name: str) -> Experiment:
+    """An experiment by its name."""
+    return import_module(MODULES[name]).EXPERIMENT
+
+
+def check_reads(name: str, fields: Mapping[str, Any]) -> None:
+    """Refuse a factor that an experiment doesn't read; raises InputError with its name."""
+    reads = experiment(name).reads
+    for field in fields:
+        if field.partition(".")[0] not in reads:
+            raise InputError(
+                f"over: {field}: expected a field that of={name} reads, of {', '.join(reads)}; it would change nothing"
+            )
+
+
+def read_by(name: str, settings: Settings) -> dict[str, Any]:
+    """The settings that an experiment reads, as JSON has them."""
+    return settings.model_dump(mode="json", include=set(experiment(name).reads))
+
+
+def digest(name: str, settings: Settings, seed: int, code: str) -> str:
+    """Name of a trial: by all that its figures depend on."""
+    content = json.dumps([code, name, read_by(name, settings), seed], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()[:20]
+
+
+def run_trial(key: str, name: str, settings: Settings, seed: int) -> tuple[str, Metrics | str]:
+    """Run a trial, and give its figures, or in one line why there are none: settings that nothing can be measured with."""
+    try:
+        return key, experiment(name).measure(settings, seed)
+    except ValueError as error:  # InputError too
+        return key, " ".join(str(error).split()) or type(error).__name__

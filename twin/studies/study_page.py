@@ -1,0 +1,79 @@
+"""A study's page: its figures over its factors, and a table."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon.files import atomic
+from recon.files.metrics import shown
+from recon.reports import figures, page
+from recon.reports.page import Opening, Section
+from twin.studies import study_plots, study_runs
+from twin.studies.study_plots import short, words
+from twin.studies.study_runs import ERROR, SEED, Done
+
+PAGE, PICTURES = "report.html", "figures"
+MOST_ROWS = 100  # points of a design in the page's table
+FOOTER = "Range: from the least to the greatest over seeds and the other factors. This file is complete: it fetches nothing."
+
+
+def write(folder: Path, title: str, done: Sequence[Done], limits: Mapping[str, str], commands: Sequence[str]) -> None:
+    """Write `report.html`, and its plots as PNG files.
+
+    Parameters
+    ----------
+    limits : figures to be shown, and the figure that is the closed form of each, or ""
+    commands : that make the same again
+    """
+    table, fields = study_runs.rows(done), list(done[0].trial.point)
+    (folder / PICTURES).mkdir(exist_ok=True)
+    sections = []
+    for figure, limit in limits.items():
+        drawings = [_drawn(folder, table, figure, field, fields, limit) for field in fields]
+        if drawings:
+            sections.append(Section(words(figure), [page.grid(drawings, "two")]))
+    failed = [row for row in table if row[ERROR] is not None]
+    head = [*map(words, fields), "trials", *map(words, limits)]
+    sections.append(Section("All points", [page.table(head, _points(table, fields, limits), "Medians over seeds.")]))
+    if failed:
+        reasons = dict.fromkeys(f"{_at(row, fields)}: {row[ERROR]}" for row in failed)
+        sections.append(Section("Points without figures", [page.notices(reasons)]))
+    pandas = f"python -c \"import pandas; print(pandas.read_parquet('{folder / study_runs.TABLE}'))\""
+    sections.append(Section("Again, and the table in pandas", [page.commands([*commands, pandas])]))
+    counted = [("trials", page.count(len(table)), ""), ("points", page.count(len(_distinct_points(table, fields))), "")]
+    result = f"{len(table) - len(failed)} of {len(table)} trials gave figures."
+    with atomic.new_file(folder / PAGE) as path:
+        path.write_text(page.render(Opening("study", title, result, counted), sections, FOOTER), encoding="utf-8")
+
+
+def _drawn(folder: Path, table: study_plots.Table, figure: str, field: str, fields: Sequence[str], limit: str) -> str:
+    """A plot for the page, kept as a PNG file too."""
+    drawn = study_plots.draw(table, figure, field, fields, limit)
+    name = f"{figure}_over_{re.sub(r'[^A-Za-z0-9]+', '_', field)}.png"
+    with atomic.new_file(folder / PICTURES / name) as path:
+        drawn.savefig(path, dpi=160, metadata={"Software": None})
+    return page.drawing(figures.inline_svg(drawn), f"{words(figure)} over {field}", f"{PICTURES}/{name}")
+
+
+def _points(table: study_plots.Table, fields: Sequence[str], limits: Mapping[str, str]) -> Iterator[list[str]]:
+    """A row a point of the design: its values, its trials, and medians of the figures beside their closed forms."""
+    for point in _distinct_points(table, fields)[:MOST_ROWS]:
+        alike = [row for row in table if tuple(row[field] for field in fields) == point]
+        cells = [_median(alike, figure) + (f" ({_median(alike, limit)})" if limit else "") for figure, limit in limits.items()]
+        yield [*(short(value) for value in point), str(len(alike)), *cells]
+
+
+def _median(rows: study_plots.Table, figure: str) -> str:
+    known = study_plots.finite(row.get(figure) for row in rows)
+    return shown(float(np.median(known)) if known.size else np.nan, ".4g")
+
+
+def _distinct_points(table: study_plots.Table, fields: Sequence[str]) -> list[tuple[Any, ...]]:
+    return list(dict.fromkeys(tuple(row[field] for field in fields) for row in table))
+
+
+def _at(row: Mapping[str, Any], fields: Sequence[str]) -> str:
+    return ", ".join([*(f"{field}={short(row[field])}" for field in fields), f"seed={row[SEED]}"])

@@ -1,0 +1,139 @@
+"""Trials of a study in its folder: each is kept as it is done, so that a study that was stopped, or grows, goes on.
+
+`OUT/study.json` describes the study and is the folder's mark, `OUT/trials/KEY.json` holds a trial's figures by a digest of all
+that they depend on, and `OUT/table.parquet` has a row a trial.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from recon.files import atomic
+from recon.files.metrics import Metrics
+from twin.engine import Engine, results
+from twin.studies import experiments
+from twin.studies.experiments import Settings
+from twin.studies.factors import Point
+
+STUDY, TABLE, TRIALS = "study.json", "table.parquet", "trials"
+ERROR = "error"  # of a trial: in one line why it has no figures
+SEED = "seed"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One run of an experiment."""
+
+    key: str
+    point: Point  # of the design: values of its factors
+    seed: int
+    settings: Settings
+
+
+@dataclass(frozen=True)
+class Done:
+    """A trial and its figures, or why there are none."""
+
+    trial: Trial
+    found: Metrics | str
+
+    @property
+    def figures(self) -> Metrics:
+        """Figures by name; none of a trial that failed."""
+        return {} if isinstance(self.found, str) else self.found
+
+
+@dataclass(frozen=True)
+class StudyFolder:
+    """The folder of one study."""
+
+    folder: Path
+
+    def open(self, description: Mapping[str, Any]) -> None:
+        """Begin or go on with a study; raises InputError if the folder holds something else."""
+        atomic.check_folder(self.folder, STUDY)
+        (self.folder / TRIALS).mkdir(parents=True, exist_ok=True)
+        with atomic.new_file(self.folder / STUDY) as path:
+            path.write_text(json.dumps(description, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+    def kept(self, trial: Trial) -> Done | None:
+        """A trial that was done before, if it is whole."""
+        path = self._path(trial.key)
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if ERROR in content:
+                return Done(trial, str(content[ERROR]))
+            return Done(trial, {name: math.nan if value is None else value for name, value in content["figures"].items()})
+        except (OSError, ValueError, KeyError, AttributeError):  # none, or damaged: done again
+            return None
+
+    def keep(self, done: Done) -> None:
+        """Keep a trial's figures."""
+        figures = {name: value if math.isfinite(value) else None for name, value in done.figures.items()}
+        content = {ERROR: done.found} if isinstance(done.found, str) else {"figures": figures}
+        with atomic.new_file(self._path(done.trial.key)) as path:
+            path.write_text(json.dumps(content) + "\n", encoding="utf-8")
+
+    def write_table(self, done: Sequence[Done]) -> None:
+        """Write a row a trial: its factors, its seed, its figures, and the error of one that has none."""
+        with atomic.new_file(self.folder / TABLE) as path:
+            pq.write_table(pa.Table.from_pylist(rows(done)), path)
+
+    def _path(self, key: str) -> Path:
+        return self.folder / TRIALS / f"{key}.json"
+
+
+def plan(name: str, points: Sequence[tuple[Point, Settings]], seeds: Sequence[int], code: str) -> list[Trial]:
+    """Trials of all points : (values, settings with these) and seeds, in order."""
+    return [
+        Trial(experiments.digest(name, changed, seed, code), point, seed, changed) for point, changed in points for seed in seeds
+    ]
+
+
+def run(folder: StudyFolder, name: str, trials: Sequence[Trial], engine: Engine) -> Iterator[Done]:
+    """Do the trials that aren't kept, and give all of them as they are done."""
+    missing: dict[str, list[Trial]] = {}
+    for trial in trials:
+        if (done := folder.kept(trial)) is not None:
+            yield done
+        else:
+            missing.setdefault(trial.key, []).append(trial)  # alike where a factor changes nothing
+    tasks = ((key, name, alike[0].settings, alike[0].seed) for key, alike in missing.items())
+    for key, found in results(engine, experiments.run_trial, tasks):
+        for k, trial in enumerate(missing[key]):
+            if k == 0:
+                folder.keep(Done(trial, found))
+            yield Done(trial, found)
+
+
+def in_order(trials: Sequence[Trial], done: Sequence[Done]) -> list[Done]:
+    """Trials that are done, in the order of their plan."""
+    place = {id(trial): k for k, trial in enumerate(trials)}
+    return sorted(done, key=lambda one: place[id(one.trial)])
+
+
+def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
+    """A table's rows, all with the same columns."""
+    figures = list(dict.fromkeys(name for one in done for name in one.figures))
+    return [
+        {
+            **{field: cell(value) for field, value in one.trial.point.items()},
+            SEED: one.trial.seed,
+            **{name: float(one.figures.get(name, math.nan)) for name in figures},
+            ERROR: one.found if isinstance(one.found, str) else None,
+        }
+        for one in done
+    ]
+
+
+def cell(value: Any) -> Any:
+    """A factor's value as a column holds it: numbers and words as they are, all else as JSON."""
+    if isinstance(value, bool | str) or value is None:
+        return value
+    return float(value) if isinstance(value, int | float) else json.dumps(value)

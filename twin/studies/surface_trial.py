@@ -1,0 +1,54 @@
+"""A plane by fringe projection, with the true calibration: what patterns, light and layout come to, beside the closed form."""
+
+import numpy as np
+
+from recon.files.metrics import Metrics
+from recon.geometry.primitives import Plane
+from recon.model.rig import Rig
+from scenes.kinds import plane
+from twin.accuracy import surface_accuracy
+from twin.accuracy.surface_accuracy import Experiment as Surface
+from twin.conditions import drifted
+from twin.studies import closed_forms
+from twin.studies.experiments import Experiment, Settings
+from twin.studies.layout import laid_out
+
+
+def measure(settings: Settings, seed: int) -> Metrics:
+    """Figures of one of the paper's planes, in turn by the seed."""
+    rig = drifted(laid_out(settings.rig, settings.layout), settings.conditions.drift, seed)
+    scene = plane.build(plane.PAPER_POSES[seed % len(plane.PAPER_POSES)])
+    result = surface_accuracy.experiment(
+        rig, scene, settings.patterns, seed, settings.tracing, settings.shooting, settings.conditions
+    )
+    seen, exposure = result.metrics, result.view.exposure
+    brightness = float(np.median(result.found.offset[result.comparison.interior])) - rig.cam1.sensor.black_level_dn
+    return {
+        "plane_rms_mm": seen["plane_plate_rms_mm"],
+        "plane_limit_mm": closed_form(rig, settings, result, brightness),
+        "noise_limit_mm": seen["limit_rms_mm"],
+        "predicted_rms_mm": seen["predicted_rms_mm"],
+        "error_over_sigma": seen["z_std"],
+        "coverage": seen["coverage"],
+        "gross_error_fraction": seen["gross_error_fraction"],
+        "brightness_dn": brightness,
+        "modulation_dn": float(np.median(result.found.modulation[result.comparison.interior])),
+        "images": settings.patterns.count,
+        "exposure_s": exposure.time_s,
+        "images_s": settings.patterns.count * exposure.time_s,
+    }
+
+
+def closed_form(rig: Rig, settings: Settings, result: Surface, brightness_dn: float) -> float:
+    """RMS distance from the plane that noise leaves, mm, by formulas, from the brightness that the camera's meter shows."""
+    fringes = closed_forms.fringes_of(settings.patterns)
+    (flat,) = (shape for shape in result.truth.shapes if isinstance(shape, Plane))
+    modulation = brightness_dn * closed_forms.contrast(rig, fringes, flat.point)
+    noise = closed_forms.brightness_noise(rig.cam1, brightness_dn, result.view.exposure)
+    sigma = fringes.pitch / (2 * np.pi) * closed_forms.phase_sigma(fringes.steps, noise, modulation)
+    return closed_forms.plane_sigma(rig, flat, sigma)
+
+
+EXPERIMENT = Experiment(
+    ("rig", "layout", "patterns", "conditions", "tracing", "shooting"), measure, {"plane_rms_mm": "plane_limit_mm"}
+)

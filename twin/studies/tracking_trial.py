@@ -1,0 +1,59 @@
+"""Poses of the target from pairs of frames, beside the Cramer-Rao bound of its circles' centres."""
+
+import numpy as np
+
+from recon.files.metrics import Metrics
+from recon.geometry.camera import Array
+from recon.model.rig import Target
+from recon.tracking import networks
+from twin.accuracy import tracking_frames
+from twin.accuracy.pose_accuracy import cameras_of, located
+from twin.accuracy.table_rows import Setup
+from twin.studies import closed_forms
+from twin.studies.experiments import Experiment, Settings
+from twin.studies.layout import laid_out
+from twin.tracking.samples import Take
+
+
+def measure(settings: Settings, seed: int) -> Metrics:
+    """Figures of some frames, each tracked as if nothing were known before."""
+    rig, film = laid_out(settings.rig, settings.layout), settings.film
+    setup = Setup(rig, {}, frames=settings.ranges)
+    shown = tracking_frames.study(setup, seed, film.frames, film.white_dn, film.blur_px, film.rays)
+    known = networks.load()
+    takes, errors = [], []
+    for take, frames in shown:
+        takes.append(take)
+        errors.append(located(take, frames, rig.target, known))
+    shift, turn, misfit = (np.array([getattr(one, name) for one in errors]) for name in ("shift_mm", "turn_deg", "misfit"))
+    bounds = np.stack([bound(take, one.limit_px, rig.target) for take, one in zip(takes, errors, strict=True)])
+    found = np.isfinite(shift)
+    return {
+        "translation_rms_mm": _rms(shift[found]),
+        "translation_limit_mm": _rms(bounds[found, 1]),
+        "rotation_rms_deg": _rms(turn[found]),
+        "rotation_limit_deg": _rms(bounds[found, 0]),
+        "centre_rms_px": _rms(np.concatenate([one.centre_px for one in errors])[np.repeat(found, 6)]),
+        "centre_limit_px": _rms(np.concatenate([one.limit_px for one in errors])[np.repeat(found, 6)]),
+        "error_over_sigma": _rms(np.sqrt(misfit[found] / 6)),
+        "found": float(found.mean()),
+    }
+
+
+def bound(take: Take, limit_px: Array, target: Target) -> tuple[float, float]:
+    """Bound of a take's pose: RMS of its turn, deg, and of its shift, mm, by the limit of its centres : (6,) px."""
+    sigma = limit_px.reshape(2, 3) / np.sqrt(2)
+    covariance = closed_forms.pose_covariance(cameras_of(take), take.motion.world_from_target, target, sigma)
+    turn, shift = np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
+    return float(np.rad2deg(np.sqrt(turn))), float(np.sqrt(shift))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values.size else np.nan
+
+
+EXPERIMENT = Experiment(
+    ("rig", "layout", "film", "ranges"),
+    measure,
+    {"translation_rms_mm": "translation_limit_mm", "rotation_rms_deg": "rotation_limit_deg"},
+)
