@@ -37,27 +37,46 @@ def phase_sigma(steps: int, noise_dn: float, modulation_dn: float) -> float:
 def contrast(rig: Rig, fringes: Fringes, place: Array) -> float:
     """Modulation of fringes over their mean brightness, B / A, in camera 1's images of a surface at a place : (3,) mm.
 
-    The first harmonic of the waveform behind the projector's gamma, less what blurs it: both lenses' point spreads and defocus,
-    the mirrors and the camera's pixels, by their variances: `exp(-2 pi^2 s^2 / pitch^2)`. The surface faces the devices.
+    The first harmonic of the waveform behind the projector's gamma, less what blurs it: the mirrors, and by their variances both
+    lenses' point spreads and defocus and the camera's pixels: `sinc(1 / pitch) exp(-2 pi^2 s^2 / pitch^2)`. The surface faces
+    the devices.
     """
     turn = 2 * np.pi * np.arange(WAVE) / WAVE
     shown = (np.cos(turn) >= 0).astype(float) if fringes.waveform == "binary" else ((1 + np.cos(turn)) / 2) ** rig.projector.gamma
     black = 1 / rig.projector.contrast
     light = black + (1 - black) * shown
     first = 2 * np.mean(light * np.cos(turn))
-    (of_projector, at), (of_camera, before) = (_blur(device, place) for device in (rig.projector, rig.cam1))
-    variance = of_projector + of_camera * (at / before) ** 2
-    return float(first / light.mean() * np.exp(-2 * np.pi**2 * variance / fringes.pitch**2))
+    mirrors = np.sinc(1 / fringes.pitch)
+    return float(first / light.mean() * mirrors * np.exp(-2 * np.pi**2 * _blur(rig, place) / fringes.pitch**2))
 
 
-def _blur(device: CameraDevice | ProjectorDevice, place: Array) -> tuple[float, float]:
-    """Variance of a device's blur along an axis, its own px^2, at a place, and its px for a mm there.
+def raster_sigma(rig: Rig, fringes: Fringes, place: Array) -> float:
+    """RMS error of the phase, rad, that the projector's mirrors leave: replicas of the fringes at 1 -+ 1 / pitch cycles a px.
 
-    Point spread, pixel, and the disc of what is out of focus.
+    Sampling makes them as strong as the fringes; a mirror's width, sinc(f), and all blur weaken them. Their phase moves with the
+    shifts, one backwards, so that no number of steps takes them out.
+    """
+    wave, amplitudes = 1 / fringes.pitch, []
+    for replica in (1 - wave, 1 + wave):
+        blurred = np.exp(-2 * np.pi**2 * _blur(rig, place) * (replica**2 - wave**2))
+        amplitudes.append(np.sinc(replica) / np.sinc(wave) * blurred)
+    return float(np.linalg.norm(amplitudes) / np.sqrt(2))
+
+
+def _blur(rig: Rig, place: Array) -> float:
+    """Variance of all blur but the mirrors' own width, projector px^2, of a surface at a place that faces the devices."""
+    (of_projector, at), (of_camera, before) = (_lens_blur(device, place) for device in (rig.projector, rig.cam1))
+    return of_projector + (of_camera + 1 / 12) * (at / before) ** 2
+
+
+def _lens_blur(device: CameraDevice | ProjectorDevice, place: Array) -> tuple[float, float]:
+    """Variance of a lens's blur along an axis, its own px^2, at a place, and its px for a mm there.
+
+    Point spread, and the disc of what is out of focus.
     """
     depth = float((device.optics.device_from_world.matrix() @ [*place, 1.0])[2])
     disc = device.optics.focal_px[0] * device.lens.aperture_mm * abs(1 / depth - 1 / device.lens.focus_mm)
-    return device.lens.blur_px**2 + 1 / 12 + disc**2 / 16, device.optics.focal_px[0] / depth
+    return device.lens.blur_px**2 + disc**2 / 16, device.optics.focal_px[0] / depth
 
 
 def plane_sigma(rig: Rig, plane: Plane, column_sigma: float) -> float:

@@ -15,11 +15,13 @@ from twin.studies.layout import laid_out
 
 
 def measure(settings: Settings, seed: int) -> Metrics:
-    """Figures of one of the paper's planes, in turn by the seed."""
+    """Figures of a plane, tilted as one of the paper's, in turn by the seed."""
     rig = drifted(laid_out(settings.rig, settings.layout), settings.conditions.drift, seed)
-    scene = plane.build(plane.PAPER_POSES[seed % len(plane.PAPER_POSES)])
+    pose = plane.PAPER_POSES[seed % len(plane.PAPER_POSES)]
+    if settings.plane.depth_mm is not None:
+        pose = pose.model_copy(update={"centre_mm": (*pose.centre_mm[:2], settings.plane.depth_mm)})
     result = surface_accuracy.experiment(
-        rig, scene, settings.patterns, seed, settings.tracing, settings.shooting, settings.conditions
+        rig, plane.build(pose), settings.patterns, seed, settings.tracing, settings.shooting, settings.conditions
     )
     seen, exposure = result.metrics, result.view.exposure
     brightness = float(np.median(result.found.offset[result.comparison.interior])) - rig.cam1.sensor.black_level_dn
@@ -40,15 +42,15 @@ def measure(settings: Settings, seed: int) -> Metrics:
 
 
 def closed_form(rig: Rig, settings: Settings, result: Surface, brightness_dn: float) -> float:
-    """RMS distance from the plane that noise leaves, mm, by formulas, from the brightness that the camera's meter shows."""
+    """RMS distance from the plane that noise and mirrors leave, mm, by formulas, from the brightness that a meter shows."""
     fringes = closed_forms.fringes_of(settings.patterns)
     (flat,) = (shape for shape in result.truth.shapes if isinstance(shape, Plane))
     modulation = brightness_dn * closed_forms.contrast(rig, fringes, flat.point)
     noise = closed_forms.brightness_noise(rig.cam1, brightness_dn, result.view.exposure)
-    sigma = fringes.pitch / (2 * np.pi) * closed_forms.phase_sigma(fringes.steps, noise, modulation)
-    return closed_forms.plane_sigma(rig, flat, sigma)
+    phase = closed_forms.phase_sigma(fringes.steps, noise, modulation), closed_forms.raster_sigma(rig, fringes, flat.point)
+    return closed_forms.plane_sigma(rig, flat, fringes.pitch / (2 * np.pi) * float(np.hypot(*phase)))
 
 
 EXPERIMENT = Experiment(
-    ("rig", "layout", "patterns", "conditions", "tracing", "shooting"), measure, {"plane_rms_mm": "plane_limit_mm"}
+    ("rig", "layout", "patterns", "plane", "conditions", "tracing", "shooting"), measure, {"plane_rms_mm": "plane_limit_mm"}
 )

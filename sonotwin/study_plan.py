@@ -1,0 +1,99 @@
+"""A study's plan: what conf/study says, what is given beside it, and the settings of each trial."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import Field, ValidationError
+
+from recon.capture.manifest import validated
+from recon.errors import InputError, one_line
+from recon.files.code_digest import code_digest
+from recon.files.regular import read_bytes
+from recon.model.rig import Part
+from sonotwin.config import folder
+from twin.studies import experiments, factors, study_runs
+from twin.studies.experiments import Settings
+from twin.studies.factors import Point
+from twin.studies.rig_search import Goal
+from twin.studies.study_runs import Trial
+
+SWEEP = "sweep"  # the study that conf/study doesn't have: all of it is given
+CODE = ("recon", "scenes", "twin")  # packages by whose code figures are made
+GROUPS = {  # fields that are choices of a group of conf/
+    **{name: name for name in ("rig", "patterns", "poses", "conditions", "tracing", "ultrasound")},
+    "board_patterns": "patterns",
+}
+
+Seeds = Annotated[int, Field(ge=1, le=10_000)]
+Points = Annotated[int, Field(ge=1, le=1_000_000)]
+
+
+class Study(Part):
+    """A study of conf/study."""
+
+    title: str
+    of: str
+    over: dict[str, Any]
+    seeds: Seeds = 3
+    points: Points | None = None
+    search: Goal | None = None
+    fields: tuple[str, ...] = ()  # of conf/study.yaml, as on the command line
+
+
+def read_study(name: str) -> Study | None:
+    """Read a study by its name in conf/study or from a YAML file; None for a sweep, which has none.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it is not YAML, or a field is wrong.
+    """
+    if name == SWEEP:
+        return None
+    known = folder() / "study" / f"{name}.yaml"
+    path = known if known.is_file() else Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        names = sorted(each.stem for each in known.parent.glob("*.yaml"))
+        raise InputError(f"study: name: expected {SWEEP}, one of {', '.join(names)}, or a YAML file, found {name}")
+    return validated(Study, read_yaml(path), path)
+
+
+def read_yaml(path: Path) -> Any:
+    """Content of a YAML file; raises InputError if it is none."""
+    try:
+        return yaml.safe_load(read_bytes(path))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected YAML, found {' '.join(str(error).split())}") from None
+
+
+def trials(of: str, settings: Settings, points: Iterable[Point], seeds: Iterable[int]) -> list[Trial]:
+    """Trials of all points and seeds, in order, with settings that are valid.
+
+    Raises
+    ------
+    InputError
+        If a field isn't one of the experiment's, or a value is nonsense.
+    """
+    points, base = list(points), settings.model_dump(mode="json")
+    experiments.check_reads(of, {name for point in points for names in point for name in names.split(factors.JOINT)})
+    return study_runs.plan(of, [(point, changed(base, point)) for point in points], list(seeds), code_digest(*CODE))
+
+
+def changed(base: Mapping[str, Any], point: Point) -> Settings:
+    """Settings with a point's values; raises InputError that names the field of one that is nonsense."""
+    chosen = {name: choice(name, value) if name in GROUPS and isinstance(value, str) else value for name, value in point.items()}
+    try:
+        return Settings.model_validate(factors.applied(base, chosen))
+    except ValidationError as error:
+        raise InputError(f"over: {', '.join(f'{name}={value}' for name, value in point.items())}: {one_line(error)}") from None
+
+
+def choice(name: str, value: str) -> Any:
+    """Content of a group's choice, such as `lifelike` of conditions."""
+    path = folder() / GROUPS[name] / f"{value}.yaml"
+    if not path.is_file():
+        names = ", ".join(sorted(each.stem for each in path.parent.glob("*.yaml")))
+        raise InputError(f"over: {name}: expected one of {names}, found {value}")
+    return yaml.safe_load(path.read_text(encoding="utf-8"))

@@ -1,0 +1,180 @@
+"""Search for the settings that make a figure least, under bounds of other figures and of the price, by Optuna.
+
+Candidates come in batches of a fixed size and are told of in order, so a search is the same whatever the engine; one that was
+stopped goes on by its kept trials.
+"""
+
+import itertools
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Annotated, Any, Literal
+
+import optuna
+from pydantic import Field
+
+from recon.errors import InputError
+from recon.model.rig import Part
+from twin.studies.factors import Choices, Factor, Normal, Point, Range
+from twin.studies.study_plots import finite, numeric
+from twin.studies.study_runs import Done
+
+PRICE = "price"
+
+
+class Bound(Part):
+    """What is asked of a figure."""
+
+    least: float | None = None
+    most: float | None = None
+
+    def excess(self, value: float) -> float:
+        """How far a value is out of bounds, relative to them; 0 or less within."""
+        over = [(value - self.most) / (abs(self.most) or 1)] if self.most is not None else []
+        under = [(self.least - value) / (abs(self.least) or 1)] if self.least is not None else []
+        return max([*over, *under, -math.inf])
+
+
+class Goal(Part):
+    """What is searched for."""
+
+    least: str  # figure to be least: its mean over seeds, in the worst of `each`
+    runs: Annotated[int, Field(ge=1, le=100_000)] = 24  # candidates
+    batch: Annotated[int, Field(ge=1, le=1000)] = 4  # that are chosen at once, and can be tried at the same time
+    by: Literal["gp", "tpe"] = "gp"  # Gaussian process, which needs PyTorch, or Parzen estimators, which need thrice the runs
+    start: Point = Field(default_factory=dict)  # the first candidate: the rig as it is; a value for each field of over, or none
+    each: dict[str, list[Any]] = Field(default_factory=dict)  # fields and values that a candidate is tried under, such as depths
+    bounds: dict[str, Bound] = Field(default_factory=dict)  # of figures, and of `price`
+    prices: dict[str, list[float]] = Field(default_factory=dict)  # of each value in a factor's list
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Settings that were tried."""
+
+    point: Point
+    done: tuple[Done, ...]
+    value: float  # of the figure to be least; NaN if a trial gave none
+    figures: Mapping[str, float]  # means over seeds, in the worst of each: the greatest, or the least where that is bound
+    excess: float  # by which bounds are missed, relative to them; 0 or less if none is
+
+    @property
+    def good(self) -> bool:
+        """Whether it has figures and keeps all bounds."""
+        return math.isfinite(self.value) and self.excess <= 0
+
+
+def check(goal: Goal, factors: Mapping[str, Factor]) -> None:
+    """Refuse a search that can't be made; raises InputError."""
+    for name, factor in factors.items():
+        if isinstance(factor, Normal):
+            raise InputError(f"over: {name}: expected values or a range to search in, found a distribution")
+    if goal.start and set(goal.start) != set(factors):
+        raise InputError(f"search: start: expected a value for each of {', '.join(factors)}, found {', '.join(goal.start)}")
+    for name, value in goal.start.items():
+        factor = factors[name]
+        if isinstance(factor, Choices) and value not in factor.choices:
+            raise InputError(f"search: start.{name}: expected one of {factor.choices}, found {value}")
+    if goal.by == "gp" and find_spec("torch") is None:
+        raise InputError("search: by: gp needs PyTorch, of sonotwin's extra train, found none; install it, or take search.by=tpe")
+    for name, prices in goal.prices.items():
+        factor = factors.get(name)
+        count = len(factor.choices) if isinstance(factor, Choices) else 0
+        if count != len(prices):
+            raise InputError(f"search: prices.{name}: expected one for each of the {count} values in over, found {len(prices)}")
+
+
+def conditions(goal: Goal) -> list[Point]:
+    """All combinations of what a candidate is tried under."""
+    return [dict(zip(goal.each, values, strict=True)) for values in itertools.product(*goal.each.values())]
+
+
+def search(
+    goal: Goal,
+    factors: Mapping[str, Factor],
+    seed: int,
+    attempt: Callable[[Sequence[Point]], Sequence[Sequence[Done]]],
+) -> Iterator[Candidate]:
+    """Try candidates, and give them in order.
+
+    Parameters
+    ----------
+    attempt : does all trials of some points, and gives them point by point
+    """
+    study = optuna.create_study(sampler=_sampler(goal, seed))
+    if goal.start:
+        study.enqueue_trial({name: _as_parameter(factors[name], value) for name, value in goal.start.items()})
+    for first in range(0, goal.runs, goal.batch):
+        asked = [study.ask() for _ in range(min(goal.batch, goal.runs - first))]
+        points = [{name: _suggested(trial, name, factor) for name, factor in factors.items()} for trial in asked]
+        for trial, point, done in zip(asked, points, attempt(points), strict=True):
+            candidate = judged(goal, factors, point, done)
+            if math.isfinite(candidate.excess):
+                trial.set_constraint("bounds", candidate.excess)
+            if math.isfinite(candidate.value):
+                study.tell(trial, candidate.value)
+            else:
+                study.tell(trial, state=optuna.trial.TrialState.FAIL)
+            yield candidate
+
+
+def _sampler(goal: Goal, seed: int) -> optuna.samplers.BaseSampler:
+    """How the next candidates are chosen."""
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    with warnings.catch_warnings(action="ignore", category=optuna.exceptions.ExperimentalWarning):
+        if goal.by == "gp":
+            return optuna.samplers.GPSampler(seed=seed, n_startup_trials=2 * goal.batch)
+        return optuna.samplers.TPESampler(seed=seed, multivariate=True, n_startup_trials=3 * goal.batch, n_ei_candidates=100)
+
+
+def judged(goal: Goal, factors: Mapping[str, Factor], point: Point, done: Sequence[Done]) -> Candidate:
+    """A candidate by its trials."""
+    names = list(dict.fromkeys(name for one in done for name in one.figures))
+    figures = {PRICE: price(goal, factors, point)} if goal.prices else {}
+    for name in names:
+        under = [finite(one.figures.get(name) for one in done if within(one, some)) for some in conditions(goal)]
+        means = [float(values.mean()) if values.size else math.nan for values in under]
+        bound = goal.bounds.get(name)
+        figures[name] = min(means) if bound is not None and bound.most is None else max(means)
+    failed = any(isinstance(one.found, str) for one in done)
+    excess = max((bound.excess(figures.get(name, math.nan)) for name, bound in goal.bounds.items()), default=-math.inf)
+    return Candidate(point, tuple(done), math.nan if failed else figures.get(goal.least, math.nan), figures, excess)
+
+
+def within(done: Done, some: Point) -> bool:
+    """Whether a trial was done under some conditions."""
+    return all(done.trial.point.get(name) == value for name, value in some.items())
+
+
+def price(goal: Goal, factors: Mapping[str, Factor], point: Point) -> float:
+    """Sum of the prices of a point's values."""
+    total = 0.0
+    for name, prices in goal.prices.items():
+        factor = factors[name]
+        assert isinstance(factor, Choices)
+        total += prices[factor.choices.index(point[name])]
+    return total
+
+
+def best(candidates: Sequence[Candidate]) -> Candidate | None:
+    """The best candidate that keeps all bounds, if one does."""
+    return min((one for one in candidates if one.good), key=lambda one: one.value, default=None)
+
+
+def _suggested(trial: optuna.Trial, name: str, factor: Factor) -> Any:
+    """A value that Optuna suggests: numbers of a list by their place, so that neighbours count as alike."""
+    if isinstance(factor, Range):
+        return trial.suggest_float(name, factor.first, factor.last, log=factor.log)
+    assert isinstance(factor, Choices)
+    if numeric(factor.choices):
+        return sorted(factor.choices)[trial.suggest_int(name, 0, len(factor.choices) - 1)]
+    return factor.choices[trial.suggest_categorical(name, list(range(len(factor.choices))))]
+
+
+def _as_parameter(factor: Factor, value: Any) -> Any:
+    """What Optuna has for a value."""
+    if isinstance(factor, Choices):
+        return (sorted(factor.choices) if numeric(factor.choices) else factor.choices).index(value)
+    return value
