@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 from recon.optical_calibration import figures_of_merit
 from recon.optical_calibration.joint_calibration import calibrate
@@ -44,7 +45,9 @@ class Laboratory:
     squared: float  # error of our calibration's parameters over its expectation, a parameter
     ours: Measured
     paper: Measured
-    paper_px: Mapping[str, float]  # device: reprojection RMS by the paper's method
+    ours_px: Mapping[str, float]  # device: reprojection RMS
+    paper_px: Mapping[str, float]
+    limit_mm: tuple[float, float]  # RMS of plane and sphere that the sensor's noise leaves
 
 
 def measurements(setup: Setup) -> list[Measurement]:
@@ -60,7 +63,8 @@ def measurements(setup: Setup) -> list[Measurement]:
 
 def rows(setup: Setup) -> list[Row]:
     """Rows g and h: planes and a sphere by both methods, and the reprojection by the paper's."""
-    found = [laboratory(setup, seed) for seed in SEEDS]
+    patterns = setup.sequences["paper_surface"]
+    found = [laboratory(session(setup, seed), patterns) for seed in SEEDS]
     ours, paper = ([getattr(one, name) for one in found] for name in ("ours", "paper"))
     what = f"{len(found)} laboratories, {COUNT} poses"
     squared = float(np.mean([one.squared for one in found]))
@@ -83,17 +87,22 @@ def rows(setup: Setup) -> list[Row]:
     return rows
 
 
-def laboratory(setup: Setup, seed: int) -> Laboratory:
-    """Render a board, a plane and a sphere under the conditions of one seed, and measure them by both methods."""
-    seen = rendered(session(setup, seed))
+def laboratory(session: board_session.Settings, patterns: Patterns) -> Laboratory:
+    """Render a board, a plane and a sphere in one laboratory, and measure them by both methods.
+
+    session : the board, with the seed and the conditions of all
+    patterns : over plane and sphere
+    """
+    seen = rendered(session)
     observations = (result := calibrate(seen.sightings, seen.board, seen.sizes)).observations
     pair = opencv_peer.stereo(observations, "projector", np.zeros_like(observations.pixels))
-    shots = shoot(setup, seed)
+    shots = shoot(session, patterns)
     reprojected = {name: opencv_peer.reprojection_rms(observations, name) for name in PAPER_PX}
     ours = result.adjustment.calibration
     squared = figures_of_merit.normalised_error(ours, seen.truth) ** 2
-    flat, ball = (as_published(shot, setup.sequences["paper_surface"]) for shot in shots)
-    return Laboratory(squared, measured(shots, ours), measured((flat, ball), pair), reprojected)
+    flat, ball = (as_published(shot, patterns) for shot in shots)
+    limits = shots[0].metrics["plane_plate_limit_rms_mm"], shots[1].metrics["sphere_sphere_limit_rms_mm"]
+    return Laboratory(squared, measured(shots, ours), measured((flat, ball), pair), result.rms, reprojected, limits)
 
 
 def session(setup: Setup, seed: int) -> board_session.Settings:
@@ -111,12 +120,14 @@ def session(setup: Setup, seed: int) -> board_session.Settings:
     )
 
 
-def shoot(setup: Setup, seed: int) -> tuple[Experiment, Experiment]:
+def shoot(session: board_session.Settings, patterns: Patterns) -> tuple[Experiment, Experiment]:
     """A plane and a sphere, rendered by devices that have drifted since they were calibrated, and decoded."""
+    seed, life = session.seed, session.conditions
     scenes = plane.build(plane.PAPER_POSES[seed % len(plane.PAPER_POSES)]), build_scene({"kind": "sphere"})
-    patterns, life = setup.sequences["paper_surface"], conditions_of(setup)
-    rig = drifted(setup.rig, life.drift, seed)
-    first, second = (surface_accuracy.experiment(rig, scene, patterns, seed, conditions=life) for scene in scenes)
+    rig = drifted(session.rig, life.drift, seed)
+    first, second = (
+        surface_accuracy.experiment(rig, scene, patterns, seed, session.tracing, session.shooting, life) for scene in scenes
+    )
     return first, second
 
 
