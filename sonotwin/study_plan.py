@@ -14,6 +14,7 @@ from recon.files.regular import read_bytes
 from recon.model.rig import Part
 from sonotwin.config import folder
 from twin.studies import experiments, factors, study_runs
+from twin.studies.error_budget import Budget
 from twin.studies.experiments import Settings
 from twin.studies.factors import Point
 from twin.studies.rig_search import Goal
@@ -39,6 +40,7 @@ class Study(Part):
     seeds: Seeds = 3
     points: Points | None = None
     search: Goal | None = None
+    budget: Budget | None = None
     fields: tuple[str, ...] = ()  # of conf/study.yaml, as on the command line
 
 

@@ -90,6 +90,7 @@ def drawn(
     noise: Mapping[str, float],
     rng: np.random.Generator,
     points: Array | None = None,
+    times: float = 1.0,
 ) -> BoardSet:
     """Simulated detections of discs, with noise of known size.
 
@@ -102,10 +103,12 @@ def drawn(
         error at the pixel where they are read is added.
     points : (n, 3) or (p, n, 3) mm, optional
         The board as it is, in all poses or in each; as designed if not given.
+    times : float
+        Of the noise that the detections claim, which is drawn; 0 draws none.
     """
     points = design.points() if points is None else points
     exact = exact_observations(truth.cameras, points, poses, noise)
-    errors = rng.standard_normal(exact.pixels.shape) * np.array([noise[name] for name in exact.devices])[:, None]
+    errors = times * rng.standard_normal(exact.pixels.shape) * np.array([noise[name] for name in exact.devices])[:, None]
     if PROJECTOR in exact.devices:
         errors[:, :, exact.devices.index(PROJECTOR)] += np.einsum("pnij,pnj->pni", exact.gradient, errors[:, :, 0])
     usual = points if points.ndim == 2 else points.mean(axis=0)

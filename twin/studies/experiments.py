@@ -23,6 +23,7 @@ from twin.conditions import IDEAL, Conditions
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
 from twin.shooting import power_of_two
+from twin.studies.drawn_session import Noise
 from twin.studies.layout import Layout
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
@@ -32,7 +33,7 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "calibration": "twin.studies.calibration_trial",
     "tracking": "twin.studies.tracking_trial",
     "laboratory": "twin.studies.laboratory_trial",
-    "probe": "twin.studies.probe_trial",
+    "chain": "twin.studies.chain_trial",
 }
 
 
@@ -67,6 +68,7 @@ class Settings(Part):
     shooting: Shooting = Shooting()
     plane: Plane = Plane()
     film: Film = Film()
+    noise: Noise = Noise()
     ultrasound: Transducer = Transducer()
     ranges: DataRanges
 

@@ -127,6 +127,14 @@ def applied(settings: Mapping[str, Any], point: Point) -> dict[str, Any]:
     return changed
 
 
+def value_at(settings: Mapping[str, Any], name: str) -> Any:
+    """The value of a field; raises InputError with its name if it isn't there."""
+    places: list[Any] = [settings]
+    for part in name.split("."):
+        places = [inner for place in places for inner in _entries(place, part, name)]
+    return places[0]
+
+
 def _put(settings: dict[str, Any], name: str, value: Value) -> None:
     """Put a value at a dotted name; a part of it is a key, a place in a list, or the kind of a list's entries."""
     places: Sequence[Any] = [settings]

@@ -20,33 +20,35 @@ MOST_ROWS = 100  # points of a design in the page's table
 FOOTER = "Range: from the least to the greatest over seeds and the other factors. This file is complete: it fetches nothing."
 
 
-def write(folder: Path, title: str, done: Sequence[Done], limits: Mapping[str, str], commands: Sequence[str]) -> None:
-    """Write `report.html`, and its plots as PNG files.
-
-    Parameters
-    ----------
-    limits : figures to be shown, and the figure that is the closed form of each, or ""
-    commands : that make the same again
-    """
+def write(folder: Path, title: str, done: Sequence[Done], sections: Sequence[Section], commands: Sequence[str]) -> None:
+    """Write `report.html`: sections, what gave no figures, and the commands that make the same again."""
     table, fields = study_runs.rows(done), list(done[0].trial.point)
-    (folder / PICTURES).mkdir(exist_ok=True)
-    sections = []
-    for figure, limit in limits.items():
-        drawings = [_drawn(folder, table, figure, field, fields, limit) for field in fields]
-        if drawings:
-            sections.append(Section(words(figure), [page.grid(drawings, "two")]))
     failed = [row for row in table if row[ERROR] is not None]
-    head = [*map(words, fields), "trials", *map(words, limits)]
-    sections.append(Section("All points", [page.table(head, _points(table, fields, limits), "Medians over seeds.")]))
-    if failed:
-        reasons = dict.fromkeys(f"{_at(row, fields)}: {row[ERROR]}" for row in failed)
-        sections.append(Section("Points without figures", [page.notices(reasons)]))
+    reasons = dict.fromkeys(f"{_at(row, fields)}: {row[ERROR]}" for row in failed)
     pandas = f"python -c \"import pandas; print(pandas.read_parquet('{folder / study_runs.TABLE}'))\""
-    sections.append(Section("Again, and the table in pandas", [page.commands([*commands, pandas])]))
+    parts = [*sections, *([Section("Points without figures", [page.notices(reasons)])] if failed else [])]
+    parts.append(Section("Again, and the table in pandas", [page.commands([*commands, pandas])]))
     counted = [("trials", page.count(len(table)), ""), ("points", page.count(len(_distinct_points(table, fields))), "")]
     result = f"{len(table) - len(failed)} of {len(table)} trials gave figures."
     with atomic.new_file(folder / PAGE) as path:
-        path.write_text(page.render(Opening("study", title, result, counted), sections, FOOTER), encoding="utf-8")
+        path.write_text(page.render(Opening("study", title, result, counted), parts, FOOTER), encoding="utf-8")
+
+
+def plots(folder: Path, done: Sequence[Done], limits: Mapping[str, str]) -> list[Section]:
+    """Sections of all figures over all factors, whose plots are kept as PNG files too, and a table.
+
+    limits : figures to be shown, and the figure that is the closed form of each, or ""
+    """
+    table, fields = study_runs.rows(done), list(done[0].trial.point)
+    (folder / PICTURES).mkdir(exist_ok=True)
+    sections = [
+        Section(words(figure), [page.grid((_drawn(folder, table, figure, field, fields, limit) for field in fields), "two")])
+        for figure, limit in limits.items()
+        if fields
+    ]
+    head = [*map(words, fields), "trials", *map(words, limits)]
+    caption = "Medians over seeds; in brackets the closed forms."
+    return [*sections, Section("All points", [page.table(head, _points(table, fields, limits), caption)])]
 
 
 def _drawn(folder: Path, table: study_plots.Table, figure: str, field: str, fields: Sequence[str], limit: str) -> str:

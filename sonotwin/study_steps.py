@@ -1,0 +1,129 @@
+"""What `sonotwin study` does: all points of a design, a search for the best, or an error budget; and what it writes and says."""
+
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import yaml
+from rich.console import Console
+from rich.progress import Progress
+
+from recon.files.metrics import shown
+from recon.reports.page import Section
+from sonotwin import study_plan
+from twin.studies import budget_page, error_budget, experiments, factors, rig_search, search_page, study_page, study_runs
+from twin.studies.error_budget import Budget
+from twin.studies.factors import Point
+from twin.studies.rig_search import Candidate, Goal
+from twin.studies.study_runs import STUDY, TABLE, Done, StudyFolder, Trial
+
+if TYPE_CHECKING:
+    from sonotwin.verbs.study import Config
+
+
+def sweep(config: "Config", console: Console) -> bool:
+    """Do all points of a design; returns whether any trial gave figures."""
+    read = factors.read(config.over)
+    points = factors.factorial(read) if config.points is None else factors.filling(read, config.points, config.fill, 0)
+    trials = study_plan.trials(config.of, config.settings, points, seeds(config))
+    done = do(config, opened(config), trials, console)
+    limits = experiments.experiment(config.of).limits
+    write(config, done, study_page.plots(config.out, done, limits), console)
+    return any(one.figures for one in done)
+
+
+def budget(config: "Config", wanted: Budget, console: Console) -> bool:
+    """Turn each source on and off; returns whether all figures of the budget are there."""
+    points = error_budget.points(wanted, config.settings.model_dump(mode="json"))
+    trials = study_plan.trials(config.of, config.settings, points.values(), seeds(config))
+    done = do(config, opened(config), trials, console)
+    sums = error_budget.added_up(wanted, dict(zip(points, _split(done, config.seeds), strict=True)))
+    for one in sums:
+        console.print(f"budget      {wanted.figures[one.figure]}: {error_budget.explained(one)}", markup=False)
+        for line in error_budget.advice(wanted, one)[:1]:
+            console.print(f"mend first  {line}", markup=False)
+    write(config, done, budget_page.sections(config.out, wanted, sums), console)
+    return all(one.whole == one.whole for one in sums)
+
+
+def search(config: "Config", goal: Goal, console: Console) -> bool:
+    """Search for the best values, and say which they are; returns whether a candidate kept all bounds."""
+    read = factors.read(config.over)
+    rig_search.check(goal, read)
+
+    def trials_of(points: Iterable[Point]) -> list[Trial]:
+        under = [point | some for point in points for some in rig_search.conditions(goal)]
+        return study_plan.trials(config.of, config.settings, under, seeds(config))
+
+    def attempt(points: Sequence[Point]) -> list[list[Done]]:
+        trials = trials_of(points)
+        done = study_runs.in_order(trials, list(study_runs.run(place, config.of, trials, config.engine)))
+        return _split(done, len(trials) // len(points))
+
+    trials_of([goal.start])  # refused before anything is written
+    place, candidates = opened(config), list[Candidate]()
+    console.print(f"search      {goal.runs} candidates for the least {goal.least} over {', '.join(config.over)}", markup=False)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        tried = rig_search.search(goal, read, config.first_seed, attempt)
+        candidates.extend(progress.track(tried, goal.runs, description="candidates"))
+    found = rig_search.best(candidates)
+    for what, one in {"start": candidates[0] if goal.start else None, "best": found}.items():
+        if one is not None:
+            console.print(f"{what:12}{goal.least} {shown(one.value, '.4g')}: {', '.join(fields_of(one.point))}", markup=False)
+    if found is None:
+        console.print("no best     no candidate kept all bounds")
+    done = [one for candidate in candidates for one in candidate.done]
+    limits = experiments.experiment(config.of).limits
+    sections = [*search_page.sections(config.out, goal, candidates), *study_page.plots(config.out, done, limits)]
+    write(config, done, sections, console)
+    return found is not None
+
+
+def seeds(config: "Config") -> range:
+    """Seeds of each point's trials."""
+    return range(config.first_seed, config.first_seed + config.seeds)
+
+
+def opened(config: "Config") -> StudyFolder:
+    """The study's folder, with a description of the study, which is its mark."""
+    place = StudyFolder(config.out)
+    described = config.model_dump(mode="json", exclude={"out", "engine", "settings"})
+    place.open(described | {"settings": experiments.read_by(config.of, config.settings)})
+    return place
+
+
+def do(config: "Config", place: StudyFolder, trials: Sequence[Trial], console: Console) -> list[Done]:
+    """Do the trials that are missing; gives all in order."""
+    there = sum(place.kept(trial) is not None for trial in trials)
+    over = f" over {', '.join(config.over)}" if config.over else ""
+    console.print(f"study       {config.of}{over}: {len(trials)} trials, {there} of them there already", markup=False)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        running = study_runs.run(place, config.of, trials, config.engine)
+        return study_runs.in_order(trials, list(progress.track(running, len(trials), description="trials")))
+
+
+def write(config: "Config", done: Sequence[Done], sections: Sequence[Section], console: Console) -> None:
+    """Write table and page, and say which points gave no figures."""
+    for one in {one.found: one for one in done if isinstance(one.found, str)}.values():
+        at = ", ".join([*fields_of(one.trial.point), f"seed={one.trial.seed}"])
+        console.print(f"no figures  {at}: {one.found}", markup=False)
+    StudyFolder(config.out).write_table(done)
+    study_page.write(config.out, config.title or config.name, done, sections, [command(config)])
+    console.print(f"wrote       {config.out}/{{{TABLE},{study_page.PAGE},{study_page.PICTURES}/,{STUDY}}}", markup=False)
+
+
+def command(config: "Config") -> str:
+    """The command line of a study, less the settings that it shares with conf/study.yaml."""
+    over = yaml.safe_dump(config.over, default_flow_style=True, width=10**6).strip()
+    fields = [f"name={config.name}", f"of={config.of}", f"over={over}", f"seeds={config.seeds}", f"out={config.out}"]
+    return shlex.join(["sonotwin", "study", *fields])
+
+
+def fields_of(point: Point) -> Iterator[str]:
+    """A point's values as fields of the command line."""
+    return (f"{name}={value}" for name, value in point.items())
+
+
+def _split(done: Sequence[Done], size: int) -> list[list[Done]]:
+    """Trials, point by point."""
+    return [list(done[first : first + size]) for first in range(0, len(done), size)]

@@ -1,0 +1,75 @@
+"""Sections of a budget on a study's page: waterfalls, tables, and what to mend first."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from recon.files import atomic
+from recon.files.metrics import shown
+from recon.reports import figures, page
+from recon.reports.figures import BARS, LINE
+from recon.reports.page import Section
+from twin.studies import error_budget
+from twin.studies.error_budget import Budget, Sum
+from twin.studies.study_page import PICTURES
+
+LEAST = 0.002  # share of the sum's square that gets a bar of its own
+
+
+def sections(folder: Path, budget: Budget, sums: Sequence[Sum]) -> list[Section]:
+    """A section a figure; its waterfall is kept as a PNG file too."""
+    made = []
+    (folder / PICTURES).mkdir(exist_ok=True)
+    for one in sums:
+        drawn = waterfall(one)
+        with atomic.new_file(folder / PICTURES / f"budget_{one.figure}.png") as path:
+            drawn.savefig(path, dpi=160, metadata={"Software": None})
+        drawing = page.drawing(figures.inline_svg(drawn), f"Budget of {budget.figures[one.figure]}", error_budget.explained(one))
+        blocks = [drawing, page.notices(error_budget.advice(budget, one)), page.table(*_parts(budget, one))]
+        if one.predicted:
+            blocks.append(page.table(*_predicted(one)))
+        made.append(Section(budget.figures[one.figure], blocks))
+    return made
+
+
+def waterfall(one: Sum) -> Figure:
+    """Squares of the parts, each on top of those before it, up to their sum, beside the whole."""
+    kept = [part for part in one.parts if part.alone**2 > LEAST * one.added**2]
+    rest = np.sqrt(max(one.added**2 - sum(part.alone**2 for part in kept), 0.0))
+    names, sizes = [part.source for part in kept], [part.alone for part in kept]
+    if len(kept) < len(one.parts):
+        names, sizes = [*names, "all others"], [*sizes, float(rest)]
+    squares = np.square(sizes)
+    starts = np.concatenate([[0.0], np.cumsum(squares)])[:-1]
+    drawn, axes = figures.blank(5.6, 0.9 + 0.3 * (len(names) + 2))
+    rows = np.arange(len(names))
+    axes.barh(rows, squares, left=starts, color=BARS, height=0.62)
+    axes.barh([len(names), len(names) + 1], [one.added**2, one.whole**2], color=[BARS, LINE], height=0.62)
+    for row, (start, square, size) in enumerate(zip(starts, squares, sizes, strict=True)):
+        axes.text(start + square, row, f" {size:.3f}", va="center", fontsize=8, color=axes.xaxis.label.get_color())
+    for row, value in ((len(names), one.added), (len(names) + 1, one.whole)):
+        axes.text(value**2, row, f" {value:.3f}", va="center", fontsize=8, color=axes.xaxis.label.get_color())
+    axes.set_yticks(range(len(names) + 2), [*names, "sum in squares", "all together"])
+    axes.invert_yaxis()
+    axes.set(xlabel="square of the error, mm² (figures: mm)", xlim=(0, 1.18 * max(one.added, one.whole) ** 2))
+    return drawn
+
+
+def _parts(budget: Budget, one: Sum) -> tuple[list[str], list[list[str]], str]:
+    head = ["source", "alone, mm", f"{budget.step:g} times as large, mm", "share of the square, %"]
+    rows = [
+        [part.source, shown(part.alone, ".4f"), shown(part.larger, ".4f"), f"{100 * part.alone**2 / (one.added**2 or 1):.1f}"]
+        for part in one.parts
+    ]
+    return head, rows, f"Root mean squares over {one.parts[0].trials} seeds."
+
+
+def _predicted(one: Sum) -> tuple[list[str], list[list[str]], str]:
+    head = ["predicted by the software", "from covariances, mm", "by switching, mm", "ratio"]
+    rows = [
+        [names, shown(known, ".4f"), shown(switched, ".4f"), shown(known / switched if switched else np.nan, ".2f")]
+        for names, (known, switched) in one.predicted.items()
+    ]
+    return head, rows, "The same errors as the software propagates them from its own covariances."

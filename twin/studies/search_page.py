@@ -1,0 +1,56 @@
+"""Section of a search on a study's page: the best so far over the candidates, and the best ones."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from recon.files import atomic
+from recon.files.metrics import shown
+from recon.reports import figures, page
+from recon.reports.figures import BARS, LINE
+from recon.reports.page import Section
+from twin.studies.rig_search import Candidate, Goal
+from twin.studies.study_page import PICTURES
+from twin.studies.study_plots import scale_heights, short, words
+
+BEST = 10  # candidates in the table
+
+
+def sections(folder: Path, goal: Goal, candidates: Sequence[Candidate]) -> list[Section]:
+    """The search's course, kept as a PNG file too, and its best candidates."""
+    drawn = course(goal, candidates)
+    (folder / PICTURES).mkdir(exist_ok=True)
+    with atomic.new_file(folder / PICTURES / "search.png") as path:
+        drawn.savefig(path, dpi=160, metadata={"Software": None})
+    good = sorted((one for one in candidates if one.good), key=lambda one: one.value)[:BEST]
+    if not good:
+        return [Section("Search", [page.paragraph("No candidate kept all bounds."), _drawing(drawn)])]
+    bound = [name for name in goal.bounds if name != goal.least]
+    head = [*(words(name) for name in good[0].point), words(goal.least), *(words(name) for name in bound)]
+    rows = [
+        [*map(short, one.point.values()), f"{one.value:.4g}", *(shown(one.figures[name], ".4g") for name in bound)]
+        for one in good
+    ]
+    return [Section("Search", [_drawing(drawn), page.table(head, rows, "The best candidates within all bounds.")])]
+
+
+def course(goal: Goal, candidates: Sequence[Candidate]) -> Figure:
+    """Values of the candidates in their order, and the best of those within all bounds so far."""
+    values = np.array([one.value for one in candidates])
+    good = np.array([one.good for one in candidates])
+    best = np.minimum.accumulate(np.where(good, values, np.inf))
+    numbers = np.arange(1, len(values) + 1)
+    drawn, axes = figures.blank(5.2, 3.3)
+    axes.plot(numbers[good], values[good], "o", color=BARS, markersize=4, label="within all bounds")
+    axes.plot(numbers[~good], values[~good], "x", color=BARS, markersize=4, label="out of bounds")
+    axes.plot(numbers, np.where(np.isfinite(best), best, np.nan), color=LINE, drawstyle="steps-post", label="best so far")
+    scale_heights(axes)
+    axes.set(xlabel="candidate", ylabel=words(goal.least))
+    axes.legend(frameon=False, fontsize=8, labelcolor=axes.xaxis.label.get_color())
+    return drawn
+
+
+def _drawing(drawn: Figure) -> str:
+    return page.drawing(figures.inline_svg(drawn), "The search", f"{PICTURES}/search.png")
