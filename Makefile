@@ -12,7 +12,7 @@ TWIN := .venv/.twin
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint slow docs accuracy benchmark clean
+.PHONY: help setup demo test lint slow docs accuracy benchmark paper clean
 
 help:  ## show this
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -54,6 +54,13 @@ accuracy: setup  ## measure errors against the ground truth and the paper's figu
 
 benchmark: setup  ## measure speed
 	@$(BIN)/python -m benchmarks $(ONLY)
+
+# Hours; goes on where it was stopped. Trials are shared: planes, sphere and optics are figures of the same laboratories.
+PAPER := optics planes sphere
+paper: setup  ## repeat the paper's experiments in full, by its method and by ours
+	@for name in $(if $(ONLY),$(ONLY),$(PAPER)); do \
+		$(BIN)/sonotwin study name=$$name out=outputs/paper/$$name trials=outputs/paper/trials document=docs/paper.md engine.workers=2 || exit; \
+	done
 
 clean:  ## delete compiled code and caches; .venv and outputs stay
 	@rm -rf build docs/reference/packages .pytest_cache .ruff_cache .import_linter_cache

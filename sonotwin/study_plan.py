@@ -14,6 +14,7 @@ from recon.files.regular import read_bytes
 from recon.model.rig import Part
 from sonotwin.config import folder
 from twin.studies import experiments, factors, study_runs
+from twin.studies.beside_paper import Figure
 from twin.studies.error_budget import Budget
 from twin.studies.experiments import Settings
 from twin.studies.factors import Point
@@ -41,6 +42,7 @@ class Study(Part):
     points: Points | None = None
     search: Goal | None = None
     budget: Budget | None = None
+    beside: tuple[Figure, ...] = ()  # figures of the paper
     fields: tuple[str, ...] = ()  # of conf/study.yaml, as on the command line
 
 

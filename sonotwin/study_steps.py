@@ -9,9 +9,21 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon.files.metrics import shown
+from recon.reports import page
 from recon.reports.page import Section
 from sonotwin import study_plan
-from twin.studies import budget_page, error_budget, experiments, factors, rig_search, search_page, study_page, study_runs
+from twin.accuracy import table_rows
+from twin.studies import (
+    beside_paper,
+    budget_page,
+    error_budget,
+    experiments,
+    factors,
+    rig_search,
+    search_page,
+    study_page,
+    study_runs,
+)
 from twin.studies.error_budget import Budget
 from twin.studies.factors import Point
 from twin.studies.rig_search import Candidate, Goal
@@ -26,10 +38,27 @@ def sweep(config: "Config", console: Console) -> bool:
     read = factors.read(config.over)
     points = factors.factorial(read) if config.points is None else factors.filling(read, config.points, config.fill, 0)
     trials = study_plan.trials(config.of, config.settings, points, seeds(config))
+    if config.document is not None:
+        table_rows.check_place(config.document, config.name)
     done = do(config, opened(config), trials, console)
-    limits = experiments.experiment(config.of).limits
-    write(config, done, study_page.plots(config.out, done, limits), console)
+    sections = study_page.plots(config.out, done, experiments.experiment(config.of).limits)
+    if config.beside:
+        sections = [_beside_paper(config, done, console), *sections]
+    write(config, done, sections, console)
     return any(one.figures for one in done)
+
+
+def _beside_paper(config: "Config", done: Sequence[Done], console: Console) -> Section:
+    """The paper's figures beside those of its method and of ours: on the console, in a document if one is given, on the page."""
+    compared = beside_paper.compare(config.beside, done)
+    for one in compared:
+        point, what, reported, paper, ours, limit, unit = beside_paper.cells(one)
+        beside = f"; limit {limit}" if limit else ""
+        console.print(f"{point:12}{what}: reported {reported}, its method {paper}, ours {ours}{beside} {unit}", markup=False)
+    if config.document is not None:
+        table_rows.refresh(config.document, config.name, beside_paper.markdown(compared))
+    caption = "Means over trials; in brackets the least, the greatest and the number of trials."
+    return Section("Beside the paper", [page.table(beside_paper.HEAD, map(beside_paper.cells, compared), caption)])
 
 
 def budget(config: "Config", wanted: Budget, console: Console) -> bool:
@@ -86,8 +115,8 @@ def seeds(config: "Config") -> range:
 
 def opened(config: "Config") -> StudyFolder:
     """The study's folder, with a description of the study, which is its mark."""
-    place = StudyFolder(config.out)
-    described = config.model_dump(mode="json", exclude={"out", "engine", "settings"})
+    place = StudyFolder(config.out, config.trials)
+    described = config.model_dump(mode="json", exclude={"out", "trials", "document", "engine", "settings"})
     place.open(described | {"settings": experiments.read_by(config.of, config.settings)})
     return place
 

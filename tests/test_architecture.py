@@ -16,7 +16,7 @@ NEEDS = {  # parts of the requirements, as they stand in pyproject.toml
     "recon": {"core"},
     "sonotwin": {"core", "train"},
     "scenes": {"core"},
-    "twin": {"core", "twin"},
+    "twin": {"core", "twin", "study"},
     "trainers": {"core", "train"},
 }
 MAY_IMPORT = {

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import shlex
 import shutil
 from functools import cache
 from importlib import import_module
@@ -54,9 +55,8 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
 def commands(text: str, fence: str = "```|~~~") -> list[list[str]]:
     """The `sonotwin` commands in a text's code blocks, without the program's name."""
     blocks = re.findall(rf"^({fence})\w*\n(.*?)^\1", text, re.MULTILINE | re.DOTALL)
-    return [
-        line.split("#")[0].split()[1:] for _, block in blocks for line in block.splitlines() if re.match("sonotwin [a-z]", line)
-    ]
+    lines = [line for _, block in blocks for line in block.splitlines() if re.match("sonotwin [a-z]", line)]
+    return [shlex.split(line, comments=True)[1:] for line in lines]
 
 
 @cache
@@ -89,7 +89,7 @@ def test_recipes_are_valid(page):
 def test_examples_of_a_verb_are_valid(verb):
     """The commands in its help have verbs and fields that exist and values that fit, and show the verb itself."""
     text = ast.get_docstring(ast.parse((ROOT / (verb.module.replace(".", "/") + ".py")).read_text(encoding="utf-8")))
-    examples = [tuple(line.split()[1:]) for line in text.splitlines() if re.match(" +sonotwin [a-z]", line)]
+    examples = [tuple(shlex.split(line)[1:]) for line in text.splitlines() if re.match(" +sonotwin [a-z]", line)]
     assert verb.name in {example[0] for example in examples}
     for example in examples:
         if not without_training(example[0]):

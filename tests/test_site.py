@@ -1,6 +1,7 @@
 """The documentation: links and anchors lead somewhere, the map of the code is complete, the site builds without a warning."""
 
 import re
+import shlex
 import subprocess
 import sys
 from importlib import import_module
@@ -115,7 +116,7 @@ def test_users_pages_name_verbs_and_fields_that_exist(page):
     text = page.read_text(encoding="utf-8")
     commands = re.findall(r"^ *sonotwin ([a-z].*)$", text, re.MULTILINE) + re.findall(r"`sonotwin ([a-z][^`]*=[^`]*)`", text)
     for command in commands:
-        verb, *fields = command.replace("FOLDER", "folder").split()
+        verb, *fields = shlex.split(command.replace("FOLDER", "folder"))
         config.compose(verb, fields)  # raises on an unknown key, and on a field that needs a value
 
 

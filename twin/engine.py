@@ -185,7 +185,7 @@ def _client(engine: Engine) -> Iterator[Any]:
     with ExitStack() as stack:
         if engine.scheduler is None:
             stack.enter_context(_threads(engine.workers))
-            local = LocalCluster(engine.workers, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL)
+            local = LocalCluster(engine.workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL)
             client = stack.enter_context(Client(stack.enter_context(local)))
         else:
             try:

@@ -3,7 +3,7 @@
 Reads the rig and the pattern sequences from conf/, and real recordings where `real` names their folder. Writes GROUP.json into
 the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}, and figures; and the tables of the Markdown page
 that `document` names. Takes some minutes a group, and about an hour for tracking, for which a thousand pairs of frames are
-rendered, and three hours for sessions. Exit status 1 if a bar is missed.
+rendered, an hour for studies and three hours for sessions. Exit status 1 if a bar is missed.
 
     sonotwin accuracy only=optics
 """
@@ -25,8 +25,11 @@ from twin.conditions import Conditions
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
-Group = Literal["optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking", "session"]
-MODULES = {"session": "sonotwin.session_accuracy"}  # of the others twin.accuracy.GROUP_accuracy
+Group = Literal["optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking", "session", "studies"]
+MODULES = {
+    "session": "sonotwin.session_accuracy",
+    "studies": "sonotwin.study_accuracy",
+}  # of the others twin.accuracy.GROUP_accuracy
 
 
 class Config(BaseModel):

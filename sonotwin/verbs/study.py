@@ -21,6 +21,7 @@ from sonotwin import study_steps
 from sonotwin.config import compose, folder
 from sonotwin.study_plan import SWEEP, Points, Seeds, read_study
 from twin.engine import Engine
+from twin.studies.beside_paper import Figure
 from twin.studies.error_budget import Budget
 from twin.studies.experiments import MODULES, Settings
 from twin.studies.factors import Filling
@@ -34,6 +35,7 @@ class Config(BaseModel):
 
     name: str
     out: Path
+    trials: Path | None = None
     title: str = ""
     of: str
     over: dict[str, Any]
@@ -43,6 +45,8 @@ class Config(BaseModel):
     fill: Filling = "sobol"
     search: Goal | None = None
     budget: Budget | None = None
+    beside: tuple[Figure, ...] = ()
+    document: Path | None = None
     engine: Engine = Engine()
     settings: Settings  # of the experiment: all fields that are not above
 

@@ -30,8 +30,7 @@ def sections(folder: Path, goal: Goal, candidates: Sequence[Candidate]) -> list[
     bound = [name for name in goal.bounds if name != goal.least]
     head = [*(words(name) for name in good[0].point), words(goal.least), *(words(name) for name in bound)]
     rows = [
-        [*map(short, one.point.values()), f"{one.value:.4g}", *(shown(one.figures[name], ".4g") for name in bound)]
-        for one in good
+        [*map(short, one.point.values()), *(shown(one.figures[name], ".4g") for name in (goal.least, *bound))] for one in good
     ]
     return [Section("Search", [_drawing(drawn), page.table(head, rows, "The best candidates within all bounds.")])]
 

@@ -54,11 +54,18 @@ class StudyFolder:
     """The folder of one study."""
 
     folder: Path
+    shared: Path | None = None  # folder of trials that several studies share; OUT/trials if not given
+
+    @property
+    def trials(self) -> Path:
+        """Where trials are kept."""
+        return self.shared or self.folder / TRIALS
 
     def open(self, description: Mapping[str, Any]) -> None:
         """Begin or go on with a study; raises InputError if the folder holds something else."""
         atomic.check_folder(self.folder, STUDY)
-        (self.folder / TRIALS).mkdir(parents=True, exist_ok=True)
+        for place in (self.folder, self.trials):
+            place.mkdir(parents=True, exist_ok=True)
         with atomic.new_file(self.folder / STUDY) as path:
             path.write_text(json.dumps(description, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
@@ -86,7 +93,7 @@ class StudyFolder:
             pq.write_table(pa.Table.from_pylist(rows(done)), path)
 
     def _path(self, key: str) -> Path:
-        return self.folder / TRIALS / f"{key}.json"
+        return self.trials / f"{key}.json"
 
 
 def plan(name: str, points: Sequence[tuple[Point, Settings]], seeds: Sequence[int], code: str) -> list[Trial]:

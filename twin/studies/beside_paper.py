@@ -1,0 +1,88 @@
+"""A study's figures beside those that the paper reports: its method in the twin, ours, and the limit."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.files.metrics import shown
+from recon.model.rig import Part
+from twin.studies.study_plots import finite, short
+from twin.studies.study_runs import Done
+
+FACTOR = 1.5  # between a figure of the paper and that of its method in the twin, that counts as met
+HEAD = ("conditions", "figure", "paper reported", "paper's method in the twin", "ours", "limit", "unit")
+
+
+class Figure(Part):
+    """A figure that the paper reports."""
+
+    what: str
+    reported: tuple[float, float]  # least and greatest
+    paper: str | None = None  # figure of trials by the paper's method
+    ours: str
+    limit: str | None = None
+    bar: float | None = None  # of ours, in the worst trial under conditions that aren't ideal
+    unit: str
+
+
+class Compared(NamedTuple):
+    """A figure under one of the study's points."""
+
+    point: str
+    figure: Figure
+    paper: NDArray[np.float64]  # (n,) sizes by the paper's method
+    ours: NDArray[np.float64]  # (m,)
+    limit: float
+
+    @property
+    def explained(self) -> bool:
+        """Whether the paper's method gives what the paper reports, within a factor."""
+        low, high = self.figure.reported
+        return bool(self.paper.size and low / FACTOR <= self.paper.mean() <= high * FACTOR)
+
+    @property
+    def met(self) -> bool:
+        """Whether ours keeps its bar in all trials; nothing is asked where there is none."""
+        return self.figure.bar is None or bool(self.ours.size and self.ours.max() <= self.figure.bar)
+
+
+def compare(figures: Sequence[Figure], done: Sequence[Done]) -> list[Compared]:
+    """Each figure under each point of the study; signs of errors don't count."""
+    points: dict[str, list[Done]] = {}
+    for one in done:
+        points.setdefault(", ".join(short(value) for value in one.trial.point.values()), []).append(one)
+    return [
+        Compared(point, figure, _sizes(alike, figure.paper), _sizes(alike, figure.ours), _middle(_sizes(alike, figure.limit)))
+        for figure in figures
+        for point, alike in points.items()
+    ]
+
+
+def cells(one: Compared) -> list[str]:
+    """A row of the table: means, and in brackets the least and the greatest."""
+    low, high = one.figure.reported
+    reported = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    limit = shown(one.limit, ".3g") if one.figure.limit else ""
+    return [one.point, one.figure.what, reported, _spread(one.paper), _spread(one.ours), limit, one.figure.unit]
+
+
+def markdown(compared: Sequence[Compared]) -> str:
+    """The table as Markdown."""
+    lines = [f"| {' | '.join(HEAD)} |", f"|{'---|' * len(HEAD)}"]
+    return "\n".join([*lines, *(f"| {' | '.join(cells(one))} |" for one in compared)])
+
+
+def _sizes(done: Sequence[Done], figure: str | None) -> NDArray[np.float64]:
+    return np.abs(finite(one.figures.get(figure) for one in done)) if figure else np.zeros(0)
+
+
+def _middle(values: NDArray[np.float64]) -> float:
+    return float(values.mean()) if values.size else float("nan")
+
+
+def _spread(values: NDArray[np.float64]) -> str:
+    if not values.size:
+        return ""
+    return f"{values.mean():.3f} ({values.min():.3f} to {values.max():.3f}; {values.size})"
