@@ -9,11 +9,11 @@ from pydantic import Field, PrivateAttr, model_validator
 from recon.model.probe import Speed
 from recon.model.rig import Positive
 from scenes.acoustics import MADE_OF
-from sonotwin.verbs import render, sweep
+from sonotwin.verbs import render
 from twin.optics import surface_session
 from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.timed_sweep import Clocks
-from twin.ultrasound.transducer import Transducer
+from twin.ultrasound.transducer import Transducer, check_scanner
 
 CALIBRATION = "calibration"  # folder
 BOARD_PATTERNS = "paper_calibration"
@@ -44,7 +44,7 @@ class Config(render.Config):
 
     @model_validator(mode="after")
     def _one_scanner(self) -> "Config":
-        sweep.check_scanner(self.rig, self.ultrasound)
+        check_scanner(self.rig, self.ultrasound)
         return self
 
     @property

@@ -18,8 +18,7 @@ from sonotwin.verbs.study import Config
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.studies import beside_paper, error_budget, experiments, factors, rig_search
 from twin.studies.beside_paper import FACTOR
-from twin.studies.study_plots import finite
-from twin.studies.study_runs import TABLE, Done
+from twin.studies.study_runs import TABLE, Done, finite
 
 RIG = "meza2021"
 SEEDS = 3

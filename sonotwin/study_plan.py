@@ -9,7 +9,6 @@ from pydantic import Field, ValidationError
 
 from recon.capture.manifest import validated
 from recon.errors import InputError, one_line
-from recon.files.code_digest import code_digest
 from recon.files.regular import read_bytes
 from recon.model.rig import Part
 from sonotwin.config import folder
@@ -22,7 +21,6 @@ from twin.studies.rig_search import Goal
 from twin.studies.study_runs import Trial
 
 SWEEP = "sweep"  # the study that conf/study doesn't have: all of it is given
-CODE = ("recon", "scenes", "twin")  # packages by whose code figures are made
 GROUPS = {  # fields that are choices of a group of conf/
     **{name: name for name in ("rig", "patterns", "poses", "conditions", "tracing", "ultrasound")},
     "board_patterns": "patterns",
@@ -46,7 +44,7 @@ class Study(Part):
     fields: tuple[str, ...] = ()  # of conf/study.yaml, as on the command line
 
 
-def read_study(name: str) -> Study | None:
+def read_study(name: object) -> Study | None:
     """Read a study by its name in conf/study or from a YAML file; None for a sweep, which has none.
 
     Raises
@@ -56,11 +54,12 @@ def read_study(name: str) -> Study | None:
     """
     if name == SWEEP:
         return None
+    name = str(name)
     known = folder() / "study" / f"{name}.yaml"
     path = known if known.is_file() else Path(name)
     if path.suffix not in (".yaml", ".yml"):
         names = sorted(each.stem for each in known.parent.glob("*.yaml"))
-        raise InputError(f"study: name: expected {SWEEP}, one of {', '.join(names)}, or a YAML file, found {name}")
+        raise InputError(f"name: expected {SWEEP}, one of {', '.join(names)}, or a YAML file, found {name}")
     return validated(Study, read_yaml(path), path)
 
 
@@ -82,12 +81,15 @@ def trials(of: str, settings: Settings, points: Iterable[Point], seeds: Iterable
     """
     points, base = list(points), settings.model_dump(mode="json")
     experiments.check_reads(of, {name for point in points for names in point for name in names.split(factors.JOINT)})
-    return study_runs.plan(of, [(point, changed(base, point)) for point in points], list(seeds), code_digest(*CODE))
+    return study_runs.plan(of, [(point, changed(base, point)) for point in points], list(seeds))
 
 
 def changed(base: Mapping[str, Any], point: Point) -> Settings:
     """Settings with a point's values; raises InputError that names the field of one that is nonsense."""
-    chosen = {name: choice(name, value) if name in GROUPS and isinstance(value, str) else value for name, value in point.items()}
+    chosen = {
+        name: choice(name, value) if set(name.split(factors.JOINT)) <= set(GROUPS) and isinstance(value, str) else value
+        for name, value in point.items()
+    }
     try:
         return Settings.model_validate(factors.applied(base, chosen))
     except ValidationError as error:
@@ -96,7 +98,7 @@ def changed(base: Mapping[str, Any], point: Point) -> Settings:
 
 def choice(name: str, value: str) -> Any:
     """Content of a group's choice, such as `lifelike` of conditions."""
-    path = folder() / GROUPS[name] / f"{value}.yaml"
+    path = folder() / GROUPS[name.split(factors.JOINT)[0]] / f"{value}.yaml"
     if not path.is_file():
         names = ", ".join(sorted(each.stem for each in path.parent.glob("*.yaml")))
         raise InputError(f"over: {name}: expected one of {names}, found {value}")

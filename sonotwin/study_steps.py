@@ -4,7 +4,6 @@ import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
-import yaml
 from rich.console import Console
 from rich.progress import Progress
 
@@ -27,7 +26,7 @@ from twin.studies import (
 from twin.studies.error_budget import Budget
 from twin.studies.factors import Point
 from twin.studies.rig_search import Candidate, Goal
-from twin.studies.study_runs import STUDY, TABLE, Done, StudyFolder, Trial
+from twin.studies.study_runs import STUDY, TABLE, Done, StudyFolder, Trial, finite
 
 if TYPE_CHECKING:
     from sonotwin.verbs.study import Config
@@ -36,12 +35,16 @@ if TYPE_CHECKING:
 def sweep(config: "Config", console: Console) -> bool:
     """Do all points of a design; returns whether any trial gave figures."""
     read = factors.read(config.over)
-    points = factors.factorial(read) if config.points is None else factors.filling(read, config.points, config.fill, 0)
+    points = factors.factorial(read) if config.points is None else factors.filling(read, config.points, config.fill)
     trials = study_plan.trials(config.of, config.settings, points, seeds(config))
     if config.document is not None:
         table_rows.check_place(config.document, config.name)
     done = do(config, opened(config), trials, console)
-    sections = study_page.plots(config.out, done, experiments.experiment(config.of).limits)
+    of = experiments.experiment(config.of)
+    for figure, limit in of.limits.items():
+        beside = f", {of.limit} {_range(done, limit)}" if limit else ""
+        console.print(f"figure      {figure} {_range(done, figure)}{beside}", markup=False)
+    sections = study_page.plots(config.out, done, of)
     if config.beside:
         sections = [_beside_paper(config, done, console), *sections]
     write(config, done, sections, console)
@@ -52,12 +55,14 @@ def _beside_paper(config: "Config", done: Sequence[Done], console: Console) -> S
     """The paper's figures beside those of its method and of ours: on the console, in a document if one is given, on the page."""
     compared = beside_paper.compare(config.beside, done)
     for one in compared:
-        point, what, reported, paper, ours, limit, unit = beside_paper.cells(one)
+        point, what, reported, paper, _, ours, limit, unit = beside_paper.cells(one)
         beside = f"; limit {limit}" if limit else ""
         console.print(f"{point:12}{what}: reported {reported}, its method {paper}, ours {ours}{beside} {unit}", markup=False)
     if config.document is not None:
         table_rows.refresh(config.document, config.name, beside_paper.markdown(compared))
-    caption = "Means over trials; in brackets the least, the greatest and the number of trials."
+    caption = (
+        f"Means; in brackets the least, the greatest and the number of trials. Met: within a factor of {beside_paper.FACTOR:g}."
+    )
     return Section("Beside the paper", [page.table(beside_paper.HEAD, map(beside_paper.cells, compared), caption)])
 
 
@@ -102,10 +107,16 @@ def search(config: "Config", goal: Goal, console: Console) -> bool:
     if found is None:
         console.print("no best     no candidate kept all bounds")
     done = [one for candidate in candidates for one in candidate.done]
-    limits = experiments.experiment(config.of).limits
-    sections = [*search_page.sections(config.out, goal, candidates), *study_page.plots(config.out, done, limits)]
+    of = experiments.experiment(config.of)
+    sections = [*search_page.sections(config.out, goal, candidates), *study_page.plots(config.out, done, of)]
     write(config, done, sections, console)
     return found is not None
+
+
+def _range(done: Sequence[Done], figure: str) -> str:
+    """The least and the greatest value of a figure."""
+    known = finite(one.figures.get(figure) for one in done)
+    return f"{known.min():.4g} to {known.max():.4g}" if known.size else "unknown"
 
 
 def seeds(config: "Config") -> range:
@@ -116,7 +127,7 @@ def seeds(config: "Config") -> range:
 def opened(config: "Config") -> StudyFolder:
     """The study's folder, with a description of the study, which is its mark."""
     place = StudyFolder(config.out, config.trials)
-    described = config.model_dump(mode="json", exclude={"out", "trials", "document", "engine", "settings"})
+    described = config.model_dump(mode="json", exclude={"out", "trials", "document", "given", "engine", "settings"})
     place.open(described | {"settings": experiments.read_by(config.of, config.settings)})
     return place
 
@@ -142,10 +153,8 @@ def write(config: "Config", done: Sequence[Done], sections: Sequence[Section], c
 
 
 def command(config: "Config") -> str:
-    """The command line of a study, less the settings that it shares with conf/study.yaml."""
-    over = yaml.safe_dump(config.over, default_flow_style=True, width=10**6).strip()
-    fields = [f"name={config.name}", f"of={config.of}", f"over={over}", f"seeds={config.seeds}", f"out={config.out}"]
-    return shlex.join(["sonotwin", "study", *fields])
+    """The command line that makes the study again."""
+    return shlex.join(["sonotwin", "study", *config.given])
 
 
 def fields_of(point: Point) -> Iterator[str]:

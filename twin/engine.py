@@ -6,13 +6,15 @@ Tasks are handed out one by one as workers get free: a worker that dies costs th
 
 import logging
 import os
+import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from itertools import islice
-from multiprocessing import connection, get_context, parent_process
+from multiprocessing import active_children, connection, get_context, parent_process
+from multiprocessing.process import BaseProcess
 from threading import Thread
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -26,17 +28,18 @@ Work = Callable[..., Result]
 Task = tuple[Any, ...]  # arguments of the work
 
 THREADS = ("SONOTWIN_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+FIRST_WORKER_S = 60.0  # that a scheduler is given to have a worker
 AHEAD = 2  # tasks a thread of Dask's, so that none waits for the next one
 
 
 class Engine(Part):
-    """Where tasks are done, see `conf/engine`. None of it changes a result."""
+    """Where tasks are done, see `conf/engine`. On machines of one kind none of it changes a result."""
 
     name: Literal["local", "dask"] = "local"
     workers: Annotated[int, Field(ge=1, le=1024)] = 1  # processes; 1 of local is this process itself
     scheduler: str | None = None  # address of Dask's scheduler, tcp://host:8786; if not given, one is started here
     recycle: Annotated[int, Field(ge=1)] = 200  # tasks after which a local worker is replaced, whatever memory it has lost
-    retries: Annotated[int, Field(ge=0, le=100)] = 3  # of a task whose worker has died
+    retries: Annotated[int, Field(ge=0, le=100)] = 3  # of a task whose worker has died; a scheduler that is given has its own
 
     @model_validator(mode="after")
     def _one_place(self) -> "Engine":
@@ -68,32 +71,49 @@ def results(engine: Engine, work: Work[Result], tasks: Iterable[Task]) -> Iterat
 class _Worker:
     """A process that does one task at a time, and is replaced when it has died or done its share."""
 
-    def __init__(self, share: int) -> None:
-        self.share, self.begun, self.process = share, 0, _process()
+    def __init__(self, engine: Engine) -> None:
+        self.share, self.threads = engine.recycle, max((os.cpu_count() or 1) // engine.workers, 1)
+        self.begun, self.pool = 0, _pool()
+        self.processes: set[BaseProcess] = set()
 
     def begin(self, work: Work[Result], task: Task) -> Future[Result]:
         """Begin a task."""
         if self.begun == self.share:
             self.replace()
-        self.begun += 1
         try:
-            return self.process.submit(work, *task)
+            return self._submit(work, task)
         except BrokenProcessPool:  # it died while it was idle
             self.replace()
-            return self.process.submit(work, *task)
+            return self._submit(work, task)
 
     def replace(self) -> None:
         """Begin anew with another process."""
-        self.process.shutdown()
-        self.begun, self.process = 0, _process()
+        self.pool.shutdown()
+        self.begun, self.pool = 0, _pool()
+        self.processes.clear()
+
+    def end(self, at_once: bool) -> None:
+        """End the process; at once if nobody waits for its task."""
+        for process in self.processes if at_once else ():
+            process.terminate()
+        self.pool.shutdown(cancel_futures=True)
+
+    def _submit(self, work: Work[Result], task: Task) -> Future[Result]:
+        others = set(active_children())
+        with _threads(self.threads):  # in the environment of a process that is begun now
+            future = self.pool.submit(work, *task)
+        self.begun += 1
+        self.processes |= set(active_children()) - others
+        return future
 
 
-def _process() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_watch_parent)
+def _pool() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_depend_on_parent)
 
 
-def _watch_parent() -> None:
-    """End this process with its parent; else it would go on with its task after the parent was killed."""
+def _depend_on_parent() -> None:
+    """End this process with its parent, which takes Ctrl-C for both; else it would go on after the parent was killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if (parent := parent_process()) is not None:
         Thread(target=_end_after, args=(parent.sentinel,), daemon=True).start()
 
@@ -106,31 +126,32 @@ def _end_after(sentinel: int) -> None:
 def _by_processes(engine: Engine, work: Work[Result], tasks: Iterable[Task]) -> Iterator[Result]:
     """Do tasks in processes of this machine."""
     waiting, again = iter(tasks), deque[tuple[Task, int]]()  # tasks, and how often their worker has died
+    workers = [_Worker(engine) for _ in range(engine.workers)]
     running: dict[Future[Result], tuple[_Worker, Task, int]] = {}
-    with _threads(engine.workers):
-        idle = [_Worker(engine.recycle) for _ in range(engine.workers)]
-        try:
-            while True:
-                while idle and (following := _next(again, waiting)):
-                    worker, (task, deaths) = idle.pop(), following
-                    running[worker.begin(work, task)] = worker, task, deaths
-                if not running:
-                    return
-                done, _ = wait(running, return_when=FIRST_COMPLETED)
-                ready = []
-                for future in done:
-                    worker, task, deaths = running.pop(future)
-                    idle.append(worker)
-                    if isinstance(future.exception(), BrokenProcessPool):
-                        worker.replace()
-                        again.append((task, _counted(engine, deaths)))
-                    else:
-                        ready.append(future)
-                for future in ready:
-                    yield future.result()
-        finally:
-            for worker in [*idle, *(worker for worker, _, _ in running.values())]:
-                worker.process.shutdown(cancel_futures=True)
+    idle = list(workers)
+    try:
+        while True:
+            while idle and (following := _next(again, waiting)):
+                worker, (task, deaths) = idle[-1], following
+                running[worker.begin(work, task)] = worker, task, deaths
+                idle.pop()
+            if not running:
+                return
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            ready = []
+            for future in done:
+                worker, task, deaths = running.pop(future)
+                idle.append(worker)
+                if isinstance(future.exception(), BrokenProcessPool):
+                    worker.replace()
+                    again.append((task, _counted(engine, deaths)))
+                else:
+                    ready.append(future)
+            for future in sorted(ready, key=lambda future: future.exception() is not None):  # an error ends it all
+                yield future.result()
+    finally:
+        for worker in workers:
+            worker.end(at_once=bool(running))
 
 
 def _next(again: deque[tuple[Task, int]], waiting: Iterator[Task]) -> tuple[Task, int] | None:
@@ -181,30 +202,32 @@ def _client(engine: Engine) -> Iterator[Any]:
     import dask
     from distributed import Client, KilledWorker, LocalCluster
 
-    dask.config.set({"distributed.scheduler.allowed-failures": engine.retries})
     with ExitStack() as stack:
         if engine.scheduler is None:
-            stack.enter_context(_threads(engine.workers))
-            local = LocalCluster(engine.workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL)
+            stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": engine.retries}))
+            stack.enter_context(_threads(max((os.cpu_count() or 1) // engine.workers, 1)))
+            here = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
+            local = LocalCluster(engine.workers, threads_per_worker=1, **here)
             client = stack.enter_context(Client(stack.enter_context(local)))
         else:
             try:
                 client = stack.enter_context(Client(engine.scheduler))
+                client.wait_for_workers(1, timeout=FIRST_WORKER_S)
             except (OSError, TimeoutError, ValueError) as error:
-                expected = f"expected the address of Dask's scheduler, found none at {engine.scheduler}"
+                expected = f"expected the address of Dask's scheduler with a worker, found none at {engine.scheduler}"
                 raise InputError(f"engine.scheduler: {expected}: {error}") from None
         try:
             yield client
-        except KilledWorker:
-            died = f"a task's worker died {engine.retries + 1} times"
-            raise InputError(f"engine: {died}, likely for want of memory; start Dask with fewer workers a machine") from None
+        except KilledWorker as error:
+            reason = "likely for want of memory; start Dask with fewer workers a machine"
+            raise InputError(f"engine: a task's worker died {error.allowed_failures + 1} times, {reason}") from None
 
 
 @contextmanager
-def _threads(workers: int) -> Iterator[None]:
-    """Let processes that are begun meanwhile share this machine's cores."""
+def _threads(count: int) -> Iterator[None]:
+    """Give processes that are begun meanwhile so many threads each."""
     kept = {name: os.environ.get(name) for name in THREADS}
-    os.environ |= dict.fromkeys(THREADS, str(max((os.cpu_count() or 1) // workers, 1)))
+    os.environ |= dict.fromkeys(THREADS, str(count))
     try:
         yield
     finally:

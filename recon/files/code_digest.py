@@ -8,10 +8,10 @@ from pathlib import Path
 
 @cache
 def code_digest(*places: str | Path) -> str:
-    """Digest of all Python and YAML files of packages, by their names, and of folders: of the files' names and content."""
+    """Digest of all files of packages, by their names, and of folders, but of compiled code: of their names and content."""
     found = hashlib.sha256()
     for root in map(_folder, places):
-        for path in sorted(path for path in root.rglob("*") if path.suffix in (".py", ".yaml")):
+        for path in sorted(path for path in root.rglob("*") if path.is_file() and "__pycache__" not in path.parts):
             found.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes() + b"\0")
     return found.hexdigest()[:12]
 

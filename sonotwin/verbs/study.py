@@ -33,7 +33,7 @@ class Config(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    name: str
+    name: Annotated[str, Field(coerce_numbers_to_str=True)]
     out: Path
     trials: Path | None = None
     title: str = ""
@@ -48,6 +48,7 @@ class Config(BaseModel):
     beside: tuple[Figure, ...] = ()
     document: Path | None = None
     engine: Engine = Engine()
+    given: tuple[str, ...] = ()  # on the command line
     settings: Settings  # of the experiment: all fields that are not above
 
     @model_validator(mode="before")
@@ -56,17 +57,21 @@ class Config(BaseModel):
         """Take from the named study what isn't given, and gather the experiment's settings."""
         if not isinstance(given, dict) or "settings" in given:
             return given
+        overrides = tuple((info.context or {}).get("overrides", ()))
         study = read_study(given["name"])
         if study is not None and study.fields:
-            given = compose("study", [*study.fields, *(info.context or {}).get("overrides", [])])
+            given = compose("study", [*study.fields, *overrides])
         own = {} if study is None else study.model_dump(exclude={"fields"})
         ranges = yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"]
         settings = {name: value for name, value in given.items() if name in Settings.model_fields} | {"ranges": ranges}
         fields = {name: value for name, value in given.items() if name not in Settings.model_fields and value is not None}
+        for name in ("search", "budget"):
+            if own.get(name) and isinstance(fields.get(name), dict):
+                fields[name] = own[name] | fields[name]
         for name in ("of", "over"):
             if name not in own | fields:
                 raise ValueError(f"{name}: needs a value with name={SWEEP}; give {name}=...")
-        return {**own, **fields, "settings": settings}
+        return {**own, **fields, "given": overrides, "settings": settings}
 
     @model_validator(mode="after")
     def _known(self) -> "Config":

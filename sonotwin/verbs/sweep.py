@@ -39,7 +39,7 @@ from twin.ultrasound.bscan import Scan, scans
 from twin.ultrasound.echo_solids import Body, at_speeds, body
 from twin.ultrasound.probe_path import WirePath
 from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise
-from twin.ultrasound.transducer import Transducer
+from twin.ultrasound.transducer import Transducer, check_scanner
 
 if TYPE_CHECKING:
     from twin.tracking.rendered_views import Frames
@@ -91,14 +91,6 @@ class Config(BaseModel):
     def _one_scanner(self) -> "Config":
         check_scanner(self.rig, self.ultrasound)
         return self
-
-
-def check_scanner(rig: Rig, transducer: Transducer) -> None:
-    """Check that `rig.probe` and the transducer describe one scanner; ValueError if they don't."""
-    for name in ("image_size", "scale_mm_per_px"):
-        design, found = getattr(rig.probe, name), getattr(transducer, name)
-        if design != found:
-            raise ValueError(f"ultrasound.{name}: expected rig.probe's {list(design)}, found {list(found)}")
 
 
 def run(config: Config) -> None:

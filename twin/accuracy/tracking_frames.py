@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from recon.errors import InputError
 from twin.accuracy.table_rows import Setup
 from twin.shooting import Quality
 from twin.tracking.mesh_bank import build_bank
@@ -13,6 +14,7 @@ from twin.tracking.surface_prints import BitGrid
 
 BATCH = 4  # takes in one launch
 STUDY_VARIANTS = 12  # of bodies and surroundings
+MOST_TRIES = 50  # poses for each that shows the target whole
 WHOLLY = 0.999  # of each disc: what a study asks to be seen of them
 
 
@@ -43,6 +45,10 @@ def study(
     bank = build_bank(setup.rig.target, STUDY_VARIANTS, seed)
     given, k = 0, 0
     while given < count:
+        if k > MOST_TRIES * count:
+            raise InputError(
+                f"film: expected targets that both cameras see whole, found {given} in {k} poses: too large, or too far off"
+            )
         takes = [study_take(setup.rig, ranges, seed, number, white_dn, blur_px) for number in range(k, k + BATCH)]
         k += BATCH
         looked = render_sketches(bank, setup.rig, takes, Quality(window=2), seed, grid)

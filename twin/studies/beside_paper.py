@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from recon.files.metrics import shown
 from recon.model.rig import Part
-from twin.studies.study_plots import finite, short
-from twin.studies.study_runs import Done
+from twin.studies.study_plots import short
+from twin.studies.study_runs import Done, finite
 
 FACTOR = 1.5  # between a figure of the paper and that of its method in the twin, that counts as met
-HEAD = ("conditions", "figure", "paper reported", "paper's method in the twin", "ours", "limit", "unit")
+HEAD = ("conditions", "figure", "paper reported", "paper's method in the twin", "met", "ours", "limit", "unit")
 
 
 class Figure(Part):
@@ -65,7 +65,8 @@ def cells(one: Compared) -> list[str]:
     low, high = one.figure.reported
     reported = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     limit = shown(one.limit, ".3g") if one.figure.limit else ""
-    return [one.point, one.figure.what, reported, _spread(one.paper), _spread(one.ours), limit, one.figure.unit]
+    met = "yes" if one.explained else "no"
+    return [one.point, one.figure.what, reported, _spread(one.paper), met, _spread(one.ours), limit, one.figure.unit]
 
 
 def markdown(compared: Sequence[Compared]) -> str:

@@ -15,6 +15,10 @@ from twin.studies import error_budget
 from twin.studies.error_budget import Budget, Sum
 from twin.studies.study_page import PICTURES
 
+PREDICTED = (
+    "Errors as the software propagates them. Of the latency and the speed of sound it is told the size that is drawn: their "
+    "ratios test slopes alone. Tolerances that act on wires and scan alike cancel in part, which neither's covariance knows."
+)
 LEAST = 0.002  # share of the sum's square that gets a bar of its own
 
 
@@ -58,12 +62,22 @@ def waterfall(one: Sum) -> Figure:
 
 
 def _parts(budget: Budget, one: Sum) -> tuple[list[str], list[list[str]], str]:
-    head = ["source", "alone, mm", f"{budget.step:g} times as large, mm", "share of the square, %"]
+    head = ["source", "alone, mm", "± 1 sigma", f"{budget.step:g} times as large, mm", "share of the square, %"]
     rows = [
-        [part.source, shown(part.alone, ".4f"), shown(part.larger, ".4f"), f"{100 * part.alone**2 / (one.added**2 or 1):.1f}"]
+        [
+            part.source,
+            shown(part.alone, ".4f"),
+            shown(part.uncertainty, ".4f"),
+            shown(part.larger, ".4f"),
+            f"{100 * part.alone**2 / (one.added**2 or 1):.1f}",
+        ]
         for part in one.parts
     ]
-    return head, rows, f"Root mean squares over {one.parts[0].trials} seeds."
+    return (
+        head,
+        rows,
+        f"Root mean squares over {one.parts[0].trials} seeds. Where a larger source isn't as much larger, it isn't linear.",
+    )
 
 
 def _predicted(one: Sum) -> tuple[list[str], list[list[str]], str]:
@@ -72,4 +86,4 @@ def _predicted(one: Sum) -> tuple[list[str], list[list[str]], str]:
         [names, shown(known, ".4f"), shown(switched, ".4f"), shown(known / switched if switched else np.nan, ".2f")]
         for names, (known, switched) in one.predicted.items()
     ]
-    return head, rows, "The same errors as the software propagates them from its own covariances."
+    return head, rows, PREDICTED

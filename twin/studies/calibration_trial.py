@@ -47,4 +47,5 @@ EXPERIMENT = Experiment(
     ("rig", "layout", "board", "board_patterns", "poses", "conditions", "tracing", "shooting"),
     measure,
     {"point_error_mm": "point_sigma_mm", "plane_form_mm": ""},
+    "predicted by the calibration's covariance",
 )

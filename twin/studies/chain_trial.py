@@ -1,5 +1,7 @@
 """A session's errors from board to mass, by drawn measurements: points of the surface, pixels of B-scans, a mass's centre.
 
+Errors of points and pixels are those in camera 1's frame; the mass's also against the skin over it, as light measures that.
+
 Beside them stand the errors that the software predicts, by their parts.
 """
 
@@ -8,13 +10,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.freehand import place_uncertainty, sequences
 from recon.freehand.place_uncertainty import PlaceErrors
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
 from recon.optical_calibration import uncertainty
+from twin.evaluation.surface_errors import rms
 from twin.studies import drawn_session
 from twin.studies.drawn_session import Noise, Session
 from twin.studies.experiments import Experiment, Settings
@@ -23,6 +28,13 @@ from twin.studies.layout import laid_out
 Array = NDArray[np.float64]
 
 MEASURING = ("cam1", "projector")
+CONDITIONS = (  # that act on drawn measurements
+    *(f"conditions.board.{name}" for name in ("place_mm", "stretch", "bow_mm", "flex_mm")),
+    *(f"conditions.motion.{name}" for name in ("trigger_s", "bracket_mm", "bracket_deg")),
+    "conditions.target",
+    "conditions.sound",
+    "conditions.drift",
+)
 NEWTON_STEPS = 5
 DEPTHS_MM = (620.0, 660.0, 700.0)  # z of the surface's points
 GRID = (7, 7)  # pixels of a B-scan, across and down
@@ -41,10 +53,11 @@ def measure(settings: Settings, seed: int) -> Metrics:
     places = np.stack([place_errors(found, k, pixels) for k in range(len(found.true_poses))])
     predicted = predicted_places(found, noise.latency_s, settings.conditions.sound.tissue, pixels)
     return {
-        "surface_rms_mm": _rms(points),
-        "pixel_rms_mm": _rms(np.linalg.norm(places, axis=-1)),
+        "surface_rms_mm": rms(points),
+        "pixel_rms_mm": rms(np.linalg.norm(places, axis=-1)),
         "mass_error_mm": float(np.linalg.norm(mass_error(found))),
-        "surface_predicted_mm": _rms(sigmas),
+        "mass_to_skin_mm": float(np.linalg.norm(mass_error(found) - skin_error(found))),
+        "surface_predicted_mm": rms(sigmas),
         "pixel_predicted_mm": float(np.sqrt(sum(sigma**2 for sigma in predicted.values()))),
         **{f"pixel_predicted_by_{name}_mm": sigma for name, sigma in predicted.items()},
     }
@@ -55,14 +68,40 @@ def surface_errors(found: Session, level: Noise, seed: int) -> tuple[Array, Arra
 
     The devices that are used see the points, and the calibration places them.
     """
-    (camera, projector), known = ([of.cameras[name] for name in MEASURING] for of in (found.used, found.optics))
     points = uncertainty.working_volume(found.used, DEPTHS_MM)
     noise = level.drawn.column * level.column_px * np.random.default_rng([seed, 26]).standard_normal(len(points))
-    rays = known[0].rays(camera.project(points))
-    placed = on_rays(known, rays, projector.project(points)[:, 0] + noise, points)
-    slope = np.einsum("mi,mi->m", linearise(known[1], points, ()).by_point[:, 0], rays)
-    by_optics = uncertainty.triangulation(found.optics, *MEASURING, points)[:, 2, 2]
-    return (placed - points)[:, 2], np.sqrt((level.column_px * rays[:, 2] / slope) ** 2 + by_optics)
+    by_noise, by_optics = predicted_points(found, points, level.column_px)
+    return (measured(found, points, noise) - points)[:, 2], np.sqrt(by_noise + by_optics)
+
+
+def measured(found: Session, points: Array, noise_px: Array | float = 0.0) -> Array:
+    """Points : (m, 3) mm as camera 1 and projector measure them, with errors of their columns."""
+    (camera, projector), known = ([of.cameras[name] for name in MEASURING] for of in (found.used, found.optics))
+    return on_rays(known, known[0].rays(camera.project(points)), projector.project(points)[:, 0] + noise_px, points)
+
+
+def skin_error(found: Session) -> Array:
+    """Error : (3,) mm of the skin under the array's face, by light."""
+    face = np.array([drawn_session.MIDDLE_MM])
+    return (measured(found, face) - face)[0]
+
+
+def predicted_points(found: Session, points: Array, column_px: float) -> tuple[Array, Array]:
+    """Predicted variances along z : (m,) mm^2 of points by the noise of columns, and by the optics with scale and drift.
+
+    A point is where camera 1 sees it, u and v, and where the projector's column is: `d(point) = -A^-1 B d(parameters)`.
+    """
+    cameras = found.optics.cameras
+    known = in_use(found.optics.uncertainty, cameras, PRINT_SCALE, DRIFT_PX)
+    assert known is not None
+    by_point, by_parameter = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, len(known.names)))
+    for device, rows, axes in ((MEASURING[0], slice(0, 2), slice(0, 2)), (MEASURING[1], slice(2, 3), slice(0, 1))):
+        own = [k for k, name in enumerate(known.names) if name.startswith(f"{device}.")]
+        seen = linearise(cameras[device], points, [known.names[k].removeprefix(f"{device}.") for k in own])
+        by_point[:, rows], by_parameter[:, rows, own] = seen.by_point[:, axes], seen.by_parameter[:, axes]
+    to_z = np.linalg.inv(by_point)[:, 2]
+    by_optics = np.einsum("mr,mrg->mg", to_z, by_parameter)
+    return (to_z[:, 2] * column_px) ** 2, np.einsum("mg,gh,mh->m", by_optics, known.covariance, by_optics)
 
 
 def on_rays(devices: list[Camera], rays: Array, columns: Array, start: Array) -> Array:
@@ -90,7 +129,10 @@ def mass_error(found: Session) -> Array:
         x, y, beside = rigid.apply(rigid.invert(pose), middle)
         inside = (offsets**2).sum(axis=1) + beside**2 < MASS_MM**2
         errors.append(place_errors(found, k, ([x, y] + offsets[inside]) / found.true_probe.scale))
-    return np.concatenate(errors).mean(axis=0)
+    together = np.concatenate(errors)
+    if not len(together):
+        raise InputError(f"noise.span_mm: expected a scan of which B-scans cut a mass of {MASS_MM:g} mm radius, found none")
+    return together.mean(axis=0)
 
 
 def predicted_places(found: Session, latency_s: float, tissue: float, pixels: Array) -> dict[str, float]:
@@ -110,16 +152,13 @@ def predicted_places(found: Session, latency_s: float, tissue: float, pixels: Ar
     forms = {name: place_uncertainty.forms(placed, found.probe, errors) for name, errors in parts.items()}
     by_probe = forms["probe"]  # in all of them
     return {
-        name: _rms(place_uncertainty.sigmas(form if name == "probe" else form - by_probe, pixels)) for name, form in forms.items()
+        name: rms(place_uncertainty.sigmas(form if name == "probe" else form - by_probe, pixels)) for name, form in forms.items()
     }
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 EXPERIMENT = Experiment(
-    ("rig", "layout", "conditions", "noise", "poses", "ultrasound"),
+    ("rig", "layout", *CONDITIONS, "noise", "poses", "ultrasound"),
     measure,
-    {"surface_rms_mm": "surface_predicted_mm", "pixel_rms_mm": "pixel_predicted_mm", "mass_error_mm": ""},
+    {"surface_rms_mm": "surface_predicted_mm", "pixel_rms_mm": "pixel_predicted_mm", "mass_error_mm": "", "mass_to_skin_mm": ""},
+    "predicted by the software's covariances",
 )

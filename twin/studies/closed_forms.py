@@ -53,14 +53,15 @@ def contrast(rig: Rig, fringes: Fringes, place: Array) -> float:
 def raster_sigma(rig: Rig, fringes: Fringes, place: Array) -> float:
     """RMS error of the phase, rad, that the projector's mirrors leave: replicas of the fringes at 1 -+ 1 / pitch cycles a px.
 
-    Sampling makes them as strong as the fringes; a mirror's width, sinc(f), and all blur weaken them. Their phase moves with the
-    shifts, one backwards, so that no number of steps takes them out.
+    Sampling makes them as strong as the fringes; a mirror's width, sinc(f), and all blur weaken them. Over a mirror's width both
+    turn once against the fringes, one forwards and one backwards, whatever the shift: no number of steps takes them out. As
+    sinc has other signs for them, their errors `sin(2 pi x)` add up.
     """
     wave, amplitudes = 1 / fringes.pitch, []
     for replica in (1 - wave, 1 + wave):
         blurred = np.exp(-2 * np.pi**2 * _blur(rig, place) * (replica**2 - wave**2))
         amplitudes.append(np.sinc(replica) / np.sinc(wave) * blurred)
-    return float(np.linalg.norm(amplitudes) / np.sqrt(2))
+    return float((amplitudes[0] - amplitudes[1]) / np.sqrt(2))
 
 
 def _blur(rig: Rig, place: Array) -> float:

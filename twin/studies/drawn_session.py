@@ -43,7 +43,7 @@ WATER_C = 22.0  # nominal, of the tank
 ROLL_DEG = 90.0  # of the probe over the wires, both ways: as far as the cameras see the target
 MIDDLE_MM = (4.0, -2.0, 620.0)  # of the array's face, in the middle of the scan
 TILT_DEG = 8.0  # standard deviation of the hand's tilts over the scan
-SOME = 1e-2  # least noise over what is claimed: adjustments scale their covariances by their residuals
+SOME = 1e-2  # least drawn noise over the claimed: adjustments would scale their covariances to zero
 SCAN_STREAM = 1000  # added to the seed of what the scan draws again: bracket and triggers
 
 
@@ -51,7 +51,7 @@ Size = Annotated[float, Field(gt=0)]
 
 
 class Noise(Part):
-    """Standard deviations of what detectors find, as they claim and as is drawn, and the motion of the scan."""
+    """Standard deviations of what detectors find, as they claim them, and the motion of the scan."""
 
     board_px: Size = 0.004  # of a disc's centre in a camera, three quarters in the projector; of rendered boards
     circle_px: Size = 0.008  # of a circle of the target, along each axis; of rendered films
@@ -60,21 +60,24 @@ class Noise(Part):
     latency_s: Size = 0.001  # of the scanner's latency, as measured over a flat bottom
     column_px: Size = 0.02  # of the projector's column that a pixel sees
     wires: Annotated[int, Field(ge=6, le=1000)] = 40  # B-scans of the wires
-    scans: Annotated[int, Field(ge=2, le=1000)] = 40  # B-scans over the mass, half of them there and half back
+    scans: Annotated[int, Field(ge=8, le=1000, multiple_of=2)] = 40  # B-scans over the mass, half of them there and half back
     span_mm: Positive = 20.0  # way of the probe over the mass
     speed_mm_s: Positive = 10.0
     drawn: "Drawn" = Field(default_factory=lambda: Drawn())
 
 
 class Drawn(Part):
-    """What is drawn, over what detectors claim: 0 turns an error off."""
+    """Sizes of drawn errors over those that detectors claim, and of a bracket's giving over that of the conditions; 0 is none."""
 
     board: NotNegative = 1.0
-    circle: NotNegative = 1.0
+    circle_at_wires: NotNegative = 1.0  # while the probe is calibrated
+    circle_in_scan: NotNegative = 1.0
     crossing: NotNegative = 1.0
     beside: NotNegative = 1.0
     latency: NotNegative = 1.0
     column: NotNegative = 1.0
+    bracket_at_wires: NotNegative = 1.0
+    bracket_in_scan: NotNegative = 1.0
 
 
 class Eye(NamedTuple):
@@ -86,7 +89,7 @@ class Eye(NamedTuple):
     printed: Target
     design: Target
     sigma_px: float  # of a circle along each axis, as the detector claims
-    drawn: float  # errors over that
+    times: float  # drawn errors over that
 
 
 class Tracked(NamedTuple):
@@ -123,13 +126,21 @@ def draw(rig: Rig, life: Conditions, noise: Noise, transducer: Transducer, poses
     used = calibration_of(conditions.drifted(rig, life.drift, seed))
     printed = conditions.printed(rig.target, life.target, seed)
     known = in_use(optics.uncertainty, optics.cameras, PRINT_SCALE, DRIFT_PX)
-    eye = Eye(pair(used), pair(optics), known, printed, rig.target, noise.circle_px, noise.drawn.circle)
+    eye = Eye(pair(used), pair(optics), known, printed, rig.target, noise.circle_px, noise.drawn.circle_in_scan)
     faster, warmer = conditions.speeds(life.sound, seed)
     water = float(speed_of_sound(WATER_C + warmer) / speed_of_sound(WATER_C))
-    probe = calibrated_probe(rig, eye, life, noise, water, transducer, seed)
+    at_wires = eye._replace(times=noise.drawn.circle_at_wires)
+    probe = calibrated_probe(rig, at_wires, life, noise, water, transducer, seed)
     true_poses, velocity = led(rig, noise, np.random.default_rng([seed, 22]))
     later = conditions.triggered(life.motion, len(true_poses), seed + SCAN_STREAM)
-    tracked = look(eye, true_poses, bracket(rig, life, len(true_poses), seed + SCAN_STREAM), later, velocity, [seed, 23])
+    tracked = look(
+        eye,
+        true_poses,
+        bracket(rig, life, noise.drawn.bracket_in_scan, len(true_poses), seed + SCAN_STREAM),
+        later,
+        velocity,
+        [seed, 23],
+    )
     if not np.isfinite(tracked.poses).all():
         raise InputError(f"target: expected to be seen in all {len(true_poses)} poses of the scan, found it lost in some")
     true_probe = ProbeCalibration(rig.probe.target_from_image.matrix(), np.array(rig.probe.scale_mm_per_px) * [1.0, faster])
@@ -161,7 +172,9 @@ def calibrated_probe(
     pixels = local[:, :2] / (np.array(rig.probe.scale_mm_per_px) * [1.0, water])
     pixels = pixels + max(drawn_too.crossing, SOME) * noise.crossing_px * rng.standard_normal(pixels.shape)
     at_rest = np.zeros((len(images), 3))
-    tracked = look(eye, images, bracket(rig, life, len(images), seed), at_rest[:, :2], at_rest, [seed, 25])
+    tracked = look(
+        eye, images, bracket(rig, life, drawn_too.bracket_at_wires, len(images), seed), at_rest[:, :2], at_rest, [seed, 25]
+    )
     found = np.isfinite(tracked.poses).all(axis=(1, 2))
     covariance = np.broadcast_to(noise.crossing_px**2 * np.eye(2), (found.sum(), 2, 2))
     beside = np.full(found.sum(), noise.beside_mm)
@@ -185,9 +198,9 @@ def led(rig: Rig, noise: Noise, rng: np.random.Generator) -> tuple[Array, Array]
     return poses, velocity
 
 
-def bracket(rig: Rig, life: Conditions, count: int, seed: int) -> Array:
+def bracket(rig: Rig, life: Conditions, times: float, count: int, seed: int) -> Array:
     """Poses `target_from_image` : (n, 4, 4) of a bracket that gives from the first to the last."""
-    design, steps = rig.probe.target_from_image.matrix(), conditions.given(life.motion, np.arange(count) * 10**9, seed)
+    design, steps = rig.probe.target_from_image.matrix(), times * conditions.given(life.motion, np.arange(count) * 10**9, seed)
     return np.stack([rigid.moved(design, step) for step in steps])
 
 
@@ -211,7 +224,9 @@ def look(eye: Eye, images: Array, held: Array, later_s: Array, velocity: Array, 
 def _sighting(eye: Eye, k: int, world_from_target: Array, rng: np.random.Generator) -> Sighting:
     """What a camera finds of the target."""
     centres, shapes = ellipses_of(eye.true[k], world_from_target, *circle_layout.circles(eye.printed))
-    seen = centres + max(eye.drawn, SOME) * eye.sigma_px * rng.standard_normal(centres.shape)
+    seen = centres + max(eye.times, SOME) * eye.sigma_px * rng.standard_normal(centres.shape)
+    outside = ((centres < 0) | (centres > np.array(eye.true[k].size) - 1)).any(axis=1)
+    seen[outside] = np.nan
     return Sighting(eye.known[k], seen, np.broadcast_to(eye.sigma_px**2 * np.eye(2), (3, 2, 2)), shapes)
 
 

@@ -4,30 +4,45 @@ Sources are fields whose values are sizes of errors, so a source that is off is 
 seeds, and independent ones add up in squares.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from recon.errors import InputError
 from recon.model.rig import Part
+from twin.evaluation.surface_errors import rms
 from twin.studies import factors
 from twin.studies.factors import Point
-from twin.studies.study_plots import finite
-from twin.studies.study_runs import Done
+from twin.studies.study_runs import Done, finite
 
 SMALL = 0.05  # share of the whole's square that is worth a word
 
 
 class Budget(Part):
-    """Sources of errors, and the figures that they add up in."""
+    """Sources of errors, and the figures that are budgeted."""
 
     sources: Annotated[dict[str, tuple[str, ...]], Field(min_length=1)]  # fields of each source, by a name for people
-    figures: Annotated[dict[str, str], Field(min_length=1)]  # figures and what they are of, for people
+    figures: Annotated[dict[str, str], Field(min_length=1)]  # figures in mm and what they are of, for people
     predicted: dict[str, dict[str, str]] = Field(default_factory=dict)  # figure: source or sources joined by +: predicted figure
     step: Annotated[float, Field(gt=1, le=10)] = 2.0  # by which each source is varied
     mend: dict[str, str] = Field(default_factory=dict)  # source: what makes it smaller
+
+    @model_validator(mode="after")
+    def _known(self) -> "Budget":
+        joined = [name.strip() for each in self.predicted.values() for names in each for name in names.split(factors.JOINT)]
+        checks = (
+            ("predicted", self.predicted, self.figures),
+            ("predicted", joined, self.sources),
+            ("mend", self.mend, self.sources),
+        )
+        for place, names, known in checks:
+            for name in names:
+                if name not in known:
+                    raise ValueError(f"{place}: expected among {', '.join(known)}, found {name}")
+        return self
 
 
 @dataclass(frozen=True)
@@ -37,7 +52,12 @@ class Contribution:
     source: str
     alone: float  # RMS over seeds, of this source alone
     larger: float  # a step larger
-    trials: int
+    trials: int  # that gave the figure
+
+    @property
+    def uncertainty(self) -> float:
+        """Standard deviation of `alone`, as of draws from a normal distribution, one a seed."""
+        return self.alone / np.sqrt(2 * max(self.trials, 1))
 
 
 @dataclass(frozen=True)
@@ -46,6 +66,7 @@ class Sum:
 
     figure: str
     whole: float  # RMS over seeds, of all sources
+    trials: int
     parts: tuple[Contribution, ...]  # the greatest first
     predicted: Mapping[str, tuple[float, float]]  # of sources that the software knows: predicted, and by switching
 
@@ -61,6 +82,9 @@ def points(budget: Budget, settings: Mapping[str, Any]) -> dict[tuple[str, float
     settings : as JSON has them
     """
     usual = {field: factors.value_at(settings, field) for fields in budget.sources.values() for field in fields}
+    for field, value in usual.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+            raise InputError(f"budget: sources: {field}: expected the size of an error, above zero, found {value}")
     found = {("", 1.0): dict(usual)}
     for source, fields in budget.sources.items():
         for size in (1.0, budget.step):
@@ -72,20 +96,21 @@ def added_up(budget: Budget, done: Mapping[tuple[str, float], Sequence[Done]]) -
     """The budgets of all figures, from trials by source and size."""
     sums = []
     for figure in budget.figures:
-        level = {key: _rms(one.figures.get(figure) for one in trials) for key, trials in done.items()}
+        sizes = {key: finite(one.figures.get(figure) for one in trials) for key, trials in done.items()}
+        level = {key: rms(values) for key, values in sizes.items()}
         parts = [
-            Contribution(source, level[source, 1.0], level[source, budget.step], len(done[source, 1.0]))
+            Contribution(source, level[source, 1.0], level[source, budget.step], len(sizes[source, 1.0]))
             for source in budget.sources
         ]
         predicted = {
             names: (
-                _rms(one.figures.get(known) for one in done["", 1.0]),
+                rms(finite(one.figures.get(known) for one in done["", 1.0])),
                 float(np.sqrt(sum(level[name.strip(), 1.0] ** 2 for name in names.split(factors.JOINT)))),
             )
             for names, known in budget.predicted.get(figure, {}).items()
         }
-        parts.sort(key=lambda part: -part.alone)
-        sums.append(Sum(figure, level["", 1.0], tuple(parts), predicted))
+        parts.sort(key=lambda part: -np.nan_to_num(part.alone))
+        sums.append(Sum(figure, level["", 1.0], len(sizes["", 1.0]), tuple(parts), predicted))
     return sums
 
 
@@ -107,9 +132,8 @@ def advice(budget: Budget, one: Sum) -> list[str]:
 def explained(one: Sum) -> str:
     """Whether the parts explain the whole, in words."""
     off = one.added / one.whole - 1 if one.whole else np.nan
-    return f"{one.whole:.3f} mm by all sources together; {one.added:.3f} mm by their sum in squares, {100 * off:+.0f} %."
-
-
-def _rms(values: Iterable[Any]) -> float:
-    known = finite(values)
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+    sure = 1 / np.sqrt(2 * max(one.trials, 1))
+    return (
+        f"{one.whole:.3f} mm by all sources together, known to {100 * sure:.0f} % by {one.trials} seeds; "
+        f"{one.added:.3f} mm by their sum in squares, {100 * off:+.0f} %."
+    )

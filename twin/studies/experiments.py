@@ -5,28 +5,34 @@ trial that is kept isn't done anew when these change.
 """
 
 import hashlib
+import importlib.metadata
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
+from socket import gethostname
 from typing import Annotated, Any
 
+import cv2
 from pydantic import Field, field_validator, model_validator
 
 from recon.errors import InputError
+from recon.files.code_digest import code_digest
 from recon.files.metrics import Metrics
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
 from scenes.board_poses import Config as BoardPoses
 from scenes.kinds.board import Config as Board
 from twin.conditions import IDEAL, Conditions
+from twin.llvm import prepare
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
 from twin.shooting import power_of_two
 from twin.studies.drawn_session import Noise
 from twin.studies.layout import Layout
 from twin.tracking.sampling_ranges import DataRanges
-from twin.ultrasound.transducer import Transducer
+from twin.ultrasound.transducer import Transducer, check_scanner
 
 MODULES = {  # where an experiment's EXPERIMENT is
     "surface": "twin.studies.surface_trial",
@@ -35,6 +41,9 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "laboratory": "twin.studies.laboratory_trial",
     "chain": "twin.studies.chain_trial",
 }
+DIGITS = 6  # significant, of figures
+PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made
+LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "mitsuba", "drjit", "onnxruntime")
 
 
 class Plane(Part):
@@ -78,6 +87,7 @@ class Settings(Part):
         for name in ("patterns", "board_patterns"):
             if (shown := getattr(self, name).projector_size) != raster:
                 raise ValueError(f"{name}.projector_size: expected the rig's {list(raster)}, found {list(shown)}")
+        check_scanner(self.rig, self.ultrasound)
         return self
 
 
@@ -85,9 +95,10 @@ class Settings(Part):
 class Experiment:
     """One kind of trial."""
 
-    reads: tuple[str, ...]  # fields of the settings
+    reads: tuple[str, ...]  # fields of the settings, or parts of fields, by dotted names
     measure: Callable[[Settings, int], Metrics]  # figures by name, the unit in the name, of settings and a seed
-    limits: Mapping[str, str]  # figures that are plotted first, and the figure that is the closed form of each, or ""
+    limits: Mapping[str, str]  # figures that are plotted, and the figure that each is held against, or ""
+    limit: str = "closed form"  # what these are
 
 
 def experiment(name: str) -> Experiment:
@@ -99,7 +110,7 @@ def check_reads(name: str, fields: Iterable[str]) -> None:
     """Refuse fields that an experiment doesn't read; raises InputError with the name of one."""
     reads = experiment(name).reads
     for field in fields:
-        if field.partition(".")[0] not in reads:
+        if not any(f"{field}.".startswith(f"{read}.") or f"{read}.".startswith(f"{field}.") for read in reads):
             raise InputError(
                 f"over: {field}: expected a field that of={name} reads, of {', '.join(reads)}; it would change nothing"
             )
@@ -107,18 +118,40 @@ def check_reads(name: str, fields: Iterable[str]) -> None:
 
 def read_by(name: str, settings: Settings) -> dict[str, Any]:
     """The settings that an experiment reads, as JSON has them."""
-    return settings.model_dump(mode="json", include=set(experiment(name).reads))
+    return settings.model_dump(mode="json", include={read.partition(".")[0] for read in experiment(name).reads})
 
 
-def digest(name: str, settings: Settings, seed: int, code: str) -> str:
+@cache
+def version() -> str:
+    """Digest of all that a trial's figures depend on beside its settings and its seed: code, libraries and the ray tracer's."""
+    libraries = {name: importlib.metadata.version(name) for name in LIBRARIES}
+    content = json.dumps([code_digest(*PACKAGES), libraries, prepare()], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()[:12]
+
+
+def digest(name: str, settings: Settings, seed: int) -> str:
     """Name of a trial: by all that its figures depend on."""
-    content = json.dumps([code, name, read_by(name, settings), seed], sort_keys=True)
+    content = json.dumps([version(), name, read_by(name, settings), seed], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:20]
 
 
 def run_trial(key: str, name: str, settings: Settings, seed: int) -> tuple[str, Metrics | str]:
-    """Run a trial, and give its figures, or in one line why there are none: settings that nothing can be measured with."""
+    """Run a trial, and give its figures, or in one line why there are none: settings that nothing can be measured with.
+
+    Figures have DIGITS significant digits: those beyond the eleventh may depend on where linear algebra finds its buffers.
+
+    Raises
+    ------
+    InputError
+        If this machine's code or libraries aren't those of who asks.
+    """
+    if digest(name, settings, seed) != key:
+        raise InputError(
+            f"engine: expected workers with the code and the libraries of this machine, found others at {gethostname()}"
+        )
+    measure = experiment(name).measure
     try:
-        return key, experiment(name).measure(settings, seed)
-    except ValueError as error:  # InputError too
-        return key, " ".join(str(error).split()) or type(error).__name__
+        return key, {figure: float(f"{value:.{DIGITS}g}") for figure, value in measure(settings, seed).items()}
+    except (ValueError, cv2.error) as error:  # InputError too
+        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        return key, kind + " ".join(str(error).split())

@@ -31,22 +31,26 @@ class Range(Part):
     last: float = Field(alias="to")
     count: Annotated[int, Field(ge=2, le=10_000)] = 5
     log: bool = False
+    whole: bool = False  # numbers, rounded
 
     @model_validator(mode="after")
-    def _positive(self) -> "Range":
+    def _upwards(self) -> "Range":
+        if self.first >= self.last:
+            raise ValueError(f"expected from below to, found {self.first:g} and {self.last:g}")
         if self.log and min(self.first, self.last) <= 0:
             raise ValueError(f"expected from and to above 0 with log, found {self.first:g} and {self.last:g}")
         return self
 
     def values(self) -> list[Value]:
         """All values."""
-        return (np.geomspace if self.log else np.linspace)(self.first, self.last, self.count).tolist()
+        even = (np.geomspace if self.log else np.linspace)(self.first, self.last, self.count).tolist()
+        return list(dict.fromkeys(map(round, even))) if self.whole else even
 
     def quantile(self, share: float) -> Value:
         """The value below which a share of the range lies."""
-        if self.log:
-            return float(self.first * (self.last / self.first) ** share)
-        return float(self.first + (self.last - self.first) * share)
+        ratio, step = self.last / self.first if self.log else 1.0, self.last - self.first
+        value = self.first * ratio**share if self.log else self.first + step * share
+        return round(value) if self.whole else float(value)
 
 
 class Normal(Part):
@@ -75,7 +79,7 @@ class Choices(Part):
 
 
 Factor = Choices | Range | Normal
-KINDS = "a list, {from, to, count, log} or {normal: [mean, deviation]}"
+KINDS = "a list, {from, to, count, log, whole} or {normal: [mean, deviation]}"
 
 
 def read(over: Mapping[str, Any]) -> dict[str, Factor]:
@@ -105,11 +109,11 @@ def factorial(factors: Mapping[str, Factor]) -> list[Point]:
     return [dict(zip(factors, values, strict=True)) for values in itertools.product(*lists)]
 
 
-def filling(factors: Mapping[str, Factor], points: int, by: Filling, seed: int) -> list[Point]:
-    """Points that fill the factors' space evenly: of Sobol's sequence, scrambled, or of a Latin hypercube."""
+def filling(factors: Mapping[str, Factor], points: int, by: Filling) -> list[Point]:
+    """Points that fill the factors' space evenly: the first ones of Sobol's sequence, scrambled, or a Latin hypercube."""
     if not factors:
         raise InputError("over: expected fields to vary with points=N, found none")
-    sampler = {"sobol": qmc.Sobol, "latin": qmc.LatinHypercube}[by](len(factors), rng=np.random.default_rng([seed, points]))
+    sampler = {"sobol": qmc.Sobol, "latin": qmc.LatinHypercube}[by](len(factors), rng=np.random.default_rng(0))
     even = 1 << (points - 1).bit_length() if by == "sobol" else points  # Sobol's balance needs a power of two
     shares = np.clip(sampler.random(even)[:points], 1e-9, 1 - 1e-9)
     return [

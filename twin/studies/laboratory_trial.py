@@ -25,4 +25,5 @@ EXPERIMENT = Experiment(
     (*calibration_trial.EXPERIMENT.reads, "patterns"),
     measure,
     {"plane_rms_ours_mm": "plane_limit_mm", "plane_rms_paper_mm": "plane_limit_mm", "sphere_rms_ours_mm": "sphere_limit_mm"},
+    "noise alone",
 )

@@ -18,8 +18,7 @@ from pydantic import Field
 from recon.errors import InputError
 from recon.model.rig import Part
 from twin.studies.factors import Choices, Factor, Normal, Point, Range
-from twin.studies.study_plots import finite, numeric
-from twin.studies.study_runs import Done
+from twin.studies.study_runs import Done, numeric
 
 PRICE = "price"
 
@@ -31,7 +30,9 @@ class Bound(Part):
     most: float | None = None
 
     def excess(self, value: float) -> float:
-        """How far a value is out of bounds, relative to them; 0 or less within."""
+        """How far a value is out of bounds, relative to the bound; 0 or less within, infinite if there is none."""
+        if not math.isfinite(value):
+            return math.inf
         over = [(value - self.most) / (abs(self.most) or 1)] if self.most is not None else []
         under = [(self.least - value) / (abs(self.least) or 1)] if self.least is not None else []
         return max([*over, *under, -math.inf])
@@ -56,9 +57,9 @@ class Candidate:
 
     point: Point
     done: tuple[Done, ...]
-    value: float  # of the figure to be least; NaN if a trial gave none
-    figures: Mapping[str, float]  # means over seeds, in the worst of each: the greatest, or the least where that is bound
-    excess: float  # by which bounds are missed, relative to them; 0 or less if none is
+    value: float  # of the figure to be least: its mean over seeds, the greatest of each; NaN if a trial gave none
+    bound: Mapping[str, float]  # figures that are bound: means over seeds, where they are farthest out
+    excess: float  # by which a bound is missed, relative to it, at most; 0 or less if none is
 
     @property
     def good(self) -> bool:
@@ -73,12 +74,18 @@ def check(goal: Goal, factors: Mapping[str, Factor]) -> None:
             raise InputError(f"over: {name}: expected values or a range to search in, found a distribution")
     if goal.start and set(goal.start) != set(factors):
         raise InputError(f"search: start: expected a value for each of {', '.join(factors)}, found {', '.join(goal.start)}")
+    if PRICE in goal.bounds and not goal.prices:
+        raise InputError("search: bounds.price: expected prices with it, found none")
     for name, value in goal.start.items():
         factor = factors[name]
         if isinstance(factor, Choices) and value not in factor.choices:
             raise InputError(f"search: start.{name}: expected one of {factor.choices}, found {value}")
+        if isinstance(factor, Range) and not factor.first <= value <= factor.last:
+            raise InputError(f"search: start.{name}: expected {factor.first:g} to {factor.last:g}, found {value}")
     if goal.by == "gp" and find_spec("torch") is None:
-        raise InputError("search: by: gp needs PyTorch, of sonotwin's extra train, found none; install it, or take search.by=tpe")
+        raise InputError(
+            "search: by: gp needs PyTorch, of sonotwin's extra train, found none; install it, or give search='{by: tpe}'"
+        )
     for name, prices in goal.prices.items():
         factor = factors.get(name)
         count = len(factor.choices) if isinstance(factor, Choices) else 0
@@ -130,17 +137,31 @@ def _sampler(goal: Goal, seed: int) -> optuna.samplers.BaseSampler:
 
 
 def judged(goal: Goal, factors: Mapping[str, Factor], point: Point, done: Sequence[Done]) -> Candidate:
-    """A candidate by its trials."""
-    names = list(dict.fromkeys(name for one in done for name in one.figures))
-    figures = {PRICE: price(goal, factors, point)} if goal.prices else {}
-    for name in names:
-        under = [finite(one.figures.get(name) for one in done if within(one, some)) for some in conditions(goal)]
-        means = [float(values.mean()) if values.size else math.nan for values in under]
-        bound = goal.bounds.get(name)
-        figures[name] = min(means) if bound is not None and bound.most is None else max(means)
-    failed = any(isinstance(one.found, str) for one in done)
-    excess = max((bound.excess(figures.get(name, math.nan)) for name, bound in goal.bounds.items()), default=-math.inf)
-    return Candidate(point, tuple(done), math.nan if failed else figures.get(goal.least, math.nan), figures, excess)
+    """A candidate by its trials; one of whose trials has no figure is out of all bounds.
+
+    Raises
+    ------
+    InputError
+        If trials have no figure of a name that the goal or a bound has.
+    """
+    cost = {PRICE: price(goal, factors, point)} if goal.prices else {}
+    for one in done:
+        for name in (goal.least, *goal.bounds):
+            if one.figures and name not in one.figures | cost:
+                raise InputError(f"search: expected figures among {', '.join([*one.figures, *cost])}, found {name}")
+    under = [[one for one in done if within(one, some)] for some in conditions(goal)]
+    worst, excess = {}, -math.inf
+    for name, bound in goal.bounds.items():
+        means = [cost[name]] if name in cost else [_mean(trials, name) for trials in under]
+        worst[name] = max(means, key=bound.excess)
+        excess = max(excess, bound.excess(worst[name]))
+    values = [_mean(trials, goal.least) for trials in under]
+    return Candidate(point, tuple(done), max(values) if all(map(math.isfinite, values)) else math.nan, worst, excess)
+
+
+def _mean(done: Sequence[Done], figure: str) -> float:
+    """Mean over trials; NaN if one of them lacks the figure."""
+    return sum(one.figures.get(figure, math.nan) for one in done) / len(done)
 
 
 def within(done: Done, some: Point) -> bool:

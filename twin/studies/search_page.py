@@ -27,10 +27,10 @@ def sections(folder: Path, goal: Goal, candidates: Sequence[Candidate]) -> list[
     good = sorted((one for one in candidates if one.good), key=lambda one: one.value)[:BEST]
     if not good:
         return [Section("Search", [page.paragraph("No candidate kept all bounds."), _drawing(drawn)])]
-    bound = [name for name in goal.bounds if name != goal.least]
-    head = [*(words(name) for name in good[0].point), words(goal.least), *(words(name) for name in bound)]
+    head = [*map(words, good[0].point), words(goal.least), *(f"{words(name)}, in the worst" for name in goal.bounds)]
     rows = [
-        [*map(short, one.point.values()), *(shown(one.figures[name], ".4g") for name in (goal.least, *bound))] for one in good
+        [*map(short, one.point.values()), shown(one.value, ".4g"), *(f"{one.bound[name]:.4g}" for name in goal.bounds)]
+        for one in good
     ]
     return [Section("Search", [_drawing(drawn), page.table(head, rows, "The best candidates within all bounds.")])]
 

@@ -12,6 +12,7 @@ from recon.files.metrics import shown
 from recon.reports import figures, page
 from recon.reports.page import Opening, Section
 from twin.studies import study_plots, study_runs
+from twin.studies.experiments import Experiment
 from twin.studies.study_plots import short, words
 from twin.studies.study_runs import ERROR, SEED, Done
 
@@ -34,26 +35,24 @@ def write(folder: Path, title: str, done: Sequence[Done], sections: Sequence[Sec
         path.write_text(page.render(Opening("study", title, result, counted), parts, FOOTER), encoding="utf-8")
 
 
-def plots(folder: Path, done: Sequence[Done], limits: Mapping[str, str]) -> list[Section]:
-    """Sections of all figures over all factors, whose plots are kept as PNG files too, and a table.
-
-    limits : figures to be shown, and the figure that is the closed form of each, or ""
-    """
+def plots(folder: Path, done: Sequence[Done], of: Experiment) -> list[Section]:
+    """Sections of all figures over all factors, whose plots are kept as PNG files too, and a table."""
     table, fields = study_runs.rows(done), list(done[0].trial.point)
     (folder / PICTURES).mkdir(exist_ok=True)
     sections = [
-        Section(words(figure), [page.grid((_drawn(folder, table, figure, field, fields, limit) for field in fields), "two")])
-        for figure, limit in limits.items()
+        Section(words(figure), [page.grid((_drawn(folder, table, of, figure, field) for field in fields), "two")])
+        for figure in of.limits
         if fields
     ]
-    head = [*map(words, fields), "trials", *map(words, limits)]
-    caption = "Medians over seeds; in brackets the closed forms."
-    return [*sections, Section("All points", [page.table(head, _points(table, fields, limits), caption)])]
+    head = [*map(words, fields), "trials", *map(words, of.limits)]
+    caption = f"Medians over seeds; in brackets: {of.limit}."
+    return [*sections, Section("All points", [page.table(head, _points(table, fields, of.limits), caption)])]
 
 
-def _drawn(folder: Path, table: study_plots.Table, figure: str, field: str, fields: Sequence[str], limit: str) -> str:
+def _drawn(folder: Path, table: study_plots.Table, of: Experiment, figure: str, field: str) -> str:
     """A plot for the page, kept as a PNG file too."""
-    drawn = study_plots.draw(table, figure, field, fields, limit)
+    fields = list(table[0])[: list(table[0]).index(SEED)]
+    drawn = study_plots.draw(table, figure, field, fields, of.limits[figure], of.limit)
     name = f"{figure}_over_{re.sub(r'[^A-Za-z0-9]+', '_', field)}.png"
     with atomic.new_file(folder / PICTURES / name) as path:
         drawn.savefig(path, dpi=160, metadata={"Software": None})
@@ -69,7 +68,7 @@ def _points(table: study_plots.Table, fields: Sequence[str], limits: Mapping[str
 
 
 def _median(rows: study_plots.Table, figure: str) -> str:
-    known = study_plots.finite(row.get(figure) for row in rows)
+    known = study_runs.finite(row.get(figure) for row in rows)
     return shown(float(np.median(known)) if known.size else np.nan, ".4g")
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon.reports import figures
 from recon.reports.figures import LINE
+from twin.studies.study_runs import finite, numeric
 
 Array = NDArray[np.float64]
 Table = Sequence[Mapping[str, Any]]  # a row a trial
@@ -31,7 +32,7 @@ class Course:
     high: Array  # greatest
 
 
-def draw(table: Table, figure: str, field: str, fields: Sequence[str], limit: str) -> Figure:
+def draw(table: Table, figure: str, field: str, fields: Sequence[str], limit: str, kind: str = "closed form") -> Figure:
     """Draw a figure over a factor.
 
     Few values of another factor get a line each; a factor with many values, as of a space-filling design, is a cloud of points.
@@ -39,14 +40,15 @@ def draw(table: Table, figure: str, field: str, fields: Sequence[str], limit: st
     Parameters
     ----------
     fields : all factors
-    limit : the figure's closed form, also a column of the table, or ""
+    limit : what the figure is held against, also a column of the table, or ""
+    kind : of the limit, for the legend
     """
     drawn, axes = figures.blank(5.2, 3.3)
     values = distinct(row[field] for row in table)
     if len(values) > MOST_VALUES and numeric(values):
         for name, style in ((figure, "o"), (limit, "x")):
             if name:
-                label = "closed form" if name == limit else "a trial"
+                label = kind if name == limit else "a trial"
                 x, y = (np.array([row.get(key, np.nan) for row in table], float) for key in (field, name))
                 axes.plot(x, y, style, color=LINE if name == limit else "C0", markersize=3, label=label)
     else:
@@ -57,12 +59,13 @@ def draw(table: Table, figure: str, field: str, fields: Sequence[str], limit: st
             axes.set_xscale("log")
             axes.set_xticks(places, [short(value) for value in values])
             axes.minorticks_off()
-        for k, course in enumerate(courses(table, figure, field, other_factor(table, field, fields))):
+        other = other_factor(table, field, fields)
+        for k, course in enumerate(courses(table, figure, field, other)):
             axes.fill_between(places, course.low, course.high, color=f"C{k}", alpha=0.18, linewidth=0)
             axes.plot(places, course.middle, "o-", color=f"C{k}", markersize=4, linewidth=1.4, label=course.label)
-        if limit:
-            (closed,) = courses(table, limit, field, None)
-            axes.plot(places, closed.middle, "--", color=LINE, linewidth=1.6, label="closed form")
+        for k, held in enumerate(courses(table, limit, field, other) if limit else []):
+            colour, label = (LINE, kind) if other is None else (f"C{k}", kind if k == 0 else None)
+            axes.plot(places, held.middle, "--", color=colour, linewidth=1.6, label=label)
     scale_heights(axes)
     axes.set(xlabel=words(field), ylabel=words(figure))
     axes.grid(alpha=0.25)
@@ -83,12 +86,6 @@ def courses(table: Table, figure: str, field: str, other: str | None) -> list[Co
     return found
 
 
-def finite(values: Iterable[Any]) -> Array:
-    """Those of values that are finite numbers : (n,)."""
-    found = np.array([np.nan if value is None else value for value in values], float)
-    return found[np.isfinite(found)]
-
-
 def other_factor(table: Table, field: str, fields: Sequence[str]) -> str | None:
     """Another factor whose values are few enough for a line each."""
     few = (name for name in fields if name != field and 1 < len(distinct(row[name] for row in table)) <= MOST_LINES)
@@ -99,11 +96,6 @@ def distinct(values: Iterable[Any]) -> list[Any]:
     """Different values, numbers in their order, others as they come."""
     found = list(dict.fromkeys(values))
     return sorted(found) if numeric(found) else found
-
-
-def numeric(values: Sequence[Any]) -> bool:
-    """Whether all values are numbers."""
-    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
 
 
 def unevenly_spaced(places: Array) -> bool:

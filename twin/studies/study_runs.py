@@ -6,13 +6,15 @@ that they depend on, and `OUT/table.parquet` has a row a trial.
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from recon.files import atomic
 from recon.files.metrics import Metrics
@@ -66,6 +68,8 @@ class StudyFolder:
         atomic.check_folder(self.folder, STUDY)
         for place in (self.folder, self.trials):
             place.mkdir(parents=True, exist_ok=True)
+        for leftover in self.trials.glob(".*.new.json"):  # of a run that was killed while it wrote a trial
+            atomic.remove_leftovers(self._path(leftover.name.split(".")[1]))
         with atomic.new_file(self.folder / STUDY) as path:
             path.write_text(json.dumps(description, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
@@ -74,18 +78,18 @@ class StudyFolder:
         path = self._path(trial.key)
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            if ERROR in content:
-                return Done(trial, str(content[ERROR]))
-            return Done(trial, {name: math.nan if value is None else value for name, value in content["figures"].items()})
-        except (OSError, ValueError, KeyError, AttributeError):  # none, or damaged: done again
+            figures = content["figures"].items()
+            return Done(trial, {name: math.nan if value is None else float(value) for name, value in figures})
+        except (OSError, ValueError, KeyError, AttributeError, TypeError):  # none, or damaged: done again
             return None
 
     def keep(self, done: Done) -> None:
-        """Keep a trial's figures."""
-        figures = {name: value if math.isfinite(value) else None for name, value in done.figures.items()}
-        content = {ERROR: done.found} if isinstance(done.found, str) else {"figures": figures}
+        """Keep a trial's figures; one that gave none is tried again by a later run."""
+        if isinstance(done.found, str):
+            return
+        figures = {name: value if math.isfinite(value) else None for name, value in done.found.items()}
         with atomic.new_file(self._path(done.trial.key)) as path:
-            path.write_text(json.dumps(content) + "\n", encoding="utf-8")
+            path.write_text(json.dumps({"figures": figures}) + "\n", encoding="utf-8")
 
     def write_table(self, done: Sequence[Done]) -> None:
         """Write a row a trial: its factors, its seed, its figures, and the error of one that has none."""
@@ -96,11 +100,9 @@ class StudyFolder:
         return self.trials / f"{key}.json"
 
 
-def plan(name: str, points: Sequence[tuple[Point, Settings]], seeds: Sequence[int], code: str) -> list[Trial]:
+def plan(name: str, points: Sequence[tuple[Point, Settings]], seeds: Sequence[int]) -> list[Trial]:
     """Trials of all points : (values, settings with these) and seeds, in order."""
-    return [
-        Trial(experiments.digest(name, changed, seed, code), point, seed, changed) for point, changed in points for seed in seeds
-    ]
+    return [Trial(experiments.digest(name, changed, seed), point, seed, changed) for point, changed in points for seed in seeds]
 
 
 def run(folder: StudyFolder, name: str, trials: Sequence[Trial], engine: Engine) -> Iterator[Done]:
@@ -126,17 +128,29 @@ def in_order(trials: Sequence[Trial], done: Sequence[Done]) -> list[Done]:
 
 
 def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
-    """A table's rows, all with the same columns."""
+    """A table's rows, all with the same columns; a column of mixed values holds words."""
     figures = list(dict.fromkeys(name for one in done for name in one.figures))
+    worded = {field for one in done for field, value in one.trial.point.items() if isinstance(cell(value), str)}
     return [
         {
-            **{field: cell(value) for field, value in one.trial.point.items()},
+            **{field: str(cell(value)) if field in worded else cell(value) for field, value in one.trial.point.items()},
             SEED: one.trial.seed,
             **{name: float(one.figures.get(name, math.nan)) for name in figures},
             ERROR: one.found if isinstance(one.found, str) else None,
         }
         for one in done
     ]
+
+
+def finite(values: Iterable[Any]) -> NDArray[np.float64]:
+    """Those of values that are finite numbers : (n,)."""
+    found = np.array([np.nan if value is None else value for value in values], float)
+    return found[np.isfinite(found)]
+
+
+def numeric(values: Sequence[Any]) -> bool:
+    """Whether all values are numbers."""
+    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
 
 
 def cell(value: Any) -> Any:

@@ -9,6 +9,7 @@ from scenes.kinds import plane
 from twin.accuracy import surface_accuracy
 from twin.accuracy.surface_accuracy import Experiment as Surface
 from twin.conditions import drifted
+from twin.sensor import Exposure, electrons_per_radiance, number_per_electron
 from twin.studies import closed_forms
 from twin.studies.experiments import Experiment, Settings
 from twin.studies.layout import laid_out
@@ -25,13 +26,15 @@ def measure(settings: Settings, seed: int) -> Metrics:
     )
     seen, exposure = result.metrics, result.view.exposure
     brightness = float(np.median(result.found.offset[result.comparison.interior])) - rig.cam1.sensor.black_level_dn
+    room = room_brightness(rig, settings, pose.reflectance, exposure)
     return {
         "plane_rms_mm": seen["plane_plate_rms_mm"],
-        "plane_limit_mm": closed_form(rig, settings, result, brightness),
+        "plane_limit_mm": closed_form(rig, settings, result, brightness, room),
         "noise_limit_mm": seen["limit_rms_mm"],
         "predicted_rms_mm": seen["predicted_rms_mm"],
         "error_over_sigma": seen["z_std"],
         "coverage": seen["coverage"],
+        "common_view": float(result.truth.lit.mean()),
         "gross_error_fraction": seen["gross_error_fraction"],
         "brightness_dn": brightness,
         "modulation_dn": float(np.median(result.found.modulation[result.comparison.interior])),
@@ -41,11 +44,17 @@ def measure(settings: Settings, seed: int) -> Metrics:
     }
 
 
-def closed_form(rig: Rig, settings: Settings, result: Surface, brightness_dn: float) -> float:
-    """RMS distance from the plane that noise and mirrors leave, mm, by formulas, from the brightness that a meter shows."""
+def room_brightness(rig: Rig, settings: Settings, reflectance: float, exposure: Exposure) -> float:
+    """Brightness, DN, that the room's light alone gives a matt surface in camera 1: radiance `reflectance * room`."""
+    electrons = electrons_per_radiance(rig.cam1, rig.projector.wavelength_nm) * exposure.time_s
+    return reflectance * settings.tracing.room_radiance * electrons * number_per_electron(rig.cam1.sensor, exposure)
+
+
+def closed_form(rig: Rig, settings: Settings, result: Surface, brightness_dn: float, room_dn: float) -> float:
+    """RMS distance from the plane that noise and mirrors leave, mm, by formulas, from the images' mean brightness."""
     fringes = closed_forms.fringes_of(settings.patterns)
     (flat,) = (shape for shape in result.truth.shapes if isinstance(shape, Plane))
-    modulation = brightness_dn * closed_forms.contrast(rig, fringes, flat.point)
+    modulation = (brightness_dn - room_dn) * closed_forms.contrast(rig, fringes, flat.point)
     noise = closed_forms.brightness_noise(rig.cam1, brightness_dn, result.view.exposure)
     phase = closed_forms.phase_sigma(fringes.steps, noise, modulation), closed_forms.raster_sigma(rig, fringes, flat.point)
     return closed_forms.plane_sigma(rig, flat, fringes.pitch / (2 * np.pi) * float(np.hypot(*phase)))

@@ -9,6 +9,7 @@ from recon.tracking import networks
 from twin.accuracy import tracking_frames
 from twin.accuracy.pose_accuracy import cameras_of, located
 from twin.accuracy.table_rows import Setup
+from twin.evaluation.surface_errors import rms
 from twin.studies import closed_forms
 from twin.studies.experiments import Experiment, Settings
 from twin.studies.layout import laid_out
@@ -29,13 +30,13 @@ def measure(settings: Settings, seed: int) -> Metrics:
     bounds = np.stack([bound(take, one.limit_px, rig.target) for take, one in zip(takes, errors, strict=True)])
     found = np.isfinite(shift)
     return {
-        "translation_rms_mm": _rms(shift[found]),
-        "translation_limit_mm": _rms(bounds[found, 1]),
-        "rotation_rms_deg": _rms(turn[found]),
-        "rotation_limit_deg": _rms(bounds[found, 0]),
-        "centre_rms_px": _rms(np.concatenate([one.centre_px for one in errors])[np.repeat(found, 6)]),
-        "centre_limit_px": _rms(np.concatenate([one.limit_px for one in errors])[np.repeat(found, 6)]),
-        "error_over_sigma": _rms(np.sqrt(misfit[found] / 6)),
+        "translation_rms_mm": rms(shift[found]),
+        "translation_limit_mm": rms(bounds[found, 1]),
+        "rotation_rms_deg": rms(turn[found]),
+        "rotation_limit_deg": rms(bounds[found, 0]),
+        "centre_rms_px": rms(np.concatenate([one.centre_px for one in errors])[np.repeat(found, 6)]),
+        "centre_limit_px": rms(np.concatenate([one.limit_px for one in errors])[np.repeat(found, 6)]),
+        "error_over_sigma": rms(np.sqrt(misfit[found] / 6)),
         "found": float(found.mean()),
     }
 
@@ -48,12 +49,9 @@ def bound(take: Take, limit_px: Array, target: Target) -> tuple[float, float]:
     return float(np.rad2deg(np.sqrt(turn))), float(np.sqrt(shift))
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if values.size else np.nan
-
-
 EXPERIMENT = Experiment(
     ("rig", "layout", "film", "ranges"),
     measure,
     {"translation_rms_mm": "translation_limit_mm", "rotation_rms_deg": "rotation_limit_deg"},
+    "Cramér-Rao bound",
 )

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from recon.model.rig import Finite, NotNegative, Part, Positive
+from recon.model.rig import Finite, NotNegative, Part, Positive, Rig
 
 Array = NDArray[np.float64]
 Bandwidth = Annotated[float, Field(ge=0.05, le=1.5)]
@@ -83,3 +83,11 @@ class Transducer(Part):
         share = np.clip(np.asarray(depth_mm) / max(self.depth_mm, 1e-9), 0, 1)
         bandwidth_mhz = self.frequency_mhz * (near + (far - near) * share)
         return 1e-3 * self.assumed_speed / 2 * np.sqrt(8 * np.log(2)) / (2 * np.pi * bandwidth_mhz)
+
+
+def check_scanner(rig: Rig, transducer: Transducer) -> None:
+    """Check that `rig.probe` and the transducer describe one scanner; ValueError if they don't."""
+    for name in ("image_size", "scale_mm_per_px"):
+        design, found = getattr(rig.probe, name), getattr(transducer, name)
+        if design != found:
+            raise ValueError(f"ultrasound.{name}: expected rig.probe's {list(design)}, found {list(found)}")
