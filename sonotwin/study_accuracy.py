@@ -22,6 +22,7 @@ from twin.studies.study_runs import TABLE, Done, finite
 
 RIG = "meza2021"
 SEEDS = 3
+BUDGET_SEEDS = 24  # a second each; a contribution is then known to 14 %
 POSES = "poses=demo"  # of the board: 10 instead of 34
 EXPLORATIONS = ("phase_steps", "fringe_pitch", "projector_distance", "exposure", "board_poses", "target_size")
 SEARCHED = {  # a smaller space than that of conf/study/better_rig.yaml, which is searched whole too
@@ -86,7 +87,7 @@ def laboratories(kept: Path) -> list[Row]:
 
 def budget(kept: Path) -> list[Row]:
     """Row c: sums of parts against the whole, and predictions against switching."""
-    config, done = study(kept, "budget", "seeds=12")
+    config, done = study(kept, "budget", f"seeds={BUDGET_SEEDS}")
     assert config.budget is not None
     points = error_budget.points(config.budget, config.settings.model_dump(mode="json"))
     size, rows = config.seeds, []

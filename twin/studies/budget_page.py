@@ -13,7 +13,7 @@ from recon.reports.figures import BARS, LINE
 from recon.reports.page import Section
 from twin.studies import error_budget
 from twin.studies.error_budget import Budget, Sum
-from twin.studies.study_page import PICTURES
+from twin.studies.study_page import PICTURES, title
 
 PREDICTED = (
     "Errors as the software propagates them. Of the latency and the speed of sound it is told the size that is drawn: their "
@@ -34,7 +34,7 @@ def sections(folder: Path, budget: Budget, sums: Sequence[Sum]) -> list[Section]
         blocks = [drawing, page.notices(error_budget.advice(budget, one)), page.table(*_parts(budget, one))]
         if one.predicted:
             blocks.append(page.table(*_predicted(one)))
-        made.append(Section(budget.figures[one.figure], blocks))
+        made.append(Section(title(budget.figures[one.figure]), blocks))
     return made
 
 

@@ -40,13 +40,18 @@ def plots(folder: Path, done: Sequence[Done], of: Experiment) -> list[Section]:
     table, fields = study_runs.rows(done), list(done[0].trial.point)
     (folder / PICTURES).mkdir(exist_ok=True)
     sections = [
-        Section(words(figure), [page.grid((_drawn(folder, table, of, figure, field) for field in fields), "two")])
+        Section(title(words(figure)), [page.grid((_drawn(folder, table, of, figure, field) for field in fields), "two")])
         for figure in of.limits
         if fields
     ]
     head = [*map(words, fields), "trials", *map(words, of.limits)]
     caption = f"Medians over seeds; in brackets: {of.limit}."
     return [*sections, Section("All points", [page.table(head, _points(table, fields, of.limits), caption)])]
+
+
+def title(text: str) -> str:
+    """A text with a capital letter."""
+    return text[:1].upper() + text[1:]
 
 
 def _drawn(folder: Path, table: study_plots.Table, of: Experiment, figure: str, field: str) -> str:
