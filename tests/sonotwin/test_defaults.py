@@ -17,7 +17,7 @@ from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.transducer import Transducer
 
 WITH_YAML = [verb for verb in VERBS if (folder() / f"{verb.name}.yaml").is_file()]
-TAKEN = {"study.of", "study.over", "study.seeds"}  # null in YAML: as the study that is named has it
+TAKEN = {f"study.{name}" for name in ("title", "of", "over", "seeds", "beside")}  # null in YAML: as the named study has it
 CHOSEN = {"default.room_lux"}  # the model leaves the room dark; on a bench it is not
 
 

@@ -147,6 +147,23 @@ def wait_until(true, seconds: float = 30) -> None:
         time.sleep(0.05)
 
 
+def test_a_run_that_is_stopped_leaves_no_process(tmp_path):
+    """Closed after its first result, while the other worker is at a task of ten minutes."""
+    running = results(Engine(workers=2), sleeps_but_once, [(str(tmp_path), k) for k in range(3)])
+    assert next(running) == 1
+    started = time.monotonic()
+    running.close()
+    assert time.monotonic() - started < 10
+    wait_until(lambda: not any(alive(int(mark.read_text())) for mark in tmp_path.glob("pid*")))
+
+
+def sleeps_but_once(folder: str, k: int) -> int:
+    (Path(folder) / f"pid{k}").write_text(str(os.getpid()))
+    if k != 1:
+        time.sleep(600)
+    return k
+
+
 def test_a_scheduler_belongs_to_dask():
     with pytest.raises(ValueError, match=r"scheduler: expected engine.name=dask with it, found local"):
         Engine(scheduler="tcp://host:8786")
@@ -159,7 +176,18 @@ def test_a_scheduler_that_is_not_there_is_named():
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "0.5s"}),
         pytest.raises(
-            InputError, match=r"engine.scheduler: expected the address of Dask's scheduler, found none at tcp://127.0.0.1:1:"
+            InputError,
+            match=r"engine\.scheduler: expected the address of Dask's scheduler with a worker, found none at tcp://127\.0\.0\.1:1:",
         ),
     ):
         list(results(Engine(name="dask", scheduler="tcp://127.0.0.1:1"), square, [(1,)]))
+
+
+def test_a_scheduler_without_workers_is_named(monkeypatch):
+    """It is given a time to have one; then nobody waits for tasks that nobody does."""
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr("twin.engine.FIRST_WORKER_S", 0.2)
+    with distributed.LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0") as idle:
+        address = idle.scheduler_address
+        with pytest.raises(InputError, match=f"Dask's scheduler with a worker, found none at {address}"):
+            list(results(Engine(name="dask", scheduler=address), square, [(1,)]))

@@ -37,13 +37,13 @@ class Compared(NamedTuple):
     limit: float
 
     @property
-    def explained(self) -> bool:
+    def paper_met(self) -> bool:
         """Whether the paper's method gives what the paper reports, within a factor."""
         low, high = self.figure.reported
         return bool(self.paper.size and low / FACTOR <= self.paper.mean() <= high * FACTOR)
 
     @property
-    def met(self) -> bool:
+    def bar_met(self) -> bool:
         """Whether ours keeps its bar in all trials; nothing is asked where there is none."""
         return self.figure.bar is None or bool(self.ours.size and self.ours.max() <= self.figure.bar)
 
@@ -65,7 +65,7 @@ def cells(one: Compared) -> list[str]:
     low, high = one.figure.reported
     reported = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     limit = shown(one.limit, ".3g") if one.figure.limit else ""
-    met = "yes" if one.explained else "no"
+    met = "yes" if one.paper_met else "no"
     return [one.point, one.figure.what, reported, _spread(one.paper), met, _spread(one.ours), limit, one.figure.unit]
 
 

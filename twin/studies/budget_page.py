@@ -27,6 +27,10 @@ def sections(folder: Path, budget: Budget, sums: Sequence[Sum]) -> list[Section]
     made = []
     (folder / PICTURES).mkdir(exist_ok=True)
     for one in sums:
+        if not np.isfinite([one.added, one.whole]).all():
+            lost = ", ".join(part.source for part in one.parts if not part.trials) or "all together"
+            made.append(Section(title(budget.figures[one.figure]), [page.paragraph(f"No trial gave figures of {lost}.")]))
+            continue
         drawn = waterfall(one)
         with atomic.new_file(folder / PICTURES / f"budget_{one.figure}.png") as path:
             drawn.savefig(path, dpi=160, metadata={"Software": None})

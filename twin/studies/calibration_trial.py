@@ -44,7 +44,10 @@ def session(settings: Settings, seed: int) -> board_session.Settings:
 
 
 EXPERIMENT = Experiment(
-    ("rig", "layout", "board", "board_patterns", "poses", "conditions", "tracing", "shooting"),
+    (
+        *("rig", "layout.projector_mm", "layout.camera_mm", "board", "board_patterns", "poses"),
+        *("conditions.board", "conditions.frames", "tracing", "shooting"),
+    ),
     measure,
     {"point_error_mm": "point_sigma_mm", "plane_form_mm": ""},
     "predicted by the calibration's covariance",

@@ -119,7 +119,7 @@ def advice(budget: Budget, one: Sum) -> list[str]:
     left, lines = one.added**2, []
     for part in one.parts:
         share = part.alone**2 / one.added**2 if one.added else 0.0
-        if share < SMALL:
+        if not share >= SMALL:
             break
         without = np.sqrt(max(left - part.alone**2, 0.0))
         remedy = f": {budget.mend[part.source]}" if part.source in budget.mend else ""

@@ -138,7 +138,8 @@ def digest(name: str, settings: Settings, seed: int) -> str:
 def run_trial(key: str, name: str, settings: Settings, seed: int) -> tuple[str, Metrics | str]:
     """Run a trial, and give its figures, or in one line why there are none: settings that nothing can be measured with.
 
-    Figures have DIGITS significant digits: those beyond the eleventh may depend on where linear algebra finds its buffers.
+    Figures have DIGITS significant digits: those beyond the eleventh of what they are made of may depend on where linear algebra
+    finds its buffers.
 
     Raises
     ------

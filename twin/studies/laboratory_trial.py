@@ -22,7 +22,7 @@ def measure(settings: Settings, seed: int) -> Metrics:
 
 
 EXPERIMENT = Experiment(
-    (*calibration_trial.EXPERIMENT.reads, "patterns"),
+    (*calibration_trial.EXPERIMENT.reads, "patterns", "conditions.drift"),
     measure,
     {"plane_rms_ours_mm": "plane_limit_mm", "plane_rms_paper_mm": "plane_limit_mm", "sphere_rms_ours_mm": "sphere_limit_mm"},
     "noise alone",

@@ -74,13 +74,13 @@ def check(goal: Goal, factors: Mapping[str, Factor]) -> None:
             raise InputError(f"over: {name}: expected values or a range to search in, found a distribution")
     if goal.start and set(goal.start) != set(factors):
         raise InputError(f"search: start: expected a value for each of {', '.join(factors)}, found {', '.join(goal.start)}")
-    if PRICE in goal.bounds and not goal.prices:
-        raise InputError("search: bounds.price: expected prices with it, found none")
+    if PRICE in (goal.least, *goal.bounds) and not goal.prices:
+        raise InputError("search: price: expected prices with it, found none")
     for name, value in goal.start.items():
         factor = factors[name]
         if isinstance(factor, Choices) and value not in factor.choices:
             raise InputError(f"search: start.{name}: expected one of {factor.choices}, found {value}")
-        if isinstance(factor, Range) and not factor.first <= value <= factor.last:
+        if isinstance(factor, Range) and not (numeric([value]) and factor.first <= value <= factor.last):
             raise InputError(f"search: start.{name}: expected {factor.first:g} to {factor.last:g}, found {value}")
     if goal.by == "gp" and find_spec("torch") is None:
         raise InputError(
@@ -155,7 +155,7 @@ def judged(goal: Goal, factors: Mapping[str, Factor], point: Point, done: Sequen
         means = [cost[name]] if name in cost else [_mean(trials, name) for trials in under]
         worst[name] = max(means, key=bound.excess)
         excess = max(excess, bound.excess(worst[name]))
-    values = [_mean(trials, goal.least) for trials in under]
+    values = [cost.get(goal.least, _mean(trials, goal.least)) for trials in under]
     return Candidate(point, tuple(done), max(values) if all(map(math.isfinite, values)) else math.nan, worst, excess)
 
 
@@ -187,7 +187,8 @@ def best(candidates: Sequence[Candidate]) -> Candidate | None:
 def _suggested(trial: optuna.Trial, name: str, factor: Factor) -> Any:
     """A value that Optuna suggests: numbers of a list by their place, so that neighbours count as alike."""
     if isinstance(factor, Range):
-        return trial.suggest_float(name, factor.first, factor.last, log=factor.log)
+        value = trial.suggest_float(name, factor.first, factor.last, log=factor.log)
+        return round(value) if factor.whole else value
     assert isinstance(factor, Choices)
     if numeric(factor.choices):
         return sorted(factor.choices)[trial.suggest_int(name, 0, len(factor.choices) - 1)]

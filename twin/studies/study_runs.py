@@ -130,7 +130,11 @@ def in_order(trials: Sequence[Trial], done: Sequence[Done]) -> list[Done]:
 def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
     """A table's rows, all with the same columns; a column of mixed values holds words."""
     figures = list(dict.fromkeys(name for one in done for name in one.figures))
-    worded = {field for one in done for field, value in one.trial.point.items() if isinstance(cell(value), str)}
+    kinds = {
+        field: {type(cell(one.trial.point[field])) for one in done} - {type(None)}
+        for field in (done[0].trial.point if done else ())
+    }
+    worded = {field for field, found in kinds.items() if str in found or len(found) > 1}
     return [
         {
             **{field: str(cell(value)) if field in worded else cell(value) for field, value in one.trial.point.items()},

@@ -60,6 +60,5 @@ def closed_form(rig: Rig, settings: Settings, result: Surface, brightness_dn: fl
     return closed_forms.plane_sigma(rig, flat, fringes.pitch / (2 * np.pi) * float(np.hypot(*phase)))
 
 
-EXPERIMENT = Experiment(
-    ("rig", "layout", "patterns", "plane", "conditions", "tracing", "shooting"), measure, {"plane_rms_mm": "plane_limit_mm"}
-)
+READS = ("rig", "layout.projector_mm", "patterns", "plane", "conditions.frames", "conditions.drift", "tracing", "shooting")
+EXPERIMENT = Experiment(READS, measure, {"plane_rms_mm": "plane_limit_mm"})

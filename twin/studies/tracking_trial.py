@@ -50,7 +50,7 @@ def bound(take: Take, limit_px: Array, target: Target) -> tuple[float, float]:
 
 
 EXPERIMENT = Experiment(
-    ("rig", "layout", "film", "ranges"),
+    ("rig", "layout.camera_mm", "layout.target_scale", "film", "ranges"),
     measure,
     {"translation_rms_mm": "translation_limit_mm", "rotation_rms_deg": "rotation_limit_deg"},
     "Cramér-Rao bound",

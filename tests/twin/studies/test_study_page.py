@@ -1,0 +1,169 @@
+"""A study's page has its figures, its table and its commands, and is complete."""
+
+import re
+from html import unescape
+from html.parser import HTMLParser
+
+import pytest
+
+from tests.twin.studies.made_up import done
+from twin.studies import budget_page, error_budget, rig_search, search_page, study_page
+from twin.studies.error_budget import Budget, Contribution, Sum
+from twin.studies.experiments import Experiment
+from twin.studies.rig_search import Bound, Candidate, Goal
+
+LIMITS = {"error_mm": "limit_mm", "turn_deg": ""}
+OF = Experiment((), lambda settings, seed: {}, LIMITS, "noise alone")
+DONE = [
+    done({"rig.pitch": pitch, "light": light}, {"error_mm": pitch * (1 + seed), "limit_mm": pitch / 4, "turn_deg": 0.5}, seed)
+    for pitch in (6, 12)
+    for light in ("dim", "<bright>")
+    for seed in (0, 1, 2)
+]
+
+
+class Balance(HTMLParser):
+    """Elements that are open, and the sources that are fetched."""
+
+    EMPTY = frozenset({"img", "meta", "link", "br", "hr", "input", "path", "use", "rect"})
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.fetched = [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.fetched += [value for name, value in attributes if name in ("src", "href") and not value.startswith(("data:", "#"))]
+        if tag not in self.EMPTY:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.handle_starttag(tag, attributes)
+        if tag not in self.EMPTY:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        if tag not in self.EMPTY:
+            assert self.open.pop() == tag
+
+
+def written(folder, trials, sections) -> str:
+    study_page.write(folder, "Pitch & light", trials, sections, ["sonotwin study name=sweep 'over={a: [1, 2]}'"])
+    return (folder / study_page.PAGE).read_text(encoding="utf-8")
+
+
+def text(html: str) -> str:
+    return unescape(re.sub(r"<svg.*?</svg>", " ", html, flags=re.S))
+
+
+def rows_of(html: str) -> list[list[str]]:
+    """Cells of the page's tables."""
+    rows = re.findall(r"<tr>(.*?)</tr>", html, flags=re.S)
+    return [[unescape(re.sub("<.*?>", "", cell)) for cell in re.findall(r"<t[hd].*?</t[hd]>", row, flags=re.S)] for row in rows]
+
+
+def test_a_page_is_complete(tmp_path):
+    """Elements are closed, nothing is fetched, commands and titles are there, and words of people are no HTML."""
+    page = written(tmp_path, DONE, study_page.plots(tmp_path, DONE, OF))
+    balance = Balance()
+    balance.feed(page)
+    assert not balance.open and not balance.fetched
+    assert "<bright>" not in page
+    for part in (
+        "Pitch & light",
+        "12 of 12 trials gave figures.",
+        "sonotwin study name=sweep 'over={a: [1, 2]}'",
+        f"pandas.read_parquet('{tmp_path / 'table.parquet'}')",
+        "<h2>Error, mm</h2>",
+        "<h2>Turn, deg</h2>",
+    ):
+        assert part in text(page)
+    assert "Points without figures" not in page
+
+
+def test_each_figure_is_drawn_over_each_factor_and_kept(tmp_path):
+    page = written(tmp_path, DONE, study_page.plots(tmp_path, DONE, OF))
+    names = {f"{figure}_over_{field}.png" for figure in LIMITS for field in ("rig_pitch", "light")}
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == names
+    assert all((tmp_path / "figures" / name).read_bytes().startswith(b"\x89PNG") and f"figures/{name}" in page for name in names)
+    assert page.count("<svg") == 4
+
+
+def test_the_table_has_medians_a_point(tmp_path):
+    """Over seeds; in brackets what they are held against, which plots and the caption name."""
+    page = written(tmp_path, DONE, study_page.plots(tmp_path, DONE, OF))
+    head, *rows = rows_of(page)
+    assert head == ["pitch", "light", "trials", "error, mm", "turn, deg"]
+    assert rows[:2] == [["6", "dim", "3", "12 (1.5)", "0.5"], ["6", "<bright>", "3", "12 (1.5)", "0.5"]] and len(rows) == 4
+    assert "Medians over seeds; in brackets: noise alone." in text(page) and "closed form" not in page
+
+
+def test_points_without_figures_are_named(tmp_path):
+    trials = [*DONE, done({"rig.pitch": 40, "light": "dim"}, "coverage: found none", 7)]
+    page = text(written(tmp_path, trials, study_page.plots(tmp_path, trials, OF)))
+    assert "12 of 13 trials gave figures." in page and "rig.pitch=40, light=dim, seed=7: coverage: found none" in page
+    assert rows_of(page)[-1][:3] == ["40", "dim", "1"]
+
+
+def test_a_study_without_factors_has_a_table_alone(tmp_path):
+    trials = [done({}, {"error_mm": 2.0, "limit_mm": 1.0, "turn_deg": 3.0}, seed) for seed in range(3)]
+    page = written(tmp_path, trials, study_page.plots(tmp_path, trials, OF))
+    assert rows_of(page)[1] == ["3", "2 (1)", "3"] and "<svg" not in page
+
+
+def candidates() -> list[Candidate]:
+    values = [(5.0, 0.1), (2.0, 0.5), (3.0, -0.1), (float("nan"), -1.0), (4.0, -0.2)]
+    return [Candidate({"a.pitch": k}, (), value, {"time_s": 1 + excess}, excess) for k, (value, excess) in enumerate(values)]
+
+
+def test_a_search_shows_its_course_and_the_best_within_bounds(tmp_path):
+    """The best first; what is out of bounds is no best, however small."""
+    goal = Goal(least="error_mm", bounds={"time_s": Bound(most=1.0)})
+    (section,) = search_page.sections(tmp_path, goal, candidates())
+    head, *rows = rows_of("".join(section.blocks))
+    assert head == ["pitch", "error, mm", "time, s, in the worst"] and rows == [["2", "3", "0.9"], ["4", "4", "0.8"]]
+    assert (tmp_path / "figures" / "search.png").is_file()
+    (axes,) = search_page.course(goal, candidates()).axes
+    lines = {line.get_label(): line for line in axes.get_lines()}
+    assert lines["within all bounds"].get_xydata().tolist() == [[3, 3], [5, 4]]
+    assert lines["out of bounds"].get_xdata().tolist() == [1, 2, 4]
+    assert lines["best so far"].get_ydata().tolist()[2:] == [3, 3, 3]
+
+
+def test_a_search_in_vain_says_so(tmp_path):
+    (section,) = search_page.sections(tmp_path, Goal(least="error_mm"), candidates()[:2])
+    assert rig_search.best(candidates()[:2]) is None and "No candidate kept all bounds." in section.blocks[0]
+
+
+BUDGET = Budget(sources={"bow": ("b",), "print": ("p",), "dust": ("d",)}, figures={"error_mm": "a place"})
+SUM = Sum(
+    "error_mm",
+    0.52,
+    24,
+    (Contribution("bow", 0.4, 0.8, 24), Contribution("print", 0.3, 0.6, 24), Contribution("dust", 0.0, 0.0, 24)),
+    {"bow + print": (0.45, 0.5)},
+)
+
+
+def test_a_waterfall_adds_squares_up_to_the_sum():
+    """Each bar begins where the one before ends; a source of nothing gets none of its own."""
+    (axes,) = budget_page.waterfall(SUM).axes
+    bars = [(bar.get_x(), bar.get_width()) for bar in axes.patches]
+    assert bars[:2] == [(0, pytest.approx(0.16)), (pytest.approx(0.16), pytest.approx(0.09))]
+    assert bars[2][1] == pytest.approx(0, abs=1e-9) and bars[3][1] == pytest.approx(0.25) and bars[4][1] == pytest.approx(0.52**2)
+    names = ["bow", "print", "all others", "sum in squares", "all together"]
+    assert [label.get_text() for label in axes.get_yticklabels()] == names
+
+
+def test_a_budgets_section_has_its_parts_its_advice_and_its_prediction(tmp_path):
+    (section,) = budget_page.sections(tmp_path, BUDGET, [SUM])
+    html = "".join(section.blocks)
+    rows = rows_of(html)
+    assert section.title == "A place" and (tmp_path / "figures" / "budget_error_mm.png").is_file()
+    assert rows[0] == ["source", "alone, mm", "± 1 sigma", "2 times as large, mm", "share of the square, %"]
+    assert rows[1:4] == [
+        ["bow", "0.4000", "0.0577", "0.8000", "64.0"],
+        ["print", "0.3000", "0.0433", "0.6000", "36.0"],
+        ["dust", "0.0000", "0.0000", "0.0000", "0.0"],
+    ]
+    assert rows[5] == ["bow + print", "0.4500", "0.5000", "0.90"]
+    assert error_budget.advice(BUDGET, SUM)[0] in unescape(html) and error_budget.explained(SUM) in unescape(html)
