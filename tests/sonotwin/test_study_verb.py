@@ -250,6 +250,7 @@ def test_a_sweep_from_end_to_end(tmp_path, capsys):
     assert "6 trials, 4 of them there already" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_study_without_any_figures_fails(tmp_path, capsys):
     """Exit status 1, and the reason: a scan so fast that no pair of frames shows one target."""
     fields = ["over={noise.speed_mm_s: [20000]}", "seeds=1", "conditions.motion.trigger_s=0.01"]

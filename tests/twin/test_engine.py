@@ -54,7 +54,7 @@ def refuses(k: int) -> int:
     return k
 
 
-@pytest.fixture(params=ENGINES, scope="module")
+@pytest.fixture(params=["this process", "two processes", pytest.param("dask", marks=pytest.mark.slow)], scope="module")
 def engine(request) -> Engine:
     if ENGINES[request.param].name == "dask":
         pytest.importorskip("distributed")
@@ -90,7 +90,7 @@ def test_a_dead_worker_costs_its_task(tmp_path, name):
     assert sorted(done) == list(range(8))
 
 
-@pytest.mark.parametrize("name", ["two processes", "dask"])
+@pytest.mark.parametrize("name", ["two processes", pytest.param("dask", marks=pytest.mark.slow)])
 def test_a_task_that_kills_its_workers_is_given_up(name):
     if name == "dask":
         pytest.importorskip("distributed")

@@ -100,6 +100,7 @@ READ = {  # sizes by which each condition that the chain reads shows
 }
 
 
+@pytest.mark.slow
 def test_conditions_that_are_not_read_change_nothing(settings):
     """Lamp, skin, tremor and ink on the board: the same figures to 1e-8 mm, where repetitions differ by 1e-9."""
     unread = Conditions(

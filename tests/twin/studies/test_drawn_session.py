@@ -61,6 +61,7 @@ def test_poses_without_noise_are_the_true_ones(rig):
     assert np.abs(off[:, :3]).max() < 2e-5 and np.abs(off[:, 3:]).max() < 5e-4
 
 
+@pytest.mark.slow
 def test_poses_err_as_their_covariance_says(rig):
     """Squares of 400 poses' errors by their covariances: 6 in the mean, to 5 standard deviations; half the noise, a quarter."""
     images, held, velocity = (np.concatenate([each] * 10) for each in scan(rig))
@@ -140,6 +141,7 @@ def test_crossings_are_found_with_noise_of_the_size_that_is_drawn(rig, scanners,
     ] == pytest.approx(0.4**2)
 
 
+@pytest.mark.slow
 def test_probes_err_as_their_covariance_says(rig, scanners):
     """20 calibrations with noisy crossings and hands beside the wires: RMS error of pixels' places, to 30 %."""
     noise = QUIET.model_copy(update={"drawn": OFF.model_copy(update={"crossing": 1.0, "beside": 1.0})})
@@ -190,6 +192,7 @@ def test_sources_over_the_wires_and_in_the_scan_are_apart(settings, session, mon
     assert moved > 1e-3 and still < 1e-6
 
 
+@pytest.mark.slow
 def test_a_session_is_that_of_its_seed(settings, session):
     again, other = draw(settings, QUIET, 3), draw(settings, Noise(), 4)
     assert again.tracked.poses == pytest.approx(session.tracked.poses, rel=1e-6, abs=1e-6)

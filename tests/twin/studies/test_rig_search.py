@@ -57,6 +57,7 @@ def test_the_grids_best_is_found_in_a_quarter_of_its_runs(seed):
     assert found.bound == pytest.approx({name: figures(found.point)[name] for name in ("time", "overlap")})
 
 
+@pytest.mark.slow
 def test_a_gaussian_process_finds_the_best_of_two_factors():
     """Of 30, in ten runs, eight of them drawn before it begins."""
     pytest.importorskip("torch")
