@@ -1,7 +1,7 @@
 """Render a data set of tracking frames with ground truth: a held probe and its target in any light, still or moving.
 
 Reads the ranges of what is drawn at random from conf/dataset.yaml. Writes OUT/shard-*.tar (WebDataset), OUT/index.parquet and
-OUT/dataset.json; docs/training.md says what is in them. About two stereo samples a second on two cores, after a minute in which
+OUT/dataset.json; docs/training.md says what is in them. About six stereo samples a second on two cores, after a minute in which
 it compiles. A run that was stopped goes on where it was when started again; the same seed gives the same bytes, on any engine.
 
     sonotwin dataset out=outputs/data samples=3000 engine.workers=2
