@@ -125,6 +125,7 @@ def short(value: Any) -> str:
 def words(name: str) -> str:
     """A field or figure as people read it: the last part of its name, the unit after a comma."""
     last = " and ".join(field.rpartition(".")[2] for field in name.split("+")) if "." in name else name
+    last = last.replace("_rms", "_RMS")
     for unit in UNITS:
         if last.endswith(f"_{unit}"):
             return f"{last[: -len(unit) - 1].replace('_', ' ')}, {unit}"

@@ -95,7 +95,7 @@ def test_a_figure_that_no_trial_gave_is_drawn_empty():
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("plane_rms_mm", "plane rms, mm"),
+        ("plane_rms_mm", "plane RMS, mm"),
         ("patterns.parts.fringes.pitch", "pitch"),
         ("rig.cam1.gain+rig.cam2.lens.blur_px", "gain and blur, px"),
         ("shooting.exposure_s", "exposure, s"),
