@@ -103,14 +103,15 @@ def budget(kept: Path) -> list[Row]:
 
 
 def exploration(kept: Path, name: str) -> list[Row]:
-    """Row d: figures of an exploration over their closed forms, the median over its points and the farthest."""
+    """Row d: figures of an exploration over what they are held against, the median over its trials and the largest."""
     fields = ["poses=demo"] if name == "board_poses" else []
     config, done = study(kept, name, f"seeds={SEEDS}", *fields)
     rows = []
-    for figure, limit in experiments.experiment(config.of).limits.items():
+    of = experiments.experiment(config.of)
+    for figure, limit in of.limits.items():
         if limit:
             ratios = finite(one.figures.get(figure, np.nan) / one.figures.get(limit, np.nan) for one in done)
-            what = f"{config.title}: {figure} over its closed form, {len(ratios)} trials"
+            what = f"{config.title}: {figure} over what it is held against ({of.limit}), {len(ratios)} trials"
             rows.append(Row("d", f"{what}, median", float(np.median(ratios)), None, 1.0, ""))
             rows.append(Row("d", f"{what}, largest", float(ratios.max()), None, 1.0, ""))
     return rows
