@@ -1,6 +1,7 @@
 """Read a rig or a pattern sequence of `conf/` by its name, or one of the user's own from a YAML file."""
 
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -27,11 +28,15 @@ def read_rig(source: str | Path = "meza2021") -> Rig:
         If there is no such file, it is not YAML, or a field is wrong.
     """
     path = _file("rig", source)
+    return validated(Rig, read_yaml(path), path)
+
+
+def read_yaml(path: Path) -> Any:
+    """Content of a YAML file; raises InputError if there is none."""
     try:
-        content = yaml.safe_load(read_bytes(path))
+        return yaml.safe_load(read_bytes(path))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected YAML, found {' '.join(str(error).split())}") from None
-    return validated(Rig, content, path)
 
 
 def read_patterns(source: str | Path = "paper_surface") -> Patterns:

@@ -63,7 +63,7 @@ def study(kept: Path, name: str, *fields: str) -> tuple[Config, list[Done]]:
     if config.budget is not None:
         points = error_budget.points(config.budget, config.settings.model_dump(mode="json")).values()
     else:
-        points = factors.factorial(factors.read(config.over))
+        points = study_steps.design(config)
     trials = study_plan.trials(config.of, config.settings, list(points), study_steps.seeds(config))
     return config, study_steps.do(config, study_steps.opened(config), trials, Console(quiet=True))
 

@@ -9,8 +9,8 @@ from pydantic import Field, ValidationError
 
 from recon.capture.manifest import validated
 from recon.errors import InputError, one_line
-from recon.files.regular import read_bytes
 from recon.model.rig import Part
+from sonotwin.choices import read_yaml
 from sonotwin.config import folder
 from twin.studies import experiments, factors, study_runs
 from twin.studies.beside_paper import Figure
@@ -61,14 +61,6 @@ def read_study(name: object) -> Study | None:
         names = sorted(each.stem for each in known.parent.glob("*.yaml"))
         raise InputError(f"name: expected {SWEEP}, one of {', '.join(names)}, or a YAML file, found {name}")
     return validated(Study, read_yaml(path), path)
-
-
-def read_yaml(path: Path) -> Any:
-    """Content of a YAML file; raises InputError if it is none."""
-    try:
-        return yaml.safe_load(read_bytes(path))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected YAML, found {' '.join(str(error).split())}") from None
 
 
 def trials(of: str, settings: Settings, points: Iterable[Point], seeds: Iterable[int]) -> list[Trial]:

@@ -34,9 +34,7 @@ if TYPE_CHECKING:
 
 def sweep(config: "Config", console: Console) -> bool:
     """Do all points of a design; returns whether any trial gave figures."""
-    read = factors.read(config.over)
-    points = factors.factorial(read) if config.points is None else factors.filling(read, config.points, config.fill)
-    trials = study_plan.trials(config.of, config.settings, points, seeds(config))
+    trials = study_plan.trials(config.of, config.settings, design(config), seeds(config))
     if config.document is not None:
         table_rows.check_place(config.document, config.name)
     done = do(config, opened(config), trials, console)
@@ -49,6 +47,12 @@ def sweep(config: "Config", console: Console) -> bool:
         sections = [_beside_paper(config, done, console), *sections]
     write(config, done, sections, console)
     return any(one.figures for one in done)
+
+
+def design(config: "Config") -> list[Point]:
+    """All points of a sweep."""
+    read = factors.read(config.over)
+    return factors.factorial(read) if config.points is None else factors.filling(read, config.points, config.fill)
 
 
 def _beside_paper(config: "Config", done: Sequence[Done], console: Console) -> Section:

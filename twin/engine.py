@@ -90,7 +90,6 @@ class _Worker:
         """Begin anew with another process."""
         self.pool.shutdown()
         self.begun, self.pool = 0, _pool()
-        self.processes.clear()
 
     def end(self, at_once: bool) -> None:
         """End the process; at once if nobody waits for its task."""
@@ -99,11 +98,13 @@ class _Worker:
         self.pool.shutdown(cancel_futures=True)
 
     def _submit(self, work: Work[Result], task: Task) -> Future[Result]:
-        others = set(active_children())
-        with _threads(self.threads):  # in the environment of a process that is begun now
-            future = self.pool.submit(work, *task)
         self.begun += 1
-        self.processes |= set(active_children()) - others
+        if self.begun > 1:
+            return self.pool.submit(work, *task)
+        others = set(active_children())
+        with _threads(self.threads):  # in the environment of the process that begins now
+            future = self.pool.submit(work, *task)
+        self.processes = set(active_children()) - others
         return future
 
 

@@ -6,14 +6,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from recon.files import atomic
 from recon.files.metrics import shown
 from recon.reports import figures, page
 from recon.reports.figures import BARS, LINE
 from recon.reports.page import Section
 from twin.studies import error_budget
 from twin.studies.error_budget import Budget, Sum
-from twin.studies.study_page import PICTURES, title
+from twin.studies.study_page import kept_drawing, title
 
 PREDICTED = (
     "Errors as the software propagates them. Of the latency and the speed of sound it is told the size that is drawn: their "
@@ -25,16 +24,13 @@ LEAST = 0.002  # share of the sum's square that gets a bar of its own
 def sections(folder: Path, budget: Budget, sums: Sequence[Sum]) -> list[Section]:
     """A section a figure; its waterfall is kept as a PNG file too."""
     made = []
-    (folder / PICTURES).mkdir(exist_ok=True)
     for one in sums:
         if not np.isfinite([one.added, one.whole]).all():
             lost = ", ".join(part.source for part in one.parts if not part.trials) or "all together"
             made.append(Section(title(budget.figures[one.figure]), [page.paragraph(f"No trial gave figures of {lost}.")]))
             continue
-        drawn = waterfall(one)
-        with atomic.new_file(folder / PICTURES / f"budget_{one.figure}.png") as path:
-            drawn.savefig(path, dpi=160, metadata={"Software": None})
-        drawing = page.drawing(figures.inline_svg(drawn), f"Budget of {budget.figures[one.figure]}", error_budget.explained(one))
+        caption, name = f"Budget of {budget.figures[one.figure]}", f"budget_{one.figure}.png"
+        drawing = kept_drawing(folder, name, waterfall(one), caption, error_budget.explained(one))
         blocks = [drawing, page.notices(error_budget.advice(budget, one)), page.table(*_parts(budget, one))]
         if one.predicted:
             blocks.append(page.table(*_predicted(one)))

@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from recon.files import atomic
 from recon.files.metrics import shown
 from recon.reports import figures, page
 from recon.reports.figures import BARS, LINE
 from recon.reports.page import Section
 from twin.studies.rig_search import Candidate, Goal
-from twin.studies.study_page import PICTURES
+from twin.studies.study_page import PICTURES, kept_drawing
 from twin.studies.study_plots import scale_heights, short, words
 
 BEST = 10  # candidates in the table
@@ -20,19 +19,16 @@ BEST = 10  # candidates in the table
 
 def sections(folder: Path, goal: Goal, candidates: Sequence[Candidate]) -> list[Section]:
     """The search's course, kept as a PNG file too, and its best candidates."""
-    drawn = course(goal, candidates)
-    (folder / PICTURES).mkdir(exist_ok=True)
-    with atomic.new_file(folder / PICTURES / "search.png") as path:
-        drawn.savefig(path, dpi=160, metadata={"Software": None})
+    drawing = kept_drawing(folder, "search.png", course(goal, candidates), "The search", f"{PICTURES}/search.png")
     good = sorted((one for one in candidates if one.good), key=lambda one: one.value)[:BEST]
     if not good:
-        return [Section("Search", [page.paragraph("No candidate kept all bounds."), _drawing(drawn)])]
+        return [Section("Search", [page.paragraph("No candidate kept all bounds."), drawing])]
     head = [*map(words, good[0].point), words(goal.least), *(f"{words(name)}, in the worst" for name in goal.bounds)]
     rows = [
         [*map(short, one.point.values()), shown(one.value, ".4g"), *(f"{one.bound[name]:.4g}" for name in goal.bounds)]
         for one in good
     ]
-    return [Section("Search", [_drawing(drawn), page.table(head, rows, "The best candidates within all bounds.")])]
+    return [Section("Search", [drawing, page.table(head, rows, "The best candidates within all bounds.")])]
 
 
 def course(goal: Goal, candidates: Sequence[Candidate]) -> Figure:
@@ -49,7 +45,3 @@ def course(goal: Goal, candidates: Sequence[Candidate]) -> Figure:
     axes.set(xlabel="candidate", ylabel=words(goal.least))
     axes.legend(frameon=False, fontsize=8, labelcolor=axes.xaxis.label.get_color())
     return drawn
-
-
-def _drawing(drawn: Figure) -> str:
-    return page.drawing(figures.inline_svg(drawn), "The search", f"{PICTURES}/search.png")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from recon.files import atomic
 from recon.files.metrics import shown
@@ -38,7 +39,6 @@ def write(folder: Path, title: str, done: Sequence[Done], sections: Sequence[Sec
 def plots(folder: Path, done: Sequence[Done], of: Experiment) -> list[Section]:
     """Sections of all figures over all factors, whose plots are kept as PNG files too, and a table."""
     table, fields = study_runs.rows(done), list(done[0].trial.point)
-    (folder / PICTURES).mkdir(exist_ok=True)
     sections = [
         Section(title(words(figure)), [page.grid((_drawn(folder, table, of, figure, field) for field in fields), "two")])
         for figure in of.limits
@@ -59,9 +59,15 @@ def _drawn(folder: Path, table: study_plots.Table, of: Experiment, figure: str, 
     fields = list(table[0])[: list(table[0]).index(SEED)]
     drawn = study_plots.draw(table, figure, field, fields, of.limits[figure], of.limit)
     name = f"{figure}_over_{re.sub(r'[^A-Za-z0-9]+', '_', field)}.png"
+    return kept_drawing(folder, name, drawn, f"{words(figure)} over {field}", f"{PICTURES}/{name}")
+
+
+def kept_drawing(folder: Path, name: str, drawn: Figure, caption: str, detail: str) -> str:
+    """A drawing for the page, kept as a PNG file too."""
+    (folder / PICTURES).mkdir(exist_ok=True)
     with atomic.new_file(folder / PICTURES / name) as path:
         drawn.savefig(path, dpi=160, metadata={"Software": None})
-    return page.drawing(figures.inline_svg(drawn), f"{words(figure)} over {field}", f"{PICTURES}/{name}")
+    return page.drawing(figures.inline_svg(drawn), caption, detail)
 
 
 def _points(table: study_plots.Table, fields: Sequence[str], limits: Mapping[str, str]) -> Iterator[list[str]]:
