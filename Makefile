@@ -55,8 +55,9 @@ accuracy: setup  ## measure errors against the ground truth and the paper's figu
 benchmark: setup  ## measure speed
 	@$(BIN)/python -m benchmarks $(ONLY)
 
-# Hours; goes on where it was stopped. Trials are shared: planes, sphere and optics are figures of the same laboratories.
-PAPER := optics planes sphere
+# Hours; goes on where it was stopped. Trials are shared: planes, sphere and optics are figures of the same laboratories, and so are
+# probe and cylinders.
+PAPER := optics planes sphere probe cylinders breast ultrasound_causes wire_tilts
 paper: setup  ## repeat the paper's experiments in full, by its method and by ours
 	@for name in $(if $(ONLY),$(ONLY),$(PAPER)); do \
 		$(BIN)/sonotwin study name=$$name out=outputs/paper/$$name trials=outputs/paper/trials document=docs/paper.md engine.workers=2 || exit; \

@@ -226,7 +226,7 @@ def compared(folder: Path) -> tuple[list[sweep_errors.Finding], sweep_errors.Swe
     truth = sweep_errors.read_truth(folder / "sweep" / "truth")
     count = int(metrics.read(folder / "tumours" / metrics.FILE)["masses"])
     found = [trimesh.load_mesh(folder / "tumours" / f"mass{number}.ply", process=False) for number in range(count)]
-    return sweep_errors.compare(found, truth), truth
+    return sweep_errors.compare(found, truth.hidden), truth
 
 
 def _figures(part: str) -> Callable[[Path], Metrics]:

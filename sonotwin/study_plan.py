@@ -89,9 +89,15 @@ def changed(base: Mapping[str, Any], point: Point) -> Settings:
 
 
 def choice(name: str, value: str) -> Any:
-    """Content of a group's choice, such as `lifelike` of conditions."""
-    path = folder() / GROUPS[name.split(factors.JOINT)[0]] / f"{value}.yaml"
+    """Content of a group's choice, such as `lifelike` of conditions, or of one part of it, such as `lifelike.sound`."""
+    file, _, part = value.partition(".")
+    path = folder() / GROUPS[name.split(factors.JOINT)[0]] / f"{file}.yaml"
     if not path.is_file():
         names = ", ".join(sorted(each.stem for each in path.parent.glob("*.yaml")))
         raise InputError(f"over: {name}: expected one of {names}, found {value}")
-    return yaml.safe_load(path.read_text(encoding="utf-8"))
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if not part:
+        return content
+    if part not in content:
+        raise InputError(f"over: {name}: expected {file}, or a part of it, {', '.join(content)}, found {value}")
+    return {part: content[part]}

@@ -106,7 +106,7 @@ def inside(folder: Path, rig: Rig, rng: np.random.Generator) -> Inside:
         sweep_part.read_sweep(folder / "sweep"),
         poses() @ np.diag([*IN_TISSUE, 1, 1]),
         volume,
-        sweep_errors.compare([ball(TUMOURS[0][0] + SHIFT, TUMOURS[0][1])], truth),
+        sweep_errors.compare([ball(TUMOURS[0][0] + SHIFT, TUMOURS[0][1])], truth.hidden),
         truth,
         calibrated(truth),
         bob,

@@ -76,7 +76,7 @@ def inside(result: Path, truth: Path, name: str) -> Metrics:
         **dict(zip(PROBE_ERRORS, apart_by_probe.ravel().tolist(), strict=True)),
         "placement_rms_mm": float(np.sqrt(np.nanmean(apart**2))),
         "placement_over_sigma": float(np.sqrt(np.nanmean((apart / place_sigmas(scans)) ** 2))),
-        **sweep_errors.measure(sweep_errors.compare(meshes, true), true, found),
+        **sweep_errors.measure(sweep_errors.compare(meshes, true.hidden), true, found),
     }
     skin = result / "surface" / "surface.ply"
     return figures | ({"contact_bias_mm": contact_bias(shown, true, skin)} if skin.is_file() else {})

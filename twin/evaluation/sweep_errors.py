@@ -153,7 +153,7 @@ def placement(world_from_pixel: Array, truth: SweepTruth) -> Array:
     return np.linalg.norm(_each(world_from_pixel, flat) - _each(true, flat), axis=-1)
 
 
-def compare(found: Sequence[trimesh.Trimesh], truth: SweepTruth) -> list[Finding]:
+def compare(found: Sequence[trimesh.Trimesh], hidden: Sequence[Thing]) -> list[Finding]:
     """Pair found with true masses, each with one at most, so that the sum of the centres' distances is least.
 
     A pair whose centres are farther apart than half the true one's greatest extent is none.
@@ -161,8 +161,9 @@ def compare(found: Sequence[trimesh.Trimesh], truth: SweepTruth) -> list[Finding
     Parameters
     ----------
     found : meshes in the world, mm; closed.
+    hidden : true things, as of `SweepTruth`.
     """
-    true = [thing.mesh for thing in truth.hidden]
+    true = [thing.mesh for thing in hidden]
     pairs: dict[int, int] = {}
     if found:
         apart = np.linalg.norm(np.array([t.center_mass for t in true])[:, None] - [f.center_mass for f in found], axis=-1)
@@ -171,7 +172,7 @@ def compare(found: Sequence[trimesh.Trimesh], truth: SweepTruth) -> list[Finding
         pairs = {t: f for t, f in zip(*linear_sum_assignment(cost), strict=True) if apart[t, f] < reach[t]}
     return [
         Finding(thing.name, thing.mesh, found[pairs[k]], pairs[k]) if k in pairs else Finding(thing.name, thing.mesh, None)
-        for k, thing in enumerate(truth.hidden)
+        for k, thing in enumerate(hidden)
     ]
 
 

@@ -16,10 +16,10 @@ HEAD = ("conditions", "figure", "paper reported", "paper's method in the twin", 
 
 
 class Figure(Part):
-    """A figure that the paper reports."""
+    """A figure of the paper's experiments."""
 
     what: str
-    reported: tuple[float, float]  # least and greatest
+    reported: tuple[float, float] | None = None  # least and greatest; None where the paper has none
     paper: str | None = None  # figure of trials by the paper's method
     ours: str
     limit: str | None = None
@@ -37,8 +37,10 @@ class Compared(NamedTuple):
     limit: float
 
     @property
-    def paper_met(self) -> bool:
-        """Whether the paper's method gives what the paper reports, within a factor."""
+    def paper_met(self) -> bool | None:
+        """Whether the paper's method gives what the paper reports, within a factor; None where it reports nothing."""
+        if self.figure.reported is None:
+            return None
         low, high = self.figure.reported
         return bool(self.paper.size and low / FACTOR <= self.paper.mean() <= high * FACTOR)
 
@@ -62,17 +64,25 @@ def compare(figures: Sequence[Figure], done: Sequence[Done]) -> list[Compared]:
 
 def cells(one: Compared) -> list[str]:
     """A row of the table: means, and in brackets the least and the greatest."""
-    low, high = one.figure.reported
-    reported = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     limit = shown(one.limit, ".3g") if one.figure.limit else ""
-    met = "yes" if one.paper_met else "no"
-    return [one.point, one.figure.what, reported, _spread(one.paper), met, _spread(one.ours), limit, one.figure.unit]
+    met = {None: "", True: "yes", False: "no"}[one.paper_met]
+    return [
+        *(one.point, one.figure.what, _reported(one.figure), _spread(one.paper)),
+        *(met, _spread(one.ours), limit, one.figure.unit),
+    ]
 
 
 def markdown(compared: Sequence[Compared]) -> str:
     """The table as Markdown."""
     lines = [f"| {' | '.join(HEAD)} |", f"|{'---|' * len(HEAD)}"]
     return "\n".join([*lines, *(f"| {' | '.join(cells(one))} |" for one in compared)])
+
+
+def _reported(figure: Figure) -> str:
+    if figure.reported is None:
+        return "none"
+    low, high = figure.reported
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def _sizes(done: Sequence[Done], figure: str | None) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from recon.model import circle_layout, tracks
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Calibration, Uncertainty, in_use
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import NotNegative, Part, Positive, Rig, Target
-from recon.optical_calibration.joint_calibration import calibrate
+from recon.optical_calibration.joint_calibration import Result, calibrate
 from recon.probe_calibration import point_calibration
 from recon.probe_calibration.point_calibration import Sightings
 from recon.probe_calibration.sound_in_water import speed_of_sound
@@ -56,6 +56,7 @@ class Noise(Part):
     board_px: Size = 0.004  # of a disc's centre in a camera, three quarters in the projector; of rendered boards
     circle_px: Size = 0.008  # of a circle of the target, along each axis; of rendered films
     crossing_px: Size = 0.3  # of the wires' crossing in a B-scan, along each axis
+    click_px: Size = 2.3  # of a person's click on the crossing, along each axis: it makes the paper's RMS of the equation
     beside_mm: Size = 0.2  # of the crossing from the image plane, as a hand holds it
     latency_s: Size = 0.001  # of the scanner's latency, as measured over a flat bottom
     column_px: Size = 0.02  # of the projector's column that a pixel sees
@@ -150,6 +151,11 @@ def draw(rig: Rig, life: Conditions, noise: Noise, transducer: Transducer, poses
 
 def calibrated_optics(rig: Rig, life: Conditions, noise: Noise, chosen: Poses, seed: int) -> Calibration:
     """Calibrate from a board whose discs are found with noise."""
+    return calibrated_board(rig, life, noise, chosen, seed).adjustment.calibration
+
+
+def calibrated_board(rig: Rig, life: Conditions, noise: Noise, chosen: Poses, seed: int) -> Result:
+    """The same, with the board's observations."""
     truth, config = calibration_of(rig), board.Config()
     design = board.design(config)
     poses = random_poses(chosen.model_copy(update={"seed": chosen.seed + seed}), design, list(truth.cameras.values()))
@@ -157,7 +163,7 @@ def calibrated_optics(rig: Rig, life: Conditions, noise: Noise, chosen: Poses, s
     points = np.stack([board.printed_centres(conditions.flexed(printed, life.board, seed, k)) for k in range(chosen.count)])
     claimed = {name: noise.board_px * (0.75 if name == "projector" else 1) for name in truth.cameras}
     seen = drawn(truth, design, poses, claimed, np.random.default_rng([seed, 20]), points, max(noise.drawn.board, SOME))
-    return calibrate(seen.sightings, design, seen.sizes).adjustment.calibration
+    return calibrate(seen.sightings, design, seen.sizes)
 
 
 def calibrated_probe(

@@ -29,9 +29,10 @@ from twin.llvm import prepare
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
 from twin.shooting import power_of_two
-from twin.studies.drawn_session import Noise
+from twin.studies.drawn_session import ROLL_DEG, Noise
 from twin.studies.layout import Layout
 from twin.tracking.sampling_ranges import DataRanges
+from twin.ultrasound.probe_path import WirePath
 from twin.ultrasound.transducer import Transducer, check_scanner
 
 MODULES = {  # where an experiment's EXPERIMENT is
@@ -40,6 +41,8 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "tracking": "twin.studies.tracking_trial",
     "laboratory": "twin.studies.laboratory_trial",
     "chain": "twin.studies.chain_trial",
+    "tank": "twin.studies.tank_trial",
+    "breast": "twin.studies.breast_trial",
 }
 DIGITS = 6  # significant, of figures
 PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made
@@ -78,6 +81,7 @@ class Settings(Part):
     plane: Plane = Plane()
     film: Film = Film()
     noise: Noise = Noise()
+    wires: WirePath = WirePath(count=45, roll_deg=ROLL_DEG)
     ultrasound: Transducer = Transducer()
     ranges: DataRanges
 

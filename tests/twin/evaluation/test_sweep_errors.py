@@ -24,7 +24,7 @@ def truth(rig, tmp_path_factory):
 def test_a_tumour_that_is_off_is_told_by_how_much(truth):
     """Shifted by 0.5 mm: the outline's error is the shift's part along the normal, 0.5 / sqrt(3) RMS."""
     found = [ball(TUMOURS[0][0] + SHIFT, TUMOURS[0][1])]
-    figures = sweep_errors.measure(sweep_errors.compare(found, truth), truth, drawn_sweep.segmented(found, truth))
+    figures = sweep_errors.measure(sweep_errors.compare(found, truth.hidden), truth, drawn_sweep.segmented(found, truth))
     assert figures["tumour0_centre_error_mm"] == pytest.approx(0.5, abs=1e-3)
     assert figures["tumour0_outline_rms_mm"] == pytest.approx(0.5 / np.sqrt(3), rel=0.03)
     assert abs(figures["tumour0_outline_bias_mm"]) < 0.02
@@ -38,7 +38,7 @@ def test_a_tumour_that_is_too_large_has_a_bias(truth):
     """By 0.6 mm all around: so its outline is off, and the tissue above it is less by as much."""
     middle, radius = TUMOURS[1]
     found = [ball(middle, radius + 0.6)]
-    figures = sweep_errors.measure(sweep_errors.compare(found, truth), truth, drawn_sweep.segmented(found, truth))
+    figures = sweep_errors.measure(sweep_errors.compare(found, truth.hidden), truth, drawn_sweep.segmented(found, truth))
     assert figures["tumour1_outline_bias_mm"] == pytest.approx(0.6, abs=0.02)
     assert figures["tumour1_extent_mm"] - figures["tumour1_true_extent_mm"] == pytest.approx(1.2, abs=0.01)
     assert figures["tumour1_volume_mm3"] == pytest.approx(4 / 3 * np.pi * (radius + 0.6) ** 3, rel=0.01)
@@ -48,14 +48,14 @@ def test_a_tumour_that_is_too_large_has_a_bias(truth):
 
 def test_each_finding_is_given_to_one_tumour_and_what_is_far_away_is_false(truth):
     near, far = (ball(TUMOURS[1][0] + [0, shift, 0], 3.0) for shift in (1.0, 15.0))
-    findings = sweep_errors.compare([far, near], truth)
+    findings = sweep_errors.compare([far, near], truth.hidden)
     assert [finding.found for finding in findings] == [None, near]
     figures = sweep_errors.measure(findings, truth, drawn_sweep.segmented([far, near], truth))
     assert (figures["tumours_found"], figures["tumours_false"]) == (1, 1)
 
 
 def test_nothing_found_is_told_too(truth):
-    figures = sweep_errors.measure(sweep_errors.compare([], truth), truth, drawn_sweep.segmented([], truth))
+    figures = sweep_errors.measure(sweep_errors.compare([], truth.hidden), truth, drawn_sweep.segmented([], truth))
     assert (figures["tumours_found"], figures["tumours_true"]) == (0, 2)
     assert np.isnan(figures["tumour0_inside"]) and figures["tumour0_true_under_skin_mm"] > 0
 
@@ -155,7 +155,7 @@ def test_a_damaged_truth_is_refused_in_one_line(damage, complaint, tmp_path):
 def test_a_tumour_that_the_surface_hardly_covers_is_neither_inside_nor_outside(truth):
     found = [ball(TUMOURS[0][0], TUMOURS[0][1])]
     segmented = drawn_sweep.segmented(found, truth) | {"mass0_inside": np.nan}
-    figures = sweep_errors.measure(sweep_errors.compare(found, truth), truth, segmented)
+    figures = sweep_errors.measure(sweep_errors.compare(found, truth.hidden), truth, segmented)
     assert np.isnan(figures["tumour0_inside"]) and sweep_errors.of_each(figures, "inside") == []
 
 

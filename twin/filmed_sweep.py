@@ -1,0 +1,134 @@
+"""A freehand sweep of a scene that both cameras may film: its settings, the probe's way, its B-scans, and the cameras' frames."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from recon.capture.manifest import SweepNameOrNone
+from recon.model.rig import Rig
+from scenes.catalogue import build_scene
+from scenes.scene_types import Scene
+from twin.conditions import Conditions, drifted, printed
+from twin.shooting import FrameShooting
+from twin.tracking.sampling_ranges import DataRanges
+from twin.ultrasound import sweep_session
+from twin.ultrasound.bscan import Scan, scans
+from twin.ultrasound.echo_solids import Body, at_speeds, body
+from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise
+from twin.ultrasound.transducer import Transducer, check_scanner
+
+if TYPE_CHECKING:
+    from twin.tracking.rendered_views import Frames
+    from twin.tracking.scene_frames import SceneFilm
+
+Shown = Callable[[Iterable["Frames"], int], Iterable["Frames"]]
+
+
+class SweepSettings(BaseModel):
+    """All that a sweep is made from; as in `conf/sweep.yaml`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rig: Rig
+    scene: dict
+    ultrasound: Transducer
+    path: sweep_session.AnyPath
+    conditions: Conditions = Conditions()
+    clocks: Clocks = Clocks()
+    pose_noise: PoseNoise = PoseNoise()
+    name: SweepNameOrNone = ""
+    filmed: bool = False
+    frames: FrameShooting = FrameShooting()
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @property
+    def own_seed(self) -> int:
+        """Of hand, clocks and frames: one for each of several sweeps, which share tissue, prints, drift and speeds by `seed`."""
+        letters = self.name.encode()
+        return int(np.random.SeedSequence([self.seed, *letters]).generate_state(1)[0]) if letters else self.seed
+
+    @model_validator(mode="after")
+    def _frames_one_after_the_other(self) -> "SweepSettings":
+        if self.filmed and self.frames.exposure_s * self.clocks.camera_hz > 1:
+            expected = f"at most 1 / clocks.camera_hz = {1 / self.clocks.camera_hz:.4g}"
+            raise ValueError(f"frames.exposure_s: expected {expected}, found {self.frames.exposure_s:g}")
+        if self.filmed and self.seed >= 2**32:
+            raise ValueError(f"seed: expected less than 2^32 with filmed=true, found {self.seed}")
+        return self
+
+    @field_validator("path", mode="before")
+    @classmethod
+    def _leads_somewhere(cls, value: object) -> object:
+        if value is None:
+            raise ValueError("expected one that leads the probe, found none, which is for demonstrations without a sweep")
+        return value
+
+    @model_validator(mode="after")
+    def _one_scanner(self) -> "SweepSettings":
+        check_scanner(self.rig, self.ultrasound)
+        return self
+
+
+@dataclass(frozen=True)
+class PlannedSweep:
+    """A sweep before anything is rendered."""
+
+    settings: SweepSettings
+    scene: Scene
+    scanned: Body  # the scene by sound
+    plan: Plan
+
+    def scans(self) -> Iterator[Scan]:
+        """Render the B-scans, one by one."""
+        seed = int(np.random.SeedSequence([self.settings.seed, 1]).generate_state(1)[0])
+        return scans(self.scanned, self.settings.ultrasound, self.plan.truth.poses, seed)
+
+    def film(self, ranges: DataRanges, shown: Shown = lambda frames, _: frames) -> "SceneFilm":
+        """The film of the sweep: light, body and motion of its frames, and their rendering.
+
+        Parameters
+        ----------
+        ranges : of body, surroundings and light
+        shown : passes on so many frames as they are rendered, and may show the progress
+        """
+        from twin.tracking import film_session, scene_frames  # load the ray tracer, which B-scans do without
+
+        settings, target = self.settings, self.plan.target
+        rig = drifted(settings.rig, settings.conditions.drift, settings.seed)
+        rig = rig.model_copy(update={"target": printed(rig.target, settings.conditions.target, settings.seed)})
+        half = settings.frames.exposure_s / 2
+        led = scene_frames.motions(target.poses(), target.poses(-half), target.poses(half))
+        bank = scene_frames.make_bank(self.scene, rig, led, settings.seed)
+        motion = settings.conditions.motion
+        made = scene_frames.takes(bank, rig, ranges, settings.frames, led, settings.own_seed, motion)
+
+        def frames() -> Iterable["Frames"]:
+            return shown(film_session.shoot(bank, rig, made, settings.frames.quality, settings.own_seed), len(made))
+
+        return scene_frames.SceneFilm(rig, settings.rig, settings.frames, self.plan.track.times, made, frames)
+
+
+def plan_sweep(settings: SweepSettings) -> PlannedSweep:
+    """Set up the scene, and lead the probe along its path.
+
+    Raises
+    ------
+    InputError
+        As `twin.ultrasound.sweep_session.plan_sweep`, or if the scene has no acoustics.
+    """
+    scene = build_scene(settings.scene)
+    scanned = at_speeds(body(scene), settings.conditions.sound, settings.seed)
+    plan = sweep_session.plan_sweep(
+        settings.path,
+        settings.rig,
+        scanned,
+        settings.ultrasound,
+        settings.clocks,
+        settings.pose_noise,
+        settings.own_seed,
+        settings.conditions.motion,
+    )
+    return PlannedSweep(settings, scene, scanned, plan)
