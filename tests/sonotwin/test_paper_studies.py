@@ -23,3 +23,18 @@ def test_ours_keeps_its_bars_where_the_papers_method_is_farther_off(kept, name):
     assert all(one.paper.max() > one.ours.max() for one in compared)
     assert all(one.ours.max() < 1.25 * one.limit for one in compared if one.figure.limit)
     assert len(list((kept / "trials").glob("*.json"))) == 1  # planes and sphere are figures of the same laboratory
+
+
+@pytest.mark.slow
+def test_in_the_tank_ours_is_nearer_to_the_truth_than_the_papers_method(kept):
+    """Five calibrations of the probe with fewer poses than the paper's, and both cylinders."""
+    few = ["over={conditions: [lifelike]}", "seeds=1", "first_seed=3", "poses.count=12", "wires.count=18"]
+    (_, (one,)) = study_accuracy.study(kept, "probe", *few)
+    figures = one.figures
+    for figure in ("cr1_mean", "probe_error", "tube_diameter_error", "cover_diameter_error"):
+        assert abs(figures[f"{figure}_ours_mm"]) < abs(figures[f"{figure}_paper_mm"])
+    assert figures["cr1_mean_ours_mm"] < 2 * figures["cr1_mean_limit_mm"]
+    assert 0.2 < figures["equation_rms_paper_mm"] < 0.6
+    assert 0.3 < figures["tube_diameter_error_paper_mm"] < 1.0  # contours run along the outside of the wall's echo
+    _, cylinders = study_accuracy.study(kept, "cylinders", *few)
+    assert cylinders[0].figures == figures  # of the same laboratory

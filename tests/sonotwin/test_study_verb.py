@@ -13,6 +13,7 @@ from sonotwin import study_plan, study_steps
 from sonotwin.cli import main
 from sonotwin.config import folder, load
 from sonotwin.verbs.study import Config
+from twin.conditions import Conditions
 from twin.studies import error_budget, experiments, factors, rig_search
 from twin.studies.drawn_session import Drawn
 
@@ -76,7 +77,9 @@ def test_what_is_given_goes_before_what_the_study_says(tmp_path):
     assert loaded(tmp_path, "name=better_rig", "shooting.exposure_s=0.008").settings.shooting.exposure_s == 0.008
 
 
-@pytest.mark.parametrize(("name", "count"), [("planes", 1), ("sphere", 2), ("optics", 3)])
+@pytest.mark.parametrize(
+    ("name", "count"), [("planes", 1), ("sphere", 2), ("optics", 3), ("probe", 7), ("cylinders", 3), ("breast", 3)]
+)
 def test_the_papers_figures_come_with_their_study(name, count, tmp_path):
     """Unless others are given, or none."""
     config = load("study", [f"name={name}", "out=x"], Config)
@@ -279,3 +282,14 @@ def test_a_budget_and_a_search_from_end_to_end(tmp_path, capsys):
 def test_wrong_choices_of_a_group_name_the_right_ones():
     with pytest.raises(InputError, match=r"over: board_patterns: expected one of gray_surface, .*, found lines"):
         study_plan.choice("board_patterns", "lines")
+    with pytest.raises(
+        InputError, match=r"over: conditions: expected lifelike, or a part of it, .*sound.*, found lifelike.sounds"
+    ):
+        study_plan.choice("conditions", "lifelike.sounds")
+
+
+def test_a_part_of_a_choice_is_a_value(tmp_path):
+    """All else is then as it is without any choice."""
+    config = loaded(tmp_path, "name=sweep", *SMALL, "over={conditions: [lifelike, lifelike.sound]}")
+    whole, sound = (trial.settings.conditions for trial in study_plan.trials("chain", config.settings, planned(config), [0]))
+    assert sound == Conditions(sound=whole.sound) and whole.sound.tissue > 0

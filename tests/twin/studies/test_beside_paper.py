@@ -45,6 +45,12 @@ def test_cells_have_means_and_in_brackets_the_range_and_the_trials():
     assert len(planes) == len(beside_paper.HEAD)
 
 
+def test_a_figure_that_the_paper_lacks_is_neither_met_nor_missed():
+    (only,) = beside_paper.compare([Figure(what="volumes", paper="paper_mm", ours="ours_mm", unit="mm")], DONE[:1])
+    assert only.paper_met is None
+    assert beside_paper.cells(only)[2:6] == ["none", "0.110 (0.110 to 0.110; 1)", "", "0.030 (0.030 to 0.030; 1)"]
+
+
 def test_a_table_in_markdown_has_a_row_a_figure_and_point():
     compared = beside_paper.compare([PLANES, RADIUS], DONE)
     head, line, *rows = beside_paper.markdown(compared).split("\n")
