@@ -17,7 +17,6 @@ from sonotwin.config import load
 from sonotwin.verbs.study import Config
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.studies import beside_paper, error_budget, experiments, factors, rig_search
-from twin.studies.beside_paper import FACTOR
 from twin.studies.study_runs import TABLE, Done, finite
 
 RIG = "meza2021"
@@ -78,12 +77,12 @@ def laboratories(kept: Path) -> list[Row]:
             what, unit = one.figure.what, one.figure.unit
             if one.figure.bar is not None:
                 what_worst = f"{what}, {len(one.ours)} laboratories, worst"
-                rows.append(Row("a", what_worst, float(one.ours.max()), one.figure.bar, one.limit, unit))
+                rows.append(Row("a", what_worst, one.worst, one.figure.bar, one.limit, unit, at_least=one.figure.at_least))
             if one.paper.size and one.figure.reported is not None:
-                low, high = one.figure.reported
+                (low, high), factor = one.figure.reported, one.figure.factor
                 by = f"{what} by the paper's method, mean (paper: {low:g} to {high:g})"
-                rows.append(Row("b", f"{by}, at least", one.paper.mean(), low / FACTOR, low, unit, at_least=True))
-                rows.append(Row("b", f"{by}, at most", one.paper.mean(), high * FACTOR, high, unit))
+                rows.append(Row("b", f"{by}, at least", one.paper.mean(), low / factor, low, unit, at_least=True))
+                rows.append(Row("b", f"{by}, at most", one.paper.mean(), high * factor, high, unit))
     return rows
 
 

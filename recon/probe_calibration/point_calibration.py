@@ -47,7 +47,7 @@ DRAWS = 500  # random sixes of frames; at 30 % outliers 0.7**6 = 12 % of them ar
 GATE = 16.27  # squared normalised residual of an outlier; exceeded by 1 of 1000 good frames (chi-square, 3)
 MEDIAN = 2.366  # of chi-square with 3 degrees of freedom
 MAX_FACTOR = 8.0  # measured over assumed noise, of frames of one point at rest
-MAX_RMS_MM = 3.0  # of their residuals, for any lever; Meza et al. 2021 have 0.423
+MAX_RMS_MM = 3.0  # of their residuals, for any lever; Meza et al. 2021 have 0.423 in each coordinate
 MIN_INLIERS = 0.5  # of the frames
 REACH = (0.43, 0.40)  # of the crossing from the middle, of the image's width and height: spots stay whole and clear of the face
 ROCK = 0.6  # greatest part of a tilt about the image's normal, by which wires are seen edge-on
@@ -98,7 +98,9 @@ class Adjustment:
 
     @property
     def rms_mm(self) -> float:
-        """Root mean square distance from the wire, outliers left out: the "equation RMS" of Meza et al. 2021."""
+        """Root mean square distance from the wire, outliers left out: sqrt(3) times the equation's RMS of Meza et al. 2021, whose
+        program takes the three coordinates' mean square.
+        """
         return float(np.sqrt((self.residuals[~self.outliers] ** 2).sum(axis=1).mean()))
 
 

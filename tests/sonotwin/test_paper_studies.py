@@ -28,7 +28,7 @@ def test_ours_keeps_its_bars_where_the_papers_method_is_farther_off(kept, name):
 @pytest.mark.slow
 def test_in_the_tank_ours_is_nearer_to_the_truth_than_the_papers_method(kept):
     """Five calibrations of the probe with fewer poses than the paper's, and both cylinders."""
-    few = ["over={conditions: [lifelike]}", "seeds=1", "first_seed=3", "poses.count=12", "wires.count=18"]
+    few = ["over={conditions: [lifelike]}", "seeds=1", "first_seed=3", "poses.count=12", "wire_path.count=18"]
     (_, (one,)) = study_accuracy.study(kept, "probe", *few)
     figures = one.figures
     for figure in ("cr1_mean", "probe_error", "tube_diameter_error", "cover_diameter_error"):

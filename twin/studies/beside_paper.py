@@ -1,10 +1,11 @@
 """A study's figures beside those that the paper reports: its method in the twin, ours, and the limit."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from recon.files.metrics import shown
 from recon.model.rig import Part
@@ -24,6 +25,8 @@ class Figure(Part):
     ours: str
     limit: str | None = None
     bar: float | None = None  # of ours, in the worst trial under conditions that aren't ideal
+    at_least: bool = False  # ours may be more than the bar, not less
+    factor: Annotated[float, Field(ge=1)] = FACTOR  # between the paper's figure and that of its method, that counts as met
     unit: str
 
 
@@ -34,6 +37,7 @@ class Compared(NamedTuple):
     figure: Figure
     paper: NDArray[np.float64]  # (n,) sizes by the paper's method
     ours: NDArray[np.float64]  # (m,)
+    missing: int  # trials without a figure of ours
     limit: float
 
     @property
@@ -42,12 +46,22 @@ class Compared(NamedTuple):
         if self.figure.reported is None:
             return None
         low, high = self.figure.reported
-        return bool(self.paper.size and low / FACTOR <= self.paper.mean() <= high * FACTOR)
+        factor = self.figure.factor
+        return bool(self.paper.size and low / factor <= self.paper.mean() <= high * factor)
 
     @property
     def bar_met(self) -> bool:
         """Whether ours keeps its bar in all trials; nothing is asked where there is none."""
-        return self.figure.bar is None or bool(self.ours.size and self.ours.max() <= self.figure.bar)
+        if self.figure.bar is None:
+            return True
+        return self.worst >= self.figure.bar if self.figure.at_least else self.worst <= self.figure.bar
+
+    @property
+    def worst(self) -> float:
+        """Ours in the worst trial; NaN if one has no figure."""
+        if self.missing or not self.ours.size:
+            return float("nan")
+        return float(self.ours.min() if self.figure.at_least else self.ours.max())
 
 
 def compare(figures: Sequence[Figure], done: Sequence[Done]) -> list[Compared]:
@@ -55,11 +69,12 @@ def compare(figures: Sequence[Figure], done: Sequence[Done]) -> list[Compared]:
     points: dict[str, list[Done]] = {}
     for one in done:
         points.setdefault(", ".join(short(value) for value in one.trial.point.values()), []).append(one)
-    return [
-        Compared(point, figure, _sizes(alike, figure.paper), _sizes(alike, figure.ours), _middle(_sizes(alike, figure.limit)))
-        for figure in figures
-        for point, alike in points.items()
-    ]
+    return [_compared(point, figure, alike) for figure in figures for point, alike in points.items()]
+
+
+def _compared(point: str, figure: Figure, alike: Sequence[Done]) -> Compared:
+    ours, limit = _sizes(alike, figure.ours), _sizes(alike, figure.limit)
+    return Compared(point, figure, _sizes(alike, figure.paper), ours, len(alike) - ours.size, _middle(limit))
 
 
 def cells(one: Compared) -> list[str]:

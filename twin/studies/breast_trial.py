@@ -3,6 +3,8 @@
 The paper's masks are drawn by a steady hand: along the tumours as each B-scan shows them.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import trimesh
@@ -50,7 +52,7 @@ def measure(settings: Settings, seed: int) -> Metrics:
         plain = filmed_laboratory.meshed(as_published(shot, settings.patterns), lab.optics.light)
         return {
             **figures("ours", segmented(lab, sweep, ours), skin, hidden),
-            **figures("paper", from_masks(lab, sweep, paper), plain, hidden),
+            **figures("paper", from_masks(lab, sweep, paper), plain, [convex(thing) for thing in hidden]),
         }
 
 
@@ -74,6 +76,11 @@ def from_masks(lab: FilmedLaboratory, sweep: TrackedSweep, probe: ProbeCalibrati
             points += [rigid.apply(matrix, probe.to_target(contour[:, 0].astype(float))) for contour in contours]
     together = [np.concatenate(points) for points in outlined.values() if sum(map(len, points)) > LEAST_POINTS]
     return [trimesh.PointCloud(points).convex_hull for points in together]
+
+
+def convex(thing: Thing) -> Thing:
+    """A thing's convex hull, which hulls of its masks are compared with."""
+    return replace(thing, mesh=thing.mesh.convex_hull)
 
 
 def figures(name: str, found: list[trimesh.Trimesh], skin: trimesh.Trimesh, hidden: list[Thing]) -> Metrics:

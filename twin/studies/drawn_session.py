@@ -56,7 +56,7 @@ class Noise(Part):
     board_px: Size = 0.004  # of a disc's centre in a camera, three quarters in the projector; of rendered boards
     circle_px: Size = 0.008  # of a circle of the target, along each axis; of rendered films
     crossing_px: Size = 0.3  # of the wires' crossing in a B-scan, along each axis
-    click_px: Size = 2.3  # of a person's click on the crossing, along each axis: it makes the paper's RMS of the equation
+    click_px: Size = 4.3  # of the crossing as a person finds it, along each axis: it makes the paper's RMS of the equation
     beside_mm: Size = 0.2  # of the crossing from the image plane, as a hand holds it
     latency_s: Size = 0.001  # of the scanner's latency, as measured over a flat bottom
     column_px: Size = 0.02  # of the projector's column that a pixel sees

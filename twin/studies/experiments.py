@@ -81,7 +81,7 @@ class Settings(Part):
     plane: Plane = Plane()
     film: Film = Film()
     noise: Noise = Noise()
-    wires: WirePath = WirePath(count=45, roll_deg=ROLL_DEG)
+    wire_path: WirePath = WirePath(count=45, roll_deg=ROLL_DEG)
     ultrasound: Transducer = Transducer()
     ranges: DataRanges
 

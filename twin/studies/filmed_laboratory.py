@@ -28,6 +28,7 @@ from twin.accuracy import surface_accuracy
 from twin.accuracy.baselines import opencv_peer, published_probe
 from twin.accuracy.baselines.published_probe import Solved
 from twin.accuracy.surface_accuracy import Experiment as Shot
+from twin.accuracy.tube_accuracy import WATER
 from twin.conditions import drifted
 from twin.filmed_sweep import SweepSettings, plan_sweep
 from twin.shooting import FrameShooting
@@ -41,11 +42,11 @@ from twin.ultrasound.timed_sweep import Clocks
 from twin.ultrasound.transducer import Transducer
 
 IMAGES = 30  # of the wires, in each calibration of the paper
-AT_REST_HZ = 5.0  # pairs of frames
+AT_REST_HZ = 4.0  # pairs of frames: two about the middle of each rest
 NOT_KEPT = "not among those that are kept"
 READS = (  # of a study's settings
-    *("rig", "layout", "patterns", "poses", "conditions", "tracing", "shooting", "film.white_dn", "ultrasound", "wires"),
-    *("noise.board_px", "noise.click_px", "noise.latency_s", "noise.drawn.board", "ranges"),
+    *("rig", "layout", "patterns", "poses", "conditions", "tracing", "shooting", "film.white_dn", "wire_path", "ranges"),
+    *("noise.board_px", "noise.click_px", "noise.latency_s", "noise.drawn.board", "noise.drawn.latency"),
 )
 
 
@@ -70,7 +71,8 @@ def opened(settings: Settings, seed: int) -> Iterator[FilmedLaboratory]:
     as_seen = np.zeros_like(board.observations.pixels)  # ellipses' middles, uncorrected
     cameras, light = (opencv_peer.stereo(board.observations, name, as_seen) for name in ("cam2", "projector"))
     optics = Optics(board.adjustment.calibration, cameras, light)
-    latency = Clocks().lag_s + settings.noise.latency_s * float(np.random.default_rng([seed, 31]).standard_normal())
+    level = settings.noise.drawn.latency * settings.noise.latency_s
+    latency = Clocks().lag_s + level * float(np.random.default_rng([seed, 31]).standard_normal())
     with TemporaryDirectory() as folder:
         yield FilmedLaboratory(settings, seed, rig, optics, latency, networks.load(), Path(folder))
 
@@ -89,16 +91,14 @@ def swept(lab: FilmedLaboratory, name: str, scene: dict, path: AnyPath, clocks: 
         frames=FrameShooting(white_dn=lab.settings.film.white_dn),
         seed=lab.seed,
     )
-    life = lab.settings.conditions
-    return tracked_sweep.track(
-        plan_sweep(settings), lab.optics, lab.networks, life.board.stretch, lab.settings.ranges, lab.folder
-    )
+    return tracked_sweep.track(plan_sweep(settings), lab.optics, lab.networks, lab.settings.ranges, lab.folder)
 
 
 def wires(lab: FilmedLaboratory, number: int) -> TrackedSweep:
-    """The probe at rest in poses about crossed wires."""
+    """The probe at rest in poses about crossed wires, others in each calibration."""
     settings = lab.settings
-    return swept(lab, f"wires{number}", {"kind": "crosswire"}, settings.wires, Clocks(camera_hz=AT_REST_HZ), settings.ultrasound)
+    path = settings.wire_path.model_copy(update={"first": settings.wire_path.first + number * settings.wire_path.count})
+    return swept(lab, f"wires{number}", {"kind": "crosswire"}, path, Clocks(camera_hz=AT_REST_HZ), WATER)
 
 
 def crossings(lab: FilmedLaboratory, sweep: TrackedSweep) -> CrossingFrames:
@@ -115,7 +115,7 @@ def crossings(lab: FilmedLaboratory, sweep: TrackedSweep) -> CrossingFrames:
 def calibrated(lab: FilmedLaboratory, found: CrossingFrames) -> Result:
     """Our calibration."""
     crossing_frames.refuse_few(found)
-    return tank_calibration.calibrate(found, lab.rig.probe, Tank(temperature_c=WATER_C))
+    return tank_calibration.calibrate(found, lab.rig.probe, Tank(temperature_c=WATER_C, wire_radius_sigma_mm=0.0))
 
 
 def published(lab: FilmedLaboratory, found: CrossingFrames, sweep: TrackedSweep, rng: np.random.Generator) -> Solved:

@@ -6,13 +6,13 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Unsure
 from recon.geometry import rigid
 from recon.geometry.primitives import Cylinder, fit_cylinder
 from recon.model.probe import ProbeCalibration
-from recon.model.rig import Rig
 from recon.probe_calibration import point_calibration, repeatability, sound_in_water
 from recon.probe_calibration.tank_calibration import Result
 from recon.segmentation import segmented_scans, tube_cover
@@ -22,6 +22,7 @@ from twin.accuracy import probe_accuracy
 from twin.accuracy.baselines import published_probe
 from twin.accuracy.baselines.published_probe import Solved
 from twin.accuracy.plane_and_sphere import as_published
+from twin.accuracy.tube_accuracy import WATER
 from twin.evaluation.surface_errors import rms
 from twin.studies import filmed_laboratory
 from twin.studies.drawn_session import WATER_C
@@ -40,22 +41,22 @@ INNER, OUTER = {"kind": "inner_cylinder", "centre_mm": CENTRE_MM}, {"kind": "cyl
 LENGTH_MM, PACE_MM_S, STANDOFF_MM = 46.5, 10.0, 17.0  # of the stroke along it
 CAMERA_HZ = 20.0  # pairs of frames, in motion
 TOP_MM = 2.5  # of ringing at the probe's face, left out of masks
-MOST_FITTED = 20_000  # points of a cylinder
 DRAWS = 2000  # of errors, for their expected distances
-PLACES = ("centre", "corner", "mean")
 
 
 def measure(settings: Settings, seed: int) -> Metrics:
     """Figures of one laboratory, by both methods."""
-    ours, paper, clicks = list[Result](), list[Solved](), np.random.default_rng([seed, 32])
+    ours, paper, images, clicks = list[Result](), list[Solved](), list[int](), np.random.default_rng([seed, 32])
     with filmed_laboratory.opened(settings, seed) as lab:
         for number in range(CALIBRATIONS):
             sweep = filmed_laboratory.wires(lab, number)
             found = filmed_laboratory.crossings(lab, sweep)
+            images.append(len(found.usable))
             ours.append(filmed_laboratory.calibrated(lab, found))
             paper.append(filmed_laboratory.published(lab, found, sweep, clicks))
         mean = repeatability.average([one.calibration for one in paper])
-        return probe_figures(lab, ours, paper) | cylinder_figures(lab, ours[-1].calibration, mean)
+        figures = probe_figures(lab, ours, paper) | cylinder_figures(lab, ours[-1].calibration, mean)
+        return figures | {"images": float(np.mean(images))}
 
 
 def probe_figures(lab: FilmedLaboratory, ours: Sequence[Result], paper: Sequence[Solved]) -> Metrics:
@@ -63,26 +64,30 @@ def probe_figures(lab: FilmedLaboratory, ours: Sequence[Result], paper: Sequence
     rig, life = lab.rig, lab.settings.conditions
     by_us, by_paper = [one.adjustment.calibration for one in ours], [one.calibration for one in paper]
     speed = float(sound_in_water.speed_of_sound(WATER_C + conditions.speeds(life.sound, lab.seed)[1]))
-    scanner = calibration_of(rig, lab.settings.ultrasound)
+    scanner = calibration_of(rig, WATER)
     truth = sound_in_water.in_medium(scanner, scanner.speed_m_s, speed)
+    points = repeatability.five_points(rig.probe.image_size)
     figures: Metrics = {}
     for name, found in (("ours", by_us), ("paper", by_paper)):
-        for kind, values in zip(("cr1", "cr2"), probe_accuracy.repeatabilities(found, rig), strict=True):
-            figures |= {f"{kind}_{place}_{name}_mm": float(value) for place, value in zip(PLACES, values, strict=True)}
+        for kind, values in (("cr1", repeatability.cr1(found, points)), ("cr2", repeatability.cr2(found, points))):
+            figures |= {f"{kind}_{place}_{name}_mm": value for place, value in at_places(values).items()}
         figures[f"probe_error_{name}_mm"] = rms(probe_accuracy.errors(found, truth, rig))
-    figures |= {f"cr1_{place}_limit_mm": value for place, value in zip(PLACES, expected_cr1(by_us, rig), strict=True)}
-    figures["equation_rms_ours_mm"] = rms(np.array([one.adjustment.rms_mm for one in ours]))
+    figures |= {f"cr1_{place}_limit_mm": value for place, value in at_places(expected_cr1(by_us, points)).items()}
+    figures["equation_rms_ours_mm"] = rms(np.array([one.adjustment.rms_mm for one in ours]) / np.sqrt(3))
     figures["equation_rms_paper_mm"] = rms(np.array([one.rms_mm for one in paper]))
     return figures
 
 
-def expected_cr1(found: Sequence[ProbeCalibration], rig: Rig) -> list[float]:
-    """CR1 that the calibrations' covariances predict, mm, at PLACES: mean length of the difference of two."""
-    points = repeatability.five_points(rig.probe.image_size)
+def at_places(values: Array) -> dict[str, float]:
+    """Figures of five points : (5,) as the paper gives them: of the centre, of the lower right corner, and their mean."""
+    return {"centre": float(values[0]), "corner": float(values[4]), "mean": float(values.mean())}
+
+
+def expected_cr1(found: Sequence[ProbeCalibration], points: Array) -> Array:
+    """CR1 : (5,) mm of pixels : (5, 2) that the calibrations' covariances predict: mean length of the difference of two."""
     covariance = 2 * np.mean([point_calibration.point_covariance(one, points) for one in found], axis=0)
     drawn = np.random.default_rng(0).standard_normal((DRAWS, 3))
-    lengths = np.linalg.norm(drawn @ np.swapaxes(np.linalg.cholesky(covariance), -1, -2), axis=-1).mean(axis=1)
-    return [float(lengths[0]), float(lengths[1:].mean()), float(lengths.mean())]
+    return np.linalg.norm(drawn @ np.swapaxes(np.linalg.cholesky(covariance), -1, -2), axis=-1).mean(axis=1)
 
 
 def cylinder_figures(lab: FilmedLaboratory, ours: ProbeCalibration, paper: ProbeCalibration) -> Metrics:
@@ -111,7 +116,7 @@ def stroke(lab: FilmedLaboratory) -> TrackedSweep:
     path = SurfacePath(start_mm=(x - half, y), end_mm=(x + half, y), speed_mm_s=PACE_MM_S, turn_deg=90.0, standoff_mm=STANDOFF_MM)
     rate = (SLICES - 1) * PACE_MM_S / LENGTH_MM
     clocks = Clocks(scanner_hz=rate, camera_hz=CAMERA_HZ)
-    return filmed_laboratory.swept(lab, "tube", INNER, path, clocks, lab.settings.ultrasound)
+    return filmed_laboratory.swept(lab, "tube", INNER, path, clocks, WATER)
 
 
 def published_cylinders(sweep: TrackedSweep, probe: ProbeCalibration, lag_s: float, surface: trimesh.Trimesh) -> dict[str, float]:
@@ -123,10 +128,13 @@ def published_cylinders(sweep: TrackedSweep, probe: ProbeCalibration, lag_s: flo
         if len(contour) and np.isfinite(matrix).all():
             points.append(rigid.apply(matrix, probe.to_target(contour)))
     together = np.concatenate(points)
-    tube = fit_cylinder(together[:: max(len(together) // MOST_FITTED, 1)]).shape
+    tube = fit_cylinder(together).shape
     along = (together - tube.point) @ tube.axis
     ends = tube.point + np.outer([along.min(), along.max()], tube.axis)
-    cover = tube_cover.fit_cover(surface, tube, ends)
+    try:
+        cover = tube_cover.fit_cover(surface, tube, ends)
+    except InputError:  # its surface is no cylinder about its tube
+        return {"tube_diameter": 2 * tube.radius, "cover_diameter": np.nan, "cover_wall": np.nan}
     return {"tube_diameter": 2 * tube.radius, "cover_diameter": 2 * cover.shape.radius, "cover_wall": cover.wall_mm}
 
 

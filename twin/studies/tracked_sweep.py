@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from recon.capture.images import write_images
 from recon.capture.manifest import image_name
 from recon.capture.sweep_part import SweepCapture
-from recon.model.calibration import DRIFT_PX, Calibration, in_use
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Calibration, in_use
 from recon.tracking import results
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
@@ -47,19 +47,16 @@ class TrackedSweep:
         return published_probe.matrices_at(self.times, self.published, self.ours.times - np.int64(round(lag_s * 1e9)))
 
 
-def track(
-    planned: PlannedSweep, optics: Optics, networks: Networks, board_scale: float, ranges: DataRanges, folder: Path
-) -> TrackedSweep:
+def track(planned: PlannedSweep, optics: Optics, networks: Networks, ranges: DataRanges, folder: Path) -> TrackedSweep:
     """Render a sweep and track it.
 
     Parameters
     ----------
-    board_scale : relative standard deviation of the calibration's lengths, as a laboratory knows its board
     ranges : of body, surroundings and light
     folder : for the B-scans
     """
     settings, plan = planned.settings, planned.plan
-    known = in_use(optics.ours.uncertainty, optics.ours.cameras, board_scale, DRIFT_PX)
+    known = in_use(optics.ours.uncertainty, optics.ours.cameras, PRINT_SCALE, DRIFT_PX)
     tracker = Tracker(pair(optics.ours), settings.rig.target, networks, optics=known)
     recipe, theirs = published_recipe(networks), pair(optics.cameras)
     steps, matrices = [], []

@@ -74,6 +74,7 @@ class WirePath(Part):
 
     kind: Literal["wire"] = "wire"
     count: Annotated[int, Field(ge=1, le=1000)] = 30  # poses, one image each
+    first: Annotated[int, Field(ge=0, le=10_000)] = 0  # number of poses of the same motion that are left out before
     tilt_deg: Annotated[float, Field(ge=0, le=80)] = 35.0  # to all sides
     roll_deg: Annotated[float, Field(ge=0, le=180)] = 180.0  # about the depth axis, both ways
     miss_mm: NotNegative = 0.2  # standard deviation of the crossing across the image plane: a hand holds it where it shines most
@@ -153,7 +154,8 @@ def about_crossing(path: WirePath, body: Body, transducer: Transducer, seed: int
     InputError
         If the scene has no crossing.
     """
-    turns, pixels = point_calibration.motion(transducer.image_size, path.count, path.tilt_deg, path.roll_deg)
+    whole = point_calibration.motion(transducer.image_size, path.first + path.count, path.tilt_deg, path.roll_deg)
+    turns, pixels = (part[path.first :] for part in whole)
     beside = path.miss_mm * np.random.default_rng(seed).standard_normal(path.count)
     poses = held(body, transducer, turns, pixels, beside)
     steps = np.rint(np.linspace(0, path.rest_s, int(path.rest_s * RATE_HZ) + 1) * 1e9).astype(np.int64)

@@ -29,7 +29,7 @@ GAP_PX = 7  # between parts of a wall that are taken for one
 
 
 class Solved(NamedTuple):
-    """A calibration, and the root mean square distance of its frames' pixels from the wires' crossing."""
+    """A calibration, and its equation's RMS: of the coordinates of its frames' pixels from the wires' crossing."""
 
     calibration: ProbeCalibration
     rms_mm: float
@@ -71,7 +71,7 @@ def calibrate(matrices: Array, pixels: Array) -> Solved:
         away = np.linalg.norm(residuals, axis=1)
         good = away < CONTRADICTS * np.median(away)
         if good.all():
-            return Solved(calibration, float(np.sqrt((away**2).mean())))
+            return Solved(calibration, float(np.sqrt((residuals**2).mean())))
         matrices, pixels = matrices[good], pixels[good]
 
 
