@@ -49,6 +49,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("fuse", "put skin, masses and B-scans into one picture with layers"),
     Verb("reconstruct", "reconstruct all that a capture holds: calibrations, skin, volumes, masses"),
     Verb("import", "read another group's data set into a capture"),
+    Verb("import-sweep", "read a scanner's clip and a tracker's poses into a capture"),
     Verb("export", "write a capture in another group's layout"),
     Verb("evaluate", "compare a surface with a rendered capture's ground truth"),
     Verb("accuracy", "measure errors of the twin's rig and compare with the paper's figures"),

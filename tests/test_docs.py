@@ -31,6 +31,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "calibrate-probe": {"probe.yaml"},
     "freehand": {"sequence.igs.mha"},
     "import": {""},
+    "import-sweep": {""},
     "reconstruct": {""},
 }
 WRITTEN = ("out", "document")  # fields that name what is written; other paths are read
@@ -47,7 +48,7 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
         "result/probe/probe.yaml",
     },
     "freehand.md": {f"{folder}/capture" for folder in ("wires", "bottom", "sweep", "tank")}
-    | {"pairs.csv", "sweep.igs.mha", "config.xml", "probe/probe.yaml", "surface/surface.ply"},
+    | {"scan.dcm", "poses.csv", "pairs.csv", "sweep.igs.mha", "config.xml", "probe/probe.yaml", "surface/surface.ply"},
     "tracking.md": {"session", "probe.yaml"},
 }
 

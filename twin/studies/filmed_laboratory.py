@@ -42,7 +42,7 @@ from twin.ultrasound.timed_sweep import Clocks
 from twin.ultrasound.transducer import Transducer
 
 IMAGES = 30  # of the wires, in each calibration of the paper
-AT_REST_HZ = 4.0  # pairs of frames: two about the middle of each rest
+AT_REST_HZ = 5.0  # pairs of frames: two or three in each rest, less apart than poses are interpolated over
 NOT_KEPT = "not among those that are kept"
 READS = (  # of a study's settings
     *("rig", "layout", "patterns", "poses", "conditions", "tracing", "shooting", "film.white_dn", "wire_path", "ranges"),

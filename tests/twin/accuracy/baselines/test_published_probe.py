@@ -46,7 +46,7 @@ def test_frames_that_contradict_the_others_are_left_out():
 def test_scattered_clicks_leave_the_equations_rms():
     """A third of the clicks' variance in each coordinate, less the share that parameters take up.
 
-    Of eleven those that move points along the image's normal take up none of a scatter within it: eight to eleven of 2 n are gone.
+    Those of the eleven that move points along the image's normal take up none of a scatter within it: eight to eleven are gone.
     """
     poses, pixels = frames(30)
     squares = [

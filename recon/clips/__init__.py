@@ -1,0 +1,1 @@
+"""Clips of B-scans as scanners and frame grabbers leave them, and other trackers' tables of poses."""

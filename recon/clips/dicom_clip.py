@@ -1,0 +1,110 @@
+"""Multi-frame DICOM files of ultrasound scanners: frames, their times, and the region of the B-scan with its scale.
+
+Tags and units are those of DICOM PS3.3, C.8.5.5 (US region calibration) and C.7.6.5 (cine).
+"""
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pydicom
+from numpy.typing import NDArray
+from pydicom.errors import BytesLengthException, InvalidDicomError
+from pydicom.pixels import iter_pixels
+
+from recon.clips.clip import Box, Clip, checked_seconds
+from recon.errors import InputError
+from recon.files.regular import check_there
+
+Dataset = Any
+
+TWO_D, TISSUE, CENTIMETRES = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits
+COLOURS = ("RGB", "YBR_FULL", "YBR_FULL_422", "PALETTE COLOR")
+DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or compressed in ways that need other packages
+    *(AttributeError, BytesLengthException, EOFError, InvalidDicomError, KeyError, NotImplementedError, OSError),
+    *(OverflowError, RuntimeError, TypeError, ValueError, IndexError),
+)
+
+
+def read(path: Path) -> Clip:
+    """Open a DICOM file of one frame or more, grey or in colour.
+
+    Raises
+    ------
+    InputError
+        If it is missing or damaged, or compressed in a way that can't be read here.
+    """
+    check_there([path])
+    try:
+        header = _dataset(path, stop_before_pixels=True)
+        count = int(header.get("NumberOfFrames") or 1)
+        size = int(header.Columns), int(header.Rows)
+        seconds, region = times(header, count), b_scan_region(header)
+    except DAMAGED as error:
+        raise InputError(f"{path}: expected a DICOM file, a video or a folder of images, found {_brief(error)}") from None
+    image, scale = (None, None) if region is None else region
+    timed = None if seconds is None else checked_seconds(path, seconds)
+    return Clip(path.name, size, timed, lambda: images(path, size, count), image, scale)
+
+
+def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np.uint8]]:
+    """Frames : (h, w), one by one; 16-bit ones scaled to 8 bits by their stored bits; InputError if one is damaged."""
+    read = 0
+    try:
+        header = _dataset(path)
+        shift = max(int(header.get("BitsStored", 8)) - 8, 0)
+        for frame in iter_pixels(header):
+            yield _grey(frame, shift)
+            read += 1
+    except DAMAGED as error:
+        raise InputError(f"{path}: frame {read}: expected an image of {size[0]}x{size[1]}, found {_brief(error)}") from None
+    if read != count:
+        raise InputError(f"{path}: expected {count} frames, as NumberOfFrames says, found {read}")
+
+
+def _dataset(path: Path, stop_before_pixels: bool = False) -> Dataset:
+    """Read a file, without pydicom's warnings of values that break a rule that nothing here depends on."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return pydicom.dcmread(path, stop_before_pixels=stop_before_pixels)
+
+
+def _grey(frame: NDArray, shift: int) -> NDArray[np.uint8]:
+    """A frame : (h, w) or (h, w, 3) RGB."""
+    plain = np.uint8(frame >> shift) if frame.dtype != np.uint8 else frame
+    return plain if plain.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(plain), cv2.COLOR_RGB2GRAY)
+
+
+def times(header: Dataset, count: int) -> NDArray[np.float64] | None:
+    """Times of n frames : (n,) s from the first: by their vector, by the time of a frame, or by the rate; None without these."""
+    vector = header.get("FrameTimeVector")
+    if vector is not None and np.size(vector) == count:
+        steps = np.ravel(np.array(vector, float))  # ms, each from the frame before
+        return (np.cumsum(steps) - steps[0]) / 1e3
+    step = float(header.get("FrameTime") or 0) / 1e3
+    rate = float(header.get("CineRate") or header.get("RecommendedDisplayFrameRate") or 0)
+    if step <= 0 and rate <= 0:
+        return None
+    return np.arange(count) * (step if step > 0 else 1 / rate)
+
+
+def b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | None:
+    """The largest two-dimensional region of tissue, and its scale in mm/px; None where the file has none."""
+    best: tuple[Box, tuple[float, float] | None] | None = None
+    for one in header.get("SequenceOfUltrasoundRegions") or []:
+        if int(one.RegionSpatialFormat) != TWO_D or int(one.get("RegionDataType", TISSUE)) != TISSUE:
+            continue
+        left, top = int(one.RegionLocationMinX0), int(one.RegionLocationMinY0)
+        box = left, top, int(one.RegionLocationMaxX1) - left + 1, int(one.RegionLocationMaxY1) - top + 1
+        units = {int(one.get(f"PhysicalUnits{axis}Direction", 0)) for axis in "XY"}
+        scale = (10 * abs(float(one.PhysicalDeltaX)), 10 * abs(float(one.PhysicalDeltaY))) if units == {CENTIMETRES} else None
+        if best is None or box[2] * box[3] > best[0][2] * best[0][3]:
+            best = box, scale
+    return best
+
+
+def _brief(error: BaseException) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__

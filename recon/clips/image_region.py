@@ -1,0 +1,57 @@
+"""The B-scan's part of a scanner's screen: what changes from frame to frame, less what is small, such as a clock."""
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.clips.clip import Box
+from recon.errors import InputError
+
+CHANGES_DN = 4.0  # standard deviation of a pixel over time: speckle has ten and more, compressed rests less
+JOIN_PX = 9  # gaps in what changes, such as dark tissue, that are closed
+LEAST_SHARE = 0.05  # of the screen
+WHOLE = 0.9  # share of the screen along both sides, from which on nothing is cut away
+
+
+def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Box:
+    """The box about the largest part that changes, from frames : (h, w) of one size.
+
+    Raises
+    ------
+    InputError
+        If nothing of some size changes.
+    """
+    changes = spread(frames) > CHANGES_DN
+    joined = cv2.morphologyEx(changes.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((JOIN_PX, JOIN_PX), np.uint8))
+    opened = cv2.morphologyEx(joined, cv2.MORPH_OPEN, np.ones((JOIN_PX, JOIN_PX), np.uint8))
+    count, _, figures, _ = cv2.connectedComponentsWithStats(opened)
+    least = LEAST_SHARE * changes.size
+    if count < 2 or (largest := figures[1:][figures[1:, cv2.CC_STAT_AREA].argmax()])[cv2.CC_STAT_AREA] < least:
+        raise InputError(f"{name}: expected a B-scan that changes from frame to frame, found none; give crop=[u,v,width,height]")
+    u, v, width, height, _ = (int(value) for value in largest)
+    tall, wide = changes.shape
+    return (0, 0, wide, tall) if width > WHOLE * wide and height > WHOLE * tall else (u, v, width, height)
+
+
+def spread(frames: Iterable[NDArray[np.uint8]]) -> NDArray[np.float32]:
+    """Standard deviation of each pixel over time : (h, w), by Welford's sums."""
+    mean, squares, count = None, None, 0
+    for frame in frames:
+        level, count = np.float32(frame), count + 1
+        if mean is None or squares is None:
+            mean, squares = level, np.zeros_like(level)
+            continue
+        step = level - mean
+        mean = mean + step / count
+        squares += step * (level - mean)
+    if squares is None:
+        return np.zeros((1, 1), np.float32)
+    return np.sqrt(squares / max(count - 1, 1))
+
+
+def cut(image: NDArray[np.uint8], box: Box) -> NDArray[np.uint8]:
+    """The part of an image : (h, w) in a box."""
+    u, v, width, height = box
+    return np.ascontiguousarray(image[v : v + height, u : u + width])

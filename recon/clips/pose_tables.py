@@ -1,0 +1,133 @@
+"""Tables of poses of any tracker: CSV with columns of any name, times and lengths of any unit, rotations of any kind."""
+
+import csv
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from scipy.spatial.transform import Rotation
+
+from recon.errors import InputError
+from recon.files.regular import read_bytes
+from recon.geometry import rigid
+from recon.model.tracks import Track
+
+Array = NDArray[np.float64]
+
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+SEPARATORS = ",;\t "
+MOST_OFF = 0.02  # of a rotation from the nearest exact one
+
+Names = tuple[str, ...]
+
+
+class Columns(BaseModel):
+    """Names of a table's columns, and units of their values."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    time: str
+    time_unit: Literal["s", "ms", "us", "ns"] = "s"
+    translation: Annotated[Names, Field(min_length=3, max_length=3)] | None = None  # x, y, z; none with a matrix of 12 or 16
+    length_unit: Literal["mm", "cm", "m"] = "mm"
+    quaternion: Annotated[Names, Field(min_length=4, max_length=4)] | None = None  # x, y, z, w
+    matrix: Names | None = None  # row by row: 9 of a rotation, 12 or 16 of a whole pose
+    inverted: bool = False  # the table holds target_from_world
+
+    @model_validator(mode="after")
+    def _one_rotation(self) -> "Columns":
+        if (self.quaternion is None) == (self.matrix is None):
+            raise ValueError(f"expected quaternion or matrix, found {'neither' if self.matrix is None else 'both'}")
+        whole = self.matrix is not None and len(self.matrix) in (12, 16)
+        if self.matrix is not None and not whole and len(self.matrix) != 9:
+            raise ValueError(f"matrix: expected 9, 12 or 16 columns, found {len(self.matrix)}")
+        if whole == (self.translation is not None):
+            raise ValueError("translation: expected with a quaternion or 9 columns of a matrix, and only then")
+        return self
+
+    @property
+    def names(self) -> Names:
+        """All columns that are read: the time first."""
+        return (self.time, *(self.translation or ()), *(self.quaternion or self.matrix or ()))
+
+
+def read(path: Path, columns: Columns) -> Track:
+    """Read poses `world_from_target`; a row with an empty cell or a NaN is one in which the target wasn't found.
+
+    Raises
+    ------
+    InputError
+        If the file or a column is missing, a value is no number, times don't increase, or a rotation is none.
+    """
+    lines, table = _numbers(path, columns.names)
+    if len(table) < 2:
+        raise InputError(f"{path}: expected two rows or more below the header, found {len(table)}")
+    times = np.rint(table[:, 0] * SECONDS[columns.time_unit] * 1e9).astype(np.int64)
+    wrong = np.flatnonzero(np.diff(times) <= 0) + 1
+    if len(wrong):
+        line, expected = lines[wrong[0]], "a time after that of the row before"
+        raise InputError(f"{path}: line {line}: {columns.time}: expected {expected}, found {table[wrong[0], 0]:.15g}")
+    poses = np.full((len(table), 4, 4), np.nan)
+    for k in np.flatnonzero(np.isfinite(table[:, 1:]).all(axis=1)):
+        poses[k] = _pose(path, lines[k], table[k, 1:], columns)
+    return Track(times, poses)
+
+
+def _pose(path: Path, line: int, values: Array, columns: Columns) -> Array:
+    pose = np.eye(4)
+    if columns.matrix is not None and len(columns.matrix) > 9:
+        pose[:3] = np.reshape(values[:12], (3, 4))
+    else:
+        pose[:3, 3] = values[:3]
+        pose[:3, :3] = _rotation(path, line, values[3:])
+    pose[:3, 3] *= MILLIMETRES[columns.length_unit]
+    left, _, right = np.linalg.svd(pose[:3, :3])
+    nearest = left @ right
+    if np.linalg.det(nearest) < 0 or np.abs(nearest - pose[:3, :3]).max() > MOST_OFF:
+        raise InputError(
+            f"{path}: line {line}: expected {rigid.RIGID}, row by row, found {rigid.fault(pose) or 'another matrix'}"
+        )
+    pose[:3, :3] = nearest
+    return rigid.invert(pose) if columns.inverted else pose
+
+
+def _rotation(path: Path, line: int, values: Array) -> Array:
+    if len(values) == 9:
+        return values.reshape(3, 3)
+    length = float(np.linalg.norm(values))
+    if abs(length - 1) > MOST_OFF:
+        raise InputError(f"{path}: line {line}: quaternion: expected a length of 1, found {length:.4g}")
+    return Rotation.from_quat(values).as_matrix()
+
+
+def _numbers(path: Path, names: Names) -> tuple[list[int], Array]:
+    """Numbers of lines, and values : (n, k) of columns; NaN of empty cells, but of the first column none may be."""
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+        first = text.partition("\n")[0]
+        separator = max(SEPARATORS, key=first.count)
+        rows = [row for row in enumerate(csv.reader(text.splitlines(), delimiter=separator), start=1) if any(row[1])]
+    except (UnicodeDecodeError, csv.Error):
+        raise InputError(f"{path}: expected a table as CSV text, found other or damaged data") from None
+    header = [word.strip() for word in rows[0][1]] if rows else []
+    missing = [name for name in names if name not in header]
+    if missing:
+        raise InputError(f"{path}: line 1: expected a column {missing[0]}, found {', '.join(header) or 'none'}; give columns=...")
+    places = [header.index(name) for name in names]
+    table = np.full((len(rows) - 1, len(names)), np.nan)
+    for k, (line, row) in enumerate(rows[1:]):
+        for j, place in enumerate(places):
+            table[k, j] = _number(path, line, names[j], row[place] if place < len(row) else "")
+        if not np.isfinite(table[k, 0]):
+            raise InputError(f"{path}: line {line}: {names[0]}: expected a time, found none")
+    return [line for line, _ in rows[1:]], table
+
+
+def _number(path: Path, line: int, name: str, word: str) -> float:
+    try:
+        return float(word) if word.strip() else np.nan
+    except ValueError:
+        raise InputError(f"{path}: line {line}: {name}: expected a number, found {word[:40]!r}") from None

@@ -1,0 +1,126 @@
+"""Read a scanner's clip of B-scans and a tracker's table of poses into a capture, which all other verbs take.
+
+A clip is a DICOM file of many frames, a video of the scanner's screen, or a folder of images. Its B-scan's part is cut out: the
+region that a DICOM file names, else what changes from frame to frame; colours become grey. Times are the clip's own, or even by
+`rate_hz`. The table is CSV with columns of any name: a time, and a translation with a quaternion or a matrix; a row without
+values is one in which the probe wasn't seen. Writes the capture folder `out`; one that is there already is replaced. Takes
+seconds.
+
+    sonotwin import-sweep clip=scan.dcm poses=poses.csv columns='{time: t, matrix: [a,b,c,d,e,f,g,h,i,j,k,l]}' out=sweep/capture
+    sonotwin import-sweep clip=screen.mp4 poses=p.csv columns='{time: t, translation: [x,y,z], quaternion: [a,b,c,d]}' out=capture
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from rich.console import Console
+
+from recon.capture import manifest
+from recon.capture.manifest import SCANNER, Device, Purpose
+from recon.capture.writer import new_capture
+from recon.clips import clip_reader, image_region, pose_tables
+from recon.clips.clip import Box, Clip
+from recon.clips.pose_tables import Columns
+from recon.errors import InputError
+from recon.files import atomic
+from recon.model.rig import Finite, Positive
+from recon.model.tracks import Track
+
+Least = Annotated[int, Field(ge=0)]
+Size = Annotated[int, Field(ge=8)]
+
+
+class Config(BaseModel):
+    """Fields of `conf/import-sweep.yaml`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    clip: Path
+    poses: Path
+    columns: Columns
+    out: Path
+    rate_hz: Positive | None = None
+    starts_s: Finite | None = None
+    crop: Literal["auto", "whole"] | tuple[Least, Least, Size, Size] = "auto"
+    purpose: Purpose = "volume"
+
+
+def run(config: Config) -> None:
+    """Read clip and table, and write the capture.
+
+    Raises
+    ------
+    InputError
+        If one is missing or damaged, they have no time in common, or `out` can't be written to.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    atomic.check_folder(config.out, manifest.MANIFEST, inputs=[config.clip, config.poses])
+    track = pose_tables.read(config.poses, config.columns)
+    with console.status("reading the clip"):
+        clip = clip_reader.read(config.clip)
+        times = stamps(config, clip, track)
+        box = b_scan(config, clip)
+    width, height = box[2:]
+    with console.status("writing"), new_capture(config.out, config.clip.stem) as capture:
+        devices = {SCANNER: Device(size=(width, height))}
+        capture.add_sweep({SCANNER: times}, _cut(clip, box), devices, track, purpose=config.purpose)
+    for line in describe(config, clip, times, box, track):
+        console.print(line, markup=False)
+    console.print(f"wrote       {config.out}", markup=False)
+
+
+def stamps(config: Config, clip: Clip, track: Track) -> NDArray[np.int64]:
+    """Times : (n,) ns of the clip's frames, by the table's clock.
+
+    Raises
+    ------
+    InputError
+        If the clip has no times and none are given, or no frame is taken while there are poses.
+    """
+    seconds = clip.seconds
+    if config.rate_hz is not None:
+        count = sum(1 for _ in clip.stream()) if seconds is None else len(seconds)
+        seconds = np.arange(count) / config.rate_hz
+    if seconds is None:
+        raise InputError(f"{config.clip}: expected times of the frames, found none; give rate_hz=...")
+    start = int(track.times[0]) if config.starts_s is None else round(1e9 * config.starts_s)
+    times = start + np.rint(1e9 * seconds).astype(np.int64)
+    if times[-1] < track.times[0] or times[0] > track.times[-1]:
+        found, expected = (f"{1e-9 * some[0]:.3f} to {1e-9 * some[-1]:.3f} s" for some in (times, track.times))
+        raise InputError(f"starts_s: expected frames while there are poses, {expected}, found {found}")
+    return times
+
+
+def b_scan(config: Config, clip: Clip) -> Box:
+    """The B-scan's part of the frames; InputError if a given one isn't within them, or none is found."""
+    width, height = clip.size
+    if config.crop == "whole":
+        return 0, 0, width, height
+    if config.crop == "auto":
+        return clip.image or image_region.find(clip.stream(), str(config.clip))
+    u, v, wide, tall = config.crop
+    if u + wide > width or v + tall > height:
+        raise InputError(f"crop: expected a part of {width}x{height} px, found {u + wide}x{v + tall} at its lower right")
+    return config.crop
+
+
+def describe(config: Config, clip: Clip, times: NDArray[np.int64], box: Box, track: Track) -> Iterator[str]:
+    """Lines for the console: frames, the B-scan's part and scale, and poses."""
+    rate = (len(times) - 1) / max(1e-9 * float(times[-1] - times[0]), 1e-9)
+    yield f"clip        {len(times)} frames, {clip.size[0]}x{clip.size[1]} px, {rate:.4g} a second"
+    u, v, width, height = box
+    how = "as given" if config.crop != "auto" else "as the file says" if clip.image else "which changes from frame to frame"
+    yield f"B-scan      {width}x{height} px from ({u}, {v}), {how}"
+    fields = f"rig.probe.image_size=[{width},{height}]"
+    if clip.mm_per_px is not None:
+        fields += " rig.probe.scale_mm_per_px=[{:.6g},{:.6g}]".format(*clip.mm_per_px)
+    yield f"give        {fields} to calibrate-probe"
+    yield f"poses       {track.found.sum()} of {len(track.times)} rows, {1e-9 * (track.times[-1] - track.times[0]):.4g} s"
+
+
+def _cut(clip: Clip, box: Box) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    return ((SCANNER, image_region.cut(frame, box)) for frame in clip.stream())

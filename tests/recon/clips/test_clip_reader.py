@@ -1,0 +1,130 @@
+"""DICOM files, videos and folders of images give the frames, times, B-scan's part and scale that were written."""
+
+import cv2
+import numpy as np
+import pydicom
+import pytest
+from pydicom.encaps import encapsulate
+from pydicom.uid import JPEGBaseline8Bit, JPEGLSLossless
+
+from recon.clips import clip_reader, image_region
+from recon.errors import InputError
+from tests.recon.clips import made_clips
+from tests.recon.clips.made_clips import BOX, SCREEN
+
+
+def frames_of(clip) -> np.ndarray:
+    return np.stack(list(clip.stream()))
+
+
+@pytest.mark.parametrize("kind", ["grey", "colour", "sixteen bits"])
+def test_a_dicom_file_gives_its_frames_region_scale_and_times(kind, tmp_path):
+    """Of regions the two-dimensional one of tissue counts; a colour picture of greys gives these greys."""
+    shown = made_clips.screens(made_clips.scans(5))
+    stored = {"grey": shown, "colour": np.repeat(shown[..., None], 3, axis=-1), "sixteen bits": np.uint16(shown) << 8}[kind]
+    made_clips.write_dicom(tmp_path / "scan.dcm", stored, FrameTime=50.0)
+    clip = clip_reader.read(tmp_path / "scan.dcm")
+    assert clip.size == SCREEN and clip.image == BOX and clip.mm_per_px == pytest.approx((0.125, 0.119))
+    assert clip.seconds == pytest.approx([0, 0.05, 0.1, 0.15, 0.2])
+    assert (frames_of(clip) == shown).all()
+
+
+@pytest.mark.parametrize(
+    ("tags", "seconds"),
+    [
+        ({"FrameTimeVector": [0, 40, 60], "FrameTime": 10}, [0, 0.04, 0.1]),
+        ({"CineRate": 25}, [0, 0.04, 0.08]),
+        ({"RecommendedDisplayFrameRate": 50}, [0, 0.02, 0.04]),
+        ({}, None),
+    ],
+)
+def test_times_are_the_most_exact_that_the_file_has(tags, seconds, tmp_path):
+    made_clips.write_dicom(tmp_path / "scan.dcm", made_clips.scans(3), region=False, **tags)
+    clip = clip_reader.read(tmp_path / "scan.dcm")
+    assert clip.image is None and clip.mm_per_px is None
+    assert clip.seconds is None if seconds is None else clip.seconds == pytest.approx(seconds)
+
+
+def compressed(path, frames, syntax) -> None:
+    """A file whose frames are JPEG, whatever its header says."""
+    made_clips.write_dicom(path, frames, region=False, FrameTime=50)
+    read = pydicom.dcmread(path)
+    encoded = [cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes() for frame in frames]
+    read.PixelData = encapsulate(encoded)
+    read["PixelData"].is_undefined_length = True
+    read.file_meta.TransferSyntaxUID = syntax
+    read.save_as(path)
+
+
+def test_jpeg_in_a_dicom_file_is_read(tmp_path):
+    smooth = np.stack([cv2.GaussianBlur(image, (0, 0), 3) for image in made_clips.scans(3)])
+    compressed(tmp_path / "scan.dcm", smooth, JPEGBaseline8Bit)
+    assert np.abs(np.int32(frames_of(clip_reader.read(tmp_path / "scan.dcm"))) - smooth).max() <= 4
+
+
+def test_a_compression_that_cant_be_read_is_named(tmp_path):
+    compressed(tmp_path / "scan.dcm", made_clips.scans(3), JPEGLSLossless)
+    with pytest.raises(InputError, match=r"scan\.dcm: frame 0: .* found .*JPEG-LS"):
+        frames_of(clip_reader.read(tmp_path / "scan.dcm"))
+
+
+def test_damaged_files_are_refused_by_name(tmp_path):
+    made_clips.write_dicom(tmp_path / "scan.dcm", made_clips.scans(3), FrameTime=50)
+    content = (tmp_path / "scan.dcm").read_bytes()
+    for name, some in {"short": content[:-5000], "none": b"no dicom at all", "empty": b"", "header": content[:300]}.items():
+        (tmp_path / name).write_bytes(some)
+        with pytest.raises(InputError, match=f"{name}: "):
+            frames_of(clip_reader.read(tmp_path / name))
+    with pytest.raises(InputError, match=r"gone\.dcm: expected a file, found none"):
+        clip_reader.read(tmp_path / "gone.dcm")
+    made_clips.write_dicom(tmp_path / "back.dcm", made_clips.scans(3), FrameTimeVector=[0, 40, -10])
+    with pytest.raises(InputError, match=r"frame 2: expected a time after .* give rate_hz"):
+        clip_reader.read(tmp_path / "back.dcm")
+
+
+def test_flipped_bytes_never_end_in_a_traceback(tmp_path):
+    """Any damage is refused in one line, or leaves frames of the size that the header has."""
+    made_clips.write_dicom(tmp_path / "scan.dcm", made_clips.scans(2, (16, 12)), FrameTime=50)
+    content, rng = np.frombuffer((tmp_path / "scan.dcm").read_bytes(), np.uint8), np.random.default_rng(1)
+    for _ in range(150):
+        spoilt = content.copy()
+        spoilt[rng.integers(128, len(spoilt), 3)] = rng.integers(0, 256, 3)
+        (tmp_path / "spoilt.dcm").write_bytes(spoilt.tobytes())
+        try:
+            clip = clip_reader.read(tmp_path / "spoilt.dcm")
+            assert all(frame.ndim == 2 and frame.dtype == np.uint8 for frame in clip.stream())
+        except InputError as error:
+            assert str(tmp_path / "spoilt.dcm") in str(error) and "\n" not in str(error)
+
+
+def test_a_video_gives_its_frames_and_times(tmp_path):
+    shown = np.stack([cv2.GaussianBlur(image, (0, 0), 4) for image in made_clips.screens(made_clips.scans(6))])
+    made_clips.write_video(tmp_path / "screen.avi", shown, 25.0)
+    clip = clip_reader.read(tmp_path / "screen.avi")
+    assert clip.size == SCREEN and clip.seconds == pytest.approx(np.arange(6) / 25)
+    assert np.abs(np.float64(frames_of(clip)) - shown).mean() < 2
+    (tmp_path / "none.mp4").write_bytes(b"none")
+    with pytest.raises(InputError, match=r"none\.mp4: expected a video"):
+        clip_reader.read(tmp_path / "none.mp4")
+
+
+def test_a_folder_of_images_is_a_clip_without_times(tmp_path):
+    shown = made_clips.scans(11)
+    for number, image in enumerate(shown):
+        cv2.imwrite(str(tmp_path / f"{number}.bmp"), image)
+    clip = clip_reader.read(tmp_path)
+    assert clip.seconds is None and (frames_of(clip) == shown).all()
+
+
+@pytest.mark.parametrize("moved", [(0, 0), (-30, 20), (60, -20)])
+def test_the_b_scan_is_what_changes_on_the_screen(moved):
+    """Wherever it is; texts, frames and a running clock aren't."""
+    shown = np.roll(made_clips.screens(made_clips.scans(12)), moved[::-1], axis=(1, 2))
+    u, v, width, height = BOX
+    assert image_region.find(shown, "screen") == pytest.approx((u + moved[0], v + moved[1], width, height), abs=2)
+
+
+def test_a_clip_that_is_all_b_scan_stays_whole():
+    assert image_region.find(made_clips.scans(8), "clip") == (0, 0, *BOX[2:])
+    with pytest.raises(InputError, match=r"still: expected a B-scan that changes .* give crop"):
+        image_region.find(np.repeat(made_clips.scans(1), 5, axis=0), "still")

@@ -1,0 +1,109 @@
+"""Tables of poses of any columns, units and kinds of rotation give the same track; faults are named by line and column."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recon.clips import pose_tables
+from recon.clips.pose_tables import Columns
+from recon.errors import InputError
+from recon.geometry import rigid
+
+RNG = np.random.default_rng(3)
+POSES = np.stack([rigid.from_rotation_vector(RNG.normal(size=3), 100 * RNG.normal(size=3)) for _ in range(6)])
+SECONDS = np.array([10.0, 10.05, 10.1, 10.2, 10.25, 10.3])
+HEADER, QUATERNION = "t,x,y,z,a,b,c,d\n", Columns(time="t", translation=("x", "y", "z"), quaternion=("a", "b", "c", "d"))
+ROTATION = tuple(f"r{k}" for k in range(9))
+
+
+def write(path, header, rows, separator=",") -> None:
+    lines = [separator.join(header), *(separator.join(f"{value:.12g}" for value in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def assert_same(track) -> None:
+    assert track.times.tolist() == np.rint(1e9 * SECONDS).astype(int).tolist()
+    assert np.allclose(track.poses, POSES, atol=1e-8)
+
+
+def test_quaternions_in_metres_and_milliseconds(tmp_path):
+    """With columns that nobody asked for, in any order, separated by semicolons."""
+    header = ["qw", "note", "x", "y", "z", "stamp", "qx", "qy", "qz"]
+    turns = Rotation.from_matrix(POSES[:, :3, :3]).as_quat()
+    rows = [
+        [turn[3], 7, *(pose[:3, 3] / 1000), 1e3 * time, *turn[:3]] for turn, pose, time in zip(turns, POSES, SECONDS, strict=True)
+    ]
+    write(tmp_path / "t.csv", header, rows, ";")
+    columns = Columns(
+        time="stamp", time_unit="ms", translation=("x", "y", "z"), length_unit="m", quaternion=("qx", "qy", "qz", "qw")
+    )
+    assert_same(pose_tables.read(tmp_path / "t.csv", columns))
+
+
+@pytest.mark.parametrize("count", [9, 12, 16])
+def test_matrices_row_by_row(count, tmp_path):
+    names = [f"m{k}" for k in range(count)]
+    whole = POSES.reshape(-1, 16)[:, :count] if count > 9 else POSES[:, :3, :3].reshape(-1, 9)
+    extra = [] if count > 9 else ["x", "y", "z"]
+    rows = np.column_stack([SECONDS, whole, *([] if count > 9 else [POSES[:, :3, 3]])])
+    write(tmp_path / "t.csv", ["t", *names, *extra], rows, "\t")
+    columns = Columns(time="t", matrix=tuple(names), translation=tuple(extra) or None)
+    assert_same(pose_tables.read(tmp_path / "t.csv", columns))
+
+
+def test_inverted_poses_are_turned_around(tmp_path):
+    names = [f"m{k}" for k in range(12)]
+    write(tmp_path / "t.csv", ["t", *names], np.column_stack([SECONDS, np.linalg.inv(POSES).reshape(-1, 16)[:, :12]]))
+    assert_same(pose_tables.read(tmp_path / "t.csv", Columns(time="t", matrix=tuple(names), inverted=True)))
+
+
+def test_rows_without_values_are_poses_that_were_not_found(tmp_path):
+    header = ["t", "x", "y", "z", "a", "b", "c", "d"]
+    (tmp_path / "t.csv").write_text(
+        ",".join(header) + "\n0.1,1,2,3,0,0,0,1\n0.2,,,,,,,\n0.3,nan,0,0,0,0,0,1\n\n0.4,1,2,3,0,0,1,0\n"
+    )
+    track = pose_tables.read(tmp_path / "t.csv", Columns(time="t", translation=("x", "y", "z"), quaternion=("a", "b", "c", "d")))
+    assert track.found.tolist() == [True, False, False, True] and track.poses[3, 0, 0] == pytest.approx(-1)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("t,x,y,z,a,b,c\n", r"line 1: expected a column d, found t, x, y, z, a, b, c; give columns="),
+        (HEADER + "0,0,0,0,0,0,0,1\n", "expected two rows or more"),
+        (
+            "t,x,y,z,a,b,c,d\n0,0,0,0,0,0,0,1\n0,0,0,0,0,0,0,1\n",
+            r"line 3: t: expected a time after that of the row before, found 0",
+        ),
+        (HEADER + "0,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,2\n", r"line 3: quaternion: expected a length of 1, found 2"),
+        (HEADER + "0,0,0,0,0,0,0,1\n1,0,left,0,0,0,0,1\n", r"line 3: y: expected a number, found 'left'"),
+        (HEADER + "0,0,0,0,0,0,0,1\n,0,0,0,0,0,0,1\n", r"line 3: t: expected a time, found none"),
+        ("", "line 1: expected a column t, found none"),
+    ],
+)
+def test_faults_are_named_by_line_and_column(text, complaint, tmp_path):
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InputError, match=complaint):
+        pose_tables.read(tmp_path / "t.csv", QUATERNION)
+
+
+def test_a_mirrored_matrix_is_refused(tmp_path):
+    mirrored = POSES @ np.diag([1.0, 1.0, -1.0, 1.0])
+    rows = np.column_stack([SECONDS, mirrored[:, :3, :3].reshape(-1, 9), mirrored[:, :3, 3]])
+    write(tmp_path / "t.csv", ["t", *ROTATION, "x", "y", "z"], rows)
+    with pytest.raises(InputError, match=r"line 2: expected a rigid transform of a right-handed frame"):
+        pose_tables.read(tmp_path / "t.csv", Columns(time="t", matrix=ROTATION, translation=("x", "y", "z")))
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({}, "expected quaternion or matrix, found neither"),
+        ({"quaternion": tuple("abcd"), "matrix": ROTATION}, "found both"),
+        ({"quaternion": tuple("abcd")}, "translation: expected with a quaternion"),
+        ({"matrix": ROTATION[:5], "translation": tuple("xyz")}, "expected 9, 12 or 16 columns, found 5"),
+    ],
+)
+def test_columns_that_make_no_pose_are_refused(fields, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        Columns(time="t", **fields)
