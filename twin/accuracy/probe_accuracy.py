@@ -39,6 +39,7 @@ ALMOST_MM = 1e-3  # noise of a crossing that is known
 PAPER = {"CR1": (0.434, 0.551, 0.591), "CR2": (0.274, 0.345, 0.368)}  # mm
 BARS = {"CR1": (0.20, 0.25, 0.30), "CR2": (0.13, 0.17, 0.20)}  # mm
 PLACES = ("centre", "corners, mean of four", "mean of five points")
+PAPER_AT = ("", ", one corner", "")
 TRUE_MM = 0.30
 LEFT_HANDED, X_AND_Y = np.diag([1.0, 1, -1, 1]), np.eye(4)[[1, 0, 2, 3]]
 
@@ -164,7 +165,14 @@ def repeats(setup: Setup, frames: Frames) -> list[Row]:
     used = np.mean([(~each.outliers).sum() for one in by_images for each in one])
     what = f"{len(found[0])} calibrations x {IMAGES} images ({used:.1f} used)"
     rows = [
-        Row("d", f"{what}: {name}, {place} (paper: {PAPER[name][k]})", figures[n, k], BARS[name][k], limits[n, k], "mm")
+        Row(
+            "d",
+            f"{what}: {name}, {place} (paper{PAPER_AT[k]}: {PAPER[name][k]})",
+            figures[n, k],
+            BARS[name][k],
+            limits[n, k],
+            "mm",
+        )
         for n, name in enumerate(("CR1", "CR2"))
         for k, place in enumerate(PLACES)
     ]

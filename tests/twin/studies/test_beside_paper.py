@@ -45,6 +45,17 @@ def test_cells_have_means_and_in_brackets_the_range_and_the_trials():
     assert len(planes) == len(beside_paper.HEAD)
 
 
+def test_a_missing_figure_misses_its_bar():
+    """Whichever way the bar is; the worst of a bar from below is the least."""
+    lost = [*DONE[:1], done({"conditions": "ideal"}, {"paper_mm": 0.1, "ours_mm": math.nan}, 2)]
+    (whole,), (some,) = (beside_paper.compare([PLANES], each) for each in (DONE[:1], lost))
+    assert whole.bar_met and not some.bar_met and some.missing == 1 and math.isnan(some.worst)
+    count = Figure(what="inside", reported=(3, 3), paper="paper", ours="ours", bar=3, at_least=True, factor=1, unit="")
+    trials = [done({}, {"paper": paper, "ours": 3}, seed) for seed, paper in enumerate((3, 2))]
+    (kept,), (fewer,) = (beside_paper.compare([count], each) for each in (trials[:1], [*trials, done({}, {"ours": 2}, 2)]))
+    assert kept.bar_met and kept.paper_met and not fewer.bar_met and fewer.worst == 2 and not fewer.paper_met
+
+
 def test_a_figure_that_the_paper_lacks_is_neither_met_nor_missed():
     (only,) = beside_paper.compare([Figure(what="volumes", paper="paper_mm", ours="ours_mm", unit="mm")], DONE[:1])
     assert only.paper_met is None
