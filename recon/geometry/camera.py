@@ -107,6 +107,13 @@ class Camera:
         local /= np.linalg.norm(local, axis=-1, keepdims=True)
         return local @ self.camera_from_world[:3, :3]
 
+    def pixel_rays(self) -> Array:
+        """Directions of the rays through all pixel centres : (h, w, 3), as of `rays`: faster, as each begins at its neighbours'."""
+        (width, height), rotation = self.size, np.ascontiguousarray(self.camera_from_world[:3, :3])
+        found = np.empty((height, width, 3))
+        in_threads(_pixel_rays, height, self.matrix, self.coefficients, rotation, found)
+        return found
+
     def pixel_grid(self) -> Array:
         """All pixel centres : (h, w, 2), as (u, v)."""
         width, height = self.size
@@ -162,10 +169,9 @@ def distortion_slopes(x, y, k):
 
 
 @njit(forceinline=True, error_model="numpy")
-def _undistort(u, v, k):
-    """Normalised point whose distortion is (u, v), by Newton's method; NaN where there is none."""
-    x, y = u, v
-    error = np.inf
+def _undistort_from(x, y, u, v, k):
+    """Normalised point near (x, y) whose distortion is (u, v), by Newton's method; NaN where there is none."""
+    error = determinant = np.inf
     for _ in range(NEWTON_STEPS):
         xd, yd = distort(x, y, k)
         ex, ey = u - xd, v - yd
@@ -176,14 +182,39 @@ def _undistort(u, v, k):
         determinant = a * d - b * c
         x += (d * ex - b * ey) / determinant
         y += (a * ey - c * ex) / determinant
-    a, b, c, d = distortion_slopes(x, y, k)
+    if determinant == np.inf:  # the start was the solution
+        a, b, c, d = distortion_slopes(x, y, k)
+        determinant = a * d - b * c
     # past the fold of a polynomial a root is not a ray: the distortion mirrors there, or throws to the other side
-    if error < ACCEPTED and x * u + y * v >= 0 and a * d - b * c > 0:
+    if error < ACCEPTED and x * u + y * v >= 0 and determinant > 0:
         return x, y
     return np.nan, np.nan
+
+
+@njit(forceinline=True, error_model="numpy")
+def _undistort(u, v, k):
+    """Normalised point whose distortion is (u, v); NaN where there is none."""
+    return _undistort_from(u, v, u, v, k)
 
 
 @kernel
 def _undistort_all(first, end, points, k, found):
     for i in range(first, end):
         found[i, 0], found[i, 1] = _undistort(points[i, 0], points[i, 1], k)
+
+
+@kernel
+def _pixel_rays(first, end, matrix, k, rotation, found):
+    for j in range(first, end):
+        v = (j - matrix[1, 2]) / matrix[1, 1]
+        x, y = np.nan, np.nan
+        x_before, y_before = np.nan, np.nan
+        for i in range(found.shape[1]):
+            u = (i - matrix[0, 2] - matrix[0, 1] * v) / matrix[0, 0]
+            x_next, y_next = _undistort_from(2 * x - x_before, 2 * y - y_before, u, v, k)  # on the line through both before
+            if np.isnan(x_next):
+                x_next, y_next = _undistort(u, v, k)
+            x_before, y_before, x, y = x, y, x_next, y_next
+            shorter = 1 / np.sqrt(x * x + y * y + 1)
+            for n in range(3):
+                found[j, i, n] = shorter * (rotation[0, n] * x + rotation[1, n] * y + rotation[2, n])

@@ -42,7 +42,7 @@ class Triangulator:
 
     def __init__(self, camera: Camera, projector: Camera) -> None:
         self.camera, self.projector = camera, projector
-        self._rays = camera.rays(camera.pixel_grid())  # (h, w, 3), unit, in the world
+        self._rays = camera.pixel_rays()  # (h, w, 3), unit, in the world
         self._matrix = projector.matrix[:2].ravel()
 
     def __call__(self, projector_map: ProjectorMap) -> PointMap:

@@ -74,6 +74,11 @@ def test_a_few_rays_are_those_of_all(camera):
     assert np.isnan(camera.rays(np.full((1, 2), np.nan))).all()
 
 
+def test_rays_of_all_pixels_are_those_of_each(camera):
+    """Begun at their neighbours', to rounding."""
+    assert np.abs(camera.pixel_rays() - camera.rays(camera.pixel_grid())).max() < 1e-12
+
+
 def test_a_few_points_are_projected_as_all_are(camera):
     """Array by array and in threads, to rounding; and, in silence, points whose pixels no number holds."""
     rays = camera.rays(camera.pixel_grid()[::20, ::20].reshape(-1, 2))
@@ -92,6 +97,8 @@ def test_unreachable_pixels_give_nan():
     camera = Camera((1280, 1024), np.array([[500.0, 0, 640], [0, 500, 512], [0, 0, 1]]), np.array([-0.4, 0, 0, 0, 0]))
     normalised = camera.undistort(np.array([[640.0, 512.0], [0.0, 0.0]]))
     assert np.isfinite(normalised[0]).all() and np.isnan(normalised[1]).all()
+    rays, each = camera.pixel_rays(), camera.rays(camera.pixel_grid())
+    assert np.array_equal(np.isnan(rays), np.isnan(each)) and np.nanmax(np.abs(rays - each)) < 1e-9
 
 
 @pytest.mark.parametrize(
