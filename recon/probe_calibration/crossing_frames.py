@@ -14,6 +14,13 @@ from recon.probe_calibration.point_calibration import MIN_FRAMES, Sightings
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width, height, px
 
+FIELDS = {  # of an appearance, by the reason of a rejection that another scanner makes of them
+    "blurred": "max_sigma_px",
+    "only drawn-out echoes": "max_extent_px",
+    "no echo stands out": "min_contrast_db",
+    "two candidates": "rival_db",
+}
+
 
 @dataclass(frozen=True)
 class CrossingFrames:
@@ -72,6 +79,8 @@ def refuse_few(frames: CrossingFrames) -> None:
         If there are fewer than six.
     """
     if len(frames.usable) < MIN_FRAMES:
-        reason = next(iter(rejected(frames)), "no more were given")
+        kind = next(iter(rejected(frames)), "no more were given")
+        reason = next((each.reason for each in frames.crossings if (each.reason or "").startswith(kind)), kind)
+        way = f"; another scanner? give appearance.{FIELDS[kind]}" if kind in FIELDS else ""
         expected = f"{MIN_FRAMES} frames or more with a pose and the crossing"
-        raise InputError(f"{frames.name}: expected {expected}, found {len(frames.usable)} (most often: {reason})")
+        raise InputError(f"{frames.name}: expected {expected}, found {len(frames.usable)} (most often: {reason}{way})")

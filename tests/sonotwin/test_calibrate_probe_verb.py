@@ -160,7 +160,8 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, rig, 
     assert complaint(capsys, f"pairs={tmp_path / 'a.csv'}", f"out={out}").endswith("a.csv: expected a file, found none")
     darker = "appearance.min_contrast_db=55"
     found = complaint(capsys, *fields, f"lag_s={LAG_S}", darker)
-    assert found == ("wires: expected 6 frames or more with a pose and the crossing, found 0 (most often: no echo stands out)")
+    assert found == ("wires: expected 6 frames or more with a pose and the crossing, found 0 "
+                     "(most often: no echo stands out; another scanner? give appearance.min_contrast_db)")  # fmt: skip
     turned = ["rig.probe.target_from_image.rotation_deg=[0,0,0]", f"lag_s={LAG_S}"]
     assert complaint(capsys, *fields, *turned).startswith("wires: calibration: expected target_from_image near its design")
     copied = shutil.copytree(capture, tmp_path / "capture")

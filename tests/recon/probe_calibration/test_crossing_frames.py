@@ -18,7 +18,10 @@ def test_reasons_are_put_together_by_kind():
     frames = CrossingFrames("wires", (321, 408), Sightings(np.eye(4)[None], np.ones((1, 2))), np.array([2, 3, 5, 8]), crossings)
     assert frames.usable.tolist() == [1]
     assert crossing_frames.rejected(frames) == {"blurred": [2, 8], "no echo stands out": [5]}
-    with pytest.raises(InputError, match=r"wires: expected 6 frames or more .* found 1 \(most often: blurred\)"):
+    with pytest.raises(
+        InputError,
+        match=r"wires: expected 6 frames or more .* found 1 \(most often: blurred: 9x3 px; .*give appearance.max_sigma_px\)",
+    ):
         crossing_frames.refuse_few(frames)
 
 
