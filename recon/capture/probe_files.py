@@ -3,8 +3,9 @@
 - own: OpenCV FileStorage YAML with `schema`, `target_from_image` (4x4, mm), `scale` (sx, sy in mm/px), `speed_m_s`, the speed of
   sound for which sy holds (1540 if it is missing), and, if known, `parameters`, their names as in `recon.model.probe`, and
   `covariance`.
-- the authors': npz with sx, sy and T_I_T, which is `target_from_image`; no speed, so that 1540 m/s is taken. A rotation that is
-  off by up to 2 % is taken as the nearest one, and a negative scale as the same map with that axis turned round.
+- the authors': npz with sx, sy and T_I_T, which is `target_from_image`. Ours have `speed_m_s` beside these, which their programs
+  leave alone; for theirs a caller gives it, or 1540 m/s is taken, with a warning. A rotation that is off by up to 2 % is taken as
+  the nearest one, and a negative scale as the same map with that axis turned round.
 """
 
 import logging
@@ -30,8 +31,10 @@ PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
 AUTHORS = "US_params.npz"
 
 
-def read(path: Path) -> ProbeCalibration:
+def read(path: Path, speed_m_s: float | None = None) -> ProbeCalibration:
     """Read a probe's calibration of either kind, recognised by its content.
+
+    speed_m_s : of the sound for which sy holds, m/s, in a file of the authors' that names none
 
     Raises
     ------
@@ -40,7 +43,7 @@ def read(path: Path) -> ProbeCalibration:
     """
     path = Path(path)
     with opencv_storage.opened(path, "a probe's calibration") as storage:
-        return _authors(path) if storage is None else _own(path, storage)
+        return _authors(path, speed_m_s) if storage is None else _own(path, storage)
 
 
 def write(path: Path, calibration: ProbeCalibration) -> None:
@@ -56,16 +59,17 @@ def write(path: Path, calibration: ProbeCalibration) -> None:
 
 
 def write_authors(path: Path, calibration: ProbeCalibration) -> None:
-    """Write the rig authors' `US_params.npz`, whole or not at all; it has no room for uncertainty and speed."""
+    """Write the rig authors' `US_params.npz`, whole or not at all, with the speed of sound; it has no room for uncertainty."""
     sx, sy = calibration.scale
     with atomic.new_file(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, sx=sx, sy=sy, T_I_T=calibration.target_from_image)
+        np.savez(file, sx=sx, sy=sy, T_I_T=calibration.target_from_image, speed_m_s=calibration.speed_m_s)
 
 
-def _authors(path: Path) -> ProbeCalibration:
+def _authors(path: Path, speed_m_s: float | None) -> ProbeCalibration:
     number = npz.Form("fiu")
-    values = npz.read(path, {"sx": number, "sy": number, "T_I_T": npz.Form("fiu", (4, 4))})
-    for name in ("sx", "sy"):
+    forms = {"sx": number, "sy": number, "T_I_T": npz.Form("fiu", (4, 4)), "speed_m_s": npz.Form("fiu", optional=True)}
+    values = npz.read(path, forms)
+    for name in values.keys() - {"T_I_T"}:
         if values[name].size != 1:
             raise InputError(f"{path}: {name}: expected one number, found {values[name].size}")
     scale = np.array([values["sx"].item(), values["sy"].item()], float)
@@ -75,7 +79,13 @@ def _authors(path: Path) -> ProbeCalibration:
         turned[axis, axis] = -1.0
         pose, scale[axis] = pose @ turned, -scale[axis]
         log.warning("%s: %s is negative, and is taken as positive with the image's axis turned round", path, ("sx", "sy")[axis])
-    return _checked(path, "T_I_T", pose, scale, None, SCANNER_SPEED)
+    if "speed_m_s" in values:
+        speed_m_s = _within_speeds(path, float(values["speed_m_s"].item()))
+    elif speed_m_s is None:
+        speed_m_s = SCANNER_SPEED
+        way = "if it was made in water, import it with speed_m_s=..., or add speed_m_s to it"
+        log.warning("%s: names no speed of sound, and is taken as right where it makes %g m/s; %s", path, speed_m_s, way)
+    return _checked(path, "T_I_T", pose, scale, None, speed_m_s)
 
 
 def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
@@ -104,11 +114,14 @@ def _speed(path: Path, storage: cv2.FileStorage) -> float:
     node = storage.getNode("speed_m_s")
     if node.empty():
         return SCANNER_SPEED
-    value = node.real() if node.isReal() or node.isInt() else None
+    return _within_speeds(path, node.real() if node.isReal() or node.isInt() else None)
+
+
+def _within_speeds(path: Path, value: float | None) -> float:
     if value is None or not SPEEDS[0] <= value <= SPEEDS[1]:
         found = "something else" if value is None else f"{value:g}"
         raise InputError(f"{path}: speed_m_s: expected a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s, found {found}")
-    return float(value)
+    return value
 
 
 def _uncertainty(path: Path, storage: cv2.FileStorage) -> Uncertainty | None:

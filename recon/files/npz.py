@@ -25,10 +25,11 @@ class Form:
 
     numbers: str  # a key of NUMBERS
     shape: tuple[int | None, ...] | None = None  # None for a length that is free, or for any shape
+    optional: bool = False  # whether the file may be without it
 
 
 def read(path: Path, forms: Mapping[str, Form]) -> dict[str, NDArray]:
-    """Read named arrays from an npz file; others in it are left alone.
+    """Read named arrays from an npz file, optional ones as far as they are there; others in it are left alone.
 
     Raises
     ------
@@ -46,6 +47,8 @@ def read(path: Path, forms: Mapping[str, Form]) -> dict[str, NDArray]:
         if not isinstance(arrays[name], np.ndarray):  # numpy gives the bytes of what it doesn't know
             raise InputError(f"{path}: {name}: expected an array, found other or damaged data")
     for name, form in forms.items():
+        if name not in arrays and form.optional:
+            continue
         if name not in arrays:
             raise InputError(f"{path}: {name}: expected an array, found none")
         array = arrays[name]

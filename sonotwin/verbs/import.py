@@ -11,6 +11,7 @@ wires are there, pairs.csv in it, for `calibrate-probe`. A capture that is there
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -28,7 +29,7 @@ from recon.errors import InputError
 from recon.files import atomic
 from recon.model.calibration import Calibration
 from recon.model.patterns import Patterns
-from recon.model.probe import SCANNER_SPEED, ProbeCalibration, Speed
+from recon.model.probe import ProbeCalibration, Speed
 from recon.model.rig import Positive
 from recon.model.tracks import Track
 
@@ -135,11 +136,10 @@ def read_probe(config: Config) -> tuple[ProbeCalibration, str] | None:
     path = config.folder / probe_files.AUTHORS
     if not path.exists():
         return None
-    read = probe_files.read(path)
     exported = None if config.speed_m_s else meza2021.speed_of(config.folder)
+    read = probe_files.read(path, config.speed_m_s or exported)
     known = f", as {meza2021.MARKER} says" if exported else " (speed_m_s)"
-    speed = config.speed_m_s or exported or SCANNER_SPEED
-    return ProbeCalibration(read.target_from_image, read.scale, read.uncertainty, speed), known
+    return replace(read, speed_m_s=config.speed_m_s or read.speed_m_s), known
 
 
 def _images(sweep: AuthorsSweep) -> Iterator[tuple[str, NDArray]]:

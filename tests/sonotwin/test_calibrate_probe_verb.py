@@ -76,8 +76,9 @@ def test_a_bracket_that_was_bent_since_is_noticed(calibrated, capture):
 
 
 def test_the_authors_program_reads_it(calibrated):
-    """Equation 1 with the names of the authors' file puts a pixel where the calibration does."""
+    """Equation 1 with the names of the authors' file puts a pixel where the calibration does; the speed is kept beside them."""
     out, _ = calibrated
+    assert probe_files.read(out / "US_params.npz").speed_m_s == probe_files.read(out / "probe.yaml").speed_m_s < 1500
     with np.load(out / "US_params.npz") as file:
         point = file["T_I_T"] @ [file["sx"] * 100, file["sy"] * 200, 0, 1]
     assert point[:3] == pytest.approx(probe_files.read(out / "probe.yaml").to_target([100, 200]), abs=1e-9)

@@ -39,8 +39,9 @@ def test_the_authors_file(probe, tmp_path):
     path = tmp_path / probe_files.AUTHORS
     probe_files.write_authors(path, probe)
     stored = np.load(path)
-    assert sorted(stored.files) == ["T_I_T", "sx", "sy"]
+    assert sorted(stored.files) == ["T_I_T", "speed_m_s", "sx", "sy"]
     back = probe_files.read(path)
+    assert back.speed_m_s == probe.speed_m_s == 1488.3, "as it was calibrated in water"
     assert np.array_equal(back.target_from_image, probe.target_from_image) and np.array_equal(back.scale, probe.scale)
 
 
@@ -78,6 +79,9 @@ def test_a_bad_file_is_refused(probe, tmp_path, old, new, named):
         ({"T_I_T": np.full((4, 4), np.nan)}, "T_I_T"),
         ({"sx": 0.0}, "scale"),
         ({"sy": [0.1, 0.2]}, "sy: expected one number"),
+        ({"speed_m_s": 1.488}, "speed_m_s: expected a speed of sound of 300 to 5000 m/s, found 1.488"),
+        ({"speed_m_s": [1488.0, 1540.0]}, "speed_m_s: expected one number"),
+        ({"speed_m_s": "water"}, "speed_m_s: expected numbers"),
     ],
 )
 def test_values_that_are_no_probe_are_refused(tmp_path, change, named):
@@ -95,10 +99,18 @@ def test_no_file_and_no_matrix_are_refused(tmp_path):
         probe_files.read(tmp_path / "list.yaml")
 
 
-def test_a_file_without_a_speed_is_for_the_scanners(probe, tmp_path):
-    """Files of before, and the authors', which has no room for it."""
+def test_a_file_of_before_without_a_speed_is_for_the_scanners(probe, tmp_path):
     path = tmp_path / "probe.yaml"
     probe_files.write(path, probe)
     path.write_text("".join(line for line in path.read_text().splitlines(True) if "speed_m_s" not in line))
-    probe_files.write_authors(tmp_path / probe_files.AUTHORS, probe)
-    assert probe_files.read(path).speed_m_s == probe_files.read(tmp_path / probe_files.AUTHORS).speed_m_s == 1540.0
+    assert probe_files.read(path).speed_m_s == 1540.0
+
+
+def test_a_file_of_the_authors_is_told_its_speed_or_warned_of(tmp_path, caplog):
+    """It names none: in water of 22 degrees 1540 m/s would be 3.4 % off, so that isn't taken without a word."""
+    path = tmp_path / probe_files.AUTHORS
+    np.savez(path, sx=0.12, sy=0.12, T_I_T=np.eye(4))
+    assert probe_files.read(path, 1488.0).speed_m_s == 1488.0 and not caplog.messages
+    assert probe_files.read(path).speed_m_s == 1540.0
+    (said,) = caplog.messages
+    assert "names no speed of sound" in said and "import it with speed_m_s=..." in said
