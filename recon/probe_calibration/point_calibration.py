@@ -143,8 +143,8 @@ def calibrate(
     noise : Noise
         For sightings without a covariance. Only its proportions matter: the level is measured.
     expected : (4, 4)
-        `target_from_image` as the bracket was designed, to within some 30 degrees and 30 mm. A mirrored image, or swapped axes of
-        image or target, fit the equations as well as the truth does; only the design excludes them.
+        `target_from_image` as designed, to within some 30 degrees and 30 mm. A mirrored image, or swapped axes of image or
+        target, fit as well as the truth; beside their design they are refused, while any other bracket is taken.
     seed : int
         Of the random draws of frames for the robust start.
     ahead_mm : float

@@ -1,5 +1,6 @@
 """Sanity checks of a probe's calibration: its poses, pixels, motion and outcome; each fault is named."""
 
+from collections.abc import Iterator
 from itertools import permutations, product
 from typing import Protocol
 
@@ -18,7 +19,10 @@ MIN_TURN_DEG = 2.0  # rms, about the second axis
 MIN_SPREAD = 0.02  # rms, of the crossing in the image, as a fraction of the width or height
 MAX_SIGMA_MM = 1.0  # predicted, of any pixel's place in any direction
 SCALES = (0.005, 2.0)  # mm/px, of any scanner
-FAR_DEG, FAR_MM = 45.0, 60.0  # from the design of the bracket
+FAR_DEG, FAR_MM = 45.0, 60.0  # from the design of the bracket; beyond, it is another bracket
+ALIKE_DEG, ALIKE_MM = 30.0, 30.0  # from the design but for axes or units: another bracket is hardly so by chance
+DEPTHS = (10.0, 400.0)  # mm, of ordinary images
+UNITS = {"cm": 10.0, "inches": 25.4}  # mm; metres and micrometres leave SCALES
 AXES = ("c0-c1", "c0-c2", "normal")  # of the target
 
 
@@ -37,16 +41,19 @@ def poses(world_from_target: Array) -> None:
 
 
 def pixels(of_crossing: Array, size: Size) -> None:
-    """Refuse pixels outside the image, with a hint if they were inside with u and v swapped."""
+    """Refuse pixels outside the image, of another scanner or with u and v swapped."""
     limit = np.array(size, float) - 0.5
     outside = ~((of_crossing >= -0.5) & (of_crossing <= limit)).all(axis=1)
     if not outside.any():
         return
     k = int(np.argmax(outside))
     swapped = ((of_crossing[:, ::-1] >= -0.5) & (of_crossing[:, ::-1] <= limit)).all()
-    hint = ": u and v are swapped" if swapped else ""
+    hint = "are u and v swapped, or is it another scanner" if swapped else "another scanner"
     found = f"({of_crossing[k, 0]:g}, {of_crossing[k, 1]:g})"
-    raise InputError(f"pixels: frame {k}: expected (u, v) in an image of {size[0]}x{size[1]} px, found {found}{hint}")
+    raise InputError(
+        f"pixels: frame {k}: expected (u, v) in an image of {size[0]}x{size[1]} px, found {found}: {hint}? "
+        "give rig.probe.image_size=[width,height], and temperature_c, the water's"
+    )
 
 
 def motion(world_from_target: Array, of_crossing: Array, size: Size) -> None:
@@ -111,17 +118,21 @@ def information(target_from_image: Array, scale: Array, matrix: Array, frames: _
 
 
 def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -> None:
-    """Refuse impossible calibrations: scales of other units, a target under the probe's face, axes swapped."""
+    """Refuse scales of other units, and a probe that is as designed but for swapped axes or other units."""
     for name, value in zip(("sx", "sy"), calibration.scale, strict=True):
         if not SCALES[0] <= value <= SCALES[1]:
-            found = f"{value:.3g}: are the poses in mm?"
+            found = f"{value:.3g} with {described(calibration)}: are the poses in mm?"
             raise InputError(f"calibration: {name}: expected {SCALES[0]:g} to {SCALES[1]:g} mm/px, found {found}")
-    depth = rigid.invert(calibration.target_from_image)[1, 3]
-    if expected is not None:
-        _as_designed(calibration, size, expected)
-    elif depth > 0:
-        found = f"it {depth:.0f} mm below: the image is upside down, or u and v are swapped"
-        raise InputError(f"calibration: expected the target above the probe's face, found {found}")
+    if expected is None or _near(calibration, size, expected):
+        return
+    off = _off_if_confused(calibration, size, expected)
+    alike = {name: angle for name, (angle, away) in off.items() if angle < ALIKE_DEG and away < ALIKE_MM}
+    if alike:
+        name = min(alike, key=lambda each: alike[each])
+        close = f"found it there to {off[name][0]:.0f} deg and {off[name][1]:.0f} mm, but as if {name}"
+        raise InputError(
+            f"calibration: expected target_from_image near its design, {close}; if it is right, give {described(calibration)}"
+        )
 
 
 def speed(implied: float) -> None:
@@ -131,23 +142,33 @@ def speed(implied: float) -> None:
         raise InputError(f"{expected}, found {implied:.0f}: are the poses in mm, and rig.probe.scale_mm_per_px the scanner's?")
 
 
-def _as_designed(calibration: ProbeCalibration, size: Size, expected: Array) -> None:
-    found = calibration.target_from_image[:3, :3]
-    near = _angle(expected[:3, :3].T @ found) < FAR_DEG
-    centre = (np.array(size) - 1) / 2
-    away = np.linalg.norm(calibration.to_target(centre) - ProbeCalibration(expected, calibration.scale).to_target(centre))
-    if near and away < FAR_MM:
+def doubts(calibration: ProbeCalibration, size: Size, expected: Array) -> Iterator[str]:
+    """Unusual traits of a calibration that can be right: another bracket than designed, a target below the face, a tiny image."""
+    deep = (size[1] - 1) * calibration.scale[1]
+    if not DEPTHS[0] <= deep <= DEPTHS[1]:
+        yield f"the image is {deep:.3g} mm deep: are the poses in mm?"
+    if _near(calibration, size, expected):
         return
-    if near:
-        name = "are the poses in mm, and is rig.probe this bracket's?"
-    elif away < FAR_MM:  # the image lies where it should, so its own axes differ
-        name = min(IMAGE_AXES, key=lambda key: _angle(IMAGE_AXES[key].T @ expected[:3, :3].T @ found))
-    else:
-        turn = min(_SIGNED, key=lambda signed: _angle(signed.T @ found @ expected[:3, :3].T))
-        signs = "".join(" -"[int(row.sum() < 0)] + "xyz"[int(np.argmax(np.abs(row)))] for row in turn).strip()
-        name = f"the target's axes are swapped: ({signs.replace(' ', ', ').replace('-', ', -').strip(', ')}) of the design"
-    off = f"{_angle(expected[:3, :3].T @ found):.0f} deg and {away:.0f} mm off"
-    raise InputError(f"calibration: expected target_from_image near its design, found it {off}: {name}")
+    angle, away = _off(calibration, size, expected)
+    yield (
+        f"the probe is {angle:.0f} deg and {away:.0f} mm from its design: another bracket? Then nothing excludes swapped axes of "
+        "the image, which fit as well; a pose that is right can be given as its design"
+    )
+    depth = rigid.invert(calibration.target_from_image)[1, 3]
+    if depth > 0:
+        yield (
+            f"the target lies {depth:.0f} mm below the probe's face: unless the bracket holds it there, the image is upside down "
+            "or u and v are swapped, and depths are converted about the wrong end"
+        )
+
+
+def described(calibration: ProbeCalibration) -> str:
+    """The pose found, as the rig's fields."""
+    turn = np.degrees(Rotation.from_matrix(calibration.target_from_image[:3, :3]).as_rotvec())
+    values = {"rotation_deg": turn, "translation_mm": calibration.target_from_image[:3, 3]}
+    return " ".join(
+        f"rig.probe.target_from_image.{name}=[{','.join(f'{value:.1f}' for value in vector)}]" for name, vector in values.items()
+    )
 
 
 def readings(world_from_target: Array) -> dict[str, Array]:
@@ -183,17 +204,48 @@ def _angle(rotation: Array) -> float:
     return float(np.degrees(Rotation.from_matrix(rotation).magnitude()))
 
 
+def _centre(calibration: ProbeCalibration, size: Size) -> Array:
+    """Place : (3,) mm of the image's centre in the target's frame."""
+    return calibration.to_target((np.array(size) - 1) / 2)
+
+
+def _off(calibration: ProbeCalibration, size: Size, expected: Array) -> tuple[float, float]:
+    """Angle, deg, and distance of the image's centre, mm, from the design : (4, 4), with the scales as found."""
+    away = _centre(calibration, size) - _centre(ProbeCalibration(expected, calibration.scale), size)
+    return _angle(expected[:3, :3].T @ calibration.target_from_image[:3, :3]), float(np.linalg.norm(away))
+
+
+def _near(calibration: ProbeCalibration, size: Size, expected: Array) -> bool:
+    angle, away = _off(calibration, size, expected)
+    return angle < FAR_DEG and away < FAR_MM
+
+
+def _off_if_confused(calibration: ProbeCalibration, size: Size, expected: Array) -> dict[str, tuple[float, float]]:
+    """Angle, deg, and distance, mm, from the design, by what may be confused: the image's axes, the target's, units."""
+    turn, (_, away) = calibration.target_from_image[:3, :3], _off(calibration, size, expected)
+    off = {name: (_angle((expected[:3, :3] @ axes).T @ turn), away) for name, axes in IMAGE_AXES.items()}
+    for signed in _TURNED:
+        axes = ", ".join(" -"[int(row.sum() < 0)].strip() + "xyz"[int(np.argmax(np.abs(row)))] for row in signed)
+        off[f"the target's axes are swapped: ({axes}) of the design"] = _off(
+            calibration, size, rigid.transform(signed, np.zeros(3)) @ expected
+        )
+    for unit, length in UNITS.items():
+        pose = rigid.transform(turn, calibration.target_from_image[:3, 3] * length)
+        off[f"the poses are in {unit}"] = _off(ProbeCalibration(pose, calibration.scale * length), size, expected)
+    return off
+
+
 def _signed_permutations() -> list[Array]:
-    """The 24 turns that take axes to axes."""
+    """The 23 turns that take axes to axes, but for none."""
     all_ = [
         np.eye(3)[list(order)] * np.array(signs)[:, None]
         for order in permutations(range(3))
         for signs in product((1, -1), repeat=3)
     ]
-    return [matrix for matrix in all_ if np.linalg.det(matrix) > 0]
+    return [matrix for matrix in all_ if np.linalg.det(matrix) > 0 and np.trace(matrix) < 3]
 
 
-_SIGNED = _signed_permutations()
+_TURNED = _signed_permutations()
 IMAGE_AXES = {  # found = expected @ this
     "the image is mirrored left to right": np.diag([-1.0, 1, -1]),
     "the image is upside down": np.diag([1.0, -1, -1]),

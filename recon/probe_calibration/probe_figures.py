@@ -11,7 +11,7 @@ from recon.files.metrics import Metrics
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import Probe
-from recon.probe_calibration import crossing_frames, movement, point_calibration, repeatability, sound_in_water
+from recon.probe_calibration import crossing_frames, movement, point_calibration, probe_checks, repeatability, sound_in_water
 from recon.probe_calibration.crossing_frames import CrossingFrames
 from recon.probe_calibration.point_calibration import Adjustment
 from recon.probe_calibration.tank_calibration import Result, Settings
@@ -89,8 +89,9 @@ def describe_frames(frames: CrossingFrames, seconds: float) -> Iterator[str]:
         yield f"rejected    {len(numbers)} {reason}: frame{'s' if len(numbers) > 1 else ''} {_listed(numbers)}"
 
 
-def describe(frames: CrossingFrames, found: Adjustment, figures: Metrics, design: Probe, settings: Settings) -> Iterator[str]:
+def describe(frames: CrossingFrames, result: Result, figures: Metrics, design: Probe, settings: Settings) -> Iterator[str]:
     """Lines: agreement of the frames, the probe with its uncertainty, and the speed of sound with its effect on depths."""
+    found, expected = result.adjustment, design.target_from_image.matrix()
     numbers = frames.numbers[frames.usable][found.outliers].tolist()
     left_out = f", {len(numbers)} outlier{'s' if len(numbers) > 1 else ''} left out ({_listed(numbers)})" if numbers else ""
     rms, factor = figures["rms_mm"], figures["noise_factor"]
@@ -103,6 +104,9 @@ def describe(frames: CrossingFrames, found: Adjustment, figures: Metrics, design
     )
     turn, away = figures["design_turn_deg"], figures["design_centre_mm"]
     yield f"probe       {scales} mm/px; {turn:.1f} deg and {away:.1f} mm from its design"
+    yield f"pose        {probe_checks.described(result.calibration)}"
+    for doubt in probe_checks.doubts(found.calibration, frames.size, expected):
+        yield f"warning     {doubt}"
     corners = [figures[f"sigma_{name}_mm"] for name in FIVE_POINTS[1:]]
     centre, edge = f"{figures['sigma_centre_mm']:.3f} mm", f"{min(corners):.3f} to {max(corners):.3f} mm"
     if found.outliers[-LAST:].all():

@@ -80,7 +80,7 @@ def run(config: Config) -> None:
     result = tank_calibration.calibrate(frames, config.rig.probe, config)
     seconds["seconds_calibrate"] = round(perf_counter() - start, 3)
     figures = probe_figures.measure(frames, result, config.rig.probe, config)
-    for line in probe_figures.describe(frames, result.adjustment, figures, config.rig.probe, config):
+    for line in probe_figures.describe(frames, result, figures, config.rig.probe, config):
         console.print(line, markup=False)
     if earlier is not None:
         figures |= probe_figures.compare(result.calibration, earlier)

@@ -10,12 +10,22 @@ from recon.probe_calibration.point_calibration import Sightings
 
 WIRE = np.array([5.0, -10.0, 800.0])  # mm, in the world
 LOOKING_AWAY = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # world_from_image of a probe that looks along the world's z
+FOREIGN_SIZES = ((640, 480), (800, 600), (1024, 768), (480, 640), (400, 500))  # px
 ANGLE_DEG, POSITION_MM, PIXEL_PX, SLICE_MM = 0.08, 0.05, 0.15, 0.1  # standard deviations per axis
 
 
 def true_probe(rig):
     """The rig's probe, without uncertainty."""
     return ProbeCalibration(rig.probe.target_from_image.matrix(), np.array(rig.probe.scale_mm_per_px))
+
+
+def foreign_probe(rng):
+    """A probe of another rig: the size of its B-scans, and its calibration, on a bracket to any side."""
+    size = FOREIGN_SIZES[rng.integers(len(FOREIGN_SIZES))]
+    scale = rng.uniform(30, 160) / size[1] * np.array([rng.uniform(0.7, 1.3), 1.0])
+    side = rng.standard_normal(3)
+    pose = rigid.transform(Rotation.random(random_state=rng).as_matrix(), rng.uniform(40, 200) * side / np.linalg.norm(side))
+    return size, ProbeCalibration(pose, scale)
 
 
 def motion(rig, roll_deg=180.0):

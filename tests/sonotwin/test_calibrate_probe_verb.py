@@ -14,7 +14,7 @@ import pytest
 
 from recon.capture import probe_files, sweep_tables
 from recon.geometry import rigid
-from recon.probe_calibration import point_calibration, repeatability, sound_in_water
+from recon.probe_calibration import point_calibration, probe_checks, repeatability, sound_in_water
 from sonotwin.cli import main
 from tests.recon import bscans, probe_motions, sweep_sets
 
@@ -55,7 +55,7 @@ def test_b_scans_become_a_calibration(calibrated, rig):
     assert figures["frames_used"] + figures["frames_outliers"] == 28
     assert figures["sigma_bottom_right_mm"] == pytest.approx(sigma[4])
     assert [line.split()[0] for line in lines] == [
-        *("find", "rejected", "rejected", "calibrate", "probe", "uncertain", "sound", "depth", "wrote")
+        *("find", "rejected", "rejected", "calibrate", "probe", "pose", "uncertain", "sound", "depth", "wrote")
     ]
     assert re.fullmatch(r"find +30 frames, 321x408: crossing in 28, 2 rejected, \d+ s", lines[0])
     assert "1 no echo stands out: frame 4" in lines[1] and "1 the target was not tracked: frame 12" in lines[2]
@@ -132,6 +132,21 @@ def test_pairs_found_elsewhere_give_the_same_kind_of_result(rig, rng, tmp_path):
     assert "crossing in 30, 0 rejected" in lines[0]
 
 
+def test_another_bracket_is_a_warning_and_its_pose_is_said(rig, rng, tmp_path):
+    """In the fields of the rig, so that it can be given as the design."""
+    probe = replace(probe_motions.true_probe(rig), target_from_image=rigid.transform(np.eye(3), [40, 20, -10]))
+    seen = probe_motions.observe(probe, *probe_motions.motion(rig), rng)
+    table = np.column_stack([seen.poses[:, :3].reshape(-1, 12), seen.pixels])
+    sweep_tables.write_rows(tmp_path / "pairs.csv", sweep_tables.PAIRS, table.tolist())
+    fields = [f"pairs={tmp_path / 'pairs.csv'}", f"out={tmp_path / 'out'}"]
+    lines = calibrate(*fields)
+    assert any(line.startswith("warning") and "another bracket?" in line for line in lines)
+    (pose,) = (line for line in lines if line.startswith("pose "))
+    origin = re.search(r"rig\.probe\.target_from_image\.translation_mm=\[([^]]+)\]", pose)
+    assert np.array(origin[1].split(","), float) == pytest.approx([40, 20, -10], abs=0.3)
+    assert not any(line.startswith("warning") for line in calibrate(*fields, *pose.split()[1:]))
+
+
 def complaint(capsys, *fields: str) -> str:
     assert main(["calibrate-probe", *fields]) == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -163,8 +178,11 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, rig, 
     found = complaint(capsys, *fields, f"lag_s={LAG_S}", darker)
     assert found == ("wires: expected 6 frames or more with a pose and the crossing, found 0 "
                      "(most often: no echo stands out; another scanner? give appearance.min_contrast_db)")  # fmt: skip
-    turned = ["rig.probe.target_from_image.rotation_deg=[0,0,0]", f"lag_s={LAG_S}"]
-    assert complaint(capsys, *fields, *turned).startswith("wires: calibration: expected target_from_image near its design")
+    true = probe_motions.true_probe(rig)
+    over = rigid.transform(np.diag([1.0, -1, -1]), [0, true.scale[1] * (bscans.SIZE[1] - 1), 0])
+    upside_down = probe_checks.described(replace(true, target_from_image=true.target_from_image @ over)).split()
+    found = complaint(capsys, *fields, f"lag_s={LAG_S}", *upside_down)
+    assert found.startswith("wires: calibration: expected target_from_image near its design") and "upside down" in found
     copied = shutil.copytree(capture, tmp_path / "capture")
     image = copied / "sweep" / "us" / "0007.png"
     image.write_bytes(image.read_bytes()[:-30])

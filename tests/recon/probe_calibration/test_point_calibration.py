@@ -1,5 +1,7 @@
 """A probe's calibration is repeatable, right, as sure as it says, and refuses what leaves it open."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -8,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
+from recon.model.rig import Pose
 from recon.probe_calibration import point_calibration, point_equation, probe_checks, repeatability, sound_in_water
 from recon.probe_calibration.point_calibration import Noise, Sightings, calibrate
 from tests.recon import bscans
@@ -16,6 +19,7 @@ from tests.recon.probe_motions import (
     PIXEL_PX,
     POSITION_MM,
     SLICE_MM,
+    foreign_probe,
     motion,
     observe,
     poses_of,
@@ -260,14 +264,76 @@ def test_axes_swapped_without_contradiction_are_known_by_the_design(probe, frame
 
 def test_u_and_v_swapped_leave_the_image(probe, frames, rng):
     sightings = observe(probe, *frames, rng)
-    with pytest.raises(InputError, match="u and v are swapped"):
+    with pytest.raises(InputError, match="are u and v swapped, or is it another scanner"):
         calibrate(Sightings(sightings.poses, sightings.pixels[:, ::-1]), SIZE, NOISE)
 
 
-def test_an_image_upside_down_puts_the_target_under_water(probe, frames, rng):
+def test_pixels_of_another_scanner_ask_for_the_size_of_its_images(probe, frames, rng):
+    """They don't fit with u and v swapped either, so that isn't said."""
     sightings = observe(probe, *frames, rng)
-    with pytest.raises(InputError, match="upside down"):
-        calibrate(Sightings(sightings.poses, [0, SIZE[1] - 1] + sightings.pixels * [1, -1]), SIZE, NOISE)
+    with pytest.raises(InputError, match=r"another scanner\? give rig\.probe\.image_size") as raised:
+        calibrate(Sightings(sightings.poses, sightings.pixels + np.array([320, 0])), SIZE, NOISE)
+    assert "swapped" not in str(raised.value)
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("designed", [False, True])
+def test_a_bracket_to_any_side_is_calibrated_whatever_the_design(rig, seed, designed):
+    """Of any size, scale and attitude; a design of another bracket only makes a doubt of it."""
+    rng = np.random.default_rng([5, seed])
+    size, probe = foreign_probe(rng)
+    design = rig.probe.target_from_image.matrix()
+    sightings = observe(probe, *point_calibration.motion(size), rng)
+    found = calibrate(sightings, size, NOISE, design if designed else None).calibration
+    points = repeatability.five_points(size)
+    away = np.linalg.norm(found.to_target(points) - probe.to_target(points), axis=1)
+    sigma = np.sqrt(np.trace(point_calibration.point_covariance(found, points), axis1=1, axis2=2))
+    assert (away < 4 * sigma).all() and sigma.max() < 0.5
+    said = list(probe_checks.doubts(found, size, design))
+    assert "from its design: another bracket?" in said[0]
+    assert (rigid.invert(probe.target_from_image)[1, 3] > 0) == any("below the probe's face" in line for line in said)
+
+
+@pytest.mark.parametrize("flip", [(-1, 1), (1, -1), (-1, -1)])
+def test_a_negative_scale_is_a_turned_image(rng, flip):
+    """Pixels counted from the other end, or both, place the wire as well."""
+    size, probe = foreign_probe(rng)
+    sightings = observe(probe, *point_calibration.motion(size), rng)
+    last, points = np.array(size) - 1, repeatability.five_points(size)
+    counted = [np.where(np.array(flip) < 0, last - each, each) for each in (sightings.pixels, points)]
+    found = calibrate(Sightings(sightings.poses, counted[0]), size, NOISE).calibration
+    assert found.scale.min() > 0
+    assert np.linalg.norm(found.to_target(counted[1]) - probe.to_target(points), axis=1).max() < 0.5
+
+
+def test_a_crossing_in_a_part_of_the_image_is_enough(rng):
+    """A screen that isn't cropped: wires in its middle third only."""
+    size, probe = foreign_probe(rng)
+    turns, pixels = point_calibration.motion(size)
+    found = calibrate(observe(probe, turns, np.array(size) / 3 + pixels / 3, rng), size, NOISE).calibration
+    points = repeatability.five_points(size)
+    assert np.linalg.norm(found.to_target(points) - probe.to_target(points), axis=1).max() < 1
+
+
+def test_an_image_upside_down_puts_the_target_under_water(probe, frames, rng):
+    """As a bracket may, so only the design decides."""
+    sightings = observe(probe, *frames, rng)
+    turned = Sightings(sightings.poses, [0, SIZE[1] - 1] + sightings.pixels * [1, -1])
+    found = calibrate(turned, SIZE, NOISE).calibration
+    elsewhere = rigid.transform(np.eye(3), [0, 200, 0])
+    assert any("upside down" in line for line in probe_checks.doubts(found, SIZE, elsewhere))
+    with pytest.raises(InputError, match="as if the image is upside down"):
+        calibrate(turned, SIZE, NOISE, probe.target_from_image)
+
+
+def test_a_refusal_by_the_design_has_the_pose_found_which_is_taken_as_design(probe, frames, rng):
+    """The way past it: given as the design, with the digits that are said, the same frames are accepted."""
+    poses, pixels = observe(probe, *frames, rng).poses, [SIZE[0] - 1, 0] + frames[1] * [-1, 1]
+    with pytest.raises(InputError, match="mirrored left to right") as raised:
+        calibrate(Sightings(poses, pixels), SIZE, NOISE, probe.target_from_image)
+    fields = dict(re.findall(r"rig\.probe\.target_from_image\.(\w+)=\[([^]]+)\]", str(raised.value)))
+    found = Pose(**{name: tuple(map(float, vector.split(","))) for name, vector in fields.items()})
+    assert calibrate(Sightings(poses, pixels), SIZE, NOISE, found.matrix())
 
 
 def test_five_frames_are_too_few(probe, frames, rng):
@@ -293,7 +359,7 @@ def test_poses_in_cm_are_told_by_the_brackets_length(probe, frames, rng):
     sightings = observe(probe, *frames, rng)
     in_cm = Sightings(shifts(sightings.poses, np.eye(4) / 10), sightings.pixels)
     small = Noise(ANGLE_DEG, POSITION_MM / 10, PIXEL_PX, SLICE_MM / 10)
-    with pytest.raises(InputError, match=r"found it \d deg and \d+ mm off: are the poses in mm, and is rig.probe") as raised:
+    with pytest.raises(InputError, match=r"as if the poses are in cm; if it is right, give rig.probe") as raised:
         calibrate(in_cm, SIZE, small, probe.target_from_image)
     assert "\n" not in str(raised.value)
 
@@ -302,6 +368,13 @@ def test_exact_poses_need_no_noise(probe, frames):
     """Nothing is inverted that is singular: a floor of a micrometre stands for none."""
     result = calibrate(Sightings(poses_of(probe, *frames), frames[1]), SIZE, Noise(0, 0, 0, 0))
     assert errors(result.calibration, probe).max() < 1e-6
+
+
+def test_a_tiny_image_makes_a_doubt_of_the_poses_unit(probe):
+    """Of a rig without a design poses in cm can't be excluded: images for the skin are as small."""
+    small = rigid.transform(probe.target_from_image[:3, :3], probe.target_from_image[:3, 3] / 10)
+    said = list(probe_checks.doubts(ProbeCalibration(small, probe.scale / 10), SIZE, probe.target_from_image))
+    assert said[0] == "the image is 4.99 mm deep: are the poses in mm?"
 
 
 @pytest.mark.parametrize("implied", [154.0, 15400.0])
