@@ -18,6 +18,7 @@ Size = tuple[int, int]  # width, height, px
 MIN_TURN_DEG = 2.0  # rms, about the second axis
 MIN_SPREAD = 0.02  # rms, of the crossing in the image, as a fraction of the width or height
 MAX_SIGMA_MM = 1.0  # predicted, of any pixel's place in any direction
+WATER = (1400.0, 1600.0)  # m/s; pure makes 1402 to 1555, at 0 to 75 deg C, salt and glycerol up to 60 more
 SCALES = (0.005, 2.0)  # mm/px, of any scanner
 FAR_DEG, FAR_MM = 45.0, 60.0  # from the design of the bracket; beyond, it is another bracket
 ALIKE_DEG, ALIKE_MM = 30.0, 30.0  # from the design but for axes or units: another bracket is hardly so by chance
@@ -135,11 +136,23 @@ def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -
         )
 
 
-def speed(implied: float) -> None:
-    """Refuse a calibration whose sy, beside the scanner's, implies a speed of sound (m/s) of no medium."""
-    if not SPEEDS[0] <= implied <= SPEEDS[1]:
-        expected = f"calibration: sy: expected to imply a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s"
-        raise InputError(f"{expected}, found {implied:.0f}: are the poses in mm, and rig.probe.scale_mm_per_px the scanner's?")
+def scanner_scale(implied: float, calibration: ProbeCalibration) -> None:
+    """Refuse a calibration of which no scale of the scanner implies the speed of sound, m/s, where nothing else has it."""
+    if np.isnan(implied):
+        expected = "expected the water's temperature, or the scanner's mm/px, as rig.probe.scale_mm_per_px is of other images"
+        way = "give temperature_c=..., or rig.probe.scale_mm_per_px=[sx,sy]"
+        raise InputError(f"calibration: sy: {expected}, found neither: {way} ({_in_the_tank(calibration)})")
+
+
+def speed(implied: float, calibration: ProbeCalibration, limits: tuple[float, float] = SPEEDS) -> None:
+    """Refuse a calibration whose sy, beside the scanner's, implies a speed of sound, m/s, out of limits; NaN is unknown."""
+    low, high = limits
+    if implied < low or implied > high:
+        raise InputError(
+            f"calibration: sy: expected to imply a speed of sound of {low:g} to {high:g} m/s, found {implied:.0f}: is "
+            "rig.probe.scale_mm_per_px this scanner's, are the poses in mm, is the tank of water? give that scale, or "
+            f"temperature_c=..., or tank_speed=... ({_in_the_tank(calibration)})"
+        )
 
 
 def doubts(calibration: ProbeCalibration, size: Size, expected: Array) -> Iterator[str]:
@@ -169,6 +182,11 @@ def described(calibration: ProbeCalibration) -> str:
     return " ".join(
         f"rig.probe.target_from_image.{name}=[{','.join(f'{value:.1f}' for value in vector)}]" for name, vector in values.items()
     )
+
+
+def _in_the_tank(calibration: ProbeCalibration) -> str:
+    sx, sy = calibration.scale
+    return f"found in the tank: {sx:.4g} and {sy:.4g} mm/px, {described(calibration)}"
 
 
 def readings(world_from_target: Array) -> dict[str, Array]:

@@ -19,6 +19,7 @@ from recon.probe_calibration.tank_calibration import Result, Settings
 COLUMNS = ("frame", "status", "u", "v", "contrast_db", "residual_mm", "normalised", "reason")  # of the table of frames
 FIVE_POINTS = ("centre", "top_left", "top_right", "bottom_left", "bottom_right")
 LAST = 3  # frames, too few to find a sudden movement by
+SPEEDS_APART = 0.03  # relative; water 15 degrees colder, or a depth setting of 50 mm for one of 48
 SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reported
 
 
@@ -46,6 +47,7 @@ def measure(frames: CrossingFrames, result: Result, design: Probe, settings: Set
         "sy_sigma_mm_per_px": uncertainty.sigma("sy"),
         "sy_measured_mm_per_px": float(found.calibration.scale[1]),
         **{f"sigma_{name}_mm": float(value) for name, value in zip(FIVE_POINTS, sigma, strict=True)},
+        "scanner_sy_mm_per_px": result.shown_sy,
         "implied_speed_m_per_s": result.implied_speed[0],
         "implied_speed_sigma_m_per_s": result.implied_speed[1],
         "water_speed_m_per_s": settings.water_speed,
@@ -114,7 +116,7 @@ def describe(frames: CrossingFrames, result: Result, figures: Metrics, design: P
     if found.moved is not None:
         yield f"warning     {found.moved.described}"
     yield f"uncertain   image centre {centre}, corners {edge} (1 sigma, of the place in space)"
-    yield from _describe_sound(figures, design, settings)
+    yield from _describe_sound(figures, settings)
 
 
 def describe_comparison(figures: Metrics, earlier: object) -> str:
@@ -127,18 +129,23 @@ def describe_comparison(figures: Metrics, earlier: object) -> str:
     return f"warning     the probe moved against its target by {by} since {earlier}: a bent bracket, or a target that slipped"
 
 
-def _describe_sound(figures: Metrics, design: Probe, settings: Settings) -> Iterator[str]:
+def _describe_sound(figures: Metrics, settings: Settings) -> Iterator[str]:
     speed, sigma = figures["implied_speed_m_per_s"], figures["implied_speed_sigma_m_per_s"]
-    implied = f"{speed:.1f} ± {sigma:.1f} m/s by sy, if the scanner's is {design.scale_mm_per_px[1]:g} mm/px"
-    yield f"sound       {implied} for {settings.assumed_speed:g} m/s"
-    if settings.temperature_c is None:
+    shown_sy, assumed, in_water = figures["scanner_sy_mm_per_px"], settings.assumed_speed, figures["water_speed_m_per_s"]
+    if np.isnan(shown_sy):
+        yield "sound       not checked by sy, as the scanner's mm/px are unknown; rig.probe.scale_mm_per_px=[sx,sy] does"
+    else:
+        yield f"sound       {speed:.1f} ± {sigma:.1f} m/s by sy, if the scanner's is {shown_sy:g} mm/px for {assumed:g} m/s"
+    if not settings.tank_known:
         same = f"as in the medium of the calibration, {figures['speed_m_per_s']:.0f} m/s, right for sweeps through the same"
         yield f"depth       {same}; temperature_c=... converts it"
         return
-    in_water, assumed = figures["water_speed_m_per_s"], settings.assumed_speed
+    if abs(speed / in_water - 1) > SPEEDS_APART:
+        yield "warning     not the tank's speed: another depth setting than of rig.probe.scale_mm_per_px, or poses not in mm?"
     deep = float(sound_in_water.shown_too_deep(SHOWN_DEPTH_MM, in_water, assumed))
     shown = f"{abs(deep):.2f} mm too {'deep' if deep > 0 else 'shallow'} at {SHOWN_DEPTH_MM:g} mm"
-    yield f"water       {settings.temperature_c:g} °C, {in_water:.1f} m/s: assuming {assumed:g}, the scanner shows echoes {shown}"
+    by = "" if settings.temperature_c is None else f"{settings.temperature_c:g} °C, "
+    yield f"water       {by}{in_water:.1f} m/s: assuming {assumed:g}, the scanner shows echoes {shown}"
     scales = f"sy {figures['sy_measured_mm_per_px']:.5f} to {figures['sy_mm_per_px']:.5f} mm/px"
     yield f"depth       converted from this water to {settings.wanted_speed:g} m/s: {scales}"
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from recon.errors import InputError
-from recon.model.probe import ProbeCalibration, Speed
+from recon.model.probe import SPEEDS, ProbeCalibration, Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Probe
 from recon.probe_calibration import point_calibration, probe_checks, sound_in_water, wires
 from recon.probe_calibration.cross_wire import Appearance
@@ -16,6 +16,7 @@ from recon.probe_calibration.crossing_frames import CrossingFrames
 from recon.probe_calibration.point_calibration import Adjustment, Noise
 
 ORDINARY_C = 22.0  # of water, where no temperature is given
+SAME_WIDTH = 0.05  # relative difference of sx, which no sound changes, within which a B-scan is of the rig's scanner
 
 
 class Settings(BaseModel):
@@ -25,6 +26,8 @@ class Settings(BaseModel):
 
     temperature_c: Finite | None = None
     temperature_sigma_c: NotNegative = 1.0
+    tank_speed: Speed | None = None
+    tank_speed_sigma: SpeedSigma = 3.0
     assumed_speed: Speed = sound_in_water.SCANNER_SPEED
     medium_speed: Speed | None = None
     wire_radius_mm: NotNegative = 0.1
@@ -57,20 +60,36 @@ class Settings(BaseModel):
         return value
 
     @model_validator(mode="after")
-    def _temperature_of_conversion(self) -> "Settings":
-        if self.medium_speed is not None and self.temperature_c is None:
-            raise ValueError("medium_speed: expected temperature_c with it, found none")
+    def _one_speed_of_the_tank(self) -> "Settings":
+        if self.tank_speed is not None and self.temperature_c is not None:
+            raise ValueError("tank_speed: expected without temperature_c, found both")
+        if self.medium_speed is not None and not self.tank_known:
+            raise ValueError("medium_speed: expected temperature_c or tank_speed with it, found none")
         return self
 
     @property
     def wanted_speed(self) -> float:
-        """Speed of sound, m/s, that the calibration is converted to where the temperature is known."""
+        """Speed of sound, m/s, that the calibration is converted to where that of the tank is known."""
         return self.medium_speed or self.assumed_speed
 
     @property
+    def tank_known(self) -> bool:
+        """Whether the speed of sound in the tank is given, by itself or by the temperature."""
+        return self.tank_speed is not None or self.temperature_c is not None
+
+    @property
     def water_speed(self) -> float:
-        """Speed of sound in the tank, m/s, or NaN where no temperature is given."""
-        return np.nan if self.temperature_c is None else float(sound_in_water.speed_of_sound(self.temperature_c))
+        """Speed of sound in the tank, m/s, or NaN where neither it nor the temperature is given."""
+        if self.temperature_c is None:
+            return np.nan if self.tank_speed is None else self.tank_speed
+        return float(sound_in_water.speed_of_sound(self.temperature_c))
+
+    @property
+    def water_speed_sigma(self) -> float:
+        """Its standard deviation, m/s."""
+        if self.temperature_c is None:
+            return self.tank_speed_sigma
+        return float(sound_in_water.speed_sigma(self.temperature_c, self.temperature_sigma_c))
 
     @property
     def echo_ahead_mm(self) -> float:
@@ -83,8 +102,8 @@ class Settings(BaseModel):
         return abs(self._ahead_of(self.wire_radius_sigma_mm))
 
     def _ahead_of(self, radius_mm: float) -> float:
-        temperature = ORDINARY_C if self.temperature_c is None else self.temperature_c
-        return wires.echo_ahead(radius_mm, self.wire_speed, float(sound_in_water.speed_of_sound(temperature)))
+        speed = self.water_speed if self.tank_known else float(sound_in_water.speed_of_sound(ORDINARY_C))
+        return wires.echo_ahead(radius_mm, self.wire_speed, speed)
 
 
 @dataclass(frozen=True)
@@ -93,18 +112,26 @@ class Result:
 
     adjustment: Adjustment  # in the tank's water
     calibration: ProbeCalibration  # for the medium of later sweeps
-    implied_speed: tuple[float, float]  # of sound in the tank by sy, m/s, and its standard deviation
+    shown_sy: float  # mm/px by which the scanner draws depths; NaN if unknown
+    implied_speed: tuple[float, float]  # of sound in the tank by both sy, m/s, and its standard deviation; NaN likewise
 
 
-def calibrate(frames: CrossingFrames, design: Probe, settings: Settings) -> Result:
+def calibrate(frames: CrossingFrames, design: Probe, settings: Settings, scanner_sy: float | None = None) -> Result:
     """Calibrate a probe; `design` holds the rig's.
 
-    Without the temperature the calibration holds for the speed of sound that sy implies.
+    Without the tank's speed of sound the calibration holds for the one that sy implies.
+
+    Parameters
+    ----------
+    scanner_sy : float, mm/px
+        By which this scanner draws depths; NaN if unknown. Without it the design's counts, if the B-scans are of its scanner: of
+        the same size and of the same sx.
 
     Raises
     ------
     InputError
-        As `recon.probe_calibration.point_calibration.calibrate`, or if sy implies an impossible speed of sound.
+        As `recon.probe_calibration.point_calibration.calibrate`, or if sy implies an impossible speed of sound, or if neither the
+        tank's speed nor the scanner's scale is known.
     """
     expected = design.target_from_image.matrix()
     try:
@@ -117,13 +144,22 @@ def calibrate(frames: CrossingFrames, design: Probe, settings: Settings) -> Resu
             settings.echo_ahead_mm,
             settings.echo_ahead_sigma_mm,
         )
-        implied = sound_in_water.implied_speed(found.calibration, design.scale_mm_per_px[1], settings.assumed_speed)
-        probe_checks.speed(implied[0])
+        shown_sy = _design_sy(found.calibration, frames.size, design) if scanner_sy is None else scanner_sy
+        implied = sound_in_water.implied_speed(found.calibration, shown_sy, settings.assumed_speed)
+        if not settings.tank_known:
+            probe_checks.scanner_scale(implied[0], found.calibration)
+        probe_checks.speed(implied[0], found.calibration, SPEEDS if settings.tank_known else probe_checks.WATER)
     except InputError as error:
         raise InputError(f"{frames.name}: {error}") from None
-    if settings.temperature_c is None:
-        return Result(found, replace(found.calibration, speed_m_s=implied[0]), implied)
-    sigma = float(sound_in_water.speed_sigma(settings.temperature_c, settings.temperature_sigma_c))
+    if not settings.tank_known:
+        return Result(found, replace(found.calibration, speed_m_s=implied[0]), shown_sy, implied)
     in_water, wanted = settings.water_speed, settings.wanted_speed
-    converted = sound_in_water.in_medium(found.calibration, in_water, wanted, ratio_sigma=wanted / in_water**2 * sigma)
-    return Result(found, converted, implied)
+    ratio_sigma = wanted / in_water**2 * settings.water_speed_sigma
+    converted = sound_in_water.in_medium(found.calibration, in_water, wanted, ratio_sigma=ratio_sigma)
+    return Result(found, converted, shown_sy, implied)
+
+
+def _design_sy(found: ProbeCalibration, size: tuple[int, int], design: Probe) -> float:
+    """The design's mm/px in depth, or NaN where the B-scans are of another scanner, or at another depth setting."""
+    sx, sy = design.scale_mm_per_px
+    return sy if size == design.image_size and abs(found.scale[0] / sx - 1) < SAME_WIDTH else np.nan

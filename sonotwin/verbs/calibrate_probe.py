@@ -12,15 +12,17 @@ target is seen, and bring the crossing near all corners of the image in turn.
     sonotwin calibrate-probe capture=outputs/wires/capture temperature_c=22.4 out=outputs/probe
     sonotwin calibrate-probe capture=outputs/wires/capture earlier=outputs/probe/probe.yaml out=outputs/probe_again
     sonotwin calibrate-probe pairs=pairs.csv out=outputs/probe
+    sonotwin calibrate-probe pairs=pairs.csv rig.probe.image_size=[640,480] temperature_c=22.4 out=outputs/probe
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import model_validator
+from pydantic import PrivateAttr, model_validator
 from rich.console import Console
 
 from recon.capture import probe_files, sweep_part, sweep_tables
@@ -34,6 +36,7 @@ from recon.probe_calibration.tank_calibration import Result, Settings
 
 PROBE = "probe.yaml"
 FRAMES = "frames.csv"  # by which the folder of a probe's calibration is known
+OF_THE_SCALE, OF_THE_SIZE = "rig.probe.scale_mm_per_px", "rig.probe.image_size"
 
 
 class Config(Settings):
@@ -46,12 +49,26 @@ class Config(Settings):
     pairs: Path | None = None
     earlier: Path | None = None
     lag_s: LagSeconds = 0.0
+    _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
 
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
         if (self.capture is None) == (self.pairs is None):
             raise ValueError(f"expected capture or pairs, found {'neither' if self.capture is None else 'both'}")
         return self
+
+    def model_post_init(self, context: Any) -> None:
+        """Keep the overrides, by which a scale that was given differs from the default rig's."""
+        if context:
+            self._overrides = context["overrides"]
+
+    @property
+    def scanner_sy(self) -> float | None:
+        """The scanner's mm/px in depth: as given; NaN where only the size was, so of another scanner; None for the rig's."""
+        given = {each.lstrip("+~").partition("=")[0] for each in self._overrides}
+        if given & {"rig", "rig.probe", OF_THE_SCALE}:
+            return self.rig.probe.scale_mm_per_px[1]
+        return np.nan if OF_THE_SIZE in given else None
 
 
 def run(config: Config) -> None:
@@ -77,7 +94,7 @@ def run(config: Config) -> None:
     crossing_frames.refuse_few(frames)
 
     start = perf_counter()
-    result = tank_calibration.calibrate(frames, config.rig.probe, config)
+    result = tank_calibration.calibrate(frames, config.rig.probe, config, config.scanner_sy)
     seconds["seconds_calibrate"] = round(perf_counter() - start, 3)
     figures = probe_figures.measure(frames, result, config.rig.probe, config)
     for line in probe_figures.describe(frames, result, figures, config.rig.probe, config):

@@ -132,13 +132,69 @@ def test_pairs_found_elsewhere_give_the_same_kind_of_result(rig, rng, tmp_path):
     assert "crossing in 30, 0 rejected" in lines[0]
 
 
+def pairs_of(probe, size, rng, path: Path, tank_speed: float = 1488.4) -> Path:
+    """Pairs of a probe whose scanner assumes 1540 m/s, in a tank of another speed."""
+    in_tank = sound_in_water.in_medium(probe, sound_in_water.SCANNER_SPEED, tank_speed)
+    seen = probe_motions.observe(in_tank, *point_calibration.motion(size, roll_deg=90), rng)
+    sweep_tables.write_rows(path, sweep_tables.PAIRS, np.column_stack([seen.poses[:, :3].reshape(-1, 12), seen.pixels]).tolist())
+    return path
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_another_probe_takes_two_commands(seed, tmp_path, capsys):
+    """The refusal of the first has the fields of the second; another bracket, and what it may mean, is a warning."""
+    rng = np.random.default_rng([8, seed])
+    size, probe = probe_motions.foreign_probe(rng)
+    fields = [f"pairs={pairs_of(probe, size, rng, tmp_path / 'pairs.csv')}", f"out={tmp_path / 'out'}"]
+    first = complaint(capsys, *fields)
+    assert "another scanner? give rig.probe.image_size=[width,height], and temperature_c, the water's" in first
+    lines = calibrate(*fields, f"rig.probe.image_size=[{size[0]},{size[1]}]", f"temperature_c={sweep_sets.WATER_C}")
+    found, points = probe_files.read(tmp_path / "out" / "probe.yaml"), repeatability.five_points(size)
+    sigma = np.sqrt(np.trace(point_calibration.point_covariance(found, points), axis1=1, axis2=2))
+    assert (np.linalg.norm(found.to_target(points) - probe.to_target(points), axis=1) < 4 * sigma).all()
+    assert any(line.startswith("warning") and "another bracket?" in line for line in lines)
+    (pose,) = (line for line in lines if line.startswith("pose "))
+    origin = re.search(r"rig\.probe\.target_from_image\.translation_mm=\[([^]]+)\]", pose)
+    assert np.array(origin[1].split(","), float) == pytest.approx(found.target_from_image[:3, 3], abs=0.06)
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["implied_speed_m_per_s"] is None
+
+
+def test_another_scanners_scale_makes_no_speed_of_sound(rig, rng, tmp_path, capsys):
+    """A depth setting of 58 mm in images of the same size would make 1738 m/s; the temperature needs no scale."""
+    deeper = replace(probe_motions.true_probe(rig), scale=np.array(rig.probe.scale_mm_per_px) * [1.0, 1.168])
+    fields = [f"pairs={pairs_of(deeper, bscans.SIZE, rng, tmp_path / 'pairs.csv')}", f"out={tmp_path / 'out'}"]
+    found = complaint(capsys, *fields)
+    assert re.search(r"sy: expected to imply a speed of sound of 1400 to 1600 m/s, found 173\d: .*temperature_c=", found)
+    lines = calibrate(*fields, f"temperature_c={sweep_sets.WATER_C}")
+    assert any(line.startswith("warning") and "another depth setting" in line for line in lines)
+    found = probe_files.read(tmp_path / "out" / "probe.yaml")
+    assert found.speed_m_s == sound_in_water.SCANNER_SPEED and found.scale == pytest.approx(deeper.scale, rel=0.01)
+    sx, sy = deeper.scale
+    calibrate(*fields, f"rig.probe.scale_mm_per_px=[{sx},{sy}]")
+    assert probe_files.read(tmp_path / "out" / "probe.yaml").speed_m_s == pytest.approx(1488.4, rel=0.01)
+
+
+def test_a_scale_of_the_rig_is_none_of_wider_images(rig, rng, tmp_path, capsys):
+    """Twice as many mm a pixel both ways, of the same size in px: another scanner's, so the temperature is asked for."""
+    wider = replace(probe_motions.true_probe(rig), scale=2 * np.array(rig.probe.scale_mm_per_px))
+    fields = [f"pairs={pairs_of(wider, bscans.SIZE, rng, tmp_path / 'pairs.csv')}", f"out={tmp_path / 'out'}"]
+    assert "give temperature_c=..., or rig.probe.scale_mm_per_px=[sx,sy] (found in the tank: " in complaint(capsys, *fields)
+    assert not any("another depth setting" in line for line in calibrate(*fields, f"temperature_c={sweep_sets.WATER_C}"))
+
+
+def test_a_tank_of_something_else_has_its_speed_given(rig, rng, tmp_path):
+    """Of oil, say, of which no temperature of water tells."""
+    probe = probe_motions.true_probe(rig)
+    path = pairs_of(probe, bscans.SIZE, rng, tmp_path / "pairs.csv", tank_speed=1380.0)
+    lines = calibrate(f"pairs={path}", f"out={tmp_path / 'out'}", "tank_speed=1380")
+    assert probe_files.read(tmp_path / "out" / "probe.yaml").scale == pytest.approx(probe.scale, rel=0.01)
+    assert not any(line.startswith("warning") for line in lines)
+
+
 def test_another_bracket_is_a_warning_and_its_pose_is_said(rig, rng, tmp_path):
     """In the fields of the rig, so that it can be given as the design."""
     probe = replace(probe_motions.true_probe(rig), target_from_image=rigid.transform(np.eye(3), [40, 20, -10]))
-    seen = probe_motions.observe(probe, *probe_motions.motion(rig), rng)
-    table = np.column_stack([seen.poses[:, :3].reshape(-1, 12), seen.pixels])
-    sweep_tables.write_rows(tmp_path / "pairs.csv", sweep_tables.PAIRS, table.tolist())
-    fields = [f"pairs={tmp_path / 'pairs.csv'}", f"out={tmp_path / 'out'}"]
+    fields = [f"pairs={pairs_of(probe, bscans.SIZE, rng, tmp_path / 'pairs.csv')}", f"out={tmp_path / 'out'}"]
     lines = calibrate(*fields)
     assert any(line.startswith("warning") and "another bracket?" in line for line in lines)
     (pose,) = (line for line in lines if line.startswith("pose "))
@@ -161,7 +217,10 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, rig, 
     assert complaint(capsys, *fields, "noise.angle_deg=-1").startswith("calibrate-probe: noise.angle_deg: expected finite")
     assert complaint(capsys, *fields, "temperature_c=120").startswith("temperature_c: expected 0 to 95 degrees Celsius")
     assert complaint(capsys, *fields, "medium_speed=1450") == (
-        "calibrate-probe: medium_speed: expected temperature_c with it, found none"
+        "calibrate-probe: medium_speed: expected temperature_c or tank_speed with it, found none"
+    )
+    assert complaint(capsys, *fields, "temperature_c=22", "tank_speed=1480") == (
+        "calibrate-probe: tank_speed: expected without temperature_c, found both"
     )
     assert complaint(capsys, *fields, "wire_speed=20000").startswith("calibrate-probe: wire_speed: expected ")
     assert complaint(capsys, *fields, "assumed_speed=1.54").startswith("calibrate-probe: assumed_speed: expected ")
