@@ -42,19 +42,19 @@ def poses(world_from_target: Array) -> None:
 
 
 def pixels(of_crossing: Array, size: Size) -> None:
-    """Refuse pixels outside the image, of another scanner or with u and v swapped."""
+    """Refuse pixels outside the image: of another scanner, with u and v swapped, or from another origin."""
     limit = np.array(size, float) - 0.5
     outside = ~((of_crossing >= -0.5) & (of_crossing <= limit)).all(axis=1)
     if not outside.any():
         return
     k = int(np.argmax(outside))
+    found = f"({of_crossing[k, 0]:g}, {of_crossing[k, 1]:g})"
+    expected = f"pixels: frame {k}: expected (u, v) in an image of {size[0]}x{size[1]} px, found {found}"
+    if (of_crossing < -0.5).any():
+        raise InputError(f"{expected}: are u and v from the centre of the top left pixel, right and down?")
     swapped = ((of_crossing[:, ::-1] >= -0.5) & (of_crossing[:, ::-1] <= limit)).all()
     hint = "are u and v swapped, or is it another scanner" if swapped else "another scanner"
-    found = f"({of_crossing[k, 0]:g}, {of_crossing[k, 1]:g})"
-    raise InputError(
-        f"pixels: frame {k}: expected (u, v) in an image of {size[0]}x{size[1]} px, found {found}: {hint}? "
-        "give rig.probe.image_size=[width,height], and temperature_c, the water's"
-    )
+    raise InputError(f"{expected}: {hint}? give rig.probe.image_size=[width,height], and temperature_c, the water's")
 
 
 def motion(world_from_target: Array, of_crossing: Array, size: Size) -> None:
