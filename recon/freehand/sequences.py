@@ -8,9 +8,11 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from recon.errors import InputError
 from recon.files import atomic, medical_images
@@ -18,6 +20,7 @@ from recon.files.medical_images import ImageFile
 from recon.model.probe import ProbeCalibration
 
 Array = NDArray[np.float64]
+FrameName = Annotated[str, Field(pattern=r"^[A-Z]\w*$")]  # of a frame of reference; of a setting
 
 FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 TRANSFORM = re.compile(r"([A-Z]\w*?)To([A-Z]\w*)")
@@ -41,6 +44,14 @@ STRUCTURE = {  # fields given by the images and the format, in either of the two
     *("data file", "datafile", "ultrasound image orientation", "ultrasound image type"),
 }
 FRAME_STRUCTURE = {"Timestamp", "ImageStatus", "Status", ""}
+
+
+class FrameNames(NamedTuple):
+    """Names of a sequence's frames of reference."""
+
+    image: str = "Image"  # of pixels
+    target: str = "Probe"  # of what the probe carries
+    reference: str = "Reference"  # of what the results are in, the world
 
 
 @dataclass(frozen=True)
@@ -124,8 +135,9 @@ def poses(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = 
                 reached[there] = there_from_here @ reached[here]
                 waiting.append(there)
     if to not in reached:
-        known = ", ".join([*(fixed or {}), *frames.transforms]) or "none"
-        raise InputError(f"transforms: expected some that lead from {of} to {to}, found {known}")
+        known = ", ".join(dict.fromkeys([*(fixed or {}), *frames.transforms])) or "none"
+        ends = f", which lead from there to {', '.join(list(reached)[1:])}" if len(reached) > 1 else ""
+        raise InputError(f"transforms: expected some that lead from {of} to {to}, found {known}{ends}")
     return reached[to]
 
 

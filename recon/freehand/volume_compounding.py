@@ -7,10 +7,11 @@ Frames pass one by one; in memory are the volume and one image. `world_from_pixe
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import repeat
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from recon.compiled import njit
 from recon.errors import InputError
@@ -21,6 +22,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Compounding = Literal["mean", "maximum", "latest", "integer_mean"]
 Interpolation = Literal["nearest", "linear"]
+Length = Annotated[int, Field(gt=0)]
+Rectangle = tuple[int, int, Length, Length]  # u, v, width, height of a clip, px; of a setting
 
 RULES = {"mean": 0, "maximum": 1, "latest": 2, "integer_mean": 3}
 LEAST_WEIGHT = 0.125  # of a voxel that a pixel is the maximum or the latest of: that of all eight where it lies in their middle
@@ -39,11 +42,21 @@ class Clip:
 
     def bounds(self, shape: tuple[int, int]) -> tuple[int, int, int, int]:
         """First and last column, first and last row, of an image (h, w)."""
-        left, top = max(self.u, 0), max(self.v, 0)
+        left, top = self.corner
         right, bottom = min(self.u + self.width, shape[1]) - 1, min(self.v + self.height, shape[0]) - 1
         if left > right or top > bottom:
             raise InputError(f"clip: expected a part of an image of {shape[1]}x{shape[0]}, found {self}")
         return left, right, top, bottom
+
+    @property
+    def corner(self) -> tuple[int, int]:
+        """Column and row, px, of its first pixel in the whole image."""
+        return max(self.u, 0), max(self.v, 0)
+
+    def cut(self, image: NDArray) -> NDArray:
+        """The part of an image : (h, w)."""
+        left, right, top, bottom = self.bounds((image.shape[0], image.shape[1]))
+        return image[top : bottom + 1, left : right + 1]
 
 
 @dataclass(frozen=True)

@@ -46,10 +46,16 @@ def look(
     poses: Array,
     pose_covariance: Array | None = None,
     appearance: Appearance | None = None,
+    corner: tuple[int, int] = (0, 0),
 ) -> CrossingFrames:
-    """Find the crossing in n B-scans, taken one by one, at poses : (n, 4, 4) with a covariance : (n, 6, 6)."""
+    """Find the crossing in n B-scans, taken one by one, at poses : (n, 4, 4) with a covariance : (n, 6, 6).
+
+    size, corner : of the whole images, and the column and row of the first pixel of the parts that are looked at; px.
+    """
     sightings, crossings = point_calibration.from_images(images, poses, appearance)
-    frames = CrossingFrames(name, size, sightings, numbers, tuple(crossings))
+    sightings = replace(sightings, pixels=sightings.pixels + corner)
+    whole = tuple(replace(crossing, pixel=crossing.pixel + corner) for crossing in crossings)
+    frames = CrossingFrames(name, size, sightings, numbers, whole)
     if pose_covariance is None:
         return frames
     return replace(frames, sightings=replace(sightings, pose_covariance=pose_covariance[frames.usable]))

@@ -1,9 +1,9 @@
 """Calibrate the ultrasound probe: where the pixels of its B-scans lie in the frame of the target that it carries.
 
-Reads the sweep part of a capture folder, B-scans of the crossing of two wires at rest in water, seen from many sides; or pairs
-of a pose and the crossing's pixel, found elsewhere. Writes into the folder `out`: probe.yaml (with its covariance); the same in
-the rig authors' layout, US_params.npz; frames.csv, the outcome of each frame; and metrics.json. A calibration that is there
-already is replaced. Takes a second for thirty B-scans.
+Reads the sweep part of a capture folder, or a tracked sequence of the PLUS toolkit: B-scans of the crossing of two wires at
+rest in water, seen from many sides; or pairs of a pose and the crossing's pixel, found elsewhere. Writes into the folder `out`:
+probe.yaml (with its covariance); the same in the rig authors' layout, US_params.npz; frames.csv, the outcome of each frame; and
+metrics.json. A calibration that is there already is replaced. Takes a second for thirty B-scans.
 
 Let the probe rest at each frame, or give the lag. Tilt it by 35 degrees, mostly forward and backward, roll it as far as the
 target is seen, and bring the crossing near all corners of the image in turn.
@@ -11,6 +11,7 @@ target is seen, and bring the crossing near all corners of the image in turn.
     sonotwin calibrate-probe capture=outputs/wires/capture out=outputs/probe
     sonotwin calibrate-probe capture=outputs/wires/capture temperature_c=22.4 out=outputs/probe
     sonotwin calibrate-probe capture=outputs/wires/capture earlier=outputs/probe/probe.yaml out=outputs/probe_again
+    sonotwin calibrate-probe sequence=wires.igs.mha reference=Tracker clip=[120,80,400,500] out=outputs/probe
     sonotwin calibrate-probe pairs=pairs.csv out=outputs/probe
     sonotwin calibrate-probe pairs=pairs.csv rig.probe.image_size=[640,480] temperature_c=22.4 out=outputs/probe
 """
@@ -26,8 +27,13 @@ from pydantic import PrivateAttr, model_validator
 from rich.console import Console
 
 from recon.capture import probe_files, sweep_part, sweep_tables
+from recon.capture.sweep_part import SweepCapture
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
+from recon.freehand import sequence_sweep
+from recon.freehand.sequence_sweep import SequenceFields, SequenceSweep
+from recon.freehand.sequences import FrameNames
+from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.rig import Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import crossing_frames, probe_figures, sound_in_water, tank_calibration
@@ -39,7 +45,7 @@ FRAMES = "frames.csv"  # by which the folder of a probe's calibration is known
 OF_THE_SCALE, OF_THE_SIZE = "rig.probe.scale_mm_per_px", "rig.probe.image_size"
 
 
-class Config(Settings):
+class Config(SequenceFields, Settings):
     """Fields of `conf/calibrate-probe.yaml`: sources, target, and all that is known beforehand."""
 
     rig: Rig
@@ -48,13 +54,18 @@ class Config(Settings):
     sweep: str = ""
     pairs: Path | None = None
     earlier: Path | None = None
+    clip: Rectangle | None = None
     lag_s: LagSeconds = 0.0
     _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
 
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
-        if (self.capture is None) == (self.pairs is None):
-            raise ValueError(f"expected capture or pairs, found {'neither' if self.capture is None else 'both'}")
+        given = [name for name in ("capture", "sequence", "pairs") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"expected one of capture, sequence and pairs, found {' and '.join(given) or 'none'}")
+        for name, value in (("clip", self.clip), ("lag_s", self.lag_s or None)):
+            if self.pairs is not None and value is not None:
+                raise ValueError(f"{name}: expected none with pairs, which come without images and times, found {value}")
         return self
 
     def model_post_init(self, context: Any) -> None:
@@ -80,7 +91,7 @@ def run(config: Config) -> None:
         If the input is incomplete or damaged, doesn't determine the calibration, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    source = config.capture or config.pairs
+    source = config.capture or config.sequence or config.pairs
     assert source is not None
     atomic.check_folder(config.out, FRAMES, inputs=[source, *([] if config.earlier is None else [config.earlier])])
     earlier = None if config.earlier is None else probe_files.read(config.earlier)
@@ -110,17 +121,27 @@ def look(config: Config, console: Console) -> CrossingFrames:
     """Read pairs, of images as large as the rig's, or find the crossing in the B-scans of a sweep, read one by one."""
     if config.pairs is not None:
         return crossing_frames.of_pairs(str(config.pairs), config.rig.probe.image_size, *sweep_tables.read_pairs(config.pairs))
-    assert config.capture is not None
-    sweep = sweep_part.read_sweep(config.capture, config.sweep, "probe")
+    sweep = read(config)
     poses, covariance = sweep.poses(config.lag_s), sweep.pose_covariance(config.lag_s)
+    clip = Clip(0, 0, *sweep.size) if config.clip is None else Clip(*config.clip)
     with console.status("") as status:
 
         def images() -> Iterator[NDArray[np.uint8]]:
             for number, image in enumerate(sweep.images()):
-                status.update(f"looking for the crossing, B-scan {number + 1} of {len(sweep.paths)}")
-                yield image
+                status.update(f"looking for the crossing, B-scan {number + 1} of {len(sweep.frames)}")
+                yield clip.cut(image)
 
-        return crossing_frames.look(sweep.name, images(), sweep.size, sweep.frames, poses, covariance, config.appearance)
+        return crossing_frames.look(
+            sweep.name, images(), sweep.size, sweep.frames, poses, covariance, config.appearance, clip.corner
+        )
+
+
+def read(config: Config) -> SweepCapture | SequenceSweep:
+    """Open the sweep over the wires."""
+    if config.capture is not None:
+        return sweep_part.read_sweep(config.capture, config.sweep, "probe")
+    assert config.sequence is not None
+    return sequence_sweep.read_sequence_sweep(config.sequence, config.frame_names(FrameNames()))
 
 
 def write(out: Path, frames: CrossingFrames, result: Result, figures: Metrics) -> list[str]:

@@ -1,10 +1,12 @@
 """Measure the lag of the scanner's images behind the poses of the tracker.
 
-Reads the sweep part of a capture folder: the probe moved up and down over a flat bottom in water, by 10 mm or more, three times
-or more, at an uneven pace. Writes into the folder `out`: lag.json, with lag_s for the other commands; depths.csv, the bottom's
-depth in each B-scan; and metrics.json. Results that are there already are replaced. Takes seconds.
+Reads the sweep part of a capture folder, or a tracked sequence of the PLUS toolkit: the probe moved up and down over a flat
+bottom in water, by 10 mm or more, three times or more, at an uneven pace. Writes into the folder `out`: lag.json, with lag_s for
+the other commands; depths.csv, the bottom's depth in each B-scan; and metrics.json. Results that are there already are replaced.
+Takes seconds.
 
     sonotwin measure-lag capture=outputs/bottom/capture out=outputs/lag
+    sonotwin measure-lag sequence=bottom.igs.mha reference=Tracker clip=[120,80,400,500] out=outputs/lag
     sonotwin freehand capture=outputs/sweep/capture lag_s=0.0503 out=outputs/volume
 """
 
@@ -15,7 +17,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 from rich.console import Console
 
 from recon.capture import lag_files, sweep_part, sweep_tables
@@ -24,6 +26,10 @@ from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
+from recon.freehand import sequence_sweep
+from recon.freehand.sequence_sweep import SequenceFields, SequenceSweep
+from recon.freehand.sequences import FrameNames
+from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.rig import Finite
 from recon.probe_calibration import latency
 from recon.probe_calibration.latency import Lag
@@ -35,14 +41,15 @@ HEADER = ("frame", "time_ns", "depth_px", "residual_px", "used")
 Array = NDArray[np.float64]
 
 
-class Config(BaseModel):
+class Config(SequenceFields):
     """Fields of `conf/measure-lag.yaml`."""
 
     model_config = ConfigDict(extra="forbid")
 
-    capture: Path
     out: Path
+    capture: Path | None = None
     sweep: str = ""
+    clip: Rectangle | None = None
     search_s: tuple[Finite, Finite] = latency.SEARCH_S
     top_px: Annotated[int, Field(ge=0)] = 40
 
@@ -55,6 +62,12 @@ class Config(BaseModel):
             )
         return value
 
+    @model_validator(mode="after")
+    def _one_source(self) -> "Config":
+        if (self.capture is None) == (self.sequence is None):
+            raise ValueError(f"expected capture or sequence, found {'neither' if self.capture is None else 'both'}")
+        return self
+
 
 def run(config: Config) -> None:
     """Find the bottom in all B-scans, compare its depth with the probe's height, and write.
@@ -62,14 +75,14 @@ def run(config: Config) -> None:
     Raises
     ------
     InputError
-        If the capture is incomplete or damaged, the motion doesn't determine the lag, or `out` can't be written to.
+        If the input is incomplete or damaged, the motion doesn't determine the lag, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    atomic.check_folder(config.out, LAG, inputs=[config.capture])
-    sweep = sweep_part.read_sweep(config.capture, config.sweep, "latency")
+    atomic.check_folder(config.out, LAG, inputs=[path for path in (config.capture, config.sequence) if path is not None])
+    sweep = read(config)
     start = perf_counter()
     with console.status("looking for the bottom"):
-        depths = np.array([latency.bottom_depth(image, config.top_px) for image in sweep.images()])
+        depths = bottom_depths(sweep, config)
     seconds = perf_counter() - start
     found_in = f"bottom in {np.isfinite(depths).sum()} of {len(depths)} B-scans"
     console.print(f"find        {found_in}, {len(sweep.track.times)} poses, {seconds:.0f} s", markup=False)
@@ -84,6 +97,20 @@ def run(config: Config) -> None:
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
 
 
+def read(config: Config) -> SweepCapture | SequenceSweep:
+    """Open the sweep; of a sequence its B-scans with a time stamp."""
+    if config.capture is not None:
+        return sweep_part.read_sweep(config.capture, config.sweep, "latency")
+    assert config.sequence is not None
+    return sequence_sweep.read_sequence_sweep(config.sequence, config.frame_names(FrameNames())).timed()
+
+
+def bottom_depths(sweep: SweepCapture | SequenceSweep, config: Config) -> Array:
+    """Depths of the bottom : (n,) px, in the whole B-scans, NaN where there is none."""
+    clip = Clip(0, 0, *sweep.size) if config.clip is None else Clip(*config.clip)
+    return np.array([latency.bottom_depth(clip.cut(image), config.top_px) for image in sweep.images()]) + clip.corner[1]
+
+
 def describe(figures: Metrics) -> Iterator[str]:
     """Lines: the lag with its interval, and the scatter about it."""
     interval = f"{figures['lag_low_ms']:.1f} to {figures['lag_high_ms']:.1f} ms"
@@ -92,7 +119,7 @@ def describe(figures: Metrics) -> Iterator[str]:
     yield f"scatter     {scatter} (1 sigma); {figures['frames_used']} B-scans used"
 
 
-def write(out: Path, sweep: SweepCapture, depths: Array, found: Lag, figures: Metrics) -> list[str]:
+def write(out: Path, sweep: SweepCapture | SequenceSweep, depths: Array, found: Lag, figures: Metrics) -> list[str]:
     """Write all files, whole or not at all; returns their names."""
     lag = LagFile(lag_s=found.seconds, sigma_s=found.sigma_s, interval_s=found.interval_s, coverage=latency.COVERAGE)
     with atomic.new_folder(out, LAG) as folder:
@@ -102,7 +129,7 @@ def write(out: Path, sweep: SweepCapture, depths: Array, found: Lag, figures: Me
     return [LAG, DEPTHS, metrics.FILE]
 
 
-def rows(sweep: SweepCapture, depths: Array, found: Lag) -> Iterator[Sequence[object]]:
+def rows(sweep: SweepCapture | SequenceSweep, depths: Array, found: Lag) -> Iterator[Sequence[object]]:
     """A row a B-scan, in the order of HEADER; empty where there is no depth."""
     for frame, time, depth, residual, used in zip(sweep.frames, sweep.times, depths, found.residuals, found.used, strict=True):
         shown = ["" if np.isnan(value) else f"{value:.3f}" for value in (depth, residual)]

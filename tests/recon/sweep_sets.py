@@ -5,7 +5,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from recon.capture import sweep_part
+from recon.freehand import sequences
 from recon.geometry import rigid
+from recon.model import tracks
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 from recon.probe_calibration import sound_in_water
@@ -13,6 +16,7 @@ from tests.recon import bscans, captures, probe_motions
 
 START_NS = 10**18  # of the clocks: seconds since 1970
 WATER_C = 22.0
+BORDER = (40, 60)  # px, of a screen to the left of the B-scan and above it; as much again to the right and below
 BLANK, UNTRACKED = 4, 12  # frames of the wires' sweep
 BALL = np.array([12.0, -8.0, 710.0])  # mm, in the world
 BALL_MM = 6.0  # its radius
@@ -86,3 +90,27 @@ def ball(folder: Path, rig, lag_s: float = 0.0, count: int = 41, with_probe: boo
     times, track = nanoseconds(moments + lag_s), Track(nanoseconds(tracked), poses)
     captures.write_sweep(folder, images, times, track, size, probe if with_probe else None, "ball")
     return folder
+
+
+def on_screen(image):
+    """A B-scan in a frame grabber's picture of the whole screen: bright, with a line of text as high as a wire's echo."""
+    across, above = BORDER
+    screen = np.pad(image, ((above, above), (across, across)), constant_values=120)
+    screen[above // 2 - 4 : above // 2 + 4, ::3] = 255
+    return screen
+
+
+def recorded(path: Path, capture: Path, probe: ProbeCalibration | None = None, screen: bool = False) -> Path:
+    """The sweep of a capture as PLUS records it: a pose a B-scan, at its time stamp, in the tracker's frame."""
+    sweep = sweep_part.read_sweep(capture)
+    poses = tracks.at(sweep.track, sweep.times)
+    found = np.isfinite(poses).all(axis=(1, 2))
+    transforms = {"ProbeToTracker": np.where(found[:, None, None], poses, np.eye(4))}
+    valid = {"ProbeToTracker": found, "Image": np.ones(len(poses), bool)}
+    if probe is not None:
+        transforms["ImageToProbe"] = np.tile(sequences.target_from_pixel(probe), (len(poses), 1, 1))
+        valid["ImageToProbe"] = np.ones(len(poses), bool)
+    images = np.stack([on_screen(image) if screen else image for image in sweep.images()])
+    times_s = (sweep.times - START_NS) * 1e-9
+    sequences.write_sequence(path, sequences.Frames(times_s, transforms, valid, images))
+    return path

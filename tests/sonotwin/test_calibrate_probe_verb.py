@@ -203,6 +203,23 @@ def test_another_bracket_is_a_warning_and_its_pose_is_said(rig, rng, tmp_path):
     assert not any(line.startswith("warning") for line in calibrate(*fields, *pose.split()[1:]))
 
 
+def test_a_sequence_of_plus_gives_the_same_calibration(capture, calibrated, tmp_path):
+    """Poses as they were at rest, so the same to a hair; of the whole screen the calibration is that of its own pixels."""
+    whole = sweep_sets.recorded(tmp_path / "wires.igs.mha", capture)
+    screen = sweep_sets.recorded(tmp_path / "screen.igs.nrrd", capture, screen=True)
+    calibrate(f"sequence={whole}", "reference=Tracker", f"out={tmp_path / 'whole'}")
+    part = [*sweep_sets.BORDER, *bscans.SIZE]
+    calibrate(f"sequence={screen}", "reference=Tracker", f"clip={part}".replace(" ", ""), f"out={tmp_path / 'screen'}")
+    ours, whole, screen = (
+        probe_files.read(folder / "probe.yaml") for folder in (calibrated[0], tmp_path / "whole", tmp_path / "screen")
+    )
+    pixels = repeatability.five_points(bscans.SIZE)
+    np.testing.assert_allclose(whole.to_target(pixels), ours.to_target(pixels), atol=1e-3)
+    np.testing.assert_allclose(screen.to_target(pixels + np.array(sweep_sets.BORDER)), ours.to_target(pixels), atol=1e-3)
+    figures = json.loads((tmp_path / "screen" / "metrics.json").read_text())
+    assert (figures["frames"], figures["frames_rejected"]) == (30, 2)
+
+
 def complaint(capsys, *fields: str) -> str:
     assert main(["calibrate-probe", *fields]) == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -212,8 +229,10 @@ def complaint(capsys, *fields: str) -> str:
 def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, rig, rng, tmp_path, capsys):
     out = tmp_path / "out"
     fields = [f"capture={capture}", f"out={out}"]
-    assert complaint(capsys, f"out={out}") == "calibrate-probe: expected capture or pairs, found neither"
-    assert complaint(capsys, *fields, "pairs=a.csv") == "calibrate-probe: expected capture or pairs, found both"
+    assert complaint(capsys, f"out={out}") == "calibrate-probe: expected one of capture, sequence and pairs, found none"
+    assert complaint(capsys, *fields, "pairs=a.csv").endswith("pairs, found capture and pairs")
+    assert complaint(capsys, *fields, "reference=Tracker").startswith("calibrate-probe: reference: expected none without a seq")
+    assert complaint(capsys, f"out={out}", "pairs=a.csv", "lag_s=0.1").startswith("calibrate-probe: lag_s: expected none with")
     assert complaint(capsys, *fields, "noise.angle_deg=-1").startswith("calibrate-probe: noise.angle_deg: expected finite")
     assert complaint(capsys, *fields, "temperature_c=120").startswith("temperature_c: expected 0 to 95 degrees Celsius")
     assert complaint(capsys, *fields, "medium_speed=1450") == (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sonotwin.cli import main
-from tests.recon import sweep_sets
+from tests.recon import bscans, sweep_sets
 
 LAG_S = 0.0473
 
@@ -33,6 +33,18 @@ def test_the_lag_is_found_and_said(capture, tmp_path, capsys):
     assert len(depths) == 86 and 150 < np.ptp(depths) < 200, "18 to 24 mm of 0.1225 mm/px"
 
 
+def test_a_sequence_of_plus_tells_its_own_lag(capture, tmp_path):
+    """Poses at the images' stamps, 15 a second, so less sure: by its own interval, of some ms. The screen's text is no bottom."""
+    path = sweep_sets.recorded(tmp_path / "bottom.igs.mha", capture, screen=True)
+    clip = f"clip=[{','.join(map(str, [*sweep_sets.BORDER, *bscans.SIZE]))}]"
+    assert main(["measure-lag", f"sequence={path}", "reference=Tracker", clip, f"out={tmp_path / 'lag'}"]) == 0
+    found = json.loads((tmp_path / "lag" / "lag.json").read_text())
+    assert found["interval_s"][0] <= LAG_S <= found["interval_s"][1] and found["sigma_s"] < 0.003
+    with (tmp_path / "lag" / "depths.csv").open(newline="") as stream:
+        depths = [float(row["depth_px"]) for row in csv.DictReader(stream)]
+    assert len(depths) == 86 and min(depths) > sweep_sets.BORDER[1] + 32, "of the whole screen's rows"
+
+
 def test_what_is_wrong_is_said_in_one_line(capture, tmp_path, capsys):
     def complaint(*fields: str) -> str:
         assert main(["measure-lag", f"capture={capture}", f"out={tmp_path / 'out'}", *fields]) == 2
@@ -43,6 +55,11 @@ def test_what_is_wrong_is_said_in_one_line(capture, tmp_path, capsys):
     assert complaint("search_s=[-0.5,0.03]").startswith("bottom: search_s: expected the lag within -0.5 to 0.03 s")
     assert complaint("search_s=[50,51]").startswith("bottom: times: expected poses at 60 % of the images or more")
     assert complaint("top_px=407") == "bottom: depths: expected at least 20 images that show the bottom, found 0"
+    assert complaint("sequence=a.igs.mha") == "measure-lag: expected capture or sequence, found both"
+    assert complaint("target=Stylus") == (
+        "measure-lag: target: expected none without a sequence, of which it names a frame, found Stylus"
+    )
+    assert complaint("clip=[400,0,10,10]").startswith("clip: expected a part of an image of 321x408")
     assert complaint("top_px=-1").startswith("measure-lag: top_px: expected ")
     assert "expected a folder apart from what is read" in complaint(f"out={capture}")
     assert not (tmp_path / "out").exists()
