@@ -6,7 +6,7 @@ latency by the pixel's speed, the speed of sound by its depth. So the variance o
 form of [1, u, v] with six numbers a B-scan. The errors count as independent of each other.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from recon.files.volumes import Volume
 from recon.freehand import sequences
 from recon.freehand.volume_compounding import Clip, Grid, Sums
 from recon.geometry import rigid
+from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
 from recon.probe_calibration.point_calibration import NAMES
 
@@ -77,6 +78,18 @@ def probe_slopes(world_from_pixel: Array, probe: ProbeCalibration) -> Array:
         in_target[1 + axis, :, axis] = along[:, axis]
         in_target[1 + axis, :, 2:5] = -rigid.cross(probe.scale[axis] * along[:, axis])
     return _world_from_target(world_from_pixel, probe)[:, None, :3, :3] @ in_target
+
+
+def from_pixel(probe: ProbeCalibration, pixel: tuple[int, int]) -> ProbeCalibration:
+    """The calibration, with its covariance, of images that begin at a pixel (u, v) of those it was made for."""
+    placed = sequences.target_from_pixel(probe)
+    origin = rigid.apply(placed, [*pixel, 0.0])
+    moved = replace(probe, target_from_image=rigid.transform(probe.target_from_image[:3, :3], origin))
+    if probe.uncertainty is None:
+        return moved
+    jacobian = np.eye(len(NAMES))
+    jacobian[5:] = np.tensordot([1, *pixel], probe_slopes(placed[None], probe)[0], axes=1)
+    return replace(moved, uncertainty=Uncertainty(NAMES, jacobian @ probe.uncertainty.ordered(NAMES) @ jacobian.T))
 
 
 def rate_slopes(rates: Array) -> Array:

@@ -1,6 +1,6 @@
 """The PLUS toolkit's configuration files: the calibration of the probe, and the settings of a sequence's reconstruction."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from recon.errors import InputError
 from recon.files import medical_images
 from recon.files.medical_images import fault
-from recon.freehand import hole_filling, sequences, volume_compounding
+from recon.freehand import scans as freehand_scans
+from recon.freehand import sequences
+from recon.freehand.scans import VolumeSettings
+from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction
 
 Array = NDArray[np.float64]
@@ -22,25 +25,12 @@ SWITCH = {"ON": True, "TRUE": True, "OFF": False, "FALSE": False}
 
 
 @dataclass(frozen=True)
-class Sticks:
-    """Filling of holes; see `recon.freehand.hole_filling.fill_holes`."""
-
-    most_voxels: int
-    sticks: int
-
-
-@dataclass(frozen=True)
 class PlusConfig:
     """The parts of a configuration on coordinates and on the reconstruction."""
 
     transforms: dict[str, Array]  # "ImageToProbe": (4, 4), mm and px
-    spacing: Array  # (3,) mm
-    clip: Clip | None
-    interpolation: Interpolation
-    compounding: Compounding  # `integer_mean` for MEAN: as PLUS computes it
-    holes: Sticks | None
-    image: str = "Image"
-    reference: str = "Reference"
+    names: FrameNames = field(default_factory=FrameNames)  # those of image and reference that the reconstruction names
+    volume: VolumeSettings | None = None  # along the reference frame's axes; None where there is no reconstruction
 
 
 def read_config(path: Path) -> PlusConfig:
@@ -49,8 +39,8 @@ def read_config(path: Path) -> PlusConfig:
     Raises
     ------
     InputError
-        If the file is missing or no such configuration, or has settings unknown here: a fan-shaped clip, another way of
-        compounding or of filling holes.
+        If the file is missing or has neither, or has settings unknown here: a fan-shaped clip, another way of compounding or of
+        filling holes.
     """
     path = Path(path)
     try:
@@ -61,52 +51,30 @@ def read_config(path: Path) -> PlusConfig:
         raise InputError(f"{path}: expected a file to read, found {error.strerror}") from None
     except ElementTree.ParseError as error:
         raise InputError(f"{path}: expected XML, found it broken: {error}") from None
+    transforms = _transforms(path, root)
     element = root if root.tag == "VolumeReconstruction" else root.find(".//VolumeReconstruction")
+    if element is None and not transforms:
+        raise fault(path, root.tag, "an element VolumeReconstruction or CoordinateDefinitions with a Transform", "neither")
     if element is None:
-        raise fault(path, "VolumeReconstruction", "an element", "none")
-    for name in ("FanAngles", "FanAnglesDeg"):
-        if element.get(name) and medical_images.numbers(path, name, element.get(name, ""), 2).any():
-            raise fault(path, name, "none, clips are rectangles", repr(element.get(name)))
-    spacing = medical_images.numbers(path, "OutputSpacing", _text(path, element, "OutputSpacing"), 3)
-    if spacing.min() <= 0:
-        raise fault(path, "OutputSpacing", "3 lengths above 0", repr(element.get("OutputSpacing")))
-    interpolation = INTERPOLATION[_choice(path, element, "Interpolation", "NEAREST_NEIGHBOR", INTERPOLATION)]
-    compounding = COMPOUNDING[_choice(path, element, "CompoundingMode", "MEAN", COMPOUNDING)]
-    return PlusConfig(
-        _transforms(path, root),
-        spacing,
-        _clip(path, element),
-        interpolation,
-        "mean" if compounding == "integer_mean" and interpolation == "linear" else compounding,
-        _sticks(path, element),
-        element.get("ImageCoordinateFrame", "Image"),
-        element.get("ReferenceCoordinateFrame", "Reference"),
-    )
+        return PlusConfig(transforms)
+    usual = FrameNames()
+    image, reference = (element.get(f"{name}CoordinateFrame", name) for name in (usual.image, usual.reference))
+    return PlusConfig(transforms, FrameNames(image, usual.target, reference), _volume(path, element))
 
 
 def reconstruct_sequence(path: Path, config: PlusConfig) -> tuple[Reconstruction, Reconstruction]:
-    """Reconstruct a sequence file by its configuration, reading the images one by one.
+    """Reconstruct a sequence file by its configuration, reading the images one by one; as usual here where it has no settings.
 
     Returns
     -------
     Reconstruction, Reconstruction
         Before its holes are filled, and after; the same without filling.
     """
-    frames = sequences.read_tracking(path)
-    shape = sequences.image_shape(path)
+    scans = freehand_scans.of_sequence(path, config.names, fixed=config.transforms)
     try:
-        world_from_pixel = sequences.poses(frames, config.reference, config.image, config.transforms)
-        world_from_pixel = np.where(frames.valid["Image"][:, None, None], world_from_pixel, np.nan)
-        grid = volume_compounding.aligned_grid(volume_compounding.corners(world_from_pixel, shape, config.clip), config.spacing)
-        images = sequences.stream_images(path)
-        pasted = volume_compounding.reconstruct(
-            images, world_from_pixel, grid, config.compounding, config.interpolation, config.clip
-        )
+        return freehand_scans.volume(scans, config.volume or VolumeSettings())
     except InputError as error:
         raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from None
-    if config.holes is None:
-        return pasted, pasted
-    return pasted, hole_filling.fill_holes(pasted, config.holes.most_voxels, config.holes.sticks)
 
 
 def _transforms(path: Path, root: Element) -> dict[str, Array]:
@@ -122,6 +90,21 @@ def _transforms(path: Path, root: Element) -> dict[str, Array]:
     return transforms
 
 
+def _volume(path: Path, element: Element) -> VolumeSettings:
+    for name in ("FanAngles", "FanAnglesDeg"):
+        if element.get(name) and medical_images.numbers(path, name, element.get(name, ""), 2).any():
+            raise fault(path, name, "none, clips are rectangles", repr(element.get(name)))
+    spacing = medical_images.numbers(path, "OutputSpacing", _text(path, element, "OutputSpacing"), 3)
+    if spacing.min() <= 0:
+        raise fault(path, "OutputSpacing", "3 lengths above 0", repr(element.get("OutputSpacing")))
+    interpolation = INTERPOLATION[_choice(path, element, "Interpolation", "NEAREST_NEIGHBOR", INTERPOLATION)]
+    compounding = COMPOUNDING[_choice(path, element, "CompoundingMode", "MEAN", COMPOUNDING)]
+    if interpolation == "linear" and compounding == "integer_mean":
+        compounding = "mean"  # PLUS rounds it at each pixel, to the nearest level, and its weights to 1/255
+    x, y, z = spacing.tolist()
+    return VolumeSettings((x, y, z), "aligned", compounding, interpolation, _clip(path, element), *_sticks(path, element))
+
+
 def _clip(path: Path, element: Element) -> Clip | None:
     if not element.get("ClipRectangleSize"):
         return None
@@ -130,9 +113,10 @@ def _clip(path: Path, element: Element) -> Clip | None:
     return Clip(u, v, width + 1, height + 1) if width and height else None  # PLUS takes the pixels on both borders
 
 
-def _sticks(path: Path, element: Element) -> Sticks | None:
+def _sticks(path: Path, element: Element) -> tuple[int, int]:
+    """Longest stick across a hole, 0 where holes stay open, and number of sticks."""
     if not SWITCH[_choice(path, element, "FillHoles", "OFF", SWITCH)]:
-        return None
+        return 0, 1
     rules = element.findall("HoleFilling/HoleFillingElement")
     if len(rules) != 1 or rules[0].get("Type") != "STICK":
         raise fault(
@@ -140,7 +124,7 @@ def _sticks(path: Path, element: Element) -> Sticks | None:
         )
     (most,) = medical_images.whole_numbers(path, "StickLengthLimit", _text(path, rules[0], "StickLengthLimit"), 1, 1)
     (sticks,) = medical_images.whole_numbers(path, "NumberOfSticksToUse", rules[0].get("NumberOfSticksToUse", "1"), 1, 1)
-    return Sticks(most, sticks)
+    return most, sticks
 
 
 def _choice(path: Path, element: Element, name: str, usual: str, known: dict) -> str:

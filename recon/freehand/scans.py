@@ -1,6 +1,6 @@
 """B-scans in space, of a capture or of a PLUS sequence, and the volume that they are compounded into."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -13,9 +13,11 @@ from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.files.volumes import Volume
-from recon.freehand import hole_filling, place_uncertainty, plus_config, sequences, volume_compounding
+from recon.freehand import hole_filling, place_uncertainty, sequence_sweep, sequences, volume_compounding
 from recon.freehand.place_uncertainty import PlaceErrors
-from recon.freehand.volume_compounding import Clip, Grid, Reconstruction, grid_of
+from recon.freehand.sequences import FrameNames
+from recon.freehand.volume_compounding import MOST_BYTES, Clip, Compounding, Interpolation, Reconstruction, grid_of
+from recon.geometry import rigid
 from recon.model import tracks
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration
 from recon.probe_calibration import sound_in_water
@@ -32,6 +34,19 @@ class Unsure(NamedTuple):
 
     lag_s: float = 0.0
     tissue_m_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class VolumeSettings:
+    """Settings of the volume that B-scans are put into."""
+
+    spacing_mm: float | tuple[float, float, float] = 0.5  # of the voxels
+    extent: Extent = "principal"  # or along the world's axes
+    compounding: Compounding = "mean"
+    interpolation: Interpolation = "nearest"
+    clip: Clip | None = None
+    hole_voxels: int = hole_filling.MOST_VOXELS  # longest stick across a hole; 0 leaves holes open
+    hole_sticks: int = 1  # the shortest ones that count
 
 
 @dataclass(frozen=True)
@@ -95,26 +110,54 @@ def _rates(sweep: SweepCapture, lag_s: float) -> Array:
     return np.nan_to_num(np.where(both, (after - before) / (2 * STEP_S), rates))
 
 
-def of_sequence(path: Path, probe: Path | None, config: Path | None, tissue_m_s: float | None) -> Scans:
-    """Place the B-scans of a PLUS sequence in its reference frame; its own calibration counts as one for 1540 m/s."""
+def of_sequence(
+    path: Path,
+    names: FrameNames | None = None,
+    probe: ProbeCalibration | None = None,
+    fixed: Mapping[str, Array] | None = None,
+    lag_s: float = 0.0,
+    tissue_m_s: float | None = None,
+) -> Scans:
+    """Place the B-scans of a PLUS sequence in its reference frame.
+
+    Parameters
+    ----------
+    probe : ProbeCalibration, optional
+        Takes the place of the sequence's own, which counts as one for 1540 m/s.
+    fixed : (4, 4) by name, optional
+        Transforms that go before those of the sequence, such as "ImageToProbe".
+    """
     frames, shape = sequences.read_tracking(path), sequences.image_shape(path)
-    fixed, to, of = {}, "Reference", "Image"
-    given = None if probe is None else probe_files.read(probe)
-    if given is not None:
-        fixed = {"ImageToProbe": sequences.target_from_pixel(given)}
-    elif config is not None:
-        wanted = plus_config.read_config(config)
-        fixed, to, of = wanted.transforms, wanted.reference, wanted.image
+    image, target, reference = names or FrameNames()
     try:
-        world_from_pixel = sequences.poses(frames, to, of, fixed)
+        if probe is None:
+            world_from_pixel = sequences.poses(frames, reference, image, fixed)
+        else:
+            world_from_pixel = sequences.poses(frames, reference, target, fixed) @ sequences.target_from_pixel(probe)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    valid = frames.valid["Image"][:, None, None]
-    calibrated = SCANNER_SPEED if given is None else given.speed_m_s
+        hint = "; no calibration of the probe among them? give probe=... or config=..." if probe is None and not fixed else ""
+        raise InputError(f"{path}: {error}{hint}") from None
+    placed = sequence_sweep.lagged(str(path), frames.times_s, world_from_pixel, lag_s)
+    calibrated = SCANNER_SPEED if probe is None else probe.speed_m_s
     speed = tissue_m_s or calibrated
-    matrices = sound_in_water.in_tissue(np.where(valid, world_from_pixel, np.nan), calibrated, speed)
-    converted = None if given is None else sound_in_water.for_tissue(given, tissue_m_s)
+    matrices = sound_in_water.in_tissue(np.where(frames.valid["Image"][:, None, None], placed, np.nan), calibrated, speed)
+    converted = None if probe is None else sound_in_water.for_tissue(probe, tissue_m_s)
     return Scans(shape, matrices, lambda: sequences.stream_images(path), speed, calibrated, converted)
+
+
+def cut(scans: Scans, clip: Clip) -> Scans:
+    """The part of each B-scan within a clip, in its place, as if the scanner had shown no more."""
+    left, right, top, bottom = clip.bounds(scans.shape)
+    pixel_from_cut = rigid.transform(np.eye(3), [left, top, 0])
+    errors = None if scans.errors is None else replace(scans.errors, rates=scans.errors.rates @ pixel_from_cut)
+    return replace(
+        scans,
+        shape=(bottom - top + 1, right - left + 1),
+        world_from_pixel=scans.world_from_pixel @ pixel_from_cut,
+        stream=lambda: (clip.cut(image) for image in scans.stream()),
+        probe=None if scans.probe is None else place_uncertainty.from_pixel(scans.probe, (left, top)),
+        errors=errors,
+    )
 
 
 def in_memory(scans: Scans, most_bytes: int = MOST_KEPT) -> Scans:
@@ -138,10 +181,33 @@ def depths(scans: Scans) -> str:
     return f"right where sound makes {speed:.0f} m/s, {how}"
 
 
-def grid_around(scans: Scans, extent: Extent, spacing_mm: float, clip: Clip | None = None) -> Grid:
-    """The grid of a volume that takes in all B-scans, along the world's axes or along the principal axes of the sweep."""
-    grid_along = volume_compounding.aligned_grid if extent == "aligned" else volume_compounding.principal_grid
-    return grid_along(volume_compounding.corners(scans.world_from_pixel, scans.shape, clip), spacing_mm)
+def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES) -> tuple[Reconstruction, Reconstruction]:
+    """Put all B-scans into a volume.
+
+    Returns
+    -------
+    Reconstruction, Reconstruction
+        Before its holes are filled, and after; the same if they are left open.
+
+    Raises
+    ------
+    InputError
+        If no B-scan has a pose, or as `recon.freehand.volume_compounding.reconstruct`.
+    """
+    around = volume_compounding.corners(scans.world_from_pixel, scans.shape, settings.clip)
+    grid_along = volume_compounding.aligned_grid if settings.extent == "aligned" else volume_compounding.principal_grid
+    pasted = volume_compounding.reconstruct(
+        scans.stream(),
+        scans.world_from_pixel,
+        grid_along(around, settings.spacing_mm),
+        settings.compounding,
+        settings.interpolation,
+        settings.clip,
+        most_bytes=most_bytes,
+    )
+    if settings.hole_voxels == 0:
+        return pasted, pasted
+    return pasted, hole_filling.fill_holes(pasted, settings.hole_voxels, settings.hole_sticks)
 
 
 def sigma_volume(scans: Scans, volume: Volume, clip: Clip | None = None) -> Volume | None:
@@ -150,11 +216,6 @@ def sigma_volume(scans: Scans, volume: Volume, clip: Clip | None = None) -> Volu
         return None
     forms = place_uncertainty.forms(scans.world_from_pixel, scans.probe, scans.errors)
     return place_uncertainty.sigma_volume(forms, scans.world_from_pixel, scans.shape, grid_of(volume), clip)
-
-
-def filled(pasted: Reconstruction, most_voxels: int, sticks: int) -> Reconstruction:
-    """A volume with its holes filled, or as it is where `most_voxels` is 0; see `recon.freehand.hole_filling`."""
-    return hole_filling.fill_holes(pasted, most_voxels, sticks) if most_voxels else pasted
 
 
 def measure(scans: Scans, pasted: Reconstruction, filled: Reconstruction) -> Metrics:

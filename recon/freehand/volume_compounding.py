@@ -168,7 +168,7 @@ def reconstruct(
         Pixels outside are left out.
     compounding
         Rule for the pixels in a voxel: their mean, the greatest, or the latest. `integer_mean` is the running mean in whole
-        grey levels, rounded down at each pixel, of the PLUS toolkit: too dark by several levels, and there for comparison.
+        grey levels, rounded down at each pixel, of the PLUS toolkit with `nearest`: too dark by several levels, to compare.
     interpolation
         A pixel counts for the nearest voxel or, by its distance, for the eight around it.
     masks : n times (h, w) bool, optional

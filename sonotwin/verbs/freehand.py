@@ -1,33 +1,39 @@
 """Put the B-scans of a freehand sweep into a volume.
 
 Reads the sweep part of a capture folder, with the probe's calibration and the lag between scanner and tracker; or a tracked
-sequence of the PLUS toolkit, reconstructed by the fields below or by its own configuration. Writes into the folder `out`:
-volume.nrrd (in the world's frame, mm); of a capture also sigma.nrrd, the standard deviation of the place, mm, of what each voxel
-shows, and sequence.igs.mha, the B-scans with their poses for PLUS and 3D Slicer; and metrics.json. Depths are as of the speed of
-sound that the probe's calibration holds for, unless tissue_m_s is given. Results that are there already are replaced. Takes a
-second for a hundred B-scans, and some seconds more when it first compiles.
+sequence of the PLUS toolkit, reconstructed by the fields below and, where they aren't given, by its own configuration. Writes
+into the folder `out`: volume.nrrd (in the world's frame, mm); of a capture also sigma.nrrd, the standard deviation of the place,
+mm, of what each voxel shows, and sequence.igs.mha, the B-scans with their poses for PLUS and 3D Slicer; and metrics.json. Depths
+are as of the speed of sound that the probe's calibration holds for, unless tissue_m_s is given. Results that are there already
+are replaced. Takes a second for a hundred B-scans, and some seconds more when it first compiles.
 
     sonotwin freehand capture=outputs/sweep/capture probe=outputs/probe/probe.yaml lag_s=0.0503 out=outputs/volume
     sonotwin freehand capture=outputs/sweep/capture tissue_m_s=1450 spacing_mm=0.3 compounding=maximum out=outputs/volume
-    sonotwin freehand sequence=sweep.igs.mha config=config.xml out=outputs/volume
+    sonotwin freehand sequence=sweep.igs.mha config=config.xml compounding=mean out=outputs/volume
+    sonotwin freehand sequence=sweep.igs.mha probe=outputs/probe/probe.yaml reference=Tracker lag_s=0.0503 out=outputs/volume
 """
 
 from collections.abc import Iterator
+from dataclasses import fields, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 from rich.console import Console
 
-from recon.capture import sweep_part
+from recon.capture import probe_files, sweep_part
 from recon.capture.sweep_part import SweepCapture
+from recon.errors import InputError
 from recon.files import atomic, metrics, volumes
 from recon.files.metrics import Metrics
 from recon.freehand import hole_filling, plus_config, volume_compounding
 from recon.freehand import scans as freehand_scans
-from recon.freehand.scans import Extent, Scans, Unsure
-from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction
+from recon.freehand.plus_config import PlusConfig
+from recon.freehand.scans import Extent, Scans, Unsure, VolumeSettings
+from recon.freehand.sequence_sweep import SequenceFields
+from recon.freehand.sequences import FrameName, FrameNames
+from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction, Rectangle
 from recon.model.probe import Speed, SpeedSigma
 from recon.model.rig import NotNegative
 from recon.model.tracks import LagSeconds
@@ -36,7 +42,7 @@ VOLUME = "volume.nrrd"  # by which the folder of a volume is known
 SIGMA, SEQUENCE = "sigma.nrrd", "sequence.igs.mha"
 
 
-class Config(BaseModel):
+class Config(SequenceFields):
     """Fields of `conf/freehand.yaml`: sources, target, and settings of the volume."""
 
     model_config = ConfigDict(extra="forbid")
@@ -49,15 +55,15 @@ class Config(BaseModel):
     lag_sigma_s: NotNegative = 0.0
     tissue_m_s: Speed | None = None
     tissue_sigma_m_s: SpeedSigma = 25.0
-    sequence: Path | None = None
+    image: FrameName | None = None
     config: Path | None = None
-    spacing_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.5
-    extent: Extent = "principal"
-    compounding: Compounding = "mean"
-    interpolation: Interpolation = "nearest"
-    clip: tuple[int, int, Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] | None = None
-    hole_voxels: Annotated[int, Field(ge=0, le=1000)] = hole_filling.MOST_VOXELS
-    hole_sticks: Annotated[int, Field(ge=1, le=len(hole_filling.STICKS))] = 1
+    spacing_mm: Annotated[float, Field(ge=0.01, le=100)] | None = None
+    extent: Extent | None = None
+    compounding: Compounding | None = None
+    interpolation: Interpolation | None = None
+    clip: Rectangle | None = None
+    hole_voxels: Annotated[int, Field(ge=0, le=1000)] | None = None
+    hole_sticks: Annotated[int, Field(ge=1, le=len(hole_filling.STICKS))] | None = None
     most_gib: Annotated[float, Field(gt=0, le=1024)] = volume_compounding.MOST_BYTES / 2**30
 
     @model_validator(mode="after")
@@ -66,16 +72,22 @@ class Config(BaseModel):
             raise ValueError(f"expected capture or sequence, found {'neither' if self.capture is None else 'both'}")
         if self.capture is not None and self.config is not None:
             raise ValueError("config: expected a configuration with a sequence only, found one with a capture")
-        for name, value in (("lag_s", self.lag_s), ("lag_sigma_s", self.lag_sigma_s)):
-            if self.sequence is not None and value != 0:
-                raise ValueError(f"{name}: expected none with a sequence, whose poses are those of its images, found {value:g}")
-        if self.config is not None and self.probe is not None:
-            raise ValueError("probe: expected none with a config, which has the calibration, found one")
-        if self.config is not None and self.tissue_m_s is not None:
-            raise ValueError(f"tissue_m_s: expected none with a config, which has the depths, found {self.tissue_m_s:g}")
+        if self.sequence is not None and self.lag_sigma_s != 0:
+            raise ValueError(f"lag_sigma_s: expected none with a sequence, without covariances, found {self.lag_sigma_s:g}")
+        if self.target is not None and self.probe is None:
+            raise ValueError(
+                f"target: expected a probe with it, whose calibration holds in that frame, found {self.target} alone"
+            )
         if self.compounding == "integer_mean" and self.interpolation == "linear":
             raise ValueError("interpolation: expected nearest with integer_mean, which counts whole pixels, found linear")
         return self
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The settings of the volume that were given, by their names."""
+        values = {field.name: getattr(self, field.name) for field in fields(VolumeSettings)}
+        values["clip"] = None if self.clip is None else Clip(*self.clip)
+        return {name: value for name, value in values.items() if value is not None}
 
 
 def run(config: Config) -> None:
@@ -87,20 +99,21 @@ def run(config: Config) -> None:
         If the input is incomplete or damaged, has no poses, needs more memory than allowed, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
+    plus = None if config.config is None else plus_config.read_config(config.config)
+    settings = settings_of(config, plus)
     inputs = [path for path in (config.capture, config.probe, config.sequence, config.config) if path is not None]
     atomic.check_folder(config.out, VOLUME, inputs=inputs)
-    sweep, scans = read(config)
+    sweep, scans = read(config, plus)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
-    if config.config is None:
-        console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
+    console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
 
     start = perf_counter()
     with console.status("putting B-scans into the volume"):
-        pasted, filled = reconstruct(scans, config)
-        sigma = freehand_scans.sigma_volume(scans, filled.volume, None if config.clip is None else Clip(*config.clip))
+        pasted, filled = freehand_scans.volume(scans, settings, int(config.most_gib * 2**30))
+        sigma = freehand_scans.sigma_volume(scans, filled.volume, settings.clip)
     seconds = {"seconds_reconstruct": round(perf_counter() - start, 3)}
     figures = freehand_scans.measure(scans, pasted, filled) | freehand_scans.measure_sigma(sigma)
-    for line in describe(filled, figures, config):
+    for line in describe(filled, figures, settings, config):
         console.print(line, markup=False)
 
     with console.status("writing"), atomic.new_folder(config.out, VOLUME) as folder:
@@ -114,35 +127,39 @@ def run(config: Config) -> None:
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
 
 
-def read(config: Config) -> tuple[SweepCapture | None, Scans]:
+def settings_of(config: Config, plus: PlusConfig | None) -> VolumeSettings:
+    """The given settings of the volume; those of the PLUS configuration where none are given, and the usual ones else."""
+    usual = VolumeSettings() if plus is None or plus.volume is None else plus.volume
+    if config.interpolation == "linear" and usual.compounding == "integer_mean":
+        usual = replace(usual, compounding="mean")  # as in a configuration that has LINEAR itself
+    settings = replace(usual, **config.given)
+    if (settings.compounding, settings.interpolation) == ("integer_mean", "linear"):
+        expected = "interpolation=nearest with integer_mean, which counts whole pixels"
+        raise InputError(f"freehand: compounding: expected {expected}, found the LINEAR of {config.config}")
+    return settings
+
+
+def read(config: Config, plus: PlusConfig | None) -> tuple[SweepCapture | None, Scans]:
     """Read the sweep, if it is a capture's, and its B-scans in the world."""
     if config.capture is None:
         assert config.sequence is not None
-        return None, freehand_scans.of_sequence(config.sequence, config.probe, config.config, config.tissue_m_s)
+        names = config.frame_names(FrameNames() if plus is None else plus.names)
+        probe = None if config.probe is None else probe_files.read(config.probe)
+        fixed = {} if plus is None else plus.transforms
+        return None, freehand_scans.of_sequence(config.sequence, names, probe, fixed, config.lag_s, config.tissue_m_s)
     sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
     unsure = Unsure(config.lag_sigma_s, config.tissue_sigma_m_s)
     return sweep, freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s, unsure)
 
 
-def reconstruct(scans: Scans, config: Config) -> tuple[Reconstruction, Reconstruction]:
-    """The volume before its holes are filled, and after."""
-    if config.config is not None:
-        assert config.sequence is not None
-        return plus_config.reconstruct_sequence(config.sequence, plus_config.read_config(config.config))
-    clip = None if config.clip is None else Clip(*config.clip)
-    grid, most_bytes = freehand_scans.grid_around(scans, config.extent, config.spacing_mm, clip), int(config.most_gib * 2**30)
-    pasted = volume_compounding.reconstruct(
-        scans.stream(), scans.world_from_pixel, grid, config.compounding, config.interpolation, clip, most_bytes=most_bytes
-    )
-    return pasted, freehand_scans.filled(pasted, config.hole_voxels, config.hole_sticks)
-
-
-def describe(filled: Reconstruction, figures: Metrics, config: Config) -> Iterator[str]:
+def describe(filled: Reconstruction, figures: Metrics, settings: VolumeSettings, config: Config) -> Iterator[str]:
     """Lines: size of the volume, and the part of it that B-scans passed through."""
     size = "x".join(str(figures[f"voxels_{axis}"]) for axis in "xyz")
     spacing = "x".join(f"{step:g}" for step in dict.fromkeys(filled.volume.spacing.tolist()))
-    how = f"by {config.config}" if config.config is not None else f"{config.extent}, {config.compounding}, {config.interpolation}"
+    how = f"{settings.extent}, {settings.compounding}, {settings.interpolation}"
+    how += "" if config.config is None else f" by {config.config}"
+    how += f" but for {', '.join(config.given)}" if config.config is not None and config.given else ""
     yield f"paste       {size} voxels of {spacing} mm, {how}: {100 * figures['pasted_fraction']:.1f} % seen"
     level = metrics.shown(figures["mean_level"], ".0f")
     yield f"fill        {100 * figures['filled_fraction']:.1f} % after filling holes, mean level {level}"

@@ -8,6 +8,7 @@ metrics.json. Results that are there already are replaced. Takes a quarter of a 
 
     sonotwin segment capture=outputs/sweep/capture lag_s=0.05 tissue_m_s=1450 out=outputs/masses
     sonotwin segment capture=outputs/sweep/capture lag_s=0.05 surface=outputs/surface/surface.ply out=outputs/masses
+    sonotwin segment sequence=sweep.igs.mha config=config.xml clip=[120,80,400,500] slice_mm=null out=outputs/masses
     sonotwin segment kind=tube capture=outputs/tank/capture probe=outputs/probe/probe.yaml lag_s=0.05 out=outputs/tube
 """
 
@@ -18,14 +19,18 @@ from typing import Annotated, Literal
 
 import cv2
 import trimesh
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from rich.console import Console
 
-from recon.capture import sweep_part
+from recon.capture import probe_files, sweep_part
 from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
+from recon.freehand import plus_config
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans, Unsure
+from recon.freehand.sequence_sweep import SequenceFields
+from recon.freehand.sequences import FrameName, FrameNames
+from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.probe import SCANNER_SPEED, Speed, SpeedSigma
 from recon.model.rig import NotNegative, Positive
 from recon.model.tracks import LagSeconds
@@ -49,7 +54,7 @@ def _rising(value: tuple[tuple[float, float], ...] | None) -> tuple[tuple[float,
 Slice = Annotated[tuple[tuple[NotNegative, Spread], ...] | None, AfterValidator(_rising)]  # depths, and across the plane there
 
 
-class Config(BaseModel):
+class Config(SequenceFields):
     """Fields of `conf/segment.yaml`."""
 
     model_config = ConfigDict(extra="forbid")
@@ -61,7 +66,9 @@ class Config(BaseModel):
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
     lag_sigma_s: NotNegative = 0.0
-    sequence: Path | None = None
+    image: FrameName | None = None
+    config: Path | None = None
+    clip: Rectangle | None = None
     surface: Path | None = None
     tissue_m_s: Speed | None = None
     tissue_sigma_m_s: SpeedSigma = 25.0
@@ -79,9 +86,14 @@ class Config(BaseModel):
     def _one_source(self) -> "Config":
         if (self.capture is None) == (self.sequence is None):
             raise ValueError(f"expected capture or sequence, found {'neither' if self.capture is None else 'both'}")
-        for name, value in (("lag_s", self.lag_s), ("lag_sigma_s", self.lag_sigma_s)):
-            if self.sequence is not None and value != 0:
-                raise ValueError(f"{name}: expected none with a sequence, whose poses are those of its images, found {value:g}")
+        if self.capture is not None and self.config is not None:
+            raise ValueError("config: expected a configuration with a sequence only, found one with a capture")
+        if self.sequence is not None and self.lag_sigma_s != 0:
+            raise ValueError(f"lag_sigma_s: expected none with a sequence, without covariances, found {self.lag_sigma_s:g}")
+        if self.target is not None and self.probe is None:
+            raise ValueError(
+                f"target: expected a probe with it, whose calibration holds in that frame, found {self.target} alone"
+            )
         if self.diameter_mm[0] >= self.diameter_mm[1]:
             raise ValueError(f"diameter_mm: expected the least before the most, found {list(self.diameter_mm)}")
         return self
@@ -106,7 +118,8 @@ def run(config: Config) -> None:
         If the input is incomplete or damaged, there is no tube where one is looked for, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    inputs = [path for path in (config.capture, config.probe, config.sequence, config.surface) if path is not None]
+    sources = (config.capture, config.probe, config.sequence, config.config, config.surface)
+    inputs = [path for path in sources if path is not None]
     atomic.check_folder(config.out, metrics.FILE, inputs=inputs)
     skin = None if config.surface is None else containment.read_skin(config.surface)
     scans = read(config)
@@ -130,14 +143,26 @@ def run(config: Config) -> None:
 
 
 def read(config: Config) -> Scans:
-    """The B-scans in the world."""
-    if config.capture is None:
-        assert config.sequence is not None
-        return freehand_scans.of_sequence(config.sequence, config.probe, None, config.tissue_m_s)
+    """The B-scans in the world, or the parts of them within the clip."""
+    if config.sequence is not None:
+        return read_sequence(config, config.sequence)
+    assert config.capture is not None
     sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
     unsure = Unsure(config.lag_sigma_s, config.tissue_sigma_m_s)
-    return freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s, unsure)
+    scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s, unsure)
+    return scans if config.clip is None else freehand_scans.cut(scans, Clip(*config.clip))
+
+
+def read_sequence(config: Config, path: Path) -> Scans:
+    """The B-scans of a sequence in its reference frame, or the parts of them within the clip."""
+    plus = None if config.config is None else plus_config.read_config(config.config)
+    names = config.frame_names(FrameNames() if plus is None else plus.names)
+    probe = None if config.probe is None else probe_files.read(config.probe)
+    fixed = {} if plus is None else plus.transforms
+    scans = freehand_scans.of_sequence(path, names, probe, fixed, config.lag_s, config.tissue_m_s)
+    clip = Clip(*config.clip) if config.clip is not None else None if plus is None or plus.volume is None else plus.volume.clip
+    return scans if clip is None else freehand_scans.cut(scans, clip)
 
 
 def found_in(scans: Scans, config: Config, skin: trimesh.Trimesh | None) -> Segmented:

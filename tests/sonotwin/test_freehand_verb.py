@@ -88,7 +88,53 @@ def test_a_sequence_by_the_configuration_of_plus(reconstructed, tmp_path, capsys
     np.testing.assert_allclose(volume.spacing, 0.8)
     np.testing.assert_allclose(volume.directions, np.eye(3), atol=1e-12)
     assert np.linalg.norm(ball_of(tmp_path / "out" / "volume.nrrd")[0] - sweep_sets.BALL) < 0.4
-    assert "voxels of 0.8 mm, by " in capsys.readouterr().out
+    assert "voxels of 0.8 mm, aligned, maximum, nearest by " in capsys.readouterr().out
+
+
+def test_what_is_given_wins_over_a_configuration(reconstructed, tmp_path, capsys):
+    """Each field by itself; what isn't given stays the configuration's: here holes, which it leaves open."""
+    (tmp_path / "plus.xml").write_text(PLUS)
+    source = [f"sequence={reconstructed / 'sequence.igs.mha'}", f"config={tmp_path / 'plus.xml'}", f"out={tmp_path / 'out'}"]
+    assert main(["freehand", *source, "spacing_mm=1.5", "compounding=mean", "clip=[20,20,40,60]", "extent=principal"]) == 0
+    said = capsys.readouterr().out
+    assert "voxels of 1.5 mm, principal, mean, nearest by " in said
+    assert "plus.xml but for spacing_mm, extent, compounding, clip:" in said
+    volume = volumes.read_volume(tmp_path / "out" / "volume.nrrd")
+    np.testing.assert_allclose(volume.spacing, 1.5)
+    assert np.abs(volume.directions - np.eye(3)).max() > 0.1
+    assert set(np.unique(volume.voxels)) - {0, 20, 200}, "means, where the maximum has two levels"
+    figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert figures["pasted_fraction"] == figures["filled_fraction"]
+    assert main(["freehand", *source, "hole_voxels=9", "tissue_m_s=1450"]) == 0
+    figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert figures["speed_m_per_s"] == 1450 and figures["filled_fraction"] >= figures["pasted_fraction"]
+
+
+def test_a_calibration_wins_over_that_of_a_configuration_and_of_the_sequence(capture, reconstructed, tmp_path):
+    """Theirs are 3 mm too deep; the configuration has no element for the volume, so that is as usual."""
+    probe = sweep_part.read_sweep(capture).probe
+    deeper = probe.target_from_image.copy()
+    deeper[:3, 3] += 3 * deeper[:3, 1]
+    wrong = sequences.target_from_pixel(type(probe)(deeper, probe.scale))
+    text = " ".join(map(repr, wrong.ravel().tolist()))
+    (tmp_path / "plus.xml").write_text(
+        f'<PlusConfiguration><CoordinateDefinitions><Transform From="Image" To="Probe" Matrix="{text}"/></CoordinateDefinitions>'
+        "</PlusConfiguration>"
+    )
+    source = [f"sequence={reconstructed / 'sequence.igs.mha'}", f"config={tmp_path / 'plus.xml'}"]
+    assert main(["freehand", *source, f"out={tmp_path / 'wrong'}"]) == 0
+    right, away = ball_of(reconstructed / "volume.nrrd")[0], ball_of(tmp_path / "wrong" / "volume.nrrd")[0]
+    assert np.linalg.norm(away - right) == pytest.approx(3, abs=0.1), "the configuration's before the sequence's"
+    probe_files.write(tmp_path / "probe.yaml", probe)
+    assert main(["freehand", *source, f"probe={tmp_path / 'probe.yaml'}", f"out={tmp_path / 'right'}"]) == 0
+    assert np.linalg.norm(ball_of(tmp_path / "right" / "volume.nrrd")[0] - right) < 0.05
+
+
+def test_a_late_sequence_in_the_trackers_frame(capture, reconstructed, tmp_path):
+    """As PLUS records it, poses at the late stamps of the images: the lag puts the ball where the capture does."""
+    path = sweep_sets.recorded(tmp_path / "s.igs.nrrd", capture, sweep_part.read_sweep(capture).probe)
+    assert main(["freehand", f"sequence={path}", "reference=Tracker", f"lag_s={LAG_S}", f"out={tmp_path / 'out'}"]) == 0
+    assert np.linalg.norm(ball_of(tmp_path / "out" / "volume.nrrd")[0] - ball_of(reconstructed / "volume.nrrd")[0]) < 0.05
 
 
 def test_fields_of_the_volume(capture, tmp_path, capsys):
@@ -151,12 +197,18 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, recon
     assert complaint() == "freehand: expected capture or sequence, found neither"
     assert complaint(f"capture={bare}") == f"{bare}: expected the probe's calibration, found none; give probe=..."
     assert complaint(f"capture={capture}", "config=a.xml").startswith("freehand: config: expected a configuration with a seq")
-    assert complaint(f"sequence={sequence}", "lag_s=0.1").startswith("freehand: lag_s: expected none with a sequence")
-    assert complaint(f"sequence={sequence}", "probe=a", "config=b").startswith("freehand: probe: expected none with a config")
+    assert complaint(f"sequence={sequence}", "lag_sigma_s=0.1").startswith("freehand: lag_sigma_s: expected none with a seq")
+    assert complaint(f"sequence={sequence}", "reference=Stylus").startswith(
+        f"{sequence}: transforms: expected some that lead from Image to Stylus, found ImageToProbe"
+    )
+    assert complaint(f"sequence={sequence}", "reference=tracker").startswith("freehand: reference: expected ")
+    assert complaint(f"sequence={sequence}", "target=Stylus").startswith("freehand: target: expected a probe with it")
+    assert complaint(f"capture={capture}", "image=Image").startswith("freehand: image: expected none without a sequence")
     both = ["compounding=integer_mean", "interpolation=linear"]
     assert complaint(f"capture={capture}", *both).startswith("freehand: interpolation: expected nearest with integer_mean")
-    both = [f"sequence={sequence}", "config=a.xml", "tissue_m_s=1450"]
-    assert complaint(*both).startswith("freehand: tissue_m_s: expected none with a config")
+    (tmp_path / "linear.xml").write_text('<VolumeReconstruction OutputSpacing="1 1 1" Interpolation="LINEAR"/>')
+    both = [f"sequence={sequence}", f"config={tmp_path / 'linear.xml'}", "compounding=integer_mean"]
+    assert complaint(*both).startswith("freehand: compounding: expected interpolation=nearest with integer_mean")
     for field in ("spacing_mm=0.001", "most_gib=2000", "lag_s=-1e7", "tissue_m_s=10"):
         assert complaint(f"capture={capture}", field).startswith(f"freehand: {field.partition('=')[0]}: expected ")
     assert complaint(f"capture={capture}", "spacing_mm=0.01").startswith("volume: expected at most 4.0 GiB, found ")

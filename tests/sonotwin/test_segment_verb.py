@@ -8,6 +8,8 @@ import pytest
 import trimesh
 from scipy.ndimage import gaussian_filter
 
+from recon.capture import sweep_part
+from recon.freehand import sequences
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
@@ -71,6 +73,35 @@ def test_the_mass_is_where_it_is_and_as_large(segmented):
     assert figures["mass0_depth_mm"] == pytest.approx(15 - RADIUS, abs=0.6)
 
 
+def test_a_sequence_of_a_screen_shows_the_same_mass(capture, segmented, tmp_path):
+    """As PLUS records it, late and uncropped, with the calibration in its configuration: as of the capture's own B-scans."""
+    probe = sweep_part.read_sweep(capture).probe
+    path = sweep_sets.recorded(tmp_path / "mass.igs.mha", capture, screen=True)
+    across, above = sweep_sets.BORDER
+    on_screen = sequences.target_from_pixel(probe) @ rigid.transform(np.eye(3), [-across, -above, 0])
+    text = " ".join(map(repr, on_screen.ravel().tolist()))
+    (tmp_path / "plus.xml").write_text(
+        f'<PlusConfiguration><CoordinateDefinitions><Transform From="Screen" To="Probe" Matrix="{text}"/></CoordinateDefinitions>'
+        "</PlusConfiguration>"
+    )
+    source = [f"sequence={path}", f"config={tmp_path / 'plus.xml'}", "image=Screen", "reference=Tracker", f"lag_s={LAG_S}"]
+    clip = f"clip=[{across},{above},{SIZE[0]},{SIZE[1]}]"
+    assert main(["segment", *source, clip, f"out={tmp_path / 'out'}"]) == 0
+    ours, theirs = (json.loads((folder / "metrics.json").read_text()) for folder in (segmented, tmp_path / "out"))
+    assert theirs["masses"] == 1 and theirs["mass0_volume_mm3"] == pytest.approx(ours["mass0_volume_mm3"], rel=0.02)
+    for axis in "xyz":
+        assert theirs[f"mass0_centre_{axis}_mm"] == pytest.approx(ours[f"mass0_centre_{axis}_mm"], abs=0.1)
+
+
+def test_a_clip_of_a_capture_keeps_the_mass_in_its_place(capture, segmented, tmp_path):
+    """Cut by 8 columns and 12 rows, over the tissue beside the mass."""
+    clip = f"clip=[8,12,{SIZE[0] - 16},{SIZE[1] - 20}]"
+    assert main(["segment", f"capture={capture}", f"lag_s={LAG_S}", clip, f"out={tmp_path / 'out'}"]) == 0
+    ours, cut = (json.loads((folder / "metrics.json").read_text()) for folder in (segmented, tmp_path / "out"))
+    for axis in "xyz":
+        assert cut[f"mass0_centre_{axis}_mm"] == pytest.approx(ours[f"mass0_centre_{axis}_mm"], abs=0.1)
+
+
 def test_files(segmented):
     names = {path.name for path in segmented.iterdir()}
     assert {"mass0.ply", "mass0.glb", "metrics.json", "overlay0.png"} <= names
@@ -95,6 +126,8 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, tmp_p
     assert f"{tmp_path / 'b.ply'}: expected a surface" in complaint(f"capture={capture}", f"surface={tmp_path / 'b.ply'}")
     (tmp_path / "c.stl").write_bytes(b"solid")
     assert complaint(f"capture={capture}", f"surface={tmp_path / 'c.stl'}").endswith("expected a surface as PLY, found .stl")
+    assert complaint(f"capture={capture}", "config=a.xml").startswith("segment: config: expected a configuration with a seq")
+    assert complaint(f"capture={capture}", "reference=Tracker").startswith("segment: reference: expected none without a seq")
     assert complaint(f"capture={capture}", "lag_s=1e9").startswith("segment: lag_s: expected ")
     assert complaint(f"capture={capture}", "tissue_m_s=1").startswith("segment: tissue_m_s: expected ")
     assert complaint(f"capture={capture}", "diameter_mm=[9,5]").startswith("segment: diameter_mm: expected the least before")

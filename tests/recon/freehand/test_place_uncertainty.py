@@ -9,7 +9,7 @@ from recon.freehand.volume_compounding import Grid
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
-from recon.probe_calibration import sound_in_water
+from recon.probe_calibration import point_calibration, sound_in_water
 from recon.probe_calibration.point_calibration import NAMES
 
 SHAPE = (408, 321)
@@ -46,6 +46,16 @@ def test_places_scatter_as_predicted(rig, pose, rng):
         places.append(rigid.apply(moved, drawn.to_target(PIXELS)))
     scatter = np.sqrt(np.var(places, axis=0).sum(axis=1))
     assert scatter == pytest.approx(predicted, rel=0.04)
+
+
+def test_a_cut_image_keeps_its_places_and_their_errors(rig, pose, rng):
+    half = np.diag([2e-4, 3e-4, 2e-3, 2e-3, 2e-3, 0.05, 0.05, 0.05]) @ (np.eye(8) + 0.3 * rng.standard_normal((8, 8)))
+    whole = probe_of(rig, half)
+    cut = place_uncertainty.from_pixel(whole, (60, 90))
+    assert np.abs(cut.to_target(PIXELS - (60, 90)) - whole.to_target(PIXELS)).max() < 1e-9
+    np.testing.assert_allclose(
+        point_calibration.point_covariance(cut, PIXELS - (60, 90)), point_calibration.point_covariance(whole, PIXELS), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("part", ["own", "shared", "lag", "depth", "probe"])

@@ -1,11 +1,14 @@
 """A sequence is reconstructed as the PLUS toolkit's configuration says."""
 
+import re
+
 import numpy as np
 import pytest
 
 from recon.errors import InputError
 from recon.files import volumes
 from recon.freehand import plus_config, sequences, volume_compounding
+from recon.freehand.scans import VolumeSettings
 from recon.freehand.volume_compounding import Clip
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
@@ -27,24 +30,33 @@ def test_what_is_in_a_configuration(tmp_path):
     (tmp_path / "c.xml").write_text(CONFIG)
     config = plus_config.read_config(tmp_path / "c.xml")
     assert np.array_equal(config.transforms["ImageToProbe"], [[0.1, 0, 0, 1], [0, 0.1, 0, 0.0025], [0, 0, 0.1, 3], [0, 0, 0, 1]])
-    assert list(config.spacing) == [0.5, 0.6, 0.7] and config.clip == Clip(3, 4, 11, 21)
-    assert (config.interpolation, config.compounding) == ("nearest", "integer_mean")
-    assert config.holes == plus_config.Sticks(9, 1)
+    assert config.volume == VolumeSettings((0.5, 0.6, 0.7), "aligned", "integer_mean", "nearest", Clip(3, 4, 11, 21), 9, 1)
+    assert config.names == ("Image", "Probe", "Reference")
 
 
 def test_what_a_configuration_may_leave_out(tmp_path):
     text = '<A><VolumeReconstruction OutputSpacing="1 1 1" Interpolation="LINEAR" ClipRectangleSize="0 0"/></A>'
     (tmp_path / "c.xml").write_text(text)
     config = plus_config.read_config(tmp_path / "c.xml")
-    assert (config.transforms, config.clip, config.holes) == ({}, None, None)
-    assert (config.interpolation, config.compounding) == ("linear", "mean")
+    assert config.transforms == {}
+    assert config.volume == VolumeSettings((1, 1, 1), "aligned", "mean", "linear", None, 0, 1)
+
+
+def test_a_configuration_without_a_reconstruction_gives_its_transforms(tmp_path):
+    """As most do, of devices and of calibrations."""
+    path = tmp_path / "c.xml"
+    path.write_text(re.sub("<VolumeReconstruction.*</VolumeReconstruction>", "", CONFIG, flags=re.DOTALL))
+    config = plus_config.read_config(path)
+    assert list(config.transforms) == ["ImageToProbe"] and config.volume is None
+    path.write_text("<PlusConfiguration><DataCollection/></PlusConfiguration>")
+    with pytest.raises(InputError, match=r"PlusConfiguration: expected an element VolumeReconstruction or CoordinateDefinitions"):
+        plus_config.read_config(path)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
         ("</Plus", "</Minus", "expected XML, found it broken: mismatched tag"),
-        ("VolumeReconstruction", "Reconstruction", "VolumeReconstruction: expected an element, found none"),
         ("0.1 0 0 1\n", "0.1 0 0\n", "ImageToProbe: expected 16 finite numbers, found '0.1 0 0"),
         ("2.5e-003", "nan", "ImageToProbe: expected 16 finite numbers"),
         ("0 0 0 1", "0 0 0 2", "ImageToProbe: expected an invertible matrix with the last row 0 0 0 1"),
