@@ -24,7 +24,12 @@ FrameName = Annotated[str, Field(pattern=r"^[A-Z]\w*$")]  # of a frame of refere
 
 FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 TRANSFORM = re.compile(r"([A-Z]\w*?)To([A-Z]\w*)")
-ORIENTATIONS = {"MF": (1, 1), "UF": (1, -1), "MN": (-1, 1), "UN": (-1, -1)}  # steps along v and u that turn one into MF
+ORIENTATIONS = {
+    "MF": (1, 1),
+    "UF": (1, -1),
+    "MN": (-1, 1),
+    "UN": (-1, -1),
+}  # steps along v and u that turn one into MF: x towards the array's marked side, y far from it
 STRUCTURE = {  # fields given by the images and the format, in either of the two
     *("ObjectType", "NDims", "DimSize", "Kinds", "ElementType", "ElementNumberOfChannels", "ElementSpacing", "Offset"),
     *("TransformMatrix", "CenterOfRotation", "AnatomicalOrientation", "BinaryData", "BinaryDataByteOrderMSB", "CompressedData"),
@@ -61,7 +66,7 @@ class Frames:
     times_s: Array  # (n,), NaN if the file has none
     transforms: dict[str, Array]  # "ProbeToTracker": tracker_from_probe (n, 4, 4), mm; the identity in frames that have none
     valid: dict[str, NDArray[np.bool_]]  # (n,) by the transforms' names; and by "Image", if there are images
-    images: NDArray[np.uint8] | None = None  # (n, h, w), the array's marked side left and depth down; None if tracking only
+    images: NDArray[np.uint8] | None = None  # (n, h, w), the array's marked side right and depth down; None if tracking only
     frame_fields: dict[str, tuple[str, ...]] = field(default_factory=dict)  # n texts; empty where a frame has none
     fields: dict[str, str] = field(default_factory=dict)  # of the whole file
 
@@ -249,7 +254,7 @@ def _images(file: ImageFile) -> Iterator[NDArray[np.uint8]]:
     if file.pixel != np.uint8:
         raise file.fault("ElementType", "MET_UCHAR", file.fields["ElementType"])
     found = file.fields.get("UltrasoundImageOrientation", file.fields.get("ultrasound image orientation", "MF"))
-    if found[:2] not in ORIENTATIONS:  # a third letter is the order of the frames
+    if found[:2] not in ORIENTATIONS:  # a third letter is the direction across the image plane, of 3-D probes
         raise file.fault("UltrasoundImageOrientation", f"one of {', '.join(ORIENTATIONS)}", found)
     down, right = ORIENTATIONS[found[:2]]
     for block in medical_images.blocks(file, shape[0] * shape[1]):

@@ -183,7 +183,8 @@ def test_quirks_of_plus(tmp_path):
     assert list(read.times_s) == [1.5, 1.6]
 
 
-def test_images_are_turned_so_that_the_marked_side_is_left(tmp_path):
+def test_images_are_turned_so_that_the_marked_side_is_right(tmp_path):
+    """As PLUS does: M is the direction in which x grows, F that in which y does."""
     turned = [sequences.read_sequence(plus_file(tmp_path, orientation=o)).images[0] for o in ("MF", "UF", "MN", "UNA")]
     assert [list(image[0]) for image in turned] == [[0, 1, 2], [2, 1, 0], [3, 4, 5], [5, 4, 3]]
 
