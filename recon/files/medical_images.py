@@ -27,7 +27,12 @@ META_TYPES = {
     "MET_FLOAT": "f4",
     "MET_DOUBLE": "f8",
 }
-NRRD_BYTES = ("unsigned char", "uchar", "uint8", "uint8_t")  # one type, four names
+NRRD_TYPES = {  # those of sequences, each with many names
+    **dict.fromkeys(("unsigned char", "uchar", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(("unsigned short", "unsigned short int", "ushort", "uint16", "uint16_t"), "u2"),
+    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
+}
+NO_PIXELS = ("MET_OTHER", "MET_NONE", "")  # types, in either format, of PLUS's files without images
 LONGEST_LINE = 1 << 20  # bytes; a file of another kind may have no line breaks at all
 READ_AT_ONCE = 1 << 18  # bytes
 MOST_UNPACKED = 1100  # times the packed size: deflate reaches 1032
@@ -40,15 +45,16 @@ class ImageFile:
     path: Path  # of the header
     fields: dict[str, str]  # as they stand in the header, in its order
     size: tuple[int, ...]  # px along each axis, the fastest first
-    pixel: np.dtype
+    pixel: np.dtype  # of no bytes where there are no pixels
     packed: bool  # by zlib or gzip
     data_path: Path
     data_offset: int  # bytes before the pixels
+    channels: int = 1  # numbers a pixel, where they have no axis of their own
 
     @property
     def data_bytes(self) -> int:
         """Unpacked size of all pixels."""
-        return math.prod(self.size) * self.pixel.itemsize
+        return math.prod(self.size) * self.channels * self.pixel.itemsize
 
     def fault(self, field: str, expected: object, found: object) -> InputError:
         """The error of a field of this file."""
@@ -150,10 +156,9 @@ def _metaimage(path: Path, stream: BinaryIO) -> ImageFile:
         raise fault(path, "DimSize", f"{dimensions[0]} numbers as in NDims", repr(fields["DimSize"]))
     if fields.get("BinaryData", "True").lower() != "true":
         raise fault(path, "BinaryData", "True", fields["BinaryData"])
-    if fields.get("ElementNumberOfChannels", "1") != "1":
-        raise fault(path, "ElementNumberOfChannels", 1, fields["ElementNumberOfChannels"])
+    (channels,) = whole_numbers(path, "ElementNumberOfChannels", fields.get("ElementNumberOfChannels", "1"), 1, 1)
     kind = _value(path, fields, "ElementType")
-    if kind not in META_TYPES:
+    if kind not in META_TYPES and kind not in NO_PIXELS:
         raise fault(path, "ElementType", f"one of {', '.join(META_TYPES)}", kind)
     big = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False")).lower() == "true"
     local = fields["ElementDataFile"].upper() == "LOCAL"
@@ -161,15 +166,16 @@ def _metaimage(path: Path, stream: BinaryIO) -> ImageFile:
         path,
         fields,
         size,
-        np.dtype((">" if big else "<") + META_TYPES[kind]),
+        np.dtype((">" if big else "<") + META_TYPES.get(kind, "V0")),
         fields.get("CompressedData", "False").lower() == "true",
         path if local else path.parent / fields["ElementDataFile"],
         stream.tell() if local else 0,
+        channels,
     )
 
 
 def _nrrd(path: Path, stream: BinaryIO) -> ImageFile:
-    """The header of an NRRD file of bytes, the pixels of sequences; files of other pixels are read by pynrrd."""
+    """The header of an NRRD file of levels of 8 or 16 bits, the pixels of sequences; files of others are read by pynrrd."""
     fields: dict[str, str] = {}
     _line(path, stream)
     while (line := _line(path, stream)).strip():
@@ -185,13 +191,15 @@ def _nrrd(path: Path, stream: BinaryIO) -> ImageFile:
     size = whole_numbers(path, "sizes", _value(path, fields, "sizes"))
     if whole_numbers(path, "dimension", _value(path, fields, "dimension")) != (len(size),):
         raise fault(path, "sizes", f"{fields['dimension']} numbers as in dimension", repr(fields["sizes"]))
-    if _value(path, fields, "type") not in NRRD_BYTES:
-        raise fault(path, "type", "unsigned char", fields["type"])
+    kind = _value(path, fields, "type")
+    if kind not in NRRD_TYPES and kind not in NO_PIXELS:
+        raise fault(path, "type", "unsigned char, unsigned short or short", kind)
+    pixel = np.dtype((">" if fields.get("endian", "little") == "big" else "<") + NRRD_TYPES.get(kind, "V0"))
     encoding = _value(path, fields, "encoding")
     if encoding not in ("raw", "gz", "gzip"):
         raise fault(path, "encoding", "raw or gzip", encoding)
     data = path.parent / detached if detached else path
-    return ImageFile(path, fields, size, np.dtype("u1"), encoding != "raw", data, 0 if detached else stream.tell())
+    return ImageFile(path, fields, size, pixel, encoding != "raw", data, 0 if detached else stream.tell())
 
 
 def _line(path: Path, stream: BinaryIO) -> str:

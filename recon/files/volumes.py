@@ -123,6 +123,10 @@ def _read_metaimage(path: Path) -> Volume:
     file = medical_images.read_header(path)
     if len(file.size) != 3 or 0 in file.size:
         raise file.fault("DimSize", "3 numbers of voxels", " ".join(map(str, file.size)))
+    if file.channels != 1:
+        raise file.fault("ElementNumberOfChannels", 1, file.channels)
+    if file.pixel.itemsize == 0:
+        raise file.fault("ElementType", f"one of {', '.join(medical_images.META_TYPES)}", file.fields["ElementType"])
     (data,) = medical_images.blocks(file, file.data_bytes)
     fields = file.fields
     origin = fields.get("Offset", fields.get("Position", fields.get("Origin", "0 0 0")))

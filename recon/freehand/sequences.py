@@ -17,6 +17,7 @@ from pydantic import Field
 from recon.errors import InputError
 from recon.files import atomic, medical_images
 from recon.files.medical_images import ImageFile
+from recon.freehand import sequence_images
 from recon.model.probe import ProbeCalibration
 
 Array = NDArray[np.float64]
@@ -24,12 +25,6 @@ FrameName = Annotated[str, Field(pattern=r"^[A-Z]\w*$")]  # of a frame of refere
 
 FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 TRANSFORM = re.compile(r"([A-Z]\w*?)To([A-Z]\w*)")
-ORIENTATIONS = {
-    "MF": (1, 1),
-    "UF": (1, -1),
-    "MN": (-1, 1),
-    "UN": (-1, -1),
-}  # steps along v and u that turn one into MF: x towards the array's marked side, y far from it
 STRUCTURE = {  # fields given by the images and the format, in either of the two
     *("ObjectType", "NDims", "DimSize", "Kinds", "ElementType", "ElementNumberOfChannels", "ElementSpacing", "Offset"),
     *("TransformMatrix", "CenterOfRotation", "AnatomicalOrientation", "BinaryData", "BinaryDataByteOrderMSB", "CompressedData"),
@@ -63,7 +58,7 @@ class FrameNames(NamedTuple):
 class Frames:
     """A tracked sequence of n frames."""
 
-    times_s: Array  # (n,), NaN if the file has none
+    times_s: Array  # (n,), NaN where a frame has none
     transforms: dict[str, Array]  # "ProbeToTracker": tracker_from_probe (n, 4, 4), mm; the identity in frames that have none
     valid: dict[str, NDArray[np.bool_]]  # (n,) by the transforms' names; and by "Image", if there are images
     images: NDArray[np.uint8] | None = None  # (n, h, w), the array's marked side right and depth down; None if tracking only
@@ -156,11 +151,10 @@ def read_sequence(path: Path) -> Frames:
     """
     file = medical_images.read_header(path)
     frames = _without_images(file)
-    count, shape = _layout(file)
-    if not _has_images(file):
+    if not sequence_images.has_images(file):
         return frames
-    images = np.empty((count, *shape), np.uint8)
-    for image, read in zip(images, _images(file), strict=True):
+    images = np.empty((len(frames.times_s), *sequence_images.turned_shape(file)), np.uint8)
+    for image, read in zip(images, sequence_images.images(file), strict=True):
         image[:] = read
     return Frames(frames.times_s, frames.transforms, frames.valid, images, frames.frame_fields, frames.fields)
 
@@ -173,15 +167,15 @@ def read_tracking(path: Path) -> Frames:
 def image_shape(path: Path) -> tuple[int, int]:
     """Height and width of a sequence's images. Raises InputError if it has none."""
     file = medical_images.read_header(path)
-    if not _has_images(file):
+    if not sequence_images.has_images(file):
         raise file.fault("DimSize", "images", "tracking only")
-    return _layout(file)[1]
+    return sequence_images.turned_shape(file)
 
 
 def stream_images(path: Path) -> Iterator[NDArray[np.uint8]]:
     """The images (h, w) of a sequence one by one; none if it is tracking only. Raises InputError where the data ends early."""
     file = medical_images.read_header(path)
-    return _images(file) if _has_images(file) else iter(())
+    return sequence_images.images(file) if sequence_images.has_images(file) else iter(())
 
 
 def write_sequence(path: Path, frames: Frames) -> None:
@@ -209,13 +203,13 @@ def write_sequence(path: Path, frames: Frames) -> None:
 
 
 def _without_images(file: ImageFile) -> Frames:
-    count, _ = _layout(file)
+    count = sequence_images.layout(file).count
     fields = {name: value for name, value in file.fields.items() if not FRAME_FIELD.fullmatch(name)}
     kept = {name: value for name, value in fields.items() if name not in STRUCTURE}
     table = _frame_table(file, count)
     transforms, valid = {}, {}
-    if _has_images(file):
-        status = table.pop("ImageStatus", table.pop("Status", [""] * count))
+    status = table.pop("ImageStatus", table.pop("Status", [""] * count))
+    if sequence_images.has_images(file):
         valid["Image"] = np.array([word.upper() in ("", "OK") for word in status])
     for key in [key for key in table if key.endswith("Transform")]:
         name = key.removesuffix("Transform")
@@ -224,41 +218,7 @@ def _without_images(file: ImageFile) -> Frames:
         if any(word.upper() not in ("", "OK", "INVALID") for word in words):
             table[key + "Status"] = words
     times = np.array([_time(file, index, text) for index, text in enumerate(table.pop("Timestamp", [""] * count))])
-    if np.isnan(times).any() and not np.isnan(times).all():
-        raise file.fault(_key(int(np.isnan(times).argmax()), "Timestamp"), "a value as in other frames", "none")
     return Frames(times, transforms, valid, None, {name: tuple(texts) for name, texts in table.items()}, kept)
-
-
-def _layout(file: ImageFile) -> tuple[int, tuple[int, int]]:
-    """Number of frames, and height and width of an image; without kinds the last axis is time."""
-    kinds = file.fields.get("Kinds", file.fields.get("kinds", "")).split()
-    kinds = kinds or ["domain"] * (len(file.size) - 1) + ["list"]
-    if len(kinds) != len(file.size):
-        raise file.fault("Kinds", f"{len(file.size)} words", repr(" ".join(kinds)))
-    space = [length for length, kind in zip(file.size, kinds, strict=True) if kind in ("domain", "space")]
-    time = [length for length, kind in zip(file.size, kinds, strict=True) if kind in ("list", "time")]
-    if len(time) != 1 or len(space) not in (2, 3) or max(space[2:], default=1) > 1:
-        raise file.fault("DimSize", "width, height and the number of frames", f"{' '.join(map(str, file.size))}")
-    return time[0], (space[1], space[0])
-
-
-def _has_images(file: ImageFile) -> bool:
-    """Tracking alone is written with images of no pixels or of one, and without their status."""
-    _, shape = _layout(file)
-    status = any(re.fullmatch(r"Seq_Frame\d+_(Image)?Status", name) for name in file.fields)
-    return shape[0] * shape[1] > 1 or (shape == (1, 1) and status)
-
-
-def _images(file: ImageFile) -> Iterator[NDArray[np.uint8]]:
-    _, shape = _layout(file)
-    if file.pixel != np.uint8:
-        raise file.fault("ElementType", "MET_UCHAR", file.fields["ElementType"])
-    found = file.fields.get("UltrasoundImageOrientation", file.fields.get("ultrasound image orientation", "MF"))
-    if found[:2] not in ORIENTATIONS:  # a third letter is the direction across the image plane, of 3-D probes
-        raise file.fault("UltrasoundImageOrientation", f"one of {', '.join(ORIENTATIONS)}", found)
-    down, right = ORIENTATIONS[found[:2]]
-    for block in medical_images.blocks(file, shape[0] * shape[1]):
-        yield np.frombuffer(block, np.uint8).reshape(shape)[::down, ::right]
 
 
 def _frame_table(file: ImageFile, count: int) -> dict[str, list[str]]:
@@ -302,13 +262,10 @@ def _usable(frames: Frames, name: str) -> Array:
 def _check(path: Path, frames: Frames) -> None:
     """Refuse frames that would not be read back the same."""
     count = len(frames.times_s)
-    known = np.isfinite(frames.times_s)
     if count == 0:
         raise medical_images.fault(path, "frames", "at least one", "none")
-    if (not known.all() and known.any()) or np.isinf(frames.times_s).any():
-        raise medical_images.fault(
-            path, _key(int(known.argmin()), "Timestamp"), "a finite number", frames.times_s[known.argmin()]
-        )
+    if (endless := np.isinf(frames.times_s)).any():
+        raise medical_images.fault(path, _key(int(endless.argmax()), "Timestamp"), "a finite number or NaN", "an infinite one")
     images = frames.images
     if images is not None and (images.ndim != 3 or images.dtype != np.uint8 or len(images) != count or 0 in images.shape):
         raise medical_images.fault(path, "images", f"{count} x height x width of uint8", f"{images.shape} of {images.dtype}")

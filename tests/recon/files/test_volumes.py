@@ -110,6 +110,17 @@ def test_a_fault_in_one_line(volume, tmp_path, change, line):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_colours_and_no_pixels_are_no_volume(volume, tmp_path):
+    """They are images of sequences, and tracking alone."""
+    path, colour = tmp_path / "v.mha", np.stack([volume.voxels.astype(np.uint8)] * 3, axis=-1)
+    SimpleITK.WriteImage(SimpleITK.GetImageFromArray(colour, isVector=True), path)
+    with pytest.raises(InputError, match=r"v.mha: ElementNumberOfChannels: expected 1, found 3"):
+        volumes.read_volume(path)
+    path.write_text("NDims = 3\nDimSize = 1 1 2\nElementType = MET_OTHER\nElementDataFile = LOCAL\n")
+    with pytest.raises(InputError, match=r"v.mha: ElementType: expected one of MET_UCHAR, .*, found MET_OTHER"):
+        volumes.read_volume(path)
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_no_file(tmp_path, suffix):
     with pytest.raises(InputError, match=r"expected a file, found none"):

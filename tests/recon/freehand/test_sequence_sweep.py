@@ -63,6 +63,16 @@ def test_a_repeated_time_stamp_counts_once(tmp_path):
     assert len(sweep.times) == 12 and len(sweep.track.times) == 11
 
 
+def test_frames_without_a_time_stamp_have_no_place_in_time(tmp_path):
+    """Their own poses hold without a lag; with one, and for a latency, they are left out."""
+    times_s = TIMES_S.copy()
+    times_s[[3, 8]] = np.nan
+    sweep = sequence_sweep.read_sequence_sweep(written(tmp_path, times_s), FrameNames(reference="Tracker"))
+    assert np.isfinite(sweep.poses()).all() and len(sweep.track.times) == 10
+    assert np.flatnonzero(np.isnan(sweep.poses(0.03)[:, 0, 0])).tolist() == [0, 3, 8]
+    assert sweep.timed().frames.tolist() == [0, 1, 2, 4, 5, 6, 7, 9, 10, 11] and len(sweep.timed().times) == 10
+
+
 def test_time_stamps_that_tell_nothing(tmp_path):
     def complaint(times_s, lag_s=0.1):
         path = written(tmp_path, times_s)
