@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 COMPOUNDING: dict[str, Compounding] = {"MEAN": "integer_mean", "MAXIMUM": "maximum", "LATEST": "latest"}
 INTERPOLATION: dict[str, Interpolation] = {"NEAREST_NEIGHBOR": "nearest", "LINEAR": "linear"}
+EARLIER = {"WEIGHTED_AVERAGE": "MEAN", "MAXIMUM": "MAXIMUM"}
 SWITCH = {"ON": True, "TRUE": True, "OFF": False, "FALSE": False}
 
 
@@ -98,11 +99,18 @@ def _volume(path: Path, element: Element) -> VolumeSettings:
     if spacing.min() <= 0:
         raise fault(path, "OutputSpacing", "3 lengths above 0", repr(element.get("OutputSpacing")))
     interpolation = INTERPOLATION[_choice(path, element, "Interpolation", "NEAREST_NEIGHBOR", INTERPOLATION)]
-    compounding = COMPOUNDING[_choice(path, element, "CompoundingMode", "MEAN", COMPOUNDING)]
+    compounding = COMPOUNDING[_choice(path, element, "CompoundingMode", _earlier_compounding(path, element), COMPOUNDING)]
     if interpolation == "linear" and compounding == "integer_mean":
         compounding = "mean"  # PLUS rounds it at each pixel, to the nearest level, and its weights to 1/255
     x, y, z = spacing.tolist()
     return VolumeSettings((x, y, z), "aligned", compounding, interpolation, _clip(path, element), *_sticks(path, element))
+
+
+def _earlier_compounding(path: Path, element: Element) -> str:
+    """The compounding as configurations of before 2014 have it, by two attributes."""
+    if _choice(path, element, "Calculation", "WEIGHTED_AVERAGE", EARLIER) == "MAXIMUM":
+        return "MAXIMUM"
+    return "MEAN" if SWITCH[_choice(path, element, "Compounding", "ON", SWITCH)] else "LATEST"
 
 
 def _clip(path: Path, element: Element) -> Clip | None:

@@ -42,6 +42,21 @@ def test_what_a_configuration_may_leave_out(tmp_path):
     assert config.volume == VolumeSettings((1, 1, 1), "aligned", "mean", "linear", None, 0, 1)
 
 
+@pytest.mark.parametrize(
+    ("attributes", "compounding"),
+    [
+        ('Compounding="OFF"', "latest"),
+        ('Compounding="ON" Calculation="WEIGHTED_AVERAGE"', "integer_mean"),
+        ('Compounding="OFF" Calculation="MAXIMUM"', "maximum"),
+        ('Compounding="OFF" CompoundingMode="MEAN"', "integer_mean"),
+    ],
+)
+def test_compounding_as_before_2014(tmp_path, attributes, compounding):
+    """By two attributes, as PLUS still understands them; the newer one goes before."""
+    (tmp_path / "c.xml").write_text(f'<VolumeReconstruction OutputSpacing="1 1 1" {attributes}/>')
+    assert plus_config.read_config(tmp_path / "c.xml").volume.compounding == compounding
+
+
 def test_a_configuration_without_a_reconstruction_gives_its_transforms(tmp_path):
     """As most do, of devices and of calibrations."""
     path = tmp_path / "c.xml"
