@@ -29,9 +29,16 @@ SWITCH = {"ON": True, "TRUE": True, "OFF": False, "FALSE": False}
 class PlusConfig:
     """The parts of a configuration on coordinates and on the reconstruction."""
 
+    path: Path
     transforms: dict[str, Array]  # "ImageToProbe": (4, 4), mm and px
     names: FrameNames = field(default_factory=FrameNames)  # those of image and reference that the reconstruction names
     volume: VolumeSettings | None = None  # along the reference frame's axes; None where there is no reconstruction
+    fan: str = ""  # angles of a fan-shaped clip, deg, as they stand there; empty without one
+
+    def check_clip(self) -> None:
+        """Refuse a fan-shaped clip, in whose place a rectangle may be given."""
+        if self.fan:
+            raise fault(self.path, "FanAngles", "none, as clips are rectangles; give clip=[u,v,width,height]", repr(self.fan))
 
 
 def read_config(path: Path) -> PlusConfig:
@@ -40,8 +47,7 @@ def read_config(path: Path) -> PlusConfig:
     Raises
     ------
     InputError
-        If the file is missing or has neither, or has settings unknown here: a fan-shaped clip, another way of compounding or of
-        filling holes.
+        If the file is missing or has neither, or has settings unknown here: another way of compounding or of filling holes.
     """
     path = Path(path)
     try:
@@ -57,10 +63,11 @@ def read_config(path: Path) -> PlusConfig:
     if element is None and not transforms:
         raise fault(path, root.tag, "an element VolumeReconstruction or CoordinateDefinitions with a Transform", "neither")
     if element is None:
-        return PlusConfig(transforms)
+        return PlusConfig(path, transforms)
     usual = FrameNames()
     image, reference = (element.get(f"{name}CoordinateFrame", name) for name in (usual.image, usual.reference))
-    return PlusConfig(transforms, FrameNames(image, usual.target, reference), _volume(path, element))
+    names = FrameNames(image, usual.target, reference)
+    return PlusConfig(path, transforms, names, _volume(path, element), _fan(path, element))
 
 
 def reconstruct_sequence(path: Path, config: PlusConfig) -> tuple[Reconstruction, Reconstruction]:
@@ -71,6 +78,7 @@ def reconstruct_sequence(path: Path, config: PlusConfig) -> tuple[Reconstruction
     Reconstruction, Reconstruction
         Before its holes are filled, and after; the same without filling.
     """
+    config.check_clip()
     scans = freehand_scans.of_sequence(path, config.names, fixed=config.transforms)
     try:
         return freehand_scans.volume(scans, config.volume or VolumeSettings())
@@ -91,10 +99,14 @@ def _transforms(path: Path, root: Element) -> dict[str, Array]:
     return transforms
 
 
-def _volume(path: Path, element: Element) -> VolumeSettings:
+def _fan(path: Path, element: Element) -> str:
     for name in ("FanAngles", "FanAnglesDeg"):
-        if element.get(name) and medical_images.numbers(path, name, element.get(name, ""), 2).any():
-            raise fault(path, name, "none, clips are rectangles", repr(element.get(name)))
+        if (angles := element.get(name)) and medical_images.numbers(path, name, angles, 2).any():
+            return angles
+    return ""
+
+
+def _volume(path: Path, element: Element) -> VolumeSettings:
     spacing = medical_images.numbers(path, "OutputSpacing", _text(path, element, "OutputSpacing"), 3)
     if spacing.min() <= 0:
         raise fault(path, "OutputSpacing", "3 lengths above 0", repr(element.get("OutputSpacing")))

@@ -100,6 +100,8 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     plus = None if config.config is None else plus_config.read_config(config.config)
+    if plus is not None and config.clip is None:
+        plus.check_clip()
     settings = settings_of(config, plus)
     inputs = [path for path in (config.capture, config.probe, config.sequence, config.config) if path is not None]
     atomic.check_folder(config.out, VOLUME, inputs=inputs)

@@ -110,6 +110,14 @@ def test_what_is_given_wins_over_a_configuration(reconstructed, tmp_path, capsys
     assert figures["speed_m_per_s"] == 1450 and figures["filled_fraction"] >= figures["pasted_fraction"]
 
 
+def test_a_rectangle_takes_the_place_of_a_fan(reconstructed, tmp_path, capsys):
+    (tmp_path / "fan.xml").write_text(PLUS.replace("Interp", 'FanAnglesDeg="-35 35" Interp'))
+    source = [f"sequence={reconstructed / 'sequence.igs.mha'}", f"config={tmp_path / 'fan.xml'}", f"out={tmp_path / 'out'}"]
+    assert main(["freehand", *source]) == 2
+    assert "FanAngles: expected none, as clips are rectangles; give clip=" in capsys.readouterr().err
+    assert main(["freehand", *source, "clip=[20,20,40,60]"]) == 0
+
+
 def test_a_calibration_wins_over_that_of_a_configuration_and_of_the_sequence(capture, reconstructed, tmp_path):
     """Theirs are 3 mm too deep; the configuration has no element for the volume, so that is as usual."""
     probe = sweep_part.read_sweep(capture).probe

@@ -80,7 +80,7 @@ def test_a_configuration_without_a_reconstruction_gives_its_transforms(tmp_path)
         ('"MEAN"', '"MEDIAN"', "CompoundingMode: expected one of MEAN, MAXIMUM, LATEST, found MEDIAN"),
         ('"STICK"', '"GAUSSIAN"', "HoleFilling: expected one element of type STICK, found GAUSSIAN"),
         ('"9"', '"nine"', "StickLengthLimit: expected a whole number of at least 1, found 'nine'"),
-        ('"FULL"', '"FULL" FanAngles="-30 30"', "FanAngles: expected none, clips are rectangles, found '-30 30'"),
+        ('"FULL"', '"FULL" FanAnglesDeg="-30"', "FanAnglesDeg: expected 2 finite numbers, found '-30'"),
     ],
 )
 def test_a_fault_in_one_line(tmp_path, old, new, line):
@@ -89,6 +89,16 @@ def test_a_fault_in_one_line(tmp_path, old, new, line):
     with pytest.raises(InputError) as fault:
         plus_config.read_config(path)
     assert str(fault.value).startswith(f"{path}: {line}") and "\n" not in str(fault.value)
+
+
+@pytest.mark.parametrize("name", ["FanAngles", "FanAnglesDeg"])
+def test_a_fan_is_no_clip(tmp_path, name):
+    path = tmp_path / "c.xml"
+    path.write_text(CONFIG.replace('"FULL"', f'"FULL" {name}="-30 30"'))
+    with pytest.raises(InputError, match=r"c.xml: FanAngles: expected none, as clips are rectangles; give clip="):
+        plus_config.read_config(path).check_clip()
+    path.write_text(CONFIG.replace('"FULL"', f'"FULL" {name}="0 0"'))
+    plus_config.read_config(path).check_clip()
 
 
 def test_the_real_sweep_becomes_the_volume_of_plus(real):
