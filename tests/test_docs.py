@@ -48,7 +48,8 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
         "result/probe/probe.yaml",
     },
     "freehand.md": {f"{folder}/capture" for folder in ("wires", "bottom", "sweep", "tank")}
-    | {"scan.dcm", "poses.csv", "pairs.csv", "sweep.igs.mha", "bottom.igs.mha", "wires.igs.mha", "config.xml", "probe/probe.yaml", "surface/surface.ply"},
+    | {"scan.dcm", "poses.csv", "pairs.csv", "config.xml", "probe/probe.yaml", "surface/surface.ply"}
+    | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires")},
     "tracking.md": {"session", "probe.yaml"},
 }
 
