@@ -203,13 +203,17 @@ def test_another_bracket_is_a_warning_and_its_pose_is_said(rig, rng, tmp_path):
     assert not any(line.startswith("warning") for line in calibrate(*fields, *pose.split()[1:]))
 
 
-def test_a_sequence_of_plus_gives_the_same_calibration(capture, calibrated, tmp_path):
-    """Poses as they were at rest, so the same to a hair; of the whole screen the calibration is that of its own pixels."""
+def test_a_sequence_of_plus_gives_the_same_calibration(capture, calibrated, rig, tmp_path):
+    """Poses as they were at rest, so the same to a hair; of the whole screen the calibration is that of its own pixels.
+
+    A screen is another image than the scanner's, so its scale has to be given, or the temperature.
+    """
     whole = sweep_sets.recorded(tmp_path / "wires.igs.mha", capture)
     screen = sweep_sets.recorded(tmp_path / "screen.igs.nrrd", capture, screen=True)
     calibrate(f"sequence={whole}", "reference=Tracker", f"out={tmp_path / 'whole'}")
     part = [*sweep_sets.BORDER, *bscans.SIZE]
-    calibrate(f"sequence={screen}", "reference=Tracker", f"clip={part}".replace(" ", ""), f"out={tmp_path / 'screen'}")
+    scale = "rig.probe.scale_mm_per_px=[{},{}]".format(*rig.probe.scale_mm_per_px)
+    calibrate(f"sequence={screen}", "reference=Tracker", f"clip={part}".replace(" ", ""), scale, f"out={tmp_path / 'screen'}")
     ours, whole, screen = (
         probe_files.read(folder / "probe.yaml") for folder in (calibrated[0], tmp_path / "whole", tmp_path / "screen")
     )
