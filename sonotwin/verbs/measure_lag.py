@@ -23,6 +23,7 @@ from rich.console import Console
 from recon.capture import lag_files, sweep_part, sweep_tables
 from recon.capture.lag_files import LagFile
 from recon.capture.sweep_part import SweepCapture
+from recon.clips import image_region
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
@@ -36,6 +37,7 @@ from recon.probe_calibration.latency import Lag
 
 LAG = lag_files.FILE  # by which the folder of a lag is known
 DEPTHS = "depths.csv"
+MOSTLY = 0.5  # share of images with a bottom; with less, it is looked for in a part of a screen
 HEADER = ("frame", "time_ns", "depth_px", "residual_px", "used")
 
 Array = NDArray[np.float64]
@@ -82,8 +84,14 @@ def run(config: Config) -> None:
     sweep = read(config)
     start = perf_counter()
     with console.status("looking for the bottom"):
-        depths = bottom_depths(sweep, config)
+        whole = Clip(0, 0, *sweep.size)
+        depths = bottom_depths(sweep, Clip(*config.clip) if config.clip else whole, config.top_px)
+        screen = None if config.clip or np.isfinite(depths).mean() > MOSTLY else part_of_screen(sweep, config.top_px)
+        depths = depths if screen is None else bottom_depths(sweep, screen, config.top_px)
     seconds = perf_counter() - start
+    if screen is not None:
+        part = f"[{screen.u},{screen.v},{screen.width},{screen.height}]"
+        console.print(f"screen      looked in what changes from image to image, clip={part}", markup=False)
     found_in = f"bottom in {np.isfinite(depths).sum()} of {len(depths)} B-scans"
     console.print(f"find        {found_in}, {len(sweep.track.times)} poses, {seconds:.0f} s", markup=False)
     try:
@@ -105,10 +113,20 @@ def read(config: Config) -> SweepCapture | SequenceSweep:
     return sequence_sweep.read_sequence_sweep(config.sequence, config.frame_names(FrameNames())).timed()
 
 
-def bottom_depths(sweep: SweepCapture | SequenceSweep, config: Config) -> Array:
-    """Depths of the bottom : (n,) px, in the whole B-scans, NaN where there is none."""
-    clip = Clip(0, 0, *sweep.size) if config.clip is None else Clip(*config.clip)
-    return np.array([latency.bottom_depth(clip.cut(image), config.top_px) for image in sweep.images()]) + clip.corner[1]
+def bottom_depths(sweep: SweepCapture | SequenceSweep, clip: Clip, top_px: int) -> Array:
+    """Depths of the bottom : (n,) px, in the whole images, NaN where there is none in their part."""
+    return np.array([latency.bottom_depth(clip.cut(image), top_px) for image in sweep.images()]) + clip.corner[1]
+
+
+def part_of_screen(sweep: SweepCapture | SequenceSweep, top_px: int) -> Clip | None:
+    """The part of a screen that changes, with the rows above it that are left out anyway; None if that is all, or nothing."""
+    try:
+        u, v, width, height = image_region.find(sweep.images(), sweep.name)
+    except InputError:
+        return None
+    above = min(v, top_px)
+    part = Clip(u, v - above, width, height + above)
+    return None if (part.width, part.height) == sweep.size else part
 
 
 def describe(figures: Metrics) -> Iterator[str]:

@@ -1,12 +1,14 @@
 """`sonotwin measure-lag`, from B-scans of a tank's bottom to the lag."""
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from recon.freehand import sequences
 from sonotwin.cli import main
 from tests.recon import bscans, sweep_sets
 
@@ -43,6 +45,22 @@ def test_a_sequence_of_plus_tells_its_own_lag(capture, tmp_path):
     with (tmp_path / "lag" / "depths.csv").open(newline="") as stream:
         depths = [float(row["depth_px"]) for row in csv.DictReader(stream)]
     assert len(depths) == 86 and min(depths) > sweep_sets.BORDER[1] + 32, "of the whole screen's rows"
+
+
+def test_the_bottom_is_found_on_a_screen(capture, tmp_path, capsys):
+    """B-scans in a third of a screen's width, beside bright texts: the part that changes is found, and said."""
+    path, beside = sweep_sets.recorded(tmp_path / "bare.igs.mha", capture), (420, 50)
+    frames = sequences.read_sequence(path)
+    screens = np.zeros((len(frames.images), 500, 1100), np.uint8)
+    screens[:, ::40, :380] = 255
+    width, height = bscans.SIZE
+    screens[:, beside[1] : beside[1] + height, beside[0] : beside[0] + width] = frames.images
+    sequences.write_sequence(tmp_path / "screen.igs.mha", dataclasses.replace(frames, images=screens))
+    fields = ["measure-lag", f"sequence={tmp_path / 'screen.igs.mha'}", "reference=Tracker", f"out={tmp_path / 'lag'}"]
+    assert main(fields) == 0
+    assert "screen      looked in what changes from image to image, clip=[" in capsys.readouterr().out
+    found = json.loads((tmp_path / "lag" / "lag.json").read_text())
+    assert found["interval_s"][0] <= LAG_S <= found["interval_s"][1]
 
 
 def test_what_is_wrong_is_said_in_one_line(capture, tmp_path, capsys):
