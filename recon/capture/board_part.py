@@ -6,6 +6,9 @@ A pose under 50 patterns is 66 MB, so a set of 34 is never held at once.
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from recon.capture import manifest
 from recon.capture.images import Images, read_image, read_images
 from recon.capture.manifest import MANIFEST, BoardPose, Device
@@ -14,13 +17,16 @@ from recon.files.regular import check_there
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
 
+FloatImage = NDArray[np.float32]
+FRINGE_CAMERA = "cam1"  # whose fringes give the projector's coordinates
+
 
 @dataclass(frozen=True)
 class Pose:
     """Images of the board in one pose."""
 
     name: str
-    lit: dict[str, Images]  # camera: (h, w) digital numbers, the projector fully on
+    lit: dict[str, Images | FloatImage]  # camera: (h, w) digital numbers, the projector fully on, or the mean of the patterns
     fringes: Images | None  # (n, h, w) of camera 1, one image a pattern
 
 
@@ -43,7 +49,7 @@ class BoardCapture:
     @property
     def cameras(self) -> tuple[str, ...]:
         """Cameras that saw the board in any pose, in the order of the devices."""
-        seen = {camera for record in self.records for camera in record.lit}
+        seen = {camera for record in self.records for camera in record.cameras}
         return tuple(name for name in self.devices if name in seen)
 
     def paths(self, number: int) -> list[Path]:
@@ -61,14 +67,28 @@ class BoardCapture:
             If one is damaged, or doesn't fit its device.
         """
         record = self.records[number]
-        lit = {
+        lit: dict[str, Images | FloatImage] = {
             camera: read_image(self.root / path, self.devices[camera].size, self.devices[camera].bits)
             for camera, path in record.lit.items()
         }
-        paths = [self.root / path for path in record.fringes.get("cam1", ())]
-        camera = self.devices.get("cam1")
-        fringes = read_images(paths, camera.size, camera.bits) if camera and paths else None
-        return Pose(record.name, lit, fringes)
+        unlit = record.fringes.keys() - lit.keys()
+        used = [camera for camera in record.fringes if camera in unlit or camera == FRINGE_CAMERA]
+        fringes = {camera: self._fringes(record, camera) for camera in used}
+        lit |= {camera: self._evenly_lit(fringes[camera], camera) for camera in used if camera in unlit}
+        return Pose(record.name, lit, fringes.get(FRINGE_CAMERA))
+
+    def _fringes(self, record: BoardPose, camera: str) -> Images:
+        device = self.devices[camera]
+        return read_images([self.root / path for path in record.fringes[camera]], device.size, device.bits)
+
+    def _evenly_lit(self, fringes: Images, camera: str) -> FloatImage:
+        """Mean of those images : (n, h, w) of a sequence that together light all alike; saturated where one of them is."""
+        assert self.patterns is not None  # as the manifest has fringes
+        full, weights = 2 ** self.devices[camera].bits - 1, self.patterns.even_light
+        used = weights > 0
+        mean = np.tensordot(weights[used].astype(np.float32), fringes[used].astype(np.float32), axes=1)
+        mean[(fringes[used] >= full).any(axis=0)] = full
+        return mean
 
 
 def read_board(folder: Path) -> BoardCapture:

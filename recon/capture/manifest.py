@@ -79,8 +79,19 @@ class BoardPose(Record):
     """Images of the calibration board in one pose."""
 
     name: Annotated[str, Field(min_length=1)]
-    lit: Annotated[dict[str, str], Field(min_length=1)]  # camera: path of the image with the projector fully on
+    lit: dict[str, str] = {}  # camera: path of the image with the projector fully on; if not given, its fringes' mean serves
     fringes: dict[str, tuple[str, ...]] = {}  # camera: paths in the order of the patterns
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Those that took images."""
+        return tuple(self.lit | self.fringes)
+
+    @model_validator(mode="after")
+    def _some_image(self) -> "BoardPose":
+        if not self.cameras:
+            raise ValueError("lit: expected an image of a camera here or fringes, found none of both")
+        return self
 
 
 class BoardPart(Part):

@@ -6,6 +6,7 @@ The same input gives the same bytes.
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -242,12 +243,13 @@ def write_pose(folder: Path, name: str, lit: Mapping[str, Images], fringes: Mapp
     Parameters
     ----------
     lit : camera name -> (h, w) uint8 or uint16
+        May be empty if there are fringes.
     fringes : camera name -> (n, h, w) uint8 or uint16
         One image a pattern; may be empty.
     """
     record = describe_pose(name, list(lit), {camera: len(stack) for camera, stack in fringes.items()})
     place = Path("board", name)
-    marker = Path(next(iter(record.lit.values()))).relative_to(place)
+    marker = Path(next(chain(record.lit.values(), *record.fringes.values()))).relative_to(place)
     with atomic.new_folder(folder / place, str(marker)) as temporary:
         for camera, stack in fringes.items():
             write_images([temporary / Path(path).relative_to(place) for path in record.fringes[camera]], stack)

@@ -214,6 +214,22 @@ class Patterns(Part):
         """Number of images in the sequence."""
         return sum(part.count for part in self.parts)
 
+    @property
+    def even_light(self) -> NDArray[np.float64]:
+        """Weights : (count,) by which the images of the sequence add up to an evenly lit one.
+
+        Each pixel is lit for the same time by the steps of a set of fringes, and by a bit with its inverse; where there is
+        neither, by the brightest uniform image.
+        """
+        weights = np.zeros(self.count)
+        for part, place in self.slices():
+            if isinstance(part, Fringes) or (isinstance(part, GrayCode) and part.inverted):
+                weights[place] = 1
+        if not weights.any():
+            levels = {place.start: part.level for part, place in self.slices() if isinstance(part, Uniform)}
+            weights[max(levels, key=lambda start: levels[start])] = 1
+        return weights / weights.sum()
+
     def length(self, axis: Axis) -> int:
         """Projector px along an axis."""
         return self.projector_size[0 if axis == "columns" else 1]

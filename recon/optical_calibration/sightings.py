@@ -15,7 +15,7 @@ from recon.optical_calibration.projector_points import correspondences
 from recon.structured_light.decode import decode
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8] | NDArray[np.uint16]
+Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 
 CORNER_REACH = 0.45  # of the distance between corners: window of the fringes' local model
 DISC_REACH = 1.7  # of a disc's radius
@@ -44,7 +44,7 @@ def sight(
     Parameters
     ----------
     lit : camera -> (h, w)
-        The board under even light.
+        The board under even light: the projector fully on, or the mean of the patterns.
     fringes : (n, h, w), optional
         Camera 1's images of a pattern sequence with fringes along both axes.
     patterns : Patterns, optional

@@ -1,6 +1,7 @@
 """Calibrate cameras and projector, all at once, from images of a board in many poses.
 
-Reads the board part of a capture folder: in each pose the lit board and, for the projector, a fringe sequence along both axes.
+Reads the board part of a capture folder: in each pose the lit board and, for the projector, a fringe sequence along both axes,
+whose mean serves where there is no lit image.
 Writes into the folder `out`: optics.yaml (with the covariance); the same in the rig authors' layout, cam1_proj_params.npz,
 cam1_cam2_params.npz and StereoParams.xml; metrics.json; and calibration.html (open it in a browser; it needs no network). A
 calibration that is there already is replaced. Takes some seconds a pose, and about a minute for the adjustment.

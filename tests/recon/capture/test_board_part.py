@@ -69,6 +69,29 @@ def test_cameras_alone_make_a_set(folder):
     assert [list(found.pose(k).lit) for k in range(3)] == [["cam1", "cam2"], ["cam1"], ["cam1", "cam2"]]
 
 
+@pytest.mark.parametrize("bits", [8, 12])
+def test_without_a_lit_image_the_mean_of_the_fringes_serves(tmp_path, bits):
+    """Of those images alone that together light all alike, so that the code's stripes don't show; full scale stays full scale."""
+    folder = write(tmp_path / "capture", bits)
+    edit(folder, lambda m: m["board"]["poses"][1]["lit"].pop("cam1"))
+    edit(folder, lambda m: m["board"]["poses"][2].pop("lit"))
+    found = board_part.read_board(folder)
+    assert found.cameras == ("cam1", "cam2") and list(found.pose(2).lit) == ["cam1"]
+    lit, stack = found.pose(1).lit["cam1"], images("01", bits)[1]["cam1"]
+    fringes = stack[[0, 1, 2, 6, 7, 8]]  # the others are Gray code
+    saturated = (fringes == 2**bits - 1).any(axis=0)
+    assert np.allclose(lit, np.where(saturated, 2**bits - 1, fringes.mean(axis=0)), rtol=1e-5)
+    assert found.pose(1).fringes is not None
+
+
+def test_a_pose_without_lit_images_is_written_and_read(tmp_path):
+    with writer.new_capture(tmp_path / "capture") as capture:
+        records = (writer.write_pose(capture.folder, "00", {}, images("00")[1]),)
+        devices = {"cam1": Device(size=SIZE), "projector": Device(size=PROJECTOR)}
+        capture.add_board(BoardPart(board=BOARD, patterns=PATTERNS, poses=records), devices)
+    assert list(board_part.read_board(tmp_path / "capture").pose(0).lit) == ["cam1"]
+
+
 def test_a_failed_write_leaves_no_half_pose(tmp_path, monkeypatch):
     """What was written of a pose before the disk was full goes away; poses before it stay."""
     writer.write_pose(tmp_path, "00", *images("00"))
@@ -108,7 +131,10 @@ FAULTS = {
         "manifest.json: board.poses.2.name: expected another than that of poses.0, found 00",
     ),
     "no poses": (lambda f: edit(f, lambda m: m["board"].update(poses=[])), "manifest.json: board.poses: expected"),
-    "nothing lit": (lambda f: edit(f, lambda m: m["board"]["poses"][0].update(lit={})), "manifest.json: board.poses.0.lit: "),
+    "no image": (
+        lambda f: edit(f, lambda m: m["board"]["poses"][0].update(lit={}, fringes={})),
+        "manifest.json: board.poses.0.lit: expected an image of a camera here or fringes, found none of both",
+    ),
     "one axis": (
         lambda f: edit(f, lambda m: m["board"]["patterns"].update(parts=m["board"]["patterns"]["parts"][:2])),
         "manifest.json: board.patterns: expected fringes along both axes, found none along rows",

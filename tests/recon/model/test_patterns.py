@@ -79,6 +79,12 @@ def test_inverted_images_are_the_inverse():
     assert (profiles[0::2] + profiles[1::2] == 1).all()
 
 
+@pytest.mark.parametrize("file", FILES, ids=lambda f: f.stem)
+def test_the_fringes_add_up_to_even_light(file):
+    patterns = Patterns(**yaml.safe_load(file.read_text(encoding="utf-8")))
+    assert np.ptp(np.tensordot(patterns.even_light, patterns.images(), axes=1)) < 1e-5
+
+
 @pytest.mark.parametrize("width", [1, 2, 3])
 def test_line_is_where_it_says(width):
     """Its light is its width, its centroid its position."""

@@ -4,12 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.capture.board_part import read_board
+from recon.capture.manifest import BoardPart, Device
+from recon.capture.writer import new_capture, write_pose
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.boards import Chessboard
 from recon.model.patterns import Fringes, GrayCode, Patterns
-from recon.optical_calibration import sightings
+from recon.optical_calibration import board_frames, sightings
 from recon.optical_calibration.sightings import sight
 from tests.recon.board_views import pose, view
 
@@ -36,27 +39,46 @@ PATTERNS = Patterns(
 def test_images_of_any_depth_tell_the_points_of_camera_and_projector(bits, rng):
     """The same light in finer steps: the points lie where they should, and as well as is said."""
     world_from_board = pose(BOARD, 640, (0.3, -0.25), 0.1)
+    photographs = photograph(PATTERNS, world_from_board, bits, rng)
+    found = sight("00", BOARD, {"cam1": photographs[0]}, photographs[1:], PATTERNS, {"cam1": bits})
+    check(found, world_from_board)
+    error = found.pixels["cam1"] - CAMERA.project(rigid.apply(world_from_board, BOARD.points()))
+    assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance["cam1"]), error)) < 4
+
+
+def test_the_mean_of_the_fringes_stands_in_for_a_lit_image(tmp_path, rng):
+    """A capture whose poses hold nothing but the projected sequence gives points as exact as with a lit image."""
+    world_from_board = pose(BOARD, 640, (0.3, -0.25), 0.1)
+    stack = photograph(PATTERNS, world_from_board, 8, rng)[1:]
+    devices = {"cam1": Device(size=CAMERA.size), "projector": Device(size=PROJECTOR.size)}
+    with new_capture(tmp_path / "capture") as capture:
+        records = (write_pose(capture.folder, "00", {}, {"cam1": stack}),)
+        capture.add_board(BoardPart(board=BOARD, patterns=PATTERNS, poses=records), devices)
+    (found,) = board_frames.look_at_all(read_board(tmp_path / "capture"))
+    check(found, world_from_board)
+
+
+def photograph(patterns, world_from_board, bits, rng):
+    """Camera 1's images : (1 + n, h, w) of the board, lit and then under each pattern."""
     lit, full = view(BOARD, CAMERA, world_from_board, dark=80), 2**bits - 1
     board_from_world = rigid.invert(world_from_board)
     rays, normal = CAMERA.rays(CAMERA.pixel_grid()), board_from_world[2]
     surface = rays * (-normal[3] / (rays @ normal[:3]))[..., None]
     at = PROJECTOR.project(surface).astype(np.float32)
-    light = np.stack([cv2.remap(np.float32(image), at[..., 0], at[..., 1], cv2.INTER_LINEAR) for image in PATTERNS.images()])
-    kind = np.uint8 if bits == 8 else np.uint16
-    photographs = [
-        np.clip(np.rint((image + rng.normal(0, 0.7, image.shape)) * full / 255), 0, full).astype(kind)
-        for image in (lit, *(lit * light))
-    ]
+    light = np.stack([cv2.remap(np.float32(image), at[..., 0], at[..., 1], cv2.INTER_LINEAR) for image in patterns.images()])
+    images = np.concatenate([lit[None], lit * light])
+    noisy = np.rint((images + rng.normal(0, 0.7, images.shape)) * full / 255)
+    return np.clip(noisy, 0, full).astype(np.uint8 if bits == 8 else np.uint16)
 
-    found = sight("00", BOARD, {"cam1": photographs[0]}, np.stack(photographs[1:]), PATTERNS, {"cam1": bits})
+
+def check(found, world_from_board):
+    """Camera 1 and projector see most points, to a tenth of a pixel."""
     assert not found.failures
     truth = rigid.apply(world_from_board, BOARD.points())
     for name, camera in (("cam1", CAMERA), ("projector", PROJECTOR)):
         error = found.pixels[name] - camera.project(truth)
         known = np.isfinite(error).all(axis=1)
         assert known.mean() > 0.8 and np.abs(error[known]).max() < 0.1, name
-    error = found.pixels["cam1"] - CAMERA.project(truth)
-    assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance["cam1"]), error)) < 4
 
 
 def test_the_decoded_part_holds_all_windows():
