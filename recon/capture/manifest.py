@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from recon.errors import InputError, one_line
 from recon.files.regular import read_bytes
 from recon.model.boards import Board
-from recon.model.patterns import Axis, Fringes, Patterns
+from recon.model.patterns import Axis, Patterns
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -108,8 +108,8 @@ class BoardPart(Part):
 
     @model_validator(mode="after")
     def _fringes_as_shown(self) -> "BoardPart":
-        if self.patterns is not None and (lacking := axes_without_fringes(self.patterns)):
-            raise ValueError(f"patterns: expected fringes along both axes, found none along {' and '.join(lacking)}")
+        if self.patterns is not None and (lacking := axes_not_encoded(self.patterns)):
+            raise ValueError(f"patterns: expected fringes or Gray code along both axes, found none along {' and '.join(lacking)}")
         for number, pose in enumerate(self.poses):
             if self.patterns is None and pose.fringes:
                 raise ValueError(f"patterns: expected those of poses.{number}.fringes, found none")
@@ -302,10 +302,10 @@ def image_name(frame: int) -> str:
     return f"{frame:04d}.png"
 
 
-def axes_without_fringes(patterns: Patterns) -> list[Axis]:
-    """Axes of the projector along which a sequence has no fringes; a board's needs both."""
+def axes_not_encoded(patterns: Patterns) -> list[Axis]:
+    """Axes of the projector along which a sequence has neither fringes nor Gray code; a board's needs both."""
     axes: tuple[Axis, Axis] = ("columns", "rows")
-    return [axis for axis in axes if not any(isinstance(part, Fringes) and part.axis == axis for part in patterns.parts)]
+    return [axis for axis in axes if axis not in patterns.axes]
 
 
 def _refuse_constant(path: Path, value: str) -> None:

@@ -74,11 +74,17 @@ class GrayCode(Part):
 
     kind: Literal["gray"] = "gray"
     axis: Axis = "columns"
-    pitch: float = Field(gt=1)  # projector px a period, that of the fringes to be unwrapped
+    pitch: float = Field(ge=1)  # projector px a period, that of the fringes to be unwrapped; without fringes a cell
     bits: int = Field(ge=1, le=12)
     start: float | None = None  # projector px where period 0 begins; if not given, where the code is centred on the axis
     complementary: bool = False  # one more image, the next bit
     inverted: bool = False  # every image is followed by its inverse
+
+    @model_validator(mode="after")
+    def _whole_pixels(self) -> "GrayCode":
+        if self.complementary and self.pitch < 2:
+            raise ValueError(f"pitch: expected 2 px or more with the complementary bit, which halves it, found {self.pitch:g}")
+        return self
 
     @property
     def count(self) -> int:
@@ -146,7 +152,7 @@ AnyPart = Annotated[Fringes | GrayCode | CentreLine | Uniform, Field(discriminat
 
 
 class Patterns(Part):
-    """A sequence of patterns and how its fringes are unwrapped.
+    """A sequence of patterns and how its fringes are unwrapped; of Gray code alone `unwrap` is `gray`, too.
 
     Raises
     ------
@@ -161,9 +167,13 @@ class Patterns(Part):
     @model_validator(mode="after")
     def _consistent(self) -> "Patterns":
         if not self.axes:
-            raise ValueError("parts: expected at least one set of fringes, found none")
+            code = " or a Gray code" if self.unwrap == "gray" else ""
+            raise ValueError(f"parts: expected at least one set of fringes{code}, found none")
         for axis in self.axes:
             fringes = [part for part in self.parts if isinstance(part, Fringes) and part.axis == axis]
+            if not fringes:
+                self._check_code_alone(axis)
+                continue
             if self.unwrap == "heterodyne":
                 if len(fringes) < 2:
                     raise ValueError(
@@ -185,6 +195,19 @@ class Patterns(Part):
                 )
         return self
 
+    def _check_code_alone(self, axis: Axis) -> None:
+        """Check that the code of an axis without fringes can be read: ValueError if there are two, or none has a threshold."""
+        codes = [part for part in self.parts if isinstance(part, GrayCode) and part.axis == axis]
+        if len(codes) > 1:
+            raise ValueError(f"parts: Gray code of {axis} without fringes expects one part of that kind, found {len(codes)}")
+        levels = {part.level for part in self.parts if isinstance(part, Uniform)}
+        if not codes[0].inverted and not {0.0, 1.0} <= levels:
+            found = ", ".join(f"level {level:g}" for level in sorted(levels)) or "none"
+            raise ValueError(
+                f"parts: Gray code of {axis} without fringes expects inverted images, or uniform ones of level 0 and 1, whose "
+                f"middle is the threshold, found {found}"
+            )
+
     @model_validator(mode="after")
     def _in_place(self) -> "Patterns":
         for part in self.parts:
@@ -205,9 +228,14 @@ class Patterns(Part):
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """The axes that carry fringes, columns first."""
+        """The axes that are encoded, by fringes or by Gray code alone, columns first."""
         axes: tuple[Axis, ...] = ("columns", "rows")
-        return tuple(axis for axis in axes if any(isinstance(part, Fringes) and part.axis == axis for part in self.parts))
+        encoding = Fringes | GrayCode if self.unwrap == "gray" else Fringes
+        return tuple(axis for axis in axes if any(isinstance(part, encoding) and part.axis == axis for part in self.parts))
+
+    def has_fringes(self, axis: Axis) -> bool:
+        """Whether an axis is encoded by fringes, not by Gray code alone."""
+        return any(isinstance(part, Fringes) and part.axis == axis for part in self.parts)
 
     @property
     def count(self) -> int:

@@ -116,7 +116,7 @@ def correspondences(found: ProjectorMap, image: NDArray, centres: ArrayLike, rea
     axes = ((found.columns, found.sigma_columns), (found.rows, found.sigma_rows))
     missing = [name for name, (x, _) in zip(("columns", "rows"), axes, strict=True) if x is None]
     if missing:
-        raise InputError(f"patterns: correspondences expect fringes along both axes, found none of {missing[0]}")
+        raise InputError(f"patterns: correspondences expect fringes or Gray code along both axes, found none of {missing[0]}")
     if image.shape != found.status.shape:
         size, wanted = ("x".join(map(str, shape[::-1])) for shape in (image.shape, found.status.shape))
         raise InputError(f"lit image: expected {wanted} grey, as the fringes, found {size}")

@@ -46,7 +46,7 @@ def sight(
     lit : camera -> (h, w)
         The board under even light: the projector fully on, or the mean of the patterns.
     fringes : (n, h, w), optional
-        Camera 1's images of a pattern sequence with fringes along both axes.
+        Camera 1's images of a pattern sequence with fringes or Gray code along both axes.
     patterns : Patterns, optional
         That sequence.
     bits : camera -> int

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from recon.compiled import kernel
 from recon.errors import InputError
-from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns
-from recon.structured_light import frame_errors, gray_code, multi_frequency, plausibility
+from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns, Uniform
+from recon.structured_light import frame_errors, gray_cells, gray_code, multi_frequency, plausibility
 from recon.structured_light.gray_code import Orders
 from recon.structured_light.phase import DEFAULT_NOISE, FrameErrors, Fringe, Noise, estimate_noise, wrapped_phase
 from recon.structured_light.unwrapping import continuity, spatial
@@ -21,7 +21,6 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 NoiseSource = Literal["given", "measured", "assumed"]
 Measured = tuple[Fringes, Fringe]
-Guide = tuple[GrayCode | CentreLine, NDArray, int]  # the part, its images, the first one's place in the sequence
 
 DARKEST = 4.0  # DN of 255: default of the least modulation
 SMALLEST = 8  # px, an image's shorter side: the extent of the stencil of continuity
@@ -60,6 +59,33 @@ class Coordinates(NamedTuple):
     status: NDArray[np.uint8]  # Status
 
 
+class _Shots(NamedTuple):
+    """Images of a sequence, and what is known of them."""
+
+    images: NDArray  # (n, h, w), DN
+    patterns: Patterns
+    errors: dict[int, FrameErrors]  # of each set of fringes, by the place of its first image
+    noise: Noise
+    least: float  # DN, of modulation
+    full: float  # DN
+    name: str
+
+    def where(self, place: slice) -> str:
+        """Images of a part, for messages."""
+        return f"{self.name}: images {place.start} to {place.stop - 1}"
+
+
+class _AxisMap(NamedTuple):
+    """What the images of an axis show. Images are (h, w)."""
+
+    coordinates: Coordinates
+    modulation: Image  # DN
+    offset: Image  # DN
+    phase: Image  # rad, NaN without fringes
+    lit: Mask
+    counts: dict[str, int]  # for the summary
+
+
 @dataclass(frozen=True)
 class ProjectorMap:
     """Projector coordinates of a camera's pixels. All images (h, w)."""
@@ -70,7 +96,7 @@ class ProjectorMap:
     sigma_rows: Image | None
     modulation: Image  # DN, of the first axis
     offset: Image  # DN
-    phase: Image  # rad, wrapped, of the first axis
+    phase: Image  # rad, wrapped, of the first axis; NaN where that has no fringes
     status: NDArray[np.uint8]  # Status; OK where every encoded axis is
     lit: Mask  # with fringes in every set, be they too weak to be decoded
     noise: Noise  # of one image
@@ -89,7 +115,8 @@ def decode(
 ) -> ProjectorMap:
     """Decode a camera's images of a pattern sequence.
 
-    The projector coordinate is `x = origin + pitch * (phase / 2 pi + k)`, its noise `pitch / (2 pi) * sigma_phase`.
+    The projector coordinate is `x = origin + pitch * (phase / 2 pi + k)`, its noise `pitch / (2 pi) * sigma_phase`. Of Gray code
+    without fringes it is the middle of a cell; see `gray_cells`.
 
     Parameters
     ----------
@@ -127,38 +154,64 @@ def decode(
         if isinstance(part, Fringes)
     }
     noise, source = _noise(images, parts, errors, full, noise)
-    axes: dict[Axis, tuple[Image, Image]] = {}
-    fringes: dict[Axis, Fringe] = {}
+    shots = _Shots(images, patterns, errors, noise, least, full, name)
+    axes: dict[Axis, _AxisMap] = {
+        axis: (_from_fringes if patterns.has_fringes(axis) else _from_code)(shots, axis) for axis in patterns.axes
+    }
     status, lit = np.zeros(images.shape[1:], np.uint8), np.ones(images.shape[1:], bool)
     counts: Counter[str] = Counter()
-    for axis in patterns.axes:
-        sets = []
-        for part, place in parts:
-            if isinstance(part, Fringes) and part.axis == axis:
-                frames = errors[place.start]
-                fringe = wrapped_phase(images[place], part.shifts, noise=noise, saturation=full, errors=frames)
-                where = f"{name}: images {place.start} to {place.stop - 1}"
-                plausibility.check_fringes(images[place], part, fringe, least, full, where, place.start)
-                sets.append((part, fringe))
-                lit &= fringe.sigma < LIT_SIGMA
-        part, fringe = min(sets, key=lambda pair: pair[0].pitch)
-        stage = _quality([f for _, f in sets], least)
-        guides = [
-            (p, images[place], place.start) for p, place in parts if isinstance(p, GrayCode | CentreLine) and p.axis == axis
-        ]
-        orders, unreachable, found = _orders(patterns, axis, sets, guides, stage == Status.OK, noise, name)
-        counts.update(found)
-        length = patterns.length(axis)
-        scale = Scale(float(part.zero(length)), part.pitch, length)
-        axes[axis] = _coordinates(fringe, orders, unreachable, stage, scale)
-        fringes[axis] = fringe
-        status = np.where(status == Status.OK, stage, status)
-    first = fringes[patterns.axes[0]]
-    columns, rows = axes.get("columns", (None, None)), axes.get("rows", (None, None))
+    for found in axes.values():
+        counts.update(found.counts)
+        lit &= found.lit
+        status = np.where(status == Status.OK, found.coordinates.status, status)
+    first = axes[patterns.axes[0]]
+    columns, rows = (axes[axis].coordinates[:2] if axis in axes else (None, None) for axis in ("columns", "rows"))
     pixels = np.bincount(status.ravel(), minlength=len(Status)).tolist()
     summary = {s.name.lower(): pixels[s] for s in Status} | dict(counts)
     shown = (first.modulation, first.offset, first.phase, status, lit)
     return ProjectorMap(columns[0], rows[0], columns[1], rows[1], *shown, noise, summary, source)
+
+
+def _from_fringes(shots: _Shots, axis: Axis) -> _AxisMap:
+    """Coordinates along an axis by the phase of its finest fringes and their orders."""
+    sets = []
+    lit = np.ones(shots.images.shape[1:], bool)
+    for part, place in shots.patterns.slices():
+        if isinstance(part, Fringes) and part.axis == axis:
+            images, frames = shots.images[place], shots.errors[place.start]
+            fringe = wrapped_phase(images, part.shifts, noise=shots.noise, saturation=shots.full, errors=frames)
+            plausibility.check_fringes(images, part, fringe, shots.least, shots.full, shots.where(place), place.start)
+            sets.append((part, fringe))
+            lit &= fringe.sigma < LIT_SIGMA
+    part, fringe = min(sets, key=lambda pair: pair[0].pitch)
+    status = _quality([f for _, f in sets], shots.least)
+    orders, unreachable, counts = _orders(shots, axis, sets, status == Status.OK)
+    length = shots.patterns.length(axis)
+    scale = Scale(float(part.zero(length)), part.pitch, length)
+    x, sigma = _coordinates(fringe, orders, unreachable, status, scale)
+    return _AxisMap(Coordinates(x, sigma, status), fringe.modulation, fringe.offset, fringe.phase, lit, counts)
+
+
+def _from_code(shots: _Shots, axis: Axis) -> _AxisMap:
+    """Coordinates along an axis by Gray code alone."""
+    patterns, noise = shots.patterns, shots.noise
+    ((code, place),) = [(p, place) for p, place in patterns.slices() if isinstance(p, GrayCode) and p.axis == axis]
+    uniform = [place.start for part, place in patterns.slices() if isinstance(part, Uniform) and part.level in (0, 1)]
+    black, white = levels = gray_cells.levels(shots.images[place], code, shots.images[uniform])
+    modulation, offset = (white - black) / 2, (white + black) / 2
+    plausibility.check_levels(modulation, offset, shots.least, shots.full, shots.where(place))
+    length = patterns.length(axis)
+    cells = gray_cells.locate(shots.images[place], code, levels, length, noise)
+    dark = modulation < shots.least
+    plausibility.check_cells(np.where(dark, gray_cells.UNKNOWN, cells.number), code, shots.where(place), place.start)
+    plausibility.check_readings(cells.middle, ~dark, length, shots.where(place))
+    status = np.where(np.isfinite(cells.middle), np.uint8(OK), np.uint8(UNCERTAIN))
+    status[(cells.middle < -0.5) | (cells.middle > length - 0.5)] = OUTSIDE
+    status[dark] = np.where(white >= shots.full, np.uint8(Status.SATURATED), np.uint8(Status.DARK))[dark]
+    unknown, nothing = status != OK, np.float32(np.nan)
+    x, sigma = np.where(unknown, nothing, cells.middle), np.where(unknown, nothing, cells.sigma)
+    lit = modulation * LIT_SIGMA > np.sqrt(noise.read_variance + noise.gain * offset)
+    return _AxisMap(Coordinates(x, sigma, status), modulation, offset, np.full_like(x, nothing), lit, {})
 
 
 def _noise(
@@ -185,23 +238,20 @@ def _quality(fringes: list[Fringe], least: float) -> NDArray[np.uint8]:
     return np.where(saturated, np.uint8(Status.SATURATED), np.where(dark, np.uint8(Status.DARK), np.uint8(Status.OK)))
 
 
-def _orders(
-    patterns: Patterns, axis: Axis, sets: list[Measured], guides: list[Guide], valid: Mask, noise: Noise, name: str
-) -> tuple[Orders, Mask, dict[str, int]]:
+def _orders(shots: _Shots, axis: Axis, sets: list[Measured], valid: Mask) -> tuple[Orders, Mask, dict[str, int]]:
     """Fringe orders by the sequence's unwrapping, pixels out of the line's reach : (h, w) bool, and counts for the summary."""
-    length = patterns.length(axis)
+    patterns, name, length = shots.patterns, shots.name, shots.patterns.length(axis)
     nowhere = np.zeros(valid.shape, bool)
     part, fringe = min(sets, key=lambda pair: pair[0].pitch)
     if patterns.unwrap == "heterodyne":
         orders = multi_frequency.fringe_order(sets, length)
         plausibility.check_pitches(orders.trusted, valid, f"{name}: fringes of {axis}")
         return orders, nowhere, {}
-    guide, images, start = guides[0]
+    guide, place = next((p, at) for p, at in patterns.slices() if isinstance(p, GrayCode | CentreLine) and p.axis == axis)
     if isinstance(guide, CentreLine):
-        return _from_line(guide, images[0], part, fringe, valid, length, axis, f"{name}: image {start}")
-    orders, residual = gray_code.fringe_order(images, guide, part, fringe, length, noise)
-    place = f"{name}: images {start} to {start + guide.count - 1}"
-    plausibility.check_code(orders.order, residual, guide, part, fringe.phase, valid, length, place)
+        return _from_line(guide, shots.images[place.start], part, fringe, valid, length, axis, f"{name}: image {place.start}")
+    orders, residual = gray_code.fringe_order(shots.images[place], guide, part, fringe, length, shots.noise)
+    plausibility.check_code(orders.order, residual, guide, part, fringe.phase, valid, length, shots.where(place))
     if not guide.complementary:  # a fifth of the pixels lies too near the period borders: fill in from both sides
         cycles = fringe.phase * np.float32(1 / (2 * np.pi))
         flags = continuity.continuity(cycles, fringe.sigma, valid)

@@ -34,8 +34,7 @@ class Bits(NamedTuple):
     """Readings of a row's pixels, each thread's own. All (w,)."""
 
     number: NDArray[np.int32]  # of the cell
-    doubt: NDArray[np.int32]  # digits that the last uncertain bit flips
-    uncertain: NDArray[np.int32]  # number of uncertain bits
+    unsure: NDArray[np.int32]  # a digit for each bit, 1 where it is uncertain; the finest bit is the last
     low: NDArray[np.float64]  # DN, the darkest that a pixel shows; without inverses
     high: NDArray[np.float64]  # DN, the brightest
 
@@ -90,45 +89,54 @@ def fringe_order(
         Remainder of cell and phase from a whole order, in +-0.5. With the complementary bit the right images spread it evenly
         over +-0.25, whatever the origins.
     """
-    half = 2 if code.complementary else 1
-    cell = code.pitch / half
-    borders = code.origin(length) + cell * np.arange(half * 2**code.bits)
-    drawn = np.mean(np.ceil(borders - 1e-9) - 0.5 - borders)  # projector pixels are lit whole
-    first = (code.origin(length) + drawn + 0.5 * cell - fringes.zero(length)) / code.pitch
-    images, cells, shape = np.ascontiguousarray(images), Cells(float(first), 1 / half, code.inverted), fringe.phase.shape
+    first, width = cell_middle(code, length)
+    cells = Cells((first - fringes.zero(length)) / code.pitch, width / code.pitch, code.inverted)
+    images, shape = np.ascontiguousarray(images), fringe.phase.shape
     orders = Orders(np.zeros(shape, np.int32), np.zeros(shape, np.bool_))
     residual = np.zeros(shape, np.float32)
 
     def fill(first: int, end: int) -> None:
-        bits = Bits(*np.zeros((3, shape[1]), np.int32), *np.zeros((2, shape[1])))
+        bits = Bits(*np.zeros((2, shape[1]), np.int32), *np.zeros((2, shape[1])))
         _fill(first, end, images, cells, fringe, noise, bits, Found(*orders, residual))
 
     in_threads(fill, shape[0])
     return orders, residual
 
 
+def cell_middle(code: GrayCode, length: int) -> tuple[float, float]:
+    """The middle of a code's first cell as it is drawn, and the width of all cells, on an axis of `length` px : projector px."""
+    half = 2 if code.complementary else 1
+    width = code.pitch / half
+    borders = code.origin(length) + width * np.arange(half * 2**code.bits)
+    drawn = np.mean(np.ceil(borders - 1e-9) - 0.5 - borders)  # projector pixels are lit whole
+    return float(code.origin(length) + drawn + 0.5 * width), width
+
+
 @kernel
 def _fill(first, end, images, cells: Cells, fringe: Fringe, noise: Noise, bits: Bits, found: Found):
     """Fill the orders of rows `first` to `end`, not included."""
-    phase, number, doubt, uncertain = fringe.phase, bits.number, bits.doubt, bits.uncertain
+    phase, number = fringe.phase, bits.number
     for v in range(first, end):
         if not cells.inverted:
             _black_and_white(images[:, v], fringe.offset[v], fringe.modulation[v], bits.low, bits.high)
-        _read_bits(images[:, v], cells.inverted, noise, bits)
+        read_bits(images[:, v], cells.inverted, noise, bits)
         for u in range(phase.shape[1]):
             cycles = cells.first + number[u] * cells.width - phase[v, u] / (2 * math.pi)
             nearest = math.floor(cycles + 0.5)
             found.order[v, u] = nearest
             found.residual[v, u] = cycles - nearest
-            other_way = math.floor(cells.first + (number[u] ^ doubt[u]) * cells.width - phase[v, u] / (2 * math.pi) + 0.5)
-            found.trusted[v, u] = uncertain[u] <= 1 and other_way == nearest and abs(cycles - nearest) < 0.5 - MARGIN
+            unsure = bits.unsure[u]
+            other = number[u] ^ (2 * unsure - 1) if unsure else number[u]  # a Gray bit flips its binary digit and all after it
+            other_way = math.floor(cells.first + other * cells.width - phase[v, u] / (2 * math.pi) + 0.5)
+            one = unsure & (unsure - 1) == 0
+            found.trusted[v, u] = one and other_way == nearest and abs(cycles - nearest) < 0.5 - MARGIN
 
 
 @kernel
-def _read_bits(images, inverted, noise: Noise, bits: Bits):
+def read_bits(images, inverted, noise: Noise, bits: Bits):
     """Read the cells of a row's pixels from its images : (n, w), bit by bit."""
-    number, doubt, uncertain, low, high = bits.number, bits.doubt, bits.uncertain, bits.low, bits.high
-    number[:], doubt[:], uncertain[:] = 0, 0, 0
+    number, unsure, low, high = bits.number, bits.unsure, bits.low, bits.high
+    number[:], unsure[:] = 0, 0
     count = len(images) // 2 if inverted else len(images)
     for i in range(count):
         here, against = (images[2 * i], images[2 * i + 1]) if inverted else (images[i], images[i])
@@ -143,9 +151,7 @@ def _read_bits(images, inverted, noise: Noise, bits: Bits):
                 variance = noise.read_variance + noise.gain * value + (2 * noise.read_variance + level) / 4
             parity = (number[u] & 1) ^ (1 if value > other else 0)  # the running one turns Gray into binary
             number[u] = 2 * number[u] + parity
-            if (value - other) ** 2 < SURE * SURE * variance:
-                uncertain[u] += 1
-                doubt[u] = (1 << (count - i)) - 1  # a Gray bit flips its binary digit and all after it
+            unsure[u] = 2 * unsure[u] + (1 if (value - other) ** 2 < SURE * SURE * variance else 0)
 
 
 @kernel

@@ -25,6 +25,9 @@ JUMPS = 0.025  # share of the code's borders at which the order may jump; the co
 CROWDED = 4.0  # times as often as elsewhere: steps of the surface lie anywhere, wrong bits at the borders
 CONTINUES = 0.6 / (2 * np.pi)  # cycle between two pixels: less is taken for one surface
 FEW = 20  # pixels, too few for a decision
+OUTSIDE_SHARE = 0.2  # of the lit pixels, that a code may place beyond the projector's image: shadows lit by what stands around
+RUSH = 0.05  # of all cells, between one pixel and the next: more than any image of a surface shows in the mean
+LEAPS = 3.0  # times the usual change of the cell: of two bits exchanged it is 3 at least, of most others hundreds
 CONTRADICTED = 0.7  # share of the pixels whose pitches contradict each other; of unrelated phases it is 0.8 or more
 
 
@@ -141,6 +144,79 @@ def check_code(
     if wrong > max(JUMPS * borders, FEW, CROWDED * chance):
         share = 100 * min(wrong / max(borders, 1), 1)
         raise InputError(f"{place}: fringe orders jump at {share:.0f} % of the code's borders: are they in the manifest's order?")
+
+
+def check_levels(modulation: Image, offset: Image, least: float, full: float, place: str) -> None:
+    """Refuse a code without fringes whose images, or whose black and white ones, hardly differ.
+
+    Parameters
+    ----------
+    modulation, offset : (h, w), DN
+        Half the difference and the mean of black and white.
+    """
+    if np.mean(modulation > least) >= LIT_SHARE:
+        return
+    if np.median(offset) > 0.95 * full:
+        raise InputError(f"{place} are saturated all over, expected Gray code: shorten the exposure")
+    found = float(np.quantile(modulation, 1 - LIT_SHARE))
+    expected = f"half of white less black of {least:.0f} DN or more"
+    raise InputError(f"{place} hold no Gray code: expected {expected}, found {found:.1f} DN")
+
+
+def check_readings(middle: Image, valid: Mask, length: int, place: str) -> None:
+    """Refuse a code without fringes that can be read nearly nowhere, or that names places that no light comes from.
+
+    Parameters
+    ----------
+    middle : (h, w), projector px
+        Of the cells, NaN where bits are uncertain.
+    valid : (h, w) bool
+    length : int, projector px
+    """
+    lit, unknown = np.count_nonzero(valid), np.count_nonzero(valid & np.isnan(middle))
+    if unknown > max(CONTRADICTED * lit, FEW):
+        raise InputError(
+            f"{place}: bits are neither black nor white in {100 * unknown / lit:.0f} % of the pixels: is each image followed by "
+            "its inverse, as in the manifest, and are the stripes in focus?"
+        )
+    outside = np.count_nonzero(valid & ((middle < -0.5) | (middle > length - 0.5)))
+    if outside > max(OUTSIDE_SHARE * lit, FEW):
+        raise InputError(
+            f"{place}: the code of {100 * outside / lit:.0f} % of the pixels lies beyond the projector's {length} px: are the "
+            "images in the manifest's order, and are projector_size, pitch and start those projected?"
+        )
+
+
+def check_cells(number: NDArray[np.int32], code: GrayCode, place: str, start: int) -> None:
+    """Refuse bits in a wrong order: where one of them flips between two pixels, the cell must change as little as elsewhere.
+
+    Parameters
+    ----------
+    number : (h, w)
+        Of the cells, negative where unknown.
+    place, start : of the code's images, for messages.
+    """
+    number = number if code.axis == "columns" else number.T
+    left, right = number[:, :-1], number[:, 1:]
+    known = (left >= 0) & (right >= 0) & (left != right)
+    left, right = left[known], right[known]
+    if left.size < FEW:
+        return
+    steps, flipped = np.abs(right - left), (left ^ (left >> 1)) ^ (right ^ (right >> 1))
+    count, usual = code.bits + code.complementary, float(np.median(steps))
+    if usual > max(RUSH * 2**count, LEAPS):
+        raise InputError(
+            f"{place}: the code changes by {usual:.0f} cells from one pixel to the next: are they in the manifest's order, the "
+            "coarsest bit first?"
+        )
+    for bit in range(count):
+        alone = steps[flipped == 1 << bit]
+        if alone.size >= FEW and np.median(alone) > LEAPS * usual:
+            image = start + (count - 1 - bit) * (2 if code.inverted else 1)
+            raise InputError(
+                f"{place}: where image {image} changes the code leaps by {np.median(alone):.0f} cells, by {usual:.0f} elsewhere: "
+                "are they in the manifest's order?"
+            )
 
 
 def _check_residuals(residual: Image, place: str) -> None:

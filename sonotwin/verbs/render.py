@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
-from recon.capture.manifest import axes_without_fringes
+from recon.capture.manifest import axes_not_encoded
 from recon.files import atomic
 from recon.geometry.rigid import Array
 from recon.model.patterns import Patterns
@@ -70,8 +70,9 @@ class Config(BaseModel):
         if self.scene.get("kind") != "board":
             raise ValueError(f"poses: expected scene=board with them, found scene.kind {self.scene.get('kind')}")
         check_board(parse_scene(self.scene)[1], self.conditions.board)
-        if lacking := axes_without_fringes(self.patterns):
-            raise ValueError(f"patterns: expected fringes along both axes with poses, found none along {' and '.join(lacking)}")
+        if lacking := axes_not_encoded(self.patterns):
+            found = f"none along {' and '.join(lacking)}"
+            raise ValueError(f"patterns: expected fringes or Gray code along both axes with poses, found {found}")
         if board_session.FRINGE_CAMERA not in self.cameras:
             found = ", ".join(self.cameras)
             raise ValueError(f"cameras: expected {board_session.FRINGE_CAMERA}, which sees the fringes of poses, found {found}")

@@ -3,7 +3,8 @@
 Reads a capture folder, whether devices or the twin wrote it, or a bare folder of images with its patterns and calibration.
 Writes surface.ply (mm, with the surface's grey), surface.glb (metres, y up), points.npz (the point of every pixel, with its
 predicted sigma) and metrics.json into the folder `out`; results that are there already are replaced. Takes three seconds for
-nine images of 1280x1024 and some seconds to start; the first run ever also compiles, for about a minute.
+nine images of 1280x1024 and some seconds to start; the first run ever also compiles, for about a minute. Patterns are fringes
+with what numbers them, or Gray code alone, by which points are known to a projector pixel.
 
     sonotwin surface capture=outputs/demo/capture out=outputs/demo/surface
     sonotwin surface capture=shots calibration=calibration/optics.yaml out=outputs/shots
@@ -24,7 +25,7 @@ from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
 from recon.files.metrics import shown
 from recon.structured_light import decode, surface_figures, surface_mesh
-from recon.structured_light.triangulate import Triangulator
+from recon.structured_light.triangulate import PointMap, Triangulator
 from sonotwin import config as configuration
 
 POINTS = "points.npz"  # by which the folder of a surface is known
@@ -84,7 +85,8 @@ def run(config: Config) -> None:
     with watch.stage("clean"):
         cleaned = surface_mesh.clean(raw, camera, found.modulation, config.limits)
     if not np.isfinite(cleaned.points).any():
-        raise InputError(f"{shots.name}: expected a surface that camera and projector both see, found no point of it")
+        found_none = nothing_left(raw, config.limits)
+        raise InputError(f"{shots.name}: expected a surface that camera and projector both see, found {found_none}")
     with watch.stage("mesh"):
         mesh = surface_mesh.mesh(cleaned, camera, config.limits.max_slope, found.offset)
     predicted = {"predicted_rms_mm": surface_figures.predicted_rms(mesh, camera), "triangles": len(mesh.faces)}
@@ -100,6 +102,17 @@ def run(config: Config) -> None:
             np.savez_compressed(folder / POINTS, **images)
         metrics.write(folder / metrics.FILE, figures | watch.seconds)
     print(f"wrote       {config.out}/{{surface.ply,surface.glb,{POINTS},{metrics.FILE}}}")
+
+
+def nothing_left(raw: PointMap, limits: surface_mesh.Limits) -> str:
+    """The reason why no point is left, in words."""
+    sigma = raw.sigma[np.isfinite(raw.points[..., 0])]
+    if not sigma.size:
+        return "no point of it"
+    return (
+        f"{sigma.size} points, all removed as unsure, of a predicted sigma of {np.median(sigma):.2g} mm: is the pitch of the "
+        f"fringes, or of Gray code alone, too coarse? limits.max_sigma={limits.max_sigma:g} sampling steps may be raised"
+    )
 
 
 def read(config: Config) -> SurfaceCapture:

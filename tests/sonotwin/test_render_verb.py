@@ -42,7 +42,7 @@ HALF = [  # both cameras at half their size
         (["scene=board", "poses=papers"], "poses: expected one of demo, none, paper, found papers; did you mean paper?"),
         (
             ["scene=board", "poses=demo", "patterns=gray_surface"],
-            "patterns: expected fringes along both axes with poses, found none along rows",
+            "patterns: expected fringes or Gray code along both axes with poses, found none along rows",
         ),
         (
             ["scene=board", "poses=demo", "patterns=paper_calibration", "cameras=[cam2]"],

@@ -15,7 +15,7 @@ from recon.capture.manifest import Device, Manifest, SurfacePart, SweepPart
 from recon.geometry import primitives, rigid
 from recon.geometry.camera import Camera
 from recon.model.calibration import Calibration
-from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns
+from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns, Uniform
 from recon.tracking import networks
 from sonotwin.cli import main
 from tests.recon.tracking import films
@@ -28,6 +28,9 @@ SEQUENCES = {
         projector_size=PROJECTOR,
         unwrap="gray",
         parts=(Fringes(pitch=20, steps=8, origin=9.5), GrayCode(pitch=20, bits=5, start=-0.5, complementary=True)),
+    ),
+    "gray_alone": Patterns(
+        projector_size=PROJECTOR, unwrap="gray", parts=(Uniform(), Uniform(level=0), GrayCode(pitch=1, bits=10, start=0))
     ),
 }
 TILT = rigid.from_rotation_vector([0.2, -0.3, 0], [0, 0, 660])  # world from the plane z = 0
@@ -78,7 +81,8 @@ def test_a_capture_becomes_a_surface(shots, tmp_path, capsys):
 
     fit = primitives.fit_plane(trimesh.load(out / "surface.ply", process=False).vertices)
     assert np.linalg.norm(np.cross(fit.shape.normal, TILT[:3, 2])) < 1e-3
-    assert fit.rms == pytest.approx(metrics["predicted_rms_mm"], rel=0.1), "scatter about the plane, and its prediction"
+    close = 0.1 if shots[2].has_fringes("columns") else 0.15  # of a code, pixels right at borders are better than their sigma
+    assert fit.rms == pytest.approx(metrics["predicted_rms_mm"], rel=close), "scatter about the plane, and its prediction"
     with np.load(out / "points.npz") as points:
         assert points["points"].shape == (SIZE[1], SIZE[0], 3)
         assert np.isfinite(points["sigma"]).sum() == metrics["points"]
@@ -97,6 +101,17 @@ def test_a_bare_folder_gives_the_same(shots, optics, tmp_path):
     assert main(["surface", *source, f"out={tmp_path / 'a'}"]) == 0
     assert main(["surface", f"capture={folder}", f"out={tmp_path / 'b'}"]) == 0
     assert (tmp_path / "a" / "surface.ply").read_bytes() == (tmp_path / "b" / "surface.ply").read_bytes()
+
+
+def test_a_code_too_coarse_for_a_surface_is_refused_by_the_cause(optics, tmp_path, capsys):
+    """All points are there, but each may lie millimetres off; whoever wants them raises the limit."""
+    coarse = Patterns(projector_size=PROJECTOR, unwrap="gray", parts=(GrayCode(pitch=8, bits=7, inverted=True),))
+    devices = {"cam1": Device(size=SIZE), "projector": Device(size=PROJECTOR)}
+    writer.write_surface(tmp_path / "capture", {"cam1": photograph(coarse, optics)}, coarse, optics, devices)
+    fields = [f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'surface'}"]
+    assert main(["surface", *fields]) == 2
+    assert re.search(r"\d{5} points, all removed as unsure, .* is the pitch .* too coarse\?", capsys.readouterr().err)
+    assert main(["surface", *fields, "limits.max_sigma=50"]) == 0
 
 
 def test_results_are_replaced_but_other_folders_are_not(shots, tmp_path, capsys):

@@ -137,7 +137,7 @@ FAULTS = {
     ),
     "one axis": (
         lambda f: edit(f, lambda m: m["board"]["patterns"].update(parts=m["board"]["patterns"]["parts"][:2])),
-        "manifest.json: board.patterns: expected fringes along both axes, found none along rows",
+        "manifest.json: board.patterns: expected fringes or Gray code along both axes, found none along rows",
     ),
     "fringes of no patterns": (
         lambda f: edit(f, lambda m: m["board"].pop("patterns")),

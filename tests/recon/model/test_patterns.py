@@ -99,7 +99,12 @@ def test_line_is_where_it_says(width):
     [
         ("gray", [{"kind": "fringes", "pitch": 12, "steps": 8}], "one part of that kind, found 0"),
         ("heterodyne", [{"kind": "fringes", "pitch": 12, "steps": 8}], "two or more sets"),
-        ("gray", [{"kind": "gray", "pitch": 12, "bits": 7}], "at least one set of fringes"),
+        ("heterodyne", [{"kind": "gray", "pitch": 1, "bits": 11, "inverted": True}], "at least one set of fringes, found none"),
+        ("gray", [{"kind": "uniform"}], "at least one set of fringes or a Gray code, found none"),
+        ("gray", [{"kind": "gray", "pitch": 12, "bits": 7}], "of level 0 and 1, whose middle is the threshold, found none"),
+        ("gray", [{"kind": "uniform"}, {"kind": "gray", "pitch": 12, "bits": 7}], "the threshold, found level 1"),
+        ("gray", [{"kind": "gray", "pitch": 1, "bits": 11, "inverted": True}] * 2, "expects one part of that kind, found 2"),
+        ("gray", [{"kind": "gray", "pitch": 1, "bits": 11, "complementary": True}], "expected 2 px or more with the compl"),
         ("gray", [{"kind": "fringes", "pitch": 12, "steps": 8}, {"kind": "gray", "pitch": 18, "bits": 7}], "one pitch"),
         ("heterodyne", [{"kind": "fringes", "pitch": 12, "steps": 8}] * 2, "expects different pitches, found 12, 12 px"),
         ("centre_line", [{"kind": "fringes", "pitch": np.inf, "steps": 8}], "finite number"),

@@ -11,7 +11,7 @@ from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.boards import Chessboard
-from recon.model.patterns import Fringes, GrayCode, Patterns
+from recon.model.patterns import Fringes, GrayCode, Patterns, Uniform
 from recon.optical_calibration import board_frames, sightings
 from recon.optical_calibration.sightings import sight
 from tests.recon.board_views import pose, view
@@ -42,7 +42,7 @@ def test_images_of_any_depth_tell_the_points_of_camera_and_projector(bits, rng):
     photographs = photograph(PATTERNS, world_from_board, bits, rng)
     found = sight("00", BOARD, {"cam1": photographs[0]}, photographs[1:], PATTERNS, {"cam1": bits})
     check(found, world_from_board)
-    error = found.pixels["cam1"] - CAMERA.project(rigid.apply(world_from_board, BOARD.points()))
+    error = camera_error(found, world_from_board)
     assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance["cam1"]), error)) < 4
 
 
@@ -58,6 +58,25 @@ def test_the_mean_of_the_fringes_stands_in_for_a_lit_image(tmp_path, rng):
     check(found, world_from_board)
 
 
+@pytest.mark.parametrize("inverted", [True, False], ids=["with inverses", "with black and white"])
+def test_gray_code_alone_gives_the_projector_its_points(inverted, rng):
+    """Both axes to the pixel: hundreds of cells about a point place it to a tenth of one, and as well as is said."""
+    world_from_board = pose(BOARD, 640, (0.3, -0.25), 0.1)
+    code = [GrayCode(axis=axis, pitch=1, bits=8, inverted=inverted) for axis in ("columns", "rows")]
+    parts = code if inverted else [Uniform(), *code, Uniform(level=0)]
+    patterns = Patterns(projector_size=PROJECTOR.size, unwrap="gray", parts=tuple(parts))
+    photographs = photograph(patterns, world_from_board, 8, rng)
+    found = sight("00", BOARD, {"cam1": photographs[0]}, photographs[1:], patterns, {"cam1": 8})
+    check(found, world_from_board, most_px=0.2)
+    expected = PROJECTOR.project(rigid.apply(world_from_board, BOARD.points()))
+    error = found.pixels["projector"] - expected - np.einsum("nij,nj->ni", found.gradient, camera_error(found, world_from_board))
+    assert 0.3 < np.nanmean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance["projector"]), error)) < 4
+
+
+def camera_error(found, world_from_board):
+    return found.pixels["cam1"] - CAMERA.project(rigid.apply(world_from_board, BOARD.points()))
+
+
 def photograph(patterns, world_from_board, bits, rng):
     """Camera 1's images : (1 + n, h, w) of the board, lit and then under each pattern."""
     lit, full = view(BOARD, CAMERA, world_from_board, dark=80), 2**bits - 1
@@ -71,14 +90,14 @@ def photograph(patterns, world_from_board, bits, rng):
     return np.clip(noisy, 0, full).astype(np.uint8 if bits == 8 else np.uint16)
 
 
-def check(found, world_from_board):
+def check(found, world_from_board, most_px=0.1):
     """Camera 1 and projector see most points, to a tenth of a pixel."""
     assert not found.failures
     truth = rigid.apply(world_from_board, BOARD.points())
     for name, camera in (("cam1", CAMERA), ("projector", PROJECTOR)):
         error = found.pixels[name] - camera.project(truth)
         known = np.isfinite(error).all(axis=1)
-        assert known.mean() > 0.8 and np.abs(error[known]).max() < 0.1, name
+        assert known.mean() > 0.8 and np.abs(error[known]).max() < most_px, name
 
 
 def test_the_decoded_part_holds_all_windows():
