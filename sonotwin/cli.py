@@ -71,6 +71,7 @@ quotes: `sonotwin surface "out=outputs/my run"`.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # of a damaged image we say so ourselves, in one line
     try:
         status = _run(sys.argv[1:] if arguments is None else list(arguments))
         sys.stdout.flush()

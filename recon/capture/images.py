@@ -1,8 +1,6 @@
-"""Grey PNG images of a capture: written, and read with every fault refused in one line that names the file."""
+"""Images of a capture: written as grey PNG, and read with every fault refused in one line that names the file."""
 
 import re
-import struct
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.capture.image_formats import SUFFIXES, decode_image, luma
 from recon.errors import InputError
 from recon.files.regular import read_bytes
 from recon.threads import mapped
@@ -17,8 +16,6 @@ from recon.threads import mapped
 Images = NDArray[np.uint8] | NDArray[np.uint16]
 Size = tuple[int, int]  # width, height, px
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_COLOURS = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}
 # Sensor noise has no repeats to look for, but for runs of one value: twice as fast, and smaller, than zlib's usual search.
 PNG_ENCODER = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 
@@ -44,12 +41,12 @@ def write_images(paths: Sequence[Path], images: Images) -> None:
 
 
 def read_images(paths: Sequence[Path], size: Size, bits: int) -> Images:
-    """Read grey PNG images of one size : (n, h, w), uint8 for 8 bits and uint16 above.
+    """Read images of one size as grey : (n, h, w), uint8 for 8 bits and uint16 above; PNG, BMP, TIFF or JPEG, in colour, too.
 
     Raises
     ------
     InputError
-        If one is missing, cut short, damaged, coloured, of another size or depth, or brighter than its bits allow.
+        If one is missing, cut short, damaged, of another size or depth, or brighter than its bits allow.
     """
     images = np.empty((len(paths), size[1], size[0]), np.uint8 if bits == 8 else np.uint16)
 
@@ -61,55 +58,49 @@ def read_images(paths: Sequence[Path], size: Size, bits: int) -> Images:
 
 
 def read_image(path: Path, size: Size, bits: int) -> Images:
-    """Read one grey PNG image : (h, w); see `read_images`."""
-    data = read_bytes(path)
-    width, height, depth, colour = png_header(path, data)
-    stored = 8 if bits == 8 else 16
-    if (width, height) != size or depth != stored or colour != "grey":
-        raise InputError(f"{path}: expected {size[0]}x{size[1]} {stored}-bit grey, found {width}x{height} {depth}-bit {colour}")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None or image.shape != (height, width):
-        raise InputError(f"{path}: expected a whole grey PNG image, found damaged data")
+    """Read one image as grey : (h, w); see `read_images`."""
+    image = decode_image(path, read_bytes(path))
+    (height, width), depth, stored = image.shape[:2], 8 * image.dtype.itemsize, 8 if bits == 8 else 16
+    if (width, height) != size or depth != stored:
+        raise InputError(f"{path}: expected {size[0]}x{size[1]} {stored}-bit, found {width}x{height} {depth}-bit")
     if bits > 8 and (brightest := int(image.max())) >= 1 << bits:
         raise InputError(f"{path}: expected {bits}-bit values up to {(1 << bits) - 1}, right-aligned, found {brightest}")
-    return image
+    return luma(image, (1 << bits) - 1)
 
 
-def image_size(path: Path) -> Size:
-    """Width and height of a PNG file, in px; checked as in `png_header`."""
-    return png_header(path, read_bytes(path))[:2]
+def read_grey(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
+    """Read an 8-bit image of another program as grey : (h, w).
 
-
-def png_header(path: Path, data: bytes) -> tuple[int, int, int, str]:
-    """Width, height, bit depth and colour of a PNG file whose every chunk is whole.
-
-    Versions of OpenCV return an image, partly black, for a file that was cut short; so the chunks and their checksums are
-    checked here.
+    Parameters
+    ----------
+    size : width, height that it must have; None for any
 
     Raises
     ------
     InputError
-        If the data is no PNG, cut short, or a checksum doesn't fit.
+        If it is missing, damaged, deeper than 8 bits, larger than any camera's, or of another size.
     """
-    if not data.startswith(PNG_SIGNATURE):
-        raise InputError(f"{path}: expected a PNG image, found {'an empty file' if not data else 'other data'}")
-    view, position, kind = memoryview(data), len(PNG_SIGNATURE), b""
-    while kind != b"IEND":
-        if position + 12 > len(data):
-            raise InputError(f"{path}: expected a whole PNG image, found it cut short at {len(data)} bytes")
-        length, kind = struct.unpack_from(">I4s", data, position)
-        end = position + 8 + length
-        if end + 4 > len(data):
-            raise InputError(f"{path}: expected a whole PNG image, found it cut short at {len(data)} bytes")
-        if zlib.crc32(view[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise InputError(f"{path}: expected a whole PNG image, found damaged data at byte {position}")
-        position = end + 4
-    if data[12:16] != b"IHDR":
-        raise InputError(f"{path}: expected a PNG image, found no header in it")
-    width, height, depth, colour = struct.unpack_from(">IIBB", data, len(PNG_SIGNATURE) + 8)
-    return width, height, depth, PNG_COLOURS.get(colour, f"colour type {colour}")
+    image = decode_image(path, read_bytes(path))
+    if image.dtype != np.uint8:
+        raise InputError(f"{path}: expected 8 bits a pixel, found {8 * image.dtype.itemsize}")
+    if size is not None and image.shape[:2] != size[::-1]:
+        raise InputError(f"{path}: expected {size[0]}x{size[1]} as of its camera, found {image.shape[1]}x{image.shape[0]}")
+    return luma(image, 255)
 
 
 def natural_key(path: Path) -> list[tuple[int, str]]:
     """Key that sorts names as people do: 2.png before 10.png."""
     return [(int(piece), "") if piece.isdigit() else (-1, piece) for piece in re.split(r"(\d+)", Path(path).name)]
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Images of a folder in natural order, 2.png before 10.png; none if there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted((path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES), key=natural_key)
+
+
+def frame_file(folder: Path, name: str) -> Path:
+    """The image of a frame whose file would be `name`, NUMBER.png; where that isn't there, the same of another kind."""
+    place = folder / name
+    return place if place.exists() else next((path for path in map(place.with_suffix, SUFFIXES) if path.exists()), place)

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from recon.capture import calibration_files
-from recon.capture.foreign_images import image_files, read_grey
-from recon.capture.images import Size, write_images
+from recon.capture.images import Size, image_files, read_grey, write_images
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError, one_line
 from recon.files import atomic

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.capture.foreign_images import image_files, read_grey
-from recon.capture.images import write_images
+from recon.capture.images import image_files, read_grey, write_images
 from recon.errors import InputError
 from recon.files.regular import read_bytes
 from recon.geometry import rigid

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.capture import calibration_files, manifest, sweep_tables
-from recon.capture.images import Images, read_image
+from recon.capture.images import Images, frame_file, read_image
 from recon.capture.manifest import CAMERAS, MANIFEST, STAMPS, image_name
 from recon.errors import InputError
 from recon.files.regular import check_there
@@ -45,7 +45,7 @@ class Film:
     def paths(self) -> Iterator[tuple[Path, Path]]:
         """Of both frames, pair by pair."""
         first, second = self.folders
-        return ((first / image_name(a), second / image_name(b)) for a, b in self.frames.tolist())
+        return ((frame_file(first, image_name(a)), frame_file(second, image_name(b))) for a, b in self.frames.tolist())
 
     @property
     def rate_hz(self) -> float:

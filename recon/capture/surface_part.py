@@ -9,7 +9,8 @@ from pathlib import Path
 import yaml
 
 from recon.capture import calibration_files
-from recon.capture.images import Images, natural_key, png_header, read_images
+from recon.capture.image_formats import decode_image
+from recon.capture.images import Images, image_files, read_images
 from recon.capture.manifest import MANIFEST, read_manifest, validated
 from recon.errors import InputError
 from recon.files.regular import read_bytes
@@ -52,7 +53,7 @@ def read_surface(folder: Path, camera: str = "cam1", calibration_file: Path | No
 
 
 def read_bare(images_dir: Path, patterns_file: Path, calibration_file: Path, camera: str = "cam1") -> SurfaceCapture:
-    """Read the PNG images of a folder, in natural order (2.png before 10.png), with patterns and calibration from elsewhere.
+    """Read the images of a folder, in natural order (2.png before 10.png), with patterns and calibration from elsewhere.
 
     8-bit images count as 8 bits; in 16-bit images the bits (10 or 12) follow from the largest value.
 
@@ -64,16 +65,15 @@ def read_bare(images_dir: Path, patterns_file: Path, calibration_file: Path, cam
     images_dir = Path(images_dir)
     patterns = read_patterns(patterns_file)
     if not images_dir.is_dir():
-        raise InputError(f"{images_dir}: expected a folder of PNG images, found {'a file' if images_dir.exists() else 'nothing'}")
-    paths = sorted((path for path in images_dir.iterdir() if path.suffix.lower() == ".png"), key=natural_key)
+        raise InputError(f"{images_dir}: expected a folder of images, found {'a file' if images_dir.exists() else 'nothing'}")
+    paths = image_files(images_dir)
     if len(paths) != patterns.count:
-        raise InputError(
-            f"{images_dir}: expected {patterns.count} PNG images, one a pattern of {patterns_file}, found {len(paths)}"
-        )
-    width, height, depth, _ = png_header(paths[0], read_bytes(paths[0]))
+        raise InputError(f"{images_dir}: expected {patterns.count} images, one a pattern of {patterns_file}, found {len(paths)}")
+    first = decode_image(paths[0], read_bytes(paths[0]))
+    (height, width), deep = first.shape[:2], first.dtype.itemsize > 1
     optics = calibration_files.read_for(Path(calibration_file), {camera: (width, height), "projector": patterns.projector_size})
-    images = read_images(paths, (width, height), 12 if depth == 16 else 8)
-    bits = 8 if depth != 16 else 10 if images.max() < 1 << 10 else 12
+    images = read_images(paths, (width, height), 12 if deep else 8)
+    bits = 8 if not deep else 10 if images.max() < 1 << 10 else 12
     return SurfaceCapture(images, patterns, bits, optics, images_dir.resolve().name)
 
 

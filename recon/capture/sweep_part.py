@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.capture import manifest, probe_files, sweep_tables
-from recon.capture.images import Size, read_image
+from recon.capture.images import Size, frame_file, read_image
 from recon.capture.manifest import MANIFEST, SCANNER, STAMPS, Purpose, image_name
 from recon.errors import InputError
 from recon.files.regular import check_there
@@ -104,7 +104,7 @@ def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None) -> 
         raise InputError(f"{folder / MANIFEST}: devices.{SCANNER}.bits: expected 8, found {device.bits}")
     scans = root / part.images[SCANNER]
     frames, times = sweep_tables.read_stamps(scans / STAMPS)
-    paths = tuple(scans / image_name(frame) for frame in frames.tolist())
+    paths = tuple(frame_file(scans, image_name(frame)) for frame in frames.tolist())
     check_there(paths)
     track = sweep_tables.read_track(root / str(part.track))
     probe = None if read.probe is None else probe_files.read(folder / read.probe)

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 
 from recon.capture import calibration_files, sweep_part
-from recon.capture.foreign_images import read_grey
+from recon.capture.images import read_grey
 from recon.errors import InputError
 from recon.files import atomic, layers, metrics
 from recon.freehand import scans as freehand_scans

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
 from recon.capture import calibration_files, manifest, meza2021, meza2021_sweep, probe_files, sweep_tables
-from recon.capture.foreign_images import read_grey
+from recon.capture.images import read_grey
 from recon.capture.manifest import SCANNER, Device, Purpose
 from recon.capture.meza2021_sweep import AuthorsSweep
 from recon.capture.writer import CaptureWriter, new_capture

@@ -109,7 +109,7 @@ def test_a_damaged_frame_is_named(copy):
 
 def test_a_frame_of_another_size_is_named(copy, rig, tmp_path):
     images.write_images([copy / "sweep/cam2/0001.png"], np.zeros((1, 512, 640), np.uint8))
-    assert complaint(copy) == "sweep/cam2/0001.png: expected 1280x1024 8-bit grey, found 640x512 8-bit grey"
+    assert complaint(copy) == "sweep/cam2/0001.png: expected 1280x1024 8-bit, found 640x512 8-bit"
 
 
 def edited(folder: Path, edit) -> Path:
