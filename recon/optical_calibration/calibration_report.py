@@ -32,7 +32,6 @@ LABELS = {
     "tz": "shift along z",
     "distance": "distance of the pinholes",
 }
-PAPER = {"cam1": 0.138, "projector": 0.131, "cam2": 0.151}  # px; Meza et al. 2021, Optical Engineering 60(5) 054106
 SUSPICIOUS = 3.0  # standard deviations
 FOOTER = (
     "World is the frame of camera 1: x right, y down, z away from it. The projector is a camera run backwards. This file is "
@@ -122,16 +121,14 @@ def residuals(result: Result, metrics: Metrics) -> Section:
             "cancels in the means of the image’s cells, so what stands out there is a pattern."
         )
     ]
-    histograms = []
+    histograms, published = [], figures_of_merit.published_rms(result.adjustment.calibration)
     for device in result.observations.devices:
         pixels, left, _ = figures_of_merit.sightings(result, device)
         middles, means, number = figures_of_merit.cell_means(result, device)
         enough = number >= min(FEWEST, number.max())
         size = result.adjustment.calibration.cameras[device].size
-        rms, compared = (
-            metrics[f"reprojection_rms_{device}_px"],
-            f"; the paper’s rig {PAPER[device]:.3f} px" if device in PAPER else "",
-        )
+        rms = metrics[f"reprojection_rms_{device}_px"]
+        compared = f"; the paper’s rig {published[device]:.3f} px" if device in published else ""
         sigma = rms / np.sqrt(2)
         magnified = figures.magnification(size, 2.5 * sigma)
         magnified_means = figures.magnification(size, 2 * float(np.sqrt(np.mean(means[enough] ** 2))))

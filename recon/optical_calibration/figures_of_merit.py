@@ -19,7 +19,24 @@ from recon.optical_calibration.uncertainty import rigid_modes
 DEPTHS = (0.05, 0.5, 0.95)  # quantiles of the depths of the board's points: those that the calibration is judged at
 CELLS = (8, 6)  # of an image, across and down, for the residuals' pattern
 GAUSS_NEWTON_STEPS = 5
+SAME_LENS = 0.05  # of the focal length, by which a lens of the paper's rig may differ when it is set up again
 TURN_STEP = 1e-6  # rad, of central differences
+
+
+@dataclass(frozen=True)
+class Published:
+    """A device of the paper's rig: what tells it from others, and what is printed of it."""
+
+    size: tuple[int, int]  # px
+    focal_px: float  # fx, likely: see conf/rig/meza2021.yaml
+    rms_px: float  # of the reprojection
+
+
+PAPER = {  # Meza et al. 2021, Optical Engineering 60(5) 054106
+    "cam1": Published((1280, 1024), 3320.0, 0.138),
+    "projector": Published((1280, 800), 1921.0, 0.131),
+    "cam2": Published((1280, 1024), 3318.0, 0.151),
+}
 
 
 @dataclass(frozen=True)
@@ -80,6 +97,15 @@ def describe_board(result: Result, figures: Metrics) -> str:
         return "taken as designed"
     in_plane, out_of_plane = (shown(figures[f"board_{name}_mm"], ".4f", " mm") for name in ("in_plane", "out_of_plane"))
     return f"differs from its design by {in_plane} in its plane and {out_of_plane} out of it (RMS), which is corrected"
+
+
+def published_rms(found: Calibration) -> dict[str, float]:
+    """Reprojection RMS by device, px, as the paper prints it for its rig; none of a rig of other images or lenses."""
+    for device, camera in found.cameras.items():
+        paper = PAPER.get(device)
+        if paper is None or camera.size != paper.size or abs(camera.matrix[0, 0] / paper.focal_px - 1) > SAME_LENS:
+            return {}
+    return {device: PAPER[device].rms_px for device in found.cameras}
 
 
 def errors(found: Calibration, truth: Calibration, volume: Array) -> Metrics:

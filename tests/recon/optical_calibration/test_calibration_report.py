@@ -110,6 +110,17 @@ def test_a_page_without_truth_projector_scores_and_halves(rig, tmp_path):
     assert not re.search(r"\bnan\b|\binf\b|true|[Pp]rojector,", shown)
 
 
+def test_another_rig_is_not_compared_with_the_papers(story, tmp_path):
+    """The same page of a camera whose focal length isn't that of the paper's rig."""
+    result, _ = story
+    adjusted = result.adjustment
+    cameras = dict(adjusted.calibration.cameras)
+    cameras["cam2"] = replace(cameras["cam2"], matrix=cameras["cam2"].matrix * [[0.9, 1, 1], [1, 0.9, 1], [1, 1, 1]])
+    foreign = replace(result, adjustment=replace(adjusted, calibration=replace(adjusted.calibration, cameras=cameras)))
+    calibration_report.write(tmp_path / "a.html", foreign, figures_of_merit.measure(result), [], [])
+    assert "paper’s rig" not in text_of((tmp_path / "a.html").read_text(encoding="utf-8"))
+
+
 def test_the_page_stands_alone(written):
     """Nothing is loaded from elsewhere, and without 3-D views there is no need of the program that draws them."""
     assert not re.findall(r"""(?:src|href)=["'](?!data:|#)|url\((?!#)|@import""", written)

@@ -49,6 +49,18 @@ def test_errors_without_truth_are_not_spoken_of(result):
     assert not [name for name in figures_of_merit.measure(result) if "error" in name]
 
 
+def test_only_the_papers_rig_is_compared_with_the_paper(result, cameras):
+    """Told by the image sizes and focal lengths of all devices, which are those of its file."""
+    published = figures_of_merit.published_rms
+    assert published(result.adjustment.calibration) == {"cam1": 0.138, "cam2": 0.151, "projector": 0.131}
+    assert published(Calibration({"cam1": cameras["cam1"]})) == {"cam1": 0.138}
+    for device, paper in figures_of_merit.PAPER.items():
+        assert cameras[device].size == paper.size and cameras[device].matrix[0, 0] == pytest.approx(paper.focal_px, rel=1e-3)
+        longer = replace(cameras[device], matrix=cameras[device].matrix * [[1.2, 1, 1], [1, 1.2, 1], [1, 1, 1]])
+        larger = replace(cameras[device], size=(1920, 1200))
+        assert published(Calibration(cameras | {device: longer})) == published(Calibration(cameras | {device: larger})) == {}
+
+
 def test_a_pattern_in_the_residuals_stands_out(result):
     """Random residuals have none; a whirl of half their size has, though their RMS hardly changes."""
     assert figures_of_merit.pattern_ratio(result, "cam1") == pytest.approx(1, abs=0.35)
