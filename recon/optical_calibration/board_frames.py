@@ -1,7 +1,8 @@
 """From the board part of a capture to sightings: the devices that take part, and the poses in which each found the board."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -13,41 +14,55 @@ from recon.optical_calibration.sightings import Sighting, sight
 from recon.threads import mapped
 
 MOST_AT_ONCE = 4  # poses, whose images and maps take some 0.3 GB each
-DEVICES = ("cam1", "cam2", "projector")  # in the order in which they are adjusted; the first is the world
+DeviceName = Literal["cam1", "cam2", "projector"]
+DEVICES: tuple[DeviceName, ...] = ("cam1", "cam2", "projector")  # in the order in which they are adjusted; the first is the world
 
 
-def sizes_of(captured: BoardCapture) -> dict[str, Size]:
+def sizes_of(captured: BoardCapture, chosen: Sequence[DeviceName] | None = None) -> dict[str, Size]:
     """Image sizes of the devices that take part, in the order in which they stand in the calibration.
+
+    Parameters
+    ----------
+    chosen : devices that are to take part; None for all of the capture
 
     Raises
     ------
     InputError
-        If camera 1, whose frame is the world, is not among them.
+        If the capture lacks a device that was chosen, or camera 1, whose frame is the world, is not among them.
     """
     sizes = {name: captured.devices[name].size for name in captured.cameras}
     if captured.patterns is not None:
         sizes["projector"] = captured.patterns.projector_size
-    if DEVICES[0] not in sizes:
-        raise InputError(f"{captured.name}: expected images of {DEVICES[0]}, the world's frame, found {', '.join(sizes)}")
-    return {name: sizes[name] for name in DEVICES if name in sizes}
+    if lacking := [name for name in chosen or () if name not in sizes]:
+        raise InputError(f"{captured.name}: expected images of {', '.join(lacking)}, as devices, found {', '.join(sizes)}")
+    taken = [name for name in DEVICES if name in sizes and (chosen is None or name in chosen)]
+    if DEVICES[0] not in taken:
+        found = ", ".join(sizes if chosen is None else taken)
+        raise InputError(f"{captured.name}: expected images of {DEVICES[0]}, the world's frame, found {found}")
+    return {name: sizes[name] for name in taken}
 
 
-def look_at_all(captured: BoardCapture) -> Iterator[Sighting]:
+def look_at_all(captured: BoardCapture, devices: Collection[str] = DEVICES) -> Iterator[Sighting]:
     """Read the images of each pose and find the board in them, some poses at once, since much of that is work for one thread.
+
+    Parameters
+    ----------
+    devices : that are to be calibrated
 
     Raises
     ------
     InputError
         If an image is damaged, or doesn't fit its device.
     """
-    return mapped(lambda number: _look(captured, captured.pose(number)), range(len(captured.poses)), most=MOST_AT_ONCE)
+    return mapped(lambda number: _look(captured, captured.pose(number), devices), range(len(captured.poses)), most=MOST_AT_ONCE)
 
 
-def _look(captured: BoardCapture, pose: Pose) -> Sighting:
-    """Find the board in the images of the cameras that can be calibrated."""
-    lit = {camera: image for camera, image in pose.lit.items() if camera in DEVICES}
+def _look(captured: BoardCapture, pose: Pose, devices: Collection[str]) -> Sighting:
+    """Find the board in the images of the devices that are calibrated."""
+    lit = {camera: image for camera, image in pose.lit.items() if camera in devices}
     bits = {name: device.bits for name, device in captured.devices.items()}
-    return sight(pose.name, captured.board, lit, pose.fringes, captured.patterns, bits)
+    patterns = captured.patterns if "projector" in devices else None
+    return sight(pose.name, captured.board, lit, pose.fringes, patterns, bits)
 
 
 def found_by(sightings: Sequence[Sighting], devices: Mapping[str, Size]) -> str:
@@ -61,8 +76,8 @@ def not_found(sightings: Sequence[Sighting]) -> dict[str, str]:
     return {f"{sighting.name} {device}": reason for sighting in sightings for device, reason in sighting.failures.items()}
 
 
-def refuse_lonely(sightings: Sequence[Sighting], name: str) -> None:
-    """Refuse a capture in which fewer than two devices found the board: nothing can be measured with one.
+def refuse_lonely(sightings: Sequence[Sighting], devices: Collection[str], name: str) -> None:
+    """Refuse a capture of several devices in which fewer than two found the board, as nothing can be measured with one.
 
     Raises
     ------
@@ -70,11 +85,13 @@ def refuse_lonely(sightings: Sequence[Sighting], name: str) -> None:
         With the commonest reason.
     """
     seeing = {device for sighting in sightings for device in sighting.pixels if _has_points(sighting, device)}
-    if len(seeing) >= 2:
+    if len(seeing) >= min(len(devices), 2):
         return
     reasons = [f"{device}: {reason}" for sighting in sightings for device, reason in sighting.failures.items()]
     why = f" ({max(set(reasons), key=reasons.count)})" if reasons else ""
-    raise InputError(f"{name}: expected two devices or more that see the board, found {', '.join(seeing) or 'none'}{why}")
+    expected = "two devices or more that see" if len(devices) > 1 else f"{', '.join(devices)} to see"
+    alone = "; devices=[cam1] calibrates it alone" if seeing == {DEVICES[0]} else ""
+    raise InputError(f"{name}: expected {expected} the board, found {', '.join(seeing) or 'none'}{why}{alone}")
 
 
 def with_absent(result: Result, devices: Mapping[str, Size], cameras: Sequence[str]) -> Result:

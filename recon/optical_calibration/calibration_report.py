@@ -32,6 +32,7 @@ LABELS = {
     "tz": "shift along z",
     "distance": "distance of the pinholes",
 }
+MEASURED = (("point_sigma_mm", ".3f", "mm"), ("shape_sigma_mm", ".4f", "mm"), ("scale_sigma_ppm", ".0f", "ppm"))
 SUSPICIOUS = 3.0  # standard deviations
 FOOTER = (
     "World is the frame of camera 1: x right, y down, z away from it. The projector is a camera run backwards. This file is "
@@ -84,10 +85,12 @@ def opening(result: Result, metrics: Metrics) -> Opening:
     together = f"{', '.join(devices[:-1])} and {devices[-1]}" if len(devices) > 1 else devices[0]
     text = (
         f"{together[0].upper()}{together[1:]}, calibrated in one adjustment from {metrics['poses']:g} poses of "
-        f"{len(result.observations.points)} points. By the calibration alone, a point in the working volume is uncertain "
-        f"by {shown(metrics['point_sigma_mm'], '.3f', ' mm')}, "
-        f"and by {shown(metrics['shape_sigma_mm'], '.4f', ' mm')} within a shape"
+        f"{len(result.observations.points)} points"
     )
+    measured = [row for row in MEASURED if row[0] in metrics]  # by two devices or more
+    if measured:
+        point, shape = shown(metrics["point_sigma_mm"], ".3f", " mm"), shown(metrics["shape_sigma_mm"], ".4f", " mm")
+        text += f". By the calibration alone, a point in the working volume is uncertain by {point}, within a shape by {shape}"
     if "shape_error_rms_mm" in metrics:
         here = shown(metrics["point_error_rms_mm"], ".3f", " mm")
         shape = shown(metrics["shape_error_rms_mm"], ".4f", " mm")
@@ -99,11 +102,7 @@ def opening(result: Result, metrics: Metrics) -> Opening:
         (f"{NAMES[device]}, RMS", shown(metrics[f"reprojection_rms_{device}_px"], ".4f"), "px")
         for device in result.observations.devices
     ]
-    numbers += [
-        ("point, 1 σ", shown(metrics["point_sigma_mm"], ".3f"), "mm"),
-        ("shape, 1 σ", shown(metrics["shape_sigma_mm"], ".4f"), "mm"),
-        ("scale, 1 σ", shown(metrics["scale_sigma_ppm"], ".0f"), "ppm"),
-    ]
+    numbers += [(f"{name.split('_')[0]}, 1 σ", shown(metrics[name], form), unit) for name, form, unit in measured]
     return Opening("optics calibration", "The calibrated cameras and projector", text + ".", numbers)
 
 
@@ -159,7 +158,7 @@ def residuals(result: Result, metrics: Metrics) -> Section:
 
 def coverage(result: Result, metrics: Metrics) -> Section:
     """Where in the images and in depth the board was."""
-    depth = _depths_of_points(result)
+    depth = figures_of_merit.board_points(result)[..., 2]
     low, high = np.floor(depth.min()), np.ceil(depth.max())
     scale = Scale(SEQUENTIAL, float(low), float(high))
     drawings = []
@@ -211,7 +210,6 @@ def poses(result: Result) -> Section:
 def uncertainty_maps(result: Result, metrics: Metrics, depths: Sequence[float], volume: Array) -> Section:
     """Maps of the parameters' covariance, carried to px and mm."""
     found = result.adjustment.calibration
-    pair = figures_of_merit.devices_that_measure(found)
     middle = depths[len(depths) // 2]
     pixels = {device: uncertainty.projection_map(found, device, middle, volume) for device in result.observations.devices}
     scale = _shared_scale(pixels.values())
@@ -233,6 +231,14 @@ def uncertainty_maps(result: Result, metrics: Metrics, depths: Sequence[float], 
         ),
         page.grid(maps),
     ]
+    if len(found.cameras) > 1:
+        blocks += _millimetre_maps(found, metrics, depths, volume)
+    return Section("Uncertainty", blocks)
+
+
+def _millimetre_maps(found: Calibration, metrics: Metrics, depths: Sequence[float], volume: Array) -> list[str]:
+    """Maps of the uncertainty of points, which two devices measure."""
+    blocks, pair = [], figures_of_merit.devices_that_measure(found)
     millimetres = {depth: uncertainty.point_maps(found, *pair, depth, volume) for depth in depths}
     for k, caption, detail in (
         (0, "Position", "Of a point in the frame of camera 1, the motion of that frame included."),
@@ -253,7 +259,7 @@ def uncertainty_maps(result: Result, metrics: Metrics, depths: Sequence[float], 
             "scale comes on top: that of a board printed 0.1 % too large makes everything 0.1 % too small."
         )
     )
-    return Section("Uncertainty", blocks)
+    return blocks
 
 
 def parameters(result: Result, metrics: Metrics, truth: Calibration | None) -> Section:
@@ -337,12 +343,6 @@ def reading() -> Section:
         ("Halves differ by many σ", "Don’t trust the ± of the parameters: an error is there that is no noise."),
     ]
     return Section("How to read it", [page.table(("what you see", "what it means"), rows)])
-
-
-def _depths_of_points(result: Result) -> Array:
-    """Depth, z, of the board's points in each pose : (p, n) mm."""
-    poses = result.adjustment.poses
-    return np.einsum("pj,nj->pn", poses[:, 2, :3], result.adjustment.points) + poses[:, 2, 3, None]
 
 
 def _marks(centres: Mapping[str, Array], axes: Sequence[int]) -> dict[str, Array]:

@@ -57,7 +57,7 @@ class Parameter:
 
 
 def measure(result: Result, truth: Calibration | None = None) -> Metrics:
-    """Figures of a calibration, each named with its unit.
+    """Figures of a calibration, each named with its unit; those of points that are measured need two devices.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def measure(result: Result, truth: Calibration | None = None) -> Metrics:
         The true one, of a render.
     """
     found, adjusted = result.adjustment.calibration, result.adjustment
-    pair, volume = devices_that_measure(found), working_volume(result)
+    volume = working_volume(result)
     figures: Metrics = {
         "poses": len(result.observations.poses),
         "poses_dropped": len({_pose(name) for name in result.dropped} - set(result.observations.poses)),
@@ -80,9 +80,11 @@ def measure(result: Result, truth: Calibration | None = None) -> Metrics:
         figures[f"pattern_ratio_{device}"] = pattern_ratio(result, device)
         figures[f"coverage_{device}"] = coverage(result, device)
         figures[f"projection_sigma_{device}_px"] = _rms(uncertainty.projection(found, device, volume, volume))
-    figures["point_sigma_mm"] = _rms(uncertainty.triangulation(found, *pair, volume))
-    figures["shape_sigma_mm"] = _rms(uncertainty.shape(found, *pair, volume, volume))
-    figures["scale_sigma_ppm"] = 1e6 * uncertainty.scale(found, *pair, volume)
+    if len(found.cameras) > 1:
+        pair = devices_that_measure(found)
+        figures["point_sigma_mm"] = _rms(uncertainty.triangulation(found, *pair, volume))
+        figures["shape_sigma_mm"] = _rms(uncertainty.shape(found, *pair, volume, volume))
+        figures["scale_sigma_ppm"] = 1e6 * uncertainty.scale(found, *pair, volume)
     in_plane, out_of_plane = departure(result.adjustment.points, result.observations.points)
     figures["board_in_plane_mm"], figures["board_out_of_plane_mm"] = in_plane, out_of_plane
     if np.isfinite(result.halves).all():
@@ -121,6 +123,8 @@ def errors(found: Calibration, truth: Calibration, volume: Array) -> Metrics:
         focal = [camera.matrix[k, k] / truth.cameras[device].matrix[k, k] - 1 for k in (0, 1)]
         figures[f"{device}_focal_error_ppm"] = 1e6 * float(np.mean(focal))
     figures["parameters_error_sigma"] = normalised_error(found, truth)
+    if len(found.cameras) == 1:
+        return figures
     error = point_errors(found, truth, volume)
     modes = rigid_modes(volume).reshape(-1, 6)
     left = error.ravel() - modes @ np.linalg.lstsq(modes, error.ravel(), rcond=None)[0]
@@ -169,7 +173,7 @@ def coverage(result: Result, device: str) -> float:
 
 
 def devices_that_measure(calibration: Calibration) -> tuple[str, str]:
-    """The pair of devices that surfaces are measured with: camera 1 and the projector, or else the second camera."""
+    """The pair of devices, of two or more, that surfaces are measured with: camera 1 and projector, or else the second camera."""
     first, *others = calibration.cameras
     return first, "projector" if "projector" in others else others[0]
 

@@ -1,13 +1,15 @@
 """Calibrate cameras and projector, all at once, from images of a board in many poses.
 
 Reads the board part of a capture folder: in each pose the lit board and, for the projector, a fringe sequence along both axes,
-whose mean serves where there is no lit image.
+whose mean serves where there is no lit image. One camera alone, with or without a projector, is calibrated as well.
 Writes into the folder `out`: optics.yaml (with the covariance); the same in the rig authors' layout, cam1_proj_params.npz,
 cam1_cam2_params.npz and StereoParams.xml; metrics.json; and calibration.html (open it in a browser; it needs no network). A
 calibration that is there already is replaced. Takes some seconds a pose, and about a minute for the adjustment.
 
     sonotwin calibrate-optics capture=outputs/board/capture out=outputs/board/calibration
     sonotwin calibrate-optics capture=outputs/board/capture truth=outputs/board/truth out=outputs/board/calibration
+    sonotwin calibrate-optics capture=board/capture devices=[cam1,projector] out=board/calibration
+    sonotwin calibrate-optics capture=board/capture devices=[cam1] out=board/camera
 """
 
 import shlex
@@ -24,6 +26,7 @@ from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown
 from recon.model.calibration import Calibration
 from recon.optical_calibration import board_frames, calibration_report, figures_of_merit
+from recon.optical_calibration.board_frames import DeviceName
 from recon.optical_calibration.distortion_selection import ModelName
 from recon.optical_calibration.joint_calibration import Result, Settings, calibrate
 
@@ -45,6 +48,7 @@ class Config(Settings):
     capture: Path
     out: Path
     truth: Path | None = None
+    devices: tuple[DeviceName, ...] | None = None
     distortion: Literal["auto", ModelName] = "auto"  # as one list of choices, for the message
     _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
 
@@ -66,13 +70,13 @@ def run(config: Config) -> None:
     inputs = [path for path in (config.capture, config.truth) if path is not None]
     atomic.check_folder(config.out, PAGE, inputs=inputs)
     captured = board_part.read_board(config.capture)
-    sizes = board_frames.sizes_of(captured)
+    sizes = board_frames.sizes_of(captured, config.devices)
     truth = None if config.truth is None else calibration_files.read_for(config.truth / manifest.OPTICS, sizes)
 
     start = perf_counter()
     sightings = []
     with console.status("looking for the board") as status:
-        for number, sighting in enumerate(board_frames.look_at_all(captured), start=1):
+        for number, sighting in enumerate(board_frames.look_at_all(captured, sizes), start=1):
             sightings.append(sighting)
             status.update(f"looking for the board, {number} of {len(captured.poses)} poses done")
     seconds = {"seconds_detect": round(perf_counter() - start, 3)}
@@ -80,7 +84,7 @@ def run(config: Config) -> None:
     missed = board_frames.not_found(sightings)
     for line in dropped(missed):
         console.print(line, markup=False)
-    board_frames.refuse_lonely(sightings, captured.name)
+    board_frames.refuse_lonely(sightings, sizes, captured.name)
 
     start = perf_counter()
     with console.status("adjusting"):
@@ -107,8 +111,13 @@ def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
     devices = result.observations.devices
     remaining = ", ".join(f"{device} {shown(figures[f'reprojection_rms_{device}_px'], '.4f')}" for device in devices)
     models = ", ".join(dict.fromkeys(result.model[device] for device in devices))
-    point, shape = (shown(figures[f"{name}_sigma_mm"], ".4f", " mm") for name in ("point", "shape"))
-    yield f"uncertain   point {point}, within a shape {shape}, scale {shown(figures['scale_sigma_ppm'], '.0f', ' ppm')} (1 sigma)"
+    if "point_sigma_mm" in figures:
+        point, shape = (shown(figures[f"{name}_sigma_mm"], ".4f", " mm") for name in ("point", "shape"))
+        scale = shown(figures["scale_sigma_ppm"], ".0f", " ppm")
+        yield f"uncertain   point {point}, within a shape {shape}, scale {scale} (1 sigma)"
+    else:
+        seen = shown(figures[f"projection_sigma_{devices[0]}_px"], ".4f", " px")
+        yield f"uncertain   projection {seen} (1 sigma); one camera alone measures no points"
     yield f"adjust      {figures['poses']} poses, {models}; reprojection RMS {remaining} px; {seconds:.0f} s"
     yield f"board       {figures_of_merit.describe_board(result, figures)}"
     if "point_error_rms_mm" in figures:

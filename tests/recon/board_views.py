@@ -81,3 +81,16 @@ def view(board, camera, world_from_board, *, blur=0.7, dark=40.0, white=180.0, n
     if noise:
         image = np.rint(image + rng.normal(0, noise, image.shape))
     return np.clip(image, 0, 255)
+
+
+def under_patterns(board, camera, projector, patterns, world_from_board, rng, bits=8):
+    """Camera's images : (1 + n, h, w) of the board, lit and then under each pattern, with 0.7 DN of noise, of 255."""
+    lit, full = view(board, camera, world_from_board, dark=80), 2**bits - 1
+    board_from_world = rigid.invert(world_from_board)
+    rays, normal = camera.rays(camera.pixel_grid()), board_from_world[2]
+    surface = rays * (-normal[3] / (rays @ normal[:3]))[..., None]
+    at = projector.project(surface).astype(np.float32)
+    light = np.stack([cv2.remap(np.float32(image), at[..., 0], at[..., 1], cv2.INTER_LINEAR) for image in patterns.images()])
+    images = np.concatenate([lit[None], lit * light])
+    noisy = np.rint((images + rng.normal(0, 0.7, images.shape)) * full / 255)
+    return np.clip(noisy, 0, full).astype(np.uint8 if bits == 8 else np.uint16)

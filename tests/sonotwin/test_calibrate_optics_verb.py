@@ -18,6 +18,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.boards import Chessboard
 from recon.model.calibration import Calibration
+from recon.model.patterns import GrayCode, Patterns
 from sonotwin.cli import main
 from tests.recon import board_views
 
@@ -140,11 +141,64 @@ def test_a_capture_without_a_board_or_that_one_camera_sees_is_refused(copied, tm
     for path in (copied / "capture" / "board").glob("*/cam2/lit.png"):
         cv2.imwrite(str(path), black)
     fields = [f"capture={copied / 'capture'}", f"out={tmp_path / 'out'}"]
-    assert complaint(capsys, *fields).startswith("small: expected two devices or more that see the board, found cam1 (cam2: ")
+    said = complaint(capsys, *fields)
+    assert said.startswith("small: expected two devices or more that see the board, found cam1 (cam2: ")
+    assert said.endswith("; devices=[cam1] calibrates it alone")
     del content["board"]
     manifest.write_text(json.dumps(content))
     assert "expected board, the poses of a calibration board, found none" in complaint(capsys, *fields)
     assert not (tmp_path / "out").exists()
+
+
+def test_one_camera_alone_is_calibrated_by_command(session, tmp_path, capsys):
+    """From lit images; the other camera isn't looked at, and nothing is said in mm, as nothing is measured with one."""
+    out = tmp_path / "out"
+    fields = [f"capture={session / 'capture'}", f"out={out}", f"truth={session / 'truth'}", "distortion=radial2"]
+    assert main(["calibrate-optics", *fields, "devices=[cam1]"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"detect +9 poses: cam1 9, \d+ s", lines[0])
+    assert re.fullmatch(r"uncertain +projection 0\.\d+ px \(1 sigma\); one camera alone measures no points", lines[1])
+    assert not [line for line in lines if "cam2" in line]
+    assert sorted(path.name for path in out.iterdir()) == ["calibration.html", "metrics.json", "optics.yaml"]
+    found = calibration_files.read(out / "optics.yaml")
+    assert list(found.cameras) == ["cam1"]
+    assert abs(found.cameras["cam1"].matrix[0, 0] - 830) < 4 * found.uncertainty.sigma("cam1.fx") < 40
+    assert "point_sigma_mm" not in json.loads((out / "metrics.json").read_text())
+    assert not re.search(r"\bnan\b|unknown", (out / "calibration.html").read_text(encoding="utf-8").split("</style>")[1])
+
+
+def test_camera_and_projector_by_gray_code_alone(tmp_path, capsys):
+    """What many rigs record: one camera, and in each pose the code with its inverses, nothing else."""
+    camera, rng = cameras()["cam1"], np.random.default_rng(0)
+    pose = rigid.from_rotation_vector(np.deg2rad([0, -15, 0]), [172.0, 4, 45])
+    projector = Camera((256, 160), np.array([[560.0, 0, 127], [0, 560, 80], [0, 0, 1]]), np.zeros(4), pose)
+    code = tuple(GrayCode(axis=axis, pitch=1, bits=8, inverted=True) for axis in ("columns", "rows"))
+    patterns = Patterns(projector_size=projector.size, unwrap="gray", parts=code)
+    board = Chessboard(columns=6, rows=5, square_mm=24)
+    with new_capture(tmp_path / "capture", "code") as capture:
+        records = []
+        for number in range(8):
+            placed = board_views.pose(board, rng.uniform(640, 720), rng.uniform(-0.5, 0.5, 2), 0.1, rng.uniform(-15, 15, 2))
+            stack = board_views.under_patterns(board, camera, projector, patterns, placed, rng)[1:]
+            records.append(write_pose(capture.folder, f"{number:02d}", {}, {"cam1": stack}))
+        devices = {"cam1": Device(size=SIZE), "projector": Device(size=projector.size)}
+        capture.add_board(BoardPart(board=board, patterns=patterns, poses=tuple(records)), devices)
+    fields = [f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}", "distortion=radial1"]
+    assert main(["calibrate-optics", *fields]) == 0
+    assert re.match(r"detect +8 poses: cam1 8, projector 8,", capsys.readouterr().out)
+    found = calibration_files.read(tmp_path / "out" / "optics.yaml")
+    for name, true in (("cam1", camera), ("projector", projector)):
+        assert abs(found.cameras[name].matrix[0, 0] - true.matrix[0, 0]) < 4 * found.uncertainty.sigma(f"{name}.fx") < 60, name
+    figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert figures["reprojection_rms_projector_px"] < 0.15 and figures["point_sigma_mm"] < 3
+
+
+def test_devices_that_the_capture_lacks_are_refused(session, tmp_path, capsys):
+    fields = [f"capture={session / 'capture'}", f"out={tmp_path / 'out'}"]
+    expected = "small: expected images of projector, as devices, found cam1, cam2"
+    assert complaint(capsys, *fields, "devices=[cam1,projector]") == expected
+    assert complaint(capsys, *fields, "devices=[cam2]") == "small: expected images of cam1, the world's frame, found cam2"
+    assert complaint(capsys, *fields, "devices=[cam3]").startswith("calibrate-optics: devices.0: expected ")
 
 
 def test_reasons_are_told_though_nothing_can_be_calibrated(copied, tmp_path, capsys):
@@ -155,13 +209,14 @@ def test_reasons_are_told_though_nothing_can_be_calibrated(copied, tmp_path, cap
         pose["lit"] = {"cam1": pose["lit"]["cam1"], "cam3": pose["lit"]["cam2"]}
     manifest["devices"]["cam3"] = manifest["devices"]["cam2"]
     (capture / "manifest.json").write_text(json.dumps(manifest))
-    cv2.imwrite(str(capture / "board" / "04" / "cam1" / "lit.png"), np.full((SIZE[1], SIZE[0]), 3, np.uint8))
+    for path in (capture / "board").glob("*/cam1/lit.png"):
+        cv2.imwrite(str(path), np.full((SIZE[1], SIZE[0]), 3, np.uint8))
     assert main(["calibrate-optics", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 2
     said = capsys.readouterr()
-    detect, dropped = said.out.splitlines()
-    assert re.fullmatch(r"detect +9 poses: cam1 8, \d+ s", detect)
-    assert dropped.startswith("dropped     04 cam1: ")
-    assert said.err.startswith("sonotwin: small: expected two devices or more that see the board, found cam1")
+    detect, *dropped = said.out.splitlines()
+    assert re.fullmatch(r"detect +9 poses: cam1 0, \d+ s", detect)
+    assert len(dropped) == 9 and dropped[4].startswith("dropped     04 cam1: ")
+    assert said.err.startswith("sonotwin: small: expected cam1 to see the board, found none (cam1: ")
 
 
 def test_a_third_camera_is_warned_of(copied, tmp_path, capsys):

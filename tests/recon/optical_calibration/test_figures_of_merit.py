@@ -173,6 +173,20 @@ def test_parameters_are_told_with_their_scatter(result, cameras, rng):
     assert distance.true == pytest.approx(np.linalg.norm(cameras["projector"].centre))
 
 
+def test_one_camera_has_figures_but_none_of_points(cameras):
+    """Nothing is triangulated with one; how well it is known is said in pixels."""
+    alone = {"cam1": cameras["cam1"]}
+    rng = np.random.default_rng(1)
+    sightings = board_sets.sightings(alone, board_sets.random_poses(alone, 14, rng), rng)
+    sizes = {"cam1": cameras["cam1"].size}
+    found = joint_calibration.calibrate(sightings, board_sets.BOARD, sizes, joint_calibration.Settings(distortion="decentred"))
+    figures = figures_of_merit.measure(found, Calibration(cameras))
+    known = found.adjustment.calibration.uncertainty
+    assert abs(found.adjustment.calibration.cameras["cam1"].matrix[0, 0] - 3320) < 4 * known.sigma("cam1.fx") < 40
+    assert 0 < figures["projection_sigma_cam1_px"] < 0.1 and figures["parameters_error_sigma"] < 2
+    assert not [name for name in figures if name.startswith(("point", "shape", "scale"))]
+
+
 def test_two_cameras_measure_without_a_projector(cameras):
     both = {name: cameras[name] for name in ("cam1", "cam2")}
     rng = np.random.default_rng(1)

@@ -1,6 +1,5 @@
 """From the images of one pose to where each device sees the board, on synthetic photographs."""
 
-import cv2
 import numpy as np
 import pytest
 
@@ -14,7 +13,7 @@ from recon.model.boards import Chessboard
 from recon.model.patterns import Fringes, GrayCode, Patterns, Uniform
 from recon.optical_calibration import board_frames, sightings
 from recon.optical_calibration.sightings import sight
-from tests.recon.board_views import pose, view
+from tests.recon.board_views import pose, under_patterns
 
 BOARD = Chessboard(columns=5, rows=4, square_mm=28)
 CAMERA = Camera((320, 256), np.array([[830.0, 0, 158], [0, 832, 127], [0, 0, 1]]), np.zeros(4))
@@ -39,7 +38,7 @@ PATTERNS = Patterns(
 def test_images_of_any_depth_tell_the_points_of_camera_and_projector(bits, rng):
     """The same light in finer steps: the points lie where they should, and as well as is said."""
     world_from_board = pose(BOARD, 640, (0.3, -0.25), 0.1)
-    photographs = photograph(PATTERNS, world_from_board, bits, rng)
+    photographs = under_patterns(BOARD, CAMERA, PROJECTOR, PATTERNS, world_from_board, rng, bits)
     found = sight("00", BOARD, {"cam1": photographs[0]}, photographs[1:], PATTERNS, {"cam1": bits})
     check(found, world_from_board)
     error = camera_error(found, world_from_board)
@@ -49,7 +48,7 @@ def test_images_of_any_depth_tell_the_points_of_camera_and_projector(bits, rng):
 def test_the_mean_of_the_fringes_stands_in_for_a_lit_image(tmp_path, rng):
     """A capture whose poses hold nothing but the projected sequence gives points as exact as with a lit image."""
     world_from_board = pose(BOARD, 640, (0.3, -0.25), 0.1)
-    stack = photograph(PATTERNS, world_from_board, 8, rng)[1:]
+    stack = under_patterns(BOARD, CAMERA, PROJECTOR, PATTERNS, world_from_board, rng)[1:]
     devices = {"cam1": Device(size=CAMERA.size), "projector": Device(size=PROJECTOR.size)}
     with new_capture(tmp_path / "capture") as capture:
         records = (write_pose(capture.folder, "00", {}, {"cam1": stack}),)
@@ -65,7 +64,7 @@ def test_gray_code_alone_gives_the_projector_its_points(inverted, rng):
     code = [GrayCode(axis=axis, pitch=1, bits=8, inverted=inverted) for axis in ("columns", "rows")]
     parts = code if inverted else [Uniform(), *code, Uniform(level=0)]
     patterns = Patterns(projector_size=PROJECTOR.size, unwrap="gray", parts=tuple(parts))
-    photographs = photograph(patterns, world_from_board, 8, rng)
+    photographs = under_patterns(BOARD, CAMERA, PROJECTOR, patterns, world_from_board, rng)
     found = sight("00", BOARD, {"cam1": photographs[0]}, photographs[1:], patterns, {"cam1": 8})
     check(found, world_from_board, most_px=0.2)
     expected = PROJECTOR.project(rigid.apply(world_from_board, BOARD.points()))
@@ -75,19 +74,6 @@ def test_gray_code_alone_gives_the_projector_its_points(inverted, rng):
 
 def camera_error(found, world_from_board):
     return found.pixels["cam1"] - CAMERA.project(rigid.apply(world_from_board, BOARD.points()))
-
-
-def photograph(patterns, world_from_board, bits, rng):
-    """Camera 1's images : (1 + n, h, w) of the board, lit and then under each pattern."""
-    lit, full = view(BOARD, CAMERA, world_from_board, dark=80), 2**bits - 1
-    board_from_world = rigid.invert(world_from_board)
-    rays, normal = CAMERA.rays(CAMERA.pixel_grid()), board_from_world[2]
-    surface = rays * (-normal[3] / (rays @ normal[:3]))[..., None]
-    at = PROJECTOR.project(surface).astype(np.float32)
-    light = np.stack([cv2.remap(np.float32(image), at[..., 0], at[..., 1], cv2.INTER_LINEAR) for image in patterns.images()])
-    images = np.concatenate([lit[None], lit * light])
-    noisy = np.rint((images + rng.normal(0, 0.7, images.shape)) * full / 255)
-    return np.clip(noisy, 0, full).astype(np.uint8 if bits == 8 else np.uint16)
 
 
 def check(found, world_from_board, most_px=0.1):
