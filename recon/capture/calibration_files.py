@@ -3,8 +3,8 @@
 - own: OpenCV FileStorage YAML; for every device a map of `size`, `matrix`, `distortion` and `camera_from_world`; and, if known,
   `parameters`, their names, and `covariance`.
 - camera and projector of SLMaster: FileStorage with M1, D1 (camera), M4, D4 (projector), Rlp, Tlp (projector from camera), S.
-- stereo pair of the rig's authors: npz, or FileStorage XML, with K1, dist1, K2, dist2, R, t. Device 1 is camera 1; which
-  device 2 is, the content doesn't say: the projector if the file's name has `proj` in it, else camera 2.
+- stereo pair of the rig's authors: npz, MATLAB file, or FileStorage XML, with K1, dist1, K2, dist2, R, t. Device 1 is camera 1;
+  which device 2 is, the content doesn't say: the projector if the file's name has `proj` in it, else camera 2.
 """
 
 from collections.abc import Mapping
@@ -12,10 +12,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.capture.manifest import SCANNER, read_manifest
 from recon.errors import InputError
-from recon.files import npz, opencv_storage
+from recon.files import matlab, npz, opencv_storage
 from recon.geometry import rigid
 from recon.geometry.camera import ROTATION, Array, Camera
 from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
@@ -24,6 +25,7 @@ from recon.model.calibration import WORLD, Calibration, Uncertainty
 SCHEMA = "sonotwin-optics/1"
 SLMASTER_KEYS = ("M1", "D1", "M4", "D4", "Rlp", "Tlp", "S")
 STEREO_KEYS = ("K1", "dist1", "K2", "dist2", "R", "t")
+OLD_KEYS = {"distCoeffs1": "dist1", "distCoeffs2": "dist2"}  # of the authors' first files
 FEW_DIGITS = 1.1e-5  # of a rotation's products, in any of the files: five decimals mostly pass
 OWN_KEYS = ("schema", "parameters", "covariance")  # any other is a device
 
@@ -42,10 +44,12 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
         If the file is missing, damaged, of no known dialect, or a value is missing, not finite, or no rotation.
     """
     path = Path(path)
+    forms = dict.fromkeys(STEREO_KEYS, npz.Form("fiu"))
+    if path.is_file() and matlab.is_matlab(path):
+        return _stereo_pair(path, _decimal(matlab.read(path, forms, OLD_KEYS)), sizes or {})
     with opencv_storage.opened(path, "a calibration file") as storage:
         if storage is None:
-            matrices = npz.read(path, dict.fromkeys(STEREO_KEYS, npz.Form("fiu")))
-            return _stereo_pair(path, {key: value.astype(float) for key, value in matrices.items()}, sizes or {})
+            return _stereo_pair(path, _decimal(npz.read(path, forms)), sizes or {})
         keys = storage.root().keys() if storage.root().isMap() else []
         if "schema" in keys:
             return _own(path, storage)
@@ -177,6 +181,10 @@ def _stereo_pair(path: Path, values: Mapping[str, Array], sizes: Mapping[str, tu
     first = _camera(path, "cam1", _size(path, "cam1", sizes), values["K1"], values["dist1"], np.eye(4))
     other = _camera(path, second, _size(path, second, sizes), values["K2"], values["dist2"], second_from_world)
     return Calibration({"cam1": first, second: other})
+
+
+def _decimal(matrices: Mapping[str, NDArray]) -> dict[str, Array]:
+    return {name: matrix.astype(float) for name, matrix in matrices.items()}
 
 
 def _camera(path: Path, name: str, size: tuple[int, int], matrix: Array, distortion: Array, camera_from_world: Array) -> Camera:

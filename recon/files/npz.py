@@ -46,6 +46,12 @@ def read(path: Path, forms: Mapping[str, Form]) -> dict[str, NDArray]:
     for name in arrays:
         if not isinstance(arrays[name], np.ndarray):  # numpy gives the bytes of what it doesn't know
             raise InputError(f"{path}: {name}: expected an array, found other or damaged data")
+    check_forms(path, arrays, forms)
+    return arrays
+
+
+def check_forms(path: Path, arrays: Mapping[str, NDArray], forms: Mapping[str, Form]) -> None:
+    """Check that the arrays of a file are all there, each in its form; raises InputError at the first that isn't."""
     for name, form in forms.items():
         if name not in arrays and form.optional:
             continue
@@ -57,7 +63,6 @@ def read(path: Path, forms: Mapping[str, Form]) -> dict[str, NDArray]:
         if form.shape is not None and not _fits(array.shape, form.shape):
             wanted = " x ".join("any" if length is None else str(length) for length in form.shape)
             raise InputError(f"{path}: {name}: expected an array of {wanted}, found one of {' x '.join(map(str, array.shape))}")
-    return arrays
 
 
 def _fits(found: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.io import savemat
 
 from recon.capture import calibration_files, meza2021
 from recon.errors import InputError
@@ -191,17 +192,30 @@ def test_slmaster_dialect(optics, tmp_path, suffix):
 
 
 @pytest.mark.parametrize(
-    ("name", "second"), [("cam1_proj_params.npz", "projector"), ("cam1_cam2_params.npz", "cam2"), ("StereoParams.xml", "cam2")]
+    ("name", "second"),
+    [
+        *(("cam1_proj_params.npz", "projector"), ("cam1_cam2_params.npz", "cam2"), ("StereoParams.xml", "cam2")),
+        *(("Params.mat", "cam2"), ("cam1_proj_params.mat", "projector")),
+    ],
 )
 def test_authors_dialects(optics, tmp_path, name, second):
     values = meza2021.parameters(optics, second)
     if name.endswith("npz"):
         np.savez(tmp_path / name, **values)
+    elif name.endswith("mat"):
+        savemat(tmp_path / name, values)
     else:
         write_storage(tmp_path / name, {key: np.ascontiguousarray(value) for key, value in values.items()})
     found = calibration_files.read(tmp_path / name, SIZES).cameras
     assert list(found) == ["cam1", second]
     assert same(found["cam1"], optics.cameras["cam1"]) and same(found[second], optics.cameras[second])
+
+
+def test_first_files_of_the_authors_name_distortions_otherwise(optics, tmp_path):
+    values = meza2021.parameters(optics, "cam2")
+    old = {{"dist1": "distCoeffs1", "dist2": "distCoeffs2"}.get(key, key): value for key, value in values.items()}
+    savemat(tmp_path / "Params.mat", old, do_compression=True)
+    assert same(calibration_files.read(tmp_path / "Params.mat", SIZES).cameras["cam2"], optics.cameras["cam2"])
 
 
 def test_the_fundamental_matrix_holds_the_epipolar_constraint(optics):
@@ -264,7 +278,9 @@ def test_damaged_files_are_refused_in_one_line(optics, tmp_path):
     np.savez_compressed(tmp_path / "a.npz", **meza2021.parameters(optics))
     spoilt = bytearray((tmp_path / "a.npz").read_bytes())
     spoilt[60:80] = 20 * b"\xff"  # within the first matrix
-    cut = [bytes(spoilt), *(data[: len(data) * i // 10] for data in (whole, archive) for i in range(1, 10))]
+    savemat(tmp_path / "a.mat", meza2021.parameters(optics), do_compression=True)
+    matlab = (tmp_path / "a.mat").read_bytes()
+    cut = [bytes(spoilt), *(data[: len(data) * i // 10] for data in (whole, archive, matlab) for i in range(1, 10))]
     newer = whole.replace(b"sonotwin-optics/1", b"sonotwin-optics/2")
     path = tmp_path / "damaged.yaml"
     for data in [b"", b"hello", b"\xff\xfe\x00", b"%YAML:1.0\n---\n- 3\n", b"PK\x03\x04", newer, *cut]:
