@@ -50,10 +50,10 @@ def levels(images: NDArray, code: GrayCode, uniform: NDArray) -> Levels:
 def locate(images: NDArray, code: GrayCode, black_white: Levels, length: int, noise: Noise) -> Cells:
     """Projector coordinates of a code without fringes.
 
-    A coordinate may lie anywhere in its cell, so its standard deviation is the width over the root of 12. Where one bit is
-    uncertain, the pixel sees the border of two cells that this bit tells apart: they count as one of twice the width. So do the
-    cells that the finest bits part where their stripes are too fine to be seen. Where bits that aren't neighbours leave cells
-    apart from each other, the coordinate is unknown.
+    A coordinate may lie anywhere in its cell, so its standard deviation is the width over the root of 12. Cells that the finest
+    bits tell apart count as one wider cell where these bits are uncertain: their stripes may be too fine to be seen. Where a
+    coarser bit is, the pixel sees the border of two cells, and lies within half a cell of it. Where more bits leave cells apart
+    from each other, the coordinate is unknown.
 
     Parameters
     ----------
@@ -95,7 +95,6 @@ def _fill(begin, end, images, axis: Axis, black_white: Levels, noise: Noise, bit
             other = number ^ (2 * unsure - 1) if unsure else number
             if unsure & (unsure - 1) or abs(number - other) > 1:
                 continue
-            left = min(number, other) << blurred
-            count = (abs(number - other) + 1) << blurred
-            cells.middle[v, u] = axis.first + axis.width * (left + (count - 1) / 2)
+            count = 1 << blurred
+            cells.middle[v, u] = axis.first + axis.width * (count * (number + other + 1) / 2 - 0.5)
             cells.sigma[v, u] = axis.width * count * WIDTH_SIGMA
