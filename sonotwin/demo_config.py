@@ -43,6 +43,12 @@ class Config(render.Config):
         return self
 
     @model_validator(mode="after")
+    def _shows_fringes(self) -> "Config":
+        if not self.patterns.has_fringes(self.patterns.axes[0]):
+            raise ValueError("patterns: expected fringes, whose phase the page shows, found Gray code alone")
+        return self
+
+    @model_validator(mode="after")
     def _one_scanner(self) -> "Config":
         check_scanner(self.rig, self.ultrasound)
         return self

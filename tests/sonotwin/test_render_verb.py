@@ -64,6 +64,13 @@ def test_nonsense_is_refused_by_name(arguments, complaint, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_demo_shows_fringes(tmp_path, capsys):
+    """Its page is of phases and orders, which Gray code alone has not."""
+    assert main(["demo", f"out={tmp_path / 'out'}", "patterns=gray_alone"]) == 2
+    assert "demo: patterns: expected fringes, whose phase the page shows" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_place_that_is_taken_is_refused_before_rendering(tmp_path, capsys):
     """A folder with other files, or a file, is left as it is."""
     (tmp_path / "out" / "truth").mkdir(parents=True)

@@ -111,6 +111,10 @@ SWEEP = "over={noise.speed_mm_s: [5, 10]}"
 @pytest.mark.parametrize(
     ("fields", "complaint"),
     [
+        (
+            [*SURFACE, "over={shooting.gain: [1, 2]}", "patterns=gray_alone"],
+            "settings.patterns: expected fringes along columns, which closed forms are of, found none",
+        ),
         (["name=exposur"], "name: expected sweep, one of better_rig, "),
         (["name=7"], "name: expected sweep, one of better_rig, "),
         (["name=sweep", SWEEP], "of: needs a value with name=sweep; give of=..."),

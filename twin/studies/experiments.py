@@ -91,6 +91,8 @@ class Settings(Part):
         for name in ("patterns", "board_patterns"):
             if (shown := getattr(self, name).projector_size) != raster:
                 raise ValueError(f"{name}.projector_size: expected the rig's {list(raster)}, found {list(shown)}")
+        if not self.patterns.has_fringes("columns"):
+            raise ValueError("patterns: expected fringes along columns, which closed forms are of, found none")
         check_scanner(self.rig, self.ultrasound)
         return self
 
