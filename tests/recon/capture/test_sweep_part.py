@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -95,6 +96,14 @@ def test_a_pose_between_two_is_surer_than_either(tmp_path):
 def test_clocks_that_have_nothing_to_do_with_each_other(folder):
     with pytest.raises(InputError, match=r"sweep: expected poses of the target .* are the clocks others\?$"):
         sweep_part.read_sweep(folder).poses(lag_s=1000.0)
+
+
+def test_scans_of_another_kind(folder):
+    """A scanner that saves bitmaps in colour: each number's file is found by its other suffix."""
+    for path in (folder / "sweep" / "us").glob("*.png"):
+        cv2.imwrite(str(path.with_suffix(".bmp")), cv2.imread(str(path), cv2.IMREAD_COLOR))
+        path.unlink()
+    np.testing.assert_array_equal(np.stack(list(sweep_part.read_sweep(folder).images())), images())
 
 
 def test_a_scanner_may_drop_frames(folder):
