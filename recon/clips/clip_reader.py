@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from recon.capture.foreign_images import image_files, read_grey
+from recon.capture.images import image_files, read_grey
 from recon.clips import dicom_clip, video_clip
 from recon.clips.clip import Clip
 from recon.errors import InputError
