@@ -1,5 +1,13 @@
-"""The surface pipeline in plain NumPy, with a flood fill in Numba: the peer of the fast one, and short enough to check by eye."""
+"""The surface pipeline in plain NumPy, with a flood fill in Numba: the peer of the fast one, and short enough to check by eye.
 
+`from_files` is the rig authors' way, written plainly: images read one by one, a mask given, columns from a flood fill, the
+projector's rows by epipolar lines, both undistorted by OpenCV, and planes met in closed form.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +36,46 @@ def reconstruct(
     seeds = (bright > 0.5) & (np.abs(phase) < np.pi / 2) & (modulation > DARKEST)
     columns = fringes.zero(patterns.length("columns")) + fringes.pitch / (2 * np.pi) * flood(phase, modulation > DARKEST, seeds)
     return columns, triangulate(columns, rays, centre, projector)
+
+
+def from_files(paths: Sequence[Path], patterns: Patterns, mask: NDArray[np.bool_], camera: Camera, projector: Camera) -> Array:
+    """Points : (n, 3) mm of the pixels of a mask : (h, w), from image files; camera 1 is the world.
+
+    Source: Meza et al. 2021, section 2.2, and the authors' public program.
+    """
+    line, fringes = patterns.parts
+    assert isinstance(line, CentreLine) and isinstance(fringes, Fringes)
+    lit = cv2.imread(str(paths[0]), cv2.IMREAD_GRAYSCALE)
+    sine, cosine = np.zeros(mask.shape), np.zeros(mask.shape)
+    for path, shift in zip(paths[1:], fringes.shifts, strict=True):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        sine += image * np.sin(shift)
+        cosine += image * np.cos(shift)
+    _, bright = cv2.threshold(np.uint8(lit * mask), 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
+    v, u = np.nonzero(bright)
+    middle = np.abs(v - v.mean()) == np.abs(v - v.mean()).min()
+    seeds = np.zeros(mask.shape, bool)
+    seeds[round(v[middle].mean()), round(u[middle].mean())] = True
+    phase = flood(np.arctan2(-sine, cosine), mask, seeds)[mask]
+    v, u = np.nonzero(mask)
+    column = fringes.zero(patterns.length("columns")) + fringes.pitch / (2 * np.pi) * phase
+    seen = np.stack([u, v], axis=-1).astype(float)
+    pixels = cv2.undistortPoints(seen[:, None], camera.matrix, camera.distortion, P=camera.matrix).reshape(-1, 1, 2)
+    lines = cv2.computeCorrespondEpilines(pixels, 1, fundamental(camera, projector)).reshape(-1, 3)
+    row = -(lines[:, 0] * column + lines[:, 2]) / lines[:, 1]
+    x, y = cv2.undistortPoints(seen[:, None], camera.matrix, camera.distortion).reshape(-1, 2).T
+    shown = np.stack([column, row], axis=-1)[:, None]
+    a = cv2.undistortPoints(shown, projector.matrix, projector.distortion).reshape(-1, 2)[:, 0]
+    turn, shift_mm = projector.camera_from_world[:3, :3], projector.camera_from_world[:3, 3]
+    across = (turn[0, 0] - turn[2, 0] * a) * x + (turn[0, 1] - turn[2, 1] * a) * y + turn[0, 2] - turn[2, 2] * a
+    z = (shift_mm[2] * a - shift_mm[0]) / across
+    return np.stack([z * x, z * y, z], axis=-1)
+
+
+def fundamental(camera: Camera, projector: Camera) -> Array:
+    """Fundamental matrix : (3, 3) from the camera, which is the world, to the projector."""
+    essential = rigid.cross(projector.camera_from_world[:3, 3]) @ projector.camera_from_world[:3, :3]
+    return np.linalg.inv(projector.matrix).T @ essential @ np.linalg.inv(camera.matrix)
 
 
 def wrapped_phase(images: Array, shifts: Array) -> tuple[Array, Array, Array]:
