@@ -53,7 +53,7 @@ def test_cylinders_by_masks_and_surface():
         matrices.append(world_from_image @ rigid.invert(HELD))
     stack = np.stack(matrices)
     sweep = SimpleNamespace(ours=SimpleNamespace(images=lambda: iter(images)), published_at=lambda _: stack)
-    angle, along = np.meshgrid(np.linspace(-1.3, 1.3, 50), np.linspace(-30, 30, 40))
+    angle, along = np.meshgrid(np.linspace(-1.3, 1.3, 100), np.linspace(-30, 30, 60))
     points = np.stack([along, outer * np.sin(angle) + 0.5, axis_z + 1.0 - outer * np.cos(angle)], axis=-1).reshape(-1, 3)
     surface = trimesh.Trimesh(points, process=False)
     found = tank_trial.published_cylinders(sweep, probe, 0.05, surface)
