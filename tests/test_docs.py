@@ -1,6 +1,7 @@
 """What the pages tell a reader to run is valid, and runs; what they link to is there."""
 
 import ast
+import json
 import re
 import shlex
 import shutil
@@ -8,9 +9,12 @@ from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from recon.capture.manifest import Manifest
+from recon.model.boards import Board
 from sonotwin.cli import VERBS, main
 from sonotwin.config import load
 
@@ -125,6 +129,27 @@ def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if not target.startswith("http"):
             assert (page.parent / target).exists(), target
+
+
+def test_manifests_of_the_page_are_valid():
+    """Every manifest that the page shows can be copied."""
+    blocks = re.findall(
+        r"^```json\n(.*?)^```", (ROOT / "docs" / "captures.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    shown = [Manifest.model_validate(json.loads(block)) for block in blocks]
+    assert {part.partition("/")[0] for manifest in shown for part in manifest.contents} >= {"board", "sweep"}
+
+
+def test_boards_are_described_field_by_field():
+    """The table has each field of each kind of board, and no other."""
+    page = (ROOT / "docs" / "captures.md").read_text(encoding="utf-8")
+    table = page.partition("| `board.kind` | field | meaning |")[2].partition("\n\n")[0]
+    described, kind = [], ""
+    for first, field in re.findall(r"^\| (?:`(\w+)` )?\| `(\w+)` \|", table, re.MULTILINE):
+        kind = first or kind
+        described.append((kind, field))
+    fields = {board.model_fields["kind"].default: board.model_fields for board in get_args(get_args(Board)[0])}
+    assert described == [(kind, name) for kind in fields for name in fields[kind] if name != "kind"]
 
 
 def test_make_targets_exist():
