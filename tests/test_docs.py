@@ -36,6 +36,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "freehand": {"sequence.igs.mha"},
     "import": {""},
     "import-sweep": {""},
+    "describe": {""},
     "reconstruct": {""},
 }
 WRITTEN = ("out", "document")  # fields that name what is written; other paths are read
@@ -45,6 +46,7 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
         "capture",
         "session",
         "shots",
+        "images",
         "optics.yaml",
         "wrapped",
         "dataset",
