@@ -28,6 +28,7 @@ class Fringes(Part):
     pitch: float = Field(gt=1)  # projector px a period
     steps: int = Field(ge=3)  # phase shifts
     first: int = 0  # index of the first shift: shift_k = 2 pi (first + k) / steps, k = 0 .. steps-1
+    backwards: bool | None = None  # whether that shift is negative; left out of files if it isn't, so that 0.1.0 reads them
     origin: float | None = None  # projector px where the phase is zero; the centre of the axis if not given
     waveform: Literal["sine", "binary"] = "sine"  # binary fringes become sinusoidal by defocus; see `profiles` for their origin
 
@@ -39,7 +40,8 @@ class Fringes(Part):
     @property
     def shifts(self) -> NDArray[np.float64]:
         """Phase shifts : (steps,) rad."""
-        return 2 * np.pi * (self.first + np.arange(self.steps)) / self.steps
+        turn = -2 * np.pi if self.backwards else 2 * np.pi
+        return turn * (self.first + np.arange(self.steps)) / self.steps
 
     def zero(self, length: int) -> float:
         """Projector coordinate of phase zero on an axis of `length` px."""

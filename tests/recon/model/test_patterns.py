@@ -47,6 +47,15 @@ def test_fringes_carry_the_published_phase():
     assert off == pytest.approx(np.rint(off), abs=1e-6)
 
 
+def test_fringes_backwards_move_to_larger_x():
+    """By a step of a period over the number of steps; they begin as the others do."""
+    onwards, backwards = (Fringes(pitch=8, steps=4, backwards=way).profiles(64) for way in (None, True))
+    assert np.allclose(backwards[0], onwards[0])
+    for k in range(3):
+        assert np.allclose(backwards[k + 1, 2:], backwards[k, :-2], atol=1e-6)
+        assert np.allclose(onwards[k + 1, :-2], onwards[k, 2:], atol=1e-6)
+
+
 @pytest.mark.parametrize(("pitch", "origin"), [(18, 640.0), (18, 639.5), (16, 639.5), (12, 639.5)])
 def test_binary_fringes_light_half_of_each_period(pitch, origin):
     """Whole pixels, as many lit as dark in each period and each image, also where an edge falls on a pixel's centre."""
