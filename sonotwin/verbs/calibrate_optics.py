@@ -4,7 +4,8 @@ Reads the board part of a capture folder: in each pose the lit board and, for th
 whose mean serves where there is no lit image. One camera alone, with or without a projector, is calibrated as well.
 Writes into the folder `out`: optics.yaml (with the covariance); the same in the rig authors' layout, cam1_proj_params.npz,
 cam1_cam2_params.npz and StereoParams.xml; metrics.json; and calibration.html (open it in a browser; it needs no network). A
-calibration that is there already is replaced. Takes some seconds a pose, and about a minute for the adjustment.
+calibration that is there already is replaced. Takes some seconds a pose, and about a minute for the adjustment. Before
+fringes are refused, other patterns are tried on three poses.
 
     sonotwin calibrate-optics capture=outputs/board/capture out=outputs/board/calibration
     sonotwin calibrate-optics capture=outputs/board/capture truth=outputs/board/truth out=outputs/board/calibration
@@ -13,7 +14,8 @@ calibration that is there already is replaced. Takes some seconds a pose, and ab
 """
 
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
@@ -22,6 +24,8 @@ from pydantic import PrivateAttr
 from rich.console import Console
 
 from recon.capture import board_part, calibration_files, manifest, meza2021
+from recon.capture.board_part import BoardCapture
+from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown
 from recon.model.calibration import Calibration
@@ -29,6 +33,8 @@ from recon.optical_calibration import board_frames, calibration_report, figures_
 from recon.optical_calibration.board_frames import DeviceName
 from recon.optical_calibration.distortion_selection import ModelName
 from recon.optical_calibration.joint_calibration import Result, Settings, calibrate
+from recon.optical_calibration.observations import PROJECTOR
+from recon.pattern_trials import likely_patterns
 
 PAGE = "calibration.html"  # by which the folder of a calibration is known
 OPTICS = "optics.yaml"
@@ -84,13 +90,19 @@ def run(config: Config) -> None:
     missed = board_frames.not_found(sightings)
     for line in dropped(missed):
         console.print(line, markup=False)
-    board_frames.refuse_lonely(sightings, sizes, captured.name)
 
     start = perf_counter()
-    with console.status("adjusting"):
-        settings = Settings(**{name: getattr(config, name) for name in Settings.model_fields})
-        result = calibrate(sightings, captured.board, sizes, settings, name=captured.name)
-        result = board_frames.with_absent(result, sizes, captured.cameras)
+    try:
+        board_frames.refuse_lonely(sightings, sizes, captured.name)
+        with console.status("adjusting"):
+            settings = Settings(**{name: getattr(config, name) for name in Settings.model_fields})
+            result = calibrate(sightings, captured.board, sizes, settings, name=captured.name)
+    except InputError as error:
+        others = other_patterns(captured, sizes, console)
+        raise InputError(f"{error} ({others})" if others else str(error)) from None
+    result = board_frames.with_absent(result, sizes, captured.cameras)
+    if PROJECTOR not in result.observations.devices and (others := other_patterns(captured, sizes, console)):
+        result = replace(result, warnings=(*result.warnings, f"{PROJECTOR}: {others}"))
     seconds["seconds_adjust"] = round(perf_counter() - start, 3)
     figures = figures_of_merit.measure(result, truth)
     contradicting = {name: reason for name, reason in result.dropped.items() if name not in missed}
@@ -98,6 +110,15 @@ def run(config: Config) -> None:
         console.print(line, markup=False)
     written = write(config, result, figures | seconds, truth)
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
+
+
+def other_patterns(captured: BoardCapture, sizes: Collection[str], console: Console) -> str:
+    """Fields of the patterns that would fit the images, for messages; nothing if none would, or no projector is calibrated."""
+    if PROJECTOR not in sizes:
+        return ""
+    with console.status("trying other patterns"):
+        fields = likely_patterns.likely(captured)
+    return "" if fields is None else f"the images fit patterns with {fields} in each set of fringes"
 
 
 def dropped(reasons: Mapping[str, str]) -> Iterator[str]:

@@ -18,7 +18,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.boards import Chessboard
 from recon.model.calibration import Calibration
-from recon.model.patterns import GrayCode, Patterns
+from recon.model.patterns import Fringes, GrayCode, Patterns
 from sonotwin.cli import main
 from tests.recon import board_views
 
@@ -191,6 +191,42 @@ def test_camera_and_projector_by_gray_code_alone(tmp_path, capsys):
         assert abs(found.cameras[name].matrix[0, 0] - true.matrix[0, 0]) < 4 * found.uncertainty.sigma(f"{name}.fx") < 60, name
     figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert figures["reprojection_rms_projector_px"] < 0.15 and figures["point_sigma_mm"] < 3
+
+
+@pytest.mark.parametrize(
+    ("shown", "refusal", "fields"),
+    [
+        ({"backwards": True}, "fringe orders jump", "backwards: true"),
+        ({"first": 4}, "expected it to stand still", "origin: 135.5 of columns, 87.5 of rows"),
+    ],
+)
+def test_fringes_other_than_described_are_named(shown, refusal, fields, tmp_path, capsys):
+    """The refusal's usual cause is images out of order; here all sets of fringes were shown otherwise."""
+    camera, rng = cameras()["cam1"], np.random.default_rng(0)
+    pose = rigid.from_rotation_vector(np.deg2rad([0, -15, 0]), [172.0, 4, 45])
+    projector = Camera((256, 160), np.array([[560.0, 0, 127], [0, 560, 80], [0, 0, 1]]), np.zeros(5), pose)
+    code = [GrayCode(axis=axis, pitch=16, bits=4) for axis in ("columns", "rows")]
+    given, true = (
+        Patterns(
+            projector_size=projector.size,
+            unwrap="gray",
+            parts=tuple(part for bits in code for part in (Fringes(axis=bits.axis, pitch=16, steps=8, **own), bits)),
+        )
+        for own in ({}, shown)
+    )
+    board = Chessboard(columns=6, rows=5, square_mm=24)
+    with new_capture(tmp_path / "capture", "fringes") as capture:
+        records = []
+        for number in range(5):
+            placed = board_views.pose(board, rng.uniform(640, 720), rng.uniform(-0.5, 0.5, 2), 0.1, rng.uniform(-15, 15, 2))
+            stack = board_views.under_patterns(board, camera, projector, true, placed, rng)[1:]
+            records.append(write_pose(capture.folder, f"{number:02d}", {}, {"cam1": stack}))
+        devices = {"cam1": Device(size=SIZE), "projector": Device(size=projector.size)}
+        capture.add_board(BoardPart(board=board, patterns=given, poses=tuple(records)), devices)
+    assert main(["calibrate-optics", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}", "distortion=radial1"]) == 2
+    line = capsys.readouterr().err
+    assert refusal in line and line.endswith(f" (the images fit patterns with {fields} in each set of fringes)\n")
+    assert not (tmp_path / "out").exists()
 
 
 def test_devices_that_the_capture_lacks_are_refused(session, tmp_path, capsys):

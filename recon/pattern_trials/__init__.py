@@ -1,0 +1,1 @@
+"""Trials of patterns on images: the likely sequence where the given one contradicts them."""
