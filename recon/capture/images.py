@@ -90,7 +90,7 @@ def read_grey(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
 
 def natural_key(path: Path) -> list[tuple[int, str]]:
     """Key that sorts names as people do: 2.png before 10.png."""
-    return [(int(piece), "") if piece.isdigit() else (-1, piece) for piece in re.split(r"(\d+)", Path(path).name)]
+    return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in re.split(r"(\d+)", Path(path).name)]
 
 
 def image_files(folder: Path) -> list[Path]:

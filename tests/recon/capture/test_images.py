@@ -90,3 +90,9 @@ def test_frames_may_be_of_another_kind(tmp_path):
     assert images.frame_file(tmp_path, "0007.png") == tmp_path / "0007.jpg"
     write(tmp_path / "0007.png", picture())
     assert images.frame_file(tmp_path, "0007.png") == tmp_path / "0007.png"
+
+
+def test_names_in_natural_order():
+    """A raised two counts as a letter, as no number can be read from it."""
+    names = [Path(name) for name in ("10.png", "²", "2.png", "a10", "a9")]
+    assert [path.name for path in sorted(names, key=images.natural_key)] == ["2.png", "10.png", "a9", "a10", "²"]
