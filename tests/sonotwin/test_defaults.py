@@ -38,6 +38,8 @@ def test_a_verbs_defaults_are_its_models(verb):
     content = yaml.safe_load((folder() / f"{verb.name}.yaml").read_text(encoding="utf-8"))
     model = import_module(verb.module).Config
     missing = [f"{name}=x" for name, value in content.items() if value == "???"]
+    inner = [(name, value) for name, value in content.items() if isinstance(value, dict)]
+    missing += [f"{name}.{field}=x" for name, fields in inner for field, value in fields.items() if value == "???"]
     written = {name for name, value in content.items() if name != "defaults" and value != "???"}
     composed = compose(verb.name, missing)
     found = []
@@ -45,8 +47,10 @@ def test_a_verbs_defaults_are_its_models(verb):
     for name in written & set(model.model_fields) - taken:
         field = model.model_fields[name]
         default = field.get_default(call_default_factory=True)
+        if default is PydanticUndefined:
+            continue
         value = TypeAdapter(field.annotation).validate_python(composed[name])
-        if default is not PydanticUndefined and value != default:
+        if value != default:
             found.append(f"{name}: {value} in YAML, {default} in the model")
     known = set(model.model_fields) | set(Settings.model_fields if verb.name == "study" else ())
     assert written <= known
