@@ -57,7 +57,7 @@ benchmark: setup  ## measure speed
 
 # Hours; goes on where it was stopped. Trials are shared: planes, sphere and optics are figures of the same laboratories, and so are
 # probe and cylinders.
-PAPER := optics planes sphere probe cylinders breast ultrasound_causes wire_tilts
+PAPER := optics planes sphere probe cylinders breast ultrasound_causes
 paper: setup  ## repeat the paper's experiments in full, by its method and by ours
 	@for name in $(if $(ONLY),$(ONLY),$(PAPER)); do \
 		$(BIN)/sonotwin study name=$$name out=outputs/paper/$$name trials=outputs/paper/trials document=docs/paper.md engine.workers=2 || exit; \
