@@ -45,7 +45,7 @@ def read(path: Path) -> Clip:
         seconds, region = times(header, count), b_scan_region(header)
     except DAMAGED as error:
         raise InputError(f"{path}: expected a DICOM file, a video or a folder of images, found {_brief(error)}") from None
-    image, scale = (None, None) if region is None else region
+    image, scale = (None, None) if region is None else within(*region, size)
     timed = None if seconds is None else checked_seconds(path, seconds)
     return Clip(path.name, size, timed, lambda: images(path, size, count), image, scale)
 
@@ -104,6 +104,18 @@ def b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | N
         if best is None or box[2] * box[3] > best[0][2] * best[0][3]:
             best = box, scale
     return best
+
+
+def within(region: Box, scale: tuple[float, float] | None, size: tuple[int, int]) -> tuple[Box, tuple[float, float] | None]:
+    """A region less the pixel by which files that count from one overstep the image, and its scale.
+
+    Farther beyond, the image is no longer the one that the region describes, and no scale of it is known.
+    """
+    u, v, width, height = region
+    beyond = max(u + width - size[0], v + height - size[1])
+    if beyond > 1:
+        return region, None
+    return (u, v, min(width, size[0] - u), min(height, size[1] - v)), scale
 
 
 def _brief(error: BaseException) -> str:

@@ -96,12 +96,20 @@ def stamps(config: Config, clip: Clip, track: Track) -> NDArray[np.int64]:
 
 
 def b_scan(config: Config, clip: Clip) -> Box:
-    """The B-scan's part of the frames; InputError if a given one isn't within them, or none is found."""
+    """The B-scan's part of the frames; InputError if one that is given or named isn't within them, or none is found."""
     width, height = clip.size
     if config.crop == "whole":
         return 0, 0, width, height
+    if config.crop == "auto" and clip.image is None:
+        return image_region.find(clip.stream(), str(config.clip))
     if config.crop == "auto":
-        return clip.image or image_region.find(clip.stream(), str(config.clip))
+        u, v, wide, tall = clip.image
+        if u + wide > width or v + tall > height:
+            raise InputError(
+                f"{config.clip}: SequenceOfUltrasoundRegions: expected a region within the image of {width}x{height} px, "
+                f"found {wide}x{tall} px from ({u}, {v}); shrunk or cropped since it was taken? give crop=[u,v,width,height]"
+            )
+        return clip.image
     u, v, wide, tall = config.crop
     if u + wide > width or v + tall > height:
         raise InputError(f"crop: expected a part of {width}x{height} px, found {u + wide}x{v + tall} at its lower right")

@@ -30,6 +30,21 @@ def test_a_dicom_file_gives_its_frames_region_scale_and_times(kind, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("cut", "expected"),
+    [
+        ((0, 1), ((40, 30, 120, 95), True)),  # counts from one, as scanners do: a row beyond
+        ((120, 90), (BOX, False)),  # half the size, as files shrunk for the web are
+    ],
+)
+def test_a_region_that_oversteps_the_image(cut, expected, tmp_path):
+    """A pixel beyond is cut off; farther beyond, the image isn't the region's any more, so that its scale isn't given."""
+    width, height = (SCREEN[0] - cut[0], SCREEN[1] - cut[1]) if cut[0] else (BOX[0] + BOX[2], BOX[1] + BOX[3] - 1)
+    made_clips.write_dicom(tmp_path / "scan.dcm", made_clips.screens(made_clips.scans(2))[:, :height, :width], FrameTime=50.0)
+    clip = clip_reader.read(tmp_path / "scan.dcm")
+    assert (clip.image, clip.mm_per_px is not None) == expected
+
+
+@pytest.mark.parametrize(
     ("tags", "seconds"),
     [
         ({"FrameTimeVector": [0, 40, 60], "FrameTime": 10}, [0, 0.04, 0.1]),
