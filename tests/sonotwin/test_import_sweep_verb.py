@@ -84,6 +84,16 @@ def test_mistakes_are_refused_in_one_line_and_nothing_is_written(fields, complai
     assert complaint in said and said.count("\n") == 1 and not (folder / "capture").exists()
 
 
+def test_a_region_beyond_the_image_is_refused_in_one_line(folder, capsys):
+    """As in files that were shrunk or cropped since."""
+    made_clips.write_dicom(folder / "scan.dcm", made_clips.scans(COUNT), FrameTime=50.0)
+    assert imported(folder, f"clip={folder / 'scan.dcm'}") == 2
+    said = capsys.readouterr().err
+    assert "expected a region within the image of 120x96 px, found 120x96 px from (40, 30)" in said and said.count("\n") == 1
+    assert imported(folder, f"clip={folder / 'scan.dcm'}", "crop=whole") == 0
+    assert "scale_mm_per_px" not in capsys.readouterr().out
+
+
 def test_images_need_a_rate(folder, capsys):
     import cv2
 
