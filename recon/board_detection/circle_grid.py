@@ -22,13 +22,14 @@ LEAST_RATIO = 0.3  # of the semi-axes
 
 def find_circles(image: Array, board: Circles, full: float) -> Detection:
     """Find the discs of a board and measure their ellipses; see `recon.board_detection.detect.detect`."""
+    image = full - image if board.white else image
     rough = discs.candidates(image, full)
     cells, steps = _grid(board)
     assignment = lattice.assign(rough.centre, cells, steps)
     present = np.flatnonzero(assignment >= 0)
     chosen = rough[assignment[present]]
     measured = discs.measure(image, chosen, _room(chosen, board), full)
-    good = refuse_bad(_faults(measured, full), len(cells), "circles")
+    good = refuse_bad(_faults(measured, full, board.white), len(cells), "circles")
     at, ellipses = present[good], measured.fit.ellipses[good]
     return Detection(
         spread(ellipses.centre, at, len(cells)),
@@ -51,15 +52,18 @@ def _room(rough: Ellipses, board: Circles) -> Array:
     return np.maximum(ROOM * min(gap, 1) * rough.semi_axes[:, 1], 2.0)
 
 
-def _faults(measured: discs.Discs, full: float) -> list[str | None]:
+def _faults(measured: discs.Discs, full: float, white: bool) -> list[str | None]:
     """Reasons to refuse each disc, None for good ones."""
     edges, fit = measured.edges, measured.fit
     longer, shorter = fit.ellipses.semi_axes.T
     contrast = edges.outside - edges.inside
     sigma = np.sqrt(np.trace(measured.covariance, axis1=1, axis2=2) / 2)
     scatter = np.sqrt(np.nansum(fit.residuals**2, axis=1) / np.maximum(np.isfinite(fit.residuals).sum(axis=1), 1))
+    least = np.maximum(LEAST_CONTRAST * full, LEAST_SIGNAL * edges.noise)
+    other = f"{'dark' if white else 'white'} discs, by {{:.1f}} %: give the board white: {str(not white).lower()}"
     tests = [
-        (contrast < np.maximum(LEAST_CONTRAST * full, LEAST_SIGNAL * edges.noise), 100 * contrast / full, "contrast of {:.1f} %"),
+        (-contrast >= least, -100 * contrast / full, other),
+        (contrast < least, 100 * contrast / full, "contrast of {:.1f} %"),
         (edges.clipped > MOST_CLIPPED, 100 * edges.clipped, "rim saturated, {:.0f} % of it"),
         (edges.blur > MOST_BLUR * shorter, edges.blur, "too blurred, {:.1f} px"),
         (shorter < LEAST_RATIO * longer, shorter / longer, "too oblique, semi-axes 1:{:.2f}"),

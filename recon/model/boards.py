@@ -23,6 +23,7 @@ class AsymmetricCircles(Part):
     rows: Few
     spacing_mm: Positive  # between rows; circles of a row stand two spacings apart
     diameter_mm: Positive
+    white: bool = False  # discs on a dark board, as metrology's are; else dark ones on a bright board
 
     def points(self) -> Array:
         """Centres of the discs : (columns * rows, 3) mm."""
@@ -38,6 +39,7 @@ class SymmetricCircles(Part):
     rows: Few
     spacing_mm: Positive
     diameter_mm: Positive
+    white: bool = False  # as above
 
     def points(self) -> Array:
         """Centres of the discs : (columns * rows, 3) mm."""

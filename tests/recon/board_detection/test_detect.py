@@ -60,6 +60,17 @@ def test_points_lie_where_they_should_as_well_as_predicted(board, clean, rng):
     assert np.std(errors) < 0.02
 
 
+@pytest.mark.parametrize("board", [ASYMMETRIC, SYMMETRIC], ids=lambda b: b.kind)
+def test_white_discs_on_a_dark_board(board, clean, rng):
+    """The negative of an image has its discs where the image has them; a design of the other colour is named."""
+    image, white = noisy(clean(board)[0], rng), board.model_copy(update={"white": True})
+    assert detect(255 - image, white).pixels == pytest.approx(detect(image, board).pixels, abs=1e-3)
+    with pytest.raises(BoardNotFound, match=r"white discs, by \d\d.\d %: give the board white: true"):
+        detect(255 - image, board)
+    with pytest.raises(BoardNotFound, match="give the board white: false"):
+        detect(image, white)
+
+
 @pytest.mark.parametrize("rows", [6, 7])
 def test_the_order_is_the_true_one_however_the_board_is_turned(rows, rng):
     """Projected points in any order, among many that belong to nothing. With even rows half a turn is a symmetry."""
