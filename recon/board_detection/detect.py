@@ -1,7 +1,7 @@
 """Calibration boards in images: each point's place to a hundredth of a pixel, its covariance, or the reason why it's missing.
 
-Discs are dark on a bright board, or white on a dark one if the design says so. Measured is the centre of a disc's ellipse, which is not yet where the disc's
-centre is projected to: see `recon.geometry.circle_projection`.
+Discs are dark on a bright board, or white on a dark one if the design says so. Measured is the centre of a disc's ellipse, which
+is not yet where the disc's centre is projected to: see `recon.geometry.circle_projection`.
 
 Which way round a board lies follows from its points where it can; an image is never taken for a mirrored one. A grid may look the
 same after a turn: a symmetric one, an asymmetric one with an even number of rows, a chessboard whose numbers of squares are both

@@ -45,7 +45,9 @@ def assign(points: Array, cells: Integers, steps: Integers) -> Integers:
     best: list[Integers] = []
     count = 0
     most_mirrored = 0
+    grids: list[dict[tuple[int, int], int]] = []
     for grown in _grown_grids(points, steps):
+        grids.append(grown)
         for assignment in _placements(grown, cells, TURNS):
             found = int((assignment >= 0).sum())
             if found > count:
@@ -63,8 +65,16 @@ def assign(points: Array, cells: Integers, steps: Integers) -> Integers:
     if len({min(tuple(a[turn]) for turn in symmetries) for a in best}) > 1:
         if count == len(cells):
             raise BoardNotFound(f"found more circles than the board's {len(cells)}: wrong board size")
-        raise BoardNotFound(f"found {count} of {len(cells)} circles, not enough to tell which are missing")
+        raise BoardNotFound(_too_few(max(grids, key=len), cells, steps))
     return min((best[0][turn] for turn in symmetries), key=lambda a: tuple(_from_upper_left(points, a)))
+
+
+def _too_few(grown: dict[tuple[int, int], int], cells: Integers, steps: Integers) -> str:
+    """The reason why a grid fits a board in several places: a whole one of fewer rows, or points that are missing."""
+    found, expected = (sorted(np.ptp(places, axis=0) + 1)[::-1] for places in (np.array(list(grown)), cells))
+    if np.count_nonzero(steps) == 2 and found[0] * found[1] == len(grown):
+        return "found {} x {} circles instead of {} x {}: wrong board size, or some hidden".format(*found, *expected)
+    return f"found {len(grown)} of {len(cells)} circles, not enough to tell which are missing"
 
 
 def _symmetries(cells: Integers) -> list[Integers]:
@@ -134,8 +144,11 @@ def _placements(grown: dict[tuple[int, int], int], cells: Integers, turns: list[
     options = []
     for turn in turns:
         turned = places @ turn.T
-        shifts, counts = np.unique((turned[:, None] - cells[None]).reshape(-1, 2), axis=0, return_counts=True)
-        options += [(counts[k], turned, shifts[k]) for k in np.flatnonzero(counts == counts.max())]
+        shifts = (turned[:, None] - cells[None]).reshape(-1, 2)
+        low, high = shifts.min(axis=0), shifts.max(axis=0)
+        counts = np.bincount(np.ravel_multi_index(tuple((shifts - low).T), tuple(high - low + 1)))
+        best = np.column_stack(np.unravel_index(np.flatnonzero(counts == counts.max()), tuple(high - low + 1))) + low
+        options += [(counts.max(), turned, shift) for shift in best]
     most = max(option[0] for option in options)
     assignments = []
     for found, turned, shift in options:

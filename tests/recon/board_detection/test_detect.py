@@ -116,6 +116,12 @@ def test_a_board_of_another_size_is_refused(seen, expected, clean, rng):
         detect(noisy(clean(seen)[0], rng), expected)
 
 
+def test_a_whole_grid_of_fewer_rows_is_called_so(clean, rng):
+    """Rather than a board with circles missing."""
+    with pytest.raises(BoardNotFound, match="found 5 x 4 circles instead of 6 x 4: wrong board size"):
+        detect(noisy(clean(SYMMETRIC)[0], rng), SYMMETRIC.model_copy(update={"columns": 6}))
+
+
 def test_a_row_of_charuco_corners_tells_no_pose(rng):
     """A board slides out of the image until a single row of its corners is left: six at first, on one line."""
     board = Charuco(columns=10, rows=7, square_mm=18, marker_mm=13)
