@@ -141,11 +141,18 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
         if (factor := adjustment.noise[device]) > NOISY:
             found.append(
                 f"{device}: residuals are {factor:.1f} times what detection predicts: board not flat or not to measure, "
-                "moved between images, or a lens that the model doesn't describe"
+                "moved between images, or a lens that the model doesn't describe" + _alone(device, observations.devices)
             )
         if uncertainty and (sigma := uncertainty.sigma(f"{device}.fx") / camera.matrix[0, 0]) > UNSURE_FOCAL:
             found.append(f"{device}: focal length is known to {100 * sigma:.2g} % only: more poses, tilted more")
     return found
+
+
+def _alone(device: str, devices: Sequence[str]) -> str:
+    """How to tell cameras that don't expose at the same moment: each of them fits its own images."""
+    if device == PROJECTOR or len(devices) == 1:
+        return ""
+    return f"; if it goes away with devices=[{device}], the devices saw the board at different moments"
 
 
 def measuring_part(adjustment: Adjustment, device: str) -> Array:

@@ -153,6 +153,21 @@ def test_a_flipped_camera_1_is_refused_by_the_projector(sizes, good):
         joint_calibration.calibrate(flipped, BOARD, sizes, QUICK)
 
 
+def test_cameras_that_expose_at_different_moments_are_told_by_one_alone(sizes, good):
+    """A board that moves by a tenth of a millimetre meanwhile; each camera by itself has a still board in every image."""
+    moments = np.random.default_rng(14).normal(0, 0.2, (len(good), 2))
+    seen = [
+        replace(one, pixels={"cam1": one.pixels["cam1"], "cam2": one.pixels["cam2"] + moved})
+        for one, moved in zip(good, moments, strict=True)
+    ]
+    pair = joint_calibration.calibrate(seen, BOARD, {name: sizes[name] for name in ("cam1", "cam2")}, QUICK)
+    assert any("saw the board at different moments" in warning for warning in pair.warnings)
+    alone = [replace(one, pixels={"cam1": one.pixels["cam1"]}) for one in seen]
+    assert not any(
+        "residuals are" in w for w in joint_calibration.calibrate(alone, BOARD, {"cam1": sizes["cam1"]}, QUICK).warnings
+    )
+
+
 def test_a_board_in_one_corner_is_warned_of(cameras, sizes):
     rng = np.random.default_rng(6)
     poses = [pose for pose in random_poses(cameras, 120, rng) if (pose[:3, :3] @ [52.5, 75, 0] + pose[:3, 3])[0] < -40][:10]
