@@ -3,11 +3,12 @@
 - own: OpenCV FileStorage YAML; for every device a map of `size`, `matrix`, `distortion` and `camera_from_world`; and, if known,
   `parameters`, their names, and `covariance`.
 - camera and projector of SLMaster: FileStorage with M1, D1 (camera), M4, D4 (projector), Rlp, Tlp (projector from camera), S.
+- two cameras of SLMaster and OpenCV's stereo_calib: FileStorage with M1, D1, M2, D2, and Rlr, Tlr or R, T (camera 2 from camera 1).
 - stereo pair of the rig's authors: npz, MATLAB file, or FileStorage XML, with K1, dist1, K2, dist2, R, t. Device 1 is camera 1;
   which device 2 is, the content doesn't say: the projector if the file's name has `proj` in it, else camera 2.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -24,6 +25,8 @@ from recon.model.calibration import WORLD, Calibration, Uncertainty
 
 SCHEMA = "sonotwin-optics/1"
 SLMASTER_KEYS = ("M1", "D1", "M4", "D4", "Rlp", "Tlp", "S")
+PAIR_KEYS = ("M1", "D1", "M2", "D2")
+PAIR_MOTIONS = (("Rlr", "Tlr"), ("R", "T"))
 STEREO_KEYS = ("K1", "dist1", "K2", "dist2", "R", "t")
 OLD_KEYS = {"distCoeffs1": "dist1", "distCoeffs2": "dist2"}  # of the authors' first files
 FEW_DIGITS = 1.1e-5  # of a rotation's products, in any of the files: five decimals mostly pass
@@ -55,9 +58,11 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
             return _own(path, storage)
         if "K1" in keys or "K2" in keys:
             return _stereo_pair(path, _matrices(path, storage, STEREO_KEYS), sizes or {})
+        if "M2" in keys and "M4" not in keys:
+            return _two_cameras(path, storage, keys, sizes or {})
         if "M1" in keys or "M4" in keys:
             return _slmaster(path, _matrices(path, storage, SLMASTER_KEYS), sizes or {})
-        raise InputError(f"{path}: expected schema, or M1 and M4, or K1 and K2, found {', '.join(keys) or 'no keys'}")
+        raise InputError(f"{path}: expected schema, or M1 and M4, or M1 and M2, or K1 and K2, found {', '.join(keys) or 'no keys'}")
 
 
 def of_capture(folder: Path, given: Path | None = None) -> Calibration | None:
@@ -173,6 +178,19 @@ def _slmaster(path: Path, values: Mapping[str, Array], sizes: Mapping[str, tuple
     camera = _camera(path, "cam1", (width, height), values["M1"], values["D1"], np.eye(4))
     projector = _camera(path, "projector", _size(path, "projector", sizes), values["M4"], values["D4"], projector_from_world)
     return Calibration({"cam1": camera, "projector": projector})
+
+
+def _two_cameras(path: Path, storage: cv2.FileStorage, keys: Sequence[str], sizes: Mapping[str, tuple[int, int]]) -> Calibration:
+    motion = next((pair for pair in PAIR_MOTIONS if set(pair) <= set(keys)), None)
+    if motion is None:
+        raise InputError(
+            f"{path}: expected Rlr and Tlr, or R and T, which take camera 1 to camera 2, found {', '.join(keys)}; "
+            "OpenCV's stereo_calib leaves R and T in extrinsics.yml: copy them into this file"
+        )
+    values = _matrices(path, storage, (*PAIR_KEYS, *motion))
+    first = _camera(path, "cam1", _size(path, "cam1", sizes), values["M1"], values["D1"], np.eye(4))
+    second = _camera(path, "cam2", _size(path, "cam2", sizes), values["M2"], values["D2"], _rigid(path, values, *motion))
+    return Calibration({"cam1": first, "cam2": second})
 
 
 def _stereo_pair(path: Path, values: Mapping[str, Array], sizes: Mapping[str, tuple[int, int]]) -> Calibration:

@@ -67,6 +67,20 @@ def test_own_format_comes_back(optics, tmp_path):
     assert (tmp_path / "optics.yaml").read_bytes() == first and len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.parametrize("motion", [("Rlr", "Tlr"), ("R", "T")])
+def test_two_cameras_of_slmaster_and_stereo_calib(motion, optics, tmp_path):
+    """Whose world is camera 1, too; without the motion between both, the file to copy it from is named."""
+    first, second = optics.cameras["cam1"], optics.cameras["cam2"]
+    values = {"M1": first.matrix, "D1": first.distortion[None], "M2": second.matrix, "D2": second.distortion[None]}
+    write_storage(tmp_path / "intrinsics.yml", values)
+    with pytest.raises(InputError, match=r"expected Rlr and Tlr, or R and T, .*found M1, D1, M2, D2; .*extrinsics.yml"):
+        calibration_files.read(tmp_path / "intrinsics.yml", SIZES)
+    values |= {motion[0]: second.camera_from_world[:3, :3].copy(), motion[1]: second.camera_from_world[:3, 3:].copy()}
+    write_storage(tmp_path / "pair.yml", values)
+    found = calibration_files.read(tmp_path / "pair.yml", SIZES).cameras
+    assert list(found) == ["cam1", "cam2"] and same(found["cam1"], first) and same(found["cam2"], second)
+
+
 def test_own_format_is_opencvs(optics, tmp_path):
     """Any OpenCV program finds the values by name."""
     calibration_files.write(tmp_path / "optics.yaml", optics)
@@ -258,7 +272,7 @@ def without(values, key):
         (lambda v: v | {"Rlp": np.eye(2)}, "Rlp, Tlp: expected a 3x3 rotation"),
         (lambda v: v | {"S": np.array([[0.0], [10.0]])}, "S: expected the camera's width and height"),
         (lambda v: v | {"M4": "text"}, "M4: expected a matrix, found something else"),
-        (lambda v: {"A": np.eye(3)}, "expected schema, or M1 and M4, or K1 and K2, found A"),
+        (lambda v: {"A": np.eye(3)}, "expected schema, or M1 and M4, or M1 and M2, or K1 and K2, found A"),
     ],
 )
 def test_wrong_values_are_refused_in_one_line(optics, tmp_path, fault, complaint):
