@@ -3,7 +3,7 @@
 - own: OpenCV FileStorage YAML; for every device a map of `size`, `matrix`, `distortion` and `camera_from_world`; and, if known,
   `parameters`, their names, and `covariance`.
 - camera and projector of SLMaster: FileStorage with M1, D1 (camera), M4, D4 (projector), Rlp, Tlp (projector from camera), S.
-- two cameras of SLMaster and OpenCV's stereo_calib: FileStorage with M1, D1, M2, D2, and Rlr, Tlr or R, T (camera 2 from camera 1).
+- two cameras of SLMaster and OpenCV's stereo_calib: FileStorage with M1, D1, M2, D2, and Rlr, Tlr or R, T (camera 2 from 1).
 - stereo pair of the rig's authors: npz, MATLAB file, or FileStorage XML, with K1, dist1, K2, dist2, R, t. Device 1 is camera 1;
   which device 2 is, the content doesn't say: the projector if the file's name has `proj` in it, else camera 2.
 """
@@ -62,7 +62,8 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
             return _two_cameras(path, storage, keys, sizes or {})
         if "M1" in keys or "M4" in keys:
             return _slmaster(path, _matrices(path, storage, SLMASTER_KEYS), sizes or {})
-        raise InputError(f"{path}: expected schema, or M1 and M4, or M1 and M2, or K1 and K2, found {', '.join(keys) or 'no keys'}")
+        found = ", ".join(keys) or "no keys"
+        raise InputError(f"{path}: expected schema, or M1 and M4, or M1 and M2, or K1 and K2, found {found}")
 
 
 def of_capture(folder: Path, given: Path | None = None) -> Calibration | None:

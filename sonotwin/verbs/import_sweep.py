@@ -100,9 +100,9 @@ def b_scan(config: Config, clip: Clip) -> Box:
     width, height = clip.size
     if config.crop == "whole":
         return 0, 0, width, height
-    if config.crop == "auto" and clip.image is None:
-        return image_region.find(clip.stream(), str(config.clip))
     if config.crop == "auto":
+        if clip.image is None:
+            return image_region.find(clip.stream(), str(config.clip))
         u, v, wide, tall = clip.image
         if u + wide > width or v + tall > height:
             raise InputError(
