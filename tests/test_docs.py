@@ -56,7 +56,7 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
     "freehand.md": {f"{folder}/capture" for folder in ("wires", "bottom", "sweep", "tank")}
     | {"scan.dcm", "poses.csv", "pairs.csv", "config.xml", "probe/probe.yaml", "surface/surface.ply"}
     | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires")},
-    "recordings.md": {"pairs", "procam", "L", "relief.yaml", "caliInfo.yml", "spine.xml", "examples_ybr_color.dcm", "poses.csv"}
+    "recordings.md": {"photographs", "procam", "L", "relief.yaml", "caliInfo.yml", "spine.xml", "examples_ybr_color.dcm", "poses.csv"}
     | {f"{name}.igs.mha" for name in ("SpinePhantomFreehand", "WaterTankBottomTranslationCombined")},
     "tracking.md": {"session", "probe.yaml"},
 }
