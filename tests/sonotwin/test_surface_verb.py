@@ -212,6 +212,7 @@ def test_the_page_names_every_field():
 def test_the_manifests_of_the_page_are_valid():
     read = [Manifest.model_validate(json.loads(text)) for text in blocks("json")]
     assert [(content.surface is not None, sorted(content.sweep.images) if content.sweep else []) for content in read] == [
+        (False, []),
         (False, ["us"]),
         (False, ["cam1", "cam2"]),
         (False, []),
@@ -225,8 +226,9 @@ def commands(verb: str) -> list[list[str]]:
 
 
 def test_the_page_is_run_whole():
-    """Each of its commands is of a verb that one of the two tests below runs."""
-    assert len(commands("surface")) + len(commands("track")) == sum(text.count("\n") for text in blocks("sh"))
+    """Each of its commands is of a verb that one of the two tests below runs, or of `describe`, which has tests of its own."""
+    verbs = ("surface", "track", "describe")
+    assert sum(len(commands(verb)) for verb in verbs) == sum(text.count("\n") for text in blocks("sh"))
 
 
 def test_the_page_tracks(rig, tmp_path, monkeypatch):
