@@ -270,9 +270,11 @@ def test_the_page_measures(rig, tmp_path, monkeypatch):
         assert main(arguments) == 0
         assert json.loads(Path("surface/metrics.json").read_text())["points"] > 500_000
 
-    (text,) = blocks("yaml")
+    text, of_gray_code = blocks("yaml")
     Path("sequence.yaml").write_text(text)
+    Path("gray_code.yaml").write_text(of_gray_code)
     sequence = surface_part.read_patterns(Path("sequence.yaml"))
+    assert surface_part.read_patterns(Path("gray_code.yaml")).count == 22
     shutil.rmtree("shots")
     images.write_images([tmp_path / "shots" / f"{i}.png" for i in range(sequence.count)], photograph(sequence, optics))
     assert main(["surface", "images=shots", "patterns=sequence.yaml", "calibration=optics.yaml", "out=surface"]) == 0
