@@ -35,7 +35,6 @@ def test_in_the_tank_ours_is_nearer_to_the_truth_than_the_papers_method(kept):
         assert abs(figures[f"{figure}_ours_mm"]) < abs(figures[f"{figure}_paper_mm"])
     assert figures["cr1_mean_ours_mm"] < 2 * figures["cr1_mean_limit_mm"]
     assert figures["equation_rms_paper_mm"] > 2 * figures["equation_rms_ours_mm"]
-    assert figures["tube_diameter_error_paper_mm"] > 0.1  # contours run along the outside of the wall's echo
     trials = len(list((kept / "trials").glob("*.json")))
     study_accuracy.study(kept, "cylinders", *few)
     assert len(list((kept / "trials").glob("*.json"))) == trials  # probe and cylinders are figures of the same laboratory
