@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import yaml
 from pydantic import Field, ValidationError
 
 from recon.capture.manifest import validated
@@ -95,7 +94,7 @@ def choice(name: str, value: str) -> Any:
     if not path.is_file():
         names = ", ".join(sorted(each.stem for each in path.parent.glob("*.yaml")))
         raise InputError(f"over: {name}: expected one of {names}, found {value}")
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    content = read_yaml(path)
     if not part:
         return content
     if part not in content:

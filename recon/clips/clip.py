@@ -20,6 +20,7 @@ class Clip:
 
     name: str
     size: tuple[int, int]  # width, height, px
+    count: int  # n
     seconds: NDArray[np.float64] | None  # (n,) from the first frame, increasing; None where the file doesn't say
     stream: Callable[[], Iterator[Grey]]  # frames (h, w), one by one, from the first at each call
     image: Box | None = None  # the B-scan's part of the frames, where the file says it

@@ -31,4 +31,4 @@ def of_images(folder: Path) -> Clip:
     if not paths:
         raise InputError(f"{folder}: expected images of a clip, found none")
     height, width = read_grey(paths[0]).shape
-    return Clip(folder.name, (width, height), None, lambda: (read_grey(path, (width, height)) for path in paths))
+    return Clip(folder.name, (width, height), len(paths), None, lambda: (read_grey(path, (width, height)) for path in paths))

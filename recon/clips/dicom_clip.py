@@ -22,10 +22,9 @@ from recon.files.regular import check_there
 Dataset = Any
 
 TWO_D, TISSUE, CENTIMETRES = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits
-COLOURS = ("RGB", "YBR_FULL", "YBR_FULL_422", "PALETTE COLOR")
 DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or compressed in ways that need other packages
-    *(AttributeError, BytesLengthException, EOFError, InvalidDicomError, KeyError, NotImplementedError, OSError),
-    *(OverflowError, RuntimeError, TypeError, ValueError, IndexError),
+    *(InvalidDicomError, BytesLengthException, AttributeError, EOFError, LookupError, OSError, OverflowError),
+    *(RuntimeError, TypeError, ValueError),
 )
 
 
@@ -47,7 +46,7 @@ def read(path: Path) -> Clip:
         raise InputError(f"{path}: expected a DICOM file, a video or a folder of images, found {_brief(error)}") from None
     image, scale = (None, None) if region is None else within(*region, size)
     timed = None if seconds is None else checked_seconds(path, seconds)
-    return Clip(path.name, size, timed, lambda: images(path, size, count), image, scale)
+    return Clip(path.name, size, count, timed, lambda: images(path, size, count), image, scale)
 
 
 def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np.uint8]]:

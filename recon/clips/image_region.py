@@ -49,9 +49,3 @@ def spread(frames: Iterable[NDArray[np.uint8]]) -> NDArray[np.float32]:
     if squares is None:
         return np.zeros((1, 1), np.float32)
     return np.sqrt(squares / max(count - 1, 1))
-
-
-def cut(image: NDArray[np.uint8], box: Box) -> NDArray[np.uint8]:
-    """The part of an image : (h, w) in a box."""
-    u, v, width, height = box
-    return np.ascontiguousarray(image[v : v + height, u : u + width])

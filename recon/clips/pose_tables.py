@@ -84,14 +84,12 @@ def _pose(path: Path, line: int, values: Array, columns: Columns) -> Array:
         pose[:3, 3] = values[:3]
         pose[:3, :3] = _rotation(path, line, values[3:])
     pose[:3, 3] *= MILLIMETRES[columns.length_unit]
-    left, _, right = np.linalg.svd(pose[:3, :3])
-    nearest = left @ right
-    if np.linalg.det(nearest) < 0 or np.abs(nearest - pose[:3, :3]).max() > MOST_OFF:
+    nearest = rigid.nearest(pose)
+    if np.linalg.det(nearest[:3, :3]) < 0 or np.abs(nearest - pose).max() > MOST_OFF:
         raise InputError(
             f"{path}: line {line}: expected {rigid.RIGID}, row by row, found {rigid.fault(pose) or 'another matrix'}"
         )
-    pose[:3, :3] = nearest
-    return rigid.invert(pose) if columns.inverted else pose
+    return rigid.invert(nearest) if columns.inverted else nearest
 
 
 def _rotation(path: Path, line: int, values: Array) -> Array:

@@ -30,7 +30,8 @@ def read(path: Path) -> Clip:
     seconds, rate = np.array(stamps), rates[0]
     if len(seconds) > 1 and np.diff(seconds).min() < LEAST_STEP_S:
         seconds = np.arange(len(seconds)) / rate if rate > 0 else None
-    return Clip(path.name, sizes[0], None if seconds is None else checked_seconds(path, seconds), lambda: _images(path))
+    timed = None if seconds is None else checked_seconds(path, seconds)
+    return Clip(path.name, sizes[0], len(frames), timed, lambda: _images(path))
 
 
 def _images(path: Path) -> Iterator[NDArray[np.uint8]]:

@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
 from recon.capture import probe_files
 from recon.capture.sweep_part import SweepCapture
@@ -15,11 +16,14 @@ from recon.files.metrics import Metrics
 from recon.files.volumes import Volume
 from recon.freehand import hole_filling, place_uncertainty, sequence_sweep, sequences, volume_compounding
 from recon.freehand.place_uncertainty import PlaceErrors
-from recon.freehand.sequences import FrameNames
+from recon.freehand.sequence_sweep import SequenceFields
+from recon.freehand.sequences import FrameName, FrameNames
 from recon.freehand.volume_compounding import MOST_BYTES, Clip, Compounding, Interpolation, Reconstruction, grid_of
 from recon.geometry import rigid
 from recon.model import tracks
-from recon.model.probe import SCANNER_SPEED, ProbeCalibration
+from recon.model.probe import SCANNER_SPEED, ProbeCalibration, Speed, SpeedSigma
+from recon.model.rig import NotNegative
+from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 
 Array = NDArray[np.float64]
@@ -34,6 +38,34 @@ class Unsure(NamedTuple):
 
     lag_s: float = 0.0
     tissue_m_s: float = 0.0
+
+
+class ScansFields(SequenceFields):
+    """Fields of a verb that places the B-scans of a capture or of a sequence in the world."""
+
+    capture: Path | None = None
+    sweep: str = ""
+    probe: Path | None = None
+    lag_s: LagSeconds = 0.0
+    lag_sigma_s: NotNegative = 0.0
+    tissue_m_s: Speed | None = None
+    tissue_sigma_m_s: SpeedSigma = 25.0
+    image: FrameName | None = None
+    config: Path | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "ScansFields":
+        if (self.capture is None) == (self.sequence is None):
+            raise ValueError(f"expected capture or sequence, found {'neither' if self.capture is None else 'both'}")
+        if self.capture is not None and self.config is not None:
+            raise ValueError("config: expected a configuration with a sequence only, found one with a capture")
+        if self.sequence is not None and self.lag_sigma_s != 0:
+            raise ValueError(f"lag_sigma_s: expected none with a sequence, without covariances, found {self.lag_sigma_s:g}")
+        if self.target is not None and self.probe is None:
+            raise ValueError(
+                f"target: expected a probe with it, whose calibration holds in that frame, found {self.target} alone"
+            )
+        return self
 
 
 @dataclass(frozen=True)

@@ -30,33 +30,20 @@ from recon.files.metrics import Metrics
 from recon.freehand import hole_filling, plus_config, volume_compounding
 from recon.freehand import scans as freehand_scans
 from recon.freehand.plus_config import PlusConfig
-from recon.freehand.scans import Extent, Scans, Unsure, VolumeSettings
-from recon.freehand.sequence_sweep import SequenceFields
-from recon.freehand.sequences import FrameName, FrameNames
+from recon.freehand.scans import Extent, Scans, ScansFields, Unsure, VolumeSettings
+from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction, Rectangle
-from recon.model.probe import Speed, SpeedSigma
-from recon.model.rig import NotNegative
-from recon.model.tracks import LagSeconds
 
 VOLUME = "volume.nrrd"  # by which the folder of a volume is known
 SIGMA, SEQUENCE = "sigma.nrrd", "sequence.igs.mha"
 
 
-class Config(SequenceFields):
+class Config(ScansFields):
     """Fields of `conf/freehand.yaml`: sources, target, and settings of the volume."""
 
     model_config = ConfigDict(extra="forbid")
 
     out: Path
-    capture: Path | None = None
-    sweep: str = ""
-    probe: Path | None = None
-    lag_s: LagSeconds = 0.0
-    lag_sigma_s: NotNegative = 0.0
-    tissue_m_s: Speed | None = None
-    tissue_sigma_m_s: SpeedSigma = 25.0
-    image: FrameName | None = None
-    config: Path | None = None
     spacing_mm: Annotated[float, Field(ge=0.01, le=100)] | None = None
     extent: Extent | None = None
     compounding: Compounding | None = None
@@ -67,17 +54,7 @@ class Config(SequenceFields):
     most_gib: Annotated[float, Field(gt=0, le=1024)] = volume_compounding.MOST_BYTES / 2**30
 
     @model_validator(mode="after")
-    def _one_source(self) -> "Config":
-        if (self.capture is None) == (self.sequence is None):
-            raise ValueError(f"expected capture or sequence, found {'neither' if self.capture is None else 'both'}")
-        if self.capture is not None and self.config is not None:
-            raise ValueError("config: expected a configuration with a sequence only, found one with a capture")
-        if self.sequence is not None and self.lag_sigma_s != 0:
-            raise ValueError(f"lag_sigma_s: expected none with a sequence, without covariances, found {self.lag_sigma_s:g}")
-        if self.target is not None and self.probe is None:
-            raise ValueError(
-                f"target: expected a probe with it, whose calibration holds in that frame, found {self.target} alone"
-            )
+    def _whole_pixels(self) -> "Config":
         if self.compounding == "integer_mean" and self.interpolation == "linear":
             raise ValueError("interpolation: expected nearest with integer_mean, which counts whole pixels, found linear")
         return self

@@ -27,6 +27,7 @@ from recon.clips.clip import Box, Clip
 from recon.clips.pose_tables import Columns
 from recon.errors import InputError
 from recon.files import atomic
+from recon.freehand import volume_compounding
 from recon.model.rig import Finite, Positive
 from recon.model.tracks import Track
 
@@ -83,8 +84,7 @@ def stamps(config: Config, clip: Clip, track: Track) -> NDArray[np.int64]:
     """
     seconds = clip.seconds
     if config.rate_hz is not None:
-        count = sum(1 for _ in clip.stream()) if seconds is None else len(seconds)
-        seconds = np.arange(count) / config.rate_hz
+        seconds = np.arange(clip.count) / config.rate_hz
     if seconds is None:
         raise InputError(f"{config.clip}: expected times of the frames, found none; give rate_hz=...")
     start = int(track.times[0]) if config.starts_s is None else round(1e9 * config.starts_s)
@@ -131,4 +131,5 @@ def describe(config: Config, clip: Clip, times: NDArray[np.int64], box: Box, tra
 
 
 def _cut(clip: Clip, box: Box) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    return ((SCANNER, image_region.cut(frame, box)) for frame in clip.stream())
+    part = volume_compounding.Clip(*box)
+    return ((SCANNER, part.cut(frame)) for frame in clip.stream())

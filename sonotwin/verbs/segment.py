@@ -27,13 +27,11 @@ from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
 from recon.freehand import plus_config
 from recon.freehand import scans as freehand_scans
-from recon.freehand.scans import Scans, Unsure
-from recon.freehand.sequence_sweep import SequenceFields
-from recon.freehand.sequences import FrameName, FrameNames
+from recon.freehand.scans import Scans, ScansFields, Unsure
+from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.probe import SCANNER_SPEED, Speed, SpeedSigma
 from recon.model.rig import NotNegative, Positive
-from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, segmented_scans
 from recon.segmentation.blur_correction import MOST_MM, Blur
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
@@ -54,24 +52,15 @@ def _rising(value: tuple[tuple[float, float], ...] | None) -> tuple[tuple[float,
 Slice = Annotated[tuple[tuple[NotNegative, Spread], ...] | None, AfterValidator(_rising)]  # depths, and across the plane there
 
 
-class Config(SequenceFields):
+class Config(ScansFields):
     """Fields of `conf/segment.yaml`."""
 
     model_config = ConfigDict(extra="forbid")
 
     out: Path
     kind: Literal["masses", "tube"] = "masses"
-    capture: Path | None = None
-    sweep: str = ""
-    probe: Path | None = None
-    lag_s: LagSeconds = 0.0
-    lag_sigma_s: NotNegative = 0.0
-    image: FrameName | None = None
-    config: Path | None = None
     clip: Rectangle | None = None
     surface: Path | None = None
-    tissue_m_s: Speed | None = None
-    tissue_sigma_m_s: SpeedSigma = 25.0
     mass_m_s: Speed = SCANNER_SPEED
     mass_sigma_m_s: SpeedSigma = 20.0
     dynamic_range_db: Annotated[float, Field(ge=20, le=120)] = 60.0
@@ -83,17 +72,7 @@ class Config(SequenceFields):
     overlays: Annotated[int, Field(ge=0, le=100)] = segmented_scans.OVERLAYS
 
     @model_validator(mode="after")
-    def _one_source(self) -> "Config":
-        if (self.capture is None) == (self.sequence is None):
-            raise ValueError(f"expected capture or sequence, found {'neither' if self.capture is None else 'both'}")
-        if self.capture is not None and self.config is not None:
-            raise ValueError("config: expected a configuration with a sequence only, found one with a capture")
-        if self.sequence is not None and self.lag_sigma_s != 0:
-            raise ValueError(f"lag_sigma_s: expected none with a sequence, without covariances, found {self.lag_sigma_s:g}")
-        if self.target is not None and self.probe is None:
-            raise ValueError(
-                f"target: expected a probe with it, whose calibration holds in that frame, found {self.target} alone"
-            )
+    def _in_order(self) -> "Config":
         if self.diameter_mm[0] >= self.diameter_mm[1]:
             raise ValueError(f"diameter_mm: expected the least before the most, found {list(self.diameter_mm)}")
         return self

@@ -167,22 +167,31 @@ def test_one_camera_alone_is_calibrated_by_command(session, tmp_path, capsys):
     assert not re.search(r"\bnan\b|unknown", (out / "calibration.html").read_text(encoding="utf-8").split("</style>")[1])
 
 
-def test_camera_and_projector_by_gray_code_alone(tmp_path, capsys):
-    """What many rigs record: one camera, and in each pose the code with its inverses, nothing else."""
-    camera, rng = cameras()["cam1"], np.random.default_rng(0)
+def small_projector() -> Camera:
     pose = rigid.from_rotation_vector(np.deg2rad([0, -15, 0]), [172.0, 4, 45])
-    projector = Camera((256, 160), np.array([[560.0, 0, 127], [0, 560, 80], [0, 0, 1]]), np.zeros(4), pose)
-    code = tuple(GrayCode(axis=axis, pitch=1, bits=8, inverted=True) for axis in ("columns", "rows"))
-    patterns = Patterns(projector_size=projector.size, unwrap="gray", parts=code)
+    return Camera((256, 160), np.array([[560.0, 0, 127], [0, 560, 80], [0, 0, 1]]), np.zeros(5), pose)
+
+
+def under_patterns_alone(folder, count: int, shown: Patterns, described: Patterns) -> None:
+    """A board in some poses under the small projector's patterns, seen by camera 1, and described as under others."""
+    camera, projector, rng = cameras()["cam1"], small_projector(), np.random.default_rng(0)
     board = Chessboard(columns=6, rows=5, square_mm=24)
-    with new_capture(tmp_path / "capture", "code") as capture:
+    with new_capture(folder, "patterns") as capture:
         records = []
-        for number in range(8):
+        for number in range(count):
             placed = board_views.pose(board, rng.uniform(640, 720), rng.uniform(-0.5, 0.5, 2), 0.1, rng.uniform(-15, 15, 2))
-            stack = board_views.under_patterns(board, camera, projector, patterns, placed, rng)[1:]
+            stack = board_views.under_patterns(board, camera, projector, shown, placed, rng)[1:]
             records.append(write_pose(capture.folder, f"{number:02d}", {}, {"cam1": stack}))
         devices = {"cam1": Device(size=SIZE), "projector": Device(size=projector.size)}
-        capture.add_board(BoardPart(board=board, patterns=patterns, poses=tuple(records)), devices)
+        capture.add_board(BoardPart(board=board, patterns=described, poses=tuple(records)), devices)
+
+
+def test_camera_and_projector_by_gray_code_alone(tmp_path, capsys):
+    """What many rigs record: one camera, and in each pose the code with its inverses, nothing else."""
+    camera, projector = cameras()["cam1"], small_projector()
+    code = tuple(GrayCode(axis=axis, pitch=1, bits=8, inverted=True) for axis in ("columns", "rows"))
+    patterns = Patterns(projector_size=projector.size, unwrap="gray", parts=code)
+    under_patterns_alone(tmp_path / "capture", 8, patterns, patterns)
     fields = [f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}", "distortion=radial1"]
     assert main(["calibrate-optics", *fields]) == 0
     assert re.match(r"detect +8 poses: cam1 8, projector 8,", capsys.readouterr().out)
@@ -202,9 +211,7 @@ def test_camera_and_projector_by_gray_code_alone(tmp_path, capsys):
 )
 def test_fringes_other_than_described_are_named(shown, refusal, fields, tmp_path, capsys):
     """The refusal's usual cause is images out of order; here all sets of fringes were shown otherwise."""
-    camera, rng = cameras()["cam1"], np.random.default_rng(0)
-    pose = rigid.from_rotation_vector(np.deg2rad([0, -15, 0]), [172.0, 4, 45])
-    projector = Camera((256, 160), np.array([[560.0, 0, 127], [0, 560, 80], [0, 0, 1]]), np.zeros(5), pose)
+    projector = small_projector()
     code = [GrayCode(axis=axis, pitch=16, bits=4) for axis in ("columns", "rows")]
     given, true = (
         Patterns(
@@ -214,15 +221,7 @@ def test_fringes_other_than_described_are_named(shown, refusal, fields, tmp_path
         )
         for own in ({}, shown)
     )
-    board = Chessboard(columns=6, rows=5, square_mm=24)
-    with new_capture(tmp_path / "capture", "fringes") as capture:
-        records = []
-        for number in range(5):
-            placed = board_views.pose(board, rng.uniform(640, 720), rng.uniform(-0.5, 0.5, 2), 0.1, rng.uniform(-15, 15, 2))
-            stack = board_views.under_patterns(board, camera, projector, true, placed, rng)[1:]
-            records.append(write_pose(capture.folder, f"{number:02d}", {}, {"cam1": stack}))
-        devices = {"cam1": Device(size=SIZE), "projector": Device(size=projector.size)}
-        capture.add_board(BoardPart(board=board, patterns=given, poses=tuple(records)), devices)
+    under_patterns_alone(tmp_path / "capture", 5, true, given)
     assert main(["calibrate-optics", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}", "distortion=radial1"]) == 2
     line = capsys.readouterr().err
     assert refusal in line and line.endswith(f" (the images fit patterns with {fields} in each set of fringes)\n")

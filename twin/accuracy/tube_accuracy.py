@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from recon.model import tracks
 from recon.model.probe import ProbeCalibration
-from recon.model.rig import Probe
+from recon.model.rig import Probe, Vector
 from recon.probe_calibration import sound_in_water
 from recon.segmentation import tube_wall
 from recon.segmentation.tube_wall import Appearance, Ring, Tube
@@ -88,14 +88,23 @@ def half_width(profile: NDArray) -> float:
 
 def stroke(probe: Probe, slices: int, seed: int, transducer: Transducer = WATER) -> Stroke:
     """Lead the probe by hand along the middle of the cylinder, its array across, and take images at the scanner's rate."""
-    config, clocks = inner_cylinder.Config(), Clocks(scanner_hz=(slices - 1) * PACE_MM_S / LENGTH_MM)
+    config, clocks = inner_cylinder.Config(), Clocks(scanner_hz=rate_hz(slices))
     made = body(inner_cylinder.build(config))
-    x, y, _ = config.centre_mm
-    half = LENGTH_MM / 2 + 0.1  # for the last image, too
-    path = SurfacePath(start_mm=(x - half, y), end_mm=(x + half, y), speed_mm_s=PACE_MM_S, turn_deg=90.0, standoff_mm=STANDOFF_MM)
-    course = along_surface(path, surface_of("inner", made), transducer, seed)
+    course = along_surface(path_along(config.centre_mm), surface_of("inner", made), transducer, seed)
     planned = plan(probe, course, moments(course, clocks.scanner_hz), clocks, PoseNoise(), seed)
     return Stroke(config, planned, [one.image for one in scans(made, transducer, planned.truth.poses, seed)])
+
+
+def rate_hz(slices: int) -> float:
+    """Images a second for so many along the stroke."""
+    return (slices - 1) * PACE_MM_S / LENGTH_MM
+
+
+def path_along(centre_mm: Vector) -> SurfacePath:
+    """The stroke over the middle of a cylinder along x, the array across."""
+    x, y, _ = centre_mm
+    half = LENGTH_MM / 2 + 0.1  # for the last image, too
+    return SurfacePath(start_mm=(x - half, y), end_mm=(x + half, y), speed_mm_s=PACE_MM_S, turn_deg=90.0, standoff_mm=STANDOFF_MM)
 
 
 def measured(recorded: Stroke, probe: Probe, speed: float, look: Appearance | None = None) -> tuple[list[Ring], Tube]:

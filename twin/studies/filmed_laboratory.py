@@ -24,7 +24,7 @@ from recon.structured_light.triangulate import triangulate
 from recon.tracking import networks
 from recon.tracking.networks import Networks
 from scenes.catalogue import build_scene
-from twin.accuracy import surface_accuracy
+from twin.accuracy import probe_accuracy, surface_accuracy
 from twin.accuracy.baselines import opencv_peer, published_probe
 from twin.accuracy.baselines.published_probe import Solved
 from twin.accuracy.surface_accuracy import Experiment as Shot
@@ -41,7 +41,6 @@ from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.timed_sweep import Clocks
 from twin.ultrasound.transducer import Transducer
 
-IMAGES = 30  # of the wires, in each calibration of the paper
 AT_REST_HZ = 5.0  # pairs of frames: two or three in each rest, less apart than poses are interpolated over
 NOT_KEPT = "not among those that are kept"
 READS = (  # of a study's settings
@@ -107,7 +106,7 @@ def crossings(lab: FilmedLaboratory, sweep: TrackedSweep) -> CrossingFrames:
     found = crossing_frames.look(
         own.name, own.images(), own.size, own.frames, own.poses(lab.latency_s), own.pose_covariance(lab.latency_s)
     )
-    kept = found.usable[seen[found.usable]][:IMAGES]
+    kept = found.usable[seen[found.usable]][: probe_accuracy.IMAGES]
     some = tuple(replace(one, reason=one.reason or (None if k in kept else NOT_KEPT)) for k, one in enumerate(found.crossings))
     return replace(found, sightings=found.sightings.of(np.isin(found.usable, kept)), crossings=some)
 

@@ -16,9 +16,10 @@ from recon.model.probe import ProbeCalibration
 from recon.probe_calibration import point_calibration, repeatability, sound_in_water
 from recon.probe_calibration.tank_calibration import Result
 from recon.segmentation import segmented_scans, tube_cover
+from recon.segmentation.tube_wall import Appearance
 from scenes.catalogue import build_scene
 from twin import conditions
-from twin.accuracy import probe_accuracy
+from twin.accuracy import probe_accuracy, tube_accuracy
 from twin.accuracy.baselines import published_probe
 from twin.accuracy.baselines.published_probe import Solved
 from twin.accuracy.plane_and_sphere import as_published
@@ -29,18 +30,14 @@ from twin.studies.drawn_session import WATER_C
 from twin.studies.experiments import Experiment, Settings
 from twin.studies.filmed_laboratory import FilmedLaboratory
 from twin.studies.tracked_sweep import TrackedSweep
-from twin.ultrasound.probe_path import SurfacePath
 from twin.ultrasound.sweep_session import calibration_of
 from twin.ultrasound.timed_sweep import Clocks
 
 Array = NDArray[np.float64]
 
-CALIBRATIONS, SLICES = 5, 94  # of the paper
 CENTRE_MM = (4.0, -2.0, 670.29)  # of the inner cylinder's axis, where it lies in the outer one
 INNER, OUTER = {"kind": "inner_cylinder", "centre_mm": CENTRE_MM}, {"kind": "cylinders"}
-LENGTH_MM, PACE_MM_S, STANDOFF_MM = 46.5, 10.0, 17.0  # of the stroke along it
 CAMERA_HZ = 20.0  # pairs of frames, in motion
-TOP_MM = 2.5  # of ringing at the probe's face, left out of masks
 DRAWS = 2000  # of errors, for their expected distances
 
 
@@ -48,7 +45,7 @@ def measure(settings: Settings, seed: int) -> Metrics:
     """Figures of one laboratory, by both methods."""
     ours, paper, images, clicks = list[Result](), list[Solved](), list[int](), np.random.default_rng([seed, 32])
     with filmed_laboratory.opened(settings, seed) as lab:
-        for number in range(CALIBRATIONS):
+        for number in range(probe_accuracy.CALIBRATIONS):
             sweep = filmed_laboratory.wires(lab, number)
             found = filmed_laboratory.crossings(lab, sweep)
             images.append(len(found.usable))
@@ -111,17 +108,14 @@ def cylinder_figures(lab: FilmedLaboratory, ours: ProbeCalibration, paper: Probe
 
 def stroke(lab: FilmedLaboratory) -> TrackedSweep:
     """The probe along the inner cylinder, its array across."""
-    x, y, _ = CENTRE_MM
-    half = LENGTH_MM / 2 + 0.1  # for the last image, too
-    path = SurfacePath(start_mm=(x - half, y), end_mm=(x + half, y), speed_mm_s=PACE_MM_S, turn_deg=90.0, standoff_mm=STANDOFF_MM)
-    rate = (SLICES - 1) * PACE_MM_S / LENGTH_MM
-    clocks = Clocks(scanner_hz=rate, camera_hz=CAMERA_HZ)
+    clocks = Clocks(scanner_hz=tube_accuracy.rate_hz(tube_accuracy.SLICES), camera_hz=CAMERA_HZ)
+    path = tube_accuracy.path_along(CENTRE_MM)
     return filmed_laboratory.swept(lab, "tube", INNER, path, clocks, WATER)
 
 
 def published_cylinders(sweep: TrackedSweep, probe: ProbeCalibration, lag_s: float, surface: trimesh.Trimesh) -> dict[str, float]:
     """Diameters and wall by the published method: a cylinder through the masks' contours, another through the surface."""
-    top_px = round(TOP_MM / float(probe.scale[1]))
+    top_px = round(Appearance().top_mm / float(probe.scale[1]))
     points = []
     for image, matrix in zip(sweep.ours.images(), sweep.published_at(lag_s), strict=True):
         contour = published_probe.mask_contour(image, top_px)

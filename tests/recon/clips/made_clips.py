@@ -35,7 +35,7 @@ def write_dicom(path: Path, frames: NDArray, region: bool = True, **tags: object
     """A multi-frame file of frames : (n, h, w) grey or (n, h, w, 3) RGB, 8 or 16 bits."""
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID, meta.TransferSyntaxUID = UltrasoundMultiFrameImageStorage, ExplicitVRLittleEndian
-    meta.MediaStorageSOPInstanceUID = generate_uid()
+    meta.MediaStorageSOPInstanceUID = generate_uid(entropy_srcs=["clip"])  # the same each time
     made = FileDataset(str(path), {}, file_meta=meta, preamble=b"\0" * 128)
     made.SOPClassUID, made.SOPInstanceUID, made.Modality = UltrasoundMultiFrameImageStorage, meta.MediaStorageSOPInstanceUID, "US"
     bits = 8 * frames.dtype.itemsize

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from recon.geometry import rigid
+from recon.model import tracks
 from recon.model.probe import ProbeCalibration
-from recon.model.tracks import MAX_GAP_S
+from recon.model.tracks import Track
 from recon.probe_calibration import point_equation
 
 Array = NDArray[np.float64]
@@ -45,16 +46,10 @@ def matrices_at(times: NDArray[np.int64], matrices: Array, wanted: NDArray[np.in
 
     A NaN where there is none nearby. They need not be rotations, and stay none.
     """
-    known = np.isfinite(matrices).all(axis=(1, 2))
-    if known.sum() < 2:
-        return np.full((len(wanted), 4, 4), np.nan)
-    moments, values = times[known], matrices[known]
-    after = np.clip(np.searchsorted(moments, wanted), 1, len(moments) - 1)
-    before = after - 1
-    share = ((wanted - moments[before]) / (moments[after] - moments[before]))[:, None, None]
-    result = (1 - share) * values[before] + share * values[after]
-    apart = (moments[after] - moments[before]) * 1e-9 > MAX_GAP_S
-    result[apart | (share < 0).ravel() | (share > 1).ravel()] = np.nan
+    track = Track(times, matrices)
+    near = np.isfinite(tracks.at(track, wanted)).all(axis=(1, 2))
+    result = np.full((len(wanted), 4, 4), np.nan)
+    result[near] = np.einsum("nm,mij->nij", tracks.shares_at(track, wanted[near], 0.0), matrices[track.found])
     return result
 
 
