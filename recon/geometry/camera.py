@@ -108,7 +108,7 @@ class Camera:
         return local @ self.camera_from_world[:3, :3]
 
     def pixel_rays(self) -> Array:
-        """Directions of the rays through all pixel centres : (h, w, 3), as of `rays`; each begins at its neighbours'."""
+        """Directions of the rays through all pixel centres : (h, w, 3), as of `rays`; each row begins where those before lead to."""
         (width, height), rotation = self.size, np.ascontiguousarray(self.camera_from_world[:3, :3])
         found = np.empty((height, width, 3))
         in_threads(_pixel_rays, height, self.matrix, self.coefficients, rotation, found)
@@ -203,18 +203,48 @@ def _undistort_all(first, end, points, k, found):
         found[i, 0], found[i, 1] = _undistort(points[i, 0], points[i, 1], k)
 
 
-@kernel
+@njit(nogil=True, noalias=True, error_model="numpy")
 def _pixel_rays(first, end, matrix, k, rotation, found):
+    """Rows `first` to `end`, not included. All but the first three begin where those before lead to; see `_continued`."""
+    width = found.shape[1]
+    rows, doubtful = np.empty((3, 2, width)), np.empty(width, np.bool_)  # normalised points of the latest three
     for j in range(first, end):
         v = (j - matrix[1, 2]) / matrix[1, 1]
-        x, y = np.nan, np.nan
-        x_before, y_before = np.nan, np.nan
-        for i in range(found.shape[1]):
-            u = (i - matrix[0, 2] - matrix[0, 1] * v) / matrix[0, 0]
-            x_next, y_next = _undistort_from(2 * x - x_before, 2 * y - y_before, u, v, k)  # on the line through both before
-            if np.isnan(x_next):
-                x_next, y_next = _undistort(u, v, k)
-            x_before, y_before, x, y = x, y, x_next, y_next
+        before, last, row = rows[(j + 1) % 3], rows[(j + 2) % 3], rows[j % 3]
+        if j < first + 3:
+            for i in range(width):
+                row[0, i], row[1, i] = _undistort((i - matrix[0, 2] - matrix[0, 1] * v) / matrix[0, 0], v, k)
+        else:
+            _continued(row, before, last, v, matrix, k, doubtful)
+        for i in range(width):
+            x, y = row[0, i], row[1, i]
             shorter = 1 / np.sqrt(x * x + y * y + 1)
             for n in range(3):
                 found[j, i, n] = shorter * (rotation[0, n] * x + rotation[1, n] * y + rotation[2, n])
+
+
+@njit(inline="always", error_model="numpy")
+def _continued(row, before, last, v, matrix, k, doubtful):
+    """Undistort an image row from three before, of which it replaces the first: extrapolated, and one step with their slopes.
+
+    Without branches, so that pixels share vector instructions; Newton's method does where that falls short of its tolerance.
+    """
+    width = row.shape[1]
+    doubtful[0] = doubtful[width - 1] = True
+    for i in range(1, width - 1):
+        u = (i - matrix[0, 2] - matrix[0, 1] * v) / matrix[0, 0]
+        x, y = 3 * (last[0, i] - before[0, i]) + row[0, i], 3 * (last[1, i] - before[1, i]) + row[1, i]
+        xd, yd = distort_side_by_side(x, y, k)
+        right, down = matrix[0, 0] * (u - xd) + matrix[0, 1] * (v - yd), matrix[1, 1] * (v - yd)  # px left to go
+        a, b = (last[0, i + 1] - last[0, i - 1]) / 2, last[0, i] - before[0, i]
+        c, d = (last[1, i + 1] - last[1, i - 1]) / 2, last[1, i] - before[1, i]
+        x, y = x + a * right + b * down, y + c * right + d * down
+        xd, yd = distort_side_by_side(x, y, k)
+        near = (abs(u - xd) <= NEWTON_TOLERANCE) & (abs(v - yd) <= NEWTON_TOLERANCE)
+        doubtful[i] = not (near & (x * u + y * v >= 0) & (a * d > b * c))
+        row[0, i], row[1, i] = x, y
+    for i in range(width):
+        if doubtful[i]:
+            u = (i - matrix[0, 2] - matrix[0, 1] * v) / matrix[0, 0]
+            x, y = _undistort_from(row[0, i], row[1, i], u, v, k)
+            row[0, i], row[1, i] = (x, y) if x == x else _undistort(u, v, k)
