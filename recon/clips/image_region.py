@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from recon.clips.clip import Box
 from recon.errors import InputError
+from recon.model.fan import Mask, box
 
 CHANGES_DN = 4.0  # standard deviation of a pixel over time: speckle has ten and more, compressed rests less
 JOIN_PX = 9  # gaps in what changes, such as dark tissue, that are closed
@@ -23,16 +24,21 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Box:
     InputError
         If nothing of some size changes.
     """
+    part = changing(frames, name)
+    (tall, wide), (u, v, width, height) = part.shape, box(part)
+    return (0, 0, wide, tall) if width > WHOLE * wide and height > WHOLE * tall else (u, v, width, height)
+
+
+def changing(frames: Iterable[NDArray[np.uint8]], name: str) -> Mask:
+    """The largest part that changes : (h, w), its gaps closed; InputError if nothing of some size does."""
     changes = spread(frames) > CHANGES_DN
     joined = cv2.morphologyEx(changes.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((JOIN_PX, JOIN_PX), np.uint8))
     opened = cv2.morphologyEx(joined, cv2.MORPH_OPEN, np.ones((JOIN_PX, JOIN_PX), np.uint8))
-    count, _, figures, _ = cv2.connectedComponentsWithStats(opened)
-    least = LEAST_SHARE * changes.size
-    if count < 2 or (largest := figures[1:][figures[1:, cv2.CC_STAT_AREA].argmax()])[cv2.CC_STAT_AREA] < least:
+    count, labels, figures, _ = cv2.connectedComponentsWithStats(opened)
+    largest = int(figures[1:, cv2.CC_STAT_AREA].argmax()) + 1 if count > 1 else 0
+    if largest == 0 or figures[largest, cv2.CC_STAT_AREA] < LEAST_SHARE * changes.size:
         raise InputError(f"{name}: expected a B-scan that changes from frame to frame, found none; give crop=[u,v,width,height]")
-    u, v, width, height, _ = (int(value) for value in largest)
-    tall, wide = changes.shape
-    return (0, 0, wide, tall) if width > WHOLE * wide and height > WHOLE * tall else (u, v, width, height)
+    return labels == largest
 
 
 def spread(frames: Iterable[NDArray[np.uint8]]) -> NDArray[np.float32]:

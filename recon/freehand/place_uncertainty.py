@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recon.compiled import njit
 from recon.files.volumes import Volume
 from recon.freehand import sequences
-from recon.freehand.volume_compounding import Clip, Grid, Sums
+from recon.freehand.volume_compounding import Clip, Grid, Mask, Sums
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
@@ -110,7 +110,9 @@ def sigmas(form: Array, pixels: Array) -> Array:
     return np.sqrt(np.einsum("ni,...ij,nj->...n", terms, form, terms))
 
 
-def sigma_volume(form: Array, world_from_pixel: Array, shape: tuple[int, int], grid: Grid, clip: Clip | None = None) -> Volume:
+def sigma_volume(
+    form: Array, world_from_pixel: Array, shape: tuple[int, int], grid: Grid, clip: Clip | None = None, mask: Mask | None = None
+) -> Volume:
     """Root mean square of the standard deviations of all pixels in a voxel, mm, float32; 0 in voxels that none falls into, filled
     holes among them.
 
@@ -120,23 +122,28 @@ def sigma_volume(form: Array, world_from_pixel: Array, shape: tuple[int, int], g
         As of `forms`; B-scans with a NaN are left out.
     shape : (h, w)
         Of the B-scans.
+    clip, mask : optional
+        Rectangle and pixels : (h, w) that are used.
     """
     sums = Sums(np.zeros(grid.size[::-1], np.float32), np.zeros(grid.size[::-1], np.float32))
     voxel_from_world = np.linalg.inv(Volume(sums.value, grid.origin, grid.spacing, grid.directions).world_from_voxel)
     bounds = (clip or Clip(0, 0, shape[1], shape[0])).bounds(shape)
+    used = np.ones(shape, bool) if mask is None else mask
     for one, matrix in zip(form, voxel_from_world @ world_from_pixel, strict=True):
         if np.isfinite(one).all() and np.isfinite(matrix).all():
-            _paste_variance(one, bounds, matrix, sums)
+            _paste_variance(one, used, bounds, matrix, sums)
     np.divide(sums.value, sums.weight, out=sums.value, where=sums.weight > 0)
     return Volume(np.sqrt(sums.value, out=sums.value), grid.origin, grid.spacing, grid.directions)
 
 
 @njit
-def _paste_variance(form, bounds, m, sums: Sums):
+def _paste_variance(form, used, bounds, m, sums: Sums):
     left, right, top, bottom = bounds
     nz, ny, nx = sums.value.shape
     for v in range(top, bottom + 1):
         for u in range(left, right + 1):
+            if not used[v, u]:
+                continue
             i = int(np.floor(m[0, 0] * u + m[0, 1] * v + m[0, 3] + 0.5))
             j = int(np.floor(m[1, 0] * u + m[1, 1] * v + m[1, 3] + 0.5))
             k = int(np.floor(m[2, 0] * u + m[2, 1] * v + m[2, 3] + 0.5))

@@ -1,6 +1,7 @@
 """The PLUS toolkit's configuration files: the calibration of the probe, and the settings of a sequence's reconstruction."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -16,12 +17,14 @@ from recon.freehand import sequences
 from recon.freehand.scans import VolumeSettings
 from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction
+from recon.model.fan import Fan
 
 Array = NDArray[np.float64]
 
 COMPOUNDING: dict[str, Compounding] = {"MEAN": "integer_mean", "MAXIMUM": "maximum", "LATEST": "latest"}
 INTERPOLATION: dict[str, Interpolation] = {"NEAREST_NEIGHBOR": "nearest", "LINEAR": "linear"}
 EARLIER = {"WEIGHTED_AVERAGE": "MEAN", "MAXIMUM": "MAXIMUM"}
+FAN_RADIUS_STOP = 500.0  # px, as PLUS has it where none is given
 SWITCH = {"ON": True, "TRUE": True, "OFF": False, "FALSE": False}
 
 
@@ -33,12 +36,6 @@ class PlusConfig:
     transforms: dict[str, Array]  # "ImageToProbe": (4, 4), mm and px
     names: FrameNames = field(default_factory=FrameNames)  # those of image and reference that the reconstruction names
     volume: VolumeSettings | None = None  # along the reference frame's axes; None where there is no reconstruction
-    fan: str = ""  # angles of a fan-shaped clip, deg, as they stand there; empty without one
-
-    def check_clip(self) -> None:
-        """Refuse a fan-shaped clip, in whose place a rectangle may be given."""
-        if self.fan:
-            raise fault(self.path, "FanAngles", "none, as clips are rectangles; give clip=[u,v,width,height]", repr(self.fan))
 
 
 def read_config(path: Path) -> PlusConfig:
@@ -67,7 +64,7 @@ def read_config(path: Path) -> PlusConfig:
     usual = FrameNames()
     image, reference = (element.get(f"{name}CoordinateFrame", name) for name in (usual.image, usual.reference))
     names = FrameNames(image, usual.target, reference)
-    return PlusConfig(path, transforms, names, _volume(path, element), _fan(path, element))
+    return PlusConfig(path, transforms, names, replace(_volume(path, element), fan=_fan(path, element)))
 
 
 def reconstruct_sequence(path: Path, config: PlusConfig) -> tuple[Reconstruction, Reconstruction]:
@@ -78,7 +75,6 @@ def reconstruct_sequence(path: Path, config: PlusConfig) -> tuple[Reconstruction
     Reconstruction, Reconstruction
         Before its holes are filled, and after; the same without filling.
     """
-    config.check_clip()
     scans = freehand_scans.of_sequence(path, config.names, fixed=config.transforms)
     try:
         return freehand_scans.volume(scans, config.volume or VolumeSettings())
@@ -99,11 +95,24 @@ def _transforms(path: Path, root: Element) -> dict[str, Array]:
     return transforms
 
 
-def _fan(path: Path, element: Element) -> str:
-    for name in ("FanAngles", "FanAnglesDeg"):
-        if (angles := element.get(name)) and medical_images.numbers(path, name, angles, 2).any():
-            return angles
-    return ""
+def _fan(path: Path, element: Element) -> Fan | None:
+    """The fan-shaped clip; None where both angles are 0. PLUS may look for narrower ones in each image."""
+    left, right = sorted(_numbers(path, element, ("FanAnglesDeg", "FanAngles"), [0, 0]))
+    if left == right == 0:
+        return None
+    u, v = _numbers(path, element, ("FanOriginPixel", "FanOrigin"), [0, 0])
+    (first,) = _numbers(path, element, ("FanRadiusStartPixel",), [0])
+    (last,) = _numbers(path, element, ("FanRadiusStopPixel", "FanDepth"), [FAN_RADIUS_STOP])
+    try:
+        return Fan(u, v, first, last, left, right)
+    except ValueError as error:
+        raise InputError(f"{path}: Fan: {error}") from None
+
+
+def _numbers(path: Path, element: Element, names: Sequence[str], usual: list[float]) -> list[float]:
+    """Numbers of an attribute, by its name or an earlier one; the usual ones where there is none."""
+    name = next((name for name in names if element.get(name)), None)
+    return usual if name is None else medical_images.numbers(path, name, _text(path, element, name), len(usual)).tolist()
 
 
 def _volume(path: Path, element: Element) -> VolumeSettings:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -18,9 +19,10 @@ from recon.freehand import hole_filling, place_uncertainty, sequence_sweep, sequ
 from recon.freehand.place_uncertainty import PlaceErrors
 from recon.freehand.sequence_sweep import SequenceFields
 from recon.freehand.sequences import FrameName, FrameNames
-from recon.freehand.volume_compounding import MOST_BYTES, Clip, Compounding, Interpolation, Reconstruction, grid_of
+from recon.freehand.volume_compounding import MOST_BYTES, Clip, Compounding, Interpolation, Mask, Reconstruction, grid_of
 from recon.geometry import rigid
-from recon.model import tracks
+from recon.model import fan, tracks
+from recon.model.fan import Fan
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration, Speed, SpeedSigma
 from recon.model.rig import NotNegative
 from recon.model.tracks import LagSeconds
@@ -79,6 +81,16 @@ class VolumeSettings:
     clip: Clip | None = None
     hole_voxels: int = hole_filling.MOST_VOXELS  # longest stick across a hole; 0 leaves holes open
     hole_sticks: int = 1  # the shortest ones that count
+    fan: Fan | None = None  # within the clip
+
+    def part(self, shape: tuple[int, int]) -> tuple[Clip | None, Mask | None]:
+        """Rectangle and pixels, of images (h, w), that are used; without a clip the rectangle about the fan."""
+        if self.fan is None:
+            return self.clip, None
+        mask = self.fan.mask(shape)
+        if not mask.any():
+            raise InputError(f"fan: expected a part of an image of {shape[1]}x{shape[0]}, found {self.fan}")
+        return self.clip or Clip(*fan.box(mask)), mask
 
 
 @dataclass(frozen=True)
@@ -226,7 +238,8 @@ def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES)
     InputError
         If no B-scan has a pose, or as `recon.freehand.volume_compounding.reconstruct`.
     """
-    around = volume_compounding.corners(scans.world_from_pixel, scans.shape, settings.clip)
+    clip, mask = settings.part(scans.shape)
+    around = volume_compounding.corners(scans.world_from_pixel, scans.shape, clip)
     grid_along = volume_compounding.aligned_grid if settings.extent == "aligned" else volume_compounding.principal_grid
     pasted = volume_compounding.reconstruct(
         scans.stream(),
@@ -234,7 +247,8 @@ def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES)
         grid_along(around, settings.spacing_mm),
         settings.compounding,
         settings.interpolation,
-        settings.clip,
+        clip,
+        None if mask is None else repeat(mask),
         most_bytes=most_bytes,
     )
     if settings.hole_voxels == 0:
@@ -242,12 +256,14 @@ def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES)
     return pasted, hole_filling.fill_holes(pasted, settings.hole_voxels, settings.hole_sticks)
 
 
-def sigma_volume(scans: Scans, volume: Volume, clip: Clip | None = None) -> Volume | None:
+def sigma_volume(scans: Scans, volume: Volume, settings: VolumeSettings) -> Volume | None:
     """Standard deviations, mm over all directions, of the place of what each voxel shows; None where they aren't known."""
     if scans.probe is None or scans.probe.uncertainty is None or scans.errors is None or not scans.errors.known:
         return None
     forms = place_uncertainty.forms(scans.world_from_pixel, scans.probe, scans.errors)
-    return place_uncertainty.sigma_volume(forms, scans.world_from_pixel, scans.shape, grid_of(volume), clip)
+    return place_uncertainty.sigma_volume(
+        forms, scans.world_from_pixel, scans.shape, grid_of(volume), *settings.part(scans.shape)
+    )
 
 
 def measure(scans: Scans, pasted: Reconstruction, filled: Reconstruction) -> Metrics:

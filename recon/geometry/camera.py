@@ -108,7 +108,7 @@ class Camera:
         return local @ self.camera_from_world[:3, :3]
 
     def pixel_rays(self) -> Array:
-        """Directions of the rays through all pixel centres : (h, w, 3), as of `rays`; each row begins where those before lead to."""
+        """Directions of the rays through all pixel centres : (h, w, 3), as of `rays`; each row begins at those before."""
         (width, height), rotation = self.size, np.ascontiguousarray(self.camera_from_world[:3, :3])
         found = np.empty((height, width, 3))
         in_threads(_pixel_rays, height, self.matrix, self.coefficients, rotation, found)

@@ -108,29 +108,35 @@ def measure(depths: Array, found: Lag) -> Metrics:
     }
 
 
-def bottom_depth(image: NDArray, top_px: int = 40) -> float:
+def bottom_depth(image: NDArray, top_px: int = 40, part: NDArray[np.bool_] | None = None) -> float:
     """Depth in px of a flat bottom at the middle column of a B-scan : (h, w), 8-bit; NaN if there is none.
 
     Columns are averaged in blocks, and the brightest echo of each below `top_px`, where reverberation at the probe's face ends,
-    is taken; the line is that through most of these echoes.
+    is taken; the line is that through most of these echoes. Of a `part` : (h, w), such as a fan, the face is where it begins.
     """
     level = np.asarray(image, np.float32)
     blocks = level.shape[1] // BLOCK_PX
     profiles = level[:, : blocks * BLOCK_PX].reshape(level.shape[0], blocks, BLOCK_PX).mean(axis=2)
     profiles = cv2.GaussianBlur(profiles, (1, 0), sigmaX=1e-6, sigmaY=BOTTOM_SIGMA_PX) if blocks else profiles
-    below = profiles[top_px:-1]
-    if blocks < 4 or len(below) < 8:
+    used = np.ones(level.shape, bool) if part is None else part
+    seen = used[:, : blocks * BLOCK_PX].reshape(profiles.shape[0], blocks, BLOCK_PX).all(axis=2)
+    face = seen.argmax(axis=0) + top_px
+    below = seen & (np.arange(len(seen))[:, None] >= face)
+    below[:-1] &= seen[1:]
+    below[-1:] = False
+    columns = np.flatnonzero(below.sum(axis=0) >= 8)
+    if len(columns) < 4:
         return np.nan
-    rows = below.argmax(axis=0) + top_px
-    columns = np.arange(blocks)
+    rows = np.where(below, profiles, -1).argmax(axis=0)[columns]
     before, peak, after = profiles[rows - 1, columns], profiles[rows, columns], profiles[rows + 1, columns]
     bend = np.minimum(before - 2 * peak + after, -1e-3)
     v = rows + np.clip((before - after) / (2 * bend), -0.5, 0.5)
     u = (columns + 0.5) * BLOCK_PX - 0.5 - (level.shape[1] - 1) / 2
-    clear = (peak - np.median(profiles, axis=0) > BOTTOM_CONTRAST) & (rows > top_px)
-    if clear.sum() < BOTTOM_SHARE * blocks:
+    usual = np.nanmedian(np.where(seen, profiles, np.nan)[:, columns], axis=0)
+    clear = (peak - usual > BOTTOM_CONTRAST) & (rows > face[columns])
+    if clear.sum() < BOTTOM_SHARE * len(columns):
         return np.nan
-    return _line_at_zero(u[clear], v[clear], blocks)
+    return _line_at_zero(u[clear], v[clear], len(columns))
 
 
 def _line_at_zero(u: Array, v: Array, blocks: int) -> float:

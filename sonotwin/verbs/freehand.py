@@ -11,6 +11,7 @@ are replaced. Takes a second for a hundred B-scans, and some seconds more when i
     sonotwin freehand capture=outputs/sweep/capture tissue_m_s=1450 spacing_mm=0.3 compounding=maximum out=outputs/volume
     sonotwin freehand sequence=sweep.igs.mha config=config.xml compounding=mean out=outputs/volume
     sonotwin freehand sequence=sweep.igs.mha probe=outputs/probe/probe.yaml reference=Tracker lag_s=0.0503 out=outputs/volume
+    sonotwin freehand sequence=abdomen.igs.mha fan=find out=outputs/volume
 """
 
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from rich.console import Console
 
 from recon.capture import probe_files, sweep_part
 from recon.capture.sweep_part import SweepCapture
+from recon.clips import fan_region
 from recon.errors import InputError
 from recon.files import atomic, metrics, volumes
 from recon.files.metrics import Metrics
@@ -33,6 +35,7 @@ from recon.freehand.plus_config import PlusConfig
 from recon.freehand.scans import Extent, Scans, ScansFields, Unsure, VolumeSettings
 from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction, Rectangle
+from recon.model.fan import Fan, Sector
 
 VOLUME = "volume.nrrd"  # by which the folder of a volume is known
 SIGMA, SEQUENCE = "sigma.nrrd", "sequence.igs.mha"
@@ -49,6 +52,7 @@ class Config(ScansFields):
     compounding: Compounding | None = None
     interpolation: Interpolation | None = None
     clip: Rectangle | None = None
+    fan: Sector | None = None
     hole_voxels: Annotated[int, Field(ge=0, le=1000)] | None = None
     hole_sticks: Annotated[int, Field(ge=1, le=len(hole_filling.STICKS))] | None = None
     most_gib: Annotated[float, Field(gt=0, le=1024)] = volume_compounding.MOST_BYTES / 2**30
@@ -64,6 +68,7 @@ class Config(ScansFields):
         """The settings of the volume that were given, by their names."""
         values = {field.name: getattr(self, field.name) for field in fields(VolumeSettings)}
         values["clip"] = None if self.clip is None else Clip(*self.clip)
+        values["fan"] = None if self.fan is None or self.fan == "find" else Fan(*self.fan)
         return {name: value for name, value in values.items() if value is not None}
 
 
@@ -77,19 +82,21 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     plus = None if config.config is None else plus_config.read_config(config.config)
-    if plus is not None and config.clip is None:
-        plus.check_clip()
     settings = settings_of(config, plus)
     inputs = [path for path in (config.capture, config.probe, config.sequence, config.config) if path is not None]
     atomic.check_folder(config.out, VOLUME, inputs=inputs)
     sweep, scans = read(config, plus)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
+    if config.fan == "find":
+        fan = fan_region.find(scans.stream(), str(config.capture or config.sequence))
+        console.print(f"fan         in what changes from image to image, {fan}", markup=False)
+        settings = replace(settings, fan=fan)
 
     start = perf_counter()
     with console.status("putting B-scans into the volume"):
         pasted, filled = freehand_scans.volume(scans, settings, int(config.most_gib * 2**30))
-        sigma = freehand_scans.sigma_volume(scans, filled.volume, settings.clip)
+        sigma = freehand_scans.sigma_volume(scans, filled.volume, settings)
     seconds = {"seconds_reconstruct": round(perf_counter() - start, 3)}
     figures = freehand_scans.measure(scans, pasted, filled) | freehand_scans.measure_sigma(sigma)
     for line in describe(filled, figures, settings, config):

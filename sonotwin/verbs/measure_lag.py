@@ -23,7 +23,7 @@ from rich.console import Console
 from recon.capture import lag_files, sweep_part, sweep_tables
 from recon.capture.lag_files import LagFile
 from recon.capture.sweep_part import SweepCapture
-from recon.clips import image_region
+from recon.clips import fan_region, image_region
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
@@ -31,6 +31,7 @@ from recon.freehand import sequence_sweep
 from recon.freehand.sequence_sweep import SequenceFields, SequenceSweep
 from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Rectangle
+from recon.model.fan import Fan, Sector
 from recon.model.rig import Finite
 from recon.probe_calibration import latency
 from recon.probe_calibration.latency import Lag
@@ -52,6 +53,7 @@ class Config(SequenceFields):
     capture: Path | None = None
     sweep: str = ""
     clip: Rectangle | None = None
+    fan: Sector | None = None
     search_s: tuple[Finite, Finite] = latency.SEARCH_S
     top_px: Annotated[int, Field(ge=0)] = 40
 
@@ -85,13 +87,17 @@ def run(config: Config) -> None:
     start = perf_counter()
     with console.status("looking for the bottom"):
         whole = Clip(0, 0, *sweep.size)
-        depths = bottom_depths(sweep, Clip(*config.clip) if config.clip else whole, config.top_px)
-        screen = None if config.clip or np.isfinite(depths).mean() > MOSTLY else part_of_screen(sweep, config.top_px)
+        fan = fan_region.find(sweep.images(), sweep.name) if config.fan == "find" else Fan(*config.fan) if config.fan else None
+        depths = bottom_depths(sweep, Clip(*config.clip) if config.clip else whole, config.top_px, fan)
+        known = config.clip is not None or fan is not None or np.isfinite(depths).mean() > MOSTLY
+        screen = None if known else part_of_screen(sweep, config.top_px)
         depths = depths if screen is None else bottom_depths(sweep, screen, config.top_px)
     seconds = perf_counter() - start
     if screen is not None:
         part = f"[{screen.u},{screen.v},{screen.width},{screen.height}]"
         console.print(f"screen      looked in what changes from image to image, clip={part}", markup=False)
+    if config.fan == "find":
+        console.print(f"fan         in what changes from image to image, {fan}", markup=False)
     found_in = f"bottom in {np.isfinite(depths).sum()} of {len(depths)} B-scans"
     console.print(f"find        {found_in}, {len(sweep.track.times)} poses, {seconds:.0f} s", markup=False)
     try:
@@ -113,9 +119,10 @@ def read(config: Config) -> SweepCapture | SequenceSweep:
     return sequence_sweep.read_sequence_sweep(config.sequence, config.frame_names(FrameNames())).timed()
 
 
-def bottom_depths(sweep: SweepCapture | SequenceSweep, clip: Clip, top_px: int) -> Array:
+def bottom_depths(sweep: SweepCapture | SequenceSweep, clip: Clip, top_px: int, fan: Fan | None = None) -> Array:
     """Depths of the bottom : (n,) px, in the whole images, NaN where there is none in their part."""
-    return np.array([latency.bottom_depth(clip.cut(image), top_px) for image in sweep.images()]) + clip.corner[1]
+    part = None if fan is None else clip.cut(fan.mask(sweep.size[::-1]))
+    return np.array([latency.bottom_depth(clip.cut(image), top_px, part) for image in sweep.images()]) + clip.corner[1]
 
 
 def part_of_screen(sweep: SweepCapture | SequenceSweep, top_px: int) -> Clip | None:

@@ -136,8 +136,9 @@ def read(config: Config) -> Scans:
 def read_sequence(config: Config, path: Path) -> Scans:
     """The B-scans of a sequence in its reference frame, or the parts of them within the clip."""
     plus = None if config.config is None else plus_config.read_config(config.config)
-    if plus is not None and config.clip is None:
-        plus.check_clip()
+    if plus is not None and plus.volume is not None and plus.volume.fan is not None and config.clip is None:
+        expected = "none, as masses are sought in rectangles; give clip=[u,v,width,height] within it"
+        raise InputError(f"{config.config}: FanAnglesDeg: expected {expected}, found a fan")
     names = config.frame_names(FrameNames() if plus is None else plus.names)
     probe = None if config.probe is None else probe_files.read(config.probe)
     fixed = {} if plus is None else plus.transforms

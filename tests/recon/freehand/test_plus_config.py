@@ -11,6 +11,7 @@ from recon.freehand import plus_config, sequences, volume_compounding
 from recon.freehand.scans import VolumeSettings
 from recon.freehand.volume_compounding import Clip
 from recon.geometry import rigid
+from recon.model.fan import Fan
 from recon.model.probe import ProbeCalibration
 
 CONFIG = """<PlusConfiguration version="2.1">
@@ -81,6 +82,7 @@ def test_a_configuration_without_a_reconstruction_gives_its_transforms(tmp_path)
         ('"STICK"', '"GAUSSIAN"', "HoleFilling: expected one element of type STICK, found GAUSSIAN"),
         ('"9"', '"nine"', "StickLengthLimit: expected a whole number of at least 1, found 'nine'"),
         ('"FULL"', '"FULL" FanAnglesDeg="-30"', "FanAnglesDeg: expected 2 finite numbers, found '-30'"),
+        ('"FULL"', '"FULL" FanAnglesDeg="-30 95"', "Fan: angles: expected two from -89 to 89"),
     ],
 )
 def test_a_fault_in_one_line(tmp_path, old, new, line):
@@ -91,14 +93,41 @@ def test_a_fault_in_one_line(tmp_path, old, new, line):
     assert str(fault.value).startswith(f"{path}: {line}") and "\n" not in str(fault.value)
 
 
-@pytest.mark.parametrize("name", ["FanAngles", "FanAnglesDeg"])
-def test_a_fan_is_no_clip(tmp_path, name):
+@pytest.mark.parametrize(
+    ("attributes", "fan"),
+    [
+        (
+            'FanAnglesDeg="-30 35" FanOriginPixel="9 -20" FanRadiusStartPixel="25" FanRadiusStopPixel="60"',
+            (9, -20, 25, 60, -30, 35),
+        ),
+        ('FanAngles="35 -30" FanOrigin="9 -20" FanDepth="60"', (9, -20, 0, 60, -30, 35)),  # as before 2013
+        ('FanAnglesDeg="-30 35"', (0, 0, 0, 500, -30, 35)),  # the rest is as PLUS has it without a word
+    ],
+)
+def test_a_fan_is_read_by_its_names_of_today_and_before(tmp_path, attributes, fan):
     path = tmp_path / "c.xml"
-    path.write_text(CONFIG.replace('"FULL"', f'"FULL" {name}="-30 30"'))
-    with pytest.raises(InputError, match=r"c.xml: FanAngles: expected none, as clips are rectangles; give clip="):
-        plus_config.read_config(path).check_clip()
-    path.write_text(CONFIG.replace('"FULL"', f'"FULL" {name}="0 0"'))
-    plus_config.read_config(path).check_clip()
+    path.write_text(CONFIG.replace('"FULL"', f'"FULL" {attributes}'))
+    assert plus_config.read_config(path).volume.fan == Fan(*fan)
+    path.write_text(CONFIG.replace('"FULL"', '"FULL" FanAnglesDeg="0 0" FanDepth="60"'))
+    assert plus_config.read_config(path).volume.fan is None
+
+
+def test_what_lies_beside_a_fan_is_no_part_of_the_volume(rng, tmp_path):
+    """As large as the fan, from end to end; and all that is in it lies there, and nothing that is not."""
+    probe = ProbeCalibration(np.eye(4), np.array([0.5, 0.5]))
+    poses = np.array([rigid.from_rotation_vector([0, 0, 0], [0, 0, z]) for z in np.arange(5) / 2])
+    fan = Fan(40.0, -15.0, 30.0, 90.0, -35.0, 35.0)
+    inside = fan.mask((90, 80))
+    images = np.where(inside, 200, 10).astype(np.uint8).repeat(5).reshape(90, 80, 5).transpose(2, 0, 1)
+    path = tmp_path / "s.igs.nrrd"
+    sequences.write_sequence(path, sequences.sequence_of(np.ascontiguousarray(images), poses, probe, np.arange(5) / 20))
+    attributes = 'FanAnglesDeg="-35 35" FanOriginPixel="40 -15" FanRadiusStartPixel="30" FanRadiusStopPixel="90"'
+    (tmp_path / "c.xml").write_text(f'<VolumeReconstruction OutputSpacing="0.5 0.5 0.5" CompoundingMode="LATEST" {attributes}/>')
+    pasted, _ = plus_config.reconstruct_sequence(path, plus_config.read_config(tmp_path / "c.xml"))
+    assert set(np.unique(pasted.volume.voxels)) == {0, 200}
+    v, u = np.nonzero(inside)
+    assert np.allclose(pasted.volume.origin, [u.min() / 2, v.min() / 2, 0])
+    assert pasted.filled.sum() == 5 * inside.sum()
 
 
 def test_the_real_sweep_becomes_the_volume_of_plus(real):

@@ -1,0 +1,67 @@
+"""The fan of a curved array's B-scan within its rectangular image: an annulus' sector, straight down the image."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator
+
+from recon.model.rig import Finite
+
+Mask = NDArray[np.bool_]
+Numbers = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+
+STEEPEST_DEG = 89.0  # of a side
+
+
+@dataclass(frozen=True)
+class Fan:
+    """Where its sides meet, the radii at which its lines begin and end, and the angles of its sides from straight down."""
+
+    u: float  # px
+    v: float  # px, mostly above the image: negative
+    first_px: float
+    last_px: float
+    left_deg: float  # negative to the left
+    right_deg: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.first_px < self.last_px:
+            raise ValueError(f"radii: expected two, the less one first, found {self.first_px:g} and {self.last_px:g} px")
+        if not -STEEPEST_DEG <= self.left_deg < self.right_deg <= STEEPEST_DEG:
+            expected = f"two from -{STEEPEST_DEG:g} to {STEEPEST_DEG:g}, the left one first"
+            raise ValueError(f"angles: expected {expected}, found {self.left_deg:g} and {self.right_deg:g} deg")
+
+    def __str__(self) -> str:
+        """As a setting."""
+        numbers = self.u, self.v, self.first_px, self.last_px, self.left_deg, self.right_deg
+        return f"fan=[{','.join(f'{number:.1f}' for number in numbers)}]"
+
+    def mask(self, shape: tuple[int, int]) -> Mask:
+        """Pixels of an image (h, w) in the fan, but for one at the sides and the end, that scan conversion has blended.
+
+        These are the pixels that the PLUS toolkit takes, for its volumes to be compared with ours.
+        """
+        down = np.arange(shape[0])[:, None] - self.v
+        across = np.arange(shape[1]) - self.u
+        left, right = np.tan(np.deg2rad([self.left_deg, self.right_deg]))
+        within = (across >= left * down + 1) & (across <= right * down - 1) & (down > 0)
+        begun = np.abs(across) > np.sqrt(np.maximum(self.first_px**2 - down**2, 0)) - 1
+        ended = np.abs(across) > np.sqrt(np.maximum(self.last_px**2 - down**2, 0)) - 1
+        return within & (begun | (down >= self.first_px)) & ~ended & (down <= self.last_px)
+
+
+def _checked(numbers: Numbers) -> Numbers:
+    Fan(*numbers)
+    return numbers
+
+
+Sector = Literal["find"] | Annotated[Numbers, AfterValidator(_checked)]  # of a setting: u, v, radii px, angles deg
+
+
+def box(mask: Mask) -> tuple[int, int, int, int]:
+    """First column and row, width and height, of the rectangle about a mask : (h, w) that isn't empty."""
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    u, v = int(columns[0]), int(rows[0])
+    return u, v, int(columns[-1]) - u + 1, int(rows[-1]) - v + 1
