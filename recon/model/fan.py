@@ -1,16 +1,15 @@
 """The fan of a curved array's B-scan within its rectangular image: an annulus' sector, straight down the image."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from math import isfinite
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator
-
-from recon.model.rig import Finite
+from pydantic import PlainValidator
 
 Mask = NDArray[np.bool_]
-Numbers = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+Numbers = tuple[float, ...]  # six
 
 STEEPEST_DEG = 89.0  # of a side
 
@@ -52,12 +51,18 @@ class Fan:
         return within & (begun | (down >= self.first_px)) & ~ended & (down <= self.last_px)
 
 
-def _checked(numbers: Numbers) -> Numbers:
+def _of_setting(value: Any) -> Numbers | Literal["find"]:
+    """Six numbers that make a fan, or the word find."""
+    if value == "find":
+        return "find"
+    numbers = value if isinstance(value, list | tuple) else ()
+    if len(numbers) != 6 or not all(isinstance(number, int | float) and isfinite(number) for number in numbers):
+        raise ValueError(f"expected find or [u,v,first,last,left,right], found {value}")
     Fan(*numbers)
-    return numbers
+    return tuple(numbers)
 
 
-Sector = Literal["find"] | Annotated[Numbers, AfterValidator(_checked)]  # of a setting: u, v, radii px, angles deg
+Sector = Annotated[Numbers | Literal["find"], PlainValidator(_of_setting)]  # of a setting: u, v, radii px, angles deg
 
 
 def box(mask: Mask) -> tuple[int, int, int, int]:

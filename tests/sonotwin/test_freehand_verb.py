@@ -110,12 +110,18 @@ def test_what_is_given_wins_over_a_configuration(reconstructed, tmp_path, capsys
     assert figures["speed_m_per_s"] == 1450 and figures["filled_fraction"] >= figures["pasted_fraction"]
 
 
-def test_a_rectangle_takes_the_place_of_a_fan(reconstructed, tmp_path, capsys):
-    (tmp_path / "fan.xml").write_text(PLUS.replace("Interp", 'FanAnglesDeg="-35 35" Interp'))
+def test_a_fan_of_ones_own_goes_before_that_of_a_configuration(reconstructed, tmp_path, capsys):
+    """One that no image reaches is refused; a setting that is no fan, by its name."""
+    (tmp_path / "fan.xml").write_text(PLUS.replace("Interp", 'FanAnglesDeg="-35 35" FanOriginPixel="9999 0" Interp'))
     source = [f"sequence={reconstructed / 'sequence.igs.mha'}", f"config={tmp_path / 'fan.xml'}", f"out={tmp_path / 'out'}"]
     assert main(["freehand", *source]) == 2
-    assert "FanAngles: expected none, as clips are rectangles; give clip=" in capsys.readouterr().err
-    assert main(["freehand", *source, "clip=[20,20,40,60]"]) == 0
+    assert "fan: expected a part of an image of" in capsys.readouterr().err
+    assert main(["freehand", *source, "fan=[160,-20,30,400,-45,45]"]) == 0
+    assert "but for fan: " in capsys.readouterr().out
+    for wrong, message in (("[1,2,3]", "fan: expected find or [u,v,first,last,left,right], found [1, 2, 3]"),
+                           ("[1,2,9,3,0,1]", "fan.radii: expected two, the less one first, found 9 and 3 px")):  # fmt: skip
+        assert main(["freehand", *source, f"fan={wrong}"]) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_a_calibration_wins_over_that_of_a_configuration_and_of_the_sequence(capture, reconstructed, tmp_path):
