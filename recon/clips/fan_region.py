@@ -1,10 +1,10 @@
 """The fan of a curved array's B-scan, from what changes on the screen from frame to frame."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from recon.clips import image_region
 from recon.errors import InputError
@@ -14,23 +14,29 @@ Array = NDArray[np.float64]
 
 LEAST_DEG = 5.0  # between the sides
 LEAST_ROWS = 20  # of a side
-AGREES = 0.9  # area of fan and changing part together over that of either
+TRIED_ROWS = 60  # of a side, through each two of which a line is laid
+NEAR_PX = 2.0  # of a side
+STRAIGHT = 0.5  # share of a side's rows near its line
+RINGING_DN = 8.0  # of the face, in the mean over time
+WITHIN = 0.95  # share of the changing part in the fan
+COVERED = 0.6  # share of the fan in the changing part; water doesn't change, nor do shadows
 EDGE_PX = 12  # of the image, within which an arc may be cut off
 BINS = 60  # of directions, in each of which the fan's first and last radius are taken
 
 
 def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
-    """The fan that agrees with the largest part that changes, from frames : (h, w) of one size.
+    """The fan about the largest part that changes, from frames : (h, w) of one size.
 
     Both sides are straight lines through the outermost pixels of rows down to the fan's widest; its arcs are those about their
-    meeting point.
+    meeting point, the first one where the face's ringing begins, which never changes, as the water after it.
 
     Raises
     ------
     InputError
         If nothing of some size changes, or what does is no fan.
     """
-    part = image_region.changing(frames, name)
+    mean, deviation = image_region.over_time(frames)
+    part = image_region.changing(deviation, name)
     rows = np.flatnonzero(part.any(axis=1))
     left, right = part[rows].argmax(axis=1), part.shape[1] - 1 - part[rows, ::-1].argmax(axis=1)
     sides = [_side(rows, left.astype(float)), _side(rows, -right.astype(float))]
@@ -42,12 +48,26 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
         raise InputError(f"{name}: {_expected()}, found sides at {left_deg:.0f} and {right_deg:.0f} deg")
     v = (start + end) / -(slope + mirrored)
     u = start + slope * v
-    fan = Fan(u, v, *_radii(part, u, v), float(left_deg), float(right_deg))
+    first, last = _radii(part, u, v)
+    before = Fan(u, v, 0.0, first, float(left_deg), float(right_deg))
+    fan = replace(before, first_px=_face(mean, before), last_px=last)
     inside = fan.mask((part.shape[0], part.shape[1]))
-    agree = (inside & part).sum() / max((inside | part).sum(), 1)
-    if agree < AGREES:
-        raise InputError(f"{name}: {_expected()}, found one that agrees with a fan by {100 * agree:.0f} %")
+    common = (inside & part).sum()
+    if common < WITHIN * part.sum() or common < COVERED * inside.sum():
+        found = f"{100 * common / part.sum():.0f} % of it in a fan, of which it is {100 * common / max(inside.sum(), 1):.0f} %"
+        raise InputError(f"{name}: {_expected()}, found {found}")
     return fan
+
+
+def _face(mean: NDArray[np.float32], before: Fan) -> float:
+    """Radius at which the face's ringing begins in the mean image, before the arc where changes do; there, if nothing rings."""
+    y, x = np.nonzero(before.mask((mean.shape[0], mean.shape[1])))
+    ring = np.hypot(x - before.u, y - before.v).astype(int)
+    if not ring.size:
+        return before.last_px
+    pixels, bright = np.bincount(ring), np.bincount(ring, mean[y, x] > RINGING_DN)
+    ringing = np.flatnonzero((pixels > 0) & (bright > pixels / 2))
+    return float(ringing[0]) if ringing.size else before.last_px
 
 
 def _expected() -> str:
@@ -55,12 +75,23 @@ def _expected() -> str:
 
 
 def _side(rows: NDArray[np.int64], outermost: Array) -> tuple[float, float] | None:
-    """Slope and start of the line `outermost = start + slope row` of the rows down to the widest; None if they are few."""
+    """Slope and start of the line `outermost = start + slope row` near most of the rows down to the widest; None without one.
+
+    Rows where the side is dark lie within it, be they as many as half of them.
+    """
     count = int(outermost.argmin()) + 1
     if count < LEAST_ROWS:
         return None
-    found = stats.theilslopes(outermost[:count], rows[:count])
-    return float(found.slope), float(found.intercept)
+    rows, outermost = rows[:count], outermost[:count]
+    tried = np.linspace(0, count - 1, min(TRIED_ROWS, count)).astype(int)
+    one, other = tried[np.transpose(np.triu_indices(len(tried), 1))].T
+    slopes = (outermost[other] - outermost[one]) / (rows[other] - rows[one])
+    near = np.abs(outermost - outermost[one, None] - slopes[:, None] * (rows - rows[one, None])) < NEAR_PX
+    most = near[near.sum(axis=1).argmax()]
+    if most.mean() < STRAIGHT:
+        return None
+    start, slope = np.polynomial.polynomial.polyfit(rows[most], outermost[most], 1)
+    return float(slope), float(start)
 
 
 def _radii(part: Mask, u: float, v: float) -> tuple[float, float]:

@@ -24,14 +24,15 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Box:
     InputError
         If nothing of some size changes.
     """
-    part = changing(frames, name)
+    _, deviation = over_time(frames)
+    part = changing(deviation, name)
     (tall, wide), (u, v, width, height) = part.shape, box(part)
     return (0, 0, wide, tall) if width > WHOLE * wide and height > WHOLE * tall else (u, v, width, height)
 
 
-def changing(frames: Iterable[NDArray[np.uint8]], name: str) -> Mask:
-    """The largest part that changes : (h, w), its gaps closed; InputError if nothing of some size does."""
-    changes = spread(frames) > CHANGES_DN
+def changing(deviation: NDArray[np.float32], name: str) -> Mask:
+    """The largest part that changes : (h, w), its gaps closed, by `over_time`; InputError if nothing of some size does."""
+    changes = deviation > CHANGES_DN
     joined = cv2.morphologyEx(changes.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((JOIN_PX, JOIN_PX), np.uint8))
     opened = cv2.morphologyEx(joined, cv2.MORPH_OPEN, np.ones((JOIN_PX, JOIN_PX), np.uint8))
     count, labels, figures, _ = cv2.connectedComponentsWithStats(opened)
@@ -41,8 +42,8 @@ def changing(frames: Iterable[NDArray[np.uint8]], name: str) -> Mask:
     return labels == largest
 
 
-def spread(frames: Iterable[NDArray[np.uint8]]) -> NDArray[np.float32]:
-    """Standard deviation of each pixel over time : (h, w), by Welford's sums."""
+def over_time(frames: Iterable[NDArray[np.uint8]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and standard deviation of each pixel over time : (h, w), by Welford's sums."""
     mean, squares, count = None, None, 0
     for frame in frames:
         level, count = np.float32(frame), count + 1
@@ -52,6 +53,6 @@ def spread(frames: Iterable[NDArray[np.uint8]]) -> NDArray[np.float32]:
         step = level - mean
         mean = mean + step / count
         squares += step * (level - mean)
-    if squares is None:
-        return np.zeros((1, 1), np.float32)
-    return np.sqrt(squares / max(count - 1, 1))
+    if mean is None or squares is None:
+        return np.zeros((1, 1), np.float32), np.zeros((1, 1), np.float32)
+    return mean, np.sqrt(squares / max(count - 1, 1))

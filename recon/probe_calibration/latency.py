@@ -112,7 +112,8 @@ def bottom_depth(image: NDArray, top_px: int = 40, part: NDArray[np.bool_] | Non
     """Depth in px of a flat bottom at the middle column of a B-scan : (h, w), 8-bit; NaN if there is none.
 
     Columns are averaged in blocks, and the brightest echo of each below `top_px`, where reverberation at the probe's face ends,
-    is taken; the line is that through most of these echoes. Of a `part` : (h, w), such as a fan, the face is where it begins.
+    is taken; the line is that through most of these echoes. Of a `part` : (h, w), such as a fan, the face is where it begins, and
+    columns are left out in which it begins lower than in the middle, aside of the face.
     """
     level = np.asarray(image, np.float32)
     blocks = level.shape[1] // BLOCK_PX
@@ -120,8 +121,9 @@ def bottom_depth(image: NDArray, top_px: int = 40, part: NDArray[np.bool_] | Non
     profiles = cv2.GaussianBlur(profiles, (1, 0), sigmaX=1e-6, sigmaY=BOTTOM_SIGMA_PX) if blocks else profiles
     used = np.ones(level.shape, bool) if part is None else part
     seen = used[:, : blocks * BLOCK_PX].reshape(profiles.shape[0], blocks, BLOCK_PX).all(axis=2)
-    face = seen.argmax(axis=0) + top_px
-    below = seen & (np.arange(len(seen))[:, None] >= face)
+    begins = seen.argmax(axis=0)
+    face = begins + top_px
+    below = seen & (np.arange(len(seen))[:, None] >= face) & (begins <= begins[blocks // 2])
     below[:-1] &= seen[1:]
     below[-1:] = False
     columns = np.flatnonzero(below.sum(axis=0) >= 8)

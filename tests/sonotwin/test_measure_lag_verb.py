@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from recon.freehand import sequences
+from recon.model.fan import Fan
 from sonotwin.cli import main
 from tests.recon import bscans, sweep_sets
 
@@ -61,6 +62,25 @@ def test_the_bottom_is_found_on_a_screen(capture, tmp_path, capsys):
     assert "screen      looked in what changes from image to image, clip=[" in capsys.readouterr().out
     found = json.loads((tmp_path / "lag" / "lag.json").read_text())
     assert found["interval_s"][0] <= LAG_S <= found["interval_s"][1]
+
+
+def test_a_fan_is_given_or_found(capture, tmp_path, capsys):
+    """B-scans cut to a fan, beside which the screen is grey."""
+    path, fan = sweep_sets.recorded(tmp_path / "bare.igs.mha", capture), Fan(160.0, -150.0, 152.0, 540.0, -24.0, 24.0)
+    frames = sequences.read_sequence(path)
+    inside = fan.mask(frames.images.shape[1:])
+    v, u = np.mgrid[: inside.shape[0], : inside.shape[1]]
+    moving = np.random.default_rng(1).integers(0, 12, frames.images.shape, np.uint8)  # noise that a scanner's gain shows
+    ring = np.uint8(120 * np.exp(-np.maximum(np.hypot(u - fan.u, v - fan.v) - fan.first_px, 0) / 8))
+    images = np.where(inside, np.maximum(frames.images, moving + ring), 60).astype(np.uint8)
+    sequences.write_sequence(tmp_path / "fan.igs.mha", dataclasses.replace(frames, images=images))
+    fields = ["measure-lag", f"sequence={tmp_path / 'fan.igs.mha'}", "reference=Tracker", f"out={tmp_path / 'lag'}", "top_px=20"]
+    for setting in ("fan=find", "fan=[160,-150,152,540,-24,24]"):
+        assert main([*fields, setting]) == 0
+        console = capsys.readouterr().out
+        assert ("fan         in what changes" in console) == (setting == "fan=find")
+        found = json.loads((tmp_path / "lag" / "lag.json").read_text())
+        assert found["interval_s"][0] <= LAG_S <= found["interval_s"][1] and found["sigma_s"] < 0.004
 
 
 def test_what_is_wrong_is_said_in_one_line(capture, tmp_path, capsys):

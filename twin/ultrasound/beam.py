@@ -7,6 +7,9 @@ Fresnel diffraction of the aperture, separable in the two directions. With `|H| 
 the echo of a scatterer of scattering length f, received as the mean over an aperture of D mm, is `f lambda H_t H_r / D` in each
 direction, relative to that of a perfect mirror. A surface element dA of a mirror is a scatterer of length `R dA / lambda`.
 
+What lies x beside a line of a curved array is nearer to it than at its own depth, by `x²/(2 (R + depth))`: the table along the
+array has the phase of that, both ways.
+
 Along the array, Hann windows leave little to interfere, and the centre frequency stands for the echo's band. Across, the edges of
 the element send waves of their own; near the face their ripples differ from frequency to frequency, and the band averages them.
 Source: Goodman, Introduction to Fourier Optics, chapter 4; reciprocity for the receiver.
@@ -19,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fresnel
 
+from twin.ultrasound.scan_lines import lines_of, widening
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -65,7 +69,7 @@ def diffracted(
 @lru_cache(maxsize=8)
 def beam(transducer: Transducer) -> Beam:
     """Tables of a transducer's point spread; they depend on its figures alone and are kept."""
-    rows = transducer.rows_mm
+    rows, lines = transducer.rows_mm, lines_of(transducer)
     lateral, reach = _lateral(transducer, rows)
     depths = np.arange(0, DEEPER * transducer.depth_mm + 0.5, 0.25)
     elevation, half, core = _elevation(transducer, depths)
@@ -78,7 +82,7 @@ def beam(transducer: Transducer) -> Beam:
         half.astype(np.float32),
         core.astype(np.float32),
         0.25,
-        (np.abs(lateral) ** 2).sum(axis=1) * transducer.scale_mm_per_px[0],
+        (np.abs(lateral) ** 2).sum(axis=1) * lines.pitch_mm * widening(rows, lines.bend),
         np.interp(rows, depths, energy),
     )
 
@@ -89,15 +93,16 @@ def receive_aperture(transducer: Transducer, depth: Array | float) -> Array:
 
 
 def _lateral(transducer: Transducer, rows: Array) -> tuple[NDArray[np.complex128], NDArray[np.int64]]:
-    step, wavelength = transducer.scale_mm_per_px[0], transducer.wavelength_mm
-    taps = int(REACH_MM / step)
-    offsets = step * np.arange(taps + 1)
+    lines, wavelength = lines_of(transducer), transducer.wavelength_mm
+    taps = int(REACH_MM / lines.pitch_mm)
     transmit = transducer.transmit_focus_mm / transducer.transmit_f_number
-    table = np.empty((len(rows), len(offsets)), complex)
+    table = np.empty((len(rows), taps + 1), complex)
     for k, depth in enumerate(np.maximum(rows, NEAREST_MM)):
+        offsets = lines.pitch_mm * widening(depth, lines.bend) * np.arange(taps + 1)
         receive = float(receive_aperture(transducer, depth))
         sent = diffracted(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
         table[k] = sent * diffracted(offsets, depth, receive, depth, wavelength, apodised=True) / receive
+        table[k] *= np.exp(-2j * transducer.wavenumber * offsets**2 / 2 * lines.bend / widening(depth, lines.bend))
     seen = np.abs(table) >= FAINT * np.abs(table).max(axis=1, keepdims=True)
     reach = np.maximum((np.arange(taps + 1) * seen).max(axis=1), 1)
     return np.hstack([table[:, :0:-1], table]), reach

@@ -7,6 +7,7 @@ from recon.compiled import kernel
 from recon.threads import in_threads
 from scenes.acoustics import BACKSCATTER
 from twin.ultrasound.beam import OVERSAMPLING, Beam
+from twin.ultrasound.scan_lines import lines_of
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -31,7 +32,7 @@ def reference_power(transducer: Transducer, beam: Beam) -> Array:
 
 def noise(transducer: Transducer, beam: Beam, rng: np.random.Generator) -> Field:
     """Electronic noise : (h, w), of the same power at every depth, before the gain."""
-    height, width = transducer.image_size[::-1]
+    height, width = len(beam.axial), lines_of(transducer).count
     focus = np.interp(transducer.transmit_focus_mm, transducer.rows_mm, reference_power(transducer, beam))
     sigma = np.sqrt(focus / 2) * 10 ** (transducer.noise_db / 20)
     parts = rng.standard_normal((height, width, 2), dtype=np.float32)
@@ -48,18 +49,23 @@ def gain_over_depth(transducer: Transducer, beam: Beam) -> Array:
 def face(transducer: Transducer) -> Array:
     """Ringing of the transducer itself : (h,), after the gain, over the reference tissue."""
     if transducer.face_ring_mm == 0:
-        return np.zeros(transducer.image_size[1])
+        return np.zeros(len(transducer.rows_mm))
     level = 10 ** ((transducer.face_ring_db - transducer.gain_db) / 20)
     depth = transducer.rows_mm
     ripple = 1 + 0.35 * np.cos(2 * np.pi * depth / (3.3 * transducer.wavelength_mm))
     return level * ripple * np.exp(-depth / transducer.face_ring_mm)
 
 
-def grey(envelope: NDArray[np.float32], transducer: Transducer) -> NDArray[np.uint8]:
-    """Log-compressed grey levels : (h, w) of an envelope after the gain, where 1 is the reference tissue."""
+def compressed(envelope: NDArray[np.float32], transducer: Transducer) -> NDArray[np.float32]:
+    """Share of the grey scale, 0 to 1, of an envelope after the gain, where 1 is the reference tissue: its logarithm."""
     db = 20 * np.log10(np.maximum(envelope, 1e-12)) + transducer.gain_db
+    return np.clip(1 + db / transducer.dynamic_range_db, 0, 1)
+
+
+def grey(share: NDArray[np.float32], transducer: Transducer) -> NDArray[np.uint8]:
+    """Grey levels of shares of the grey scale."""
     levels = 2**transducer.bits - 1
-    steps = np.rint(levels * np.clip(1 + db / transducer.dynamic_range_db, 0, 1))
+    steps = np.rint(levels * share)
     return np.rint(steps * (255 / levels)).astype(np.uint8)
 
 

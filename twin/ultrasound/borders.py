@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from recon.compiled import kernel, njit
 from recon.threads import in_threads
 from twin.ultrasound.echo_solids import Body, distance_at
+from twin.ultrasound.scan_lines import Lines, widening, world_from_lines
 
 Array = NDArray[np.float64]
 
@@ -35,50 +36,49 @@ class Spans(NamedTuple):
 class Bundles(NamedTuple):
     """Middles of the bundles on the probe's face, and figures common to all."""
 
-    along: Array  # (n / 8,) mm
+    poses: Array  # (n / 8, 4, 4) mm, of a line through each
     across: Array  # (m / 5,) mm
     first_mm: Array  # (m / 5,) depth from which they count
     deepest_mm: float
     radius_mm: float  # around the middle, within which a bundle's rays run
 
 
-def spans(body: Body, world_from_image: Array, x: Array, z: Array, first_mm: Array, deepest_mm: float) -> Spans:
+def spans(body: Body, lines: Lines, world_from_face: Array, along: Array, z: Array, first_mm: Array, deepest_mm: float) -> Spans:
     """Spans of depth outside of which no ray of a bundle meets a border.
 
     Parameters
     ----------
-    x, z : (n,), (m,) mm
+    along, z : (n,), (m,) mm
         Places of the rays on the probe's face, evenly spaced; bundle (i, j) has those of [8 i, 8 i + 8) and [5 j, 5 j + 5).
     first_mm : (m,) mm
         Depth from which a ray counts, by its place across the plane.
     deepest_mm : to which rays go.
     """
-    groups = [np.split(places, range(size, len(places), size)) for places, size in zip((x, z), BUNDLE, strict=True)]
+    groups = [np.split(places, range(size, len(places), size)) for places, size in zip((along, z), BUNDLE, strict=True)]
     middles = [np.array([(part[0] + part[-1]) / 2 for part in group]) for group in groups]
     reach = [max(np.ptp(part) for part in group) / 2 for group in groups]
     starts = np.array([part.min() for part in np.split(first_mm, range(BUNDLE[1], len(z), BUNDLE[1]))])
-    radius = CLEAR * float(np.hypot(reach[0], reach[1]))
-    bundles = Bundles(middles[0], middles[1], starts, deepest_mm, radius)
-    solids, pose, shape = body.packed(), np.ascontiguousarray(world_from_image, float), (len(middles[0]), len(middles[1]))
+    radius = CLEAR * float(np.hypot(reach[0] * widening(deepest_mm, lines.bend), reach[1]))
+    bundles = Bundles(world_from_lines(lines, world_from_face, middles[0]), middles[1], starts, deepest_mm, radius)
+    solids, shape = body.packed(), (len(middles[0]), len(middles[1]))
     found = Spans(np.zeros((*shape, MOST, 2)), np.zeros(shape, np.int64), np.zeros((*shape, MOST, len(solids.grid)), np.int8))
 
     def fill(first: int, end: int) -> None:
         clear, side = np.zeros(len(solids.grid)), np.zeros(len(solids.grid), np.int8)
-        _fill(first, end, found, solids, pose, bundles, clear, side)
+        _fill(first, end, found, solids, bundles, clear, side)
 
     in_threads(fill, len(middles[0]))
     return found
 
 
 @kernel
-def _fill(first, end, spans, solids, pose, bundles, clear, side):
+def _fill(first, end, spans, solids, bundles, clear, side):
     depths, counts = spans.depths, spans.counts
     for i in range(first, end):
+        pose = bundles.poses[i]
         for j in range(len(bundles.across)):
-            along, across = bundles.along[i], bundles.across[j]
-            x = pose[0, 0] * along + pose[0, 2] * across + pose[0, 3]
-            y = pose[1, 0] * along + pose[1, 2] * across + pose[1, 3]
-            z = pose[2, 0] * along + pose[2, 2] * across + pose[2, 3]
+            across = bundles.across[j]
+            x, y, z = pose[0, 2] * across + pose[0, 3], pose[1, 2] * across + pose[1, 3], pose[2, 2] * across + pose[2, 3]
             t, count, stop = bundles.first_mm[j], 0, -1.0
             clear[:] = t
             while t < bundles.deepest_mm:

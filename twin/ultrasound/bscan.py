@@ -11,6 +11,7 @@ from twin.ultrasound import bmode_image
 from twin.ultrasound.beam import beam
 from twin.ultrasound.echo_solids import Body
 from twin.ultrasound.medium import scatter
+from twin.ultrasound.scan_lines import converted
 from twin.ultrasound.sound_paths import Paths, follow
 from twin.ultrasound.surface_echoes import surface_echoes, wire_echoes
 from twin.ultrasound.transducer import Transducer
@@ -23,7 +24,7 @@ class Scan:
     """A B-scan, and its intermediate results."""
 
     image: NDArray[np.uint8]  # (h, w)
-    envelope: NDArray[np.float32]  # (h, w) after the gain; 1 is the reference tissue
+    envelope: NDArray[np.float32]  # (rows, lines), of a linear array (h, w), after the gain; 1 is the reference tissue
     paths: Paths
 
 
@@ -35,7 +36,8 @@ def scan(scene: Body, transducer: Transducer, world_from_image: Array, seed: int
     scene : Body
         Of `twin.ultrasound.echo_solids.body(scene)`, built once.
     world_from_image : (4, 4) mm
-        Rigid: where the image plane stands; x along the array, y into the depth, origin at pixel (0, 0) on the face.
+        Rigid: where the image plane stands; x along the array, y into the depth, origin at pixel (0, 0): on the face of a linear
+        array; a curved one begins in the first row.
     seed : int
         Of the tissue: the same from every pose.
     frame : int
@@ -51,7 +53,8 @@ def scan(scene: Body, transducer: Transducer, world_from_image: Array, seed: int
     received *= bmode_image.gain_over_depth(transducer, spread).astype(np.float32)[:, None]
     received += bmode_image.face(transducer).astype(np.float32)[:, None]
     envelope = np.abs(received)
-    return Scan(bmode_image.grey(envelope, transducer), envelope, paths)
+    shown = converted(bmode_image.compressed(envelope, transducer), transducer, order=1)
+    return Scan(bmode_image.grey(shown, transducer), envelope, paths)
 
 
 def scans(scene: Body, transducer: Transducer, world_from_image: Array, seed: int) -> Iterator[Scan]:

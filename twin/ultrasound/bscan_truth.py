@@ -11,6 +11,7 @@ from recon.geometry import rigid
 from recon.threads import in_threads
 from twin.ultrasound import bmode_image
 from twin.ultrasound.echo_solids import Body
+from twin.ultrasound.scan_lines import converted, lines_of, widening
 from twin.ultrasound.sound_paths import Paths
 from twin.ultrasound.transducer import Transducer
 
@@ -21,10 +22,10 @@ SAME_MM = 1e-5  # between ends of neighbouring segments of a section
 
 def labels(paths: Paths, transducer: Transducer) -> NDArray[np.uint8]:
     """Label of what each pixel shows : (h, w), 0 the surroundings, k + 1 solid k; delays and refraction included."""
-    rows, line = transducer.rows_mm, np.float32(transducer.scale_mm_per_px[0])
+    rows, lines = transducer.rows_mm, lines_of(transducer)
     shown = np.empty((len(rows), len(paths.labels)), np.uint8)
-    in_threads(_fill_labels, len(paths.labels), shown, paths, rows, line)
-    return shown
+    in_threads(_fill_labels, len(paths.labels), shown, paths, rows, np.float32(lines.pitch_mm) * widening(rows, lines.bend))
+    return converted(shown, transducer, order=0)
 
 
 def masks(shown: NDArray[np.uint8], solids: int) -> NDArray[np.bool_]:
@@ -33,9 +34,11 @@ def masks(shown: NDArray[np.uint8], solids: int) -> NDArray[np.bool_]:
 
 
 def echo_free(shown: NDArray[np.uint8], body: Body, transducer: Transducer) -> NDArray[np.uint8]:
-    """Mean grey of each pixel's tissue : (h, w), without speckle, surfaces, loss, blur or noise."""
+    """Mean grey of each pixel's tissue : (h, w), without speckle, surfaces, loss, blur or noise; 0 beside a fan."""
     reference = [0.0 if tissue.echogenicity is None else 10 ** (tissue.echogenicity / 20) for tissue in body.tissues]
-    return bmode_image.grey(np.array(reference, np.float32)[shown], transducer)
+    share = bmode_image.compressed(np.array(reference, np.float32)[shown], transducer)
+    on_lines = np.ones((len(transducer.rows_mm), lines_of(transducer).count), np.float32)
+    return bmode_image.grey(share * converted(on_lines, transducer, order=0), transducer)
 
 
 def sections(body: Body, world_from_image: Array) -> dict[str, list[Array]]:
@@ -87,9 +90,9 @@ def _loops(edges: NDArray[np.int64]) -> list[list[int]]:
 def _fill_labels(first, end, shown, paths, rows_mm, line_mm):
     lines, depths = paths.labels.shape
     for line in range(first, end):
-        level = 0  # the first that is shown at a row's depth or below
+        level = 0  # the one that is shown nearest to a row's depth
         for row in range(len(rows_mm)):
-            while level < depths - 1 and paths.shown_mm[line, level] < rows_mm[row]:
+            while level < depths - 1 and (paths.shown_mm[line, level] + paths.shown_mm[line, level + 1]) / 2 < rows_mm[row]:
                 level += 1
-            aside = int(np.rint(np.float32(line) + paths.shift_mm[line, level] / line_mm))
+            aside = int(np.rint(np.float32(line) + paths.shift_mm[line, level] / line_mm[row]))
             shown[row, line] = paths.labels[min(max(aside, 0), lines - 1), level]

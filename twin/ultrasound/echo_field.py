@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from recon.compiled import njit
 from recon.threads import in_threads
 from twin.ultrasound.beam import OVERSAMPLING, Beam
+from twin.ultrasound.scan_lines import lines_of, world_from_face
 from twin.ultrasound.sound_paths import Paths
 from twin.ultrasound.transducer import Transducer
 
@@ -27,8 +28,10 @@ SPREAD = 7  # without a common factor with PARTS
 class Scanner(NamedTuple):
     """The image's plane in the world, and figures of the scanner, for compiled code."""
 
-    world_from_image: Array  # (4, 4) mm
-    line_mm: float  # between lines
+    world_from_face: Array  # (4, 4) mm
+    line_mm: float  # between lines, on the face
+    bend: float  # 1/mm, of the face; see `scan_lines`
+    middle_mm: float  # of the face, along it
     sample_mm: float  # between samples of the field, as shown
     deepest_mm: float  # beyond which no line shows anything
     wavenumber: float  # rad/mm, one way
@@ -40,11 +43,13 @@ class Scanner(NamedTuple):
 
 def scanner_at(transducer: Transducer, beam: Beam, paths: Paths, world_from_image: Array, seed: int) -> Scanner:
     """The scanner's figures with the image's plane at a pose."""
-    sx, sy = transducer.scale_mm_per_px
+    lines = lines_of(transducer)
     return Scanner(
-        np.ascontiguousarray(world_from_image, float),
-        sx,
-        sy / OVERSAMPLING,
+        np.ascontiguousarray(world_from_face(transducer, world_from_image), float),
+        lines.pitch_mm,
+        lines.bend,
+        lines.middle_mm,
+        transducer.scale_mm_per_px[1] / OVERSAMPLING,
         _deepest_seen(transducer, beam, paths),
         transducer.wavenumber,
         transducer.assumed_speed,
@@ -55,9 +60,9 @@ def scanner_at(transducer: Transducer, beam: Beam, paths: Paths, world_from_imag
 
 
 def field_like(transducer: Transducer, beam: Beam) -> Field:
-    """An empty field of echoes : (w + taps - 1, OVERSAMPLING h), lines by shown depth, with room for the beam's width."""
-    width, height = transducer.image_size
-    return np.zeros((width + beam.lateral.shape[1] - 1, OVERSAMPLING * height), np.complex64)
+    """An empty field of echoes : (lines + taps - 1, OVERSAMPLING h), by shown depth, with room for the beam's width."""
+    lines = lines_of(transducer).count + beam.lateral.shape[1] - 1
+    return np.zeros((lines, OVERSAMPLING * len(beam.axial)), np.complex64)
 
 
 def _deepest_seen(transducer: Transducer, beam: Beam, paths: Paths) -> float:

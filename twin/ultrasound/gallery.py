@@ -42,7 +42,7 @@ def bscans() -> dict[str, NDArray[np.uint8]]:
         images[f"breast, tumour of {size}"] = scan(breast, TISSUE, pose, 1).image
     for title, kind, array, face, along in STATIONS:
         axes = np.column_stack([along, [0, 0, 1], np.cross(along, [0, 0, 1])])
-        pose = rigid.transform(axes, face) @ rigid.transform(np.eye(3), (-array.width_mm / 2, 0, 0))
+        pose = rigid.transform(axes, face) @ rigid.transform(np.eye(3), (-array.face_mm[0], -array.face_mm[1], 0))
         images[title] = scan(body(build_scene({"kind": kind})), array, pose, 1).image
     return images
 

@@ -16,6 +16,7 @@ from recon.geometry import rigid
 from twin.ultrasound.beam import STEP_MM, Beam
 from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
 from twin.ultrasound.echo_solids import Body, between, distance_at, label_at
+from twin.ultrasound.scan_lines import on_lines, widening
 from twin.ultrasound.sound_paths import Paths
 from twin.ultrasound.transducer import Transducer
 
@@ -26,8 +27,8 @@ MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.
 BITS = 21  # of a hash for each coordinate of the place in a cell
 RUN = 8  # cells in a row whose tissue is looked up at once, where no border is near
 CLEAR = 1.15  # over a run's reach: distances of bent surfaces are true to second order
-X, Y, Z = range(3)  # rows of `Lattice.image_from_world`, and of a column's places in the image's frame
-LABEL, P, Q, R = range(3, 7)  # rows of a column's places: tissue, and place in the cell in steps of 2^-BITS
+X, Y, Z = range(3)  # rows of `Lattice.face_from_world`, and of a column's places in the face's frame
+LABEL, ALONG, DEPTH, P, Q, R = range(3, 9)  # the others: tissue, place on the lines, and place in the cell in steps of 2^-BITS
 NEAR_BORDER = -1  # a label that has to be looked up at each place
 
 
@@ -38,7 +39,7 @@ class Lattice(NamedTuple):
     axes: NDArray[np.int64]  # (3,) the one most along the image's x, the other, and the columns': most across the plane
     low: NDArray[np.int64]  # (3,) first cell of the box around the slice
     high: NDArray[np.int64]  # (3,) last cell
-    image_from_world: Array  # (3, 4) mm
+    face_from_world: Array  # (3, 4) mm
     half_mm: NDArray[np.float32]  # (m,) half thickness of the slice that a column may meet which crosses the plane at a depth
     strength: NDArray[np.float32]  # (n + 1,) of a scatterer's echo, by label
     turns: Field  # (TURNS,) phases of an echo
@@ -49,20 +50,20 @@ class Columns(NamedTuple):
 
     first: int  # of them, along the lattice's first axis
     end: int
-    places: Array  # (7, m) of its scatterers in the slice
+    places: Array  # (9, m) of its scatterers in the slice
     cell: NDArray[np.int64]  # (3,) its place on the lattice
 
 
 def scatter(body: Body, transducer: Transducer, beam: Beam, paths: Paths, world_from_image: Array, seed: int) -> Field:
     """Demodulated echoes of the tissue's scatterers, weighed across the plane, before the point spread in the plane."""
     scanner = scanner_at(transducer, beam, paths, world_from_image, seed)
-    lattice = _lattice(body, transducer, beam, scanner.world_from_image)
+    lattice = _lattice(body, transducer, beam, scanner.world_from_face)
     first, solids = lattice.axes[0], body.packed()
     most = 2 * RUN + int(4 * (lattice.half_mm.max() / lattice.edge_mm + 2))  # cells of a column; its cosine is 0.57 at least
 
     def lay(field: Field, part: int) -> tuple[int, int]:
         begin, end = slab(part, int(lattice.high[first] - lattice.low[first] + 1))
-        columns = Columns(lattice.low[first] + begin, lattice.low[first] + end, np.empty((7, most)), np.zeros(3, np.int64))
+        columns = Columns(lattice.low[first] + begin, lattice.low[first] + end, np.empty((9, most)), np.zeros(3, np.int64))
         return _scatter(field, columns, solids, lattice, scanner, beam, paths)
 
     return laid(lay, field_like(transducer, beam))
@@ -74,9 +75,9 @@ def _lattice(body: Body, transducer: Transducer, beam: Beam, pose: Array) -> Lat
     turns = np.exp(2j * np.pi * np.arange(TURNS) / TURNS).astype(np.complex64)
     axes = _axes(pose)
     low, high = _box(transducer, beam, pose, edge)
-    image_from_world = np.ascontiguousarray(rigid.invert(pose)[:3])
-    half = _half_thickness(beam, pose, axes[2], edge)
-    return Lattice(edge, axes, low, high, image_from_world, half, strength.astype(np.float32), turns)
+    face_from_world = np.ascontiguousarray(rigid.invert(pose)[:3])
+    half = _half_thickness(beam, pose, axes[2], edge, transducer.curved is not None)
+    return Lattice(edge, axes, low, high, face_from_world, half, strength.astype(np.float32), turns)
 
 
 def _axes(pose: Array) -> NDArray[np.int64]:
@@ -87,16 +88,19 @@ def _axes(pose: Array) -> NDArray[np.int64]:
 
 def _box(transducer: Transducer, beam: Beam, pose: Array, edge: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First and last cell of the box around the slice."""
-    x = np.array([-BESIDE_MM, transducer.width_mm + BESIDE_MM])
-    y = np.array([0.0, beam.depth_step_mm * (len(beam.core_mm) - 1)])
+    deepest = beam.depth_step_mm * (len(beam.core_mm) - 1)
+    x, y = np.array([-BESIDE_MM, transducer.width_mm + BESIDE_MM]), np.array([0.0, deepest])
+    if transducer.curved is not None:
+        aside = transducer.foot_mm / 2 * (1 + deepest / transducer.curved.radius_mm) + BESIDE_MM
+        x, y = np.array([-aside, aside]), np.array([-transducer.curved.sagitta_mm - BESIDE_MM, deepest])
     z = np.array([-1.0, 1.0]) * float(beam.core_mm.max())
     corners = np.stack(np.meshgrid(x, y, z), axis=-1).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
     low, high = corners.min(axis=0) / edge, corners.max(axis=0) / edge
     return np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
 
 
-def _half_thickness(beam: Beam, pose: Array, main: int, edge: float) -> NDArray[np.float32]:
-    tilt = abs(pose[main, 1] / pose[main, 2])
+def _half_thickness(beam: Beam, pose: Array, main: int, edge: float, fanned: bool) -> NDArray[np.float32]:
+    tilt = float(np.hypot(pose[main, 0] if fanned else 0, pose[main, 1]) / abs(pose[main, 2]))
     rows = int(np.ceil(((float(beam.core_mm.max()) + 2 * edge) * tilt + 2 * edge) / beam.depth_step_mm))
     return maximum_filter1d(beam.core_mm, 2 * rows + 1)
 
@@ -135,7 +139,7 @@ def _scatter(field, columns, solids, lattice, scanner, beam, paths):
 def _places_in_slice(places, cell, solids, lattice, scanner, beam, paths):
     """Find a column's scatterers in the slice: fills the rows of `places`; their number."""
     right = scanner.line_mm * (len(paths.labels) - 1) + BESIDE_MM
-    low, high = _cells_in_slice(cell, lattice, beam, scanner.deepest_mm, right)
+    low, high = _cells_in_slice(cell, lattice, beam, scanner, right)
     found, per_step = 0, 1 / beam.depth_step_mm
     for start in range(low, high + 1, RUN):
         label = _label_of_run(cell, start, solids, lattice)
@@ -144,25 +148,31 @@ def _places_in_slice(places, cell, solids, lattice, scanner, beam, paths):
         _hash_places(places, found, cell, start, lattice, scanner.seed)
         for n in range(found, found + min(RUN, high + 1 - start)):
             x, y, z = places[X, n], places[Y, n], places[Z, n]
-            if 0 <= y < scanner.deepest_mm and -BESIDE_MM <= x <= right and abs(z) < beam.core_mm[int(y * per_step + 0.5)]:
+            along, depth = on_lines(x, y, scanner.bend, scanner.middle_mm)
+            inside = 0 <= depth < scanner.deepest_mm and -BESIDE_MM <= along <= right
+            if inside and abs(z) < beam.core_mm[int(depth * per_step + 0.5)]:
                 places[X, found], places[Y, found], places[Z, found], places[LABEL, found] = x, y, z, label
+                places[ALONG, found], places[DEPTH, found] = along, depth
                 found += 1
     return found
 
 
 @njit(inline="always")
-def _cells_in_slice(cell, lattice, beam, deepest, right):
+def _cells_in_slice(cell, lattice, beam, scanner, right):
     """First and last cell of a column that may hold scatterers in the slice; the last before the first if none may."""
     first, second, main = lattice.axes[0], lattice.axes[1], lattice.axes[2]
-    to, edge = lattice.image_from_world, lattice.edge_mm
+    to, edge = lattice.face_from_world, lattice.edge_mm
     u, v, normal = cell[first] * edge, cell[second] * edge, to[Z, main]
     w = -(u * to[Z, first] + v * to[Z, second] + to[Z, 3]) / normal  # where the column crosses the image's plane
     x = u * to[X, first] + v * to[X, second] + w * to[X, main] + to[X, 3]
     y = u * to[Y, first] + v * to[Y, second] + w * to[Y, main] + to[Y, 3]
-    half = lattice.half_mm[min(max(int(y / beam.depth_step_mm + 0.5), 0), len(lattice.half_mm) - 1)]
+    along, depth = on_lines(x, y, scanner.bend, scanner.middle_mm)
+    half = lattice.half_mm[min(max(int(depth / beam.depth_step_mm + 0.5), 0), len(lattice.half_mm) - 1)]
     most = (half + 2 * edge) / abs(normal)
     aside, deeper = most * abs(to[X, main]) + 2 * edge, most * abs(to[Y, main]) + 2 * edge
-    if y < -deeper or y > deepest + deeper or x < -BESIDE_MM - aside or x > right + aside:
+    if scanner.bend > 0:  # lines run to all sides
+        aside = deeper = aside + deeper
+    if depth < -deeper or depth > scanner.deepest_mm + deeper or along < -BESIDE_MM - aside or along > right + aside:
         return 0, -1
     before = edge * (min(to[Z, 0], 0.0) + min(to[Z, 1], 0.0) + min(to[Z, 2], 0.0))  # how far a cell reaches beside its corner
     beyond = edge * (max(to[Z, 0], 0.0) + max(to[Z, 1], 0.0) + max(to[Z, 2], 0.0))
@@ -192,7 +202,7 @@ def _label_of_run(cell, start, solids, lattice):
 def _hash_places(places, found, cell, start, lattice, seed):
     """Places of the scatterers of a run of cells, after those that are found already."""
     first, second, main = lattice.axes[0], lattice.axes[1], lattice.axes[2]
-    to, edge = lattice.image_from_world, lattice.edge_mm
+    to, edge = lattice.face_from_world, lattice.edge_mm
     folded = np.uint64(cell[first]) * MIX[first] ^ np.uint64(cell[second]) * MIX[second]
     mix, mask, bit = MIX[main], np.uint64(2**BITS - 1), edge / 2**BITS
     p, q, r = places[P, found : found + RUN], places[Q, found : found + RUN], places[R, found : found + RUN]
@@ -217,24 +227,24 @@ def _lay_echoes(field, places, found, solids, lattice, scanner, beam, paths):
     per_row, per_column = 1 / beam.depth_step_mm, 1 / STEP_MM
     first, end = len(field), 0
     for n in range(found):
-        x, y, z, label = places[X, n], places[Y, n], places[Z, n], int(places[LABEL, n])
+        along, y, z, label = places[ALONG, n], places[DEPTH, n], places[Z, n], int(places[LABEL, n])
         if label == NEAR_BORDER:
-            label = _label_in_image(solids, scanner.world_from_image, x, y, z)
+            label = _label_on_face(solids, scanner.world_from_face, places[X, n], places[Y, n], z)
         if lattice.strength[label] == 0:
             continue
-        line, level = min(max(int(x * per_line + 0.5), 0), lines - 1), min(int(y * per_level), depths - 2)
+        line, level = min(max(int(along * per_line + 0.5), 0), lines - 1), min(int(y * per_level), depths - 2)
         seen = between(paths.shown_mm[line, level], paths.shown_mm[line, level + 1], y * per_level - level)
         weight = beam.elevation[int(y * per_row + 0.5), int(abs(z) * per_column + 0.5)]
         value = lattice.strength[label] * paths.amplitude[line, level] * weight
-        across = (x - paths.shift_mm[line, level]) * per_line + pad
+        across = (along - paths.shift_mm[line, level] / widening(y, scanner.bend)) * per_line + pad
         deposit(field, across, seen * per_sample, value * lattice.turns[int(seen * to_turn) & (TURNS - 1)])
         first, end = min(first, int(across)), max(end, int(across) + 2)
     return first, end
 
 
 @njit(inline="always")
-def _label_in_image(solids, pose, x, y, z):
-    """Label of a point of the image's frame."""
+def _label_on_face(solids, pose, x, y, z):
+    """Label of a point of the face's frame."""
     return label_at(
         solids,
         pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],

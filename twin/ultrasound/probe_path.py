@@ -188,7 +188,7 @@ def _placed(path: SurfacePath, place: Array, solid: Solid, transducer: Transduce
     """Pose of the face's middle : (4, 4), in contact at a place (x, y)."""
     axes = _upright(path.turn_deg)
     along, across = np.meshgrid(
-        np.linspace(-0.5, 0.5, FOOT_POINTS[0]) * transducer.width_mm, np.linspace(-0.5, 0.5, FOOT_POINTS[1]) * FOOT_MM
+        np.linspace(-0.5, 0.5, FOOT_POINTS[0]) * transducer.foot_mm, np.linspace(-0.5, 0.5, FOOT_POINTS[1]) * FOOT_MM
     )
     foot = place + np.outer(along.ravel(), axes[:2, 0]) + np.outer(across.ravel(), axes[:2, 2])
     height = top(solid, foot)
@@ -206,7 +206,7 @@ def _placed(path: SurfacePath, place: Array, solid: Solid, transducer: Transduce
     turn = turn @ Rotation.from_euler("zx", [path.tilt_deg[0], path.tilt_deg[1]], degrees=True).as_matrix()
     surface = np.column_stack([foot[seen], height[seen]])
     middle = np.array([*place, level])
-    under = (np.abs((surface - middle) @ turn[:, [0, 2]]) <= [transducer.width_mm / 2, FOOT_MM / 2]).all(axis=1)
+    under = (np.abs((surface - middle) @ turn[:, [0, 2]]) <= [transducer.foot_mm / 2, FOOT_MM / 2]).all(axis=1)
     gap = ((surface - middle) @ turn[:, 1])[under].min()
     return rigid.transform(turn, middle + (gap - path.standoff_mm) * turn[:, 1])
 
@@ -231,7 +231,7 @@ def _led(faces: Array, hand: Hand, shaken: Tremor, transducer: Transducer, seed:
     wander = rng.standard_normal((2, len(faces), 3))
     smooth = hand.correlation_s * RATE_HZ
     wander = gaussian_filter1d(wander, smooth, axis=1, mode="wrap") * np.sqrt(2 * np.sqrt(np.pi) * smooth)  # of unit variance
-    corner = rigid.transform(np.eye(3), (-transducer.width_mm / 2, 0, 0))
+    corner = rigid.transform(np.eye(3), (-transducer.face_mm[0], -transducer.face_mm[1], 0))
     moves = []
     for k, (turn, shift) in enumerate(zip(*wander, strict=True)):
         fast = shaken.at(k / RATE_HZ)

@@ -1,6 +1,6 @@
 """Propagation of sound along each line: delay, loss, shadow, refraction, as tables over the image plane.
 
-A line is followed straight down the image plane through the tissues. Their borders give, as a function of true depth: the shown
+A line is followed straight through the tissues in the image plane. Their borders give, as a function of true depth: the shown
 depth (delay at the assumed speed), the amplitude that is left both ways (attenuation and transmission), and the sideways
 bend by refraction.
 """
@@ -14,6 +14,7 @@ from recon.compiled import kernel, njit
 from recon.threads import in_threads
 from twin.ultrasound.beam import DEEPER
 from twin.ultrasound.echo_solids import Body, between, distance_at, label_at
+from twin.ultrasound.scan_lines import lines_of, world_from_face, world_from_lines
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -24,7 +25,7 @@ GRADIENT_MM = 0.3  # over which a surface's normal is taken
 
 
 class Paths(NamedTuple):
-    """Tables over lines (the image's columns) and true depth in steps of `step_mm`."""
+    """Tables over lines (a linear array's columns) and true depth in steps of `step_mm`."""
 
     step_mm: float
     labels: NDArray[np.uint8]  # (w, m)
@@ -36,7 +37,6 @@ class Paths(NamedTuple):
 class Steps(NamedTuple):
     """Delay and loss of a step down a line, by label."""
 
-    line_mm: float  # between lines
     delay_mm: Array  # (n + 1,) shown depth
     kept: Array  # (n + 1,) amplitude, both ways
     refract: bool  # whether borders turn the line
@@ -44,15 +44,16 @@ class Steps(NamedTuple):
 
 def follow(body: Body, transducer: Transducer, world_from_image: Array) -> Paths:
     """Follow the lines of one pose : world_from_image (4, 4) mm."""
-    sx, sy = transducer.scale_mm_per_px
-    size = transducer.image_size[0], int(np.ceil(DEEPER * transducer.depth_mm / sy)) + 1
+    sy, lines = transducer.scale_mm_per_px[1], lines_of(transducer)
+    size = lines.count, int(np.ceil(DEEPER * transducer.depth_mm / sy)) + 1
     tables = [np.full(size, start, np.float32) for start in (0, 1, 0)]
     paths = Paths(sy, np.zeros(size, np.uint8), *tables)
-    pose = np.ascontiguousarray(world_from_image, float)
+    along = lines.pitch_mm * np.arange(lines.count)
+    poses = world_from_lines(lines, world_from_face(transducer, world_from_image), along)
     tissues = body.acoustics(transducer.frequency_mhz)
-    steps = Steps(sx, sy * transducer.assumed_speed * (1 / tissues.speed), np.exp(-sy * tissues.loss), transducer.refraction)
+    steps = Steps(sy * transducer.assumed_speed * (1 / tissues.speed), np.exp(-sy * tissues.loss), transducer.refraction)
     solids = body.packed()
-    in_threads(_follow, size[0], paths, solids, tissues, steps, pose)
+    in_threads(_follow, size[0], paths, solids, tissues, steps, poses)
     return paths
 
 
@@ -116,14 +117,11 @@ def _through_border(solids, tissues, pose, point, here, there):
 
 
 @kernel
-def _follow(first, end, paths, solids, tissues, steps, pose):
-    step, line_mm, delays = paths.step_mm, steps.line_mm, steps.delay_mm
+def _follow(first, end, paths, solids, tissues, steps, poses):
+    step, delays = paths.step_mm, steps.delay_mm
     for line in range(first, end):
-        x0, y0, z0 = (
-            pose[0, 0] * line_mm * line + pose[0, 3],
-            pose[1, 0] * line_mm * line + pose[1, 3],
-            pose[2, 0] * line_mm * line + pose[2, 3],
-        )
+        pose = poses[line]
+        x0, y0, z0 = pose[0, 3], pose[1, 3], pose[2, 3]
         here = label_at(solids, x0, y0, z0)
         paths.labels[line, 0] = here
         delay, left, slope, aside, clear = 0.0, 1.0, 0.0, 0.0, 0.0

@@ -17,6 +17,7 @@ from twin.ultrasound.borders import BUNDLE, NEAR, START, STOP
 from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
 from twin.ultrasound.echo_solids import Body, Wire, distance_at
 from twin.ultrasound.medium import hashed
+from twin.ultrasound.scan_lines import lines_of, on_lines, widening, world_from_lines
 from twin.ultrasound.sound_paths import Paths, normal_at, reflection, table_at
 from twin.ultrasound.transducer import Transducer
 
@@ -44,12 +45,13 @@ class Rays(NamedTuple):
     first: int  # number of the first of them along the array, of all
     along: Array  # (n,) mm
     across: Array  # (m,) mm
+    poses: Array  # (n, 4, 4) of lines through them; see `scan_lines.world_from_lines`
     distances: Array  # (3, k) mm to the solids, BEFORE and AFTER a step, and LAST
     crossings: Array  # (CROSSINGS, 3) of borders
 
 
 class Ray(NamedTuple):
-    """One of them, straight into the depth: its place on the face, and its start and direction in the world."""
+    """One of them, down a line: its place on the face, and its start and direction in the world."""
 
     along: float
     across: float
@@ -65,8 +67,8 @@ class Strand(NamedTuple):
     """Points of a wire, and the echoes of each."""
 
     world: Array  # (n, 3) mm
-    image: Array  # (n, 3) mm, of its front
-    rise_mm: float  # from point to point, into the depth
+    front: Array  # (n, 3) mm: along the face, depth, and across the plane
+    rise_mm: Array  # (n,) from point to point, into the depth
     roughness: float  # mm
     echoes: Array  # (m, 2) mm behind the front, and strength
 
@@ -76,20 +78,21 @@ def surface_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths,
     if not body.solids:
         return field_like(transducer, beam)
     scanner = scanner_at(transducer, beam, paths, world_from_image, seed)
-    half, sx = float(beam.half_mm.max()), scanner.line_mm
+    half, lines = float(beam.half_mm.max()), lines_of(transducer)
     across = ACROSS_MM * np.arange(-int(half / ACROSS_MM), int(half / ACROSS_MM) + 1)
-    beside = int(SUBLINES * BESIDE_MM / sx)  # rays beside the image, or its edges would diffract
-    along = (np.arange(-beside, SUBLINES * transducer.image_size[0] + beside) + 0.5) * sx / SUBLINES - sx / 2
+    beside = int(SUBLINES * BESIDE_MM / lines.pitch_mm)  # rays beside the image, or its edges would diffract
+    along = ((np.arange(-beside, SUBLINES * lines.count + beside) + 0.5) / SUBLINES - 0.5) * lines.pitch_mm
+    poses = world_from_lines(lines, scanner.world_from_face, along)
     first = _first_depths(transducer, beam, across)
-    spans = borders.spans(body, scanner.world_from_image, along, across, first, scanner.deepest_mm)
+    spans = borders.spans(body, lines, scanner.world_from_face, along, across, first, scanner.deepest_mm)
     tissues = body.acoustics(transducer.frequency_mhz)
     solids, outer = body.packed(), (paths.shift_mm.max(), paths.shift_mm.min())
 
     def lay(field: Field, part: int) -> tuple[int, int]:
         begin, end = slab(part, len(along))
-        rays = Rays(begin, along[begin:end], across, np.zeros((3, len(solids.grid))), np.empty((CROSSINGS, 3)))
+        rays = Rays(begin, along[begin:end], across, poses[begin:end], np.zeros((3, len(solids.grid))), np.empty((CROSSINGS, 3)))
         _border_echoes(field, solids, tissues, rays, spans, scanner, beam, paths)
-        left, right = (along[[begin, end - 1]] - outer) / sx + (len(field) - len(paths.labels)) // 2
+        left, right = (along[[begin, end - 1]] - outer) / lines.pitch_mm + (len(field) - len(paths.labels)) // 2
         return int(np.floor(left)) - 1, int(np.floor(right)) + 3
 
     return laid(lay, field_like(transducer, beam))
@@ -113,24 +116,28 @@ def wire_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths, wo
     field = field_like(transducer, beam)
     scanner = scanner_at(transducer, beam, paths, world_from_image, seed)
     for wire in body.wires:
-        _lay_wire(field, _strand(wire, body.medium.impedance, transducer, world_from_image), scanner, beam, paths)
+        _lay_wire(field, _strand(wire, body.medium.impedance, transducer, scanner.world_from_face), scanner, beam, paths)
     return field
 
 
-def _strand(wire: Wire, around: float, transducer: Transducer, world_from_image: Array) -> Strand:
+def _strand(wire: Wire, around: float, transducer: Transducer, world_from_face: Array) -> Strand:
     """A wire's points, every ALONG_MM, in a medium of an impedance."""
-    image_from_world = np.linalg.inv(world_from_image)
+    face_from_world, lines = np.linalg.inv(world_from_face), lines_of(transducer)
     length = float(np.linalg.norm(wire.ends[1] - wire.ends[0]))
     count = max(int(length / ALONG_MM), 2)
     share = (np.arange(count) + 0.5)[:, None] / count
     points = wire.ends[0] * (1 - share) + wire.ends[1] * share
-    direction = (wire.ends[1] - wire.ends[0]) / length @ image_from_world[:3, :3].T
-    local = points @ image_from_world[:3, :3].T + image_from_world[:3, 3] - [0, wire.radius, 0]
+    direction = (wire.ends[1] - wire.ends[0]) / length @ face_from_world[:3, :3].T
+    local = points @ face_from_world[:3, :3].T + face_from_world[:3, 3]
+    along, depth = np.transpose([on_lines(x, y, lines.bend, lines.middle_mm) for x, y, _ in local.tolist()])
+    angle = (along - lines.middle_mm) * lines.bend
+    rise = (np.sin(angle) * direction[0] + np.cos(angle) * direction[1]) * length / count
+    front = np.column_stack([along, depth - wire.radius, local[:, 2]])
     bounce = (wire.tissue.impedance - around) / (wire.tissue.impedance + around)
     ring = 2 * wire.radius * transducer.assumed_speed / wire.tissue.speed
     echoes = [(0.0, bounce)] + [(ring * n, -bounce * (1 - bounce**2) * bounce ** (2 * n - 2)) for n in range(1, RINGS + 1)]
     strength = np.sqrt(wire.radius * transducer.wavelength_mm / 2) * length / count
-    return Strand(points, local, float(direction[1] * length / count), wire.tissue.roughness, np.array(echoes) * [1, strength])
+    return Strand(points, front, rise, wire.tissue.roughness, np.array(echoes) * [1, strength])
 
 
 @njit(inline="always")
@@ -164,11 +171,11 @@ def _border_echoes(field, solids, tissues, rays, spans, scanner, beam, paths):
     """Lay the echoes of all borders that some rays meet in the slice."""
     for i in range(len(rays.along)):
         for j in range(len(rays.across)):
-            ray = _ray(rays.along[i], rays.across[j], scanner.world_from_image)
+            ray = _ray(rays.along[i], rays.across[j], rays.poses[i])
             bundle = (rays.first + i) // BUNDLE[0], j // BUNDLE[1]
             met = _crossings_of(ray, rays.crossings, rays.distances, solids, spans, bundle, beam, scanner.repeats)
             for n in range(met):
-                _lay_facet(field, ray, rays.crossings[n], solids, tissues, scanner, beam, paths)
+                _lay_facet(field, ray, rays.poses[i], rays.crossings[n], solids, tissues, scanner, beam, paths)
 
 
 @njit(inline="always")
@@ -176,9 +183,9 @@ def _ray(along, across, pose):
     return Ray(
         along,
         across,
-        pose[0, 0] * along + pose[0, 2] * across + pose[0, 3],
-        pose[1, 0] * along + pose[1, 2] * across + pose[1, 3],
-        pose[2, 0] * along + pose[2, 2] * across + pose[2, 3],
+        pose[0, 2] * across + pose[0, 3],
+        pose[1, 2] * across + pose[1, 3],
+        pose[2, 2] * across + pose[2, 3],
         pose[0, 1],
         pose[1, 1],
         pose[2, 1],
@@ -274,11 +281,11 @@ def _facet(ray, y, solids, solid, pose):
 
 
 @njit(inline="always")
-def _lay_facet(field, ray, crossing, solids, tissues, scanner, beam, paths):
+def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths):
     """Lay the echo of a border's facet, and its repeats between border and face."""
     here, there, solid = int(crossing[FROM]), int(crossing[TO]), int(max(crossing[FROM], crossing[TO])) - 1
     depth = crossing[DEPTH]
-    y, square, slope_x, slope_z = _facet(ray, depth, solids, solid, scanner.world_from_image)
+    y, square, slope_x, slope_z = _facet(ray, depth, solids, solid, pose)
     if square <= GLANCING:
         return
     lines, depths = paths.labels.shape
@@ -289,7 +296,8 @@ def _lay_facet(field, ray, crossing, solids, tissues, scanner, beam, paths):
     left = paths.amplitude[line, level]
     r = reflection(impedance[here], impedance[there], speed[here], speed[there], square)
     mirror = np.exp(-0.5 * (2 * scanner.wavenumber * tissues.roughness[solid + 1] * square) ** 2)
-    area, carrier = scanner.line_mm / SUBLINES * ACROSS_MM, _turned(2 * scanner.wavenumber * seen)
+    line_mm = scanner.line_mm * widening(y, scanner.bend)
+    area, carrier = line_mm / SUBLINES * ACROSS_MM, _turned(2 * scanner.wavenumber * seen)
     strength, once = area * left * carrier, r * scanner.face_reflection * left * carrier
     last, deepest = field.shape[1] * scanner.sample_mm, min(scanner.deepest_mm, paths.step_mm * (depths - 2))
     for order in range(1, scanner.repeats + 2):
@@ -298,7 +306,7 @@ def _lay_facet(field, ray, crossing, solids, tissues, scanner, beam, paths):
         row = min(int(order * y / beam.depth_step_mm + 0.5), len(beam.half_mm) - 1)
         if abs(ray.across) < beam.half_mm[row]:
             value = complex(r * mirror ** (order * order))
-            value *= _unaliased(2 * order * scanner.wavenumber * slope_x * scanner.line_mm)
+            value *= _unaliased(2 * order * scanner.wavenumber * slope_x * line_mm)
             value *= _unaliased(2 * order * scanner.wavenumber * slope_z * ACROSS_MM)
             if order == 1 and mirror < 1:
                 phase = _phase_of_patch(ray.x + ray.dx * depth, ray.y + ray.dy * depth, ray.z + ray.dz * depth, scanner.seed)
@@ -306,7 +314,7 @@ def _lay_facet(field, ray, crossing, solids, tissues, scanner, beam, paths):
             if value != 0:
                 echo = np.complex64(strength * value) * beam.elevation[row, int(abs(ray.across) / STEP_MM + 0.5)]
                 beside = paths.shift_mm[line, min(int(order * y / paths.step_mm), depths - 1)]
-                across = (ray.along - beside) / scanner.line_mm + (len(field) - lines) // 2
+                across = (ray.along - beside / widening(order * y, scanner.bend)) / scanner.line_mm + (len(field) - lines) // 2
                 deposit(field, across, order * seen / scanner.sample_mm, echo)
         strength *= once
 
@@ -325,9 +333,9 @@ def _lay_wire(field, strand, scanner, beam, paths):
     pad = (len(field) - lines) // 2
     deepest, last = paths.step_mm * (depths - 2), field.shape[1] * scanner.sample_mm
     smooth = np.exp(-0.5 * (2 * scanner.wavenumber * strand.roughness) ** 2)
-    coherent, rough = smooth * _sinc(scanner.wavenumber * strand.rise_mm), np.sqrt(1 - smooth * smooth)
-    for k in range(len(strand.image)):
-        x, y, z = strand.image[k]
+    rough = np.sqrt(1 - smooth * smooth)
+    for k in range(len(strand.front)):
+        x, y, z = strand.front[k]
         if not (0 <= y < deepest and -pad <= x / scanner.line_mm <= lines - 1 + pad):
             continue
         row = min(int(y / beam.depth_step_mm + 0.5), len(beam.half_mm) - 1)
@@ -336,9 +344,10 @@ def _lay_wire(field, strand, scanner, beam, paths):
         line = min(max(int(x / scanner.line_mm + 0.5), 0), lines - 1)
         seen = table_at(paths.shown_mm, line, y, paths.step_mm)
         patch = _phase_of_patch(strand.world[k, 0], strand.world[k, 1], strand.world[k, 2], scanner.seed)
-        part = coherent + rough * _turned(patch)
+        part = smooth * _sinc(scanner.wavenumber * strand.rise_mm[k]) + rough * _turned(patch)
         part *= table_at(paths.amplitude, line, y, paths.step_mm) * beam.elevation[row, int(abs(z) / STEP_MM + 0.5)]
-        across = (x - paths.shift_mm[line, min(int(y / paths.step_mm), depths - 1)]) / scanner.line_mm + pad
+        beside = paths.shift_mm[line, min(int(y / paths.step_mm), depths - 1)] / widening(y, scanner.bend)
+        across = (x - beside) / scanner.line_mm + pad
         for behind, strength in strand.echoes:
             if seen + behind < last:
                 value = strength * part * _turned(2 * scanner.wavenumber * (seen + behind))

@@ -18,7 +18,7 @@ from recon.model.tracks import Track
 from scenes.scene_types import Scene
 from twin import conditions
 from twin.session import Session, TruthFolder, describe
-from twin.ultrasound import bscan_truth
+from twin.ultrasound import bscan_truth, scan_lines
 from twin.ultrasound.bscan import Scan
 from twin.ultrasound.echo_solids import Body, Solid, label_at
 from twin.ultrasound.probe_path import Bob, SurfacePath, WirePath, about_crossing, along_surface, bobbing
@@ -97,7 +97,11 @@ def refuse_inside(course: Track, body: Body, transducer: Transducer, allowed_mm:
         If it does; the solid is named.
     """
     tables = body.packed()
-    face = np.column_stack([np.linspace(0, transducer.width_mm, 5), np.full(5, -allowed_mm), np.zeros(5)])
+    lines = scan_lines.lines_of(transducer)
+    places = scan_lines.world_from_lines(
+        lines, scan_lines.world_from_face(transducer, np.eye(4)), lines.middle_mm * np.linspace(0, 2, 5)
+    )
+    face = places[:, :3, 3] - allowed_mm * places[:, :3, 1]
     for time, pose in zip(course.times, course.poses, strict=True):
         found = max(label_at(tables, *point) for point in rigid.apply(pose, face))
         if found:

@@ -1,4 +1,4 @@
-"""A linear array and the scanner behind it: their figures, with units."""
+"""A linear or curved array and the scanner behind it: their figures, with units."""
 
 from typing import Annotated
 
@@ -12,11 +12,30 @@ Array = NDArray[np.float64]
 Bandwidth = Annotated[float, Field(ge=0.05, le=1.5)]
 
 
+class CurvedArray(Part):
+    """The face of a curved array: an arc, whose lines leave it at right angles, evenly spaced."""
+
+    radius_mm: Annotated[float, Field(ge=5, le=500)]
+    sector_deg: Annotated[float, Field(ge=1, le=170)]  # between the first line and the last
+    lines: Annotated[int, Field(ge=16, le=2048)]
+
+    @property
+    def pitch_mm(self) -> float:
+        """From line to line on the face."""
+        return self.radius_mm * np.deg2rad(self.sector_deg) / (self.lines - 1)
+
+    @property
+    def sagitta_mm(self) -> float:
+        """By which the middle of the face stands out before its ends."""
+        return float(self.radius_mm * (1 - np.cos(np.deg2rad(self.sector_deg / 2))))
+
+
 class Transducer(Part):
-    """A linear array, its beams, and the scanner's processing of the echoes; as conf/ultrasound/linear.yaml has it."""
+    """A linear or curved array, its beams, and the scanner's processing of the echoes; as conf/ultrasound/linear.yaml has it."""
 
     image_size: tuple[Annotated[int, Field(ge=16, le=4096)], Annotated[int, Field(ge=16, le=4096)]] = (321, 408)
     scale_mm_per_px: tuple[Positive, Positive] = (0.1229, 0.1225)  # sx, sy of the scanner, at its assumed speed
+    curved: CurvedArray | None = None  # a linear array's face is as wide as the image, a curved one's begins in its first row
     assumed_speed: Annotated[float, Field(ge=300, le=5000)] = 1540.0  # m/s
     frequency_mhz: Annotated[float, Field(ge=0.5, le=40)] = 7.5
     bandwidth: tuple[Bandwidth, Bandwidth] = (0.5, 0.4)  # -6 dB of an echo, over the frequency: at the face, at the image's end
@@ -46,6 +65,9 @@ class Transducer(Part):
                 f"scale_mm_per_px: expected a row of at most two wavelengths of {self.wavelength_mm:.3f} mm, "
                 f"found {self.scale_mm_per_px[1]:g}"
             )
+        if self.depth_mm < 1:
+            found = f"{self.scale_mm_per_px[1] * (self.image_size[1] - 1):g} mm, with {self.face_mm[1]:g} mm of the face's arc"
+            raise ValueError(f"image_size: expected an image deeper than the face's arc by 1 mm or more, found {found}")
         return self
 
     @property
@@ -60,8 +82,8 @@ class Transducer(Part):
 
     @property
     def depth_mm(self) -> float:
-        """Of the image's last row, as shown."""
-        return self.scale_mm_per_px[1] * (self.image_size[1] - 1)
+        """Of the image's last row under the middle of the face, as shown."""
+        return self.scale_mm_per_px[1] * (self.image_size[1] - 1) - self.face_mm[1]
 
     @property
     def width_mm(self) -> float:
@@ -69,9 +91,22 @@ class Transducer(Part):
         return self.scale_mm_per_px[0] * (self.image_size[0] - 1)
 
     @property
+    def face_mm(self) -> tuple[float, float]:
+        """The middle of the face in the image's frame, x and y."""
+        return self.width_mm / 2, 0.0 if self.curved is None else self.curved.sagitta_mm
+
+    @property
+    def foot_mm(self) -> float:
+        """Width of the face, from end to end."""
+        if self.curved is None:
+            return self.width_mm
+        return float(2 * self.curved.radius_mm * np.sin(np.deg2rad(self.curved.sector_deg / 2)))
+
+    @property
     def rows_mm(self) -> Array:
-        """Shown depth of the image's rows : (h,)."""
-        return self.scale_mm_per_px[1] * np.arange(self.image_size[1])
+        """Shown depth of the rows : (h,), those of a linear array's image."""
+        rows = self.image_size[1] if self.curved is None else int(self.depth_mm / self.scale_mm_per_px[1]) + 1
+        return self.scale_mm_per_px[1] * np.arange(rows)
 
     def axial_sigma_mm(self, depth_mm: Array) -> Array:
         """Standard deviation in depth of the echo's Gaussian envelope (amplitude).

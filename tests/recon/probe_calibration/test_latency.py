@@ -6,6 +6,7 @@ import pytest
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model import tracks
+from recon.model.fan import Fan
 from recon.model.tracks import Track
 from recon.probe_calibration import latency
 from tests.recon import bscans
@@ -143,6 +144,19 @@ def test_the_bottom_is_followed_to_a_tenth_of_a_pixel(rng, slope):
     off = np.array(found) - depths
     assert np.abs(off - np.median(off)).max() < 0.1
     assert abs(np.median(off)) < 0.5
+
+
+def test_of_a_fan_the_columns_under_its_face_tell_the_bottom(rng):
+    """What lies beside the fan is bright on the screen; where the fan begins the face rings; its corners lie too low."""
+    fan = Fan(160.0, -100.0, 130.0, 480.0, -30.0, 30.0)
+    part = fan.mask((bscans.SIZE[1], bscans.SIZE[0]))
+    v, u = np.mgrid[: bscans.SIZE[1], : bscans.SIZE[0]]
+    ring = 0.8 * np.exp(-(np.hypot(u - fan.u, v - fan.v) - fan.first_px) / 10)
+    for depth in (110, 200, 330):
+        image = bscans.image(bscans.bottom(depth, 0.05) + ring, rng)
+        image[~part] = 240
+        assert abs(latency.bottom_depth(image, part=part) - depth) < 0.5
+        assert np.isnan(latency.bottom_depth(np.where(part, 20, image).astype(np.uint8), part=part))
 
 
 def test_where_there_is_no_bottom(rng):

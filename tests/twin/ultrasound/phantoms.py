@@ -20,7 +20,7 @@ def down(transducer: Transducer, face: tuple[float, float, float], tilt_deg: flo
     """A pose that looks along the world's z, the array along x, its middle at `face`; tilted in the image plane."""
     upright = rigid.transform([[1, 0, 0], [0, 0, -1], [0, 1, 0]], face)
     tilt = rigid.from_rotation_vector([0, 0, np.deg2rad(tilt_deg)], [0, 0, 0])
-    return upright @ tilt @ rigid.transform(np.eye(3), (-transducer.width_mm / 2, 0, 0))
+    return upright @ tilt @ rigid.transform(np.eye(3), (-transducer.face_mm[0], -transducer.face_mm[1], 0))
 
 
 def width_at_half(profile: np.ndarray, step: float) -> float:

@@ -90,7 +90,8 @@ def shown_labels(paths: Paths, transducer: Transducer) -> np.ndarray:
     lines, depths = paths.shown_mm.shape
     shown = np.empty((transducer.image_size[1], lines), np.uint8)
     for line in range(lines):
-        level = np.clip(np.searchsorted(paths.shown_mm[line], transducer.rows_mm), 0, depths - 1)
+        between = (paths.shown_mm[line, :-1] + paths.shown_mm[line, 1:]) / 2
+        level = np.clip(np.searchsorted(between, transducer.rows_mm), 0, depths - 1)
         aside = np.rint(line + paths.shift_mm[line, level] / transducer.scale_mm_per_px[0]).astype(int)
         shown[:, line] = paths.labels[np.clip(aside, 0, lines - 1), level]
     return shown

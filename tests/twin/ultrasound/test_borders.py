@@ -8,6 +8,7 @@ from scenes.catalogue import build_scene
 from tests.twin.ultrasound.phantoms import down
 from twin.ultrasound import borders
 from twin.ultrasound.echo_solids import body, distance_at, label_at
+from twin.ultrasound.scan_lines import lines_of
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +21,7 @@ def test_no_border_lies_outside_the_spans(made, small, rng, turn):
     """Rays at random, looked at every 0.05 mm: where the tissue changes, their bundle has a span; most of the way has none."""
     pose = down(small, (4.0, -2.0, 655.0)) @ rigid.from_rotation_vector(turn, [0, 0, 0])
     x, z = np.arange(-2, 14, 0.0615), 0.2 * np.arange(-15, 16)
-    spans, counts, sides = borders.spans(made, pose, x, z, np.zeros(len(z)), 50.0)
+    spans, counts, sides = borders.spans(made, lines_of(small), pose, x, z, np.zeros(len(z)), 50.0)
     packed, depths, met = made.packed(), np.arange(0, 50, 0.05), 0
     apart = 0
     for _ in range(60):
