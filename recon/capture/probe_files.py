@@ -1,11 +1,11 @@
 """Files of the probe's calibration: sonotwin's own `probe.yaml`, and the rig authors' `US_params.npz`.
 
 - own: OpenCV FileStorage YAML with `schema`, `target_from_image` (4x4, mm), `scale` (sx, sy in mm/px), `speed_m_s`, the speed of
-  sound for which sy holds (1540 if it is missing), and, if known, `parameters`, their names as in `recon.model.probe`, and
-  `covariance`.
-- the authors': npz with sx, sy and T_I_T, which is `target_from_image`. Ours have `speed_m_s` beside these, which their programs
-  leave alone; for theirs a caller gives it, or 1540 m/s is taken, with a warning. A rotation that is off by up to 2 % is taken as
-  the nearest one, and a negative scale as the same map with that axis turned round.
+  sound for which sy holds (1540 if it is missing), `face_row`, the row at which echoes have no delay (0 likewise), and, if known,
+  `parameters`, their names as in `recon.model.probe`, and `covariance`.
+- the authors': npz with sx, sy and T_I_T, which is `target_from_image`. Ours have `speed_m_s`, and `face_row` if it isn't 0,
+  beside these, which their programs leave alone; for theirs a caller gives the speed, or 1540 m/s is taken, with a warning. A
+  rotation that is off by up to 2 % is taken as the nearest one, and a negative scale as the same map with that axis turned round.
 """
 
 import logging
@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 SCHEMA = "sonotwin-probe/1"
 PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
 AUTHORS = "US_params.npz"
+MOST_ROWS = 1e5  # of a scanner's image
 
 
 def read(path: Path, speed_m_s: float | None = None) -> ProbeCalibration:
@@ -53,6 +54,7 @@ def write(path: Path, calibration: ProbeCalibration) -> None:
     storage.write("target_from_image", calibration.target_from_image)
     storage.write("scale", np.asarray(calibration.scale, float).reshape(1, 2))
     storage.write("speed_m_s", float(calibration.speed_m_s))
+    storage.write("face_row", float(calibration.face_row))
     if calibration.uncertainty is not None:
         opencv_storage.write_covariance(storage, calibration.uncertainty.names, calibration.uncertainty.covariance)
     opencv_storage.save(path, storage)
@@ -62,12 +64,14 @@ def write_authors(path: Path, calibration: ProbeCalibration) -> None:
     """Write the rig authors' `US_params.npz`, whole or not at all, with the speed of sound; it has no room for uncertainty."""
     sx, sy = calibration.scale
     with atomic.new_file(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, sx=sx, sy=sy, T_I_T=calibration.target_from_image, speed_m_s=calibration.speed_m_s)
+        beside = {"face_row": calibration.face_row} if calibration.face_row else {}
+        np.savez(file, sx=sx, sy=sy, T_I_T=calibration.target_from_image, speed_m_s=calibration.speed_m_s, **beside)
 
 
 def _authors(path: Path, speed_m_s: float | None) -> ProbeCalibration:
     number = npz.Form("fiu")
     forms = {"sx": number, "sy": number, "T_I_T": npz.Form("fiu", (4, 4)), "speed_m_s": npz.Form("fiu", optional=True)}
+    forms["face_row"] = npz.Form("fiu", optional=True)
     values = npz.read(path, forms)
     for name in values.keys() - {"T_I_T"}:
         if values[name].size != 1:
@@ -85,7 +89,9 @@ def _authors(path: Path, speed_m_s: float | None) -> ProbeCalibration:
         speed_m_s = SCANNER_SPEED
         way = "if it was made in water, import it with speed_m_s=..., or add speed_m_s to it"
         log.warning("%s: names no speed of sound, and is taken as right where it makes %g m/s; %s", path, speed_m_s, way)
-    return _checked(path, "T_I_T", pose, scale, None, speed_m_s)
+    return _checked(
+        path, "T_I_T", ProbeCalibration(pose, scale, None, speed_m_s, float(values.get("face_row", np.zeros(1)).item()))
+    )
 
 
 def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
@@ -97,17 +103,21 @@ def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
         opencv_storage.matrix(path, "target_from_image", storage.getNode("target_from_image")),
         opencv_storage.matrix(path, "scale", storage.getNode("scale")).ravel(),
     )
-    return _checked(path, "target_from_image", pose, scale, _uncertainty(path, storage), _speed(path, storage))
+    node = storage.getNode("face_row")
+    face_row = 0.0 if node.empty() else node.real() if node.isReal() or node.isInt() else np.nan
+    read = ProbeCalibration(pose, scale.ravel(), _uncertainty(path, storage), _speed(path, storage), face_row)
+    return _checked(path, "target_from_image", read)
 
 
-def _checked(
-    path: Path, name: str, pose: Array, scale: Array, uncertainty: Uncertainty | None, speed_m_s: float
-) -> ProbeCalibration:
-    if found := rigid.fault(pose):
+def _checked(path: Path, name: str, read: ProbeCalibration) -> ProbeCalibration:
+    scale = read.scale
+    if found := rigid.fault(read.target_from_image):
         raise InputError(f"{path}: {name}: expected {rigid.RIGID}, in mm, found {found}")
     if scale.shape != (2,) or not np.isfinite(scale).all() or scale.min() <= 0:
         raise InputError(f"{path}: scale: expected sx and sy above zero in mm/px, found {scale.tolist()}")
-    return ProbeCalibration(pose, scale, uncertainty, speed_m_s)
+    if not abs(read.face_row) < MOST_ROWS:
+        raise InputError(f"{path}: face_row: expected a row of an image, found {read.face_row:g}")
+    return read
 
 
 def _speed(path: Path, storage: cv2.FileStorage) -> float:

@@ -54,7 +54,7 @@ def forms(world_from_pixel: Array, probe: ProbeCalibration, errors: PlaceErrors)
     by_pose = pose_slopes(world_from_pixel, probe)
     total = _form(by_pose, errors.own + errors.shared)
     total += _form(rate_slopes(errors.rates), np.array([[errors.lag_s**2]]))
-    total += _form(depth_slopes(world_from_pixel), np.array([[errors.depth**2]]))
+    total += _form(depth_slopes(world_from_pixel, probe.face_row), np.array([[errors.depth**2]]))
     if probe.uncertainty is not None:
         total += _form(probe_slopes(world_from_pixel, probe), probe.uncertainty.ordered(NAMES))
     return np.where(np.isfinite(world_from_pixel).all(axis=(1, 2))[:, None, None], total, np.nan)
@@ -84,7 +84,8 @@ def from_pixel(probe: ProbeCalibration, pixel: tuple[int, int]) -> ProbeCalibrat
     """The calibration, with its covariance, of images that begin at a pixel (u, v) of those it was made for."""
     placed = sequences.target_from_pixel(probe)
     origin = rigid.apply(placed, [*pixel, 0.0])
-    moved = replace(probe, target_from_image=rigid.transform(probe.target_from_image[:3, :3], origin))
+    turn = probe.target_from_image[:3, :3]
+    moved = replace(probe, target_from_image=rigid.transform(turn, origin), face_row=probe.face_row - pixel[1])
     if probe.uncertainty is None:
         return moved
     jacobian = np.eye(len(NAMES))
@@ -97,10 +98,11 @@ def rate_slopes(rates: Array) -> Array:
     return rates[:, :3, COLUMNS].transpose(0, 2, 1)[..., None]
 
 
-def depth_slopes(world_from_pixel: Array) -> Array:
-    """Coefficients : (n, 3, 3, 1) of places by the ratio of all depths."""
+def depth_slopes(world_from_pixel: Array, face_row: float = 0.0) -> Array:
+    """Coefficients : (n, 3, 3, 1) of places by the ratio of all depths, which count from the face's row."""
     result = np.zeros((len(world_from_pixel), 3, 3, 1))
     result[:, 2, :, 0] = world_from_pixel[:, :3, 1]
+    result[:, 0, :, 0] = -face_row * world_from_pixel[:, :3, 1]
     return result
 
 

@@ -182,9 +182,11 @@ def of_sequence(
         hint = "; no calibration of the probe among them? give probe=... or config=..." if probe is None and not fixed else ""
         raise InputError(f"{path}: {error}{hint}") from None
     placed = sequence_sweep.lagged(str(path), frames.times_s, world_from_pixel, lag_s)
-    calibrated = SCANNER_SPEED if probe is None else probe.speed_m_s
+    calibrated, face_row = (SCANNER_SPEED, 0.0) if probe is None else (probe.speed_m_s, probe.face_row)
     speed = tissue_m_s or calibrated
-    matrices = sound_in_water.in_tissue(np.where(frames.valid["Image"][:, None, None], placed, np.nan), calibrated, speed)
+    matrices = sound_in_water.in_tissue(
+        np.where(frames.valid["Image"][:, None, None], placed, np.nan), calibrated, speed, face_row
+    )
     converted = None if probe is None else sound_in_water.for_tissue(probe, tissue_m_s)
     return Scans(shape, matrices, lambda: sequences.stream_images(path), speed, calibrated, converted)
 

@@ -30,6 +30,7 @@ class ProbeCalibration:
     scale: Array  # (2,) sx, sy, mm/px
     uncertainty: Uncertainty | None = None
     speed_m_s: float = SCANNER_SPEED  # m/s, of the sound for which sy holds
+    face_row: float = 0.0  # px, row of the image at which an echo has no delay: depths count from there
 
     def to_target(self, pixels: ArrayLike) -> Array:
         """Pixels : (..., 2) of a B-scan, to points : (..., 3) mm in the target's frame."""

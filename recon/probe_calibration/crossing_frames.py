@@ -31,6 +31,7 @@ class CrossingFrames:
     sightings: Sightings  # of the m usable frames
     numbers: NDArray[np.int64]  # (n,) of the frames
     crossings: tuple[Crossing, ...]  # (n,)
+    first_row: int = 0  # px, of the part of the images that was looked at
 
     @property
     def usable(self) -> NDArray[np.int64]:
@@ -55,7 +56,7 @@ def look(
     sightings, crossings = point_calibration.from_images(images, poses, appearance)
     sightings = replace(sightings, pixels=sightings.pixels + corner)
     whole = tuple(replace(crossing, pixel=crossing.pixel + corner) for crossing in crossings)
-    frames = CrossingFrames(name, size, sightings, numbers, whole)
+    frames = CrossingFrames(name, size, sightings, numbers, whole, corner[1])
     if pose_covariance is None:
         return frames
     return replace(frames, sightings=replace(sightings, pose_covariance=pose_covariance[frames.usable]))

@@ -68,28 +68,29 @@ def implied_speed(calibration: ProbeCalibration, scanner_sy: float, assumed: flo
     return float(assumed * calibration.scale[1] / scanner_sy), float(assumed * sigma / scanner_sy)
 
 
-def in_tissue(world_from_pixel: Array, calibrated: float, speed: float) -> Array:
-    """Convert matrices : (..., 4, 4) px to mm from a calibrated speed to that of another medium; row 0 is the face."""
+def in_tissue(world_from_pixel: Array, calibrated: float, speed: float, face_row: float = 0.0) -> Array:
+    """Convert matrices : (..., 4, 4) px to mm from a calibrated speed to that of another medium; the face keeps its place."""
     _check(calibrated=calibrated, speed=speed)
-    return world_from_pixel @ np.diag([1, speed / calibrated, 1, 1])
+    ratio = speed / calibrated
+    stretch = np.diag([1, ratio, 1, 1])
+    stretch[1, 3] = (1 - ratio) * face_row
+    return world_from_pixel @ stretch
 
 
-def in_medium(
-    calibration: ProbeCalibration, calibrated: float, speed: float, face_row: float = 0.0, ratio_sigma: float = 0.0
-) -> ProbeCalibration:
+def in_medium(calibration: ProbeCalibration, calibrated: float, speed: float, ratio_sigma: float = 0.0) -> ProbeCalibration:
     """A calibration made in a medium of one speed, for images of a medium of another.
+
+    The face keeps its place, so the image's origin moves if the face isn't row 0.
 
     Parameters
     ----------
     calibrated, speed : float, m/s
         Of the medium of the calibration, and of that of the images: 1540 for the scanner's own scale.
-    face_row : float, px
-        Row of the image at which the delay is zero. It keeps its place, so the image's origin moves if it isn't row 0.
     ratio_sigma : float
         Standard deviation of `speed / calibrated`, say from that of the temperature.
     """
     _check(calibrated=calibrated, speed=speed)
-    ratio = speed / calibrated
+    ratio, face_row = speed / calibrated, calibration.face_row
     sx, sy = calibration.scale
     depth = calibration.target_from_image[:3, 1]
     origin = calibration.target_from_image[:3, 3] + depth * sy * (1 - ratio) * face_row
@@ -99,7 +100,7 @@ def in_medium(
         covariance = jacobian @ uncertainty.covariance @ jacobian.T + ratio_sigma**2 * np.outer(by_ratio, by_ratio)
         uncertainty = Uncertainty(uncertainty.names, covariance)
     turn = calibration.target_from_image[:3, :3]
-    return ProbeCalibration(rigid.transform(turn, origin), np.array([sx, sy * ratio]), uncertainty, speed)
+    return ProbeCalibration(rigid.transform(turn, origin), np.array([sx, sy * ratio]), uncertainty, speed, face_row)
 
 
 def for_tissue(calibration: ProbeCalibration, speed: float | None, sigma: float = 0.0) -> ProbeCalibration:

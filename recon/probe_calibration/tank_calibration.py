@@ -30,6 +30,7 @@ class Settings(BaseModel):
     tank_speed_sigma: SpeedSigma = 3.0
     assumed_speed: Speed = sound_in_water.SCANNER_SPEED
     medium_speed: Speed | None = None
+    face_row: Annotated[float, Field(ge=0, le=1e4)] | None = None
     wire_radius_mm: NotNegative = 0.1
     wire_radius_sigma_mm: NotNegative = 0.03
     wire_speed: Annotated[float, Field(ge=300, le=10000)] = 2600.0
@@ -134,6 +135,7 @@ def calibrate(frames: CrossingFrames, design: Probe, settings: Settings, scanner
         tank's speed nor the scanner's scale is known.
     """
     expected = design.target_from_image.matrix()
+    face_row = frames.first_row if settings.face_row is None else settings.face_row
     try:
         found = point_calibration.calibrate(
             frames.sightings,
@@ -144,6 +146,7 @@ def calibrate(frames: CrossingFrames, design: Probe, settings: Settings, scanner
             settings.echo_ahead_mm,
             settings.echo_ahead_sigma_mm,
         )
+        found = replace(found, calibration=replace(found.calibration, face_row=float(face_row)))
         shown_sy = _design_sy(found.calibration, frames.size, design) if scanner_sy is None else scanner_sy
         implied = sound_in_water.implied_speed(found.calibration, shown_sy, settings.assumed_speed)
         if not settings.tank_known:

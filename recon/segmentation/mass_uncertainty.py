@@ -138,7 +138,8 @@ def by_placing(weights: Weights, shown: Shown, scans: Scans) -> Array:
 
 def by_speeds(mass: Mass, weights: Weights, shown: Shown, scans: Scans, speeds: Speeds) -> Array:
     """Covariance : (5, 5) of centre, volume and depth: the tissue's speed moves the front, that within the border behind."""
-    deeper = _moved(weights, shown, place_uncertainty.depth_slopes(scans.world_from_pixel)).sum(axis=0)[:, 0]
+    slopes = place_uncertainty.depth_slopes(scans.world_from_pixel, 0.0 if scans.probe is None else scans.probe.face_row)
+    deeper = _moved(weights, shown, slopes).sum(axis=0)[:, 0]
     depth = np.linalg.norm(deeper[:3])
     along = deeper[:3] / depth
     half = np.ptp(np.asarray(mass.mesh.vertices) @ along) / 2

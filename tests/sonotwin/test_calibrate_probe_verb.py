@@ -159,6 +159,21 @@ def test_another_probe_takes_two_commands(seed, tmp_path, capsys):
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["implied_speed_m_per_s"] is None
 
 
+def test_depths_count_from_the_faces_row(rig, rng, tmp_path):
+    """On an uncropped screen, 80 rows below the first: without that row the conversion to tissue would be off by 0.33 mm."""
+    probe = replace(probe_motions.true_probe(rig), face_row=80.0)
+    fields = [f"pairs={pairs_of(probe, bscans.SIZE, rng, tmp_path / 'pairs.csv')}", f"temperature_c={sweep_sets.WATER_C}"]
+    points, found = repeatability.five_points(bscans.SIZE), {}
+    for row in (80, 0):
+        calibrate(*fields, f"face_row={row}", f"out={tmp_path / str(row)}")
+        found[row] = probe_files.read(tmp_path / str(row) / "probe.yaml")
+        assert found[row].face_row == row == probe_files.read(tmp_path / str(row) / "US_params.npz").face_row
+    sigma = np.sqrt(np.trace(point_calibration.point_covariance(found[80], points), axis1=1, axis2=2))
+    assert (np.linalg.norm(found[80].to_target(points) - probe.to_target(points), axis=1) < 4 * sigma).all()
+    off = 80 * rig.probe.scale_mm_per_px[1] * (1 - 1488.4 / 1540)
+    assert np.linalg.norm(found[0].to_target(points) - found[80].to_target(points), axis=1) == pytest.approx(off, rel=0.05)
+
+
 def test_another_scanners_scale_makes_no_speed_of_sound(rig, rng, tmp_path, capsys):
     """A depth setting of 58 mm in images of the same size would make 1738 m/s; the temperature needs no scale."""
     deeper = replace(probe_motions.true_probe(rig), scale=np.array(rig.probe.scale_mm_per_px) * [1.0, 1.168])

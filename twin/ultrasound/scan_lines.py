@@ -1,8 +1,8 @@
 """Lines of a B-scan in the image's plane: parallel ones, or the fan of a curved array.
 
 The scanner's own coordinates are `along`, mm on the face from the first line, and `depth`, mm on a line. The face's frame has x
-along the array, y into the depth, and its origin on the first line, or in the middle of a curved array. There a place at the angle
-a from the middle line is
+along the array, y into the depth, and its origin on the first line, or in the middle of a curved array. There a place at an
+angle a from the middle line is
 
     x = (R + depth) sin a,   y = (R + depth) cos a - R,   along = middle + R a,
 

@@ -1,5 +1,7 @@
 """Sound in water, and what a scanner makes of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,14 +49,16 @@ def probe(rig, rng):
 
 
 def test_the_face_keeps_its_place_and_depths_scale_about_it(probe):
-    made = sound_in_water.in_medium(probe, 1488.0, 1540.0, face_row=12.0)
+    probe = replace(probe, face_row=12.0)
+    made = sound_in_water.in_medium(probe, 1488.0, 1540.0)
     before, after = probe.to_target([[40, 12], [40, 112]]), made.to_target([[40, 12], [40, 112]])
     assert after[0] == pytest.approx(before[0])
     assert after[1] - after[0] == pytest.approx((before[1] - before[0]) * 1540 / 1488)
 
 
 def test_there_and_back_is_where_it_was(probe):
-    back = sound_in_water.in_medium(sound_in_water.in_medium(probe, 1488.0, 1540.0, 12.0), 1540.0, 1488.0, 12.0)
+    probe = replace(probe, face_row=12.0)
+    back = sound_in_water.in_medium(sound_in_water.in_medium(probe, 1488.0, 1540.0), 1540.0, 1488.0)
     assert back.scale == pytest.approx(probe.scale) and back.speed_m_s == 1488.0
     assert back.target_from_image == pytest.approx(probe.target_from_image)
     assert back.uncertainty.covariance == pytest.approx(probe.uncertainty.covariance)
@@ -63,13 +67,15 @@ def test_there_and_back_is_where_it_was(probe):
 def test_the_covariance_goes_along(probe, rng):
     """Calibrations drawn from the covariance and converted scatter as the converted covariance says."""
     face, ratio_sigma = 40.0, 0.002
-    made = sound_in_water.in_medium(probe, 1488.0, 1540.0, face, ratio_sigma)
+    probe = replace(probe, face_row=face)
+    made = sound_in_water.in_medium(probe, 1488.0, 1540.0, ratio_sigma)
     placed = []
     for step in rng.multivariate_normal(np.zeros(8), probe.uncertainty.covariance, 3000):
         turn = rigid.from_rotation_vector(step[2:5], [0, 0, 0])[:3, :3] @ probe.target_from_image[:3, :3]
-        drawn = ProbeCalibration(rigid.transform(turn, probe.target_from_image[:3, 3] + step[5:]), probe.scale + step[:2])
+        shifted = rigid.transform(turn, probe.target_from_image[:3, 3] + step[5:])
+        drawn = ProbeCalibration(shifted, probe.scale + step[:2], face_row=face)
         speed = 1540.0 + 1488.0 * ratio_sigma * rng.standard_normal()
-        converted = sound_in_water.in_medium(drawn, 1488.0, speed, face)
+        converted = sound_in_water.in_medium(drawn, 1488.0, speed)
         placed.append(np.concatenate([converted.scale, converted.target_from_image[:3, 3]]))
     kept = [0, 1, 5, 6, 7]
     sampled, predicted = np.cov(np.array(placed), rowvar=False), made.uncertainty.covariance[np.ix_(kept, kept)]
@@ -90,6 +96,10 @@ def test_matrices_and_calibrations_are_converted_alike(probe, rng):
     assert sound_in_water.for_tissue(in_water, None) is in_water
     pixels = rng.uniform(0, 300, (20, 2))
     flat = np.column_stack([pixels, np.zeros(20)])
+    cropped_above = replace(in_water, face_row=30.0)
+    matrix = sound_in_water.in_tissue(sequences.target_from_pixel(cropped_above), in_water.speed_m_s, 1450.0, 30.0)
+    alike = sequences.target_from_pixel(sound_in_water.for_tissue(cropped_above, 1450.0))
+    assert matrix[:, [0, 1, 3]] == pytest.approx(alike[:, [0, 1, 3]])
     matrix = sound_in_water.in_tissue(sequences.target_from_pixel(in_water), in_water.speed_m_s, 1450.0)
     np.testing.assert_allclose(rigid.apply(matrix, flat), made.to_target(pixels), atol=1e-9)
     with pytest.raises(InputError, match="speed: expected a speed of sound of 300 to 5000 m/s, found nan"):
