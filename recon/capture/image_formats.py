@@ -37,7 +37,10 @@ def decode_image(path: Path, data: bytes) -> Pixels:
         _check_chunks(path, data)
     if data.startswith(JPEG_BEGIN) and JPEG_END not in data[-PADDING:]:
         raise InputError(f"{path}: expected a whole JPEG image, found it cut short at {len(data)} bytes")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:  # of images that are declared larger than OpenCV takes
+        image = None
     if image is None or image.shape[0] * image.shape[1] > MOST_PX:
         raise InputError(f"{path}: expected an image ({kinds}), found other or damaged data")
     if image.dtype not in (np.uint8, np.uint16):
@@ -72,3 +75,6 @@ def _check_chunks(path: Path, data: bytes) -> None:
         position = end + 4
     if data[12:16] != b"IHDR":
         raise InputError(f"{path}: expected a PNG image, found no header in it")
+    width, height = struct.unpack_from(">II", data, 16)
+    if width * height > MOST_PX:
+        raise InputError(f"{path}: expected an image of up to {MOST_PX} px, found {width}x{height}")

@@ -64,7 +64,8 @@ def read_image(path: Path, size: Size, bits: int) -> Images:
     if (width, height) != size or depth != stored:
         raise InputError(f"{path}: expected {size[0]}x{size[1]} {stored}-bit, found {width}x{height} {depth}-bit")
     if bits > 8 and (brightest := int(image.max())) >= 1 << bits:
-        raise InputError(f"{path}: expected {bits}-bit values up to {(1 << bits) - 1}, right-aligned, found {brightest}")
+        expected = f"{bits}-bit values up to {(1 << bits) - 1}, right-aligned"
+        raise InputError(f"{path}: expected {expected}, found {brightest}; has the camera 12? describe it with bits=12")
     return luma(image, (1 << bits) - 1)
 
 
@@ -97,7 +98,8 @@ def image_files(folder: Path) -> list[Path]:
     """Images of a folder in natural order, 2.png before 10.png; none if there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted((path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES), key=natural_key)
+    kept = (path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith("."))
+    return sorted(kept, key=natural_key)
 
 
 def frame_file(folder: Path, name: str) -> Path:

@@ -13,7 +13,7 @@ import numpy as np
 import pydicom
 from numpy.typing import NDArray
 from pydicom.errors import BytesLengthException, InvalidDicomError
-from pydicom.pixels import iter_pixels
+from pydicom.pixels import apply_color_lut, iter_pixels
 
 from recon.clips.clip import Box, Clip, checked_seconds
 from recon.errors import InputError
@@ -40,6 +40,8 @@ def read(path: Path) -> Clip:
     try:
         header = _dataset(path, stop_before_pixels=True)
         count = int(header.get("NumberOfFrames") or 1)
+        if count < 1:
+            raise ValueError(f"NumberOfFrames {count}")
         size = int(header.Columns), int(header.Rows)
         seconds, region = times(header, count), b_scan_region(header)
     except DAMAGED as error:
@@ -54,9 +56,8 @@ def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np
     read = 0
     try:
         header = _dataset(path)
-        shift = max(int(header.get("BitsStored", 8)) - 8, 0)
         for frame in iter_pixels(header):
-            yield _grey(frame, shift)
+            yield _grey(frame, header)
             read += 1
     except DAMAGED as error:
         raise InputError(f"{path}: frame {read}: expected an image of {size[0]}x{size[1]}, found {_brief(error)}") from None
@@ -71,10 +72,16 @@ def _dataset(path: Path, stop_before_pixels: bool = False) -> Dataset:
         return pydicom.dcmread(path, stop_before_pixels=stop_before_pixels)
 
 
-def _grey(frame: NDArray, shift: int) -> NDArray[np.uint8]:
-    """A frame : (h, w) or (h, w, 3) RGB."""
-    plain = np.uint8(frame >> shift) if frame.dtype != np.uint8 else frame
-    return plain if plain.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(plain), cv2.COLOR_RGB2GRAY)
+def _grey(frame: NDArray, header: Dataset) -> NDArray[np.uint8]:
+    """Grey levels : (h, w) of a frame of any photometric interpretation; pydicom has made RGB of the other colours."""
+    stored, kind = int(header.get("BitsStored", 8)), str(header.get("PhotometricInterpretation", "MONOCHROME2"))
+    if kind == "PALETTE COLOR":
+        frame = apply_color_lut(frame, header)
+        stored = 8 * frame.dtype.itemsize
+    plain = np.uint8(frame >> max(stored - 8, 0)) if frame.dtype != np.uint8 else frame
+    if plain.ndim == 3:
+        return cv2.cvtColor(np.ascontiguousarray(plain), cv2.COLOR_RGB2GRAY)
+    return 255 - plain if kind == "MONOCHROME1" else plain  # of which 0 is white
 
 
 def times(header: Dataset, count: int) -> NDArray[np.float64] | None:
@@ -98,8 +105,11 @@ def b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | N
             continue
         left, top = int(one.RegionLocationMinX0), int(one.RegionLocationMinY0)
         box = left, top, int(one.RegionLocationMaxX1) - left + 1, int(one.RegionLocationMaxY1) - top + 1
+        if min(box) < 0 or min(box[2:]) == 0:
+            continue
         units = {int(one.get(f"PhysicalUnits{axis}Direction", 0)) for axis in "XY"}
-        scale = (10 * abs(float(one.PhysicalDeltaX)), 10 * abs(float(one.PhysicalDeltaY))) if units == {CENTIMETRES} else None
+        x, y = (10 * abs(float(one.get(f"PhysicalDelta{axis}", 0))) for axis in "XY")
+        scale = (x, y) if units == {CENTIMETRES} and x > 0 and y > 0 else None
         if best is None or box[2] * box[3] > best[0][2] * best[0][3]:
             best = box, scale
     return best

@@ -12,6 +12,7 @@ from recon.model.fan import STEEPEST_DEG, Fan, Mask
 
 Array = NDArray[np.float64]
 
+FIELD = "fan=[u,v,first,last,left,right]"
 LEAST_DEG = 5.0  # between the sides
 LEAST_ROWS = 20  # of a side
 TRIED_ROWS = 60  # of a side, through each two of which a line is laid
@@ -36,7 +37,7 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
         If nothing of some size changes, or what does is no fan.
     """
     mean, deviation = image_region.over_time(frames)
-    part = image_region.changing(deviation, name)
+    part = image_region.changing(deviation, name, FIELD)
     rows = np.flatnonzero(part.any(axis=1))
     left, right = part[rows].argmax(axis=1), part.shape[1] - 1 - part[rows, ::-1].argmax(axis=1)
     sides = [_side(rows, left.astype(float)), _side(rows, -right.astype(float))]
@@ -71,7 +72,7 @@ def _face(mean: NDArray[np.float32], before: Fan) -> float:
 
 
 def _expected() -> str:
-    return "expected a part between two sides and two arcs that changes from frame to frame; give fan=[u,v,first,last,left,right]"
+    return f"expected a part between two sides and two arcs that changes from frame to frame; give {FIELD}"
 
 
 def _side(rows: NDArray[np.int64], outermost: Array) -> tuple[float, float] | None:

@@ -16,8 +16,10 @@ LEAST_SHARE = 0.05  # of the screen
 WHOLE = 0.9  # share of the screen along both sides, from which on nothing is cut away
 
 
-def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Box:
+def find(frames: Iterable[NDArray[np.uint8]], name: str, field: str) -> Box:
     """The box about the largest part that changes, from frames : (h, w) of one size.
+
+    field : that a message names, by which the part is given
 
     Raises
     ------
@@ -25,12 +27,12 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Box:
         If nothing of some size changes.
     """
     _, deviation = over_time(frames)
-    part = changing(deviation, name)
+    part = changing(deviation, name, field)
     (tall, wide), (u, v, width, height) = part.shape, box(part)
     return (0, 0, wide, tall) if width > WHOLE * wide and height > WHOLE * tall else (u, v, width, height)
 
 
-def changing(deviation: NDArray[np.float32], name: str) -> Mask:
+def changing(deviation: NDArray[np.float32], name: str, field: str) -> Mask:
     """The largest part that changes : (h, w), its gaps closed, by `over_time`; InputError if nothing of some size does."""
     changes = deviation > CHANGES_DN
     joined = cv2.morphologyEx(changes.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((JOIN_PX, JOIN_PX), np.uint8))
@@ -38,7 +40,7 @@ def changing(deviation: NDArray[np.float32], name: str) -> Mask:
     count, labels, figures, _ = cv2.connectedComponentsWithStats(opened)
     largest = int(figures[1:, cv2.CC_STAT_AREA].argmax()) + 1 if count > 1 else 0
     if largest == 0 or figures[largest, cv2.CC_STAT_AREA] < LEAST_SHARE * changes.size:
-        raise InputError(f"{name}: expected a B-scan that changes from frame to frame, found none; give crop=[u,v,width,height]")
+        raise InputError(f"{name}: expected a B-scan that changes from frame to frame, found none; give {field}")
     return labels == largest
 
 

@@ -18,7 +18,10 @@ Array = NDArray[np.float64]
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-SEPARATORS = ",;\t "
+SEPARATORS = ",;\t"  # else blanks
+MOST_SECONDS = 9e9  # of a time stamp, that nanoseconds of 64 bits can hold
+LAST_ROW = 1e-6  # by which a matrix' last row may be off 0 0 0 1
+LAST_ROW = 1e-6  # by which a matrix' last row may be off 0 0 0 1
 MOST_OFF = 0.02  # of a rotation from the nearest exact one
 
 Names = tuple[str, ...]
@@ -65,12 +68,19 @@ def read(path: Path, columns: Columns) -> Track:
     lines, table = _numbers(path, columns.names)
     if len(table) < 2:
         raise InputError(f"{path}: expected two rows or more below the header, found {len(table)}")
-    times = np.rint(table[:, 0] * SECONDS[columns.time_unit] * 1e9).astype(np.int64)
+    seconds = table[:, 0] * SECONDS[columns.time_unit]
+    if not (np.abs(seconds) < MOST_SECONDS).all():
+        k = int(np.abs(seconds).argmax())
+        expected = f"seconds below {MOST_SECONDS:g}; another unit? give columns.time_unit=ms, us or ns"
+        raise InputError(f"{path}: line {lines[k]}: {columns.time}: expected {expected}, found {seconds[k]:.15g}")
+    times = np.rint(seconds * 1e9).astype(np.int64)
     wrong = np.flatnonzero(np.diff(times) <= 0) + 1
     if len(wrong):
         line, expected = lines[wrong[0]], "a time after that of the row before"
         raise InputError(f"{path}: line {line}: {columns.time}: expected {expected}, found {table[wrong[0], 0]:.15g}")
     poses = np.full((len(table), 4, 4), np.nan)
+    if not np.isfinite(table[:, 1:]).all(axis=1).any():
+        raise InputError(f"{path}: expected a row with values in all of {', '.join(columns.names)}, found none")
     for k in np.flatnonzero(np.isfinite(table[:, 1:]).all(axis=1)):
         poses[k] = _pose(path, lines[k], table[k, 1:], columns)
     return Track(times, poses)
@@ -79,13 +89,13 @@ def read(path: Path, columns: Columns) -> Track:
 def _pose(path: Path, line: int, values: Array, columns: Columns) -> Array:
     pose = np.eye(4)
     if columns.matrix is not None and len(columns.matrix) > 9:
-        pose[:3] = np.reshape(values[:12], (3, 4))
+        pose[: len(values) // 4] = values.reshape(-1, 4)
     else:
         pose[:3, 3] = values[:3]
         pose[:3, :3] = _rotation(path, line, values[3:])
     pose[:3, 3] *= MILLIMETRES[columns.length_unit]
-    nearest = rigid.nearest(pose)
-    if np.linalg.det(nearest[:3, :3]) < 0 or np.abs(nearest - pose).max() > MOST_OFF:
+    nearest, last = rigid.nearest(pose), np.abs(pose[3] - [0, 0, 0, 1]).max()
+    if np.linalg.det(nearest[:3, :3]) < 0 or np.abs(nearest - pose).max() > MOST_OFF or last > LAST_ROW:
         raise InputError(
             f"{path}: line {line}: expected {rigid.RIGID}, row by row, found {rigid.fault(pose) or 'another matrix'}"
         )
@@ -106,8 +116,9 @@ def _numbers(path: Path, names: Names) -> tuple[list[int], Array]:
     try:
         text = read_bytes(path).decode("utf-8-sig")
         first = text.partition("\n")[0]
-        separator = max(SEPARATORS, key=first.count)
-        rows = [row for row in enumerate(csv.reader(text.splitlines(), delimiter=separator), start=1) if any(row[1])]
+        separator = next((one for one in SEPARATORS if one in first), " ")
+        parsed = csv.reader(text.splitlines(), delimiter=separator, skipinitialspace=True)
+        rows = [row for row in enumerate(parsed, start=1) if any(row[1])]
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: expected a table as CSV text, found other or damaged data") from None
     header = [word.strip() for word in rows[0][1]] if rows else []
@@ -117,6 +128,8 @@ def _numbers(path: Path, names: Names) -> tuple[list[int], Array]:
     places = [header.index(name) for name in names]
     table = np.full((len(rows) - 1, len(names)), np.nan)
     for k, (line, row) in enumerate(rows[1:]):
+        if len(row) > len(header) and any(row[len(header) :]):
+            raise InputError(f"{path}: line {line}: expected {len(header)} values, as the header has, found {len(row)}")
         for j, place in enumerate(places):
             table[k, j] = _number(path, line, names[j], row[place] if place < len(row) else "")
         if not np.isfinite(table[k, 0]):

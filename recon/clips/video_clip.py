@@ -44,10 +44,9 @@ def _frames(path: Path) -> Iterator[tuple[float, NDArray[np.uint8], float]]:
     try:
         rate = float(video.get(cv2.CAP_PROP_FPS))
         while True:
-            stamp = float(video.get(cv2.CAP_PROP_POS_MSEC)) / 1e3
             good, image = video.read()
             if not good:
                 return
-            yield stamp, np.asarray(image, np.uint8), rate
+            yield float(video.get(cv2.CAP_PROP_POS_MSEC)) / 1e3, np.asarray(image, np.uint8), rate  # of the frame just read
     finally:
         video.release()

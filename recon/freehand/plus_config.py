@@ -53,7 +53,7 @@ def read_config(path: Path) -> PlusConfig:
         raise InputError(f"{path}: expected a file, found none") from None
     except OSError as error:
         raise InputError(f"{path}: expected a file to read, found {error.strerror}") from None
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter of encodings
         raise InputError(f"{path}: expected XML, found it broken: {error}") from None
     transforms = _transforms(path, root)
     element = root if root.tag == "VolumeReconstruction" else root.find(".//VolumeReconstruction")

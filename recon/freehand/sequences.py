@@ -23,7 +23,7 @@ from recon.model.probe import ProbeCalibration
 Array = NDArray[np.float64]
 FrameName = Annotated[str, Field(pattern=r"^[A-Z]\w*$")]  # of a frame of reference; of a setting
 
-FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
+FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(.+)")
 TRANSFORM = re.compile(r"([A-Z]\w*?)To([A-Z]\w*)")
 STRUCTURE = {  # fields given by the images and the format, in either of the two
     *("ObjectType", "NDims", "DimSize", "Kinds", "ElementType", "ElementNumberOfChannels", "ElementSpacing", "Offset"),

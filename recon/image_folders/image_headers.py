@@ -52,5 +52,5 @@ def _size(path: Path) -> Size:
     try:
         with Image.open(path) as image:
             return image.size
-    except (UnidentifiedImageError, Image.DecompressionBombError):
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError):
         raise InputError(f"{path}: expected an image, found other or damaged data") from None

@@ -84,12 +84,12 @@ def adjust(
     observations : Observations
         With the noise that the detection predicts. How large it really is, is measured on the residuals, device by device.
     start : Estimate
-        Near the solution: see `start.estimate`.
+        Near the solution: see `initial_estimate.estimate`.
     free : device -> names of parameters
         Those to be adjusted, as in `calibration.Uncertainty`; the rest keep their values. The first device defines the world:
         it has no motion to adjust.
     offsets : (p, n, d, 2) px, optional
-        From where a device would see a point to where the detection puts it: see `circles.centre_offsets`.
+        From where a device would see a point to where the detection puts it: see `circle_projection.centre_offsets`.
     tolerances : Tolerances, optional
         Of the board.
     released : bool

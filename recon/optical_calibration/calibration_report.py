@@ -53,7 +53,7 @@ def write(
     Parameters
     ----------
     metrics : dict
-        Those of `calibration_metrics.measure`.
+        Those of `figures_of_merit.measure`.
     outputs : (file, what is in it)
         For the list at the end.
     commands : sequence of str
@@ -312,7 +312,8 @@ def models(result: Result) -> Section:
     names = list(dict.fromkeys(name for scores in result.scores.values() for name in scores))
     if not names:
         given = ", ".join(f"{NAMES[device]}: {model}" for device, model in result.model.items())
-        return Section("Distortion models", [page.paragraph(f"Given, not chosen by the data. {given}.")])
+        why = "Given, or too few poses to choose by the data"
+        return Section("Distortion models", [page.paragraph(f"{why}. {given}.")])
     rows = []
     for device in result.observations.devices:
         scores = result.scores.get(device, {})

@@ -49,7 +49,7 @@ def choose(observations: Observations, start: Estimate, device: str, offsets: Ar
     start : Estimate
         An adjustment of all devices, with any distortion.
     offsets : (p, n, d, 2) px
-        As in `adjust.adjust`.
+        As in `adjustment.adjust`.
 
     Returns
     -------

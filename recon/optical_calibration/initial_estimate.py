@@ -19,7 +19,7 @@ CONTRADICTING = 1 / 3  # share of such poses from which on the captures contradi
 
 
 def estimate(observations: Observations) -> Estimate:
-    """Estimate devices and poses, well enough for `adjust.adjust` to start from.
+    """Estimate devices and poses, well enough for `adjustment.adjust` to start from.
 
     Each device is calibrated alone (`cv2.calibrateCamera`, Zhang's method), and placed in the first one's frame by the median
     over the poses that both see, so that a few poses that contradict the others don't count.

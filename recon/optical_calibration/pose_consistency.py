@@ -44,7 +44,7 @@ class Consistency:
             return None
         bend = f"the board seems to bend by {self.bend_mm:.2g} mm (RMS) from pose to pose" if self.bend_mm else ""
         rest = f"poses contradict each other by {self.factor:.1f} times the residuals" if self.factor > 1 else ""
-        causes = " and ".join(filter(None, (bend, rest)))
+        causes = " and ".join(filter(None, (bend, rest))) or "poses contradict each other"
         return f"{causes}, which the uncertainty includes: is the board stiff, did a device move or warm up?"
 
 

@@ -39,6 +39,7 @@ MIN_AGREEMENT = 0.95  # their correlation without outliers
 MAX_OUTLIERS = 0.4  # of the images
 RIVAL = 0.98  # correlation of another lag, over the best, that makes the motion ambiguous
 VALLEY = 0.8  # correlation between two such lags, over the best, that separates them
+MOST_PAIRED = 1000  # images by whose pairs the fit begins
 GATE = 4.0  # normalised residual of an outlier
 COVERAGE = 0.95  # of the interval
 BLOCK_PX = 8  # columns taken together
@@ -228,7 +229,8 @@ def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, sta
     seen = np.isfinite(depths)
     used = seen & _within(moments, seconds - lag)
     line = np.zeros(1 + spline(start).size)  # a, b
-    line[1::-1] = stats.theilslopes(depths[used], spline(seconds[used] - lag)[:, 0])[:2]
+    some = np.flatnonzero(used)[:: -(-int(used.sum()) // MOST_PAIRED)]
+    line[1::-1] = stats.theilslopes(depths[some], spline(seconds[some] - lag)[:, 0])[:2]
     variance = np.ones(len(depths))
     for round_ in range(15):
         inside = seen & _within(moments, seconds - lag)

@@ -32,6 +32,7 @@ from recon.model.patterns import Patterns
 from sonotwin import choices
 
 Camera = Literal["cam1", "cam2"]
+LEAST_PX = 8  # of an image's shorter side
 
 
 class Config(BaseModel):
@@ -97,13 +98,14 @@ def read(config: Config, paths: list[str], expected: Expected) -> Reading:
 
 
 def devices_of(config: Config, reading: Reading, patterns: Patterns | None) -> dict[str, Device]:
-    """Cameras by the headers of all images, and by the levels of the first pose; the projector by the patterns."""
+    """Cameras by the headers of all images, and by their levels where they have 16 bits; the projector by the patterns."""
     devices = {}
     for camera in reading.cameras:
-        first = next(view.paths for (_, own), view in reading.views.items() if own == camera)
-        size = image_headers.common_size([config.folder / path for path in reading.paths(camera)])
-        bits = config.bits or image_headers.bits([config.folder / path for path in first])
-        devices[camera] = Device(size=size, bits=bits)
+        paths = [config.folder / path for path in reading.paths(camera)]
+        size = image_headers.common_size(paths)
+        if min(size) < LEAST_PX:
+            raise InputError(f"{paths[0]}: expected {LEAST_PX}x{LEAST_PX} px or more, found {size[0]}x{size[1]}")
+        devices[camera] = Device(size=size, bits=config.bits or image_headers.bits(paths))
     return devices if patterns is None else devices | {"projector": Device(size=patterns.projector_size)}
 
 

@@ -24,11 +24,10 @@ from recon.capture.manifest import SCANNER, Device, Purpose
 from recon.capture.writer import new_capture
 from recon.clips import clip_reader, image_region, pose_tables
 from recon.clips.clip import Box, Clip
-from recon.clips.pose_tables import Columns
+from recon.clips.pose_tables import MOST_SECONDS, Columns
 from recon.errors import InputError
 from recon.files import atomic
 from recon.freehand import volume_compounding
-from recon.model.rig import Finite, Positive
 from recon.model.tracks import Track
 
 Least = Annotated[int, Field(ge=0)]
@@ -44,8 +43,8 @@ class Config(BaseModel):
     poses: Path
     columns: Columns
     out: Path
-    rate_hz: Positive | None = None
-    starts_s: Finite | None = None
+    rate_hz: Annotated[float, Field(ge=0.01, le=1e5)] | None = None
+    starts_s: Annotated[float, Field(gt=-MOST_SECONDS, lt=MOST_SECONDS)] | None = None
     crop: Literal["auto", "whole"] | tuple[Least, Least, Size, Size] = "auto"
     purpose: Purpose = "volume"
 
@@ -102,7 +101,7 @@ def b_scan(config: Config, clip: Clip) -> Box:
         return 0, 0, width, height
     if config.crop == "auto":
         if clip.image is None:
-            return image_region.find(clip.stream(), str(config.clip))
+            return image_region.find(clip.stream(), str(config.clip), "crop=[u,v,width,height]")
         u, v, wide, tall = clip.image
         if u + wide > width or v + tall > height:
             raise InputError(

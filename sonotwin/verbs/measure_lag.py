@@ -128,7 +128,7 @@ def bottom_depths(sweep: SweepCapture | SequenceSweep, clip: Clip, top_px: int, 
 def part_of_screen(sweep: SweepCapture | SequenceSweep, top_px: int) -> Clip | None:
     """The part of a screen that changes, with the rows above it that are left out anyway; None if that is all, or nothing."""
     try:
-        u, v, width, height = image_region.find(sweep.images(), sweep.name)
+        u, v, width, height = image_region.find(sweep.images(), sweep.name, "clip=[u,v,width,height]")
     except InputError:
         return None
     above = min(v, top_px)

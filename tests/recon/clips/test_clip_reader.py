@@ -7,7 +7,7 @@ import pytest
 from pydicom.encaps import encapsulate
 from pydicom.uid import JPEGBaseline8Bit, JPEGLSLossless
 
-from recon.clips import clip_reader, image_region
+from recon.clips import clip_reader, image_region, video_clip
 from recon.errors import InputError
 from tests.recon.clips import made_clips
 from tests.recon.clips.made_clips import BOX, SCREEN
@@ -71,6 +71,35 @@ def compressed(path, frames, syntax) -> None:
     read.save_as(path)
 
 
+def test_grey_levels_are_those_that_the_file_means(tmp_path):
+    """Of a palette its colours, of MONOCHROME1 the complement: neither is what is stored."""
+    stored = np.arange(64, dtype=np.uint8).reshape(1, 8, 8)
+    made_clips.write_dicom(tmp_path / "inverse.dcm", stored, region=False, PhotometricInterpretation="MONOCHROME1")
+    assert (frames_of(clip_reader.read(tmp_path / "inverse.dcm")) == 255 - stored).all()
+    white_to_black = (np.arange(256, dtype=np.uint16)[::-1] * 257).tobytes()
+    palette = {f"{colour}PaletteColorLookupTableData": white_to_black for colour in ("Red", "Green", "Blue")}
+    palette |= {f"{colour}PaletteColorLookupTableDescriptor": [256, 0, 16] for colour in ("Red", "Green", "Blue")}
+    made_clips.write_dicom(tmp_path / "palette.dcm", stored, region=False, PhotometricInterpretation="PALETTE COLOR", **palette)
+    assert (frames_of(clip_reader.read(tmp_path / "palette.dcm")) == 255 - stored).all()
+
+
+@pytest.mark.parametrize("change", [{"NumberOfFrames": -5}, {"NumberOfFrames": 0}])
+def test_frames_are_counted(change, tmp_path):
+    made_clips.write_dicom(tmp_path / "scan.dcm", made_clips.scans(2), **change)
+    with pytest.raises(InputError, match="scan.dcm"):
+        frames_of(clip_reader.read(tmp_path / "scan.dcm"))
+
+
+def test_a_region_turned_round_or_without_a_scale_is_left_out(tmp_path):
+    reversed_, scaleless = made_clips.region_of((20, 20, -6, -8), 1, 1), made_clips.region_of(BOX, 1, 1)
+    scaleless.PhysicalDeltaX = 0.0
+    for region, image in ((reversed_, None), (scaleless, BOX)):
+        regions = {"SequenceOfUltrasoundRegions": pydicom.sequence.Sequence([region])}
+        made_clips.write_dicom(tmp_path / "scan.dcm", made_clips.screens(made_clips.scans(2)), **regions)
+        clip = clip_reader.read(tmp_path / "scan.dcm")
+        assert clip.image == image and clip.mm_per_px is None
+
+
 def test_jpeg_in_a_dicom_file_is_read(tmp_path):
     smooth = np.stack([cv2.GaussianBlur(image, (0, 0), 3) for image in made_clips.scans(3)])
     compressed(tmp_path / "scan.dcm", smooth, JPEGBaseline8Bit)
@@ -118,6 +147,9 @@ def test_a_video_gives_its_frames_and_times(tmp_path):
     clip = clip_reader.read(tmp_path / "screen.avi")
     assert clip.size == SCREEN and clip.seconds == pytest.approx(np.arange(6) / 25)
     assert np.abs(np.float64(frames_of(clip)) - shown).mean() < 2
+    assert [stamp for stamp, _, _ in video_clip._frames(tmp_path / "screen.avi")] == pytest.approx(np.arange(6) / 25), (
+        "not even by the rate"
+    )
     (tmp_path / "none.mp4").write_bytes(b"none")
     with pytest.raises(InputError, match=r"none\.mp4: expected a video"):
         clip_reader.read(tmp_path / "none.mp4")
@@ -136,10 +168,10 @@ def test_the_b_scan_is_what_changes_on_the_screen(moved):
     """Wherever it is; texts, frames and a running clock aren't."""
     shown = np.roll(made_clips.screens(made_clips.scans(12)), moved[::-1], axis=(1, 2))
     u, v, width, height = BOX
-    assert image_region.find(shown, "screen") == pytest.approx((u + moved[0], v + moved[1], width, height), abs=2)
+    assert image_region.find(shown, "screen", "crop=...") == pytest.approx((u + moved[0], v + moved[1], width, height), abs=2)
 
 
 def test_a_clip_that_is_all_b_scan_stays_whole():
-    assert image_region.find(made_clips.scans(8), "clip") == (0, 0, *BOX[2:])
+    assert image_region.find(made_clips.scans(8), "clip", "crop=...") == (0, 0, *BOX[2:])
     with pytest.raises(InputError, match=r"still: expected a B-scan that changes .* give crop"):
-        image_region.find(np.repeat(made_clips.scans(1), 5, axis=0), "still")
+        image_region.find(np.repeat(made_clips.scans(1), 5, axis=0), "still", "crop=...")

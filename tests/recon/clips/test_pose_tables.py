@@ -51,6 +51,22 @@ def test_matrices_row_by_row(count, tmp_path):
     assert_same(pose_tables.read(tmp_path / "t.csv", columns))
 
 
+def test_matrices_column_by_column_are_refused(tmp_path):
+    """Their last row isn't 0 0 0 1: taken as it stands they would be turned back and lose their place."""
+    names = tuple(f"m{k}" for k in range(16))
+    write(tmp_path / "t.csv", ["t", *names], np.column_stack([SECONDS, POSES.transpose(0, 2, 1).reshape(-1, 16)]))
+    with pytest.raises(InputError, match=r"line 2: expected a rigid transform .* row by row"):
+        pose_tables.read(tmp_path / "t.csv", Columns(time="t", matrix=names))
+
+
+def test_headers_with_blanks_and_columns_set_apart_by_some(tmp_path):
+    (tmp_path / "t.csv").write_text("Time (s),X (mm),y,z,a,b,c,d\n0.5,1,2,3,0,0,0,1\n1.5,1,2,3,0,0,0,1\n")
+    columns = Columns(time="Time (s)", translation=("X (mm)", "y", "z"), quaternion=("a", "b", "c", "d"))
+    assert pose_tables.read(tmp_path / "t.csv", columns).poses[0, :3, 3].tolist() == [1, 2, 3]
+    (tmp_path / "t.txt").write_text("t   x y  z a b c d\n0.5  1  2 3 0 0  0 1\n1.5 1 2  3 0 0 0 1\n")
+    assert pose_tables.read(tmp_path / "t.txt", QUATERNION).poses[0, :3, 3].tolist() == [1, 2, 3]
+
+
 def test_inverted_poses_are_turned_around(tmp_path):
     names = [f"m{k}" for k in range(12)]
     write(tmp_path / "t.csv", ["t", *names], np.column_stack([SECONDS, np.linalg.inv(POSES).reshape(-1, 16)[:, :12]]))
@@ -79,6 +95,9 @@ def test_rows_without_values_are_poses_that_were_not_found(tmp_path):
         (HEADER + "0,0,0,0,0,0,0,1\n1,0,left,0,0,0,0,1\n", r"line 3: y: expected a number, found 'left'"),
         (HEADER + "0,0,0,0,0,0,0,1\n,0,0,0,0,0,0,1\n", r"line 3: t: expected a time, found none"),
         ("", "line 1: expected a column t, found none"),
+        (HEADER + "0,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,1,8\n", r"line 3: expected 8 values, as the header has, found 9"),
+        (HEADER + "1,,,,,,,\n2,,,,,,,\n", "expected a row with values in all of t, x, y, z, a, b, c, d, found none"),
+        (HEADER + "1.7e18,0,0,0,0,0,0,1\n1.8e18,0,0,0,0,0,0,1\n", r"line 3: t: expected seconds below 9e\+09; another unit\?"),
     ],
 )
 def test_faults_are_named_by_line_and_column(text, complaint, tmp_path):

@@ -73,6 +73,21 @@ def test_a_doubtful_bit_is_trusted_only_if_it_does_not_matter(rng):
         assert found.trusted.mean() < 0.01
 
 
+def test_a_doubtful_bit_of_a_complementary_code_mostly_does_not_matter(rng):
+    """Of the finest bit, which both ways of reading put into neighbouring cells of one order, or of another."""
+    fringes, code = Fringes(pitch=18, steps=18), GrayCode(pitch=18, bits=8, complementary=True)
+    patterns = Patterns(projector_size=(1280, 800), unwrap="gray", parts=(fringes, code))
+    x = rng.uniform(10, 1270, (100, 120))
+    images = photograph(patterns, {"columns": x}, rng, noise=Noise(0.1, 0.0))
+    fringe = wrapped_phase(images[:18], fringes.shifts, noise=NOISE, saturation=255)
+    doubtful = images[18:].copy()
+    doubtful[-1] = 8 + 90
+    found, _ = fringe_order(doubtful, code, fringes, fringe, 1280, NOISE)
+    decoded = fringes.zero(1280) + 18 * (fringe.phase / (2 * np.pi) + found.order)
+    assert found.trusted.mean() > 0.3
+    assert (np.abs(decoded - x)[found.trusted] < 1).all()
+
+
 def test_gamma_does_not_move_the_threshold(rng):
     """Grey fringes pass the gamma and are darker in the mean than half of white: the bits' borders must not follow them.
 
