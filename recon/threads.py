@@ -4,9 +4,11 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, TypeVar
 
+import cv2
 import numba
 
 Result = TypeVar("Result")
@@ -70,6 +72,17 @@ def mapped(work: Callable[..., Result], *streams: Iterable[Any], most: int | Non
             yield waiting.popleft().result()
     finally:
         pool.shutdown(cancel_futures=True)  # of those that nobody waits for any more
+
+
+@contextmanager
+def opencv_on_one_thread() -> Iterator[None]:
+    """Let OpenCV add up in one order meanwhile, so that each call gives the same bits; it holds for the whole process."""
+    count = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(count)
 
 
 @cache

@@ -73,6 +73,7 @@ quotes: `sonotwin surface "out=outputs/my run"`.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # of a damaged image we say so ourselves, in one line
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: one order of sums, the same bytes on any number of cores
     try:
         status = _run(sys.argv[1:] if arguments is None else list(arguments))
         sys.stdout.flush()

@@ -27,7 +27,8 @@ Result = TypeVar("Result")
 Work = Callable[..., Result]
 Task = tuple[Any, ...]  # arguments of the work
 
-THREADS = ("SONOTWIN_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+THREADS = ("SONOTWIN_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")  # whose results are the same from any number
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # of linear algebra, whose sums are not
 FIRST_WORKER_S = 60.0  # that a scheduler is given to have a worker
 AHEAD = 2  # tasks a thread of Dask's, so that none waits for the next one
 
@@ -227,8 +228,8 @@ def _client(engine: Engine) -> Iterator[Any]:
 @contextmanager
 def _threads(count: int) -> Iterator[None]:
     """Give processes that are begun meanwhile so many threads each."""
-    kept = {name: os.environ.get(name) for name in THREADS}
-    os.environ |= dict.fromkeys(THREADS, str(count))
+    kept = {name: os.environ.get(name) for name in (*THREADS, *ONE_THREAD)}
+    os.environ |= dict.fromkeys(THREADS, str(count)) | dict.fromkeys(ONE_THREAD, "1")
     try:
         yield
     finally:

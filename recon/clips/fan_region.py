@@ -19,8 +19,9 @@ TRIED_ROWS = 60  # of a side, through each two of which a line is laid
 NEAR_PX = 2.0  # of a side
 STRAIGHT = 0.5  # share of a side's rows near its line
 RINGING_DN = 8.0  # of the face, in the mean over time
-WITHIN = 0.95  # share of the changing part in the fan
-COVERED = 0.6  # share of the fan in the changing part; water doesn't change, nor do shadows
+STIRS_DN = 0.3  # standard deviation over time, of what is dark but no border
+WITHIN = 0.9  # share of the changing part in the fan
+COVERED = 0.6  # share of the fan that stirs; black water doesn't, nor do shadows
 EDGE_PX = 12  # of the image, within which an arc may be cut off
 BINS = 60  # of directions, in each of which the fan's first and last radius are taken
 
@@ -51,24 +52,34 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
     u = start + slope * v
     first, last = _radii(part, u, v)
     before = Fan(u, v, 0.0, first, float(left_deg), float(right_deg))
-    fan = replace(before, first_px=_face(mean, before), last_px=last)
+    fan = replace(before, first_px=_face(mean, before), last_px=_end(deviation, replace(before, last_px=last)))
     inside = fan.mask((part.shape[0], part.shape[1]))
-    common = (inside & part).sum()
-    if common < WITHIN * part.sum() or common < COVERED * inside.sum():
-        found = f"{100 * common / part.sum():.0f} % of it in a fan, of which it is {100 * common / max(inside.sum(), 1):.0f} %"
+    within, stirring = inside[part].mean(), (deviation > STIRS_DN)[inside].mean()
+    if within < WITHIN or stirring < COVERED:
+        found = f"{100 * within:.0f} % of it in a fan, of which {100 * stirring:.0f} % change"
         raise InputError(f"{name}: {_expected()}, found {found}")
     return fan
 
 
 def _face(mean: NDArray[np.float32], before: Fan) -> float:
     """Radius at which the face's ringing begins in the mean image, before the arc where changes do; there, if nothing rings."""
-    y, x = np.nonzero(before.mask((mean.shape[0], mean.shape[1])))
-    ring = np.hypot(x - before.u, y - before.v).astype(int)
-    if not ring.size:
-        return before.last_px
-    pixels, bright = np.bincount(ring), np.bincount(ring, mean[y, x] > RINGING_DN)
-    ringing = np.flatnonzero((pixels > 0) & (bright > pixels / 2))
+    ringing = np.flatnonzero(_shares(mean > RINGING_DN, before) > 0.5)
     return float(ringing[0]) if ringing.size else before.last_px
+
+
+def _end(deviation: NDArray[np.float32], fan: Fan) -> float:
+    """Radius at which the fan ends, maybe beyond its last clear changes: up to there at least the dark's noise stirs."""
+    farthest = float(np.hypot(*deviation.shape) + abs(fan.v))
+    stirring = np.flatnonzero(_shares(deviation > STIRS_DN, replace(fan, last_px=farthest)) > 0.5)
+    return max(fan.last_px, float(stirring[-1]) + 1) if stirring.size else fan.last_px
+
+
+def _shares(marked: Mask, fan: Fan) -> Array:
+    """Share of marked pixels on each arc between a fan's sides, by its radius in px; 0 where it has no pixel."""
+    y, x = np.nonzero(fan.mask((marked.shape[0], marked.shape[1])))
+    ring = np.hypot(x - fan.u, y - fan.v).astype(int)
+    pixels = np.bincount(ring, minlength=int(fan.last_px) + 1)
+    return np.bincount(ring, marked[y, x], minlength=len(pixels)) / np.maximum(pixels, 1)
 
 
 def _expected() -> str:

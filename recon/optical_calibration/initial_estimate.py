@@ -11,6 +11,7 @@ from recon.geometry.camera import Camera
 from recon.optical_calibration.bundle import Array, Estimate
 from recon.optical_calibration.observations import Observations
 from recon.optical_calibration.sightings import ENOUGH
+from recon.threads import opencv_on_one_thread
 
 HEIGHTS = (0.5, 0.0, 1.0)  # of the principal point, tried in turn: a projector's lies near an edge, and the wrong guess may stay
 ENOUGH_STEPS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 1e-6)  # to a relative change; OpenCV's is rounding's
@@ -57,7 +58,8 @@ def alone(observations: Observations, number: int) -> tuple[Camera, Array]:
     objects = [np.float32(observations.points[seen[k]]) for k in enough]
     pixels = [np.float32(observations.pixels[k, seen[k], number]) for k in enough]
     size = observations.sizes[number]
-    trials = [_zhang(objects, pixels, size, height) for height in HEIGHTS]
+    with opencv_on_one_thread():
+        trials = [_zhang(objects, pixels, size, height) for height in HEIGHTS]
     _, matrix, distortion, turns, shifts = min(trials, key=lambda trial: trial[0])
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise ValueError(

@@ -25,7 +25,9 @@ from twin.conditions import Conditions
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
-Group = Literal["optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking", "session", "studies"]
+Group = Literal[
+    "optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking", "session", "studies", "strangers"
+]  # fmt: skip
 MODULES = {
     "session": "sonotwin.session_accuracy",
     "studies": "sonotwin.study_accuracy",

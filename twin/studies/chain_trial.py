@@ -35,6 +35,11 @@ CONDITIONS = (  # that act on drawn measurements
     "conditions.sound",
     "conditions.drift",
 )
+RIG = (
+    *(f"rig.{device}.optics" for device in ("cam1", "cam2", "projector")),
+    "rig.target",
+    "rig.probe",
+)  # sensors act in images only
 NEWTON_STEPS = 5
 DEPTHS_MM = (620.0, 660.0, 700.0)  # z of the surface's points
 GRID = (7, 7)  # pixels of a B-scan, across and down
@@ -157,7 +162,7 @@ def predicted_places(found: Session, latency_s: float, tissue: float, pixels: Ar
 
 
 EXPERIMENT = Experiment(
-    ("rig", "layout", *CONDITIONS, "noise", "poses", "ultrasound"),
+    (*RIG, "layout", *CONDITIONS, "noise", "poses", "ultrasound"),
     measure,
     {"surface_rms_mm": "surface_predicted_mm", "pixel_rms_mm": "pixel_predicted_mm", "mass_error_mm": "", "mass_to_skin_mm": ""},
     "predicted by the software's covariances",
