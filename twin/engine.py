@@ -13,7 +13,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from itertools import islice
-from multiprocessing import active_children, connection, get_context, parent_process
+from multiprocessing import active_children, connection, get_context, parent_process, resource_tracker
 from multiprocessing.process import BaseProcess
 from threading import Thread
 from typing import Annotated, Any, Literal, TypeVar
@@ -209,7 +209,8 @@ def _client(engine: Engine) -> Iterator[Any]:
             stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": engine.retries}))
             stack.enter_context(_threads(max((os.cpu_count() or 1) // engine.workers, 1)))
             here = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
-            local = LocalCluster(engine.workers, threads_per_worker=1, **here)
+            with _no_interrupts():
+                local = LocalCluster(engine.workers, threads_per_worker=1, **here)
             client = stack.enter_context(Client(stack.enter_context(local)))
         else:
             try:
@@ -223,6 +224,20 @@ def _client(engine: Engine) -> Iterator[Any]:
         except KilledWorker as error:
             reason = "likely for want of memory; start Dask with fewer workers a machine"
             raise InputError(f"engine: a task's worker died {error.allowed_failures + 1} times, {reason}") from None
+
+
+@contextmanager
+def _no_interrupts() -> Iterator[None]:
+    """Hold Ctrl-C back; threads and processes that are begun meanwhile never get it, as this process ends them all."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # which lets Ctrl-C through again when it begins
+    kept = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, kept)
 
 
 @contextmanager

@@ -1,9 +1,14 @@
 """`sonotwin study`: studies of conf/study can be planned, a sweep runs from end to end, mistakes are refused beforehand."""
 
 import json
+import os
 import re
 import shlex
+import signal
+import subprocess
+import sys
 from html import unescape
+from time import sleep
 
 import pyarrow.parquet as pq
 import pytest
@@ -255,6 +260,42 @@ def test_a_sweep_from_end_to_end(tmp_path, capsys):
     assert "4 trials, 4 of them there already" in capsys.readouterr().out and (out / "table.parquet").read_bytes() == table
     assert main([*fields, "seeds=3", "noise.scans=8"]) == 0
     assert "6 trials, 4 of them there already" in capsys.readouterr().out
+
+
+COMMAND = [sys.executable, "-c", "import sys; from sonotwin.cli import main; sys.exit(main())", "study"]
+
+
+@pytest.mark.slow
+def test_tables_are_the_same_bytes_from_any_number_of_threads(tmp_path):
+    """Of drawn sessions, whose calibrations make much of a last bit: in processes that may have one thread or several."""
+    tables = []
+    for count in ("1", "2"):
+        threads = dict.fromkeys(("NUMBA_NUM_THREADS", "SONOTWIN_THREADS", "OMP_NUM_THREADS"), count)
+        kept = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+        fields = ["name=sweep", *SMALL, "over={noise.board_px: [0.004, 0.008]}", "seeds=1", f"out={tmp_path / count}"]
+        subprocess.run([*COMMAND, *fields], env=kept | threads, check=True, capture_output=True)
+        tables.append((tmp_path / count / "table.parquet").read_bytes())
+    assert tables[0] == tables[1]
+
+
+@pytest.mark.slow
+def test_a_key_press_that_reaches_dasks_workers_is_told_in_one_line(tmp_path):
+    """Ctrl-C in a terminal goes to all processes of the group."""
+    pytest.importorskip("distributed")
+    fields = ["name=sweep", *SMALL, "over={noise.board_px: [0.004, 0.008]}", "seeds=50", "engine=dask", "engine.workers=2"]
+    with subprocess.Popen(
+        [*COMMAND, *fields, f"out={tmp_path / 'out'}"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    ) as running:  # fmt: skip
+        try:
+            while not list((tmp_path / "out").glob("**/trials/*.json")) and running.poll() is None:
+                sleep(0.2)
+            os.killpg(running.pid, signal.SIGINT)
+            _, said = running.communicate(timeout=60)
+        finally:
+            if running.poll() is None:
+                os.killpg(running.pid, signal.SIGKILL)
+    assert (running.returncode, said) == (130, "sonotwin: interrupted\n")
 
 
 @pytest.mark.slow

@@ -250,8 +250,25 @@ def test_fields_that_an_experiment_does_not_read_are_refused():
 
 def test_parts_of_a_field_that_would_change_nothing_are_refused():
     """Of conditions the chain reads some; a whole that holds one of them, and a part of one, are read."""
-    experiments.check_reads("chain", ["conditions", "conditions.board", "conditions.board.bow_mm", "conditions.drift.focal"])
-    for inert in ("conditions.skin.wet", "conditions.board.diameter_mm", "conditions.board.bow", "conditions.frames", "nois"):
+    experiments.check_reads(
+        "chain",
+        [
+            "rig.probe",
+            "rig.cam1.optics.focal_px",
+            "conditions",
+            "conditions.board",
+            "conditions.board.bow_mm",
+            "conditions.drift.focal",
+        ],
+    )
+    for inert in (
+        "conditions.skin.wet",
+        "conditions.board.diameter_mm",
+        "conditions.board.bow",
+        "conditions.frames",
+        "rig.cam1.sensor",
+        "nois",
+    ):
         with pytest.raises(InputError, match=rf"over: {inert}: expected a field that of=chain reads, .* would change nothing"):
             experiments.check_reads("chain", ["noise", inert])
 
