@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from recon.clips import image_region
 from recon.errors import InputError
-from recon.model.fan import STEEPEST_DEG, Fan, Mask
+from recon.model.fan import STEEPEST_DEG, Fan, Mask, box
 
 Array = NDArray[np.float64]
 
+EXPECTED = "expected a part between two sides and two arcs that changes from frame to frame"
 FIELD = "fan=[u,v,first,last,left,right]"
 LEAST_DEG = 5.0  # between the sides
 LEAST_ROWS = 20  # of a side
@@ -39,15 +40,16 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
     """
     mean, deviation = image_region.over_time(frames)
     part = image_region.changing(deviation, name, FIELD)
+    expected = f"{EXPECTED}; give {FIELD}, or clip=[{','.join(map(str, box(part)))}], a rectangle about it"
     rows = np.flatnonzero(part.any(axis=1))
     left, right = part[rows].argmax(axis=1), part.shape[1] - 1 - part[rows, ::-1].argmax(axis=1)
     sides = [_side(rows, left.astype(float)), _side(rows, -right.astype(float))]
     if any(side is None for side in sides):
-        raise InputError(f"{name}: {_expected()}, found one without straight sides")
+        raise InputError(f"{name}: {expected}, found one without straight sides")
     (slope, start), (mirrored, end) = (side for side in sides if side is not None)
     left_deg, right_deg = np.rad2deg(np.arctan([slope, -mirrored]))
     if right_deg - left_deg <= LEAST_DEG or max(-left_deg, right_deg) > STEEPEST_DEG:
-        raise InputError(f"{name}: {_expected()}, found sides at {left_deg:.0f} and {right_deg:.0f} deg")
+        raise InputError(f"{name}: {expected}, found sides at {left_deg:.0f} and {right_deg:.0f} deg")
     v = (start + end) / -(slope + mirrored)
     u = start + slope * v
     first, last = _radii(part, u, v)
@@ -57,7 +59,7 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
     within, stirring = inside[part].mean(), (deviation > STIRS_DN)[inside].mean()
     if within < WITHIN or stirring < COVERED:
         found = f"{100 * within:.0f} % of it in a fan, of which {100 * stirring:.0f} % change"
-        raise InputError(f"{name}: {_expected()}, found {found}")
+        raise InputError(f"{name}: {expected}, found {found}")
     return fan
 
 
@@ -80,10 +82,6 @@ def _shares(marked: Mask, fan: Fan) -> Array:
     ring = np.hypot(x - fan.u, y - fan.v).astype(int)
     pixels = np.bincount(ring, minlength=int(fan.last_px) + 1)
     return np.bincount(ring, marked[y, x], minlength=len(pixels)) / np.maximum(pixels, 1)
-
-
-def _expected() -> str:
-    return f"expected a part between two sides and two arcs that changes from frame to frame; give {FIELD}"
 
 
 def _side(rows: NDArray[np.int64], outermost: Array) -> tuple[float, float] | None:

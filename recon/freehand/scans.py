@@ -179,7 +179,8 @@ def of_sequence(
         else:
             world_from_pixel = sequences.poses(frames, reference, target, fixed) @ sequences.target_from_pixel(probe)
     except InputError as error:
-        hint = "; no calibration of the probe among them? give probe=... or config=..." if probe is None and not fixed else ""
+        asked = probe is None and not fixed and frames.transforms
+        hint = "; no calibration of the probe among them? give probe=... or config=..." if asked else ""
         raise InputError(f"{path}: {error}{hint}") from None
     placed = sequence_sweep.lagged(str(path), frames.times_s, world_from_pixel, lag_s)
     calibrated, face_row = (SCANNER_SPEED, 0.0) if probe is None else (probe.speed_m_s, probe.face_row)

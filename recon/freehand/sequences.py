@@ -12,7 +12,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
+from pydantic import AfterValidator
 
 from recon.errors import InputError
 from recon.files import atomic, medical_images
@@ -21,7 +21,15 @@ from recon.freehand import sequence_images
 from recon.model.probe import ProbeCalibration
 
 Array = NDArray[np.float64]
-FrameName = Annotated[str, Field(pattern=r"^[A-Z]\w*$")]  # of a frame of reference; of a setting
+
+
+def _named(name: str) -> str:
+    if not re.fullmatch(r"[A-Z]\w*", name):
+        raise ValueError(f"expected a frame as in the sequence's transforms, AToB, with a capital letter first, found {name}")
+    return name
+
+
+FrameName = Annotated[str, AfterValidator(_named)]  # of a frame of reference; of a setting
 
 FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(.+)")
 TRANSFORM = re.compile(r"([A-Z]\w*?)To([A-Z]\w*)")
@@ -134,6 +142,9 @@ def poses(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = 
             if there not in reached:
                 reached[there] = there_from_here @ reached[here]
                 waiting.append(there)
+    if to not in reached and not frames.transforms:
+        expected = "some in each frame, such as ProbeToTracker, of the tracker"
+        raise InputError(f"transforms: expected {expected}, found none: without poses nothing says where an image was taken")
     if to not in reached:
         known = ", ".join(dict.fromkeys([*(fixed or {}), *frames.transforms])) or "none"
         ends = f", which lead from there to {', '.join(list(reached)[1:])}" if len(reached) > 1 else ""

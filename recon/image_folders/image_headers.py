@@ -27,7 +27,7 @@ def common_size(paths: Sequence[Path]) -> Size:
     for path in paths[1:]:
         if (found := _size(path)) != size:
             expected = f"{size[0]}x{size[1]}, as {paths[0]} of the same camera"
-            raise InputError(f"{path}: expected {expected}, found {found[0]}x{found[1]}: is it another camera's?")
+            raise InputError(f"{path}: expected {expected}, found {found[0]}x{found[1]}: another camera's? files=... takes some")
     return size
 
 

@@ -51,18 +51,18 @@ class Fan:
         return within & (begun | (down >= self.first_px)) & ~ended & (down <= self.last_px)
 
 
-def _of_setting(value: Any) -> Numbers | Literal["find"]:
-    """Six numbers that make a fan, or the word find."""
-    if value == "find":
-        return "find"
+def _of_setting(value: Any) -> Numbers | Literal["find", "none"]:
+    """Six numbers that make a fan, or the words find or none."""
+    if value in ("find", "none"):
+        return value
     numbers = value if isinstance(value, list | tuple) else ()
     if len(numbers) != 6 or not all(isinstance(number, int | float) and isfinite(number) for number in numbers):
-        raise ValueError(f"expected find or [u,v,first,last,left,right], found {value}")
+        raise ValueError(f"expected find, none or [u,v,first,last,left,right], found {value}")
     Fan(*numbers)
     return tuple(numbers)
 
 
-Sector = Annotated[Numbers | Literal["find"], PlainValidator(_of_setting)]  # of a setting: u, v, radii px, angles deg
+Sector = Annotated[Numbers | Literal["find", "none"], PlainValidator(_of_setting)]  # of a setting: u, v, radii px, angles deg
 
 
 def box(mask: Mask) -> tuple[int, int, int, int]:

@@ -38,7 +38,8 @@ def sizes_of(captured: BoardCapture, chosen: Sequence[DeviceName] | None = None)
     taken = [name for name in DEVICES if name in sizes and (chosen is None or name in chosen)]
     if DEVICES[0] not in taken:
         found = ", ".join(sizes if chosen is None else taken)
-        raise InputError(f"{captured.name}: expected images of {DEVICES[0]}, the world's frame, found {found}")
+        way = f"to calibrate another camera alone, describe its images as those of {DEVICES[0]}"
+        raise InputError(f"{captured.name}: expected images of {DEVICES[0]}, the world's frame, found {found}; {way}")
     return {name: sizes[name] for name in taken}
 
 

@@ -118,6 +118,7 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
         found.append(f"only {len(observations.poses)} poses: {FEW_POSES} to 40 are usual")
     if not adjustment.converged:
         found.append("the adjustment ended before it converged: the poses hardly determine the lenses; more of them, tilted more")
+    found += _contradictions(observations, adjustment)
     uncertainty = adjustment.calibration.uncertainty
     for number, device in enumerate(observations.devices):
         camera = adjustment.calibration.cameras[device]
@@ -138,21 +139,21 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
                 f"{device}: points surround {100 * share:.0f} % of the image; "
                 f"none {_where(seen, part)}, where distortion is a guess"
             )
-        if (factor := adjustment.noise[device]) > NOISY:
-            found.append(
-                f"{device}: residuals are {factor:.1f} times what detection predicts: board not flat or not to measure, "
-                "moved between images, or a lens that the model doesn't describe" + _alone(device, observations.devices)
-            )
         if uncertainty and (sigma := uncertainty.sigma(f"{device}.fx") / camera.matrix[0, 0]) > UNSURE_FOCAL:
             found.append(f"{device}: focal length is known to {100 * sigma:.2g} % only: more poses, tilted more")
     return found
 
 
-def _alone(device: str, devices: Sequence[str]) -> str:
-    """How to tell cameras that don't expose at the same moment: each of them fits its own images."""
-    if device == PROJECTOR or len(devices) == 1:
-        return ""
-    return f"; if it goes away with devices=[{device}], the devices saw the board at different moments"
+def _contradictions(observations: Observations, adjustment: Adjustment) -> list[str]:
+    """Warnings of residuals beyond what detection predicts; of two cameras, that they may have exposed at different moments."""
+    found, cameras = [], [device for device in observations.devices if device != PROJECTOR]
+    for device in observations.devices:
+        if (factor := adjustment.noise[device]) > NOISY:
+            causes = "board not flat or not to measure, moved between images, or a lens that the model doesn't describe"
+            if device in cameras and len(cameras) > 1:
+                causes = f"did both cameras expose at the same moment? devices=[{cameras[0]}] shows one alone; or {causes}"
+            found.append(f"{device}: residuals are {factor:.1f} times what detection predicts: {causes}")
+    return found
 
 
 def measuring_part(adjustment: Adjustment, device: str) -> Array:

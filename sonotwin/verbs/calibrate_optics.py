@@ -103,6 +103,11 @@ def run(config: Config) -> None:
     result = board_frames.with_absent(result, sizes, captured.cameras)
     if PROJECTOR not in result.observations.devices and (others := other_patterns(captured, sizes, console)):
         result = replace(result, warnings=(*result.warnings, f"{PROJECTOR}: {others}"))
+    if beyond := sum("beyond the projector" in reason for reason in missed.values()):
+        cause = "other patterns than those that were shown make a wrong calibration: are projector_size, pitch and start right?"
+        result = replace(
+            result, warnings=(f"{PROJECTOR}: the code leaves its image in {beyond} poses; {cause}", *result.warnings)
+        )
     seconds["seconds_adjust"] = round(perf_counter() - start, 3)
     figures = figures_of_merit.measure(result, truth)
     contradicting = {name: reason for name, reason in result.dropped.items() if name not in missed}

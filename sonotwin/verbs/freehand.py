@@ -68,7 +68,7 @@ class Config(ScansFields):
         """The settings of the volume that were given, by their names."""
         values = {field.name: getattr(self, field.name) for field in fields(VolumeSettings)}
         values["clip"] = None if self.clip is None else Clip(*self.clip)
-        values["fan"] = None if self.fan is None or self.fan == "find" else Fan(*self.fan)
+        values["fan"] = None if self.fan is None or isinstance(self.fan, str) else Fan(*self.fan)
         return {name: value for name, value in values.items() if value is not None}
 
 
@@ -88,13 +88,15 @@ def run(config: Config) -> None:
     sweep, scans = read(config, plus)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
-    if (config.fan or settings.fan) and scans.speed_m_s != scans.calibrated_m_s:
+    if (config.fan == "find" or settings.fan) and scans.speed_m_s != scans.calibrated_m_s:
         expected = f"none with a fan, whose lines run to all sides, or {scans.calibrated_m_s:g} m/s as calibrated"
         raise InputError(f"freehand: tissue_m_s: expected {expected}, found {scans.speed_m_s:g} m/s")
     if config.fan == "find":
         fan = fan_region.find(scans.stream(), str(config.capture or config.sequence))
         console.print(f"fan         in what changes from image to image, {fan}", markup=False)
         settings = replace(settings, fan=fan)
+    elif plus is not None and config.fan is None and settings.fan is not None:
+        console.print(f"fan         of {config.config}, {settings.fan}; all of each B-scan by fan=none", markup=False)
 
     start = perf_counter()
     with console.status("putting B-scans into the volume"):
@@ -122,6 +124,7 @@ def settings_of(config: Config, plus: PlusConfig | None) -> VolumeSettings:
     if config.interpolation == "linear" and usual.compounding == "integer_mean":
         usual = replace(usual, compounding="mean")  # as in a configuration that has LINEAR itself
     settings = replace(usual, **config.given)
+    settings = replace(settings, fan=None) if config.fan == "none" else settings
     if (settings.compounding, settings.interpolation) == ("integer_mean", "linear"):
         expected = "interpolation=nearest with integer_mean, which counts whole pixels"
         raise InputError(f"freehand: compounding: expected {expected}, found the LINEAR of {config.config}")
@@ -151,7 +154,8 @@ def describe(filled: Reconstruction, figures: Metrics, settings: VolumeSettings,
     how += f" but for {', '.join(config.given)}" if config.config is not None and config.given else ""
     yield f"paste       {size} voxels of {spacing} mm, {how}: {100 * figures['pasted_fraction']:.1f} % seen"
     level = metrics.shown(figures["mean_level"], ".0f")
-    yield f"fill        {100 * figures['filled_fraction']:.1f} % after filling holes, mean level {level}"
+    filling = f"{100 * figures['filled_fraction']:.1f} % after filling holes" if settings.hole_voxels else "holes stay open"
+    yield f"fill        {filling}, mean level {level}"
     if "place_sigma_median_mm" in figures:
         median, most = (figures[f"place_sigma_{name}_mm"] for name in ("median", "most"))
         yield f"place       known to {median:.2f} mm in the median, {most:.2f} mm at most, by its own prediction"

@@ -87,7 +87,8 @@ def run(config: Config) -> None:
     start = perf_counter()
     with console.status("looking for the bottom"):
         whole = Clip(0, 0, *sweep.size)
-        fan = fan_region.find(sweep.images(), sweep.name) if config.fan == "find" else Fan(*config.fan) if config.fan else None
+        given = None if config.fan is None or isinstance(config.fan, str) else Fan(*config.fan)
+        fan = fan_region.find(sweep.images(), sweep.name) if config.fan == "find" else given
         depths = bottom_depths(sweep, Clip(*config.clip) if config.clip else whole, config.top_px, fan)
         known = config.clip is not None or fan is not None or np.isfinite(depths).mean() > MOSTLY
         screen = None if known else part_of_screen(sweep, config.top_px)

@@ -116,11 +116,13 @@ def test_a_fan_of_ones_own_goes_before_that_of_a_configuration(reconstructed, tm
     source = [f"sequence={reconstructed / 'sequence.igs.mha'}", f"config={tmp_path / 'fan.xml'}", f"out={tmp_path / 'out'}"]
     assert main(["freehand", *source]) == 2
     assert "fan: expected a part of an image of" in capsys.readouterr().err
+    assert main(["freehand", *source, "fan=none"]) == 0
+    capsys.readouterr()
     assert main(["freehand", *source, "fan=[160,-20,30,400,-45,45]"]) == 0
     assert "but for fan: " in capsys.readouterr().out
     assert main(["freehand", *source, "fan=[160,-20,30,400,-45,45]", "tissue_m_s=1450"]) == 2
     assert "tissue_m_s: expected none with a fan, whose lines run to all sides" in capsys.readouterr().err
-    for wrong, message in (("[1,2,3]", "fan: expected find or [u,v,first,last,left,right], found [1, 2, 3]"),
+    for wrong, message in (("[1,2,3]", "fan: expected find, none or [u,v,first,last,left,right], found [1, 2, 3]"),
                            ("[1,2,9,3,0,1]", "fan.radii: expected two, the less one first, found 9 and 3 px")):  # fmt: skip
         assert main(["freehand", *source, f"fan={wrong}"]) == 2
         assert message in capsys.readouterr().err
