@@ -232,10 +232,8 @@ def test_devices_that_the_capture_lacks_are_refused(session, tmp_path, capsys):
     fields = [f"capture={session / 'capture'}", f"out={tmp_path / 'out'}"]
     expected = "small: expected images of projector, as devices, found cam1, cam2"
     assert complaint(capsys, *fields, "devices=[cam1,projector]") == expected
-    assert (
-        complaint(capsys, *fields, "devices=[cam2]")
-        == "small: expected images of cam1, the world's frame, found cam2; to calibrate another camera alone, describe its images as those of cam1"
-    )
+    refused = complaint(capsys, *fields, "devices=[cam2]")
+    assert refused.startswith("small: expected images of cam1, the world's frame, found cam2; to calibrate another camera alone,")
     assert complaint(capsys, *fields, "devices=[cam3]").startswith("calibrate-optics: devices.0: expected ")
 
 
