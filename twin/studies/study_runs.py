@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from recon.errors import InputError
 from recon.files import atomic
 from recon.files.metrics import Metrics
 from twin.engine import Engine, results
@@ -24,6 +25,7 @@ from twin.studies.experiments import Settings
 from twin.studies.factors import Point
 
 STUDY, TABLE, TRIALS = "study.json", "table.parquet", "trials"
+MARKS = ("of", "settings")  # fields of a study's description, by which it is known
 ERROR = "error"  # of a trial: in one line why it has no figures
 SEED = "seed"
 
@@ -66,6 +68,7 @@ class StudyFolder:
     def open(self, description: Mapping[str, Any]) -> None:
         """Begin or go on with a study; raises InputError if the folder holds something else."""
         atomic.check_folder(self.folder, STUDY)
+        _check_mark(self.folder / STUDY)
         for place in (self.folder, self.trials):
             place.mkdir(parents=True, exist_ok=True)
         for leftover in self.trials.glob(".*.new.json"):  # of a run that was killed while it wrote a trial
@@ -98,6 +101,18 @@ class StudyFolder:
 
     def _path(self, key: str) -> Path:
         return self.trials / f"{key}.json"
+
+
+def _check_mark(path: Path) -> None:
+    """Refuse a file that isn't a study's description, as another program may have one of this name; raises InputError."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return
+    except (ValueError, RecursionError):  # other text, or no text at all
+        found = None
+    if not (isinstance(found, dict) and all(name in found for name in MARKS)):
+        raise InputError(f"{path}: expected a study's description to replace, found other or damaged data; choose another out")
 
 
 def plan(name: str, points: Sequence[tuple[Point, Settings]], seeds: Sequence[int]) -> list[Trial]:

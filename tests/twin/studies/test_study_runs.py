@@ -14,6 +14,7 @@ from twin.studies.experiments import Settings
 from twin.studies.study_runs import StudyFolder
 
 HERE = Engine()
+DESCRIPTION = {"of": made_up.NAME, "settings": {}}
 SPEED, SCALE = "noise.speed_mm_s", "layout.target_scale"
 
 
@@ -26,7 +27,7 @@ def experiment(monkeypatch):
 @pytest.fixture
 def place(tmp_path) -> StudyFolder:
     folder = StudyFolder(tmp_path / "study")
-    folder.open({"of": made_up.NAME})
+    folder.open(DESCRIPTION)
     return folder
 
 
@@ -161,7 +162,7 @@ def test_tables_are_the_same_bytes_whatever_the_engine(settings, place, tmp_path
     """And whether a study was stopped in between."""
     over = {SPEED: {"from": 10, "to": 90, "count": 5}, SCALE: [1.0, 2.0]}
     expected = StudyFolder(tmp_path / "plain")
-    expected.open({})
+    expected.open(DESCRIPTION)
     expected.write_table(measured(expected, planned(settings, over)))
     running = study_runs.run(place, made_up.NAME, planned(settings, over), HERE)
     next(running)
@@ -204,7 +205,7 @@ def test_what_a_killed_run_left_is_removed(settings, place):
     (trial,) = planned(settings, {SPEED: [10]}, (0,))
     measured(place, [trial])
     (place.trials / f".{trial.key}.999999999.new.json").write_text('{"figures": {"su')
-    place.open({})
+    place.open(DESCRIPTION)
     assert [file.name for file in place.trials.iterdir()] == [f"{trial.key}.json"] and place.kept(trial) is not None
 
 
@@ -232,12 +233,29 @@ def test_a_folder_of_other_files_is_left_alone(tmp_path):
     """A study's own is gone on with, and described as it now is."""
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(InputError, match=r"expected a new or empty folder or one with study\.json to replace, found other files"):
-        StudyFolder(tmp_path).open({})
+        StudyFolder(tmp_path).open(DESCRIPTION)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     own = StudyFolder(tmp_path / "own")
-    own.open({"seeds": 3})
-    own.open({"seeds": 4})
-    assert json.loads((own.folder / "study.json").read_text()) == {"seeds": 4}
+    own.open(DESCRIPTION | {"seeds": 3})
+    own.open(DESCRIPTION | {"seeds": 4})
+    assert json.loads((own.folder / "study.json").read_text()) == DESCRIPTION | {"seeds": 4}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"{", b"", b"[]", b"7", b'{"seeds": 4}', b'{"of": "a survey", "year": 2020}', b"\xff\xfe", b"[" * 100_000],
+    ids=["cut", "empty", "list", "number", "other map", "survey", "no text", "deep"],
+)
+def test_a_file_of_the_same_name_is_left_alone(content, tmp_path):
+    """`study.json` is what another program may call its own: only a study's description marks a folder as one to replace."""
+    for name, held in (("study.json", content), ("thesis.tex", b"years of work")):
+        (tmp_path / name).write_bytes(held)
+    with pytest.raises(InputError, match=r"study\.json: expected a study's description to replace, found other or damaged data"):
+        StudyFolder(tmp_path).open(DESCRIPTION)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {
+        "study.json": content,
+        "thesis.tex": b"years of work",
+    }
 
 
 def test_fields_that_an_experiment_does_not_read_are_refused():
