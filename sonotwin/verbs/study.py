@@ -77,6 +77,10 @@ class Config(BaseModel):
     def _known(self) -> "Config":
         if self.of not in MODULES:
             raise ValueError(f"of: expected one of {', '.join(MODULES)}, found {self.of}")
+        if not self.over and self.budget is None and (self.name == SWEEP or self.search is not None):
+            raise ValueError(
+                "over: expected a field with its values, as in over='{shooting.exposure_s: [0.004, 0.008]}', found none"
+            )
         return self
 
 

@@ -131,7 +131,9 @@ SWEEP = "over={noise.speed_mm_s: [5, 10]}"
         ([*OURS, "over={noise.speed_mm_s: [5, -1]}"], "over: noise.speed_mm_s=-1: noise.speed_mm_s: expected"),
         ([*OURS, "over={noise.speed_mm_s: 5}"], "over: noise.speed_mm_s: expected a list, {from, to,"),
         ([*OURS, "over={noise.speed_mm_s: {normal: [5, 1]}}"], "over: noise.speed_mm_s: a distribution needs points=N"),
-        ([*OURS, "over={}", "points=8"], "over: expected fields to vary with points=N, found none"),
+        ([*OURS, "over={}"], "over: expected a field with its values, as in over='{shooting.exposure_s: [0.004, 0.008]}', found none"),
+        ([*OURS, "over={}", "points=8"], "over: expected a field with its values, as in"),
+        (["name=better_rig", "over={}"], "over: expected a field with its values, as in"),
         ([*OURS, "over={conditions.skin.wet: [0, 1]}"], "over: conditions.skin.wet: expected a field that of=chain reads,"),
         ([*OURS, SWEEP, "document=nowhere.md"], "nowhere.md: expected a Markdown file, found none"),
         ([*OURS, "over=5"], "over: expected dictionary, found 5"),
@@ -188,6 +190,12 @@ def test_a_place_that_is_taken_is_refused_before_any_trial(tmp_path, capsys):
     assert main(["study", "name=sweep", f"out={tmp_path / 'out'}", *SMALL, SWEEP]) == 2
     assert "expected a new or empty folder or one with study.json to replace" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
+    (tmp_path / "out" / "study.json").write_text("{")
+    assert main(["study", "name=sweep", f"out={tmp_path / 'out'}", *SMALL, SWEEP]) == 2
+    message = capsys.readouterr().err
+    assert "study.json: expected a study's description to replace, found other" in message and message.count("\n") == 1
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["study.json", "thesis.tex"]
+    assert (tmp_path / "out" / "study.json").read_text() == "{"
 
 
 def test_a_choice_of_a_group_is_a_value(tmp_path):
@@ -212,7 +220,15 @@ def test_a_choice_of_a_group_is_a_value(tmp_path):
         [*SURFACE, "over={rig.cam1.sensor.prnu+rig.cam2.sensor.prnu: [0.0, 0.01]}"],
         [*SURFACE, "over={conditions: [ideal, lifelike]}", "title='Light & \\'lamp\\''"],
         ["name=sweep", "of=chain", "over={noise.drawn: [{board: 0.0}, {column: 2.0}]}", "conditions=lifelike", "noise.scans=8"],
-        [*SURFACE, "over={}", "patterns=gray_surface", "shooting.gain=2", "first_seed=3", "engine=dask", "trials=my kept trials"],
+        [
+            *SURFACE,
+            "over={shooting.bits: [8, 10]}",
+            "patterns=gray_surface",
+            "shooting.gain=2",
+            "first_seed=3",
+            "engine=dask",
+            "trials=my kept trials",
+        ],
         ["name=budget", "budget={step: 3.0}", "poses.count=8"],
         ["name=better_rig", "search={by: tpe, runs: 7}", "~plane"],
     ],
