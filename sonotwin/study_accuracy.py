@@ -77,8 +77,10 @@ def laboratories(kept: Path) -> list[Row]:
             what, unit = one.figure.what, one.figure.unit
             if one.figure.bar is not None:
                 what_worst = f"{what}, {len(one.ours)} laboratories, worst"
-                rows.append(Row("a", what_worst, one.worst, one.figure.bar, one.limit, unit, at_least=one.figure.at_least))
-            if one.paper.size and one.figure.reported is not None:
+                what_worst += "; predicted by the software's covariances" if one.figure.predicted else ""
+                known = one.predicted if one.figure.predicted else one.limit if one.figure.limit else None
+                rows.append(Row("a", what_worst, one.worst, one.figure.bar, known, unit, at_least=one.figure.at_least))
+            if one.paper.size and one.figure.reported is not None and not one.figure.fitted:
                 (low, high), factor = one.figure.reported, one.figure.factor
                 by = f"{what} by the paper's method, mean (paper: {low:g} to {high:g})"
                 rows.append(Row("b", f"{by}, at least", one.paper.mean(), low / factor, low, unit, at_least=True))

@@ -59,15 +59,17 @@ def _beside_paper(config: "Config", done: Sequence[Done], console: Console) -> S
     """The paper's figures beside those of its method and of ours: on the console, in a document if one is given, on the page."""
     compared = beside_paper.compare(config.beside, done)
     for one in compared:
-        point, what, reported, paper, _, ours, limit, unit = beside_paper.cells(one)
-        beside = f"; limit {limit}" if limit else ""
+        point, what, reported, paper, _, ours, limit, predicted, unit = beside_paper.cells(one)
+        beside = (f"; limit of noise {limit}" if limit else "") + (f"; predicted for ours {predicted}" if predicted else "")
         console.print(f"{point:12}{what}: reported {reported}, its method {paper}, ours {ours}{beside} {unit}", markup=False)
     if config.document is not None:
         table_rows.refresh(config.document, config.name, beside_paper.markdown(compared))
     caption = (
-        f"Means; in brackets the least, the greatest and the number of trials. Met: within a factor of {beside_paper.FACTOR:g}."
+        f"Means; in brackets the least, the greatest and the number of trials. Met: within a factor of {beside_paper.FACTOR:g}. "
+        "Predicted for ours: by our software's covariances, with all that it can't exclude; no limit, so ours may be less."
     )
-    return Section("Beside the paper", [page.table(beside_paper.HEAD, map(beside_paper.cells, compared), caption)])
+    meanings = map(page.paragraph, beside_paper.meanings(config.beside))
+    return Section("Beside the paper", [page.table(beside_paper.HEAD, map(beside_paper.cells, compared), caption), *meanings])
 
 
 def budget(config: "Config", wanted: Budget, console: Console) -> bool:

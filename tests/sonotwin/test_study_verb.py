@@ -18,8 +18,9 @@ from sonotwin import study_plan, study_steps
 from sonotwin.cli import main
 from sonotwin.config import folder, load
 from sonotwin.verbs.study import Config
+from tests.twin.studies.made_up import done
 from twin.conditions import Conditions
-from twin.studies import error_budget, experiments, factors, rig_search
+from twin.studies import beside_paper, error_budget, experiments, factors, rig_search
 from twin.studies.drawn_session import Drawn
 
 STUDIES = sorted(path.stem for path in (folder() / "study").glob("*.yaml"))
@@ -93,6 +94,18 @@ def test_the_papers_figures_come_with_their_study(name, count, tmp_path):
     assert load("study", ["name=phase_steps", "out=x"], Config).beside == ()
 
 
+def test_the_papers_document_has_the_tables_of_its_studies():
+    """Columns, figures and what the paper reports: the numbers of trials are of the last measurement."""
+    text = (folder().parent / "docs" / "paper.md").read_text(encoding="utf-8")
+    for name in ("planes", "sphere", "optics", "probe", "cylinders", "breast", "ultrasound_causes"):
+        config = load("study", [f"name={name}", "out=x"], Config)
+        lost = [done({"conditions": point}, "not measured") for point in config.over["conditions"]]
+        rows = re.search(rf"<!-- {name} -->.*?\n(\|.*?)\n\n<!-- /{name} -->", text, flags=re.DOTALL)[1].splitlines()
+        planned = beside_paper.markdown(beside_paper.compare(config.beside, lost)).splitlines()
+        assert rows[:2] == planned[:2]
+        assert [row.split("|")[1:4] for row in rows] == [row.split("|")[1:4] for row in planned]
+
+
 def test_a_studys_name_may_be_a_number(tmp_path, monkeypatch):
     (tmp_path / "study").mkdir()
     (tmp_path / "study" / "7.yaml").write_text("title: Seventh\nof: surface\nover: {}\n")
@@ -131,7 +144,7 @@ SWEEP = "over={noise.speed_mm_s: [5, 10]}"
         ([*OURS, "over={noise.speed_mm_s: [5, -1]}"], "over: noise.speed_mm_s=-1: noise.speed_mm_s: expected"),
         ([*OURS, "over={noise.speed_mm_s: 5}"], "over: noise.speed_mm_s: expected a list, {from, to,"),
         ([*OURS, "over={noise.speed_mm_s: {normal: [5, 1]}}"], "over: noise.speed_mm_s: a distribution needs points=N"),
-        ([*OURS, "over={}"], "over: expected a field with its values, as in over='{shooting.exposure_s: [0.004, 0.008]}', found none"),
+        ([*OURS, "over={}"], "over: expected a field with its values, as in over='{shooting.exposure_s: [0.004, 0.008]}', found"),
         ([*OURS, "over={}", "points=8"], "over: expected a field with its values, as in"),
         (["name=better_rig", "over={}"], "over: expected a field with its values, as in"),
         ([*OURS, "over={conditions.skin.wet: [0, 1]}"], "over: conditions.skin.wet: expected a field that of=chain reads,"),

@@ -1,4 +1,4 @@
-"""A study's figures beside those that the paper reports: its method in the twin, ours, and the limit."""
+"""A study's figures beside those that the paper reports: its method in the twin, ours, and the limit of noise or a prediction."""
 
 from collections.abc import Sequence
 from typing import Annotated, NamedTuple
@@ -13,7 +13,10 @@ from twin.studies.study_plots import short
 from twin.studies.study_runs import Done, finite
 
 FACTOR = 1.5  # between a figure of the paper and that of its method in the twin, that counts as met
-HEAD = ("conditions", "figure", "paper reported", "paper's method in the twin", "met", "ours", "limit", "unit")
+HEAD = (
+    *("conditions", "figure", "paper reported", "paper's method in the twin", "met", "ours"),
+    *("limit of noise", "predicted for ours", "unit"),
+)
 
 
 class Figure(Part):
@@ -23,7 +26,10 @@ class Figure(Part):
     reported: tuple[float, float] | None = None  # least and greatest; None where the paper has none
     paper: str | None = None  # figure of trials by the paper's method
     ours: str
-    limit: str | None = None
+    limit: str | None = None  # figure of what noise alone leaves
+    predicted: str | None = None  # figure that our software's covariances predict of ours, which ours may come out below
+    meaning: str = ""  # in a sentence, for people
+    fitted: bool = False  # the twin was fitted to what the paper reports, so that meeting it says nothing
     bar: float | None = None  # of ours, in the worst trial under conditions that aren't ideal
     at_least: bool = False  # ours may be more than the bar, not less
     factor: Annotated[float, Field(ge=1)] = FACTOR  # between the paper's figure and that of its method, that counts as met
@@ -38,12 +44,13 @@ class Compared(NamedTuple):
     paper: NDArray[np.float64]  # (n,) sizes by the paper's method
     ours: NDArray[np.float64]  # (m,)
     missing: int  # trials without a figure of ours
-    limit: float
+    limit: float  # of noise; NaN where there is none
+    predicted: float  # for ours; NaN likewise
 
     @property
     def paper_met(self) -> bool | None:
-        """Whether the paper's method gives what the paper reports, within a factor; None where it reports nothing."""
-        if self.figure.reported is None:
+        """Whether the paper's method gives what the paper reports, within a factor; None where nothing is to be met."""
+        if self.figure.reported is None or self.figure.fitted:
             return None
         low, high = self.figure.reported
         factor = self.figure.factor
@@ -73,18 +80,24 @@ def compare(figures: Sequence[Figure], done: Sequence[Done]) -> list[Compared]:
 
 
 def _compared(point: str, figure: Figure, alike: Sequence[Done]) -> Compared:
-    ours, limit = _sizes(alike, figure.ours), _sizes(alike, figure.limit)
-    return Compared(point, figure, _sizes(alike, figure.paper), ours, len(alike) - ours.size, _middle(limit))
+    paper, ours, limit, predicted = (_sizes(alike, name) for name in (figure.paper, figure.ours, figure.limit, figure.predicted))
+    return Compared(point, figure, paper, ours, len(alike) - ours.size, _middle(limit), _middle(predicted))
 
 
 def cells(one: Compared) -> list[str]:
     """A row of the table: means, and in brackets the least and the greatest."""
     limit = shown(one.limit, ".3g") if one.figure.limit else ""
-    met = {None: "", True: "yes", False: "no"}[one.paper_met]
+    predicted = shown(one.predicted, ".3g") if one.figure.predicted else ""
+    met = "fitted" if one.figure.fitted else {None: "", True: "yes", False: "no"}[one.paper_met]
     return [
         *(one.point, one.figure.what, _reported(one.figure), _spread(one.paper)),
-        *(met, _spread(one.ours), limit, one.figure.unit),
+        *(met, _spread(one.ours), limit, predicted, one.figure.unit),
     ]
+
+
+def meanings(figures: Sequence[Figure]) -> list[str]:
+    """Sentences of what figures mean, each once."""
+    return list(dict.fromkeys(figure.meaning for figure in figures if figure.meaning))
 
 
 def markdown(compared: Sequence[Compared]) -> str:

@@ -9,6 +9,7 @@ from twin.studies import beside_paper
 from twin.studies.beside_paper import FACTOR, Figure
 
 PLANES = Figure(what="planes, RMS", reported=(0.1, 0.13), paper="paper_mm", ours="ours_mm", limit="limit_mm", bar=0.06, unit="mm")
+KNOWN = Figure(what="planes, RMS", ours="ours_mm", predicted="limit_mm", unit="mm")
 RADIUS = Figure(what="radius error", reported=(0.045, 0.045), ours="radius_mm", unit="mm")
 
 
@@ -39,10 +40,28 @@ def test_each_figure_stands_under_each_point():
 def test_cells_have_means_and_in_brackets_the_range_and_the_trials():
     planes, _, radius, _ = map(beside_paper.cells, beside_paper.compare([PLANES, RADIUS], DONE))
     assert planes == [
-        "ideal", "planes, RMS", "0.1 to 0.13", "0.120 (0.110 to 0.130; 2)", "yes", "0.040 (0.030 to 0.050; 2)", "0.03", "mm"
+        "ideal", "planes, RMS", "0.1 to 0.13", "0.120 (0.110 to 0.130; 2)", "yes", "0.040 (0.030 to 0.050; 2)", "0.03", "", "mm"
     ]  # fmt: skip
-    assert radius == ["ideal", "radius error", "0.045", "", "no", "0.020 (0.010 to 0.030; 2)", "", "mm"]
+    assert radius == ["ideal", "radius error", "0.045", "", "no", "0.020 (0.010 to 0.030; 2)", "", "", "mm"]
     assert len(planes) == len(beside_paper.HEAD)
+
+
+def test_a_prediction_is_no_limit():
+    """What covariances predict stands in a column of its own, as ours may come out below it."""
+    (found, _) = beside_paper.compare([KNOWN], DONE)
+    row = dict(zip(beside_paper.HEAD, beside_paper.cells(found), strict=True))
+    assert (row["limit of noise"], row["predicted for ours"]) == ("", "0.03") and math.isnan(found.limit)
+
+
+def test_what_was_fitted_is_not_met():
+    """It shows what the paper reports, and that meeting it says nothing."""
+    (found, _) = beside_paper.compare([PLANES.model_copy(update={"fitted": True})], DONE)
+    assert found.paper_met is None and beside_paper.cells(found)[2:5:2] == ["0.1 to 0.13", "fitted"]
+
+
+def test_meanings_are_given_once():
+    same = [figure.model_copy(update={"meaning": "RMS: root mean square."}) for figure in (PLANES, RADIUS)]
+    assert beside_paper.meanings([*same, KNOWN]) == ["RMS: root mean square."]
 
 
 def test_a_missing_figure_misses_its_bar():
