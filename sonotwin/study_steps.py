@@ -1,7 +1,7 @@
 """What `sonotwin study` does: all points of a design, a search for the best, or an error budget; and what it writes and says."""
 
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -82,8 +82,13 @@ def budget(config: "Config", wanted: Budget, console: Console) -> bool:
         console.print(f"budget      {wanted.figures[one.figure]}: {error_budget.explained(one)}", markup=False)
         for line in error_budget.advice(wanted, one)[:1]:
             console.print(f"mend first  {line}", markup=False)
-    write(config, done, budget_page.sections(config.out, wanted, sums), console)
+    write(config, done, budget_page.sections(config.out, wanted, sums), console, _labels(points, done))
     return all(one.whole == one.whole for one in sums)
+
+
+def _labels(points: Mapping[tuple[str, float], Point], done: Sequence[Done]) -> list[str]:
+    """Of each trial the source that is on, instead of the many fields that are zero."""
+    return [next(error_budget.label(*key) for key, point in points.items() if point == one.trial.point) for one in done]
 
 
 def search(config: "Config", goal: Goal, console: Console) -> bool:
@@ -148,13 +153,15 @@ def do(config: "Config", place: StudyFolder, trials: Sequence[Trial], console: C
         return study_runs.in_order(trials, list(progress.track(running, len(trials), description="trials")))
 
 
-def write(config: "Config", done: Sequence[Done], sections: Sequence[Section], console: Console) -> None:
-    """Write table and page, and say which points gave no figures."""
-    for one in {one.found: one for one in done if isinstance(one.found, str)}.values():
-        at = ", ".join([*fields_of(one.trial.point), f"seed={one.trial.seed}"])
-        console.print(f"no figures  {at}: {one.found}", markup=False)
+def write(
+    config: "Config", done: Sequence[Done], sections: Sequence[Section], console: Console, labels: Sequence[str] | None = None
+) -> None:
+    """Write table and page, and say which trials gave no figures: by labels of their points, or by the values that vary."""
+    labels = study_page.labels(done) if labels is None else labels
+    for one, label in {one.found: (one, label) for one, label in zip(done, labels, strict=True) if one.failed}.values():
+        console.print(f"no figures  {study_page.named(one, label)}: {one.found}", markup=False)
     StudyFolder(config.out).write_table(done)
-    study_page.write(config.out, config.title or config.name, done, sections, [command(config)])
+    study_page.write(config.out, config.title or config.name, done, sections, [command(config)], labels)
     console.print(f"wrote       {config.out}/{{{TABLE},{study_page.PAGE},{study_page.PICTURES}/,{STUDY}}}", markup=False)
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from recon.files.metrics import shown
 from recon.reports import figures, page
@@ -18,6 +19,7 @@ PREDICTED = (
     "Errors as the software propagates them. Of the latency and the speed of sound it is told the size that is drawn: their "
     "ratios test slopes alone. Tolerances that act on wires and scan alike cancel in part, which neither's covariance knows."
 )
+TICKS, GAP = 8, 0.07  # lengths on the axis at most, and the least distance between them, of all
 LEAST = 0.002  # share of the sum's square that gets a bar of its own
 
 
@@ -53,12 +55,27 @@ def waterfall(one: Sum) -> Figure:
     axes.barh([len(names), len(names) + 1], [one.added**2, one.whole**2], color=[BARS, LINE], height=0.62)
     for row, (start, square, size) in enumerate(zip(starts, squares, sizes, strict=True)):
         axes.text(start + square, row, f" {size:.3f}", va="center", fontsize=8, color=axes.xaxis.label.get_color())
-    for row, value in ((len(names), one.added), (len(names) + 1, one.whole)):
-        axes.text(value**2, row, f" {value:.3f}", va="center", fontsize=8, color=axes.xaxis.label.get_color())
-    axes.set_yticks(range(len(names) + 2), [*names, "sum in squares", "all together"])
+    least, most = max(one.whole - one.uncertainty, 0.0), one.whole + one.uncertainty
+    reach = [[one.whole**2 - least**2], [most**2 - one.whole**2]]
+    axes.errorbar([one.whole**2], [len(names) + 1], xerr=reach, color=axes.xaxis.label.get_color(), capsize=3, linewidth=1.2)
+    for row, value, end in ((len(names), one.added, one.added), (len(names) + 1, one.whole, most)):
+        axes.text(end**2, row, f" {value:.3f}", va="center", fontsize=8, color=axes.xaxis.label.get_color())
+    axes.set_yticks(range(len(names) + 2), [*names, "sum in squares", "all together, ± 1 sigma"])
     axes.invert_yaxis()
-    axes.set(xlabel="square of the error, mm² (figures: mm)", xlim=(0, 1.18 * max(one.added, one.whole) ** 2))
+    longest = max(one.added, most)
+    ticks = lengths(longest)
+    axes.set_xticks(np.square(ticks), [f"{value:g}" for value in ticks])
+    axes.set(xlabel="error, mm, on an axis of squares, along which bars add up", xlim=(0, 1.18 * longest**2))
     return drawn
+
+
+def lengths(longest: float) -> list[float]:
+    """Round lengths up to the longest, whose squares stand so far apart that each has room for its figure."""
+    room, kept = GAP * longest**2, list[float]()
+    for value in MaxNLocator(TICKS, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, longest):
+        if value <= longest and (not kept or value**2 - kept[-1] ** 2 >= room):
+            kept.append(round(float(value), 12))
+    return kept
 
 
 def _parts(budget: Budget, one: Sum) -> tuple[list[str], list[list[str]], str]:
@@ -76,7 +93,8 @@ def _parts(budget: Budget, one: Sum) -> tuple[list[str], list[list[str]], str]:
     return (
         head,
         rows,
-        f"Root mean squares over {one.parts[0].trials} seeds. Where a larger source isn't as much larger, it isn't linear.",
+        f"Root mean squares over {error_budget.seeds(one.parts[0].trials)}. "
+        "Where a larger source isn't as much larger, it isn't linear.",
     )
 
 

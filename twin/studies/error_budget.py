@@ -19,6 +19,7 @@ from twin.studies.factors import Point
 from twin.studies.study_runs import Done, finite
 
 SMALL = 0.05  # share of the whole's square that is worth a word
+FEW = 8  # seeds, below which an advice says their number
 
 
 class Budget(Part):
@@ -57,7 +58,7 @@ class Contribution:
     @property
     def uncertainty(self) -> float:
         """Standard deviation of `alone`, as of draws from a normal distribution, one a seed."""
-        return self.alone / np.sqrt(2 * max(self.trials, 1))
+        return _uncertainty(self.alone, self.trials)
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,11 @@ class Sum:
     trials: int
     parts: tuple[Contribution, ...]  # the greatest first
     predicted: Mapping[str, tuple[float, float]]  # of sources that the software knows: predicted, and by switching
+
+    @property
+    def uncertainty(self) -> float:
+        """Standard deviation of `whole`, as of a contribution."""
+        return _uncertainty(self.whole, self.trials)
 
     @property
     def added(self) -> float:
@@ -90,6 +96,13 @@ def points(budget: Budget, settings: Mapping[str, Any]) -> dict[tuple[str, float
         for size in (1.0, budget.step):
             found[source, size] = {field: size * value if field in fields else 0.0 for field, value in usual.items()}
     return found
+
+
+def label(source: str, size: float) -> str:
+    """A point of the budget for people, by its key."""
+    if not source:
+        return "all sources"
+    return f"{source} alone" if size == 1 else f"{source} alone, {size:g} times as large"
 
 
 def added_up(budget: Budget, done: Mapping[tuple[str, float], Sequence[Done]]) -> list[Sum]:
@@ -117,6 +130,7 @@ def added_up(budget: Budget, done: Mapping[tuple[str, float], Sequence[Done]]) -
 def advice(budget: Budget, one: Sum) -> list[str]:
     """What to mend first, in words."""
     left, lines = one.added**2, []
+    by = f", by {seeds(one.trials)} only" if one.trials < FEW else ""
     for part in one.parts:
         share = part.alone**2 / one.added**2 if one.added else 0.0
         if not share >= SMALL:
@@ -124,7 +138,7 @@ def advice(budget: Budget, one: Sum) -> list[str]:
         without = np.sqrt(max(left - part.alone**2, 0.0))
         remedy = f": {budget.mend[part.source]}" if part.source in budget.mend else ""
         less = f"without it {np.sqrt(left):.3f} mm become {without:.3f} mm"
-        lines.append(f"{part.source} makes {100 * share:.0f} % of the square; {less}{remedy}.")
+        lines.append(f"{part.source} makes {100 * share:.0f} % of the square{by}; {less}{remedy}.")
         left -= part.alone**2
     return lines
 
@@ -132,8 +146,17 @@ def advice(budget: Budget, one: Sum) -> list[str]:
 def explained(one: Sum) -> str:
     """Whether the parts explain the whole, in words."""
     off = one.added / one.whole - 1 if one.whole else np.nan
-    sure = 1 / np.sqrt(2 * max(one.trials, 1))
     return (
-        f"{one.whole:.3f} mm by all sources together, known to {100 * sure:.0f} % by {one.trials} seeds; "
+        f"{one.whole:.3f} mm by all sources together, ± {100 * _uncertainty(1.0, one.trials):.0f} % by {seeds(one.trials)}; "
         f"{one.added:.3f} mm by their sum in squares, {100 * off:+.0f} %."
     )
+
+
+def seeds(count: int) -> str:
+    """A number of seeds in words."""
+    return f"{count} seed" + ("" if count == 1 else "s")
+
+
+def _uncertainty(size: float, trials: int) -> float:
+    """Standard deviation of a root mean square over so many trials, one draw of a normal distribution each."""
+    return size / np.sqrt(2 * max(trials, 1))

@@ -22,11 +22,25 @@ MOST_ROWS = 100  # points of a design in the page's table
 FOOTER = "Range: from the least to the greatest over seeds and the other factors. This file is complete: it fetches nothing."
 
 
-def write(folder: Path, title: str, done: Sequence[Done], sections: Sequence[Section], commands: Sequence[str]) -> None:
-    """Write `report.html`: sections, what gave no figures, and the commands that make the same again."""
+def write(
+    folder: Path,
+    title: str,
+    done: Sequence[Done],
+    sections: Sequence[Section],
+    commands: Sequence[str],
+    points: Sequence[str] | None = None,
+) -> None:
+    """Write `report.html`: sections, what gave no figures, and the commands that make the same again.
+
+    Parameters
+    ----------
+    points : labels of the trials' points, for people; if not given, the values that vary
+    """
     table, fields = study_runs.rows(done), list(done[0].trial.point)
+    points = labels(done) if points is None else points
     failed = [row for row in table if row[ERROR] is not None]
-    reasons = dict.fromkeys(f"{_at(row, fields)}: {row[ERROR]}" for row in failed)
+    named_alike = (f"{named(one, point)}: {one.found}" for one, point in zip(done, points, strict=True) if one.failed)
+    reasons = dict.fromkeys(named_alike)
     pandas = f"python -c \"import pandas; print(pandas.read_parquet('{folder / study_runs.TABLE}'))\""
     parts = [*sections, *([Section("Points without figures", [page.notices(reasons)])] if failed else [])]
     parts.append(Section("Again, and the table in pandas", [page.commands([*commands, pandas])]))
@@ -87,5 +101,13 @@ def _distinct_points(table: study_plots.Table, fields: Sequence[str]) -> list[tu
     return list(dict.fromkeys(tuple(row[field] for field in fields) for row in table))
 
 
-def _at(row: Mapping[str, Any], fields: Sequence[str]) -> str:
-    return ", ".join([*(f"{field}={short(row[field])}" for field in fields), f"seed={row[SEED]}"])
+def labels(done: Sequence[Done]) -> list[str]:
+    """Points of trials by the values that vary among them, as fields of the command line; by all where none does."""
+    table, fields = study_runs.rows(done), list(done[0].trial.point)
+    varied = [field for field in fields if len({row[field] for row in table}) > 1] or fields
+    return [", ".join(f"{field}={short(row[field])}" for field in varied) for row in table]
+
+
+def named(one: Done, point: str) -> str:
+    """A trial by a label of its point and its seed."""
+    return f"{point}, seed={one.trial.seed}" if point else f"seed={one.trial.seed}"

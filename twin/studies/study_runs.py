@@ -48,6 +48,11 @@ class Done:
     found: Metrics | str
 
     @property
+    def failed(self) -> bool:
+        """Whether there is a reason instead of figures."""
+        return isinstance(self.found, str)
+
+    @property
     def figures(self) -> Metrics:
         """Figures by name; none of a trial that failed."""
         return {} if isinstance(self.found, str) else self.found

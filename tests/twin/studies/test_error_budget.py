@@ -103,10 +103,10 @@ def test_predictions_stand_beside_what_switching_finds(rng):
     assert found.predicted["circles + bow"] == pytest.approx((0.2, np.hypot(0.15, 0.4)), rel=0.05)
 
 
-def given(alone: dict[str, float], whole: float) -> error_budget.Sum:
+def given(alone: dict[str, float], whole: float, trials: int = 8) -> error_budget.Sum:
     """A budget by its parts."""
-    parts = tuple(error_budget.Contribution(source, value, 2 * value, 5) for source, value in alone.items())
-    return error_budget.Sum("error_mm", whole, 8, parts, {})
+    parts = tuple(error_budget.Contribution(source, value, 2 * value, trials) for source, value in alone.items())
+    return error_budget.Sum("error_mm", whole, trials, parts, {})
 
 
 def test_advice_begins_with_the_greatest_and_leaves_out_the_small():
@@ -115,6 +115,23 @@ def test_advice_begins_with_the_greatest_and_leaves_out_the_small():
     assert len(lines) == 2
     assert lines[0] == "bow makes 63 % of the square; without it 0.502 mm become 0.304 mm: a stiffer plate."
     assert lines[1] == "fringes makes 36 % of the square; without it 0.304 mm become 0.050 mm."
+
+
+@pytest.mark.parametrize(("trials", "by"), [(1, ", by 1 seed only"), (7, ", by 7 seeds only"), (8, "")])
+def test_advice_of_few_seeds_says_their_number(trials, by):
+    """And a whole of one seed is uncertain by 71 %, which is no precision."""
+    found = given({"bow": 0.4}, 0.4, trials)
+    assert error_budget.advice(BUDGET, found)[0].startswith(f"bow makes 100 % of the square{by}; without it")
+    if trials == 1:
+        assert "0.400 mm by all sources together, ± 71 % by 1 seed; " in error_budget.explained(found)
+
+
+def test_a_point_has_a_short_name():
+    assert [error_budget.label(*key) for key in (("", 1.0), ("bow", 1.0), ("bow", 2.5))] == [
+        "all sources",
+        "bow alone",
+        "bow alone, 2.5 times as large",
+    ]
 
 
 def test_no_error_needs_no_advice():
@@ -127,7 +144,7 @@ def test_no_error_needs_no_advice():
 def test_what_the_parts_explain_is_said():
     """And how well the whole is known: 8 seeds, 1 / sqrt(16)."""
     assert error_budget.explained(given({"bow": 0.3, "fringes": 0.4}, 0.4)) == (
-        "0.400 mm by all sources together, known to 25 % by 8 seeds; 0.500 mm by their sum in squares, +25 %."
+        "0.400 mm by all sources together, ± 25 % by 8 seeds; 0.500 mm by their sum in squares, +25 %."
     )
 
 

@@ -4,6 +4,7 @@ import re
 from html import unescape
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
 from tests.twin.studies.made_up import done
@@ -104,6 +105,25 @@ def test_points_without_figures_are_named(tmp_path):
     assert rows_of(page)[-1][:3] == ["40", "dim", "1"]
 
 
+def test_a_trial_is_named_by_what_varies(tmp_path):
+    """Of twenty fields those with several values; a point that is alone by all, or by a label that it is given."""
+    same = {f"noise.drawn.{k}": 0.0 for k in range(20)}
+    trials = [done(same | {"rig.pitch": pitch}, "nothing seen", seed) for pitch in (6, 9) for seed in (0, 1)]
+    assert study_page.labels(trials) == ["rig.pitch=6", "rig.pitch=6", "rig.pitch=9", "rig.pitch=9"]
+    assert study_page.named(trials[1], "rig.pitch=6") == "rig.pitch=6, seed=1" and study_page.named(trials[1], "") == "seed=1"
+    assert study_page.labels([done({"a": 1}, {}), done({"a": 1}, {}, 1)]) == ["a=1", "a=1"]
+    study_page.write(tmp_path, "Budget", trials, [], [], ["all sources", "all sources", "bow alone", "bow alone"])
+    assert "<li>bow alone, seed=1: nothing seen</li>" in (tmp_path / study_page.PAGE).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("longest", [0.013, 0.52, 0.98, 1.0, 37.0])
+def test_an_axis_of_squares_has_a_few_round_lengths(longest):
+    """From zero, with room between them."""
+    lengths = budget_page.lengths(longest)
+    assert lengths[0] == 0 and 4 <= len(lengths) <= 9 and lengths[-1] > 0.8 * longest
+    assert (np.diff(np.square(lengths)) >= 0.07 * longest**2).all()
+
+
 def test_a_study_without_factors_has_a_table_alone(tmp_path):
     trials = [done({}, {"error_mm": 2.0, "limit_mm": 1.0, "turn_deg": 3.0}, seed) for seed in range(3)]
     page = written(tmp_path, trials, study_page.plots(tmp_path, trials, OF))
@@ -149,8 +169,14 @@ def test_a_waterfall_adds_squares_up_to_the_sum():
     (axes,) = budget_page.waterfall(SUM).axes
     bars = [(bar.get_x(), bar.get_width()) for bar in axes.patches]
     assert bars[:2] == [(0, pytest.approx(0.16)), (pytest.approx(0.16), pytest.approx(0.09))]
+    ticks = dict(zip((label.get_text() for label in axes.get_xticklabels()), axes.get_xticks(), strict=True))
+    assert len(ticks) > 3 and all(place == pytest.approx(float(length) ** 2) for length, place in ticks.items())
+    (error,) = axes.collections
+    (ends,) = error.get_segments()
+    assert ends[:, 0] == pytest.approx([(0.52 * (1 - 48**-0.5)) ** 2, (0.52 * (1 + 48**-0.5)) ** 2])
+    assert axes.get_xlim()[1] > ends[1, 0] and "mm²" not in axes.get_xlabel()
     assert bars[2][1] == pytest.approx(0, abs=1e-9) and bars[3][1] == pytest.approx(0.25) and bars[4][1] == pytest.approx(0.52**2)
-    names = ["bow", "print", "all others", "sum in squares", "all together"]
+    names = ["bow", "print", "all others", "sum in squares", "all together, ± 1 sigma"]
     assert [label.get_text() for label in axes.get_yticklabels()] == names
 
 
