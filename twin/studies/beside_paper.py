@@ -9,7 +9,7 @@ from pydantic import Field
 
 from recon.files.metrics import shown
 from recon.model.rig import Part
-from twin.studies.study_plots import short
+from twin.studies.study_plots import Name, short
 from twin.studies.study_runs import Done, finite
 
 FACTOR = 1.5  # between a figure of the paper and that of its method in the twin, that counts as met
@@ -93,6 +93,17 @@ def cells(one: Compared) -> list[str]:
         *(one.point, one.figure.what, _reported(one.figure), _spread(one.paper)),
         *(met, _spread(one.ours), limit, predicted, one.figure.unit),
     ]
+
+
+def names(figures: Sequence[Figure]) -> dict[str, Name]:
+    """Figures of trials by what the study calls them, with what the paper reports."""
+    found = {}
+    for one in figures:
+        unit = f", {one.unit}" if one.unit else ""
+        for name, by in ((one.ours, "ours"), (one.paper, "paper's method")):
+            if name is not None:
+                found[name] = Name(f"{one.what}, {by}{unit}", one.reported)
+    return found
 
 
 def meanings(figures: Sequence[Figure]) -> list[str]:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,11 @@ from recon.reports import figures, page
 from recon.reports.page import Opening, Section
 from twin.studies import study_plots, study_runs
 from twin.studies.experiments import Experiment
-from twin.studies.study_plots import short, words
+from twin.studies.study_plots import Name, short, words
 from twin.studies.study_runs import ERROR, SEED, Done
 
 PAGE, PICTURES = "report.html", "figures"
+NO_NAMES: Mapping[str, Name] = MappingProxyType({})
 MOST_ROWS = 100  # points of a design in the page's table
 FOOTER = "Range: from the least to the greatest over seeds and the other factors. This file is complete: it fetches nothing."
 
@@ -50,17 +52,34 @@ def write(
         path.write_text(page.render(Opening("study", title, result, counted), parts, FOOTER), encoding="utf-8")
 
 
-def plots(folder: Path, done: Sequence[Done], of: Experiment) -> list[Section]:
-    """Sections of all figures over all factors, whose plots are kept as PNG files too, and a table."""
+def plots(folder: Path, done: Sequence[Done], of: Experiment, names: Mapping[str, Name] = NO_NAMES) -> list[Section]:
+    """Sections of all figures over all factors, whose plots are kept as PNG files too.
+
+    Parameters
+    ----------
+    names : of figures for people, and what the paper reports of them; other figures have those of their columns
+    """
     table, fields = study_runs.rows(done), list(done[0].trial.point)
-    sections = [
-        Section(title(words(figure)), [page.grid((_drawn(folder, table, of, figure, field) for field in fields), "two")])
+    return [
+        Section(
+            title(_name(names, figure).title),
+            [page.grid((_drawn(folder, table, of, figure, field, names) for field in fields), "two")],
+        )
         for figure in of.limits
         if fields
     ]
-    head = [*map(words, fields), "trials", *map(words, of.limits)]
+
+
+def points(done: Sequence[Done], of: Experiment, names: Mapping[str, Name] = NO_NAMES) -> Section:
+    """A table of medians of all points."""
+    table, fields = study_runs.rows(done), list(done[0].trial.point)
+    titles = []
+    for figure, limit in of.limits.items():
+        table, shown_as = study_plots.comparable(table, figure, limit, _name(names, figure))
+        titles.append(shown_as)
+    head = [*map(words, fields), "trials", *titles]
     caption = f"Medians over seeds; in brackets: {of.limit}."
-    return [*sections, Section("All points", [page.table(head, _points(table, fields, of.limits), caption)])]
+    return Section("All points", [page.table(head, _points(table, fields, of.limits), caption)])
 
 
 def title(text: str) -> str:
@@ -68,12 +87,16 @@ def title(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _drawn(folder: Path, table: study_plots.Table, of: Experiment, figure: str, field: str) -> str:
+def _name(names: Mapping[str, Name], figure: str) -> Name:
+    return names.get(figure) or Name(words(figure))
+
+
+def _drawn(folder: Path, table: study_plots.Table, of: Experiment, figure: str, field: str, names: Mapping[str, Name]) -> str:
     """A plot for the page, kept as a PNG file too."""
     fields = list(table[0])[: list(table[0]).index(SEED)]
-    drawn = study_plots.draw(table, figure, field, fields, of.limits[figure], of.limit)
+    drawn = study_plots.draw(table, figure, field, fields, of.limits[figure], of.limit, _name(names, figure))
     name = f"{figure}_over_{re.sub(r'[^A-Za-z0-9]+', '_', field)}.png"
-    return kept_drawing(folder, name, drawn, f"{words(figure)} over {field}", f"{PICTURES}/{name}")
+    return kept_drawing(folder, name, drawn, f"{_name(names, figure).title} over {field}", f"{PICTURES}/{name}")
 
 
 def kept_drawing(folder: Path, name: str, drawn: Figure, caption: str, detail: str) -> str:

@@ -1,7 +1,9 @@
 """Plots of a study: a figure over a factor, with its spread, and its closed form."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,17 @@ Table = Sequence[Mapping[str, Any]]  # a row a trial
 MOST_LINES = 6  # values of another factor that get a line each
 MOST_VALUES = 24  # of a factor; more are drawn as points
 WIDE = 1.5  # ratio of the largest to the smallest step between values, above which an axis is logarithmic
+LETTERS = 38  # in a line beside an axis
+ASIDE = 0.14  # of the distance between words on an axis: that between courses over one of them
 TALL = 8.0  # ratio of the largest to the smallest figure, likewise
+
+
+@dataclass(frozen=True)
+class Name:
+    """A figure for people."""
+
+    title: str  # with its unit
+    reported: tuple[float, float] | None = None  # by the paper, least and greatest
 
 
 @dataclass(frozen=True)
@@ -32,45 +44,94 @@ class Course:
     high: Array  # greatest
 
 
-def draw(table: Table, figure: str, field: str, fields: Sequence[str], limit: str, kind: str = "closed form") -> Figure:
+def draw(
+    table: Table,
+    figure: str,
+    field: str,
+    fields: Sequence[str],
+    limit: str,
+    kind: str = "closed form",
+    name: Name | None = None,
+) -> Figure:
     """Draw a figure over a factor.
 
     Few values of another factor get a line each; a factor with many values, as of a space-filling design, is a cloud of points.
+    Between values that are words there is no line.
 
     Parameters
     ----------
     fields : all factors
     limit : what the figure is held against, also a column of the table, or ""
     kind : of the limit, for the legend
+    name : of the figure for people, with what the paper reports of it
     """
+    name = name or Name(words(figure))
+    table, title = comparable(table, figure, limit, name)
     drawn, axes = figures.blank(5.2, 3.3)
     values = distinct(row[field] for row in table)
     if len(values) > MOST_VALUES and numeric(values):
-        for name, style in ((figure, "o"), (limit, "x")):
-            if name:
-                label = kind if name == limit else "a trial"
-                x, y = (np.array([row.get(key, np.nan) for row in table], float) for key in (field, name))
-                axes.plot(x, y, style, color=LINE if name == limit else "C0", markersize=3, label=label)
+        _cloud(axes, table, field, {figure: "a trial"} | ({limit: kind} if limit else {}))
     else:
-        places = np.array(values, float) if numeric(values) else np.arange(len(values), dtype=float)
-        if not numeric(values):
-            axes.set_xticks(places, [short(value) for value in values])
-        elif unevenly_spaced(places):
-            axes.set_xscale("log")
-            axes.set_xticks(places, [short(value) for value in values])
-            axes.minorticks_off()
         other = other_factor(table, field, fields)
-        for k, course in enumerate(courses(table, figure, field, other)):
-            axes.fill_between(places, course.low, course.high, color=f"C{k}", alpha=0.18, linewidth=0)
-            axes.plot(places, course.middle, "o-", color=f"C{k}", markersize=4, linewidth=1.4, label=course.label)
-        for k, held in enumerate(courses(table, limit, field, other) if limit else []):
-            colour, label = (LINE, kind) if other is None else (f"C{k}", kind if k == 0 else None)
-            axes.plot(places, held.middle, "--", color=colour, linewidth=1.6, label=label)
+        found, held = courses(table, figure, field, other), courses(table, limit, field, other) if limit else []
+        if numeric(values):
+            _along(axes, np.array(values, float), found, held, kind)
+        else:
+            _beside(axes, [short(value) for value in values], found, held, kind)
+    for k, value in enumerate(dict.fromkeys(name.reported or ())):
+        colour, label = axes.xaxis.label.get_color(), None if k else "paper reported"
+        axes.axhline(value, color=colour, linestyle=(0, (7, 4)), linewidth=1.0, label=label)
     scale_heights(axes)
-    axes.set(xlabel=words(field), ylabel=words(figure))
+    axes.set(xlabel=words(field), ylabel=fill(title, LETTERS))
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize=8, labelcolor=axes.xaxis.label.get_color())
     return drawn
+
+
+def comparable(table: Table, figure: str, limit: str, name: Name) -> tuple[Table, str]:
+    """A table and the figure's title for what it is held against: sizes, which are positive, beside a figure of both signs."""
+    signed = any(row.get(figure) is not None and row[figure] < 0 for row in table)
+    if not (signed and (limit or name.reported)):
+        return table, name.title
+    return [{**row, figure: abs(row.get(figure, np.nan))} for row in table], f"size of {name.title}"
+
+
+def _cloud(axes: Axes, table: Table, field: str, labels: Mapping[str, str]) -> None:
+    """Figures of all trials over a factor : {figure: label}, the first one's by dots."""
+    for k, (name, label) in enumerate(labels.items()):
+        x, y = (np.array([row.get(key, np.nan) for row in table], float) for key in (field, name))
+        axes.plot(x, y, "x" if k else "o", color=LINE if k else "C0", markersize=3, label=label, clip_on=False)
+
+
+def _along(axes: Axes, places: Array, found: Sequence[Course], held: Sequence[Course], kind: str) -> None:
+    """Courses over numbers : (n,), and what they are held against, dashed."""
+    if unevenly_spaced(places):
+        axes.set_xscale("log")
+        axes.set_xticks(places, [short(place) for place in places.tolist()])
+        axes.minorticks_off()
+    for k, one in enumerate(found):
+        axes.fill_between(places, one.low, one.high, color=f"C{k}", alpha=0.18, linewidth=0)
+        axes.plot(places, one.middle, "o-", color=f"C{k}", markersize=4, linewidth=1.4, label=one.label, clip_on=False)
+    for k, one in enumerate(held):
+        axes.plot(places, one.middle, "--", color=_colour(k, held), linewidth=1.6, label=None if k else kind)
+
+
+def _beside(axes: Axes, values: Sequence[str], found: Sequence[Course], held: Sequence[Course], kind: str) -> None:
+    """Courses over words, beside each other, with their ranges as bars, and what they are held against as strokes."""
+    places, aside = np.arange(len(values)), ASIDE * (np.arange(len(found)) - (len(found) - 1) / 2)
+    axes.set_xticks(places, values)
+    axes.set_xlim(-0.5, len(values) - 0.5)
+    for k, one in enumerate(found):
+        axes.vlines(places + aside[k], one.low, one.high, color=f"C{k}", alpha=0.35, linewidth=5)
+        axes.plot(places + aside[k], one.middle, "o", color=f"C{k}", markersize=5, label=one.label, clip_on=False)
+    for k, one in enumerate(held):
+        style = {"color": _colour(k, held), "markersize": 18, "markeredgewidth": 1.8, "label": None if k else kind}
+        axes.plot(places + aside[k], one.middle, "_", **style, clip_on=False)
+
+
+def _colour(k: int, held: Sequence[Course]) -> str:
+    """Of what the k-th course is held against: its own where there are several."""
+    return LINE if len(held) == 1 else f"C{k}"
 
 
 def courses(table: Table, figure: str, field: str, other: str | None) -> list[Course]:
@@ -81,7 +142,8 @@ def courses(table: Table, figure: str, field: str, other: str | None) -> list[Co
         chosen = [row for row in table if other is None or row[other] == group]
         known = [finite(row.get(figure) for row in chosen if row[field] == value) for value in values]
         middle, low, high = ([of(one) if one.size else np.nan for one in known] for of in (np.median, np.min, np.max))
-        label = "median and range" if other is None else f"{words(other)}: {short(group)}"
+        alone = "median and range" if any(one.size > 1 for one in known) else "a trial"
+        label = alone if other is None else f"{words(other)}: {short(group)}"
         found.append(Course(label, np.array(middle), np.array(low), np.array(high)))
     return found
 
@@ -123,13 +185,28 @@ def short(value: Any) -> str:
 
 
 def words(name: str) -> str:
-    """A field or figure as people read it: the last part of its name, the unit after a comma."""
+    """A field or figure as people read it: the last part of its name, whose method's it is, and the unit, after commas."""
     last = " and ".join(field.rpartition(".")[2] for field in name.split("+")) if "." in name else name
-    last = last.replace("_rms", "_RMS")
-    for unit in UNITS:
-        if last.endswith(f"_{unit}"):
-            return f"{last[: -len(unit) - 1].replace('_', ' ')}, {unit}"
-    return last.replace("_", " ")
+    last = re.sub(r"^cr(?=\d)", "CR", last.replace("_rms", "_RMS"))
+    after = ""
+    for ending, shown in ENDINGS:
+        if last.endswith(f"_{ending}"):
+            last, after = last.removesuffix(f"_{ending}"), f", {shown}{after}"
+    return last.replace("_", " ") + after
 
 
-UNITS = ("mm", "px", "deg", "dn", "s", "ms", "lux", "ppm")
+UNITS = {
+    **{
+        "mm_s": "mm/s",
+        "m_s": "m/s",
+        "e_per_s": "e/s",
+        "per_m": "1/m",
+        "mm": "mm",
+        "um": "µm",
+        "nm": "nm",
+        "px": "px",
+        "deg": "deg",
+    },
+    **{"dn": "DN", "ms": "ms", "s": "s", "hz": "Hz", "lux": "lux", "ppm": "ppm", "percent": "%", "w": "W"},
+}
+ENDINGS = (*UNITS.items(), ("ours", "ours"), ("paper", "paper's method"))  # of names, in the order in which they are taken off

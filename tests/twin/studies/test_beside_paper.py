@@ -59,6 +59,17 @@ def test_what_was_fitted_is_not_met():
     assert found.paper_met is None and beside_paper.cells(found)[2:5:2] == ["0.1 to 0.13", "fitted"]
 
 
+def test_figures_have_names_for_plots():
+    """Whose method's they are, their unit, and what the paper reports."""
+    names = beside_paper.names([PLANES, KNOWN.model_copy(update={"ours": "count", "unit": ""})])
+    assert {name: found.title for name, found in names.items()} == {
+        "ours_mm": "planes, RMS, ours, mm",
+        "paper_mm": "planes, RMS, paper's method, mm",
+        "count": "planes, RMS, ours",
+    }
+    assert names["ours_mm"].reported == (0.1, 0.13) and names["count"].reported is None
+
+
 def test_meanings_are_given_once():
     same = [figure.model_copy(update={"meaning": "RMS: root mean square."}) for figure in (PLANES, RADIUS)]
     assert beside_paper.meanings([*same, KNOWN]) == ["RMS: root mean square."]

@@ -77,6 +77,57 @@ def test_words_are_shown_in_the_order_in_which_they_come():
     assert line.get_ydata().tolist() == [3.0, 9.0]
 
 
+def test_there_is_no_line_between_words():
+    """Nor an area: markers, with bars from the least to the greatest, and strokes of what they are held against."""
+    (axes,) = study_plots.draw(TABLE, "error_mm", "how", ["how"], "limit_mm", "noise alone").axes
+    assert [(line.get_linestyle(), line.get_marker()) for line in axes.get_lines()] == [("None", "o"), ("None", "_")]
+    (bars,) = axes.collections
+    assert [segment[:, 1].tolist() for segment in bars.get_segments()] == [[1.0, 7.0], [9.0, 9.0]]
+    (axes,) = study_plots.draw(TABLE, "error_mm", "how", ["how", "pitch"], "limit_mm").axes
+    places = [line.get_xdata()[0] for line in axes.get_lines()]
+    assert places[0] < 0 < places[1] and places[:2] == places[2:]  # of pitch 6 and 12, beside each other
+    (axes,) = study_plots.draw(TABLE, "error_mm", "pitch", ["pitch"], "").axes
+    assert axes.get_lines()[0].get_linestyle() == "-"
+
+
+def test_no_marker_is_cut_off():
+    """At the edges of the axes, as of a figure of zero."""
+    rows = table((6, "a", 0, 0.0, 1.0), (12, "b", 0, 3.0, 1.0))
+    for field in ("pitch", "how"):
+        (axes,) = study_plots.draw(rows, "error_mm", field, [field], "limit_mm").axes
+        assert not axes.get_lines()[0].get_clip_on()
+    assert axes.get_xlim() == (-0.5, 1.5)
+
+
+def test_one_seed_has_no_median():
+    rows = table((6, "a", 0, 2.0, 1.0), (12, "a", 0, 3.0, 1.0))
+    (axes,) = study_plots.draw(rows, "error_mm", "pitch", ["pitch"], "").axes
+    assert [line.get_label() for line in axes.get_lines()] == ["a trial"]
+
+
+@pytest.mark.parametrize(("reported", "heights"), [((0.72, 0.72), [0.72]), ((10.0, 13.0), [10.0, 13.0])])
+def test_what_the_paper_reports_is_a_dashed_line(reported, heights):
+    """Two for a range, one entry of the legend; it is within the axes."""
+    name = study_plots.Name("planes, RMS, ours, mm", reported)
+    for field in ("pitch", "how"):
+        (axes,) = study_plots.draw(TABLE, "error_mm", field, [field], "", "", name).axes
+        lines = [line for line in axes.get_lines() if line.get_linestyle() == "--"]
+        assert [line.get_ydata()[0] for line in lines] == heights
+        assert [text.get_text() for text in axes.get_legend().get_texts()].count("paper reported") == 1
+        assert axes.get_ylabel() == "planes, RMS, ours, mm" and axes.get_ylim()[1] >= max(heights)
+
+
+def test_an_error_of_both_signs_is_compared_by_its_size():
+    """With a standard deviation or what the paper reports; alone it keeps its sign."""
+    rows = table((6, "a", 0, -2.0, 1.0), (12, "a", 0, 3.0, 1.0), (18, "a", 0, NAN, 1.0))
+    (held,) = study_plots.draw(rows, "error_mm", "pitch", ["pitch"], "limit_mm").axes
+    assert held.get_lines()[0].get_ydata().tolist()[:2] == [2.0, 3.0] and held.get_ylabel() == "size of error, mm"
+    (alone,) = study_plots.draw(rows, "error_mm", "pitch", ["pitch"], "").axes
+    assert alone.get_lines()[0].get_ydata().tolist()[:2] == [-2.0, 3.0] and alone.get_ylabel() == "error, mm"
+    (positive,) = study_plots.draw(rows[1:], "error_mm", "pitch", ["pitch"], "limit_mm").axes
+    assert positive.get_ylabel() == "error, mm"
+
+
 def test_many_values_are_a_cloud():
     """Of a space-filling design: a point a trial, and what it is held against."""
     rows = table(*((k + 0.5, "", 0, float(k), k / 2) for k in range(30)))
@@ -102,6 +153,12 @@ def test_a_figure_that_no_trial_gave_is_drawn_empty():
         ("scale_sigma_ppm", "scale sigma, ppm"),
         ("coverage", "coverage"),
         ("images", "images"),
+        ("rig.projector.radiant_flux_w", "radiant flux, W"),
+        ("noise.speed_mm_s", "speed, mm/s"),
+        ("brightness_dn", "brightness, DN"),
+        ("cr1_mean_ours_mm", "CR1 mean, ours, mm"),
+        ("tumours_inside_paper", "tumours inside, paper's method"),
+        ("tumour_volume_error_ours_percent", "tumour volume error, ours, %"),
     ],
 )
 def test_names_are_words_with_their_unit(name, expected):
