@@ -28,6 +28,8 @@ from twin.studies.factors import Point
 from twin.studies.rig_search import Candidate, Goal
 from twin.studies.study_runs import STUDY, TABLE, Done, StudyFolder, Trial, finite
 
+FEWEST = 10  # trials of a search that are drawn over each factor; fewer are scattered over all of them
+
 if TYPE_CHECKING:
     from sonotwin.verbs.study import Config
 
@@ -40,9 +42,11 @@ def sweep(config: "Config", console: Console) -> bool:
     done = do(config, opened(config), trials, console)
     of = experiments.experiment(config.of)
     for figure, limit in of.limits.items():
-        beside = f", {of.limit} {_range(done, limit)}" if limit else ""
+        sign = "± " if (finite(one.figures.get(figure) for one in done) < 0).any() else ""  # an error, beside a size
+        beside = f", {of.limit} {sign}{_range(done, limit)}" if limit else ""
         console.print(f"figure      {figure} {_range(done, figure)}{beside}", markup=False)
-    sections = study_page.plots(config.out, done, of)
+    names = beside_paper.names(config.beside)
+    sections = [*study_page.plots(config.out, done, of, names), study_page.points(done, of, names)]
     if config.beside:
         sections = [_beside_paper(config, done, console), *sections]
     write(config, done, sections, console)
@@ -115,11 +119,14 @@ def search(config: "Config", goal: Goal, console: Console) -> bool:
     for what, one in {"start": candidates[0] if goal.start else None, "best": found}.items():
         if one is not None:
             console.print(f"{what:12}{goal.least} {shown(one.value, '.4g')}: {', '.join(fields_of(one.point))}", markup=False)
+    if goal.start and candidates[0].lost:
+        console.print(f"no start    {search_page.no_start(candidates[0])}", markup=False)
     if found is None:
         console.print("no best     no candidate kept all bounds")
     done = [one for candidate in candidates for one in candidate.done]
     of = experiments.experiment(config.of)
-    sections = [*search_page.sections(config.out, goal, candidates), *study_page.plots(config.out, done, of)]
+    courses = study_page.plots(config.out, done, of) if len(done) >= FEWEST else []
+    sections = [*search_page.sections(config.out, goal, candidates), *courses, study_page.points(done, of)]
     write(config, done, sections, console)
     return found is not None
 

@@ -65,7 +65,7 @@ def waterfall(one: Sum) -> Figure:
     longest = max(one.added, most)
     ticks = lengths(longest)
     axes.set_xticks(np.square(ticks), [f"{value:g}" for value in ticks])
-    axes.set(xlabel="error, mm, on an axis of squares, along which bars add up", xlim=(0, 1.18 * longest**2))
+    axes.set(xlabel="error, mm (squares add up)", xlim=(0, 1.18 * longest**2))
     return drawn
 
 

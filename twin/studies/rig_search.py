@@ -66,6 +66,20 @@ class Candidate:
         """Whether it has figures and keeps all bounds."""
         return math.isfinite(self.value) and self.excess <= 0
 
+    @property
+    def lost(self) -> str:
+        """Why there is no figure to be least, in one line; empty where there is one."""
+        if math.isfinite(self.value):
+            return ""
+        return next((one.found for one in self.done if isinstance(one.found, str)), "the figure is missing in a trial")
+
+
+def missed(goal: Goal, candidate: Candidate) -> str:
+    """The figure, or the price, that is farthest out of its bound; empty where all bounds are kept."""
+    if candidate.excess <= 0:
+        return ""
+    return max(candidate.bound, key=lambda name: goal.bounds[name].excess(candidate.bound[name]))
+
 
 def check(goal: Goal, factors: Mapping[str, Factor]) -> None:
     """Refuse a search that can't be made; raises InputError."""

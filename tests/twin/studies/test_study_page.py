@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.twin.studies.made_up import done
-from twin.studies import budget_page, error_budget, rig_search, search_page, study_page
+from twin.studies import budget_page, error_budget, rig_search, search_page, study_page, study_plots
 from twin.studies.error_budget import Budget, Contribution, Sum
 from twin.studies.experiments import Experiment
 from twin.studies.rig_search import Bound, Candidate, Goal
@@ -52,6 +52,10 @@ def written(folder, trials, sections) -> str:
     return (folder / study_page.PAGE).read_text(encoding="utf-8")
 
 
+def shown(folder, trials, of=OF, names=study_page.NO_NAMES):
+    return [*study_page.plots(folder, trials, of, names), study_page.points(trials, of, names)]
+
+
 def text(html: str) -> str:
     return unescape(re.sub(r"<svg.*?</svg>", " ", html, flags=re.S))
 
@@ -64,7 +68,7 @@ def rows_of(html: str) -> list[list[str]]:
 
 def test_a_page_is_complete(tmp_path):
     """Elements are closed, nothing is fetched, commands and titles are there, and words of people are no HTML."""
-    page = written(tmp_path, DONE, study_page.plots(tmp_path, DONE, OF))
+    page = written(tmp_path, DONE, shown(tmp_path, DONE))
     balance = Balance()
     balance.feed(page)
     assert not balance.open and not balance.fetched
@@ -82,7 +86,7 @@ def test_a_page_is_complete(tmp_path):
 
 
 def test_each_figure_is_drawn_over_each_factor_and_kept(tmp_path):
-    page = written(tmp_path, DONE, study_page.plots(tmp_path, DONE, OF))
+    page = written(tmp_path, DONE, shown(tmp_path, DONE))
     names = {f"{figure}_over_{field}.png" for figure in LIMITS for field in ("rig_pitch", "light")}
     assert {path.name for path in (tmp_path / "figures").iterdir()} == names
     assert all((tmp_path / "figures" / name).read_bytes().startswith(b"\x89PNG") and f"figures/{name}" in page for name in names)
@@ -91,7 +95,7 @@ def test_each_figure_is_drawn_over_each_factor_and_kept(tmp_path):
 
 def test_the_table_has_medians_a_point(tmp_path):
     """Over seeds; in brackets what they are held against, which plots and the caption name."""
-    page = written(tmp_path, DONE, study_page.plots(tmp_path, DONE, OF))
+    page = written(tmp_path, DONE, shown(tmp_path, DONE))
     head, *rows = rows_of(page)
     assert head == ["pitch", "light", "trials", "error, mm", "turn, deg"]
     assert rows[:2] == [["6", "dim", "3", "12 (1.5)", "0.5"], ["6", "<bright>", "3", "12 (1.5)", "0.5"]] and len(rows) == 4
@@ -100,7 +104,7 @@ def test_the_table_has_medians_a_point(tmp_path):
 
 def test_points_without_figures_are_named(tmp_path):
     trials = [*DONE, done({"rig.pitch": 40, "light": "dim"}, "coverage: found none", 7)]
-    page = text(written(tmp_path, trials, study_page.plots(tmp_path, trials, OF)))
+    page = text(written(tmp_path, trials, shown(tmp_path, trials)))
     assert "12 of 13 trials gave figures." in page and "rig.pitch=40, light=dim, seed=7: coverage: found none" in page
     assert rows_of(page)[-1][:3] == ["40", "dim", "1"]
 
@@ -126,7 +130,7 @@ def test_an_axis_of_squares_has_a_few_round_lengths(longest):
 
 def test_a_study_without_factors_has_a_table_alone(tmp_path):
     trials = [done({}, {"error_mm": 2.0, "limit_mm": 1.0, "turn_deg": 3.0}, seed) for seed in range(3)]
-    page = written(tmp_path, trials, study_page.plots(tmp_path, trials, OF))
+    page = written(tmp_path, trials, shown(tmp_path, trials))
     assert rows_of(page)[1] == ["3", "2 (1)", "3"] and "<svg" not in page
 
 
@@ -145,13 +149,64 @@ def test_a_search_shows_its_course_and_the_best_within_bounds(tmp_path):
     (axes,) = search_page.course(goal, candidates()).axes
     lines = {line.get_label(): line for line in axes.get_lines()}
     assert lines["within all bounds"].get_xydata().tolist() == [[3, 3], [5, 4]]
-    assert lines["out of bounds"].get_xdata().tolist() == [1, 2, 4]
+    assert lines["out of bounds: time, s"].get_xdata().tolist() == [1, 2]
+    assert (lines["no figures"].get_xdata().tolist(), lines["no figures"].get_ydata().tolist()) == ([4], [1])  # the upper edge
+    assert all(tick == round(tick) for tick in axes.get_xticks())
     assert lines["best so far"].get_ydata().tolist()[2:] == [3, 3, 3]
 
 
 def test_a_search_in_vain_says_so(tmp_path):
-    (section,) = search_page.sections(tmp_path, Goal(least="error_mm"), candidates()[:2])
+    goal = Goal(least="error_mm", bounds={"time_s": Bound(most=1.0)})
+    (section,) = search_page.sections(tmp_path, goal, candidates()[:2])
     assert rig_search.best(candidates()[:2]) is None and "No candidate kept all bounds." in section.blocks[0]
+
+
+def test_each_bound_that_is_missed_has_a_cross_of_its_own():
+    """By the one that is missed most; a bound that nobody missed isn't in the legend."""
+    goal = Goal(least="error_mm", bounds={"time_s": Bound(most=1.0), "coverage": Bound(least=0.9), "price": Bound(most=9)})
+    bounds = [{"time_s": 1.1, "coverage": 0.3}, {"time_s": 3.0, "coverage": 0.8}, {"time_s": 1.0, "coverage": float("nan")}]
+    excess = [0.7, 2.0, float("inf")]
+    tried = [Candidate({"a": 1}, (), 1.0, bound | {"price": 1}, over) for bound, over in zip(bounds, excess, strict=True)]
+    (axes,) = search_page.course(goal, tried).axes
+    lines = {line.get_label(): line for line in axes.get_lines()}
+    crosses = {label: line for label, line in lines.items() if label.startswith("out of bounds")}
+    assert {label: line.get_xdata().tolist() for label, line in crosses.items()} == {
+        "out of bounds: coverage": [1, 3],
+        "out of bounds: time, s": [2],
+    }
+    assert len({line.get_marker() for line in crosses.values()}) == 2
+
+
+def test_a_start_without_figures_is_explained(tmp_path):
+    """By its reason, and nothing is said of an improvement."""
+    point = {"a.pitch": 40}
+    start = Candidate(
+        point,
+        (done(point, {"error_mm": 1.0}), done(point, "coverage: found none")),
+        float("nan"),
+        {"time_s": float("nan")},
+        float("inf"),
+    )
+    goal = Goal(least="error_mm", start=point, bounds={"time_s": Bound(most=1.0)})
+    (section,) = search_page.sections(tmp_path, goal, [start, *candidates()])
+    assert "no improvement on it can be stated: coverage: found none" in section.blocks[0]
+    assert not any("no improvement" in block for block in search_page.sections(tmp_path, goal, candidates())[0].blocks)
+    incomplete = Candidate(point, (done(point, {"error_mm": float("nan")}),), float("nan"), {}, 0.0)
+    assert incomplete.lost == "the figure is missing in a trial" and not candidates()[0].lost
+
+
+def test_figures_have_the_studys_names(tmp_path):
+    """And an error of both signs is shown by its size, where it stands beside one."""
+    names = {"error_mm": study_plots.Name("CR1, mean of five points, ours, mm", (0.6, 0.6))}
+    trials = [
+        done({"light": light}, {"error_mm": error, "limit_mm": 1.5, "turn_deg": -2.0})
+        for light, error in (("a", -3.0), ("b", 2.0))
+    ]
+    page = text(written(tmp_path, trials, shown(tmp_path, trials, names=names)))
+    assert "<h2>CR1, mean of five points, ours, mm</h2>" in page
+    head, first, second = rows_of(page)
+    assert head == ["light", "trials", "size of CR1, mean of five points, ours, mm", "turn, deg"]
+    assert (first[2:], second[2:]) == (["3 (1.5)", "-2"], ["2 (1.5)", "-2"])
 
 
 BUDGET = Budget(sources={"bow": ("b",), "print": ("p",), "dust": ("d",)}, figures={"error_mm": "a place"})
