@@ -5,7 +5,7 @@ composes them; pydantic validates what comes out; the mistakes that either finds
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from recon.errors import InputError, one_line
 
+MOST_NAMES = 12  # of keys in a message
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -81,13 +82,12 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
                 OmegaConf.update(composed, field, None if value == "null" else value.strip("'\""))
             result = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         except MissingConfigException as error:
-            group, _, choice = str(error.missing_cfg_file).rpartition("/")
-            raise InputError(f"{verb}: {group}: {_expected_one_of(choice, error.options or [])}") from error
+            raise InputError(f"{verb}: {_missing_choice(verb, str(error.missing_cfg_file))}") from error
         except ConfigCompositionException as error:
             unknown = re.search(r"Could not override '([^']+)'", str(error))
             if unknown is None:
                 raise InputError(f"{verb}: {_first_line(error)}") from error
-            known = list(_keys(OmegaConf.to_container(hydra_compose(name)))) if name else []
+            known = OmegaConf.to_container(hydra_compose(name)) if name else {}
             raise InputError(f"{verb}: {unknown[1]}: {_unknown_key(unknown[1], known)}") from error
         except MissingMandatoryValue as error:
             raise InputError(f"{verb}: {error.full_key}: needs a value; give {error.full_key}=...") from error
@@ -112,7 +112,7 @@ def describe(error: ValidationError, model: type[BaseModel]) -> str:
     field = ".".join(str(part) for part in first["loc"])
     match first["type"]:
         case "extra_forbidden":
-            text = f"{field}: {_unknown_key(field, list(model.model_fields))}"
+            text = f"{field}: {_unknown_key(field, dict.fromkeys(model.model_fields))}"
         case "missing":
             text = f"{field}: needs a value; give {field}=..."
         case _:
@@ -132,9 +132,27 @@ def _literal_if_not_grammar(verb: str, override: str) -> str:
         if not OverridesParser.create().parse_override(override).is_sweep_override():
             return override
     except HydraException as error:
+        if value[:1] in ("[", "{") and not _balanced(value):
+            raise InputError(f"{verb}: {key}: expected balanced brackets and quotes, found {value}") from error
         if value[:1] in ("[", "{", "'", '"') or not re.fullmatch(r"[+~]*[\w./@:-]+", key):
             raise InputError(f"{verb}: {override}: can't be read as field=value: {_first_line(error)}") from error
     return f"{key}='{_escape(value)}'"
+
+
+def _balanced(value: str) -> bool:
+    """Whether each bracket and each quote of a value is closed, in the order of the openings."""
+    pairs, open_ones, quote, before = {"]": "[", "}": "{", ")": "("}, list[str](), "", ""
+    for letter in value:
+        if quote:
+            quote = "" if letter == quote and before != "\\" else quote
+        elif letter in "'\"":
+            quote = letter
+        elif letter in pairs.values():
+            open_ones.append(letter)
+        elif letter in pairs and (not open_ones or open_ones.pop() != pairs[letter]):
+            return False
+        before = letter
+    return not open_ones and not quote
 
 
 def _escape(text: str) -> str:
@@ -142,25 +160,38 @@ def _escape(text: str) -> str:
     return re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), text)
 
 
-def _expected_one_of(found: str, choices: Sequence[str]) -> str:
-    return f"expected one of {', '.join(choices) or 'nothing'}, found {found}" + _did_you_mean(found, choices)
+def _missing_choice(verb: str, file: str) -> str:
+    """A choice that a group doesn't have, by the file that Hydra looked for, such as `rig/narow`, or `rig//home/me/mine.yaml`."""
+    known = groups(verb)
+    group = next((name for name in known if file.startswith(f"{name}/")), file.rpartition("/")[0])
+    choice, names = file.removeprefix(f"{group}/"), known.get(group, [])
+    if "/" in choice or choice.endswith((".yaml", ".yml")):
+        way_on = f"copy the file to {folder() / group} and give its name"
+        return f"{group}: expected one of {', '.join(names) or 'nothing'}, found the path {choice}; {way_on}"
+    return f"{group}: expected one of {', '.join(names) or 'nothing'}, found {choice}" + _did_you_mean(choice, names)
 
 
-def _unknown_key(key: str, known: Sequence[str]) -> str:
-    return "unknown key" + _did_you_mean(key, known)
+def _unknown_key(key: str, tree: Any) -> str:
+    """The keys that stand where a dotted one was looked for in a nested dictionary, and the nearest of them."""
+    way: list[str] = []
+    for part in key.split("."):
+        if not isinstance(tree, Mapping) or part not in tree:
+            break
+        tree = tree[part]
+        way.append(part)
+    names = [str(name) for name in tree] if isinstance(tree, Mapping) else []
+    missing = key.split(".")[min(len(way), key.count("."))]
+    near = _did_you_mean(missing, names, ".".join([*way, ""]))
+    if not names:
+        return f"unknown key; expected none{' below ' + '.'.join(way) if way else ''}"
+    listed = ", ".join(names) if len(names) <= MOST_NAMES else f"{', '.join(names[:MOST_NAMES])}, ..."
+    return f"unknown key; expected one of {listed}{near}"
 
 
-def _did_you_mean(word: str, known: Sequence[str]) -> str:
-    close = get_close_matches(word, known, n=1)
-    return f"; did you mean {close[0]}?" if close else ""
-
-
-def _keys(tree: Any, prefix: str = "") -> Iterator[str]:
-    """Dotted names of all fields of a nested dictionary."""
-    if isinstance(tree, Mapping):
-        for key, value in tree.items():
-            yield f"{prefix}{key}"
-            yield from _keys(value, f"{prefix}{key}.")
+def _did_you_mean(word: str, known: Sequence[str], before: str = "") -> str:
+    """The nearest of known words: one that is nearly alike, else one that has the word in it."""
+    close = get_close_matches(word, known, n=1) or [name for name in known if len(word) > 2 and word in name][:1]
+    return f"; did you mean {before}{close[0]}?" if close else ""
 
 
 def _first_line(error: Exception) -> str:

@@ -78,7 +78,7 @@ def test_unknown_option(capsys):
 
 
 def test_unknown_key(capsys):
-    assert complaint(capsys, "doctor", "pitchh=3") == "doctor: pitchh: unknown key"
+    assert complaint(capsys, "doctor", "pitchh=3") == "doctor: pitchh: unknown key; expected none"
 
 
 def test_a_reader_that_has_seen_enough():

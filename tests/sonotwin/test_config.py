@@ -78,9 +78,17 @@ def test_paths_are_taken_as_they_stand(path):
 @pytest.mark.parametrize(
     ("override", "line"),
     [
-        ("pitchh=3", "surface: pitchh: unknown key; did you mean pitch?"),
-        ("rig.gama=3", "surface: rig.gama: unknown key; did you mean rig.gamma?"),
-        ("+extra=3", "surface: extra: unknown key"),
+        ("pitchh=3", "surface: pitchh: unknown key; expected one of rig, capture, out, pitch, unwrap; did you mean pitch?"),
+        ("rig.gama=3", "surface: rig.gama: unknown key; expected one of gamma; did you mean rig.gamma?"),
+        ("rig.gam=3", "surface: rig.gam: unknown key; expected one of gamma; did you mean rig.gamma?"),
+        ("rig.mma=3", "surface: rig.mma: unknown key; expected one of gamma; did you mean rig.gamma?"),
+        ("rigg.gamma=3", "surface: rigg.gamma: unknown key; expected one of rig, capture, out, pitch, unwrap; did you mean rig?"),
+        ("pitch.fine=3", "surface: pitch.fine: unknown key; expected none below pitch"),
+        ("+extra=3", "surface: extra: unknown key; expected one of rig, capture, out, pitch, unwrap"),
+        ("out=[a", "surface: out: expected balanced brackets and quotes, found [a"),
+        ("out={a: [1, 2}", "surface: out: expected balanced brackets and quotes, found {a: [1, 2}"),
+        ("out={a: 'b}", "surface: out: expected balanced brackets and quotes, found {a: 'b}"),
+        ("out=[1]]", "surface: out: expected balanced brackets and quotes, found [1]]"),
         ("rig=narow", "surface: rig: expected one of narrow, wide, found narow; did you mean narrow?"),
         ("pitch=0", "surface: pitch: expected greater than 1, found 0"),
         ("unwrap=grey", "surface: unwrap: expected 'gray' or 'centre_line', found 'grey'"),
@@ -102,6 +110,21 @@ def test_nonsense_is_one_line(override):
         load(override)
 
 
+@pytest.mark.parametrize("path", ["/home/me/mine.yaml", "mine.yaml", "./mine.yml", "~/rigs/mine", "rigs/mine"])
+def test_a_path_where_a_name_is_expected_is_said_so(path, tmp_path):
+    """With the way on: where the file has to be for its name to be known."""
+    with pytest.raises(InputError) as caught:
+        load(f"rig={path}")
+    way_on = f"copy the file to {tmp_path / 'rig'} and give its name"
+    assert str(caught.value) == f"surface: rig: expected one of narrow, wide, found the path {path}; {way_on}"
+
+
+def test_brackets_and_quotes_are_balanced():
+    """As they open and close; in quotes all letters are text."""
+    assert all(map(config._balanced, ["{a: [1, (2)]}", "['[', '}']", '{a: "it\'s"}', "['it\\'s']", ""]))
+    assert not any(map(config._balanced, ["{a: [1}]", "]", "['a]", "[']'", "{"]))
+
+
 def test_further_mistakes_are_counted():
     with pytest.raises(InputError, match=r"\(and 1 more\)$"):
         load("pitch=0", "unwrap=x")
@@ -112,5 +135,5 @@ def test_a_verb_without_file_has_no_fields():
         model_config = ConfigDict(extra="forbid")
 
     assert config.load("nothing", [], Empty) == Empty()
-    with pytest.raises(InputError, match="nothing: x: unknown key"):
+    with pytest.raises(InputError, match="nothing: x: unknown key; expected none"):
         config.load("nothing", ["x=1"], Empty)

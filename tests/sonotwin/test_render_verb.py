@@ -29,7 +29,7 @@ HALF = [  # both cameras at half their size
         (["patterns=paper"], "patterns: expected one of"),
         (["patterns.unwrap=luck"], "patterns.unwrap: expected"),
         (["patterns.projector_size=[1920,1080]"], "patterns.projector_size: expected the rig's [1280, 800], found [1920, 1080]"),
-        (["rig.projector.gama=2"], "rig.projector.gama: unknown key; did you mean rig.projector.gamma?"),
+        (["rig.projector.gama=2"], "gamma, contrast; did you mean rig.projector.gamma?"),
         (
             ["rig.cam1.sensor.quantum_efficiency=1.4"],
             "rig.cam1.sensor.quantum_efficiency: expected less than or equal to 1, found 1.4",

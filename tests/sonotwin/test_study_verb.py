@@ -139,7 +139,7 @@ SWEEP = "over={noise.speed_mm_s: [5, 10]}"
         (["name=sweep", "of=chain"], "over: needs a value with name=sweep; give over=..."),
         (["name=sweep", "of=chains", SWEEP], "of: expected one of surface, calibration, tracking, laboratory, chain,"),
         (["of=chain", SWEEP], "name: needs a value; give name=..."),
-        ([*OURS, "over={noise.sped_mm_s: [5]}"], "over: noise.sped_mm_s: unknown key sped_mm_s; did you mean"),
+        ([*OURS, "over={noise.sped_mm_s: [5]}"], "over: noise.sped_mm_s: unknown key sped_mm_s; expected one of board_px, "),
         ([*OURS, "over={shooting.gain: [1]}"], "over: shooting.gain: expected a field that of=chain reads,"),
         ([*OURS, "over={noise.speed_mm_s: [5, -1]}"], "over: noise.speed_mm_s=-1: noise.speed_mm_s: expected"),
         ([*OURS, "over={noise.speed_mm_s: 5}"], "over: noise.speed_mm_s: expected a list, {from, to,"),
@@ -153,7 +153,14 @@ SWEEP = "over={noise.speed_mm_s: [5, 10]}"
         ([*OURS, "over={conditions: [lifelik]}"], "over: conditions: expected one of ideal, lifelike, found lifelik"),
         ([*OURS, SWEEP, "seeds=0"], "seeds: expected greater than or equal to 1, found 0"),
         ([*OURS, SWEEP, "fill=halton"], "fill: expected 'sobol' or 'latin', found 'halton'"),
-        ([*OURS, SWEEP, "sead=3"], "sead: unknown key; did you mean seeds?"),
+        ([*OURS, SWEEP, "sead=3"], "; did you mean seeds?"),
+        (
+            [*OURS, SWEEP, "rig.cam1.sensor.dark=3"],
+            "rig.cam1.sensor.dark: unknown key; expected one of pixel_um, quantum_efficiency, saturation_e, dark_noise_e,",
+        ),
+        ([*OURS, SWEEP, "rig.cam1.sensor.dark=3"], "; did you mean rig.cam1.sensor.dark_noise_e?"),
+        ([*OURS, "over={noise.speed_mm_s: [5}"], "over: expected balanced brackets and quotes, found {noise.speed_mm_s: [5}"),
+        ([*OURS, SWEEP, "rig=/home/me/mine.yaml"], "rig: expected one of meza2021, found the path /home/me/mine.yaml; copy"),
         ([*OURS, SWEEP, "poses.count=0"], "poses.count: expected greater than or equal to 1, found 0"),
         ([*OURS, SWEEP, "search={runs: 3}"], "search.least: needs a value"),
         (
@@ -162,7 +169,7 @@ SWEEP = "over={noise.speed_mm_s: [5, 10]}"
         ),
         (
             [*OURS, "over={}", "budget={figures: {pixel_rms_mm: x}, sources: {a: [noise.drawn.colum]}}"],
-            "noise.drawn.colum: unknown key colum; did you mean column?",
+            "bracket_at_wires, bracket_in_scan; did you mean column?",
         ),
         (
             [*OURS, "over={}", "noise.drawn.column=0", "budget={figures: {pixel_rms_mm: x}, sources: {a: [noise.drawn.column]}}"],

