@@ -1,5 +1,6 @@
 """`sonotwin study`: studies of conf/study can be planned, a sweep runs from end to end, mistakes are refused beforehand."""
 
+import inspect
 import json
 import os
 import re
@@ -20,7 +21,7 @@ from sonotwin.config import folder, load
 from sonotwin.verbs.study import Config
 from tests.twin.studies.made_up import done
 from twin.conditions import Conditions
-from twin.studies import beside_paper, error_budget, experiments, factors, rig_search
+from twin.studies import beside_paper, error_budget, experiments, factors, rig_search, surface_trial
 from twin.studies.drawn_session import Drawn
 
 STUDIES = sorted(path.stem for path in (folder() / "study").glob("*.yaml"))
@@ -104,6 +105,13 @@ def test_the_papers_document_has_the_tables_of_its_studies():
         planned = beside_paper.markdown(beside_paper.compare(config.beside, lost)).splitlines()
         assert rows[:2] == planned[:2]
         assert [row.split("|")[1:4] for row in rows] == [row.split("|")[1:4] for row in planned]
+
+
+def test_the_columns_of_surfaces_are_explained():
+    """All figures of a trial, by their names in its source; those of sessions are compared where one is run."""
+    glossary = (folder().parent / "docs" / "studies.md").read_text(encoding="utf-8")
+    figures = re.findall(r'^ +"(\w+)": ', inspect.getsource(surface_trial.measure), flags=re.MULTILINE)
+    assert len(figures) > 10 and not [name for name in figures if f"`{name}`" not in glossary]
 
 
 def test_a_studys_name_may_be_a_number(tmp_path, monkeypatch):
@@ -278,6 +286,8 @@ def test_a_sweep_from_end_to_end(tmp_path, capsys):
     rows = pq.read_table(out / "table.parquet").to_pylist()
     assert [(row["conditions"], row["seed"]) for row in rows] == [("ideal", 0), ("ideal", 1), ("lifelike", 0), ("lifelike", 1)]
     assert max(row["pixel_rms_mm"] for row in rows[:2]) < min(row["pixel_rms_mm"] for row in rows[2:])
+    glossary = (folder().parent / "docs" / "studies.md").read_text(encoding="utf-8")
+    assert not [name for name in rows[0] if f"`{name}`" not in glossary and name not in ("conditions", "seed", "error")]
     predicted = loaded(tmp_path, "name=budget").budget.predicted
     assert {name for known in predicted.values() for name in known.values()} <= set(rows[0])
     description = json.loads((out / "study.json").read_text())
@@ -358,6 +368,33 @@ def test_a_budget_and_a_search_from_end_to_end(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "start       pixel_rms_mm" in said and "best        pixel_rms_mm" in said
     assert pq.read_table(tmp_path / "b" / "table.parquet").num_rows == 4
+    assert [path.name for path in (tmp_path / "b" / "figures").iterdir()] == ["search.png"]  # too few for single factors
+
+
+@pytest.mark.slow
+def test_a_search_from_a_start_without_figures_says_why(tmp_path, capsys):
+    """A scan so fast that no pair of frames shows one target; the best is found, and no improvement stated."""
+    fields = ["over={noise.speed_mm_s: [20000, 10]}", "seeds=1", "conditions.motion.trigger_s=0.01"]
+    search = "search={least: pixel_rms_mm, runs: 3, batch: 1, by: tpe, start: {noise.speed_mm_s: 20000}}"
+    main(["study", "name=sweep", f"out={tmp_path / 'out'}", *SMALL, *fields, search])
+    said = capsys.readouterr().out
+    assert "start       pixel_rms_mm unknown: noise.speed_mm_s=20000" in said
+    assert "no start    The start gives no figures, so no improvement on it can be stated: target: expected to be seen" in said
+
+
+@pytest.mark.slow
+def test_a_budgets_lost_trials_are_named_by_their_source(tmp_path, capsys):
+    """Not by all the fields that are zero."""
+    lost = [*SMALL, "over={}", "seeds=1", "conditions.motion.trigger_s=0.005", "noise.speed_mm_s=20000"]
+    sources = "{scanner: [noise.drawn.latency], triggers: [conditions.motion.trigger_s]}"
+    budget = f"budget={{sources: {sources}, figures: {{pixel_rms_mm: pixels}}}}"
+    assert main(["study", "name=sweep", f"out={tmp_path / 'out'}", *lost, budget]) == 1
+    said = capsys.readouterr().out
+    lines = [line for line in said.splitlines() if line.startswith("no figures")]
+    assert lines and all(
+        re.match(r"no figures  (all sources|(scanner|triggers) alone.*), seed=0: target: ", line) for line in lines
+    )
+    assert all(len(line) < 250 for line in lines)
 
 
 def test_wrong_choices_of_a_group_name_the_right_ones():

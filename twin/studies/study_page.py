@@ -128,7 +128,7 @@ def labels(done: Sequence[Done]) -> list[str]:
     """Points of trials by the values that vary among them, as fields of the command line; by all where none does."""
     table, fields = study_runs.rows(done), list(done[0].trial.point)
     varied = [field for field in fields if len({row[field] for row in table}) > 1] or fields
-    return [", ".join(f"{field}={short(row[field])}" for field in varied) for row in table]
+    return [", ".join(f"{field}={short(one.trial.point[field])}" for field in varied) for one in done]
 
 
 def named(one: Done, point: str) -> str:

@@ -115,7 +115,7 @@ def test_a_trial_is_named_by_what_varies(tmp_path):
     trials = [done(same | {"rig.pitch": pitch}, "nothing seen", seed) for pitch in (6, 9) for seed in (0, 1)]
     assert study_page.labels(trials) == ["rig.pitch=6", "rig.pitch=6", "rig.pitch=9", "rig.pitch=9"]
     assert study_page.named(trials[1], "rig.pitch=6") == "rig.pitch=6, seed=1" and study_page.named(trials[1], "") == "seed=1"
-    assert study_page.labels([done({"a": 1}, {}), done({"a": 1}, {}, 1)]) == ["a=1", "a=1"]
+    assert study_page.labels([done({"a": 20000}, {}), done({"a": 20000}, {}, 1)]) == ["a=20000", "a=20000"]
     study_page.write(tmp_path, "Budget", trials, [], [], ["all sources", "all sources", "bow alone", "bow alone"])
     assert "<li>bow alone, seed=1: nothing seen</li>" in (tmp_path / study_page.PAGE).read_text(encoding="utf-8")
 
