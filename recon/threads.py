@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
+from threading import RLock
 from typing import Any, TypeVar
 
 import cv2
@@ -14,6 +15,7 @@ import numba
 Result = TypeVar("Result")
 
 PARTS_A_THREAD = 8  # of a range, so that idle threads take over
+_OPENCV = RLock()  # of its number of threads
 
 
 def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any) -> None:
@@ -76,13 +78,14 @@ def mapped(work: Callable[..., Result], *streams: Iterable[Any], most: int | Non
 
 @contextmanager
 def opencv_on_one_thread() -> Iterator[None]:
-    """Let OpenCV add up in one order meanwhile, so that each call gives the same bits; it holds for the whole process."""
-    count = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(count)
+    """Let OpenCV add up in one order meanwhile, for the same bits at each call; for all of the process, so one at a time."""
+    with _OPENCV:
+        count = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+        try:
+            yield
+        finally:
+            cv2.setNumThreads(count)
 
 
 @cache
