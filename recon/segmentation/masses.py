@@ -1,5 +1,6 @@
 """Masses darker than the tissue around them, in tracked B-scans: each a closed surface in the world."""
 
+import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 
@@ -18,6 +19,8 @@ from recon.segmentation.echo_power import EchoPower, pixel_mm
 from recon.segmentation.mass_surface import Mass, distances, evened, meshed
 from recon.segmentation.refraction import Sound, follow
 from recon.segmentation.shadow_clearing import Recording, cleared
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -41,6 +44,8 @@ REFINEMENTS = (2, 3)  # after each clearing
 SAMPLED = 40  # images for the level of tissue
 LEAST_GREY = 5.0  # of 255, of tissue
 CORE = 0.6  # of a mass's extent: its darkest part
+MOSTLY_AROUND = 0.6  # share of a cut body's shell that shows tissue: elsewhere than behind phantoms
+CUT = "a dark body of %.0f mm3 at %.0f, %.0f, %.0f mm lies at the scan's end, and is left out: scan on there"
 LEAST_SEEN = 0.3  # of the core, by sound that came through other masses
 
 
@@ -151,7 +156,10 @@ def refined(masses: Sequence[Mass], power: EchoPower, times: int) -> list[Mass]:
 
 
 def rough(power: EchoPower) -> list[Mass]:
-    """Dark bodies with tissue all around, without the shadows that hang on to them."""
+    """Dark bodies with tissue all around, without the shadows that hang on to them.
+
+    A warning is logged of one with tissue around most of it that the scan's end cuts.
+    """
     spacing = power.volume.spacing[::-1]
     smooth = _smoothed(power.volume.voxels, power.weight, SMOOTH_MM / spacing)
     seen = np.isfinite(smooth)
@@ -176,7 +184,13 @@ def rough(power: EchoPower) -> list[Mass]:
         touches = (_widened(inside, EDGE_MM, spacing) & unknown[part]).any()
         cut = any(s.start < m or s.stop > n - m for s, m, n in zip(parts[number - 1], edge, dark.shape, strict=True))
         core = np.median(ratio[part][inside])
-        if volume < LEAST_MM3 or touches or cut or core > SEED:
+        if volume < LEAST_MM3 or core > SEED:
+            continue
+        if touches or cut:
+            grown, tissues = (np.pad(field, 2 * edge.max()) for field in (inside, seen[part] & (ratio[part] > DARK)))
+            if tissues[_widened(grown, 2 * EDGE_MM, spacing) & ~grown].mean() > MOSTLY_AROUND:
+                middle = [np.mean(axis) + s.start for axis, s in zip(np.nonzero(inside), part, strict=True)][::-1]
+                log.warning(CUT, volume, *rigid.apply(power.volume.world_from_voxel, np.array(middle)))
             continue
         field = np.where(_widened(inside, GROW_MM, spacing), ratio[part], 1.0)
         result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))

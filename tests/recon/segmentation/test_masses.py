@@ -1,5 +1,7 @@
 """Are dark bodies found, and as large as they are, in averaged power with walls and shadows?"""
 
+import re
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -84,6 +86,20 @@ def test_what_reaches_the_images_end_is_no_mass(rng):
     assert find(speckled(shadow, rng)) == []
     assert find(speckled(gel, rng)) == []
     assert find(speckled(np.ones(shadow.shape), rng)) == []
+
+
+def test_a_mass_that_the_scans_end_cuts_is_told(rng, caplog):
+    """Nine tenths of it are in the scan. What is dark all along an end, as behind a phantom, isn't told."""
+    mean, _ = ball()
+    last = int((CENTRE[2] - ORIGIN[2] + 0.8 * RADIUS) / SPACING[2])
+    seen = speckled(mean[:last], rng)
+    assert not find(seen)
+    (told,) = caplog.messages
+    found = re.fullmatch(r"a dark body of (\d+) mm3 at 3, 698, 1[34] mm lies at the scan's end, .*: scan on there", told)
+    assert 0.6 * VOLUME < float(found[1]) < VOLUME
+    caplog.clear()
+    mean[:, -20:] = DARK
+    assert len(find(speckled(mean, rng))) == 1 and not caplog.messages
 
 
 def test_the_level_of_tissue_is_that_of_images_with_a_pose():
