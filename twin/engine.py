@@ -221,6 +221,10 @@ def _client(engine: Engine) -> Iterator[Any]:
                 raise InputError(f"engine.scheduler: {expected}: {error}") from None
         try:
             yield client
+        except KeyboardInterrupt:
+            for worker in active_children() if engine.scheduler is None else ():
+                worker.kill()  # whose tasks nobody waits for any more
+            raise
         except KilledWorker as error:
             reason = "likely for want of memory; start Dask with fewer workers a machine"
             raise InputError(f"engine: a task's worker died {error.allowed_failures + 1} times, {reason}") from None

@@ -337,7 +337,7 @@ def test_a_key_press_that_reaches_dasks_workers_is_told_in_one_line(tmp_path):
             while not list((tmp_path / "out").glob("**/trials/*.json")) and running.poll() is None:
                 sleep(0.2)
             os.killpg(running.pid, signal.SIGINT)
-            _, said = running.communicate(timeout=60)
+            _, said = running.communicate(timeout=120)
         finally:
             if running.poll() is None:
                 os.killpg(running.pid, signal.SIGKILL)
