@@ -222,12 +222,20 @@ def _client(engine: Engine) -> Iterator[Any]:
         try:
             yield client
         except KeyboardInterrupt:
-            for worker in active_children() if engine.scheduler is None else ():
-                worker.kill()  # whose tasks nobody waits for any more
+            if engine.scheduler is None:
+                _end_at_once()
             raise
         except KilledWorker as error:
             reason = "likely for want of memory; start Dask with fewer workers a machine"
             raise InputError(f"engine: a task's worker died {error.allowed_failures + 1} times, {reason}") from None
+
+
+def _end_at_once() -> None:
+    """End all workers of this machine, whose tasks nobody waits for any more; what Dask would say of it isn't said."""
+    for name in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
+        logging.getLogger(name).disabled = True
+    for worker in active_children():
+        worker.kill()
 
 
 @contextmanager
