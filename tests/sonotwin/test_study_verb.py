@@ -308,7 +308,8 @@ def test_a_sweep_from_end_to_end(tmp_path, capsys):
     assert "6 trials, 4 of them there already" in capsys.readouterr().out
 
 
-COMMAND = [sys.executable, "-c", "import sys; from sonotwin.cli import main; sys.exit(main())", "study"]
+HEARING = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"  # which a shell's background job isn't
+COMMAND = [sys.executable, "-c", f"{HEARING}; from sonotwin.cli import main; sys.exit(main())", "study"]
 
 
 @pytest.mark.slow
