@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,7 +41,7 @@ class Status(IntEnum):
 
 
 # Numba takes no enumeration members as constants.
-OK, UNREACHABLE, UNCERTAIN, OUTSIDE = map(int, (Status.OK, Status.UNREACHABLE, Status.UNCERTAIN, Status.OUTSIDE))
+OK, DARK, SATURATED, UNREACHABLE, UNCERTAIN, OUTSIDE = map(int, Status)
 
 
 class Scale(NamedTuple):
@@ -158,15 +159,14 @@ def decode(
     axes: dict[Axis, _AxisMap] = {
         axis: (_from_fringes if patterns.has_fringes(axis) else _from_code)(shots, axis) for axis in patterns.axes
     }
-    status, lit = np.zeros(images.shape[1:], np.uint8), np.ones(images.shape[1:], bool)
-    counts: Counter[str] = Counter()
-    for found in axes.values():
+    first, *others = (axes[axis] for axis in patterns.axes)
+    status, lit, counts = first.coordinates.status, first.lit, Counter(first.counts)
+    for found in others:
         counts.update(found.counts)
-        lit &= found.lit
+        lit = lit & found.lit
         status = np.where(status == Status.OK, found.coordinates.status, status)
-    first = axes[patterns.axes[0]]
     columns, rows = (axes[axis].coordinates[:2] if axis in axes else (None, None) for axis in ("columns", "rows"))
-    pixels = np.bincount(status.ravel(), minlength=len(Status)).tolist()
+    pixels = cv2.calcHist([status], [0], None, [len(Status)], [0, len(Status)]).astype(int).ravel().tolist()
     summary = {s.name.lower(): pixels[s] for s in Status} | dict(counts)
     shown = (first.modulation, first.offset, first.phase, status, lit)
     return ProjectorMap(columns[0], rows[0], columns[1], rows[1], *shown, noise, summary, source)
@@ -175,16 +175,14 @@ def decode(
 def _from_fringes(shots: _Shots, axis: Axis) -> _AxisMap:
     """Coordinates along an axis by the phase of its finest fringes and their orders."""
     sets = []
-    lit = np.ones(shots.images.shape[1:], bool)
     for part, place in shots.patterns.slices():
         if isinstance(part, Fringes) and part.axis == axis:
             images, frames = shots.images[place], shots.errors[place.start]
             fringe = wrapped_phase(images, part.shifts, noise=shots.noise, saturation=shots.full, errors=frames)
             plausibility.check_fringes(images, part, fringe, shots.least, shots.full, shots.where(place), place.start)
             sets.append((part, fringe))
-            lit &= fringe.sigma < LIT_SIGMA
     part, fringe = min(sets, key=lambda pair: pair[0].pitch)
-    status = _quality([f for _, f in sets], shots.least)
+    status, lit = _quality([f for _, f in sets], shots.least)
     orders, unreachable, counts = _orders(shots, axis, sets, status == Status.OK)
     length = shots.patterns.length(axis)
     scale = Scale(float(part.zero(length)), part.pitch, length)
@@ -228,14 +226,24 @@ def _noise(
     return DEFAULT_NOISE.scaled(full / 255), "assumed"
 
 
-def _quality(fringes: list[Fringe], least: float) -> NDArray[np.uint8]:
-    """OK, DARK or SATURATED : (h, w), the worst over the sets of fringes."""
-    dark = np.zeros(fringes[0].phase.shape, bool)
-    saturated = dark.copy()
+def _quality(fringes: list[Fringe], least: float) -> tuple[NDArray[np.uint8], Mask]:
+    """OK, DARK or SATURATED : (h, w), the worst over the sets of fringes, and where all sets have fringes, however weak."""
+    shape = fringes[0].phase.shape
+    status, lit = np.zeros(shape, np.uint8), np.ones(shape, bool)
     for fringe in fringes:
-        dark |= (fringe.modulation < least) | (fringe.sigma > WORST_SIGMA)
-        saturated |= fringe.saturated
-    return np.where(saturated, np.uint8(Status.SATURATED), np.where(dark, np.uint8(Status.DARK), np.uint8(Status.OK)))
+        in_threads(_judge, shape[0], fringe, np.float32(least), status, lit)
+    return status, lit
+
+
+@kernel
+def _judge(first, end, fringe: Fringe, least, status, lit):
+    """Count one set of fringes to the worst of rows `first` to `end`, not included: `Status` rises from OK to SATURATED."""
+    modulation, sigma, saturated = fringe.modulation, fringe.sigma, fringe.saturated
+    for v in range(first, end):
+        for u in range(status.shape[1]):
+            dark = modulation[v, u] < least or sigma[v, u] > WORST_SIGMA
+            status[v, u] = max(status[v, u], SATURATED if saturated[v, u] else DARK if dark else OK)
+            lit[v, u] &= sigma[v, u] < LIT_SIGMA
 
 
 def _orders(shots: _Shots, axis: Axis, sets: list[Measured], valid: Mask) -> tuple[Orders, Mask, dict[str, int]]:
@@ -281,7 +289,7 @@ def _coordinates(
 ) -> tuple[Image, Image]:
     """Projector coordinates and their noise, NaN where unknown; writes the reasons into `status`."""
     shape = status.shape
-    found = Coordinates(np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32), status)
+    found = Coordinates(np.empty(shape, np.float32), np.empty(shape, np.float32), status)
     in_threads(_place, shape[0], fringe.phase, fringe.sigma, orders, unreachable, scale, found)
     return found.x, found.sigma
 
@@ -292,6 +300,7 @@ def _place(first, end, phase, sigma, orders: Orders, unreachable, scale: Scale, 
     order, trusted, pitch, status = orders.order, orders.trusted, scale.pitch, found.status
     for v in range(first, end):
         for u in range(phase.shape[1]):
+            found.x[v, u] = found.sigma[v, u] = np.nan
             if status[v, u] != OK:
                 continue
             if not trusted[v, u]:

@@ -24,6 +24,7 @@ ASTRAY = 0.3  # share that may lie beyond on both sides; of fringes that run bac
 JUMPS = 0.025  # share of the code's borders at which the order may jump; the coarsest bits change at 3 % of them
 CROWDED = 4.0  # times as often as elsewhere: steps of the surface lie anywhere, wrong bits at the borders
 CONTINUES = 0.6 / (2 * np.pi)  # cycle between two pixels: less is taken for one surface
+THIN = 3  # every so many rows and columns tell shares
 FEW = 20  # pixels, too few for a decision
 OUTSIDE_SHARE = 0.2  # of the lit pixels, that a code may place beyond the projector's image: shadows lit by what stands around
 RUSH = 0.05  # of all cells, between one pixel and the next: more than any image of a surface shows in the mean
@@ -40,7 +41,8 @@ def check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, 
             raise InputError(f"{place} are saturated all over, expected fringes: shorten the exposure")
         level = np.median(swing) / 2
         raise InputError(f"{place} hold no fringes: expected a modulation of {least:.0f} DN or more, found {level:.1f} DN")
-    saturated, lit = np.count_nonzero(fringe.saturated), np.count_nonzero(fringe.saturated | (fringe.modulation > least))
+    bright, strong = (field[::THIN, ::THIN] for field in (fringe.saturated, fringe.modulation))
+    saturated, lit = np.count_nonzero(bright), np.count_nonzero(bright | (strong > least))
     if saturated > SATURATED_SHARE * lit:
         share = 100 * saturated / lit
         raise InputError(f"{place} are saturated in {share:.0f} % of the lit pixels, expected under half: shorten the exposure")
@@ -79,7 +81,8 @@ def _check_order(samples: Image, beside: Image, part: Fringes, place: str, start
 
 def check_light(image: NDArray, fringe: Fringe, valid: Mask, place: str) -> None:
     """Refuse an image in the place of the line that is lit all over."""
-    bright = np.mean((image > fringe.offset)[valid]) if valid.any() else 0.0
+    image, offset, valid = (field[::THIN, ::THIN] for field in (image, fringe.offset, valid))
+    bright = np.mean((image > offset)[valid]) if valid.any() else 0.0
     if bright > LINE_SHARE:
         raise InputError(
             f"{place} is bright over {100 * bright:.0f} % of the fringes, not a line: is it in the manifest's order?"

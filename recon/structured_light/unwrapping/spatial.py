@@ -29,7 +29,7 @@ from recon.threads import in_threads
 
 MARGIN_CELLS = 3  # cells that a basin grows into torn ground, so that neighbours across a tear meet
 LINE_LEVEL = 0.25  # of full light: brighter is the line
-EVERY = 97  # pixel that tells how bright the image of the line is without the line
+EVERY = (7, 13)  # rows and columns, whose pixels tell how bright the image of the line is without the line
 RESIDUAL = 0.2  # cycle that a vote may be off a whole order
 
 Flags = NDArray[np.uint8]
@@ -129,8 +129,8 @@ def _line_light(image: NDArray, valid: Mask, fringe: Fringe) -> NDArray[np.float
     nothing is dark between fringes.
     """
     light = np.zeros(image.shape, np.float32)
-    offset = np.maximum(fringe.offset[valid][::EVERY], 1)
-    unlit = np.float32(np.median(image[valid][::EVERY] / offset)) if offset.size else np.float32(0)
+    some, level, offset = (field[:: EVERY[0], :: EVERY[1]] for field in (valid, image, fringe.offset))
+    unlit = np.float32(np.median(level[some] / np.maximum(offset[some], 1))) if some.any() else np.float32(0)
     in_threads(_fill_light, len(image), image, valid, fringe, unlit, light)
     return light
 
