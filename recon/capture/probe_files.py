@@ -69,9 +69,8 @@ def write_authors(path: Path, calibration: ProbeCalibration) -> None:
 
 
 def _authors(path: Path, speed_m_s: float | None) -> ProbeCalibration:
-    number = npz.Form("fiu")
-    forms = {"sx": number, "sy": number, "T_I_T": npz.Form("fiu", (4, 4)), "speed_m_s": npz.Form("fiu", optional=True)}
-    forms["face_row"] = npz.Form("fiu", optional=True)
+    number, optional = npz.Form("fiu"), npz.Form("fiu", optional=True)
+    forms = {"sx": number, "sy": number, "T_I_T": npz.Form("fiu", (4, 4)), "speed_m_s": optional, "face_row": optional}
     values = npz.read(path, forms)
     for name in values.keys() - {"T_I_T"}:
         if values[name].size != 1:
@@ -89,9 +88,8 @@ def _authors(path: Path, speed_m_s: float | None) -> ProbeCalibration:
         speed_m_s = SCANNER_SPEED
         way = "if it was made in water, import it with speed_m_s=..., or add speed_m_s to it"
         log.warning("%s: names no speed of sound, and is taken as right where it makes %g m/s; %s", path, speed_m_s, way)
-    return _checked(
-        path, "T_I_T", ProbeCalibration(pose, scale, None, speed_m_s, float(values.get("face_row", np.zeros(1)).item()))
-    )
+    face_row = float(values["face_row"].item()) if "face_row" in values else 0.0
+    return _checked(path, "T_I_T", ProbeCalibration(pose, scale, None, speed_m_s, face_row))
 
 
 def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
@@ -105,7 +103,7 @@ def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
     )
     node = storage.getNode("face_row")
     face_row = 0.0 if node.empty() else node.real() if node.isReal() or node.isInt() else np.nan
-    read = ProbeCalibration(pose, scale.ravel(), _uncertainty(path, storage), _speed(path, storage), face_row)
+    read = ProbeCalibration(pose, scale, _uncertainty(path, storage), _speed(path, storage), face_row)
     return _checked(path, "target_from_image", read)
 
 
