@@ -87,7 +87,5 @@ def converted(shown: NDArray, transducer: Transducer, order: int) -> NDArray:
     lines, (sx, sy) = lines_of(transducer), transducer.scale_mm_per_px
     width, height = transducer.image_size
     x, y = sx * np.arange(width) - transducer.face_mm[0], (sy * np.arange(height) - transducer.face_mm[1])[:, None]
-    radius = 1 / lines.bend
-    line = (lines.middle_mm + radius * np.arctan2(x, y + radius)) / lines.pitch_mm
-    row = (np.hypot(x, y + radius) - radius) / sy
-    return map_coordinates(shown, [row, line], order=order, mode="constant", cval=0)
+    along, depth = on_lines.py_func(x, y, lines.bend, lines.middle_mm)
+    return map_coordinates(shown, [depth / sy, along / lines.pitch_mm], order=order, mode="constant", cval=0)

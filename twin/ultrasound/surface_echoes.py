@@ -129,7 +129,7 @@ def _strand(wire: Wire, around: float, transducer: Transducer, world_from_face: 
     points = wire.ends[0] * (1 - share) + wire.ends[1] * share
     direction = (wire.ends[1] - wire.ends[0]) / length @ face_from_world[:3, :3].T
     local = points @ face_from_world[:3, :3].T + face_from_world[:3, 3]
-    along, depth = np.transpose([on_lines(x, y, lines.bend, lines.middle_mm) for x, y, _ in local.tolist()])
+    along, depth = on_lines.py_func(local[:, 0], local[:, 1], lines.bend, lines.middle_mm)
     angle = (along - lines.middle_mm) * lines.bend
     rise = (np.sin(angle) * direction[0] + np.cos(angle) * direction[1]) * length / count
     front = np.column_stack([along, depth - wire.radius, local[:, 2]])
