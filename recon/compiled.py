@@ -256,7 +256,7 @@ def _one_process_compiles(dispatcher: Any) -> None:
         place = Path(cache.cache_path)
         names = dispatcher.__module__, dispatcher.__name__
         with file_locks.held(
-            place / f"{dispatcher.__name__}.lock", lambda: log.info("waiting for another process that compiles %s.%s", *names)
+            place / f"{dispatcher.__name__}.lock", lambda _: log.info("waiting for another process that compiles %s.%s", *names)
         ):
             made = cache.load_overload(tuple(args), dispatcher.targetctx)
             if made is not None:

@@ -1,14 +1,17 @@
 """The command `sonotwin VERB [field=value ...]`: the table of verbs, their help, and what a mistake looks like.
 
 Verbs are imported when they are called, so that `sonotwin --help` is instant and a verb needs only the packages that it uses.
-Exit status: 0 done, 2 a mistake of the user or of the installation (one line on stderr), 130 interrupted.
+Exit status: 0 done, 2 a mistake of the user or of the installation (one line on stderr), 130 interrupted by Ctrl-C, 143 ended by
+SIGTERM, which schedulers send, or 129 by SIGHUP, which a closed terminal sends; all of these clean up first.
 """
 
 import ast
 import os
 import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
@@ -75,7 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # of a damaged image we say so ourselves, in one line
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: one order of sums, the same bytes on any number of cores
     try:
-        status = _run(sys.argv[1:] if arguments is None else list(arguments))
+        with _signals_interrupt():
+            status = _run(sys.argv[1:] if arguments is None else list(arguments))
         sys.stdout.flush()
         return status
     except BrokenPipeError:  # the reader, such as `head`, has seen enough; nothing more may be flushed at the end
@@ -92,8 +96,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.errno is None:
             raise
         return _complain(f"{error.filename or 'output'}: {error.strerror}")
+    except Ended as error:
+        return _complain("ended by the system", status=128 + error.number)
     except KeyboardInterrupt:
         return _complain("interrupted", status=130)
+
+
+class Ended(KeyboardInterrupt):
+    """The system has asked this process to end."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+@contextmanager
+def _signals_interrupt() -> Iterator[None]:
+    """Let signals that ask for an end raise `Ended`, once: cleaning up isn't interrupted by a second one."""
+    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # Windows has no SIGHUP
+    numbers = [number for number in map(signal.Signals.__getitem__, names) if signal.getsignal(number) == signal.SIG_DFL]
+    if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
+        numbers = []
+
+    def end(number: int, frame: object) -> None:
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)
+        raise Ended(number)
+
+    for number in numbers:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _run(arguments: list[str]) -> int:

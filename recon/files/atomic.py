@@ -1,7 +1,8 @@
-"""Files and folders that appear whole or not at all: written to a temporary sibling, then renamed.
+"""Files and folders that appear whole or not at all: written to a temporary sibling, then exchanged with what was there.
 
 One process at a time writes a place, and others wait for it: a hidden lock lies beside the place meanwhile. Temporary siblings of
-a place whose lock is free are therefore leftovers of a process that was killed.
+a place whose lock is free are therefore leftovers of a process that was killed, on this machine or, where the file system has
+locks across machines (NFS 4, SMB), on another.
 """
 
 import errno
@@ -11,26 +12,29 @@ import re
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from recon import file_locks
 from recon.errors import InputError
+from recon.files import renaming
 
 log = logging.getLogger(__name__)
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Give a temporary path with the same suffix to write to; on success it becomes `path`, on failure it goes away."""
-    path = Path(path)
+    """Give a temporary path with the same suffix to write to; on success it becomes `path`, on failure it goes away.
+
+    Where `path` is a link, the file that it leads to is written.
+    """
+    path = Path(os.path.realpath(path))
     if not path.parent.is_dir():  # the lock's file would make it
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
     temporary = _beside(path, "new")
-    with alone(path):
+    with _named_in_errors(path), alone(path):
         try:
             yield temporary
             os.replace(temporary, path)
@@ -42,7 +46,7 @@ def new_file(path: Path) -> Iterator[Path]:
 def new_folder(path: Path, marker: str) -> Iterator[Path]:
     """Give a temporary folder to fill; on success it takes the place of `path`, on failure it goes away.
 
-    A folder that is already there is replaced if `check_folder` allows it: set aside, and deleted once the new one is there.
+    A folder that is already there is replaced if `check_folder` allows it, and deleted once the new one is in its place.
     """
     with new_folders({path: marker}) as (folder,):
         yield folder
@@ -50,16 +54,17 @@ def new_folder(path: Path, marker: str) -> Iterator[Path]:
 
 @contextmanager
 def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
-    """Give temporary folders to fill, one a place; on success all are renamed, on failure all old folders stay.
+    """Give temporary folders to fill, one a place; on success all take their places, on failure all old folders stay.
 
-    The last folder is set aside first and renamed last, so it never stands beside an old or a new one that isn't its own.
-    Waits until no other process writes one of them; what stands there then doesn't change before the end.
+    Each is exchanged with the old one at once, so that at every moment an old or a new one can be read. Where a path is a link,
+    the folder that it leads to is replaced. Waits until no other process writes one of them; what stands there then doesn't
+    change before the end.
 
     Parameters
     ----------
     places : path -> marker, as of `check_folder`
     """
-    paths = [Path(os.path.abspath(path)) for path in places]
+    paths = [Path(os.path.realpath(path)) for path in places]
     with ExitStack() as locks:
         for path in sorted(paths):
             _check_writable(path)
@@ -68,42 +73,61 @@ def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
         _put_back(paths)
         for path, marker in zip(paths, places.values(), strict=True):
             check_folder(path, marker)
-        with _exchanged(paths) as temporaries:
+        with _named_in_errors(paths[-1]), _exchanged(paths) as temporaries:
             yield temporaries
+
+
+@contextmanager
+def _named_in_errors(path: Path) -> Iterator[None]:
+    """Name what is being written in an error of the system that names nothing, such as that of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 @contextmanager
 def _exchanged(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
     """Give temporary folders, as `new_folders`, which holds the locks."""
-    temporaries, asides = [_beside(path, "new") for path in paths], [_beside(path, "old") for path in paths]
-    placed: list[Path] = []
-    try:
-        for temporary in temporaries:
-            temporary.mkdir()
+    temporaries = list[Path]()
+    with ExitStack() as undone, ExitStack() as removed:
+        for path in paths:
+            temporaries.append(_temporary_folder(path))
+            removed.callback(shutil.rmtree, temporaries[-1], ignore_errors=True)
         yield tuple(temporaries)
-        for path, aside in zip(reversed(paths), reversed(asides), strict=True):
-            if path.exists():
-                path.rename(aside)
         for path, temporary in zip(paths, temporaries, strict=True):
-            temporary.rename(path)
-            placed.append(path)
-    finally:
-        if len(placed) < len(paths):
-            for path, temporary, aside in zip(paths, temporaries, asides, strict=True):
-                if path in placed:
-                    path.rename(temporary)
-                if aside.exists():
-                    aside.rename(path)
-        for folder in (*temporaries, *asides):
-            shutil.rmtree(folder, ignore_errors=True)
+            _exchange(temporary, path)
+            undone.callback(_exchange, path, temporary)
+        undone.pop_all()
+
+
+def _temporary_folder(path: Path) -> Path:
+    """Make a folder beside `path` with its inode in its name: one of another inode is what stood at `path` before an exchange."""
+    made = _beside(path, "begun")
+    made.mkdir()
+    return made.rename(path.with_name(f".{path.stem}.{made.stat().st_ino}.new{path.suffix}"))
+
+
+def _exchange(folder: Path, path: Path) -> None:
+    """Exchange two folders, or move the first where the second isn't there."""
+    if not path.exists():
+        folder.rename(path)
+    elif not renaming.exchange(folder, path):
+        aside = _beside(path, "old")
+        path.rename(aside)
+        folder.rename(path)
+        aside.rename(folder)
 
 
 def restore(paths: Sequence[Path]) -> None:
-    """Put back what a process has set aside that was killed in `new_folders`, and remove its other leftovers.
+    """Put back what a process that was killed in `new_folders` has exchanged in part, and remove its other leftovers.
 
     Nothing is done where another process is writing.
     """
-    if any(_leftovers(path, "new|old") for path in paths):
+    paths = [Path(os.path.realpath(path)) for path in paths]
+    if any(_leftovers(path) for path in paths):
         with ExitStack() as locks, suppress(Timeout):
             for path in sorted(paths):
                 locks.enter_context(alone(path, wait=False))
@@ -112,12 +136,22 @@ def restore(paths: Sequence[Path]) -> None:
 
 def _put_back(paths: Sequence[Path]) -> None:
     """As `restore`, for a process that holds the locks."""
-    stopped = not paths[-1].exists()
     for path in paths:
-        for aside in _leftovers(path, "old") if stopped else ():
-            shutil.rmtree(path, ignore_errors=True)
+        for aside in [] if path.exists() else _leftovers(path, "old"):
             aside.rename(path)
-        _remove(_leftovers(path, "new|old"))
+    pairs = [(path, folder) for path in paths for folder in _leftovers(path)]
+    before = [(path, folder) for path, folder in pairs if _stood_before(path, folder)]
+    if len(before) < len(pairs):  # some are still to come: the process was killed before it had exchanged all
+        for path, folder in before:
+            _exchange(folder, path)
+    for path in paths:
+        _remove(_leftovers(path))
+
+
+def _stood_before(path: Path, folder: Path) -> bool:
+    """Whether a leftover of `path` is what stood there before an exchange."""
+    number, state = folder.name.removesuffix(path.suffix).split(".")[-2:]
+    return state == "old" or (state == "new" and folder.stat().st_ino != int(number))
 
 
 def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> None:
@@ -143,9 +177,10 @@ def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> No
 
 def remove_leftovers(path: Path) -> None:
     """Remove the temporary files and folders that a process which was killed while it wrote `path` has left beside it."""
-    if _leftovers(path, "new|old"):
+    path = Path(os.path.realpath(path))
+    if _leftovers(path):
         with suppress(Timeout), alone(path, wait=False):  # what another process is writing is no leftover
-            _remove(_leftovers(path, "new|old"))
+            _remove(_leftovers(path))
 
 
 def _remove(entries: Iterable[Path]) -> None:
@@ -169,9 +204,11 @@ def check_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
         If something else is there: a file, or a folder that holds files but not `marker`; if `path` is one of the inputs or has
         one in it; or if the place can't be written to.
     """
-    path = Path(os.path.abspath(path))
+    named, path = path, Path(os.path.realpath(path))
+    if path.is_symlink():
+        raise InputError(f"{named}: expected a folder or nothing, found a loop of links")
     for source in inputs:
-        if Path(source).resolve().is_relative_to(path.resolve()):
+        if Path(os.path.realpath(source)).is_relative_to(path):
             raise InputError(f"{path}: expected a folder apart from what is read, found it to hold {source}")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: expected a folder or nothing, found a file")
@@ -192,9 +229,13 @@ def _check_writable(path: Path) -> None:
 @contextmanager
 def alone(path: Path, wait: bool = True) -> Iterator[None]:
     """Hold the lock of a place. Where another process, or another thread, holds it: wait, or raise Timeout."""
+    path = Path(os.path.realpath(path))
     place = path.with_name(f".{path.name}.lock")
-    announce = partial(log.warning, "%s: waiting for another process that is writing it", path)
-    with file_locks.held(place, announce) if wait else FileLock(place, blocking=False):
+
+    def announce(holder: str) -> None:
+        log.warning("%s: waiting for %s, which is writing it", path, holder)
+
+    with file_locks.held(place, announce if wait else None):
         try:
             yield
         finally:
@@ -202,8 +243,8 @@ def alone(path: Path, wait: bool = True) -> Iterator[None]:
                 place.unlink()  # before the release: whoever waits then sees that its file is gone, and makes a new one
 
 
-def _leftovers(path: Path, states: str) -> list[Path]:
-    """Hidden names of `_beside` in one of the states, of any process."""
+def _leftovers(path: Path, states: str = "begun|new|old") -> list[Path]:
+    """Hidden names beside `path` in one of the states, of any process."""
     name = re.compile(rf"\.{re.escape(path.stem)}\.\d+\.({states}){re.escape(path.suffix)}")
     entries = list(path.parent.iterdir()) if path.parent.is_dir() else []
     return [entry for entry in entries if name.fullmatch(entry.name)]

@@ -295,11 +295,12 @@ def measure_sigma(sigma: Volume | None) -> Metrics:
 
 def write_sequence(path: Path, sweep: SweepCapture, probe: ProbeCalibration, lag_s: float) -> None:
     """Write the B-scans with their poses as a PLUS sequence, by way of a file, so that they are never all in memory."""
-    store = path.with_name("images.npy")
-    images = np.lib.format.open_memmap(store, "w+", np.uint8, (len(sweep.paths), *sweep.size[::-1]))
+    store = path.with_name("images.raw")
+    with store.open("wb") as file:  # a full disk ends this in an error, but a write to a mapped file in a signal
+        for image in sweep.images():
+            file.write(image.tobytes())
+    images = np.memmap(store, np.uint8, "r", shape=(len(sweep.paths), *sweep.size[::-1]))
     try:
-        for stored, image in zip(images, sweep.images(), strict=True):
-            stored[:] = image
         times_s = sweep.times * 1e-9 - lag_s
         sequences.write_sequence(path, sequences.sequence_of(images, sweep.poses(lag_s), probe, times_s))
     finally:

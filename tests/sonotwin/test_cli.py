@@ -1,5 +1,7 @@
 """What a person sees of the command line: help, and one line for each mistake."""
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -129,3 +131,34 @@ def test_interrupt(failing, capsys):
     failing(KeyboardInterrupt())
     assert cli.main(["doctor"]) == 130
     assert capsys.readouterr().err == "sonotwin: interrupted\n"
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 130)])
+def test_a_command_that_is_told_to_end_cleans_up(tmp_path, number, status):
+    """One line, the status of the signal, and nothing half written; a second signal doesn't disturb the cleaning."""
+    program = """
+import os, signal, sys, time
+from pathlib import Path
+from recon.files import atomic
+from sonotwin import cli
+
+def work(arguments):
+    with atomic.new_folder(Path("out"), "mark"):
+        try:
+            print("ready", flush=True)
+            time.sleep(60)
+        finally:
+            if sys.argv[1] != "2":
+                os.kill(os.getpid(), signal.SIGTERM)
+
+cli._run = work
+sys.exit(cli.main([]))
+"""
+    env = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[1])}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    running = subprocess.Popen([sys.executable, "-c", program, str(int(number))], cwd=tmp_path, env=env, text=True, **pipes)
+    assert running.stdout.readline() == "ready\n"
+    running.send_signal(number)
+    said = running.communicate(timeout=30)[1]
+    assert running.returncode == status
+    assert len(said.splitlines()) == 1 and list(tmp_path.iterdir()) == []

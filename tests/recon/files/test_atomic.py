@@ -1,6 +1,7 @@
 """What is written appears whole; what was there is replaced only if it is of the same kind, and never what is read."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -127,7 +128,8 @@ def test_one_process_writes_at_a_time(tmp_path, place):
     }[place]
     with ours as temporary:
         other = program(tmp_path, f"file_locks.PATIENCE_S = 0.0\nwith atomic.{theirs}")
-        assert other.stderr.readline().endswith("out: waiting for another process that is writing it\n")
+        said = other.stderr.readline()
+        assert re.search(rf"out: waiting for process {os.getpid()} of .+ since 20.+ UTC, which is writing it", said)
         (temporary / "mark" if place == "folder" else temporary).write_text("1")
     assert other.wait() == 0 and other.stderr.read() == ""
     assert (tmp_path / "out" / "mark" if place == "folder" else tmp_path / "out").read_text() == "12"
@@ -168,26 +170,84 @@ def test_folders_appear_together_or_not_at_all(tmp_path):
     assert names(tmp_path) == ["capture", "truth"] and (tmp_path / "truth" / "mark").read_text() == "first"
 
 
-@pytest.mark.parametrize("steps", range(4))
-def test_what_a_killed_process_has_set_aside_is_put_back(tmp_path, steps):
-    """A process is killed after some of the four renamings: the last folder is gone, or beside its own, and comes back."""
+@pytest.mark.parametrize("atomically", [True, False])
+@pytest.mark.parametrize("calls", range(10))
+def test_a_killed_process_leaves_old_folders_or_new_ones(tmp_path, calls, atomically):
+    """Killed before any of the renamings: the next process finds a pair of one age, new if all was exchanged, and no more."""
     write_both(tmp_path, "first")
     program = f"""
 import itertools, os
 from pathlib import Path
-from recon.files import atomic
-count, rename = itertools.count(), Path.rename
-Path.rename = lambda self, target: os._exit(9) if next(count) == {steps} else rename(self, target)
+from recon.files import atomic, renaming
+count, rename, exchange = itertools.count(), Path.rename, renaming.exchange
+def or_die(work):
+    return lambda *given: os._exit(9) if next(count) == {calls} else work(*given)
+Path.rename = or_die(rename)
+renaming.exchange = or_die(exchange) if {atomically} else lambda *given: False
 with atomic.new_folders({{Path("truth"): "mark", Path("capture"): "mark"}}) as folders:
     for folder in folders:
         (folder / "mark").write_text("second")
 """
     root = {"PYTHONPATH": str(Path(__file__).resolve().parents[3])}
-    assert subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=os.environ | root, check=False).returncode == 9
-    assert (tmp_path / "capture").is_dir() == (steps == 0)
-    with pytest.raises(KeyboardInterrupt), atomic.new_folders({tmp_path / "truth": "mark", tmp_path / "capture": "mark"}):
-        raise KeyboardInterrupt
-    assert [(tmp_path / name / "mark").read_text() for name in names(tmp_path)] == ["first", "first"]
+    status = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=os.environ | root, check=False).returncode
+    renamings = 4 if atomically else 8
+    assert status == (9 if calls < renamings else 0)
+    if atomically:
+        assert all((tmp_path / name / "mark").is_file() for name in ("capture", "truth"))
+    atomic.restore([tmp_path / "truth", tmp_path / "capture"])
+    age = "first" if calls < renamings - (not atomically) else "second"
+    assert [(tmp_path / name / "mark").read_text() for name in names(tmp_path)] == [age, age]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the system can't exchange folders")
+def test_a_folder_is_there_at_every_moment(tmp_path):
+    """While it is replaced over and over, another process always finds it whole."""
+    with atomic.new_folder(tmp_path / "out", "mark") as folder:
+        (folder / "mark").write_text("")
+    lines = """
+import itertools
+for number in itertools.count():
+    with atomic.new_folder(Path("out"), "mark") as new: (new / "mark").write_text(str(number))
+"""
+    other = program(tmp_path, lines)
+    seen = set()
+    while len(seen) < 30:
+        seen.add((tmp_path / "out" / "mark").read_text())
+        assert other.poll() is None
+    other.kill()
+    other.wait()
+
+
+@pytest.mark.parametrize("target", ["there", "new"])
+def test_links_are_written_through(tmp_path, target):
+    """What a link leads to is replaced, again and again; the link stays, and nothing is left beside it."""
+    (tmp_path / "disk").mkdir()
+    if target == "there":
+        (tmp_path / "disk" / "folder").mkdir()
+        (tmp_path / "disk" / "file").write_text("")
+    for name in ("folder", "file"):
+        (tmp_path / name).symlink_to(Path("disk", name))
+    for text in ("first", "second"):
+        with atomic.new_folder(tmp_path / "folder", "mark") as folder, atomic.new_file(tmp_path / "file") as file:
+            (folder / "mark").write_text(text)
+            file.write_text(text)
+        assert (tmp_path / "folder").is_symlink() and (tmp_path / "file").is_symlink()
+        assert (tmp_path / "disk" / "folder" / "mark").read_text() == (tmp_path / "disk" / "file").read_text() == text
+    assert names(tmp_path) == ["disk", "file", "folder"] and names(tmp_path / "disk") == ["file", "folder"]
+
+
+def test_a_loop_of_links_is_refused(tmp_path):
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(InputError, match="loop of links"):
+        atomic.check_folder(tmp_path / "a", "mark", inputs=[tmp_path / "b"])
+
+
+@pytest.mark.parametrize("place", [lambda path: atomic.new_file(path), lambda path: atomic.new_folder(path, "mark")])
+def test_a_full_disk_is_named(tmp_path, place):
+    with pytest.raises(OSError, match=r"No space left.*out"), place(tmp_path / "out"):
+        raise OSError(28, "No space left on device")
+    assert names(tmp_path) == []
 
 
 def test_linked_files_outlive_the_folder_that_they_come_from(tmp_path):
