@@ -321,3 +321,12 @@ def test_two_scanners_are_refused_before_any_work(tmp_path, capsys):
     assert main(["demo", "ultrasound.image_size=[161,272]", f"out={tmp_path / 'demo'}"]) != 0
     assert "ultrasound.image_size: expected rig.probe's [321, 408]" in capsys.readouterr().err
     assert not (tmp_path / "demo").exists()
+
+
+def test_a_folder_of_others_is_no_place_for_the_board(tmp_path, capsys):
+    """It stays as it is, and nothing is begun beside it."""
+    (tmp_path / "paper").mkdir()
+    (tmp_path / "paper" / "thesis.tex").write_text("years of work")
+    assert main(["demo", f"board={tmp_path / 'paper'}", f"out={tmp_path / 'demo'}"]) == 2
+    assert "paper: expected a new or empty folder or one with capture/manifest.json" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "paper").iterdir()] == ["thesis.tex"] and not (tmp_path / "demo").exists()

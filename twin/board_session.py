@@ -8,6 +8,7 @@ import math
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import mitsuba as mi
@@ -32,7 +33,7 @@ from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, is_convex, move_things
 from twin.optics.surface_session import CameraName, Shooting, calibration_of, camera_optics, describe_visible, device_of
 from twin.sensor import Exposure, Numbers, auto_exposure, expose
-from twin.session import SETTINGS, Session, read_json, write_json
+from twin.session import CAPTURE, SETTINGS, Session, read_json, write_json
 
 FRINGE_CAMERA: CameraName = "cam1"  # sees the fringes; others see the board lit only
 CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
@@ -246,6 +247,12 @@ def is_finished(session: Session) -> bool:
     """Whether the board of this session is there already, whole."""
     kept = session.truth.described / SETTINGS
     return kept.is_file() and (session.capture / MANIFEST).is_file() and session.truth.settings() == session.settings
+
+
+def check_place(folder: Path) -> None:
+    """Check, before any work, that a folder is new, or one in which a board's images are kept; raises InputError if it is neither."""
+    if not (folder / UNFINISHED / SETTINGS).is_file():
+        atomic.check_folder(folder, f"{CAPTURE}/{MANIFEST}")
 
 
 def missing_poses(session: Session, settings: Settings) -> list[int]:

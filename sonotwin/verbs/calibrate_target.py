@@ -5,7 +5,7 @@ film in which both cameras see the target whole, slowly moved, tilted to all sid
 `out`: target.yaml (with the covariance) and metrics.json. What is there already is replaced. Takes half a second a pose, besides
 tracking the film.
 
-    sonotwin film out=outputs/turned path.turn_deg=20 white_dn=120
+    sonotwin film out=outputs/turned path.turn_deg=20 white_dn=120 seed=1
     sonotwin calibrate-target capture=outputs/turned/capture out=outputs/target
     sonotwin track capture=outputs/film/capture target=outputs/target/target.yaml out=outputs/track
 """

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from recon.files import atomic
 from recon.files.metrics import Metrics, shown
 from recon.tracking import networks
 from sonotwin import latency_fields, pipeline
@@ -25,6 +26,7 @@ from sonotwin.demo_config import Config
 from sonotwin.demo_steps import Figures, commands, compared, fusing_fields, poses_of, tracked_film, verb_steps
 from sonotwin.pipeline import Step
 from sonotwin.verbs import fuse, surface
+from twin import board_session
 from twin.evaluation import sweep_errors
 from twin.evaluation.surface_errors import things
 from twin.reports import demo_report, sweep_report
@@ -68,11 +70,14 @@ def run(config: Config) -> None:
     Raises
     ------
     InputError
-        If a setting is wrong, the tracker's networks are missing, or `out` holds something else.
+        If a setting is wrong, the tracker's networks are missing, or `out` or `board` holds something else.
     """
     console = Console(soft_wrap=True, highlight=False)
     if config.looks_inside or config.film_frames:
         networks.load()  # before minutes of work
+    atomic.check_folder(config.out, pipeline.MARKER)
+    if config.poses is not None:
+        board_session.check_place(config.board)
     steps = [each if isinstance(each, Step) else each.step() for each in verb_steps(config.out, config, config._overrides)]
     found = pipeline.play(
         [*steps, telling_step(config)],
