@@ -16,9 +16,12 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.util import find_spec
+from io import TextIOWrapper
 from pathlib import Path
 
 from recon.errors import InputError
+
+BROKEN_PIPE = 13  # number of the signal, which Windows doesn't have
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # of a damaged image we say so ourselves, in one line
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: one order of sums, the same bytes on any number of cores
+    if isinstance(sys.stdout, TextIOWrapper):  # names of files may hold what the terminal has no letters for
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with _signals_interrupt():
             status = _run(sys.argv[1:] if arguments is None else list(arguments))
@@ -84,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
     except BrokenPipeError:  # the reader, such as `head`, has seen enough; nothing more may be flushed at the end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
+        return 128 + BROKEN_PIPE
     except InputError as error:
         return _complain(str(error))
     except ModuleNotFoundError as error:

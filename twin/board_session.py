@@ -250,7 +250,7 @@ def is_finished(session: Session) -> bool:
 
 
 def check_place(folder: Path) -> None:
-    """Check, before any work, that a folder is new, or one in which a board's images are kept; raises InputError if it is neither."""
+    """Check, before any work, that a folder is new or one in which a board's images are kept; else raises InputError."""
     if not (folder / UNFINISHED / SETTINGS).is_file():
         atomic.check_folder(folder, f"{CAPTURE}/{MANIFEST}")
 

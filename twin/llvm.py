@@ -15,7 +15,6 @@ import logging
 import os
 import platform
 import re
-import signal
 import site
 import subprocess
 import sys
@@ -48,8 +47,11 @@ VERSION_IN_FOLDER = re.compile(r"llvm[-@](\d+)|/llvm/(\d+)\.")
 
 # Compiles and runs a kernel with minimum and maximum, on which the unsuitable versions end the process.
 KERNEL = """
-import resource
-resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except ImportError:  # Windows leaves no core files
+    pass
 import drjit
 from drjit.llvm.ad import Float
 x = drjit.arange(Float, 17)
@@ -57,6 +59,7 @@ print(drjit.sum(drjit.minimum(drjit.maximum(x - 3, 0), 5))[0], drjit.detail.llvm
 """
 KERNEL_ANSWER = "55.0"
 KERNEL_TIMEOUT = 120  # s
+KILLED = 9  # number of the signal
 
 
 @dataclass(frozen=True)
@@ -241,7 +244,7 @@ def _try(path: Path) -> Verdict:
     else:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         verdict = Verdict(str(path), version(path), False, f"was tried and failed: {last}")
-    if done.returncode != -signal.SIGKILL:  # someone else's doing, such as a lack of memory
+    if done.returncode != -KILLED:  # someone else's doing, such as a lack of memory
         _remember(path, verdict)
     return verdict
 
@@ -265,7 +268,7 @@ def _remember(path: Path, verdict: Verdict) -> None:
 
 def _read_cache() -> dict:
     try:
-        content = json.loads(cache_file().read_text())
+        content = json.loads(cache_file().read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
