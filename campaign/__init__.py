@@ -1,0 +1,1 @@
+"""Attacks on every command: bad inputs, fuzzed files, kills, full disks, two writers, long runs."""

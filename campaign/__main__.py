@@ -1,0 +1,111 @@
+"""`python -m campaign [PART ...] [count=N]`: attack every command, write what came of it to outputs/campaign/ and docs/trust.md.
+
+Parts: bad_inputs, fuzzing, kills, full_disk, two_writers, soak; all of them take some hours. A part that was done is kept in
+outputs/campaign/PART.md until it is asked for by name.
+"""
+
+import re
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from campaign import bad_inputs, full_disk, fuzzing, kills, soak, sources, two_writers
+from recon.files import atomic
+
+OUT, DOCUMENT = Path("outputs/campaign"), Path("docs/trust.md")
+WORKERS = 2
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the campaign."""
+
+    does: str
+    run: Callable[[Path, int], tuple[list[str], int]]  # (sources, count) -> lines of a table, and how many of its rows are faults
+    count: int  # usual
+
+
+def _bad_inputs(place: Path, count: int) -> tuple[list[str], int]:
+    for control in bad_inputs.controls(place, WORKERS):
+        if control.outcome.status:
+            raise RuntimeError(f"sonotwin {' '.join(control.case.line)}: {control.outcome.said}")
+    found = bad_inputs.run(bad_inputs.chosen(bad_inputs.cases(place), count, seed=0), place, WORKERS)
+    bad_inputs.write(OUT / "bad_inputs.csv", found)
+    return bad_inputs.table(found), sum(bool(one.fault) for one in found)
+
+
+def _fuzzing(place: Path, count: int) -> tuple[list[str], int]:
+    found = fuzzing.run(place, float(count))
+    return fuzzing.table(found), sum(bool(one.faults) for one in found)
+
+
+def _kills(place: Path, count: int) -> tuple[list[str], int]:
+    found = kills.run(place, count, 0, WORKERS)
+    return kills.table(found), sum(not one.good for one in found)
+
+
+def _full_disk(place: Path, count: int) -> tuple[list[str], int]:
+    found = full_disk.run(place)
+    return full_disk.table(found), sum(not one.good for one in found)
+
+
+def _two_writers(place: Path, count: int) -> tuple[list[str], int]:
+    found = two_writers.run(place, count)
+    return two_writers.table(found), sum(not one.good for one in found)
+
+
+def _soak(place: Path, count: int) -> tuple[list[str], int]:
+    found = [soak.run(place, verb, count or usual) for verb, usual in soak.COUNTS.items()]
+    return soak.table(found), sum(one.growth_mb > 50 or one.slowing > 0.05 for one in found)
+
+
+PARTS = {
+    "bad_inputs": Part("bad inputs of every verb", _bad_inputs, 1600),
+    "fuzzing": Part("seconds of fuzzing of each reader", _fuzzing, 600),
+    "kills": Part("moments of kills of each command, by each signal", _kills, 50),
+    "full_disk": Part("full disks", _full_disk, 0),
+    "two_writers": Part("pairs of writers of each command", _two_writers, 3),
+    "soak": Part("long runs, 0 for the usual numbers", _soak, 0),
+}
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run parts, those that have no table yet if none is named; returns 1 if one has found a fault."""
+    counts = [int(each.removeprefix("count=")) for each in arguments if each.startswith("count=")]
+    named = [each for each in arguments if not each.startswith("count=")]
+    unknown = set(named) - PARTS.keys()
+    if unknown:
+        print(f"campaign: {unknown.pop()}: expected one of {', '.join(PARTS)}", file=sys.stderr)
+        return 2
+    place = OUT / "sources"
+    sources.make(place.resolve())
+    bad_inputs.clear(place)
+    faults = 0
+    for name in named or [name for name in PARTS if not (OUT / f"{name}.md").exists()]:
+        part = PARTS[name]
+        lines, wrong = part.run(place.resolve(), counts[0] if counts else part.count)
+        faults += wrong
+        with atomic.new_file(OUT / f"{name}.md") as path:
+            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        print(f"{name}: {wrong} faults", *lines, "", sep="\n")
+    _put_into(DOCUMENT, {name: OUT / f"{name}.md" for name in PARTS})
+    return 1 if faults else 0
+
+
+def _put_into(document: Path, tables: dict[str, Path]) -> None:
+    """Put the tables that are there into the places <!-- NAME --> ... <!-- end --> of a page."""
+    if not document.exists():
+        return
+    text = document.read_text(encoding="utf-8")
+    for name, path in tables.items():
+        if path.exists():
+            lines = path.read_text(encoding="utf-8")
+            pattern = rf"(<!-- {name} -->\n)(.*?)(<!-- end -->)"
+            text = re.sub(pattern, lambda found, lines=lines: found[1] + lines + found[3], text, flags=re.DOTALL)
+    with atomic.new_file(document) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,117 @@
+"""Commands whose disk is full before they have ended: status 2 with the place's name, the old result as it was, no leftovers.
+
+The disk is a small file system in memory, which only root can mount.
+"""
+
+import os
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from campaign import commands, results, sources
+from campaign.sources import COMMANDS, Command
+
+LONGEST_S = 300.0
+SHARES = (0.02, 0.5, 0.97)  # of the result's size that is free beside the old one
+BLOCK = 4096  # bytes
+WITHOUT = ("accuracy", "demo")  # which write by the other verbs
+
+
+@dataclass(frozen=True)
+class Full:
+    """What came of a command whose disk was full."""
+
+    verb: str
+    share: float
+    outcome: commands.Outcome
+    kept: bool  # whether the old result is as it was
+    left: tuple[str, ...]  # leftovers
+
+    @property
+    def good(self) -> bool:
+        """Whether it said so and nothing was lost."""
+        lines = self.outcome.said.splitlines()
+        return self.outcome.status == 2 and len(lines) == 1 and "disk" in lines[0] and self.kept and not self.left
+
+
+def can_mount() -> bool:
+    """Whether this process may mount a file system."""
+    with TemporaryDirectory() as name:
+        try:
+            with small_disk(Path(name), 1 << 20):
+                return True
+        except (OSError, subprocess.CalledProcessError):
+            return False
+
+
+@contextmanager
+def small_disk(folder: Path, size: int) -> Iterator[None]:
+    """Mount a file system of so many bytes in a folder."""
+    options = f"size={max(size // BLOCK, 1) * BLOCK},nr_inodes=100k"
+    subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], check=True, capture_output=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True, capture_output=True)
+
+
+def writers() -> list[Command]:
+    """A command of each verb that writes."""
+    firsts = {command.verb: command for command in reversed(COMMANDS) if command.verb not in WITHOUT}
+    return list(reversed(firsts.values()))
+
+
+def run(place: Path, only: Sequence[str] = ()) -> list[Full]:
+    """Fill the disk of each command to some shares of what it needs."""
+    found = []
+    for command in writers():
+        if not only or command.verb in only:
+            with TemporaryDirectory(dir=place.parent, ignore_cleanup_errors=True) as name:
+                found += fill(place, command, Path(name))
+    return found
+
+
+def fill(place: Path, command: Command, folder: Path) -> list[Full]:
+    """Run one command on disks that are too small."""
+    sources.lay_out(folder, place, command.folders)
+    disk = folder / "disk"
+    disk.mkdir()
+    line = (command.verb, *command.fields, "out=disk/new")
+    with small_disk(disk, 1 << 32):
+        first = commands.run(line, folder, LONGEST_S)
+        if first.status:
+            raise RuntimeError(f"sonotwin {' '.join(line)}: {first.said}")
+        size = _blocks(disk)
+    found = []
+    for share in SHARES:
+        with small_disk(disk, size + int(share * size) + 2 * BLOCK):
+            commands.run(line, folder, LONGEST_S)
+            before = results.digests(disk)
+            outcome = commands.run((*line, *_anew(command.verb)), folder, LONGEST_S)
+            kept = bool(before) and before.items() <= results.digests(disk).items()
+            found.append(Full(command.verb, share, outcome, kept, tuple(results.leftovers(disk))))
+    return found
+
+
+def _anew(verb: str) -> tuple[str, ...]:
+    """Fields by which a verb that goes on with its own result makes another one."""
+    given = {"dataset": ("samples=2",), "train": ("steps=4",), "study": ("seeds=2",), "reconstruct": ("spacing_mm=0.4",)}
+    return given.get(verb, ())
+
+
+def _blocks(folder: Path) -> int:
+    """Bytes that files take on the disk."""
+    return sum(-(-os.lstat(path).st_size // BLOCK) * BLOCK + BLOCK for path in folder.rglob("*"))
+
+
+def table(found: Sequence[Full]) -> list[str]:
+    """Lines of Markdown: a row a case."""
+    lines = ["| verb | room beside the old result | status | old result kept | leftovers | said |", "|---|---|---|---|---|---|"]
+    for one in found:
+        (said,) = one.outcome.said.strip().splitlines()[-1:] or [""]
+        cells = [one.verb, f"{100 * one.share:.0f} %", one.outcome.status, "yes" if one.kept else "**no**", len(one.left)]
+        lines.append(f"| {' | '.join(map(str, cells))} | `{said[-90:]}` |")
+    return lines

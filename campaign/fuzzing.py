@@ -1,0 +1,111 @@
+"""Coverage-guided fuzzing of each reader (atheris, libFuzzer): whatever the bytes, it gives a value or an InputError.
+
+Each reader is fuzzed in a process of its own, as `python -m campaign.fuzzing READER FOLDER`, begun again after each finding.
+"""
+
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+MOST_MB, LONGEST_S = 2000, 10
+MOST_FAULTS = 5  # of one reader, after which it isn't fuzzed on
+NAMES = (
+    "manifest", "calibration", "calibration_xml", "calibration_npz", "probe", "target", "lag", "stamps", "track", "pairs",
+    "pose_table", "image", "mesh", "volume_nrrd", "volume_mha", "sequence", "plus_config", "dicom", "video", "patterns",
+    "metrics", "truth", "points", "shard", "checkpoint", "network",
+)  # fmt: skip
+
+
+@dataclass
+class Fuzzed:
+    """What came of fuzzing one reader."""
+
+    reader: str
+    seconds: float = 0.0
+    inputs: int = 0
+    edges: int = 0  # covered
+    faults: list[str] = field(default_factory=list)  # last lines of what was raised or said
+
+
+def run(place: Path, seconds: float, only: Sequence[str] = (), workers: int = 2) -> list[Fuzzed]:
+    """Fuzz readers for some seconds each."""
+    names = [name for name in NAMES if not only or name in only]
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(lambda name: fuzz(place, name, seconds), names))
+
+
+def fuzz(place: Path, name: str, seconds: float) -> Fuzzed:
+    """Fuzz one reader; what breaks it is kept in the folder `fuzzing` beside the sources."""
+    found, kept = Fuzzed(name), place.parent / "fuzzing" / name
+    kept.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    while (left := seconds - (time.perf_counter() - start)) > 1 and len(found.faults) < MOST_FAULTS:
+        with TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
+            limits = [f"-max_total_time={int(left)}", f"-rss_limit_mb={MOST_MB}", f"-timeout={LONGEST_S}"]
+            settings = [*limits, f"-artifact_prefix={kept}/", "-print_final_stats=1"]
+            line = [sys.executable, "-m", "campaign.fuzzing", name, str(place), folder, *settings]
+            done = subprocess.run(line, capture_output=True, check=False, cwd=Path(__file__).resolve().parents[1])
+        said = done.stderr.decode(errors="replace") + done.stdout.decode(errors="replace")
+        found.inputs += sum(int(number) for number in re.findall(r"stat::number_of_executed_units:\s*(\d+)", said))
+        found.edges = max([found.edges, *(int(number) for number in re.findall(r"cov: (\d+)", said))])
+        if done.returncode:
+            found.faults.append(_cause(said) or f"status {done.returncode}")
+    found.seconds = time.perf_counter() - start
+    return found
+
+
+def _cause(said: str) -> str:
+    """The line that says what went wrong."""
+    raised = r"^(\w[\w.]*(?:Error|Exception|Warning|Iteration|Interrupt|Exit)\b.*)$"
+    for pattern in (raised, r"(ERROR: libFuzzer: .*)", r"(.*Sanitizer.*)"):
+        if lines := re.findall(pattern, said, re.MULTILINE):
+            return lines[-1][:200]
+    return said.strip().splitlines()[-1][:200] if said.strip() else ""
+
+
+def table(found: Sequence[Fuzzed]) -> list[str]:
+    """Lines of Markdown: a row a reader."""
+    lines = ["| reader | s | inputs | edges covered | faults |", "|---|---|---|---|---|"]
+    for one in found:
+        lines.append(f"| {one.reader} | {one.seconds:.0f} | {one.inputs} | {one.edges} | {'; '.join(sorted(set(one.faults)))} |")
+    return lines
+
+
+def main(name: str, place: Path, folder: Path, settings: Sequence[str]) -> None:
+    """Fuzz one reader in this process; it ends with the process."""
+    import atheris
+
+    with atheris.instrument_imports(  # pyrefly: ignore[missing-attribute]
+        include=["recon", "trainers", "twin.session"]
+    ):
+        from campaign.readers import READERS
+    from recon.errors import InputError
+
+    reader = READERS[name]
+    corpus = folder / "corpus"
+    corpus.mkdir()
+    for number, seed in enumerate(reader.seeds):
+        (corpus / str(number)).write_bytes((place / seed).read_bytes())
+    path = folder / "read" / reader.name
+    path.parent.mkdir()
+
+    def read(content: bytes) -> None:
+        path.write_bytes(content)
+        try:
+            reader.read(path)
+        except InputError as error:
+            if len(str(error).splitlines()) != 1:
+                raise RuntimeError(f"a message of several lines: {error}") from error
+
+    atheris.Setup([sys.argv[0], *settings, str(corpus)], read)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), sys.argv[4:])

@@ -1,0 +1,79 @@
+"""Every reader of files that may come from strangers, as a function of one file, with valid files to begin from."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon.capture import calibration_files, images, lag_files, manifest, probe_files, sweep_tables, target_files
+from recon.capture.surface_part import read_patterns
+from recon.clips import dicom_clip, pose_tables, video_clip
+from recon.clips.pose_tables import Columns
+from recon.files import meshes, metrics, npz, volumes
+from recon.freehand import plus_config, sequences
+from recon.model.rig import Target
+from recon.tracking import networks
+from sonotwin import config
+from trainers import export, shard_reader
+from twin import session
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader."""
+
+    read: Callable[[Path], object]
+    seeds: tuple[str, ...]  # valid files among the sources
+    name: str = "file"  # that the file has, where it matters
+
+
+def _design() -> Target:
+    from sonotwin.verbs import track
+
+    return config.load("track", ["capture=none", "out=none"], track.Config).rig.target
+
+
+def _manifest(path: Path) -> object:
+    return manifest.read_manifest(path.parent)
+
+
+def _shard(path: Path) -> object:
+    return shard_reader.read_views(path.parent)
+
+
+def _sequence(path: Path) -> object:
+    return sequences.read_tracking(path), sum(1 for _ in sequences.stream_images(path))
+
+
+COLUMNS = Columns(time="t", translation=("x", "y", "z"), quaternion=("qx", "qy", "qz", "qw"))
+POINTS = {"points": npz.Form("f", (None, 3)), "pixels": npz.Form("f", (None, 2))}
+
+READERS = {
+    "manifest": Reader(_manifest, ("ball/capture/manifest.json", "board/capture/manifest.json", "scan/capture/manifest.json"),
+                       "manifest.json"),
+    "calibration": Reader(calibration_files.read, ("optics/optics.yaml", "ball/capture/calibration/optics.yaml")),
+    "calibration_xml": Reader(calibration_files.read, ("optics/StereoParams.xml",), "file.xml"),
+    "calibration_npz": Reader(calibration_files.read, ("optics/cam1_proj_params.npz", "optics/cam1_cam2_params.npz"), "file.npz"),
+    "probe": Reader(probe_files.read, ("probe/probe.yaml",)),
+    "target": Reader(lambda path: target_files.read(path, DESIGN), ("target/target.yaml",)),
+    "lag": Reader(lag_files.read, ("lag/lag.json",), "lag.json"),
+    "stamps": Reader(sweep_tables.read_stamps, ("scan/capture/sweep/us/timestamps.csv",)),
+    "track": Reader(sweep_tables.read_track, ("scan/capture/sweep/track.csv",)),
+    "pairs": Reader(sweep_tables.read_pairs, ("pairs.csv",)),
+    "pose_table": Reader(lambda path: pose_tables.read(path, COLUMNS), ("poses.csv",)),
+    "image": Reader(lambda path: images.read_image(path, (321, 408), 8), ("scan/capture/sweep/us/0003.png",)),
+    "mesh": Reader(lambda path: meshes.read_ply(path, "a mesh"), ("small.ply",), "file.ply"),
+    "volume_nrrd": Reader(volumes.read_volume, ("small.nrrd",), "file.nrrd"),
+    "volume_mha": Reader(volumes.read_volume, ("small.mha",), "file.mha"),
+    "sequence": Reader(_sequence, ("small.igs.mha",), "file.igs.mha"),
+    "plus_config": Reader(plus_config.read_config, ("plus.xml",)),
+    "dicom": Reader(dicom_clip.read, ("scan.dcm",), "file.dcm"),
+    "video": Reader(video_clip.read, ("screen.avi",), "file.avi"),
+    "patterns": Reader(read_patterns, ("patterns.yaml",), "file.yaml"),
+    "metrics": Reader(metrics.read, ("skin/metrics.json",)),
+    "truth": Reader(session.read_json, ("ball/truth/scene.json",)),
+    "points": Reader(lambda path: npz.read(path, POINTS), ("small.npz",)),
+    "shard": Reader(_shard, ("data/shard-00000.tar",), "shard-00000.tar"),
+    "checkpoint": Reader(export.read_state, ("small.pt",)),
+    "network": Reader(lambda path: networks.session(path, networks.SEGMENTER), ("networks/segmenter.onnx",), "file.onnx"),
+}  # fmt: skip
+DESIGN = _design()

@@ -1,0 +1,207 @@
+"""Valid inputs, small ones, made by the commands themselves, and the commands that read them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from campaign import commands
+from recon.capture import probe_files, surface_part
+from recon.files import atomic
+from recon.geometry import rigid
+from tests.recon.clips import made_clips
+
+LONGEST_S = 600.0
+STROKE = ("path.start_mm=[-18,-2]", "path.end_mm=[-18,8]", "path.speed_mm_s=20")
+MADE = (  # command lines in the order in which they are run
+    ("render", "scene=sphere", "cameras=[cam1]", "tracing.samples=4", "out=ball"),
+    ("render", "scene=board", "poses=demo", "poses.count=5", "patterns=paper_calibration", "cameras=[cam1,cam2]",
+     "tracing.samples=4", "out=board"),
+    ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "path.count=12", "out=wires"),
+    ("sweep", "scene=tank", "ultrasound=water", "path=bob", "path.seconds=2", "out=bottom"),
+    ("sweep", *STROKE, "out=scan"),
+    ("film", "frames=24", "path.turn_deg=20", "white_dn=120", "seed=1", "out=film"),
+    ("dataset", "samples=4", "shard=2", "out=data"),
+    ("train", "network=detector", "data=data", "steps=2", "batch=2", "crop_px=64", "out=net"),
+    ("surface", "capture=ball/capture", "out=skin"),
+    ("calibrate-optics", "capture=board/capture", "out=optics"),
+    ("calibrate-probe", "capture=wires/capture", "out=probe"),
+    ("measure-lag", "capture=bottom/capture", "out=lag"),
+    ("freehand", "capture=scan/capture", "out=volume"),
+    ("segment", "capture=scan/capture", "out=masses"),
+    ("calibrate-target", "capture=film/capture", "least_tilt_deg=0", "least_range_mm=0", "out=target"),
+    ("export", "capture=ball/capture", "out=published"),
+    ("study", "name=sweep", "of=tracking", "film.frames=2", "over={film.rays: [16]}", "seeds=1", "out=study"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Command:
+    """A valid command, as it is run in a folder that holds copies of some sources; its result goes to `new`."""
+
+    verb: str
+    fields: tuple[str, ...] = ()
+    folders: tuple[str, ...] = ()  # sources that it needs
+    reads: tuple[str, ...] = ()  # files of those that it must refuse if they are damaged
+    minutes: bool = False  # that it takes without a fault: it isn't tried without one
+
+    @property
+    def line(self) -> tuple[str, ...]:
+        """The whole command line."""
+        return (self.verb, *self.fields, "out=new")
+
+
+def _sweep(name: str, number: int = 3) -> tuple[str, ...]:
+    part = f"{name}/capture/sweep"
+    return f"{name}/capture/manifest.json", f"{part}/track.csv", f"{part}/us/timestamps.csv", f"{part}/us/{number:04d}.png"
+
+
+def _film(name: str) -> tuple[str, ...]:
+    part = f"{name}/capture/sweep"
+    images = tuple(f"{part}/cam{k}/{file}" for k in (1, 2) for file in ("timestamps.csv", "0001.png"))
+    return f"{name}/capture/manifest.json", *images, f"{name}/capture/calibration/optics.yaml"
+
+
+BALL = ("ball/capture/manifest.json", "ball/capture/surface/cam1/0003.png", "ball/capture/calibration/optics.yaml")
+SCAN = (*_sweep("scan"), "scan/capture/calibration/probe.yaml")
+POSES = ("columns.time=t", "columns.translation=[x,y,z]", "columns.quaternion=[qx,qy,qz,qw]")
+
+COMMANDS = (
+    Command("surface", ("capture=ball/capture",), ("ball",), BALL),
+    Command("surface", ("images=shots", "patterns=patterns.yaml", "calibration=optics/optics.yaml"),
+            ("shots", "patterns.yaml", "optics"), ("shots/0003.png", "patterns.yaml", "optics/optics.yaml")),
+    Command("surface", ("images=shots", "patterns=paper_surface", "calibration=optics/cam1_proj_params.npz"),
+            ("shots", "optics"), ("optics/cam1_proj_params.npz",)),
+    Command("evaluate", ("surface=skin", "truth=ball/truth"), ("skin", "ball"),
+            ("skin/points.npz", "ball/truth/scene.json", "ball/truth/calibration/optics.yaml", "ball/truth/surface/cam1.npz")),
+    Command("calibrate-optics", ("capture=board/capture",), ("board",),
+            ("board/capture/manifest.json", "board/capture/board/01/cam1/0003.png", "board/capture/board/02/cam2/lit.png")),
+    Command("calibrate-optics", ("capture=board/capture", "truth=board/truth"), ("board",), ("board/truth/board.npz",)),
+    Command("calibrate-probe", ("capture=wires/capture", "earlier=probe/probe.yaml"), ("wires", "probe"),
+            (*_sweep("wires"), "probe/probe.yaml")),
+    Command("calibrate-probe", ("pairs=pairs.csv",), ("pairs.csv",), ("pairs.csv",)),
+    Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
+    Command("measure-lag", ("capture=bottom/capture",), ("bottom",), _sweep("bottom")),
+    Command("track", ("capture=film/capture", "target=target/target.yaml", "networks=networks"),
+            ("film", "target", "networks"),
+            (*_film("film"), "target/target.yaml", "networks/detector.onnx", "networks/segmenter.onnx")),
+    Command("freehand", ("capture=scan/capture",), ("scan",), SCAN),
+    Command("freehand", ("sequence=volume/sequence.igs.mha", "config=plus.xml"), ("volume", "plus.xml"),
+            ("volume/sequence.igs.mha", "plus.xml")),
+    Command("segment", ("capture=scan/capture",), ("scan",), SCAN),
+    Command("segment", ("sequence=volume/sequence.igs.mha", "kind=masses"), ("volume",), ("volume/sequence.igs.mha",)),
+    Command("fuse", ("capture=scan/capture", "surface=skin/surface.ply", "volume=volume", "part_table=false"),
+            ("scan", "skin", "volume"), (*SCAN, "skin/surface.ply", "volume/volume.nrrd")),
+    Command("reconstruct", ("capture=scan/capture", "probe=probe/probe.yaml"), ("scan", "probe"),
+            ("scan/capture/manifest.json", "probe/probe.yaml")),
+    Command("export", ("capture=ball/capture", "surface=skin"), ("ball", "skin"), (*BALL, "skin/points.npz")),
+    Command("import", ("folder=published",), ("published",),
+            ("published/cam1_proj_params.npz", "published/SLdata/images/3.png")),
+    Command("import-sweep", ("clip=scan.dcm", "poses=poses.csv", "starts_s=100", *POSES), ("scan.dcm", "poses.csv"),
+            ("scan.dcm", "poses.csv")),
+    Command("import-sweep", ("clip=screen.avi", "poses=poses.csv", *POSES), ("screen.avi", "poses.csv"), ("screen.avi",)),
+    Command("describe", ("folder=shots", "patterns=patterns.yaml", "calibration=optics/optics.yaml"),
+            ("shots", "patterns.yaml", "optics"), ("shots/0003.png", "patterns.yaml", "optics/optics.yaml")),
+    Command("train", ("network=detector", "data=data", "init=net/detector.safetensors", "steps=2", "batch=2", "crop_px=64"),
+            ("data", "net"), ("data/shard-00001.tar", "data/dataset.json", "net/detector.safetensors")),
+    Command("train", ("network=detector", "data=data", "init=net/detector.pt", "steps=2", "batch=2", "crop_px=64"),
+            ("data", "net"), ("net/detector.pt",)),
+    Command("render", ("scene=sphere", "tracing.samples=2")),
+    Command("sweep", STROKE),
+    Command("film", ("frames=1",)),
+    Command("dataset", ("samples=1",)),
+    Command("study", ("name=study.yaml", "of=tracking", "film.frames=1"), ("study.yaml",), ("study.yaml",)),
+    Command("demo", ("scene=sphere", "path=none", "poses=none", "board=boards", "film_frames=0")),
+    Command("accuracy", ("only=optics",), minutes=True),
+)  # fmt: skip
+
+
+def make(folder: Path) -> None:
+    """Make all sources that aren't there yet; raises RuntimeError if a command fails."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for line in MADE:
+        if not (folder / _out(line)).exists():
+            outcome = commands.run(line, folder, LONGEST_S)
+            if outcome.status:
+                raise RuntimeError(f"sonotwin {' '.join(line)}: {outcome.said}")
+    if not (folder / "study.yaml").exists():
+        _write_others(folder)
+
+
+def _out(line: Sequence[str]) -> str:
+    return next(field.removeprefix("out=") for field in line if field.startswith("out="))
+
+
+def _write_others(folder: Path) -> None:
+    """Files that no command writes: shots without a manifest, a clip, tables, configurations."""
+    import json
+    import shutil
+
+    import yaml
+
+    from recon.tracking import networks
+
+    shutil.copytree(folder / "ball/capture/surface/cam1", folder / "shots", dirs_exist_ok=True)
+    patterns = surface_part.read_surface(folder / "ball/capture").patterns
+    (folder / "patterns.yaml").write_text(yaml.safe_dump(json.loads(patterns.model_dump_json())), encoding="utf-8")
+    shutil.copytree(networks.WEIGHTS, folder / "networks", dirs_exist_ok=True)
+    shown = made_clips.screens(made_clips.scans(24))
+    made_clips.write_dicom(folder / "scan.dcm", shown, FrameTime=50.0)
+    made_clips.write_video(folder / "screen.avi", shown, 20.0)
+    rows = [f"{time:.6f},0,{10 * (time - 99):.6f},650,0,0,0,1" for time in 99.0 + np.arange(60) / 20]
+    (folder / "poses.csv").write_text("\n".join(["t,x,y,z,qx,qy,qz,qw", *rows]) + "\n", encoding="utf-8")
+    (folder / "pairs.csv").write_text(_pairs(folder), encoding="utf-8")
+    (folder / "plus.xml").write_text(PLUS, encoding="utf-8")
+    _write_small_ones(folder)
+    (folder / "study.yaml").write_text("title: Rays\nof: tracking\nover:\n  film.rays: [16]\nseeds: 1\n", encoding="utf-8")
+
+
+def _write_small_ones(folder: Path) -> None:
+    """Small files of the kinds that are read whole, to begin fuzzing from."""
+    import torch
+    import trimesh
+
+    from recon.files import meshes, volumes
+    from recon.freehand import sequences
+
+    meshes.write_ply(folder / "small.ply", trimesh.creation.icosphere(1, 10.0))
+    voxels = np.random.default_rng(0).integers(0, 256, (4, 5, 6), np.uint8)
+    for suffix in (".nrrd", ".mha"):
+        volumes.write_volume(folder / f"small{suffix}", volumes.Volume(voxels, np.zeros(3), np.ones(3)))
+    probe = probe_files.read(folder / "probe" / "probe.yaml")
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    sequences.write_sequence(folder / "small.igs.mha", sequences.sequence_of(voxels, poses, probe, np.arange(4.0)))
+    np.savez(folder / "small.npz", points=np.zeros((7, 3)), pixels=np.zeros((7, 2)))
+    torch.save({"weight": torch.zeros(3, 2), "bias": torch.zeros(3)}, folder / "small.pt")
+
+
+def _pairs(folder: Path) -> str:
+    """Poses and pixels of a crossing at rest, by a calibration that is there, a pair a line."""
+    probe, rng = probe_files.read(folder / "probe" / "probe.yaml"), np.random.default_rng(0)
+    names = [f"m{i}{j}" for i in range(3) for j in range(4)]
+    lines = [",".join([*names, "u", "v"])]
+    for pixel in rng.uniform([40, 60], [280, 340], (20, 2)):
+        turn = Rotation.from_euler("xyz", rng.uniform(-30, 30, 3), degrees=True).as_matrix()
+        pose = rigid.transform(turn, np.array([0.0, 0.0, 650.0]) - turn @ probe.to_target(pixel[None])[0])
+        lines.append(",".join(f"{value:.9g}" for value in (*pose[:3].ravel(), *pixel)))
+    return "\n".join(lines) + "\n"
+
+
+PLUS = """<PlusConfiguration version="2.7">
+  <VolumeReconstruction ImageCoordinateFrame="Image" ReferenceCoordinateFrame="Reference" OutputSpacing="0.5 0.5 0.5"
+    ClipRectangleOrigin="0 0" ClipRectangleSize="321 408" Interpolation="NEAREST_NEIGHBOR" Optimization="FULL_OPTIMIZATION"
+    CompoundingMode="MEAN" FillHoles="FALSE" />
+</PlusConfiguration>
+"""
+
+
+def lay_out(folder: Path, sources: Path, names: Sequence[str]) -> None:
+    """Fill a folder with some of the sources, as links to their files."""
+    for name in names:
+        source, target = sources / name, folder / name
+        if source.is_dir():
+            atomic.link_tree(source, target)
+        else:
+            target.hardlink_to(source)
