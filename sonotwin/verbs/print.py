@@ -75,7 +75,7 @@ def draw_board(config: Config, board: Board) -> None:
     scale = "Rulers not 100.0 mm long? Multiply the board's lengths by their mean / 100, wherever you give board={...}."
     write(config, card, sheet, words, [scale, "Matt paper, glued flat onto glass or aluminium."])
     field = f"board='{board_drawing.as_field(board)}'"
-    report(config, card, sheet, f"sonotwin describe folder=poses {field} out=capture, with the lengths as printed")
+    report(config, card, sheet, f"sonotwin describe folder=poses {field} out=capture  # with the lengths as printed")
 
 
 def draw_target(config: Config, target: Target) -> None:
@@ -85,7 +85,7 @@ def draw_target(config: Config, target: Target) -> None:
     scale = "Rulers not 100.0 mm long? Multiply rig.target.c1_mm by the lower / 100 and c2_mm by the left / 100, or film it"
     care = "This side up: c0 is below at the left. Matt paper, glued flat onto a stiff board."
     write(config, card, sheet, words, [f"{scale}: sonotwin calibrate-target.", care])
-    report(config, card, sheet, "sonotwin calibrate-target capture=film out=target, of a film of it as it was printed")
+    report(config, card, sheet, "sonotwin calibrate-target capture=film out=target  # of a film of it as it was printed")
 
 
 def check_discs(board: Board) -> None:

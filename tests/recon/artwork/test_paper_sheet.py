@@ -22,7 +22,7 @@ def drawn(path, card=CARD, paper="a4"):
 def test_rulers_measure_a_hundred_millimetres(tmp_path):
     """From the first long line to the last, along both axes, to 0.02 mm."""
     drawn(tmp_path / "a.pdf")
-    image, pixel = raster(tmp_path / "a.pdf")
+    image, pixel = raster(tmp_path / "a.pdf", 300)
     height, ink = image.shape[0], image.max() - image.astype(float)
     corner = np.array([MARGIN + paper_sheet.LEFT_MM, MARGIN + paper_sheet.BELOW_MM])
     row = height - (corner[1] - 4.7) / pixel[1]  # across the long lines, beyond the shorter ones
