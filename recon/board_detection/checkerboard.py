@@ -47,7 +47,7 @@ def find_chessboard(image: Array, board: Chessboard, full: float) -> Detection:
 def find_charuco(image: Array, board: Charuco, full: float) -> Detection:
     """Find those inner corners of a ChArUco board that are in view; see `recon.board_detection.detect.detect`."""
     grey = _eight_bits(image, full)
-    design = _design(board)
+    design = charuco_of(board)
     markers, numbers = _markers(grey, design)
     if len(numbers) < LEAST_MARKERS and len(_markers(np.ascontiguousarray(grey[:, ::-1]), design)[1]) >= LEAST_MARKERS:
         raise BoardNotFound("image is mirrored")
@@ -183,7 +183,8 @@ def _faults(corners: Corners, window: float, full: float) -> list[str | None]:
     return first_faults(tests, len(contrast))
 
 
-def _design(board: Charuco) -> cv2.aruco.CharucoBoard:
+def charuco_of(board: Charuco) -> cv2.aruco.CharucoBoard:
+    """OpenCV's board of a design; raises InputError if its dictionary is unknown, or has too few markers."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not isinstance(number, int):
         raise InputError(f"dictionary: expected one of OpenCV's, such as DICT_5X5_100, found {board.dictionary!r}")

@@ -43,6 +43,7 @@ FEW = 3  # windows
 UNUSUAL = 5  # standard deviations, from which on a phasor is left out
 SURE = 1e-4  # of the modulation: no phasor is more certain
 MEDIAN = np.sqrt(2 * np.log(2))  # of the length of a complex normal number, per part's standard deviation
+ROUNDING = 1 / 12  # DN^2, of whole numbers: no residual is known better, be the images computed
 FIXED = 1e6  # weight by which mean errors are held at zero
 
 
@@ -129,8 +130,11 @@ def _by_residuals(data: Image, fit: Image, shifts: Array, saturation: float) -> 
     known = np.concatenate([fit, np.ones((1, fit.shape[1]), np.float32)])
     weighted = known / np.maximum(noise.read_variance + noise.gain * fit[0], noise.read_variance / 2)
     residual = project.astype(np.float32) @ data
-    excess = float(weighted[3] @ (residual**2).sum(axis=0)) / (residual.shape[1] * (len(shifts) - 3))
+    power = float(weighted[3] @ (residual**2).sum(axis=0)) / (len(shifts) - 3)
+    excess = max(power, ROUNDING * float(weighted[3].sum())) / residual.shape[1]
     products, pulls = (weighted @ known.T).astype(float), (weighted @ residual.T).astype(float)
+    # Rounded alike in many like pixels, sums seem to show errors that leave no residuals: none is left by an exact projection
+    products, pulls = (products + products.T) / 2, pulls @ project
     slopes = _slopes(shifts)
     normal = np.einsum("akx,xy,bly,kl->akbl", slopes, products, slopes, project)
     right = np.einsum("akx,xk->ak", slopes, pulls)

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.model.patterns import Fringes
 from recon.structured_light import frame_errors
 from recon.structured_light.phase import FrameErrors, Noise, design, estimate_noise, pseudo_inverse, steady, wrapped_phase
 
@@ -68,6 +69,19 @@ def phase_errors(images, shifts, phase, errors=None):
     off = np.angle(np.exp(1j * (found.phase - phase)))[lit]
     off -= off.mean()
     return off, off / found.sigma[lit]
+
+
+def test_computed_images_show_no_errors():
+    """Fringes of whole projector px, seen pixel by pixel without noise: all periods are alike, their rounding errors, too."""
+    fringes = Fringes(pitch=PITCH, steps=8, first=1)
+    columns = np.arange(SHAPE[1]) - fringes.zero(SHAPE[1])
+    images = (16 * np.rint(255 * fringes.profiles(SHAPE[1]))).astype(np.uint16)
+    images = np.broadcast_to(images[:, None], (8, *SHAPE))
+    found = frame_errors.estimate(images, fringes.shifts, least_modulation=64, saturation=4095)
+    assert np.abs(found.gain).max() < 0.02 and np.abs(found.shift).max() < 0.01
+    phase = wrapped_phase(images, fringes.shifts, noise=Noise(14.0, 0.0), saturation=4095, errors=found).phase
+    off = np.angle(np.exp(1j * (phase - 2 * np.pi * columns / PITCH)))
+    assert np.abs(off).max() < 4 / np.pi * 0.5 / 127.5  # the largest by rounding to half a DN
 
 
 @pytest.mark.parametrize("n", [4, 5, 8, 18])

@@ -1,0 +1,142 @@
+"""Draw a calibration board or the probe's target for a printer: a PDF of one page, true to scale.
+
+`part=board` draws the board of the field `board`, of any kind that `calibrate-optics` finds; `part=target` draws the three rings
+of `rig.target`. Around the card to cut out are cut marks, a ruler of 100 mm along each axis, and its lengths in small print.
+Writes the file `out`; one that is there is replaced. Takes a second.
+
+Print at 100 %, measure both rulers, and where they aren't 100.0 mm long, give the lengths as they are on paper wherever board or
+target are described: docs/calibration.md says how.
+
+    sonotwin print part=board out=board.pdf
+    sonotwin print part=board board='{kind: charuco, columns: 8, rows: 11, square_mm: 20, marker_mm: 15}' paper=a4 out=charuco.pdf
+    sonotwin print part=target out=target.pdf
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from recon.artwork import board_drawing, paper_sheet, target_drawing
+from recon.artwork.paper_sheet import PAPERS, Card, Sheet, Size
+from recon.errors import InputError
+from recon.files import atomic
+from recon.model.boards import AsymmetricCircles, Board
+from recon.model.rig import Rig, Target
+from sonotwin.verbs.describe import design
+
+USUAL = AsymmetricCircles(columns=4, rows=11, spacing_mm=15, diameter_mm=9)  # as conf/scene/board.yaml
+LEAST_SCALE = 0.1  # of a board, that is offered where it doesn't fit
+
+Paper = Literal["a4", "letter", "a3", "tabloid", "a2", "a1", "a0"]
+Millimetres = Annotated[float, Field(gt=0, le=5000)]
+
+
+class Config(BaseModel):
+    """Fields of `conf/print.yaml`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rig: Rig
+    part: Literal["board", "target"]
+    out: Path
+    board: dict[str, Any] | None = None
+    paper: Paper | tuple[Millimetres, Millimetres] = "a4"
+    margin_mm: Annotated[float, Field(ge=0, le=50)] = 5.0
+
+    @model_validator(mode="after")
+    def _board_to_draw(self) -> "Config":
+        if self.part == "target" and self.board is not None:
+            raise ValueError("board: expected none with part=target, which draws rig.target")
+        return self
+
+
+def run(config: Config) -> None:
+    """Draw, and say how to go on.
+
+    Raises
+    ------
+    InputError
+        If the design is wrong, the card doesn't fit on the paper, or `out` is no PDF or can't be written.
+    """
+    if config.out.suffix.lower() != ".pdf":
+        raise InputError(f"out: expected the name of a PDF, such as {config.part}.pdf, found {config.out}")
+    if config.part == "target":
+        draw_target(config, config.rig.target)
+    else:
+        draw_board(config, USUAL if config.board is None else design(config.board))
+
+
+def draw_board(config: Config, board: Board) -> None:
+    """Draw a calibration board."""
+    check_discs(board)
+    card, words = board_drawing.card_of(board), board_drawing.in_words(board)
+    sheet = placed(config, card, shorter_board(config, board))
+    scale = "Rulers not 100.0 mm long? Multiply the board's lengths by their mean / 100, wherever you give board={...}."
+    write(config, card, sheet, words, [scale, "Matt paper, glued flat onto glass or aluminium."])
+    field = f"board='{board_drawing.as_field(board)}'"
+    report(config, card, sheet, f"sonotwin describe folder=poses {field} out=capture  # with the lengths as printed")
+
+
+def draw_target(config: Config, target: Target) -> None:
+    """Draw the probe's target."""
+    card, words = target_drawing.card_of(target), target_drawing.in_words(target)
+    sheet = placed(config, card, "")
+    scale = "Rulers not 100.0 mm long? Multiply rig.target.c1_mm by the lower / 100 and c2_mm by the left / 100, or film it"
+    care = "This side up: c0 is below at the left. Matt paper, glued flat onto a stiff board."
+    write(config, card, sheet, words, [f"{scale}: sonotwin calibrate-target.", care])
+    report(config, card, sheet, "sonotwin calibrate-target capture=film out=target  # of a film of it as it was printed")
+
+
+def check_discs(board: Board) -> None:
+    """Refuse discs that touch each other."""
+    diameter = getattr(board, "diameter_mm", 0.0)
+    apart = getattr(board, "spacing_mm", 1.0) * (2**0.5 if isinstance(board, AsymmetricCircles) else 1)
+    if diameter >= apart:
+        raise InputError(f"board.diameter_mm: expected less than the {apart:.2f} mm between centres, found {diameter:g}")
+
+
+def placed(config: Config, card: Card, advice: str) -> Sheet:
+    """The card's place on the paper; raises InputError with the paper that is large enough, and further advice."""
+    paper: Size = PAPERS[config.paper] if isinstance(config.paper, str) else config.paper
+    sheet = paper_sheet.lay_out(card.size, paper, config.margin_mm)
+    if sheet is not None:
+        return sheet
+    width, height = paper_sheet.needed(card.size, config.margin_mm)
+    large = paper_sheet.smallest_paper(card.size, config.margin_mm)
+    ways = [f"give paper={large or f'[{width:.0f},{height:.0f}]'}", *([advice] if advice else [])]
+    raise InputError(
+        f"paper: expected {width:.0f}x{height:.0f} mm or more for a {config.part} of {card.size[0]:.0f}x{card.size[1]:.0f} mm "
+        f"with its rulers, found {paper[0]:g}x{paper[1]:g} mm; {', or '.join(ways)}"
+    )
+
+
+def shorter_board(config: Config, board: Board) -> str:
+    """The largest lengths with which a board of these numbers fits on the paper, as advice; empty if there are none."""
+    paper: Size = PAPERS[config.paper] if isinstance(config.paper, str) else config.paper
+    least, most = LEAST_SCALE, 1.0
+    for _ in range(20):
+        middle = (least + most) / 2
+        small = board_drawing.scaled(board, middle)
+        fits = paper_sheet.lay_out(board_drawing.card_of(small).size, paper, config.margin_mm) is not None
+        least, most = (middle, most) if fits else (least, middle)
+    if least == LEAST_SCALE:
+        return ""
+    return "at most " + board_drawing.in_words(board_drawing.scaled(board, least)).partition(f"{board.rows}, ")[2]
+
+
+def write(config: Config, card: Card, sheet: Sheet, words: str, notes: list[str]) -> None:
+    """Write the PDF."""
+    lines = ["Print at 100 %, not fitted to the page, and measure both rulers.", f"sonotwin {words}.", *notes]
+    config.out.parent.mkdir(parents=True, exist_ok=True)
+    with atomic.new_file(config.out) as path:
+        paper_sheet.write(path, card, sheet, config.margin_mm, f"sonotwin {words}", lines)
+
+
+def report(config: Config, card: Card, sheet: Sheet, following: str) -> None:
+    """Say what was drawn."""
+    turned = "turned" if sheet.paper[0] > sheet.paper[1] else "upright"
+    print(f"{config.part:11} {card.size[0]:g} x {card.size[1]:g} mm to cut out")
+    print(f"paper       {sheet.paper[0]:g} x {sheet.paper[1]:g} mm, {turned}; print at 100 % and measure both rulers")
+    print(f"wrote       {config.out}")
+    print(f"next        {following}")

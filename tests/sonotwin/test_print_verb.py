@@ -1,0 +1,77 @@
+"""`sonotwin print`: sheets are written whole, said how to be used, and refused with a way on where they don't fit."""
+
+import pytest
+
+from sonotwin.cli import main
+from tests.recon.artwork.rasters import raster
+
+WIDE = "board={kind: chessboard, columns: 9, rows: 6, square_mm: 25}"
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def refusal(capsys, *fields: str) -> str:
+    """The line that refuses; nothing is written."""
+    assert main(["print", *fields]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line.removeprefix("sonotwin: ")
+
+
+def test_a_board_and_a_target_are_written(place, capsys):
+    """Of the usual design, on A4; the same bytes again."""
+    assert main(["print", "part=board", "out=sheets/board.pdf"]) == 0
+    assert "board={kind: asymmetric_circles, columns: 4, rows: 11, spacing_mm: 15, diameter_mm: 9}" in (
+        capsys.readouterr().out.replace("'", "")
+    )
+    assert main(["print", "part=target", "rig.target.c1_mm=30", "out=sheets/target.pdf"]) == 0
+    for name in ("board", "target"):
+        image, pixel = raster(place / "sheets" / f"{name}.pdf", 50)
+        assert image.shape[1] * pixel[0] == pytest.approx(210, abs=0.01)
+    before = (place / "sheets/board.pdf").read_bytes()
+    assert main(["print", "part=board", "out=sheets/board.pdf"]) == 0
+    assert (place / "sheets/board.pdf").read_bytes() == before
+    assert sorted(path.name for path in (place / "sheets").iterdir()) == ["board.pdf", "target.pdf"]
+
+
+def test_a_board_too_large_is_refused_with_paper_and_lengths_that_fit(place, capsys):
+    """And what the message offers fits: the smallest paper, and the largest squares to a tenth of a mm."""
+    said = refusal(capsys, "part=board", WIDE, "out=board.pdf")
+    assert said.startswith("paper: expected ") and "found 210x297 mm; give paper=a3, or at most square " in said
+    side = float(said.rpartition("square ")[2].removesuffix(" mm"))
+    assert not list(place.iterdir())
+    assert main(["print", "part=board", WIDE.replace("25", f"{side}"), "out=board.pdf"]) == 0
+    refusal(capsys, "part=board", WIDE.replace("25", f"{side + 0.1:.1f}"), "out=other.pdf")
+    assert main(["print", "part=board", WIDE, "paper=a3", "out=board.pdf"]) == 0
+    assert main(["print", "part=board", WIDE, "paper=[240,320]", "out=board.pdf"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        (["part=target", WIDE, "out=x.pdf"], "print: board: expected none with part=target, which draws rig.target"),
+        (["part=board", "out=x.png"], "out: expected the name of a PDF, such as board.pdf, found x.png"),
+        (
+            ["part=board", "out=x.pdf", "board={kind: symmetric_circles, columns: 4, rows: 4, spacing_mm: 9, diameter_mm: 9}"],
+            "board.diameter_mm: expected less than the 9.00 mm between centres, found 9",
+        ),
+        (
+            ["part=target", "out=x.pdf", "paper=[100,150]"],
+            "paper: expected 200x127 mm or more for a target of 60x65 mm with its rulers, found 100x150 mm; give paper=a4",
+        ),
+        (
+            [
+                "part=board",
+                "out=x.pdf",
+                "board={kind: charuco, columns: 5, rows: 7, square_mm: 9, marker_mm: 7, dictionary: DICT_X}",
+            ],
+            "dictionary: expected one of OpenCV's, such as DICT_5X5_100, found 'DICT_X'",
+        ),
+    ],
+)
+def test_mistakes_are_refused(fields, said, place, capsys):
+    assert refusal(capsys, *fields) == said
+    assert not list(place.iterdir())
