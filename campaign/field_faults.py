@@ -10,7 +10,7 @@ from sonotwin import config
 OBJECT, LISTS = "{unknown: [1]}", "[[[[]]]]"
 NONSENSE = {  # type of the field's value -> values that no field of the type can have
     bool: ("perhaps", "7", OBJECT, LISTS),
-    int: ("nan", "inf", "1.5", "many", OBJECT, LISTS, f"-{DIGITS}", "1e30"),
+    int: ("nan", "inf", "many", OBJECT, LISTS, f"-{DIGITS}"),  # numbers without a point may be lengths, too
     float: ("nan", "inf", "-inf", "many", OBJECT, LISTS, "1e999"),
     str: (OBJECT, LISTS),
     list: ("many", OBJECT, "[nan,nan,nan]", LISTS),

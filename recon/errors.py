@@ -2,6 +2,8 @@
 
 from pydantic import ValidationError
 
+OWN_WORDS = {"int_parsing_size": "a whole number of fewer digits", "path_type": "a path"}  # kinds that pydantic says in other words
+
 
 class InputError(ValueError):
     """Bad input: a file, a field or a value that the software can't work with.
@@ -26,6 +28,8 @@ def one_line(error: ValidationError) -> str:
         text = f"expected a map of fields, found {_brief(found)}"
     elif kind == "extra_forbidden":
         text = f"expected no such field, found {_brief(found)}"
+    elif kind in OWN_WORDS:
+        text = f"expected {OWN_WORDS[kind]}, found {_brief(found)}"
     elif kind == "value_error":
         text = message.removeprefix("Value error, ")
         if field and not text.startswith("expected"):  # a model's own check names the field within it

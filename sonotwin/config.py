@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 from recon.errors import InputError, one_line
 
 MOST_NAMES = 12  # of keys in a message
+MOST_DIGITS = 1000  # of a number; Hydra's parser can't take more than Python's own limit of some thousands
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -84,6 +85,9 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
         except MissingConfigException as error:
             raise InputError(f"{verb}: {_missing_choice(verb, str(error.missing_cfg_file))}") from error
         except ConfigCompositionException as error:
+            other = re.match(r"Error merging override ([^=]+)=(.*)", str(error))
+            if other is not None:
+                raise InputError(f"{verb}: {other[1]}: expected a value of its default's kind, found {other[2]}") from error
             unknown = re.search(r"Could not override '([^']+)'", str(error))
             if unknown is None:
                 raise InputError(f"{verb}: {_first_line(error)}") from error
@@ -128,6 +132,8 @@ def _literal_if_not_grammar(verb: str, override: str) -> str:
     key, equals, value = override.partition("=")
     if not key.startswith("~") and not (key and equals):
         raise InputError(f"{verb}: {override}: expected field=value")
+    if re.search(rf"\d{{{MOST_DIGITS}}}", value):
+        raise InputError(f"{verb}: {key}: expected numbers of at most {MOST_DIGITS} digits, found more")
     try:
         if not OverridesParser.create().parse_override(override).is_sweep_override():
             return override

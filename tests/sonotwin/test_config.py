@@ -96,6 +96,9 @@ def test_paths_are_taken_as_they_stand(path):
         ("capture=???", "surface: capture: needs a value; give capture=..."),
         ("outputs/demo", "surface: outputs/demo: expected field=value"),
         ("=3", "surface: =3: expected field=value"),
+        ("pitch=" + 9999 * "9", "surface: pitch: expected numbers of at most 1000 digits, found more"),
+        ("rig.gamma={a: 1}", "surface: rig.gamma: expected number, found {'a': 1}"),
+        ("out={a: b}", "surface: out: expected a path, found {'a': 'b'}"),
     ],
 )
 def test_mistakes_name_key_expected_and_found(override, line):
