@@ -2,7 +2,7 @@
 
 from pydantic import ValidationError
 
-OWN_WORDS = {"int_parsing_size": "a whole number of fewer digits", "path_type": "a path"}  # kinds that pydantic says in other words
+OWN_WORDS = {"int_parsing_size": "a whole number of fewer digits", "path_type": "a path"}  # of kinds of pydantic's
 
 
 class InputError(ValueError):

@@ -104,6 +104,7 @@ class Scans:
     calibrated_m_s: float  # of that for which the calibration holds
     probe: ProbeCalibration | None = None  # converted likewise; None where the sequence has its own
     errors: PlaceErrors | None = None  # of their places; None where nothing is known of them
+    elsewhere: bool = False  # 3D Slicer shows their sequence elsewhere than results in the world
 
     @property
     def placed(self) -> int:
@@ -170,9 +171,18 @@ def of_sequence(
         Takes the place of the sequence's own, which counts as one for 1540 m/s.
     fixed : (4, 4) by name, optional
         Transforms that go before those of the sequence, such as "ImageToProbe".
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, no transforms lead from the images to the reference frame, or that is RAS, which results aren't
+        written in.
     """
     frames, shape = sequences.read_tracking(path), sequences.image_shape(path)
     image, target, reference = names or FrameNames()
+    if reference.upper() == sequences.RAS:
+        expected = f"{sequences.LPS}, which files of volumes and surfaces are declared to be in; 3D Slicer turns them to RAS"
+        raise InputError(f"{path}: reference: expected {expected}, found {reference}")
     try:
         if probe is None:
             world_from_pixel = sequences.poses(frames, reference, image, fixed)
@@ -189,7 +199,8 @@ def of_sequence(
         np.where(frames.valid["Image"][:, None, None], placed, np.nan), calibrated, speed, face_row
     )
     converted = None if probe is None else sound_in_water.for_tissue(probe, tissue_m_s)
-    return Scans(shape, matrices, lambda: sequences.stream_images(path), speed, calibrated, converted)
+    elsewhere = sequences.lies_elsewhere(frames, reference)
+    return Scans(shape, matrices, lambda: sequences.stream_images(path), speed, calibrated, converted, elsewhere=elsewhere)
 
 
 def cut(scans: Scans, clip: Clip) -> Scans:
@@ -226,6 +237,12 @@ def depths(scans: Scans) -> str:
     calibrated, speed = scans.calibrated_m_s, scans.speed_m_s
     how = "as calibrated" if speed == calibrated else f"converted from {calibrated:.0f} m/s, for which the probe is calibrated"
     return f"right where sound makes {speed:.0f} m/s, {how}"
+
+
+def cautions(scans: Scans) -> Iterator[str]:
+    """Lines of warning about where results lie; none as a rule."""
+    if scans.elsewhere:
+        yield "3D Slicer shows the sequence where its transforms to RAS put it, and these results elsewhere: give reference=LPS"
 
 
 def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES) -> tuple[Reconstruction, Reconstruction]:

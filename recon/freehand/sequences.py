@@ -1,6 +1,10 @@
 """Tracked ultrasound as sequence files of the PLUS toolkit and 3D Slicer, `.igs.mha` and `.igs.nrrd`: B-scans with their poses.
 
 A transform `AToB` takes points of frame A to frame B. The frame `Image` is in pixels: (u, v, 0) is the centre of pixel (u, v).
+`RAS` is 3D Slicer's frame, `LPS` that of its files of volumes and meshes, half a turn from it.
+
+3D Slicer makes a node of each transform of a sequence and puts none under another; what stands at the top is taken as RAS. Only
+the images have a place of their own: by the transform `TToPhysical`, where T is the file's field `TrackName`.
 """
 
 import re
@@ -52,6 +56,11 @@ STRUCTURE = {  # fields given by the images and the format, in either of the two
     *("data file", "datafile", "ultrasound image orientation", "ultrasound image type"),
 }
 FRAME_STRUCTURE = {"Timestamp", "ImageStatus", "Status", ""}
+RAS, LPS = "RAS", "LPS"
+RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # and LPS from RAS
+SHOWN = "Physical"  # where 3D Slicer shows the images, its RAS
+TRACK_NAME = "TrackName"  # field of the file that names the frame of the images shown there
+SAME = 1e-6  # of the entries of matrices
 
 
 class FrameNames(NamedTuple):
@@ -78,7 +87,9 @@ def sequence_of(images: ArrayLike, world_from_target: Array, probe: ProbeCalibra
     """Make a PLUS sequence of one's own B-scans and poses.
 
     Its frames are `Image`, `Probe` (the target), `Tracker` and `Reference` (both are the world), so that the reconstruction in
-    PLUS or 3D Slicer finds `ImageToReference` without further settings.
+    PLUS or 3D Slicer finds `ImageToReference` without further settings. Files of volumes, meshes and markups in the world are
+    declared LPS, so that 3D Slicer turns them: `ReferenceToRAS` is the same half turn, and by `ImageToPhysical` 3D Slicer shows
+    each B-scan where they lie.
 
     Parameters
     ----------
@@ -98,13 +109,16 @@ def sequence_of(images: ArrayLike, world_from_target: Array, probe: ProbeCalibra
         raise InputError(f"world_from_target: expected n poses of 4 x 4, found {poses.shape}")
     found = np.isfinite(poses).all(axis=(1, 2))
     always = np.ones(len(poses), bool)
+    shown = RAS_FROM_LPS @ poses @ target_from_pixel(probe)
     transforms = {
         "ImageToProbe": np.tile(target_from_pixel(probe), (len(poses), 1, 1)),
         "ProbeToTracker": np.where(found[:, None, None], poses, np.eye(4)),
         "ReferenceToTracker": np.tile(np.eye(4), (len(poses), 1, 1)),
+        f"ReferenceTo{RAS}": np.tile(RAS_FROM_LPS, (len(poses), 1, 1)),
+        f"ImageTo{SHOWN}": np.where(found[:, None, None], shown, np.eye(4)),
     }
-    valid = {"ImageToProbe": always, "ProbeToTracker": found, "ReferenceToTracker": always, "Image": always}
-    frames = Frames(times, transforms, valid, images)
+    valid = dict.fromkeys([*transforms, "Image"], always) | {"ProbeToTracker": found, f"ImageTo{SHOWN}": found}
+    frames = Frames(times, transforms, valid, images, fields={TRACK_NAME: "Image"})
     _check(Path("sequence"), frames)
     return frames
 
@@ -116,6 +130,8 @@ def target_from_pixel(probe: ProbeCalibration) -> Array:
 
 def poses(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = None) -> Array:
     """Transforms (n, 4, 4) that take points of frame `of` to frame `to`, along a chain of transforms; NaN where invalid.
+
+    Where a transform leads to RAS, by whatever case of letters, its half turn leads on to LPS.
 
     Parameters
     ----------
@@ -135,6 +151,9 @@ def poses(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = 
             forth = np.broadcast_to((fixed or {})[name], (count, 4, 4)) if fixed and name in fixed else _usable(frames, name)
             steps.setdefault(source, {}).setdefault(destination, forth)
             steps.setdefault(destination, {}).setdefault(source, np.linalg.inv(forth))
+    for name in [name for name in steps if name.upper() == RAS]:
+        steps[name].setdefault(LPS, np.broadcast_to(RAS_FROM_LPS, (count, 4, 4)))
+        steps.setdefault(LPS, {}).setdefault(name, np.broadcast_to(RAS_FROM_LPS, (count, 4, 4)))
     reached, waiting = {of: np.broadcast_to(np.eye(4), (count, 4, 4))}, deque([of])
     while waiting and to not in reached:
         here = waiting.popleft()
@@ -150,6 +169,16 @@ def poses(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = 
         ends = f", which lead from there to {', '.join(list(reached)[1:])}" if len(reached) > 1 else ""
         raise InputError(f"transforms: expected some that lead from {of} to {to}, found {known}{ends}")
     return reached[to]
+
+
+def lies_elsewhere(frames: Frames, reference: str) -> bool:
+    """Whether the file's transforms to RAS put a frame elsewhere than files that are declared LPS; False if it has none."""
+    try:
+        lps_from_reference = poses(frames, LPS, reference)
+    except InputError:
+        return False
+    placed = lps_from_reference[np.isfinite(lps_from_reference).all(axis=(1, 2))]
+    return bool(np.abs(placed - np.eye(4)).max(initial=0) > SAME)
 
 
 def read_sequence(path: Path) -> Frames:

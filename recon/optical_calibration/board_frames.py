@@ -10,7 +10,7 @@ from recon.capture.board_part import BoardCapture, Pose
 from recon.errors import InputError
 from recon.optical_calibration.joint_calibration import Result
 from recon.optical_calibration.observations import Size
-from recon.optical_calibration.sightings import Sighting, sight
+from recon.optical_calibration.sightings import Failure, Sighting, sight
 from recon.threads import mapped
 
 MOST_AT_ONCE = 4  # poses, whose images and maps take some 0.3 GB each
@@ -72,9 +72,9 @@ def found_by(sightings: Sequence[Sighting], devices: Mapping[str, Size]) -> str:
     return f"{len(sightings)} poses: {', '.join(counts)}"
 
 
-def not_found(sightings: Sequence[Sighting]) -> dict[str, str]:
-    """Reasons by pose and device without any point of the board."""
-    return {f"{sighting.name} {device}": reason for sighting in sightings for device, reason in sighting.failures.items()}
+def not_found(sightings: Sequence[Sighting]) -> dict[str, Failure]:
+    """Failures by pose and device without any point of the board."""
+    return {f"{sighting.name} {device}": failure for sighting in sightings for device, failure in sighting.failures.items()}
 
 
 def refuse_lonely(sightings: Sequence[Sighting], devices: Collection[str], name: str) -> None:

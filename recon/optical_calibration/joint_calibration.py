@@ -105,7 +105,7 @@ def calibrate(
 
 def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size], settings: Settings, name: str) -> Result:
     """`calibrate`, with sightings of enough points."""
-    dropped = {f"{sighting.name} {device}": reason for sighting in sightings for device, reason in sighting.failures.items()}
+    dropped = {f"{sighting.name} {device}": str(reason) for sighting in sightings for device, reason in sighting.failures.items()}
     if not any(sighting.pixels for sighting in sightings):
         raise InputError(f"{name}: expected the board in {len(sightings)} poses, found it in none: {_commonest(dropped)}")
     observations = gather(sightings, board, sizes)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from recon.model.patterns import Patterns
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
 from recon.optical_calibration.projector_points import correspondences
 from recon.structured_light.decode import decode
+from recon.structured_light.plausibility import CodeOutside
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
@@ -24,6 +26,26 @@ ENOUGH = 8  # points of a pose that a device must see, to place it
 FIRST = "cam1"
 
 
+class Cause(Enum):
+    """Causes for which a device sees nothing of the board in a pose."""
+
+    NO_BOARD = auto()
+    UNDECODED = auto()  # the projector's patterns aren't as the manifest has them
+    CODE_OUTSIDE = auto()  # the projector's code leaves its image
+    FEW_POINTS = auto()
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A device's sighting that came to nothing."""
+
+    cause: Cause
+    reason: str  # in words
+
+    def __str__(self) -> str:
+        return self.reason
+
+
 @dataclass(frozen=True)
 class Sighting:
     """Sighting of one pose by all devices; a device without any point has no entry."""
@@ -33,7 +55,7 @@ class Sighting:
     covariance: Mapping[str, Array]  # device: (n, 2, 2) px^2
     gradient: Array  # (n, 2, 2) projector px / cam1 px
     radii: Mapping[str, Array] = field(default_factory=dict)  # camera: (n, 2) px, semi-axes of the discs
-    failures: Mapping[str, str] = field(default_factory=dict)  # device: why it sees nothing
+    failures: Mapping[str, Failure] = field(default_factory=dict)  # of devices that see nothing
 
 
 def sight(
@@ -58,12 +80,12 @@ def sight(
         A camera that doesn't find the board is left out, with the reason; so is the projector if its fringes can't be decoded.
     """
     found: dict[str, Detection] = {}
-    failures = {}
+    failures: dict[str, Failure] = {}
     for camera, image in lit.items():
         try:
             found[camera] = detect(image, board, full=2.0 ** bits[camera] - 1)
         except BoardNotFound as reason:
-            failures[camera] = str(reason)
+            failures[camera] = Failure(Cause.NO_BOARD, str(reason))
     pixels = {camera: detection.pixels for camera, detection in found.items()}
     covariance = {camera: detection.covariance for camera, detection in found.items()}
     radii = {camera: detection.radii for camera, detection in found.items() if detection.radii is not None}
@@ -77,7 +99,8 @@ def sight(
             seen = correspondences(projector_map, lit[FIRST][rows, columns], centres - corner, reach)
             pixels[PROJECTOR], covariance[PROJECTOR], gradient = seen.pixels, seen.covariance, seen.gradient
         except InputError as reason:
-            failures[PROJECTOR] = str(reason)
+            cause = Cause.CODE_OUTSIDE if isinstance(reason, CodeOutside) else Cause.UNDECODED
+            failures[PROJECTOR] = Failure(cause, str(reason))
     return without_scraps(Sighting(name, pixels, covariance, gradient, radii, failures))
 
 
@@ -86,7 +109,8 @@ def without_scraps(sighting: Sighting) -> Sighting:
     counts = {device: int(np.isfinite(pixels).all(axis=1).sum()) for device, pixels in sighting.pixels.items()}
     scraps = {device: count for device, count in counts.items() if count < ENOUGH}
     reasons = {
-        device: f"only {count} of {len(sighting.pixels[device])} points, {ENOUGH} are needed" for device, count in scraps.items()
+        device: Failure(Cause.FEW_POINTS, f"only {count} of {len(sighting.pixels[device])} points, {ENOUGH} are needed")
+        for device, count in scraps.items()
     }
 
     def kept(values: Mapping[str, Array]) -> dict[str, Array]:

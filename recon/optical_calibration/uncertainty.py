@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from recon.geometry.camera import Array, Camera
 from recon.geometry.camera_jacobian import linearise, moved
@@ -62,7 +63,7 @@ def seen(calibration: Calibration, points: Array) -> Array:
 
 
 def triangulation(
-    calibration: Calibration, first: str, second: str, points: Array, pixel_sigma: tuple[float, float] = (1.0, 1.0)
+    calibration: Calibration, first: str, second: str, points: Array, pixel_sigma: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)
 ) -> Array:
     """Uncertainty of points triangulated from exact pixels of two devices, by that of all calibrated parameters.
 
@@ -73,7 +74,8 @@ def triangulation(
     points : (m, 3), mm
         In the world.
     pixel_sigma : (2,), px
-        Weighs the devices' pixels against each other as `1 / sigma^2`. The pixels' own noise is not in the result.
+        Weighs the devices' pixels against each other as `1 / sigma^2`; a pair for a device weighs its u and v, infinite where
+        it has one alone. The pixels' own noise is not in the result.
 
     Returns
     -------
@@ -183,11 +185,14 @@ def _covariances(calibration: Calibration, slopes: Array) -> Array:
     return slopes @ _known(calibration).covariance @ np.swapaxes(slopes, -1, -2)
 
 
-def _point_slopes(calibration: Calibration, first: str, second: str, points: Array, pixel_sigma: tuple[float, float]) -> Array:
+def _point_slopes(
+    calibration: Calibration, first: str, second: str, points: Array, pixel_sigma: tuple[ArrayLike, ArrayLike]
+) -> Array:
     """Derivatives of triangulated points by the parameters : (m, 3, g): `d(point) = -(A^T A)^-1 A^T B d(parameters)`."""
     pairs = [_slopes(calibration, device, points) for device in (first, second)]
     by_point, by_parameter = (
-        np.concatenate([pair[k] / sigma for pair, sigma in zip(pairs, pixel_sigma, strict=True)], axis=-2) for k in (0, 1)
+        np.concatenate([pair[k] / np.reshape(sigma, (-1, 1)) for pair, sigma in zip(pairs, pixel_sigma, strict=True)], axis=-2)
+        for k in (0, 1)
     )
     return -np.linalg.pinv(by_point) @ by_parameter
 

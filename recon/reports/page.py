@@ -7,6 +7,7 @@ import base64
 import gzip
 import html
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -19,6 +20,7 @@ from recon.reports import figures
 from recon.reports.figures import Colours, Scale
 
 FOLDER = Path(__file__).parent
+UNITS = r"(?:(?:mm[²³]?|px|ms|m/s|s|DN|ppm|deg)(?!\w)|%|σ)"
 
 
 @dataclass(frozen=True)
@@ -105,16 +107,17 @@ def grid(blocks: Iterable[str], arrangement: str = "") -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> str:
-    """A table; a number in the last of three or more columns is emphasised."""
+    """A table, to be scrolled where the page is narrower; a number in the last of three or more columns is emphasised."""
     top = "".join(f"<th scope='col'>{_text(cell)}</th>" for cell in head)
     body = ""
     for first, *others in rows:
-        cells = [f"<td>{_text(cell)}</td>" for cell in others]
+        cells = [f"<td>{_together(cell)}</td>" for cell in others]
         if len(head) > 2:
             cells[-1] = cells[-1].replace("<td>", '<td class="number">') if others[-1][:1].isdigit() else cells[-1]
         body += f'<tr><th scope="row">{_text(first)}</th>{"".join(cells)}</tr>'
-    below = f"<caption>{_text(caption)}</caption>" if caption else ""
-    return f'<div class="scroll"><table>{below}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+    below = f'<p class="below">{_text(caption)}</p>' if caption else ""
+    inner = f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div class="scroll" tabindex="0">{inner}</div>{below}'
 
 
 def commands(lines: Iterable[str]) -> str:
@@ -131,8 +134,8 @@ def colour_bar(scale: Scale, unit: str) -> str:
 
 
 def count(number: float) -> str:
-    """A whole number with thin spaces between thousands."""
-    return f"{number:,.0f}".replace(",", "\u2009")
+    """A whole number with thin spaces between thousands, at which no line breaks."""
+    return f"{number:,.0f}".replace(",", "\u202f")
 
 
 def _number(value: float) -> str:
@@ -148,6 +151,11 @@ def _packed(program: str) -> str:
 
 def _caption(caption: str, detail: str) -> str:
     return f"<figcaption><b>{_text(caption)}.</b> {_text(detail)}</figcaption>"
+
+
+def _together(cell: str) -> str:
+    """A cell's text whose numbers stay beside their units on narrow pages."""
+    return re.sub(rf"(?<=\d) (?={UNITS})", "\u00a0", _text(cell))
 
 
 def _text(text: str) -> str:

@@ -166,6 +166,10 @@ def check_levels(modulation: Image, offset: Image, least: float, full: float, pl
     raise InputError(f"{place} hold no Gray code: expected {expected}, found {found:.1f} DN")
 
 
+class CodeOutside(InputError):
+    """A code that names places beyond the projector's image."""
+
+
 def check_readings(middle: Image, valid: Mask, length: int, place: str) -> None:
     """Refuse a code without fringes that can be read nearly nowhere, or that names places that no light comes from.
 
@@ -184,7 +188,7 @@ def check_readings(middle: Image, valid: Mask, length: int, place: str) -> None:
         )
     outside = np.count_nonzero(valid & ((middle < -0.5) | (middle > length - 0.5)))
     if outside > max(OUTSIDE_SHARE * lit, FEW):
-        raise InputError(
+        raise CodeOutside(
             f"{place}: the code of {100 * outside / lit:.0f} % of the pixels lies beyond the projector's {length} px: are the "
             "images in the manifest's order, and are projector_size, pitch and start those projected?"
         )

@@ -34,6 +34,7 @@ from recon.optical_calibration.board_frames import DeviceName
 from recon.optical_calibration.distortion_selection import ModelName
 from recon.optical_calibration.joint_calibration import Result, Settings, calibrate
 from recon.optical_calibration.observations import PROJECTOR
+from recon.optical_calibration.sightings import Cause, Failure
 from recon.pattern_trials import likely_patterns
 
 PAGE = "calibration.html"  # by which the folder of a calibration is known
@@ -103,7 +104,7 @@ def run(config: Config) -> None:
     result = board_frames.with_absent(result, sizes, captured.cameras)
     if PROJECTOR not in result.observations.devices and (others := other_patterns(captured, sizes, console)):
         result = replace(result, warnings=(*result.warnings, f"{PROJECTOR}: {others}"))
-    if beyond := sum("beyond the projector" in reason for reason in missed.values()):
+    if beyond := sum(failure.cause is Cause.CODE_OUTSIDE for failure in missed.values()):
         cause = "other patterns than those that were shown make a wrong calibration: are projector_size, pitch and start right?"
         result = replace(
             result, warnings=(f"{PROJECTOR}: the code leaves its image in {beyond} poses; {cause}", *result.warnings)
@@ -126,7 +127,7 @@ def other_patterns(captured: BoardCapture, sizes: Collection[str], console: Cons
     return "" if fields is None else f"the images fit patterns with {fields} in each set of fringes"
 
 
-def dropped(reasons: Mapping[str, str]) -> Iterator[str]:
+def dropped(reasons: Mapping[str, str | Failure]) -> Iterator[str]:
     """Lines: poses and devices left out, with the reasons."""
     for name, reason in reasons.items():
         yield f"dropped     {name}: {reason}"

@@ -17,15 +17,16 @@ from pathlib import Path
 
 from rich.console import Console
 
+from recon.capture import calibration_files
 from recon.files import atomic
 from recon.files.metrics import Metrics, shown
 from recon.tracking import networks
 from sonotwin import latency_fields, pipeline
 from sonotwin.config import load
-from sonotwin.demo_config import Config
+from sonotwin.demo_config import CALIBRATION, Config
 from sonotwin.demo_steps import Figures, commands, compared, fusing_fields, poses_of, tracked_film, verb_steps
 from sonotwin.pipeline import Step
-from sonotwin.verbs import fuse, surface
+from sonotwin.verbs import calibrate_optics, fuse, surface
 from twin import board_session
 from twin.evaluation import sweep_errors
 from twin.evaluation.surface_errors import things
@@ -94,7 +95,9 @@ def telling_step(config: Config) -> Step:
     """The report of all steps before it."""
 
     def telling(folder: Path, figures: Figures) -> Figures:
-        story = demo_report.read(folder / "capture", folder / "truth", folder / "surface" / surface.POINTS, config.cameras[0])
+        estimated = calibration_files.read(folder / CALIBRATION / calibrate_optics.OPTICS) if config.poses else None
+        points = folder / "surface" / surface.POINTS
+        story = demo_report.read(folder / "capture", folder / "truth", points, config.cameras[0], estimated)
         inside = None
         if config.looks_inside:
             findings, truth = compared(folder)

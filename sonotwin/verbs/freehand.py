@@ -88,6 +88,8 @@ def run(config: Config) -> None:
     sweep, scans = read(config, plus)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
+    for line in freehand_scans.cautions(scans):
+        console.print(f"warning     {line}", markup=False)
     if (config.fan == "find" or settings.fan) and scans.speed_m_s != scans.calibrated_m_s:
         expected = f"none with a fan, whose lines run to all sides, or {scans.calibrated_m_s:g} m/s as calibrated"
         raise InputError(f"freehand: tissue_m_s: expected {expected}, found {scans.speed_m_s:g} m/s")

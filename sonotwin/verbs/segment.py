@@ -104,6 +104,8 @@ def run(config: Config) -> None:
     scans = read(config)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
+    for line in freehand_scans.cautions(scans):
+        console.print(f"warning     {line}", markup=False)
     start = perf_counter()
     with console.status(f"looking for {'a tube' if config.kind == 'tube' else 'masses'}"):
         found = found_in(scans, config, skin)

@@ -10,6 +10,8 @@ import pytest
 from recon.capture import probe_files, sweep_part
 from recon.files import volumes
 from recon.freehand import sequences
+from recon.freehand.sequences import Frames
+from recon.geometry import rigid
 from sonotwin.cli import main
 from tests.recon import sweep_sets
 
@@ -78,6 +80,26 @@ def test_a_sequence_gives_the_same_volume(reconstructed, tmp_path):
     np.testing.assert_array_equal(ours.voxels, theirs.voxels)
     np.testing.assert_allclose(ours.origin, theirs.origin, atol=1e-9)
     assert not (tmp_path / "out" / "sequence.igs.mha").exists()
+
+
+def test_anothers_sequence_is_said_to_lie_elsewhere_in_slicer_and_lps_mends_it(reconstructed, tmp_path, capsys):
+    """With a ReferenceToRas that moves by 50 mm and doesn't turn: LPS is half a turn from there."""
+    frames = sequences.read_sequence(reconstructed / "sequence.igs.mha")
+    ras_from_reference = rigid.transform(np.eye(3), [50, 0, 0])
+    others = {name: frames.transforms[name] for name in ("ImageToProbe", "ProbeToTracker", "ReferenceToTracker")}
+    others["ReferenceToRas"] = np.tile(ras_from_reference, (len(frames.times_s), 1, 1))
+    valid = dict.fromkeys((*others, "Image"), frames.valid["ProbeToTracker"])
+    sequences.write_sequence(tmp_path / "s.igs.mha", Frames(frames.times_s, others, valid, frames.images))
+    fields = ["freehand", f"sequence={tmp_path / 's.igs.mha'}", f"out={tmp_path / 'out'}"]
+    assert main(fields) == 0
+    assert "warning     3D Slicer shows the sequence where its transforms to RAS put it" in capsys.readouterr().out
+    assert np.linalg.norm(ball_of(tmp_path / "out" / "volume.nrrd")[0] - sweep_sets.BALL) < 0.3
+    assert main([*fields, "reference=LPS"]) == 0
+    assert "warning" not in capsys.readouterr().out
+    expected = np.add(sweep_sets.BALL, (50, 0, 0)) * (-1, -1, 1)
+    assert np.linalg.norm(ball_of(tmp_path / "out" / "volume.nrrd")[0] - expected) < 0.3
+    assert main([*fields, "reference=RAS"]) == 2
+    assert "s.igs.mha: reference: expected LPS, which files of volumes" in capsys.readouterr().err
 
 
 def test_a_sequence_by_the_configuration_of_plus(reconstructed, tmp_path, capsys):

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,25 +15,23 @@ from recon.files import atomic
 from recon.files.metrics import Metrics, shown
 from recon.fusion import scene_page
 from recon.fusion.fused_scene import FusedScene
+from recon.model.calibration import Calibration
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Uniform
 from recon.reports import figures, page, space_views
-from recon.reports.figures import CYCLIC, DIVERGING, SEQUENTIAL, Scale
+from recon.reports.figures import CYCLIC, SEQUENTIAL, Scale
 from recon.reports.page import Opening, Section
 from recon.structured_light import decode
 from recon.structured_light.decode import ProjectorMap, Status
-from twin.evaluation import surface_errors
+from twin.evaluation import error_parts, surface_errors
+from twin.evaluation.error_parts import ErrorParts
 from twin.evaluation.surface_errors import GROSS_MM, Comparison, Truth
-from twin.reports import chain_report, sweep_report, track_report
+from twin.reports import chain_report, error_report, sweep_report, track_report
 from twin.reports.sweep_report import Inside
 from twin.reports.track_report import Tracked
 from twin.ultrasound.sweep_session import SUPPORTS
 
-ERROR_MM = 0.1  # colours of errors span plus and minus this, or twice their RMS if that is more
-SYSTEMATIC_MM = 0.02  # colours of averaged errors span plus and minus this
-AVERAGED_PX = 15  # width of the square that errors are averaged over
 FRINGES_SHOWN = 4
 TITLES = {"breast": "breast phantom"}  # where a scene's name alone is too short
-NOT_HERE = "not in this scene"
 PAPER = {  # Meza et al. 2021, Optical Engineering 60(5) 054106, section 3
     "plane_rms": "0.101 to 0.131 mm",
     "sphere_radius_error": "0.045 mm",
@@ -54,10 +51,14 @@ class Measurement:
     points: NDArray[np.float32]  # (h, w, 3), mm
     truth: Truth
     comparison: Comparison
+    parts: ErrorParts
 
 
-def read(captured: Path, truth: Path, points: Path, camera: str = "cam1") -> Measurement:
+def read(captured: Path, truth: Path, points: Path, camera: str = "cam1", calibration: Calibration | None = None) -> Measurement:
     """Read a capture folder, the truth folder beside it and the `points.npz` reconstructed from the capture.
+
+    calibration : Calibration, optional
+        By which the points were reconstructed; the true one if it isn't given.
 
     Raises
     ------
@@ -69,7 +70,9 @@ def read(captured: Path, truth: Path, points: Path, camera: str = "cam1") -> Mea
     measured, sigma = surface_errors.read_points(points)
     comparison = surface_errors.compare(measured, sigma, expected)
     found = decode.decode(shots.images, shots.patterns, bits=shots.bits, name=shots.name)
-    return Measurement(read_manifest(captured), shots, camera, found, measured, expected, comparison)
+    by_calibration = None if calibration is None else error_parts.of_calibration(found, expected, calibration, camera)
+    parts = error_parts.split(comparison, by_calibration)
+    return Measurement(read_manifest(captured), shots, camera, found, measured, expected, comparison, parts)
 
 
 def write(
@@ -108,7 +111,7 @@ def write(
         *whole,
         surface(measurement),
         *scanned,
-        errors(measurement, metrics),
+        error_report.errors(measurement.comparison, measurement.parts),
         images(measurement),
         decoding(measurement),
         *probe,
@@ -132,32 +135,48 @@ def opening(measurement: Measurement, metrics: Metrics) -> Opening:
     """The title, the result in one sentence, and the figures that matter."""
     scene = TITLES.get(measurement.truth.scene, measurement.truth.scene).replace("_", " ")
     here, limit = metrics["surface_rms_mm"], metrics["limit_rms_mm"]
-    factor = f", {here / limit:.2f} times what the camera’s noise alone would leave" if np.isfinite(limit) else ""
     things = ", ".join(f"{name} {shown(value, '.3f')}" for name, value in surface_errors.things(metrics).items())
     result = (
         f"From {measurement.shots.patterns.count} images, {page.count(metrics['points'])} points of the surface were measured to "
-        f"{here:.3f} mm RMS of the true one ({things}){factor}.{sweep_report.result(metrics)}"
+        f"{here:.3f} mm RMS of the true one ({things}){_mostly(measurement.parts, limit)}.{sweep_report.result(metrics)}"
         f"{track_report.result(metrics)}"
     )
     both = "tumours_true" in metrics
+    by_part = [
+        (f"by {name}, RMS", shown(part.rms_mm, ".3f"), "mm") for name, part in measurement.parts.parts.items() if name != "rest"
+    ]
     return Opening(
         f"fringe projection{' and freehand ultrasound' if both else ''}, digital twin",
         f"The {scene}, {'outside and inside' if both else 'measured by fringe projection'}",
         result,
         (
             ("error, RMS", f"{here:.3f}", "mm"),
+            *by_part,
             ("limit by noise, RMS", shown(limit, ".3f"), "mm"),
-            ("away from edges, RMS", shown(metrics["surface_interior_rms_mm"], ".3f"), "mm"),
             ("coverage", f"{100 * metrics['coverage']:.1f}", "%"),
             (f"errors above {GROSS_MM:g} mm", f"{100 * metrics['gross_error_fraction']:.3f}", "%"),
         ),
     )
 
 
+def _mostly(parts: ErrorParts, limit: float) -> str:
+    """The errors' two main parts in words, beside the limit of noise."""
+    noise, alone = parts.parts["noise"].rms_mm, shown(limit, ".3f")
+    if not (np.isfinite(noise) and np.isfinite(limit)):
+        return ""
+    if "calibration" not in parts.parts:
+        return f"; their noise is {noise:.3f} mm, where the camera’s alone would leave {alone}"
+    moved = parts.parts["calibration"]
+    by = f"; the calibration accounts for {moved.rms_mm:.3f} mm of it, {moved.mean_mm:+.3f} mm in the mean".replace("-", "−")
+    return f"{by}, noise for {noise:.3f} mm, where the camera’s alone would leave {alone}"
+
+
 def surface(measurement: Measurement) -> Section:
     """The surface in 3-D."""
     drawn = space_views.surface_view(
-        measurement.points, measurement.comparison.error, _half_range(measurement.comparison.error, ERROR_MM)
+        measurement.points,
+        measurement.comparison.error,
+        error_report.half_range(measurement.comparison.error, error_report.ERROR_MM),
     )
     caption = "Drag to turn, scroll to come nearer. Red lies outside the true surface, blue inside; equal scales on all axes."
     return Section("The surface", [page.switch("surface"), page.view("surface", drawn, caption)])
@@ -167,64 +186,6 @@ def without_supports(measurement: Measurement) -> NDArray[np.bool_]:
     """Pixels : (h, w) of things other than their support."""
     supports = [number for number, name in enumerate(measurement.truth.things) if name in SUPPORTS]
     return ~np.isin(measurement.truth.objects, supports)
-
-
-def errors(measurement: Measurement, metrics: Metrics) -> Section:
-    """Error map, and errors over the points' own sigma."""
-    comparison = measurement.comparison
-    known = surface_errors.points_with_prediction(comparison)
-    error, predicted = comparison.error[known], comparison.predicted[known]
-    mean = local_mean(comparison.error, comparison.interior, AVERAGED_PX)
-    scale, systematic = (
-        Scale(DIVERGING, -end, end) for end in (_half_range(comparison.error, ERROR_MM), _half_range(mean, SYSTEMATIC_MM))
-    )
-    sigma = Scale(SEQUENTIAL, 0, _round_up(float(np.quantile(predicted, 0.99))) if predicted.size else ERROR_MM)
-    maps = [
-        page.picture(
-            scale(np.where(comparison.interior, comparison.error, np.float32(np.nan))),
-            "Error",
-            f"Distance from the true surface, positive outwards. A band of {surface_errors.EDGE_PX} px along edges is left out.",
-            scale,
-            "mm",
-        ),
-        page.picture(
-            systematic(mean),
-            "Systematic part",
-            f"Mean error over {AVERAGED_PX} × {AVERAGED_PX} px: noise falls fifteenfold, and what stands out is not noise.",
-            systematic,
-            "mm",
-        ),
-        page.picture(
-            sigma(comparison.predicted), "Predicted", "Standard deviation that the images’ own noise lets expect.", sigma, "mm"
-        ),
-    ]
-    if predicted.size:
-        compared = page.grid(histograms(error, predicted, metrics), "two")
-    else:
-        compared = page.paragraph(f"No point is both within {GROSS_MM:g} mm of the truth and has a prediction to compare with.")
-    text = (
-        "The error of a point is its distance from the plane that touches the true surface where the pixel’s ray meets it. "
-        "The calibration’s errors are a bias that neighbours share; the rest is noise, whose size is predicted for each point."
-    )
-    return Section("Errors", [page.paragraph(text), page.grid(maps), compared])
-
-
-def histograms(error: NDArray[np.float32], predicted: NDArray[np.float32], metrics: Metrics) -> list[str]:
-    """Drawings of errors : (n,) mm against their predicted standard deviations : (n,) mm, n > 0."""
-    half = _round_up(float(3.5 * np.sqrt(np.mean(predicted.astype(float) ** 2))))
-    here, bias = metrics["surface_rms_mm"], metrics["surface_bias_mm"]
-    return [
-        page.drawing(
-            figures.histogram(error, figures.noise_mixture(predicted, half, "predicted noise"), "error, mm", half),
-            "Errors in mm",
-            f"RMS {here:.4f} mm; predicted {metrics['predicted_rms_mm']:.4f} mm; bias {bias:+.4f} mm.",
-        ),
-        page.drawing(
-            figures.histogram(error / predicted, figures.standard_normal(5), "error / predicted standard deviation", 5),
-            "Errors in units of their own prediction",
-            f"Standard deviation {metrics['z_std']:.3f}, robust {metrics['z_robust_std']:.3f}; 1 if the prediction is right.",
-        ),
-    ]
 
 
 def images(measurement: Measurement) -> Section:
@@ -268,7 +229,7 @@ def decoding(measurement: Measurement) -> Section:
     cycle = Scale(CYCLIC, -np.pi, np.pi)
     order = np.rint((coordinate - fringes.zero(patterns.length(axis))) / fringes.pitch - found.phase / (2 * np.pi))
     orders, columns = _span(order, usable), _span(coordinate, usable)
-    strength = Scale("gray", 0, _round_up(float(np.quantile(found.modulation, 0.995))))
+    strength = Scale("gray", 0, error_report.round_up(float(np.quantile(found.modulation, 0.995))))
     seen = found.status != Status.DARK
     stages = [
         page.picture(
@@ -284,19 +245,20 @@ def decoding(measurement: Measurement) -> Section:
 
 
 def beside_the_paper(metrics: Metrics) -> Section:
-    """The paper's figures, the limit and ours."""
+    """The paper's figures, the limit and ours: of the shapes that the scene has."""
     limit, interior = (shown(metrics[name], ".4f", " mm") for name in ("limit_rms_mm", "surface_interior_rms_mm"))
     rows = [
         ("Surface against its true shape, RMS", "not measured: shown only", limit, f"{metrics['surface_rms_mm']:.4f} mm"),
         ("the same, away from edges", "not measured", limit, interior),
-        _fitted(metrics, "Plane, RMS of the fit", "plane", "rms"),
-        _fitted(metrics, "Sphere, error of the radius", "sphere", "radius_error"),
-        _fitted(metrics, "Sphere, RMS of the fit", "sphere", "rms"),
-        _fitted(metrics, "Cylinder, error of the radius", "cylinder", "radius_error"),
+        *_fitted(metrics, "Plane, RMS of the fit", "plane", "rms"),
+        *_fitted(metrics, "Sphere, error of the radius", "sphere", "radius_error"),
+        *_fitted(metrics, "Sphere, RMS of the fit", "sphere", "rms"),
+        *_fitted(metrics, "Cylinder, error of the radius", "cylinder", "radius_error"),
     ]
     caption = (
         "Paper: J. Meza et al., Three-dimensional multimodal medical imaging system based on free-hand ultrasound and structured "
-        "light, Optical Engineering 60(5) 054106, 2021. Limit: the noise of photons, sensor and digits alone, through the rig’s "
+        "light, Optical Engineering 60(5) 054106, 2021, which measured a plane, a sphere and a cylinder: scenes of these have "
+        "their figures here. Limit: the noise of photons, sensor and digits alone, through the rig’s "
         "true geometry. The paper’s rig was calibrated with its own images; here "
         + ("so was the rig, with a rendered board." if "poses" in metrics else "the capture came with the true calibration.")
     )
@@ -331,14 +293,8 @@ def settings(measurement: Measurement, metrics: Metrics) -> Section:
     return Section("The capture", [page.table(("", "value"), rows)])
 
 
-def local_mean(values: NDArray[np.float32], mask: NDArray[np.bool_], width: int) -> NDArray[np.float32]:
-    """Mean over a square of the masked pixels around each masked pixel : (h, w), NaN elsewhere."""
-    total, weight = (cv2.blur(part, (width, width)) for part in (np.where(mask, values, np.float32(0)), np.float32(mask)))
-    return np.where(mask, total / np.maximum(weight, np.float32(1e-6)), np.float32(np.nan))
-
-
-def _fitted(metrics: Metrics, what: str, kind: str, figure: str) -> tuple[str, str, str, str]:
-    """A row of the table: the paper's figure, and limit and ours for all shapes of the kind that the scene has."""
+def _fitted(metrics: Metrics, what: str, kind: str, figure: str) -> list[tuple[str, str, str, str]]:
+    """A row of the table: the paper's figure, and limit and ours for all shapes of the kind; none if the scene has none."""
     names = [
         key.removeprefix(f"{kind}_").removesuffix("_limit_rms_mm")
         for key in metrics
@@ -346,21 +302,9 @@ def _fitted(metrics: Metrics, what: str, kind: str, figure: str) -> tuple[str, s
     ]
     here = ", ".join(shown(abs(metrics[f"{kind}_{name}_{figure}_mm"]), ".4f", " mm") for name in names)
     limit = ", ".join(shown(metrics[f"{kind}_{name}_limit_rms_mm"], ".4f", " mm") for name in names) if figure == "rms" else ""
-    return what, PAPER[f"{kind}_{figure}"], limit, here or NOT_HERE
+    return [(what, PAPER[f"{kind}_{figure}"], limit, here)] if names else []
 
 
 def _span(values: NDArray, usable: NDArray[np.bool_]) -> Scale:
     low, high = np.quantile(values[usable], (0.001, 0.999)) if usable.any() else (0, 1)
     return Scale(SEQUENTIAL, float(np.floor(low)), float(np.ceil(high)))
-
-
-def _half_range(error: NDArray[np.float32], least: float) -> float:
-    """The end of a scale for errors : (h, w) mm, NaN where there are none."""
-    known = error[np.isfinite(error)]
-    return max(least, _round_up(2 * surface_errors.rms(known))) if known.any() else least
-
-
-def _round_up(value: float) -> float:
-    """The next number with one or two significant digits, for the end of an axis."""
-    step = 10 ** np.floor(np.log10(value)) / 2
-    return float(np.ceil(value / step) * step)

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Table = Sequence[Mapping[str, Any]]  # a row a trial
 
 MOST_LINES = 6  # values of another factor that get a line each
+TICKS = 6  # of an even axis, so that numbers of many digits stay apart
 MOST_VALUES = 24  # of a factor; more are drawn as points
 WIDE = 1.5  # ratio of the largest to the smallest step between values, above which an axis is logarithmic
 LETTERS = 38  # in a line beside an axis
@@ -109,6 +110,8 @@ def _along(axes: Axes, places: Array, found: Sequence[Course], held: Sequence[Co
         axes.set_xscale("log")
         axes.set_xticks(places, [short(place) for place in places.tolist()])
         axes.minorticks_off()
+    else:
+        axes.locator_params(axis="x", nbins=TICKS)
     for k, one in enumerate(found):
         axes.fill_between(places, one.low, one.high, color=f"C{k}", alpha=0.18, linewidth=0)
         axes.plot(places, one.middle, "o-", color=f"C{k}", markersize=4, linewidth=1.4, label=one.label, clip_on=False)

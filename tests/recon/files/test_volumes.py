@@ -1,5 +1,7 @@
 """A voxel lies where it was put, in our eyes and in ITK's, before and after a file."""
 
+import time
+
 import nrrd
 import numpy as np
 import pytest
@@ -31,6 +33,17 @@ def test_what_is_written_is_read(volume, tmp_path, suffix, dtype):
     assert np.array_equal(read.origin, volume.origin)
     # NRRD holds spacing times direction, so the last bit may differ; 100 mm x 2e-16 x some
     assert np.abs(read.world_from_voxel - volume.world_from_voxel).max() < 1e-13
+
+
+def test_the_same_volume_has_the_same_bytes_a_second_later(volume, tmp_path):
+    def bytes_of(name: str) -> list[bytes]:
+        for suffix in SUFFIXES:
+            volumes.write_volume(tmp_path / f"{name}{suffix}", volume)
+        return [(tmp_path / f"{name}{suffix}").read_bytes() for suffix in SUFFIXES]
+
+    first = bytes_of("a")
+    time.sleep(1.05)  # formats that hold dates have them in seconds
+    assert bytes_of("b") == first
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -66,8 +66,9 @@ def written(story, tmp_path_factory):
 
 
 def text_of(page: str) -> str:
-    """What a person reads."""
-    return html.unescape(re.sub("<[^>]*>", " ", re.sub("<(script|style|svg).*?</\\1>", "", page, flags=re.DOTALL)))
+    """What a person reads; a space that doesn't break is a space."""
+    text = re.sub("<(script|style|svg).*?</\\1>", "", page, flags=re.DOTALL)
+    return html.unescape(re.sub("<[^>]*>", " ", text)).replace("\u00a0", " ")
 
 
 def test_the_page_says_what_came_out(story, written):

@@ -15,6 +15,7 @@ from recon.optical_calibration import adjustment, joint_calibration
 from recon.optical_calibration.adjustment import adjust, free_parameters
 from recon.optical_calibration.bundle import Estimate
 from recon.optical_calibration.joint_calibration import Settings, Shape, departure, deviation
+from recon.optical_calibration.sightings import Cause, Failure
 from tests.recon.board_sets import BOARD, DEVICES, corners, devices, observe, random_poses, sightings
 
 QUICK = Settings(distortion="decentred")
@@ -106,7 +107,7 @@ def test_an_adjustment_that_ends_too_early_is_warned_of(sizes, good, monkeypatch
 
 
 def test_a_board_found_nowhere_says_why(sizes, good):
-    blind = [replace(one, pixels={}, failures={"cam1": "found 12 of 44 circles"}) for one in good]
+    blind = [replace(one, pixels={}, failures={"cam1": Failure(Cause.NO_BOARD, "found 12 of 44 circles")}) for one in good]
     with pytest.raises(InputError, match="found it in none: found 12 of 44 circles"):
         joint_calibration.calibrate(blind, BOARD, sizes, QUICK)
 

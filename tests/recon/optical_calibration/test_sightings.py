@@ -12,7 +12,7 @@ from recon.geometry.camera import Camera
 from recon.model.boards import Chessboard
 from recon.model.patterns import Fringes, GrayCode, Patterns, Uniform
 from recon.optical_calibration import board_frames, sightings
-from recon.optical_calibration.sightings import sight
+from recon.optical_calibration.sightings import Cause, sight
 from tests.recon.board_views import pose, under_patterns
 
 BOARD = Chessboard(columns=5, rows=4, square_mm=28)
@@ -70,6 +70,22 @@ def test_gray_code_alone_gives_the_projector_its_points(inverted, rng):
     expected = PROJECTOR.project(rigid.apply(world_from_board, BOARD.points()))
     error = found.pixels["projector"] - expected - np.einsum("nij,nj->ni", found.gradient, camera_error(found, world_from_board))
     assert 0.3 < np.nanmean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance["projector"]), error)) < 4
+
+
+def test_a_failure_has_its_cause(rng):
+    """A camera that sees no board, a code of a larger projector, and images in another order."""
+    world_from_board = pose(BOARD, 640, (0.3, -0.25), 0.1)
+    code = tuple(GrayCode(axis=axis, pitch=1, bits=8, inverted=True) for axis in ("columns", "rows"))
+    patterns = Patterns(projector_size=PROJECTOR.size, unwrap="gray", parts=code)
+    first, *photographs = under_patterns(BOARD, CAMERA, PROJECTOR, patterns, world_from_board, rng)
+    lit, coded = {"cam1": first}, np.stack(photographs)
+    width, height = PROJECTOR.size
+    smaller = patterns.model_copy(update={"projector_size": (width // 4, height // 4)})
+    for shown, images, cause in ((smaller, coded, Cause.CODE_OUTSIDE), (patterns, coded[::-1], Cause.UNDECODED)):
+        failures = sight("00", BOARD, lit, images, shown, {"cam1": 8}).failures
+        assert {device: failure.cause for device, failure in failures.items()} == {"projector": cause}
+    (failure,) = sight("00", BOARD, {"cam1": np.zeros_like(first)}, None, None, {"cam1": 8}).failures.values()
+    assert failure.cause is Cause.NO_BOARD
 
 
 def camera_error(found, world_from_board):

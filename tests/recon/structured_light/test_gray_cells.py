@@ -6,6 +6,7 @@ import pytest
 from recon.errors import InputError
 from recon.model.patterns import GrayCode, Patterns, Uniform
 from recon.structured_light.decode import Status, decode
+from recon.structured_light.plausibility import CodeOutside
 from tests.recon.fringe_scenes import breast, photograph
 
 SIZE = (1280, 800)
@@ -112,5 +113,5 @@ def test_another_projector_is_refused(rng):
     larger = sequence(axes=("columns",))
     images = photograph(larger, {"columns": slanted()["columns"] + 400}, rng)
     smaller = larger.model_copy(update={"projector_size": (912, 1140)})
-    with pytest.raises(InputError, match=r"lies beyond the projector's 912 px: .* projector_size"):
+    with pytest.raises(CodeOutside, match=r"lies beyond the projector's 912 px: .* projector_size"):
         decode(images, smaller)
