@@ -1,5 +1,6 @@
 """Who works in a folder keeps others out while alive, and not a moment longer."""
 
+import errno
 import os
 import re
 import signal
@@ -109,3 +110,17 @@ def test_a_disk_of_its_own_is_marked_within(tmp_path, monkeypatch):
         with pytest.raises(InputError), occupied(disk):
             pass
     assert list(tmp_path.iterdir()) == [disk] and not list(disk.iterdir())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="flock is of Unix")
+def test_a_disk_without_locks_is_used_with_a_warning(tmp_path, monkeypatch, caplog):
+    """Some network disks have none; nobody is kept from their work by that."""
+
+    def flock(descriptor, operation):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with occupied(tmp_path / "out"):
+        pass
+    assert "this disk has no locks" in caplog.text
+    assert not list(tmp_path.iterdir())
