@@ -22,6 +22,8 @@ def one_line(error: ValidationError) -> str:
     field = ".".join(str(piece) for piece in place)
     if kind in ("missing", "union_tag_not_found"):
         text = "expected a value, found none"
+    elif kind == "json_invalid":
+        text = f"expected JSON, found damaged data: {first['ctx']['error']}"
     elif kind == "union_tag_invalid":
         text = f"expected one of {first['ctx']['expected_tags']}, found {first['ctx']['tag']!r}"
     elif kind in ("model_type", "model_attributes_type"):

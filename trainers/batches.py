@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from recon.errors import InputError
 from trainers.augment import WHITE, moved, occlude, photograph, turns, uniform, warp
 from trainers.labels import HIDDEN, SEEN, Labels, label_offset, labels, seen_in_view
 from trainers.shard_reader import PATCH, Data, Patches, Views
@@ -20,6 +21,8 @@ COVERED = (HIDDEN + SEEN) / 2  # visible fraction of a circle whose centre somet
 SCALES, DISC_SCALES = (0.5, 1.6), (0.6, 1.5)  # least and most, of views and of patches
 COARSEST, COARSEST_DISC = 0.45, 0.22  # a picture 300 px wide may have been made larger, to full resolution
 SHIFT = 12.0  # px, most, of a disc from the middle of its patch: the detector's error, and the rounding
+
+Batch = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Discs:
 
 
 @dataclass(frozen=True)
-class Batches(Dataset[tuple[Tensor, Tensor, Tensor]]):
+class Batches(Dataset[Batch]):
     """Batches by their steps' numbers: images, and the labels for the losses of `trainers.labels`."""
 
     data: Data
@@ -49,7 +52,7 @@ class Batches(Dataset[tuple[Tensor, Tensor, Tensor]]):
     crop_px: int  # of views
     seed: int
 
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
+    def __getitem__(self, index: int) -> Batch:
         generator = generator_of(self.seed, index)
         if isinstance(self.data, Patches):
             some = discs(self.data, self.size, generator)
@@ -57,9 +60,31 @@ class Batches(Dataset[tuple[Tensor, Tensor, Tensor]]):
         some = crops(self.data, self.size, self.crop_px, generator)
         return some.images, some.labels.pixel, some.labels.identity
 
-    def since(self, step: int, loaders: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Batches from a step on, prepared ahead by worker processes; without workers, one at a time on request."""
-        return iter(DataLoader(self, batch_size=None, sampler=count(step), num_workers=loaders, worker_init_fn=_apart))
+    def since(self, step: int, loaders: int) -> Iterator[Batch]:
+        """Batches from a step on, prepared ahead by worker processes; without workers, one at a time on request.
+
+        Raises
+        ------
+        InputError
+            In one line, also from a worker, where an image that was left in its shard turns out to be damaged.
+        """
+        for batch in DataLoader(_Told(self), batch_size=None, sampler=count(step), num_workers=loaders, worker_init_fn=_apart):
+            if isinstance(batch, InputError):
+                raise batch
+            yield batch
+
+
+@dataclass(frozen=True)
+class _Told(Dataset["Batch | InputError"]):
+    """Batches, or the user's mistakes as what they are: the loader would put a worker's traceback into the message."""
+
+    batches: Batches
+
+    def __getitem__(self, index: int) -> Batch | InputError:
+        try:
+            return self.batches[index]
+        except InputError as error:
+            return error
 
 
 def _apart(_: int) -> None:
@@ -107,7 +132,8 @@ def discs(patches: Patches, size: int, generator: Generator) -> Discs:
     source = torch.where(near[:, None], drawn, middle)
     goal = middle + SHIFT * uniform(-1.0, 1.0, (size, 2), generator)
     change = (linear, source, goal, (PATCH, PATCH))
-    images = warp(patches.images[which], *change, _fill(patches.images[which], generator))
+    images = patches.images[which]  # once: they may have to be decoded
+    images = warp(images, *change, _fill(images, generator))
     masks = warp(patches.masks[which], *change, torch.zeros(size)) / 255
     known = (warp(np.full((size, PATCH, PATCH), 255, np.uint8), *change, torch.zeros(size)) > 254).float()
     images, _ = occlude(images, 1, generator)

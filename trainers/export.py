@@ -1,8 +1,12 @@
 """Weights as files: .safetensors, .pt of torch, and ONNX for the tracker, which needs no torch."""
 
+import io
+import struct
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from pickle import UnpicklingError
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -17,16 +21,28 @@ from trainers.architectures import Name, is_detector, weights_of
 from trainers.shard_reader import PATCH, VIEW
 
 OPSET = 17
+DAMAGE = (  # what reading damaged files of weights ends in
+    *(RuntimeError, EOFError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ArithmeticError),
+    *(OSError, MemoryError, NameError, struct.error),
+)
 AGREEMENT = 1e-4  # of the largest logit, most between torch and ONNX Runtime
 
 
 def save(path: Path, network: nn.Module) -> None:
-    """Write weights as .safetensors or .pt, by the path's suffix."""
+    """Write weights as .safetensors or .pt, by the path's suffix; the same weights give the same bytes."""
+    if path.suffix == ".pt":
+        write_state(path, weights_of(network))
+        return
     with atomic.new_file(path) as temporary:
-        if path.suffix == ".pt":
-            torch.save(weights_of(network), temporary)
-        else:
-            temporary.write_bytes(safetensors.torch.save(dict(weights_of(network))))  # its own writer lets nobody else read
+        temporary.write_bytes(safetensors.torch.save(dict(weights_of(network))))  # its own writer lets nobody else read
+
+
+def write_state(path: Path, state: Mapping) -> None:
+    """Write a dictionary as torch does, but for the name of a file to write to, which torch would write into it."""
+    content = io.BytesIO()
+    torch.save(dict(state), content)
+    with atomic.new_file(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
 
 
 def load(path: Path, network: nn.Module) -> None:
@@ -39,18 +55,33 @@ def load(path: Path, network: nn.Module) -> None:
     """
     weights = _read(path)
     # torch pads names of modules that ran in parallel
-    weights = {name.removeprefix("module."): value for name, value in weights.items()}
+    weights = {name.removeprefix("module.") if isinstance(name, str) else name: value for name, value in weights.items()}
     expected = network.state_dict()
     weights |= {name: value for name, value in expected.items() if name.endswith("num_batches_tracked") and name not in weights}
-    for name, value in expected.items():
-        found = weights.get(name)
-        if found is None or found.shape != value.shape:
-            shape = "none" if found is None else list(found.shape)
-            raise InputError(f"{path}: expected weights {name} of shape {list(value.shape)}, found {shape}")
-    unknown = sorted(set(weights) - set(expected))
-    if unknown:
-        raise InputError(f"{path}: expected weights of a {type(network).__name__}, found {unknown[0]} too")
+    unknown = next((name for name in weights if name not in expected), None)
+    check_tensors(path, "weights", weights, expected)
+    if unknown is not None:
+        raise InputError(f"{path}: expected weights of a {type(network).__name__}, found {_brief(unknown)} too")
     network.load_state_dict(weights)
+
+
+def check_tensors(path: Path, kind: str, found: object, expected: Mapping[Any, Tensor]) -> None:
+    """Refuse, in one line, a dictionary that hasn't all expected tensors: of their shapes, in memory, of finite numbers."""
+    if not isinstance(found, Mapping):
+        raise InputError(f"{path}: expected {kind}, a dictionary of tensors, found {_brief(found)}")
+    for name, value in expected.items():
+        there, wanted = found.get(name), f"{path}: expected {kind} {name} of shape {list(value.shape)}"
+        if there is None:
+            raise InputError(f"{wanted}, found none")
+        if not isinstance(there, Tensor):
+            raise InputError(f"{wanted}, found {_brief(there)}")
+        if there.shape != value.shape:
+            raise InputError(f"{wanted}, found {list(there.shape)}")
+        plain = there.layout == torch.strided and there.device.type == "cpu" and not (there.is_quantized or there.is_nested)
+        if not plain or there.is_floating_point() != value.is_floating_point() or there.is_complex():
+            raise InputError(f"{wanted}, found {there.dtype} of another kind of tensor")
+        if not bool(torch.isfinite(there.float()).all()):
+            raise InputError(f"{wanted}, found numbers in it that aren't finite")
 
 
 def read_state(path: Path) -> dict:
@@ -62,28 +93,26 @@ def read_state(path: Path) -> dict:
         If the file is damaged or something else.
     """
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: expected a file that torch saved, found a damaged one: {_first(error)}") from None
+        with warnings.catch_warnings(action="ignore"):  # torch's on how such files were written: what counts is checked
+            state = torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError:
         raise InputError(f"{path}: expected a state dictionary of torch, found something else") from None
+    except DAMAGE as error:
+        raise InputError(f"{path}: expected a file that torch saved, found a damaged one: {_first(error)}") from None
     if not isinstance(state, dict):
         raise InputError(f"{path}: expected a state dictionary of torch, found something else")
     return state
 
 
-def _read(path: Path) -> dict[str, Tensor]:
+def _read(path: Path) -> dict[Any, Any]:
     if not path.is_file():
         raise InputError(f"{path}: expected weights, .safetensors or .pt, found none")
-    if path.suffix == ".safetensors":
-        try:
-            return safetensors.torch.load_file(path)
-        except SafetensorError as error:
-            raise InputError(f"{path}: expected weights as safetensors, found a damaged file: {_first(error)}") from None
-    weights = read_state(path)
-    if not all(isinstance(value, Tensor) for value in weights.values()):
-        raise InputError(f"{path}: expected a state dictionary of weights, found something else")
-    return weights
+    if path.suffix != ".safetensors":
+        return read_state(path)
+    try:
+        return safetensors.torch.load_file(path)
+    except (SafetensorError, *DAMAGE) as error:
+        raise InputError(f"{path}: expected weights as safetensors, found a damaged file: {_first(error)}") from None
 
 
 def save_onnx(path: Path, network: nn.Module, name: Name) -> None:
@@ -129,4 +158,14 @@ def _check(path: Path, network: nn.Module, example: Tensor) -> None:
 
 
 def _first(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return _brief((str(error).strip().splitlines() or [type(error).__name__])[0], str)
+
+
+def _brief(value: object, shown: Callable[[object], str] = repr) -> str:
+    """A value from a file in a message: one line, and not all of it if it is long."""
+    try:
+        text = "a tensor" if isinstance(value, Tensor) else shown(value)
+    except (ValueError, RecursionError):  # whole numbers of thousands of digits, dictionaries in themselves
+        text = f"a {type(value).__name__}"
+    text = "".join(letter if letter.isprintable() else "?" for letter in text)
+    return text if len(text) <= 100 else f"{text[:97]}..."

@@ -10,18 +10,20 @@ from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from lightning_fabric import Fabric
+from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
-from recon.errors import InputError
+from recon.errors import InputError, one_line
 from recon.files import atomic
+from recon.files.regular import read_bytes
+from trainers import checkpoints
 from trainers.architectures import Name, is_detector
 from trainers.batches import Batches
-from trainers.export import read_state
 from trainers.labels import Labels, detector_loss, segmenter_loss
 from trainers.network_metrics import measure_detector, measure_segmenter
 from trainers.shard_reader import Data, Views, chosen
@@ -33,7 +35,8 @@ CLIP = 5.0  # most of the gradient's norm
 AVERAGE = 0.998  # of the averaged weights that stays in a step, once there were enough steps
 
 Precision = Literal["auto", "32-true", "bf16-mixed"]
-Row = dict[str, float | int]
+Row = dict[str, Annotated[int | float, Field(allow_inf_nan=False)] | None]
+ROW = TypeAdapter(Row)
 
 
 @dataclass(frozen=True)
@@ -82,17 +85,16 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
     average = deepcopy(plain).requires_grad_(False)
     module, optimizer = fabric.setup(plain, optimizer)
     average = average.to(fabric.device)
-    step, before = _resume(folder / CHECKPOINT, plain, average, optimizer, (len(train), len(validation)))
+    networks, samples = {"network": plain, "average": average}, (len(train), len(validation))
+    step, before = checkpoints.resume(folder / CHECKPOINT, networks, optimizer, samples)
     resumed_at = step
-    _forget_later(folder / LOG, step)
+    _forget_later(folder, step)
     began = written = perf_counter()
     losses: list[float] = []
     shown = chosen(validation, np.unique(np.linspace(0, len(validation) - 1, plan.validate_at_most).round().astype(int)))
 
     def save() -> None:
-        state = {"network": plain.state_dict(), "average": average.state_dict(), "optimizer": optimizer.state_dict()}
-        counts = {"samples": (len(train), len(validation))}
-        _write(folder / CHECKPOINT, state | counts | {"step": step, "seconds": seconds})
+        checkpoints.write(folder / CHECKPOINT, networks, optimizer, samples, step, seconds)
 
     batches = Batches(train, plan.batch, plan.crop_px, plan.seed).since(step, plan.loaders)
     with _stops() as stopped:
@@ -161,10 +163,26 @@ def precision_of(wanted: Precision) -> Literal["32-true", "bf16-mixed"]:
 
 
 def read_log(folder: Path) -> list[Row]:
-    """Rows of the log so far."""
+    """Rows of the log so far.
+
+    Raises
+    ------
+    InputError
+        If a line isn't a row: a map of numbers, or null, with its step.
+    """
     path = folder / LOG
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    return [json.loads(line) for line in lines if line.endswith("}")]  # the last one may be cut short
+    *whole, _ = read_bytes(path).split(b"\n") if path.is_file() else [b""]  # the last one may be cut short
+    return [_row(f"{path}: line {number}", line) for number, line in enumerate(whole, 1)]
+
+
+def _row(place: str, line: bytes) -> Row:
+    try:
+        row = ROW.validate_json(line, strict=True)
+    except ValidationError as error:
+        raise InputError(f"{place}: {one_line(error)}; resume=false starts anew") from None
+    if not isinstance(row.get("step"), int):
+        raise InputError(f"{place}: expected a row with its step, a whole number, found none; resume=false starts anew")
+    return row
 
 
 def _loss(module: nn.Module, name: Name, batch: tuple[Tensor, Tensor, Tensor]) -> Tensor:
@@ -192,50 +210,18 @@ def _blend(average: nn.Module, module: nn.Module, stays: float) -> None:
             old.copy_(new)
 
 
-def _resume(
-    path: Path, module: nn.Module, average: nn.Module, optimizer: torch.optim.Optimizer, samples: tuple[int, int]
-) -> tuple[int, float]:
-    """Step and seconds of the checkpoint, whose state is put in place; 0 without one.
-
-    InputError if it is of another network, or of another number of samples to train and to validate with: a data set that has
-    grown gives other batches, and validates with what was trained with.
-    """
-    if not path.is_file():
-        return 0, 0.0
-    state = read_state(path)
-    if tuple(state.get("samples", samples)) != samples:
-        raise InputError(
-            f"{path}: expected a checkpoint of {samples[0]} samples, found one of {state['samples'][0]}; resume=false"
-        )
-    try:
-        module.load_state_dict(state["network"])
-        average.load_state_dict(state["average"])
-        optimizer.load_state_dict(state["optimizer"])
-        return int(state["step"]), float(state["seconds"])
-    except (KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: expected a checkpoint of this network, found another: {str(error).splitlines()[0]}") from None
-
-
-def _write(path: Path, state: Mapping) -> None:
-    with atomic.new_file(path) as temporary:
-        torch.save(dict(state), temporary)
-
-
 def _append(path: Path, row: Mapping[str, float | int]) -> None:
     finite = {name: value if math.isfinite(value) else None for name, value in row.items()}
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(finite) + "\n")
 
 
-def _forget_later(path: Path, step: int) -> None:
+def _forget_later(folder: Path, step: int) -> None:
     """Drop rows of steps after the checkpoint: they come again."""
-    if path.is_file():
-        whole = [
-            line for line in path.read_text(encoding="utf-8").splitlines() if line.endswith("}")
-        ]  # the last may be cut short
-        kept = [line for line in whole if json.loads(line)["step"] <= step]
-        with atomic.new_file(path) as temporary:
-            temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+    if (folder / LOG).is_file():
+        kept = [row for row in read_log(folder) if (row["step"] or 0) <= step]
+        with atomic.new_file(folder / LOG) as temporary:
+            temporary.write_text("".join(f"{json.dumps(row)}\n" for row in kept), encoding="utf-8")
 
 
 @contextmanager

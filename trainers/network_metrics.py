@@ -15,7 +15,8 @@ from torch.nn.functional import max_pool2d, pixel_shuffle
 
 from trainers.architectures import NO_PIXEL
 from trainers.labels import HIDDEN, SEEN
-from trainers.shard_reader import CIRCLES, Patches, Views
+from trainers.shard_reader import Patches, Views
+from trainers.shard_truth import CIRCLES
 
 Array = NDArray[np.float64]
 Metrics = dict[str, float | int]
@@ -117,21 +118,20 @@ def measure_segmenter(network: nn.Module, patches: Patches) -> Metrics:
     of patches without a disc, those whose answer is less than 50 px.
     """
     network.eval()
-    masks = [network(_grey(patches.images[k : k + BATCH])).numpy()[:, 0] > 0 for k in range(0, len(patches), BATCH)]
-    found, true = np.concatenate(masks), patches.masks > 127
-    both, either = (found & true).sum((1, 2)), (found | true).sum((1, 2))
-    empty = ~true.any((1, 2))
+    parts = [_areas(network, patches.images[k : k + BATCH], patches.masks[k : k + BATCH]) for k in range(0, len(patches), BATCH)]
+    found, true, both, either, errors = (np.concatenate(column) for column in zip(*parts, strict=True))
+    empty = true == 0
     counts = (patches.visible >= SEEN) & ~empty
     iou = np.where(either > 0, both / np.maximum(either, 1), 1.0)
-    answered = counts & (found.sum((1, 2)) >= LEAST_PX)
-    errors = np.linalg.norm(_middles(found[answered]) - _middles(true[answered]), axis=1)
+    answered = counts & (found >= LEAST_PX)
+    errors = errors[answered]
     figures: Metrics = {
         "patches": len(patches),
         "iou": float(iou[counts].mean()) if counts.any() else math.nan,
         "centre_median_px": float(np.median(errors)) if len(errors) else math.nan,
         "centre_95_px": float(np.percentile(errors, 95)) if len(errors) else math.nan,
         "missed": 1 - _share_of(answered.sum(), counts.sum()),
-        "empty_right": _share(found[empty].sum((1, 2)) < LEAST_PX),
+        "empty_right": _share(found[empty] < LEAST_PX),
         "empty_patches": int(empty.sum()),
     }
     for name, (least, most) in BRIGHT.items():
@@ -141,6 +141,13 @@ def measure_segmenter(network: nn.Module, patches: Patches) -> Metrics:
 
 
 LEAST_PX = 50  # of a mask that is one
+
+
+def _areas(network: nn.Module, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> tuple[NDArray, ...]:
+    """Areas (n,) px of answers, of true masks, of both and of either, and the distance of their centres of area, px."""
+    found, true = network(_grey(images)).numpy()[:, 0] > 0, masks > 127
+    areas = (some.sum((1, 2)) for some in (found, true, found & true, found | true))
+    return *areas, np.linalg.norm(_middles(found) - _middles(true), axis=1)
 
 
 def _grey(images: NDArray[np.uint8]) -> Tensor:

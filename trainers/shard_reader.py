@@ -1,37 +1,53 @@
-"""Reads a data set for the tracker's networks: tar shards in WebDataset's layout, decoded once into memory.
+"""Reads data sets for the tracker's networks, tar shards in WebDataset's layout: the truth at once, the images as memory allows.
 
-Two cores that train can't decode PNGs as well, and a set of 10 000 samples is 1.5 GB of views and 1.7 GB of patches and masks.
+Images in memory cost no decoding during the training. What is larger than memory stays in the shards, and is read image by image
+by its place: the same images either way, whatever the order.
 """
 
-import json
-import tarfile
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import groupby
 from pathlib import Path
+from typing import Annotated, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, ValidationError
 
-from recon.errors import InputError
+from recon.errors import InputError, one_line
+from recon.files import tar_members
+from recon.files.regular import read_bytes
+from trainers import grey_png
+from trainers.shard_truth import (
+    CIRCLES,
+    Array,
+    Facts,
+    PatchedTruth,
+    PatchTruth,
+    SampleTruth,
+    Strict,
+    ViewTruth,
+    ellipses_in_patches,
+    facts,
+    identity,
+    parse,
+)
+from trainers.stored_images import Decode, Grey, StoredImages
 
 VIEW = (320, 240)  # px, width and height of a view as the detector gets it
 PATCH = 120  # px, edge of a patch as the segmenter gets it
-CIRCLES = 3
 VIEWS = ("1", "2")  # of the cameras, as members are named
+AT_ONCE = 1024  # images that are decoded between two calls of `tell`
 
-Grey = NDArray[np.uint8]
-Array = NDArray[np.float64]
-Tell = Callable[[int], None]  # of how many samples were read
+Images = Grey | StoredImages
+Tell = Callable[[int], None]  # of how many samples were read, or images decoded
 
 
 @dataclass(frozen=True)
 class Views:
     """Views of n samples, two each, and their ground truth. Without a target centres are NaN and the rest is 0."""
 
-    images: Grey  # (2 n, 240, 320)
+    images: Images  # (2 n, 240, 320)
     scale: Array  # (2 n, 2) px of full resolution a px of a view, along u and v
     centres: Array  # (2 n, 3, 2) px of full resolution
     visible: Array  # (2 n, 3) fraction of each outer disc that is seen
@@ -53,8 +69,8 @@ class Views:
 class Patches:
     """Patches of n samples, six each."""
 
-    images: Grey  # (6 n, 120, 120)
-    masks: Grey  # (6 n, 120, 120) 255 within the outer disc
+    images: Images  # (6 n, 120, 120)
+    masks: Images  # (6 n, 120, 120) 255 within the outer disc
     ellipses: Array  # (6 n, 5) u, v in px of the patch, semi-axes in px, angle in rad; NaN without a target
     visible: Array  # (6 n,) fraction of the disc that is seen
     white: Array  # (6 n,) digital number of the target's white
@@ -65,22 +81,50 @@ class Patches:
 
 
 Data = Views | Patches
+Some = TypeVar("Some", bound=Data)
 
 
-def read_views(folder: Path, tell: Tell = lambda count: None, partial: bool = False) -> Views:
-    """Both views of every sample; InputError, in one line, where the set is missing, damaged or, unless `partial`, incomplete."""
-    samples = _read(folder, ["json", "cam1.png", "cam2.png"], _views_of, tell, partial)
-    return Views(*(np.concatenate(column) for column in zip(*samples, strict=True)))
+def read_views(folders: Sequence[Path], tell: Tell = lambda count: None, partial: bool = False) -> Views:
+    """Both views of every sample of some data sets, one after the other, with the images left in the shards.
+
+    Raises
+    ------
+    InputError
+        In one line, where a set is missing, damaged or, unless `partial`, incomplete, or a sample is in two of them. Damage of
+        images shows when they are decoded.
+    """
+    index = _read(folders, [f"cam{k}.png" for k in VIEWS], SampleTruth, facts, tell, partial)
+    known = Facts(*index.columns)
+    return Views(
+        index.images(slice(None), _view, VIEW, 1),
+        known.size / VIEW,
+        known.centres,
+        known.visible,
+        known.inside,
+        known.blur,
+        known.white,
+        np.arange(len(known.white)) // len(VIEWS),
+    )
 
 
-def read_patches(folder: Path, tell: Tell = lambda count: None, partial: bool = False) -> Patches:
-    """All six patches of every sample, with their masks; InputError as `read_views`."""
-    members = ["json", *(f"{kind}{camera}.png" for camera in VIEWS for kind in ("patches", "masks"))]
-    samples = _read(folder, members, _patches_of, tell, partial)
-    return Patches(*(np.concatenate(column) for column in zip(*samples, strict=True)))
+def read_patches(folders: Sequence[Path], tell: Tell = lambda count: None, partial: bool = False) -> Patches:
+    """All six patches of every sample, with their masks; otherwise as `read_views`."""
+
+    def convert(views: Sequence[PatchTruth]) -> tuple[Array, ...]:
+        return *facts(views), ellipses_in_patches(views)
+
+    index = _read(
+        folders, [f"{kind}{k}.png" for kind in ("patches", "masks") for k in VIEWS], PatchedTruth, convert, tell, partial
+    )
+    *known, ellipses = index.columns
+    visible, white = Facts(*known).visible.reshape(-1), np.repeat(Facts(*known).white, CIRCLES)
+    images, masks = (
+        index.images(which, _patches, (PATCH, PATCH), CIRCLES) for which in (slice(len(VIEWS)), slice(len(VIEWS), None))
+    )
+    return Patches(images, masks, ellipses, visible, white, np.arange(len(white)) // (CIRCLES * len(VIEWS)))
 
 
-def split(data: Data, validation: float) -> tuple[Data, Data]:
+def split(data: Some, validation: float) -> tuple[Some, Some]:
     """The first samples to train with and the last ones, a fraction `validation` and at least one, to validate with.
 
     Raises
@@ -92,32 +136,134 @@ def split(data: Data, validation: float) -> tuple[Data, Data]:
     if count < 2:
         raise InputError("data: expected at least 2 samples, one of them to validate with, found 1")
     last = min(max(round(validation * count), 1), count - 1)
-    held = data.sample >= count - last
-    return chosen(data, ~held), chosen(data, held)
+    held_out = data.sample >= count - last
+    return chosen(data, ~held_out), chosen(data, held_out)
 
 
-def chosen(data: Data, which: NDArray) -> Data:
+def chosen(data: Some, which: NDArray) -> Some:
     """The views or patches that a mask or an index selects."""
-    return replace(data, **{field.name: getattr(data, field.name)[which] for field in fields(data)})
+    columns = {field.name: getattr(data, field.name) for field in fields(data)}
+    return replace(
+        data, **{name: some.chosen(which) if isinstance(some, StoredImages) else some[which] for name, some in columns.items()}
+    )
 
 
-def _read(folder: Path, members: Sequence[str], decode: Callable, tell: Tell, partial: bool) -> list[tuple]:
+def bytes_decoded(data: Data) -> int:
+    """Memory that the images of a data set take."""
+    images = (data.images, data.masks) if isinstance(data, Patches) else (data.images,)
+    return sum(int(np.prod(some.shape)) for some in images)
+
+
+def in_memory(data: Some, tell: Tell = lambda count: None) -> Some:
+    """The same with its images decoded; InputError in one line where one is damaged, or of another size."""
+    stored = {field.name: getattr(data, field.name) for field in fields(data)}
+    decoded = {name: _decoded(some, tell) for name, some in stored.items() if isinstance(some, StoredImages)}
+    return replace(data, **decoded)
+
+
+def as_fits(sets: Sequence[Data], most_bytes: float, tell: Tell = lambda count: None) -> list[Data]:
+    """Data sets, the smaller ones first in memory as long as they fit; the others stay in their shards."""
+    result = list(sets)
+    for place in sorted(range(len(sets)), key=lambda place: bytes_decoded(sets[place])):
+        most_bytes -= bytes_decoded(sets[place])
+        if most_bytes >= 0:
+            result[place] = in_memory(sets[place], tell)
+    return result
+
+
+def _decoded(images: StoredImages, tell: Tell) -> Grey:
+    result = np.empty(images.shape, np.uint8)
+    for first in range(0, len(images), AT_ONCE):
+        result[first : first + AT_ONCE] = images[first : first + AT_ONCE]
+        tell(min(first + AT_ONCE, len(images)))
+    return result
+
+
+class _Index(NamedTuple):
+    """What is known of all samples without their images."""
+
+    shards: tuple[Path, ...]
+    places: NDArray[np.int64]  # (samples, members, 3) as of `StoredImages`
+    columns: list[Array]
+
+    def images(self, which: slice, decode: Decode, size: tuple[int, int], pieces: int) -> StoredImages:
+        """Images in some of the members."""
+        places = self.places[:, which].reshape(-1, 3)
+        return StoredImages(self.shards, places, decode, size, pieces, np.arange(pieces * len(places)))
+
+
+class _Shard(NamedTuple):
+    places: NDArray[np.int64]  # (samples, members, 3)
+    identities: NDArray[np.uint64]  # (samples,)
+    columns: Sequence[Array]
+
+
+def _read(
+    folders: Sequence[Path], ends: Sequence[str], model: type[SampleTruth], convert: Callable, tell: Tell, partial: bool
+) -> _Index:
+    """Read the truth of all samples, and find the members with these ends of their names."""
+    shards: list[Path] = []
+    parts: list[_Shard] = []
+    count = 0
+    for folder in folders:
+        before = count
+        for shard in _shards_of(folder):
+            parts.append(_scan(shard, len(shards), ends, model, convert))
+            shards.append(shard)
+            count += len(parts[-1].identities)
+            tell(count)
+        expected = None if partial else _promised(folder)
+        if expected is not None and expected != count - before:
+            found = f"found {count - before} in shards; partial=true takes these"
+            raise InputError(f"{folder}: expected {expected} samples as of dataset.json, {found}")
+        if count == before:
+            raise InputError(f"{folder}: expected samples in its shards, found none")
+    _check_apart(shards, parts)
+    columns = [np.concatenate(column) for column in zip(*(part.columns for part in parts), strict=True)]
+    return _Index(tuple(shards), np.concatenate([part.places for part in parts]), columns)
+
+
+def _shards_of(folder: Path) -> list[Path]:
     shards = sorted(path for path in folder.glob("*.tar") if not path.name.startswith("."))  # such are being written
     if not shards:
         found = "no such folder" if not folder.exists() else "none" if folder.is_dir() else "a file"
         raise InputError(f"{folder}: expected a folder with shards, shard-00000.tar ..., found {found}")
-    results: list[tuple] = []
-    with ThreadPoolExecutor(2) as pool:
-        for shard in shards:
-            for result in pool.map(lambda one: decode(*one), _samples(shard, members)):
-                results.append((*result, np.full(len(result[0]), len(results))))
-                tell(len(results))
-    expected = None if partial else _promised(folder)
-    if expected is not None and expected != len(results):
+    return shards
+
+
+def _scan(path: Path, number: int, ends: Sequence[str], model: type[SampleTruth], convert: Callable) -> _Shard:
+    views: list[ViewTruth] = []
+    places: list[list[tuple[int, int, int]]] = []
+    identities: list[int] = []
+    for key, members in tar_members.samples(path):
+        for end in ("json", *ends):
+            if end not in members:
+                raise InputError(f"{path}: {key}: expected the member {key}.{end}, found none")
+        _, offset, size = members["json"]
+        content = tar_members.read(path, offset, size)
+        truth = parse(f"{path}: {key}.json", content, model)
+        views.extend(truth.views)
+        places.append([(number, members[end].offset, members[end].size) for end in ends])
+        identities.append(identity(truth, content))
+    return _Shard(np.array(places, np.int64).reshape(-1, len(ends), 3), np.array(identities, np.uint64), convert(views))
+
+
+def _check_apart(shards: Sequence[Path], parts: Sequence[_Shard]) -> None:
+    """Refuse samples that are there twice: some would be trained with and validated with."""
+    identities = np.concatenate([part.identities for part in parts])
+    of_shard = np.repeat(np.arange(len(parts)), [len(part.identities) for part in parts])
+    order = np.argsort(identities, kind="stable")
+    same = np.flatnonzero((np.diff(identities[order]) == 0) & (identities[order][1:] > 0))
+    if len(same):
+        one, other = (shards[of_shard[order[place]]] for place in (same[0], same[0] + 1))
         raise InputError(
-            f"{folder}: expected {expected} samples as of dataset.json, found {len(results)} in shards; partial=true takes these"
+            f"{other}: expected samples that are in no other part, found {len(same)} in two, here and in {one} the first; "
+            "parts of one set need ranges apart (first, samples), or seeds of their own"
         )
-    return results
+
+
+class _Promise(Strict):
+    samples: Annotated[int, Field(ge=0)] | None = None
 
 
 def _promised(folder: Path) -> int | None:
@@ -126,103 +272,17 @@ def _promised(folder: Path) -> int | None:
     if not path.is_file():
         return None
     try:
-        count = json.loads(path.read_text(encoding="utf-8")).get("samples")
-    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError):
-        raise InputError(f"{path}: expected a data set's settings as JSON, found other or damaged data") from None
-    return count if isinstance(count, int) else None
+        return _Promise.model_validate_json(read_bytes(path)).samples
+    except ValidationError as error:
+        raise InputError(f"{path}: {one_line(error)}; expected a data set's settings") from None
 
 
-def _samples(shard: Path, members: Sequence[str]) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Each sample's place, for messages, and its requested members, in the order of the shard."""
-    try:
-        with tarfile.open(shard, "r:") as archive:
-            files = (entry for entry in archive if entry.isfile())
-            for key, entries in groupby(files, key=lambda entry: entry.name.partition(".")[0]):
-                content = {}
-                for entry in entries:
-                    name = entry.name.partition(".")[2]
-                    file = archive.extractfile(entry) if name in members else None
-                    if file is not None:
-                        content[name] = file.read()
-                for name in members:
-                    if name not in content:
-                        raise InputError(f"{shard}: {key}: expected the member {key}.{name}, found none")
-                yield f"{shard}: {key}", content
-    except (tarfile.TarError, EOFError) as error:
-        raise InputError(f"{shard}: expected a tar file, found a damaged one: {error}") from None
+def _view(place: str, content: bytes) -> Grey:
+    """A view of 320x240, or a full frame as the tracker makes it smaller : (1, 240, 320)."""
+    image = grey_png.decode(place, content, None)
+    return (image if image.shape[::-1] == VIEW else cv2.resize(image, VIEW))[None]
 
 
-def _views_of(place: str, content: dict[str, bytes]) -> tuple:
-    truth = _truth(place, content["json"])
-    images = np.stack([_full_or_view(f"{place}.cam{k}.png", content[f"cam{k}.png"]) for k in VIEWS])
-    return images, *_facts(place, truth)
-
-
-def _facts(place: str, truth: dict) -> tuple[Array, ...]:
-    """Scale, centres, visible, inside, blur, white, as of `Views`."""
-    rows = []
-    try:
-        for view in truth["views"]:
-            scale = np.divide(view["camera"]["size"], VIEW)
-            if view["centres"] is None:
-                nothing = np.zeros(CIRCLES)
-                rows.append((scale, np.full((CIRCLES, 2), np.nan), nothing, nothing.astype(bool), nothing, 0.0))
-            else:
-                seen = [
-                    np.array(view[name], dtype=kind) for name, kind in (("visible", float), ("inside", bool), ("blur_px", float))
-                ]
-                rows.append(
-                    (scale, np.array(view["centres"], dtype=float).reshape(CIRCLES, 2), *seen, float(view["white_dn"] or 0))
-                )
-        return tuple(np.stack(column) for column in zip(*rows, strict=True))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{place}.json: expected two views with camera, centres, visible ..., found otherwise: {error}"
-        ) from None
-
-
-def _patches_of(place: str, content: dict[str, bytes]) -> tuple:
-    truth = _truth(place, content["json"])
-    facts = _facts(place, truth)
-    visible, white = facts[2].reshape(-1), np.repeat(facts[-1], CIRCLES)
-    stacks = [
-        np.concatenate([_decoded(f"{place}.{kind}{k}.png", content[f"{kind}{k}.png"], (PATCH, CIRCLES * PATCH)) for k in VIEWS])
-        for kind in ("patches", "masks")
-    ]
-    ellipses = []
-    try:
-        for view in truth["views"]:
-            origins = np.array(view["patch_origins"], dtype=float).reshape(CIRCLES, 2)
-            ellipse = np.full((CIRCLES, 5), np.nan) if view["ellipses"] is None else np.array(view["ellipses"], dtype=float)
-            ellipses.append(ellipse.reshape(CIRCLES, 5) - np.pad(origins, ((0, 0), (0, 3))))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{place}.json: expected ellipses and patch_origins of each view, found otherwise: {error}") from None
-    images, masks = (stack.reshape(-1, PATCH, PATCH) for stack in stacks)
-    return images, masks, np.concatenate(ellipses), visible, white
-
-
-def _truth(place: str, content: bytes) -> dict:
-    try:
-        truth = json.loads(content)
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{place}.json: expected JSON, found damaged data: {error}") from None
-    if not isinstance(truth, dict) or len(truth.get("views") or ()) != len(VIEWS):
-        raise InputError(f"{place}.json: expected a map with {len(VIEWS)} views, found otherwise")
-    return truth
-
-
-def _full_or_view(place: str, content: bytes) -> Grey:
-    """A view of 320x240, or a full frame as the tracker makes it smaller."""
-    image = _decoded(place, content, None)
-    return image if image.shape[::-1] == VIEW else cv2.resize(image, VIEW)
-
-
-def _decoded(place: str, content: bytes, size: tuple[int, int] | None) -> Grey:
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
-    if image is None:
-        raise InputError(f"{place}: expected a PNG, found damaged data")
-    if image.dtype != np.uint8 or image.ndim != 2 or (size is not None and image.shape[::-1] != size):
-        wanted = "" if size is None else f"{size[0]}x{size[1]} "
-        found = f"{image.shape[1]}x{image.shape[0]} {image.dtype}" + (" in colour" if image.ndim > 2 else "")
-        raise InputError(f"{place}: expected {wanted}8-bit grey, found {found}")
-    return image
+def _patches(place: str, content: bytes) -> Grey:
+    """Patches or masks of one view : (3, 120, 120)."""
+    return grey_png.decode(place, content, (PATCH, CIRCLES * PATCH)).reshape(CIRCLES, PATCH, PATCH)

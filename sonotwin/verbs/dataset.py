@@ -3,9 +3,12 @@
 Reads the ranges of what is drawn at random from conf/dataset.yaml. Writes OUT/shard-*.tar (WebDataset), OUT/index.parquet and
 OUT/dataset.json; docs/training.md says what is in them. About six stereo samples a second on two cores, after a minute in which
 it compiles. A run that was stopped goes on where it was when started again; the same seed gives the same bytes, on any engine.
+Several machines make ranges of one set, each into a folder of its own from its sample `first` on; `sonotwin train data=[a,b]`
+takes them together. A second run into one folder is refused while the first is at work.
 
     sonotwin dataset out=outputs/data samples=3000 engine.workers=2
     sonotwin dataset out=outputs/test samples=1000 seed=1
+    sonotwin dataset out=outputs/more first=3000 samples=3000
     sonotwin dataset out=outputs/full samples=20 frames=full
 """
 
@@ -17,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from rich.progress import Progress
 
+from recon.files.occupied import occupied
 from recon.model.rig import Rig
 from twin.engine import Engine
 from twin.shooting import Quality
@@ -31,6 +35,7 @@ class Config(BaseModel):
 
     rig: Rig
     out: Path
+    first: Annotated[int, Field(ge=0, le=1_000_000_000)] = 0
     samples: Annotated[int, Field(ge=1, le=10_000_000)]
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     frames: Literal["views", "sketches", "full"] = "views"
@@ -50,12 +55,16 @@ def run(config: Config) -> None:
     Raises
     ------
     InputError
-        If `out` holds anything but a data set of these settings.
+        If `out` holds anything but a data set of these settings, or another run is writing there.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    with occupied(config.out):
+        _make(config, Console(soft_wrap=True, highlight=False))
+
+
+def _make(config: Config, console: Console) -> None:
     place, settings = Place(config.out), config.settings()
     missing = prepare(place, settings)
-    total = sum(len(settings.shards()[number]) for number in missing)
+    total = sum(len(settings.samples_of(number)) for number in missing)
     if total < config.samples:
         console.print(f"found       {config.samples - total} samples")
     start = perf_counter()

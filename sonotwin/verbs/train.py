@@ -1,13 +1,16 @@
 """Train a network of the tracker: the detector, which finds circles in a view, or the segmenter, which outlines one in a patch.
 
-Reads a data set as of `sonotwin dataset` into memory, 150 kB a sample for a detector and 170 kB for a segmenter. Writes into the
-folder `out`: the network as ONNX for the tracker, its weights as .safetensors and .pt with the published names, metrics.json of
-the validation samples, the curves as log.jsonl and curves.png, and checkpoint.pt, from which the same command goes on if it was
-interrupted. Needs the extra `train`. On one core the networks of ours see some 40 crops or 100 patches a second, and half an hour
-to some hours are asked for; the published ones take 6 to 20 times as long.
+Reads data sets as of `sonotwin dataset`, one or several: ranges of one, or of other seeds. Their images are decoded into memory,
+150 kB a sample for a detector and 170 kB for a segmenter, or read from the shards as they are needed where that is more than
+`memory_gb`; the training is the same either way. Writes into the folder `out`: the network as ONNX for the tracker, its weights
+as .safetensors and .pt with the published names, metrics.json of the validation samples, the curves as log.jsonl and curves.png,
+and checkpoint.pt, from which the same command goes on if it was interrupted. A second run into one folder is refused while the
+first is at work. Needs the extra `train`. On one core the networks of ours see some 40 crops or 100 patches a second, and half an
+hour to some hours are asked for; the published ones take 6 to 20 times as long.
 
     sonotwin train network=detector data=outputs/dataset out=outputs/detector max_minutes=60
     sonotwin train network=published_segmenter data=outputs/dataset out=outputs/segmenter steps=20000 threads=1
+    sonotwin train network=detector data=[outputs/first,outputs/second] out=outputs/detector max_minutes=600 memory_gb=8
     sonotwin train network=detector data=outputs/more init=outputs/detector/detector.safetensors out=outputs/detector2 steps=5000
 """
 
@@ -18,20 +21,40 @@ from typing import Annotated
 
 import torch
 from matplotlib.figure import Figure
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown
-from trainers import export, fit, shard_reader
+from recon.files.occupied import occupied
+from recon.files.regular import read_bytes
+from trainers import export, fit, free_memory, shard_reader
 from trainers.architectures import Name, is_detector, network
 from trainers.fit import Fitted, Plan, Precision
 from trainers.shard_reader import Data
+from trainers.stored_images import StoredImages
 
 MARKER = "training.json"  # what a run was asked for
-MAY_CHANGE = {"out", "resume", "steps", "max_minutes", "threads", "loaders", "checkpoint_minutes"}  # when a run goes on
+MAY_CHANGE = {"out", "resume", "steps", "max_minutes", "checkpoint_minutes"}  # when a run goes on
+MAY_CHANGE |= {"threads", "loaders", "memory_gb"}  # which change no batch
+LISTS = ("data", "validation_data")  # of folders; one may be given by itself
+MEMORY_SHARE = 0.5  # of what is free, for images, if memory_gb isn't given
+
+
+def _listed(value: object) -> object:
+    return [value] if isinstance(value, str | Path) else value
+
+
+def _each_once(folders: list[Path]) -> list[Path]:
+    for place, folder in enumerate(folders):
+        if folder.resolve() in (other.resolve() for other in folders[:place]):
+            raise ValueError(f"expected each folder once, found {folder} twice")
+    return folders
+
+
+Folders = Annotated[list[Path], BeforeValidator(_listed), AfterValidator(_each_once), Field(min_length=1)]
 
 
 class Config(BaseModel):
@@ -40,14 +63,14 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     network: Name
-    data: Path
+    data: Folders
     out: Path
     steps: Annotated[int, Field(ge=1)] | None = None
     max_minutes: Annotated[float, Field(gt=0, le=100_000)] | None = None
     init: Path | None = None
     resume: bool = True
     partial: bool = False
-    validation_data: Path | None = None
+    validation_data: Folders | None = None
     validation: Annotated[float, Field(gt=0, lt=1)] = 0.05
     batch: Annotated[int, Field(ge=2, le=4096)] | None = None
     crop_px: Annotated[int, Field(ge=64, le=240, multiple_of=8)] = 160
@@ -56,6 +79,7 @@ class Config(BaseModel):
     precision: Precision = "auto"
     threads: Annotated[int, Field(ge=1, le=1024)] | None = None
     loaders: Annotated[int, Field(ge=0, le=1024)] = 0
+    memory_gb: Annotated[float, Field(ge=0)] | None = None
     checkpoint_minutes: Annotated[float, Field(gt=0)] = 5.0
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
@@ -64,6 +88,11 @@ class Config(BaseModel):
         if self.steps is None and self.max_minutes is None:
             raise ValueError("expected steps or max_minutes, found neither")
         return self
+
+    @property
+    def memory(self) -> float:
+        """Bytes that decoded images may take."""
+        return MEMORY_SHARE * free_memory.free_bytes() if self.memory_gb is None else 1e9 * self.memory_gb
 
     @property
     def plan(self) -> Plan:
@@ -94,9 +123,13 @@ def run(config: Config) -> None:
     KeyboardInterrupt
         If it was stopped; a checkpoint is there then.
     """
-    console = Console(soft_wrap=True, highlight=False)
-    inputs = [path for path in (config.data, config.validation_data, config.init) if path is not None]
+    inputs = [*config.data, *(config.validation_data or ()), *([config.init] if config.init else ())]
     atomic.check_folder(config.out, MARKER, inputs=inputs)
+    with occupied(config.out):
+        _train(config, Console(soft_wrap=True, highlight=False))
+
+
+def _train(config: Config, console: Console) -> None:
     goes_on = check_resumed(config)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
     torch.manual_seed(config.seed)
@@ -104,8 +137,6 @@ def run(config: Config) -> None:
     if config.init is not None:
         export.load(config.init, module)
     train, validation = read(config, console)
-    what = "views" if is_detector(config.network) else "patches"
-    console.print(f"read        {len(train)} {what} to train with, {len(validation)} to validate with", markup=False)
     prepare(config, goes_on)
     fitted = fitted_with_progress(config, module, train, validation, console)
     since = f", from step {fitted.resumed_at} on" if fitted.resumed_at else ""
@@ -127,22 +158,32 @@ def check_resumed(config: Config) -> bool:
     if not config.resume or not checkpoint.is_file():
         return False
     try:
-        before = json.loads(marker.read_text(encoding="utf-8"))
+        before = json.loads(read_bytes(marker))
+        before |= {name: _listed(before[name]) for name in LISTS}  # runs of earlier versions had one folder
         differing = [name for name, value in settings(config).items() if name not in MAY_CHANGE and before[name] != value]
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
+        expected = [f"{name}={given(before[name])}" for name in differing]
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise InputError(
             f"{marker}: expected a training's settings, found other or damaged data; resume=false starts anew"
         ) from None
-    if differing:
-        name = differing[0]
-        raise InputError(f"{config.out}: expected {name}={before[name]} as its checkpoint has, or resume=false to start anew")
+    if expected:
+        raise InputError(f"{config.out}: expected {expected[0]} as its checkpoint has, or resume=false to start anew")
+    fit.read_log(config.out)  # a damaged one is refused before anything is done
     return True
+
+
+def given(value: object) -> str:
+    """A field's value in the command's own words, where they are short."""
+    values = value if isinstance(value, list) else [value]
+    text = str(values[0]) if len(values) == 1 else f"[{','.join(map(str, values))}]"
+    return "".join(letter if letter.isprintable() else "?" for letter in text[:300])
 
 
 def settings(config: Config) -> dict:
     """The request as JSON; folders by their whole paths."""
-    paths = {name: str(path.resolve()) for name in ("data", "out", "init", "validation_data") if (path := getattr(config, name))}
-    return config.model_dump(mode="json") | paths
+    paths = {name: str(path.resolve()) for name in ("out", "init") if (path := getattr(config, name))}
+    lists = {name: [str(path.resolve()) for path in some] for name in LISTS if (some := getattr(config, name))}
+    return config.model_dump(mode="json") | paths | lists
 
 
 def prepare(config: Config, goes_on: bool) -> None:
@@ -157,15 +198,22 @@ def prepare(config: Config, goes_on: bool) -> None:
 
 
 def read(config: Config, console: Console) -> tuple[Data, Data]:
-    """Training and validation samples."""
+    """Training and validation samples, in memory as far as they may be."""
     reader = shard_reader.read_views if is_detector(config.network) else shard_reader.read_patches
     with console.status("reading") as status:
-        data = reader(
-            config.data, lambda count: status.update(f"reading, {count} samples") if count % 100 == 0 else None, config.partial
-        )
+        data = reader(config.data, lambda count: status.update(f"reading, {count} samples"), config.partial)
         if config.validation_data is not None:
-            return data, reader(config.validation_data)
-    return shard_reader.split(data, config.validation)
+            sets = data, reader(config.validation_data)
+        else:
+            sets = shard_reader.split(data, config.validation)
+        memory = config.memory
+        train, validation = shard_reader.as_fits(sets, memory, lambda count: status.update(f"decoding, {count} images"))
+    what = "views" if is_detector(config.network) else "patches"
+    console.print(f"read        {len(train)} {what} to train with, {len(validation)} to validate with", markup=False)
+    if isinstance(train.images, StoredImages):
+        needed = shard_reader.bytes_decoded(train) / 1e9
+        console.print(f"stream      from the shards: {needed:.2g} GB of images, memory for {memory / 1e9:.2g} GB", markup=False)
+    return train, validation
 
 
 def fitted_with_progress(config: Config, module: torch.nn.Module, train: Data, validation: Data, console: Console) -> Fitted:

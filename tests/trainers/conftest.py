@@ -48,21 +48,23 @@ def _fixed(points: np.ndarray) -> np.ndarray:
     return np.rint(points * 2**FINER).astype(int)
 
 
-def write_set(folder: Path, count: int, shard: int = 16, seed: int = 0, sizes: tuple[float, float] = (4.0, 6.5)) -> Path:
+def write_set(
+    folder: Path, count: int, shard: int = 16, seed: int = 0, sizes: tuple[float, float] = (4.0, 6.5), first: int = 0
+) -> Path:
     """Write a data set of `count` samples, every sixth without a target."""
     folder.mkdir(parents=True, exist_ok=True)
-    for first in range(0, count, shard):
-        with tarfile.open(folder / f"shard-{first // shard:05d}.tar", "w") as archive:
-            for k in range(first, min(first + shard, count)):
-                for name, content in members(np.random.default_rng([seed, k]), k, sizes).items():
-                    entry = tarfile.TarInfo(f"{k:08d}.{name}")
+    for begin in range(first, first + count, shard):
+        with tarfile.open(folder / f"shard-{begin // shard:05d}.tar", "w") as archive:
+            for k in range(begin, min(begin + shard, first + count)):
+                for name, content in members(np.random.default_rng([seed, k]), k, seed, sizes).items():
+                    entry = tarfile.TarInfo(f"{seed}-{k:08d}.{name}")
                     entry.size = len(content)
                     archive.addfile(entry, io.BytesIO(content))
-    (folder / "dataset.json").write_text(json.dumps({"samples": count, "seed": seed}))
+    (folder / "dataset.json").write_text(json.dumps({"version": 2, "first": first, "samples": count, "seed": seed}))
     return folder
 
 
-def members(rng: np.random.Generator, k: int, sizes: tuple[float, float]) -> dict[str, bytes]:
+def members(rng: np.random.Generator, k: int, seed: int, sizes: tuple[float, float]) -> dict[str, bytes]:
     """The files of one sample by the ends of their names."""
     present, views, files = k % 6 != 5, [], {}
     for camera in (1, 2):
@@ -81,7 +83,7 @@ def members(rng: np.random.Generator, k: int, sizes: tuple[float, float]) -> dic
         ):
             files[f"{name}{camera}.png"] = cv2.imencode(".png", picture)[1].tobytes()
         views.append(view)
-    files["json"] = json.dumps({"k": k, "present": present, "world_from_target": None, "views": views}).encode()
+    files["json"] = json.dumps({"k": k, "seed": seed, "present": present, "world_from_target": None, "views": views}).encode()
     return files
 
 

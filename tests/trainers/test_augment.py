@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 from trainers import augment
 from trainers.augment import moved, photograph, turns, warp
 from trainers.batches import crops, discs, generator_of
-from trainers.shard_reader import read_patches, read_views
+from trainers.shard_reader import in_memory, read_patches, read_views
 
 
 def test_a_rings_centre_follows_its_label(rng):
@@ -40,7 +40,7 @@ def test_no_map_mirrors():
 
 def test_targets_of_a_batch_have_their_circles_in_the_real_order(data_set):
     """In the image, from c0, c2 lies anticlockwise of c1 for a target that is seen from the front."""
-    places = crops(read_views(data_set), 64, 160, generator_of(3, 5)).places
+    places = crops(in_memory(read_views([data_set])), 64, 160, generator_of(3, 5)).places
     x, y = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
     turn = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]
     assert torch.isfinite(turn).sum() > 30
@@ -49,7 +49,7 @@ def test_targets_of_a_batch_have_their_circles_in_the_real_order(data_set):
 
 def test_dark_rings_are_where_a_batch_says(data_set):
     """Blindly: on a white board a ring's middle is brighter than its rim, at its place and not 4 px beside it."""
-    batch = crops(read_views(data_set), 128, 160, generator_of(2, 0))
+    batch = crops(in_memory(read_views([data_set])), 128, 160, generator_of(2, 0))
     images = batch.images[:, 0].numpy()
     peaks = []
     for view, row, column in np.argwhere((batch.labels.pixel < 64).numpy() & (batch.labels.pixel >= 0).numpy()):
@@ -64,7 +64,7 @@ def test_dark_rings_are_where_a_batch_says(data_set):
 
 
 def test_a_batch_is_that_of_its_seed_and_step(data_set):
-    views, patches = read_views(data_set), read_patches(data_set)
+    views, patches = in_memory(read_views([data_set])), in_memory(read_patches([data_set]))
     for make in (lambda g: crops(views, 8, 96, g).images, lambda g: discs(patches, 8, g).images):
         first, again, other = make(generator_of(1, 7)), make(generator_of(1, 7)), make(generator_of(1, 8))
         assert torch.equal(first, again)
@@ -73,7 +73,7 @@ def test_a_batch_is_that_of_its_seed_and_step(data_set):
 
 def test_masks_are_of_the_discs(data_set):
     """A mask's middle is within the shift of the patch's; patches without a disc have none; its pixels count where known."""
-    batch = discs(read_patches(data_set), 96, generator_of(0, 1))
+    batch = discs(in_memory(read_patches([data_set])), 96, generator_of(0, 1))
     area = batch.masks.sum((1, 2, 3))
     assert (area == 0).any() and (area > 500).sum() > 40
     columns = (batch.masks * torch.arange(120.0)).sum((1, 2, 3))[area > 500] / area[area > 500]

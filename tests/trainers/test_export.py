@@ -74,3 +74,60 @@ def test_other_files_are_refused_in_one_line(tmp_path):
         with pytest.raises(InputError, match=message) as caught:
             load(tmp_path / name, network("published_segmenter"))
         assert str(caught.value).startswith(str(tmp_path / name)) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+def test_the_same_weights_are_the_same_bytes(suffix, tmp_path):
+    """Under any name; torch would write that of the file, which while it is written has the process's number in it."""
+    paths = [tmp_path / f"{name}{suffix}" for name in ("one", "other")]
+    for path in paths:
+        save(path, trained("segmenter"))
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def _weights(**changes):
+    return {**trained("segmenter").state_dict(), **changes}
+
+
+FIRST = "level1.double_conv.0.weight"  # 8 x 1 x 3 x 3
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({1: torch.zeros(3)}, "expected weights level1.* found none"),
+        (_weights() | {1: torch.zeros(3)}, "expected weights of a Segmenter, found 1 too"),
+        (_weights(**{"a\nb": torch.zeros(3)}), r"expected weights of a Segmenter, found 'a\\nb' too"),
+        (_weights(**{"x" * 10_000: 1}), "expected weights of a Segmenter, found 'xxx"),
+        (_weights(**{FIRST: 1.0}), f"expected weights {FIRST} of shape .*, found 1.0"),
+        (_weights(**{FIRST: "9" * 10_000}), f"expected weights {FIRST} of shape .*, found '999"),
+        (_weights(**{FIRST: torch.full((8, 1, 3, 3), torch.nan)}), f"weights {FIRST} .* numbers in it that aren't finite"),
+        (_weights(**{FIRST: torch.zeros(8, 1, 3, 3, dtype=torch.complex64)}), f"weights {FIRST} .* another kind of tensor"),
+        (_weights(**{FIRST: torch.zeros(8, 1, 3, 3).to_sparse()}), f"weights {FIRST} .* another kind of tensor"),
+        (_weights(**{FIRST: torch.zeros(8, 1, 3, 3, device="meta")}), f"weights {FIRST} .* another kind of tensor"),
+        (_weights(**{FIRST: torch.zeros(8, 1, 3, 3, dtype=torch.int64)}), f"weights {FIRST} .* another kind of tensor"),
+    ],
+)
+def test_what_is_no_state_of_the_network_is_named(tmp_path, content, message, recwarn):
+    torch.save(content, tmp_path / "weights.pt")
+    with pytest.raises(InputError, match=message) as caught:
+        load(tmp_path / "weights.pt", network("segmenter"))
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 400
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+def test_damage_at_random_ends_in_a_line(tmp_path, rng, suffix, recwarn):
+    path = tmp_path / f"weights{suffix}"
+    save(path, network("segmenter"))
+    whole = path.read_bytes()
+    for _ in range(60):
+        content = bytearray(whole)
+        for place in rng.integers(0, 6000, 3):
+            content[place] = rng.integers(256)
+        path.write_bytes(content[: rng.integers(len(content))] if rng.random() < 0.2 else content)
+        try:
+            load(path, network("segmenter"))
+        except InputError as error:
+            assert str(error).isprintable() and len(str(error)) < 400
+    assert not recwarn.list

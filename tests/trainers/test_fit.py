@@ -15,7 +15,7 @@ torch = pytest.importorskip("torch")
 from trainers import fit
 from trainers.architectures import Detector, Segmenter
 from trainers.fit import Plan, progress, rate, read_log
-from trainers.shard_reader import read_patches, read_views, split
+from trainers.shard_reader import in_memory, read_patches, read_views, split
 
 
 def plan(name, steps, **changes):
@@ -47,14 +47,14 @@ class Interrupted(Exception):
 def test_an_interrupted_training_ends_with_the_same_weights(name, data_set, tmp_path):
     """Switched off at step 7, after the checkpoint of step 5; log rows of steps that come again are there once.
 
-    The last part's batches are made by two other processes.
+    The last part's batches are made by two other processes. The whole one's images are in memory, the parts' are not.
     """
-    data = split((read_views if name == "detector" else read_patches)(data_set), 0.1)
+    data = split((read_views if name == "detector" else read_patches)([data_set]), 0.1)
     paths = [tmp_path / "whole", tmp_path / "parts"]
     for path in paths:
         path.mkdir()
     asked = plan(name, 10, log_steps=2)
-    whole = fit.fit(small(name), *data, asked, paths[0], lambda step, done, loss: None)
+    whole = fit.fit(small(name), *map(in_memory, data), asked, paths[0], lambda step, done, loss: None)
 
     def stop(step, done, loss):
         if step == 5:
@@ -88,7 +88,7 @@ from trainers.architectures import Segmenter
 from trainers.shard_reader import read_patches, split
 torch.set_num_threads(1)
 plan = fit.Plan("segmenter", 4, 64, 1e-3, 0.01, 3, 100000, None, loaders=2)
-data = split(read_patches(Path(sys.argv[1])), 0.1)
+data = split(read_patches([Path(sys.argv[1])]), 0.1)
 fit.fit(Segmenter((4, 4, 4)), *data, plan, Path(sys.argv[2]), lambda step, *_: print(step, flush=True))
 """
 
@@ -122,7 +122,7 @@ def test_the_end_comes_with_steps_or_minutes():
 
 def test_a_tiny_segmenter_learns_the_drawn_discs(data_set, tmp_path):
     """In 50 steps from nothing to an outline that is right for most of a disc, and to none where there is none."""
-    train, held = split(read_patches(data_set), 0.2)
+    train, held = split(in_memory(read_patches([data_set])), 0.2)
     torch.manual_seed(0)
     fitted = fit.fit(
         Segmenter((4, 8, 16)), train, held, plan("segmenter", 50, batch=8, learning_rate=1e-2), tmp_path, lambda *_: None
@@ -139,7 +139,7 @@ def test_a_small_detector_learns_the_drawn_targets(write, tmp_path):
     The target is far away, all of it within a few cells: c0 and c1 have alike surroundings, and to tell them apart by where c2
     lies takes thousands of steps more if it lies twice as far.
     """
-    train, held = split(read_views(write(tmp_path / "set", 120, sizes=(2.2, 3.4))), 0.1)
+    train, held = split(in_memory(read_views([write(tmp_path / "set", 120, sizes=(2.2, 3.4))])), 0.1)
     torch.manual_seed(0)
     asked = plan("detector", 2500, batch=16, crop_px=96, learning_rate=4e-3)
     fitted = fit.fit(Detector(32), train, held, asked, tmp_path, lambda *_: None)

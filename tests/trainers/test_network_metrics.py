@@ -9,7 +9,7 @@ from torch import nn
 
 from trainers.labels import labels
 from trainers.network_metrics import decode, measure_detector, measure_segmenter
-from trainers.shard_reader import read_patches, read_views
+from trainers.shard_reader import in_memory, read_patches, read_views
 
 
 class Knowing(nn.Module):
@@ -37,7 +37,7 @@ def known(views):
 
 
 def test_a_perfect_detector_is_perfect(data_set):
-    views = read_views(data_set)
+    views = in_memory(read_views([data_set]))
     figures = measure_detector(Knowing(*known(views)), views)
     assert figures["recall"] == figures["all_three"] == figures["all_three_bright"] == figures["identity_accuracy"] == 1
     assert figures["false_per_empty_view"] == 0 and figures["empty_views"] == 8 and figures["wrong"] == 0
@@ -45,14 +45,14 @@ def test_a_perfect_detector_is_perfect(data_set):
 
 
 def test_swapped_identities_are_found_but_wrong(data_set):
-    views = read_views(data_set)
+    views = in_memory(read_views([data_set]))
     figures = measure_detector(Knowing(*known(views), swap=(1, 0, 2, 3)), views)
     assert figures["recall_c0"] == figures["recall_c1"] == 0 and figures["recall_c2"] == 1
     assert figures["all_three"] == 0 and figures["wrong"] > 0.6
 
 
 def test_a_detector_that_errs_by_a_cell_finds_nothing(data_set):
-    views = read_views(data_set)
+    views = in_memory(read_views([data_set]))
     assert measure_detector(Knowing(*known(views), shift=1), views)["recall"] == 0
 
 
@@ -70,7 +70,7 @@ def test_of_near_peaks_the_best_stays_and_of_many_three():
 
 
 def test_segmenters_errors_are_measured(data_set):
-    patches = read_patches(data_set)
+    patches = in_memory(read_patches([data_set]))
     logits = torch.from_numpy(np.where(patches.masks > 0, 9.0, -9.0).astype(np.float32))[:, None]
     perfect = measure_segmenter(Knowing(logits), patches)
     assert perfect["iou"] == perfect["empty_right"] == 1 and perfect["centre_95_px"] == 0 and perfect["missed"] == 0

@@ -2,23 +2,29 @@
 
 A shard is written to a temporary name and renamed, and sample k depends on the settings and k alone. So a run that was killed
 goes on with the shards that are missing, and workers need no coordinator: the bytes are the same, however they were made.
+
+Shard n has the samples from n times its size on, whatever range of them a folder has: folders of one set with ranges apart have
+shards of different names, but for one that a range ends in, and no key twice.
 """
 
 import json
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import webdataset as wds
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-from recon.errors import InputError
-from recon.files import atomic
+from recon.errors import InputError, one_line
+from recon.files import atomic, tar_members
+from recon.files.regular import read_bytes
 from recon.model.rig import Rig
 from twin.engine import Engine, results
 from twin.session import first_difference
@@ -30,14 +36,23 @@ from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import ViewTruth, disc_masks
 
 INDEX, SETTINGS = "index.parquet", "dataset.json"
-VERSION = 1
+VERSION = 2  # 1 had keys without the seed, and began with sample 0
 BATCH = 5  # samples traced in one launch; doesn't change them
+ROWS = 10_000  # of the index that are written at once
+COLUMNS = pa.schema(
+    [("seed", pa.int64()), ("k", pa.int64()), ("shard", pa.string()), ("present", pa.bool_())]
+    + [("body", pa.int64()), ("surroundings", pa.int64()), ("gain", pa.float64())]
+    + [(f"{name}_{i}", pa.float64()) for name in ("white_dn", "blur_px", "visible") for i in (1, 2)]
+    + [(f"inside_{i}", pa.bool_()) for i in (1, 2)]
+)
+LEFTOVER = re.compile(r"\.shard-(\d+)\..+\.tar")  # perhaps, as of recon.files.atomic
+MADE_ANEW = "delete the file, and the same command makes it anew"
 PNG = [cv2.IMWRITE_PNG_COMPRESSION, 4]
 RENDER = {"views": render_views, "sketches": render_sketches, "full": render_full}
 
 
 class Settings(BaseModel):
-    """Everything that a data set's bytes depend on, and the number of its samples."""
+    """Everything that a data set's bytes depend on, and the range of its samples."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -46,12 +61,22 @@ class Settings(BaseModel):
     quality: Quality
     frames: Literal["views", "sketches", "full"]
     seed: int
+    first: int = 0
     samples: int
     shard: int  # samples a shard
 
-    def shards(self) -> list[range]:
-        """Samples of each shard."""
-        return [range(first, min(first + self.shard, self.samples)) for first in range(0, self.samples, self.shard)]
+    def shards(self) -> range:
+        """Numbers of the shards."""
+        return range(self.first // self.shard, (self.first + self.samples - 1) // self.shard + 1)
+
+    def samples_of(self, shard: int) -> range:
+        """Samples in a shard."""
+        first, end = shard * self.shard, (shard + 1) * self.shard
+        return range(max(first, self.first), min(end, self.first + self.samples))
+
+    def key(self, k: int) -> str:
+        """A sample's key, unique among data sets of all seeds."""
+        return f"{self.seed}-{k:08d}"
 
 
 @dataclass(frozen=True)
@@ -65,50 +90,89 @@ class Place:
         return self.folder / f"shard-{number:05d}.tar"
 
 
+class Written(BaseModel):
+    """What `dataset.json` must have so that its other fields can be compared."""
+
+    model_config = ConfigDict(strict=True)
+
+    version: int
+    first: int = 0
+    samples: int
+
+
 def prepare(place: Place, settings: Settings) -> list[int]:
     """Open a folder for a data set, and say which shards are missing.
 
     Raises
     ------
     InputError
-        If the folder holds a data set of other settings, or something else.
+        If the folder holds a data set of other settings or of another version, or something else.
     """
     told = place.folder / SETTINGS
     written = {"version": VERSION, **settings.model_dump(mode="json")}
     if told.exists():
-        try:
-            found = json.loads(told.read_text())
-        except json.JSONDecodeError as error:
-            raise InputError(f"{told}: expected JSON, found {error}") from None
-        if not isinstance(found, dict) or not isinstance(found.get("samples"), int):
-            raise InputError(f"{told}: expected a data set's settings, found something else")
-        if found["samples"] > settings.samples:
-            expected = f"expected at least the {found['samples']} it was begun with"
-            raise InputError(f"{told}: samples: {expected}, found {settings.samples}")
-        name, wanted, there = first_difference(written, found | {"samples": settings.samples})
-        if name:
-            expected = f"expected {wanted} as in this run, found {there}, another data set"
-            raise InputError(f"{told}: {name}: {expected}; choose another out")
-    elif place.folder.exists() and any(place.folder.iterdir()):
+        _check_same(told, written)
+    elif place.folder.exists() and any(not path.name.startswith(".") for path in _entries(place.folder)):
         raise InputError(f"{place.folder}: expected an empty folder or a data set, found other files")
     place.folder.mkdir(parents=True, exist_ok=True)
-    for number, _ in enumerate(settings.shards()):
-        atomic.remove_leftovers(place.shard(number))
+    _remove_leftovers(place)
+    missing = [number for number in settings.shards() if not _complete(place, settings, number)]
     with atomic.new_file(told) as path:
         path.write_text(json.dumps(written, indent=1))
-    return [number for number, _ in enumerate(settings.shards()) if not _complete(place, settings, number)]
+    return missing
+
+
+def _check_same(told: Path, written: Mapping[str, Any]) -> None:
+    """Refuse a folder whose data set isn't this one, or a longer one."""
+    content = read_bytes(told)
+    try:
+        found, there = json.loads(content), Written.model_validate_json(content)
+    except ValidationError as error:
+        raise InputError(f"{told}: {one_line(error)}; expected a data set's settings, or another out") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{told}: expected a data set's settings as JSON, found damaged data: {error}") from None
+    if there.version != VERSION:
+        keys = ", whose keys lack the seed" if there.version < VERSION else ""
+        raise InputError(
+            f"{told}: version: expected {VERSION}, found {there.version}{keys}; it can be trained with as it is, "
+            "but gets no more samples: choose another out, with first=... for those that come after its own"
+        )
+    if there.samples > written["samples"]:
+        expected = f"expected at least the {there.samples} it was begun with"
+        raise InputError(f"{told}: samples: {expected}, found {written['samples']}")
+    name, wanted, other = first_difference(written, found | {"samples": written["samples"]})
+    if name:
+        expected = f"expected {_brief(wanted)} as in this run, found {_brief(other)}, another data set"
+        raise InputError(f"{told}: {name}: {expected}; choose another out")
+
+
+def _brief(value: object) -> str:
+    text = "".join(letter if letter.isprintable() else "?" for letter in str(value))
+    return text if len(text) <= 100 else f"{text[:97]}..."
+
+
+def _entries(folder: Path) -> Iterable[Path]:
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder or nothing, found a file")
+    return folder.iterdir()
+
+
+def _remove_leftovers(place: Place) -> None:
+    """Remove what a killed run has left of shards; the folder, which may have many thousands, is looked through once."""
+    leftovers = [LEFTOVER.fullmatch(path.name) for path in place.folder.iterdir()]
+    for number in sorted({int(name[1]) for name in leftovers if name}):
+        atomic.remove_leftovers(place.shard(number))
 
 
 def _complete(place: Place, settings: Settings, number: int) -> bool:
-    """Whether a shard is there in full; the last one of a smaller data set of the same settings may have to grow."""
+    """Whether a shard is there with all its samples; the last one of a smaller data set of the same settings has to grow."""
     path = place.shard(number)
     if not path.exists():
         return False
-    return len(settings.shards()[number]) == settings.shard or _samples_in(path) == len(settings.shards()[number])
-
-
-def _samples_in(path: Path) -> int:
-    return sum(1 for _ in truths(path))
+    try:
+        return [key for key, _ in tar_members.samples(path)] == [settings.key(k) for k in settings.samples_of(number)]
+    except InputError as error:
+        raise InputError(f"{error}; {MADE_ANEW}") from None
 
 
 def generate(place: Place, settings: Settings, missing: Sequence[int], engine: Engine) -> Iterator[int]:
@@ -119,13 +183,13 @@ def generate(place: Place, settings: Settings, missing: Sequence[int], engine: E
 def write_shard(place: Place, settings: Settings, number: int) -> int:
     """Render a shard's samples and write them; gives their number."""
     bank = build_bank(settings.rig.target, settings.ranges.variants, settings.seed)
-    samples = settings.shards()[number]
+    samples = settings.samples_of(number)
     with atomic.new_file(place.shard(number)) as path, wds.TarWriter(str(path), encoder=False, mtime=0, mode=0o644) as tar:
         for first in range(samples.start, samples.stop, BATCH):
             takes = [draw(settings.ranges, settings.rig, settings.seed, k) for k in samples if first <= k < first + BATCH]
             rendered = RENDER[settings.frames](bank, settings.rig, takes, settings.quality, settings.seed)
             for take, frames in zip(takes, rendered, strict=True):
-                tar.write({"__key__": f"{take.k:08d}", **members(take, frames, settings)})
+                tar.write({"__key__": settings.key(take.k), **members(take, frames, settings)})
     return len(samples)
 
 
@@ -191,27 +255,40 @@ def _view_record(truth: ViewTruth, present: bool) -> dict:
 
 
 def truths(path: Path) -> Iterator[dict]:
-    """Truth records of a shard, in order."""
-    for sample in wds.WebDataset(str(path), shardshuffle=False, select_files=lambda name: name.endswith(".json")):
-        yield json.loads(sample["json"])
+    """Truth records of a shard, in order.
+
+    Raises
+    ------
+    InputError
+        If the shard is damaged.
+    """
+    for key, files in tar_members.samples(path):
+        try:
+            _, offset, size = files["json"]
+            yield json.loads(tar_members.read(path, offset, size))
+        except (KeyError, ValueError, RecursionError):
+            raise InputError(f"{path}: {key}: expected its truth, found none or damaged data; {MADE_ANEW}") from None
 
 
 def write_index(place: Place, settings: Settings) -> None:
     """Index table, a row a sample: its place, and the quantities by which samples are chosen."""
-    rows = []
-    for number, _ in enumerate(settings.shards()):
-        for record in truths(place.shard(number)):
-            rows.append({
-                "k": record["k"],
-                "shard": place.shard(number).name,
-                "present": record["present"],
-                "body": record["body"],
-                "surroundings": record["surroundings"],
-                "gain": record["exposure"]["gain"],
-                **{f"white_dn_{i}": view["white_dn"] for i, view in enumerate(record["views"], 1)},
-                **{f"blur_px_{i}": max(view["blur_px"] or [0]) for i, view in enumerate(record["views"], 1)},
-                **{f"visible_{i}": min(view["visible"]) for i, view in enumerate(record["views"], 1)},
-                **{f"inside_{i}": all(view["inside"]) for i, view in enumerate(record["views"], 1)},
-            })  # fmt: skip
-    with atomic.new_file(place.folder / INDEX) as path:
-        pq.write_table(pa.Table.from_pylist(rows), path)
+    rows = (_index_row(place.shard(number), record) for number in settings.shards() for record in truths(place.shard(number)))
+    with atomic.new_file(place.folder / INDEX) as path, pq.ParquetWriter(path, COLUMNS) as table:
+        while some := list(islice(rows, ROWS)):  # not all at once: there may be millions
+            table.write_table(pa.Table.from_pylist(some, COLUMNS))
+
+
+def _index_row(shard: Path, record: dict) -> dict:
+    try:
+        views = list(enumerate(record["views"], 1))
+        return {
+            **{name: record[name] for name in ("seed", "k", "present", "body", "surroundings")},
+            "shard": shard.name,
+            "gain": record["exposure"]["gain"],
+            **{f"white_dn_{i}": view["white_dn"] for i, view in views},
+            **{f"blur_px_{i}": max(view["blur_px"] or [0]) for i, view in views},
+            **{f"visible_{i}": min(view["visible"]) for i, view in views},
+            **{f"inside_{i}": all(view["inside"]) for i, view in views},
+        }
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{shard}: expected the truth of samples made here, found other data ({error}); {MADE_ANEW}") from None

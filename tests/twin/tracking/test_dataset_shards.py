@@ -4,6 +4,7 @@ import io
 import json
 import shutil
 import tarfile
+import time
 
 import cv2
 import numpy as np
@@ -86,7 +87,7 @@ def test_two_workers_write_the_same_bytes(made, tmp_path, name):
 def test_what_is_in_a_shard(made):
     files = members(made.shard(0))
     keys = {name.split(".")[0] for name in files}
-    assert keys == {"00000000", "00000001"}
+    assert keys == {"5-00000000", "5-00000001"}
     for key in keys:
         truth = json.loads(files[f"{key}.json"])
         for number, view in enumerate(truth["views"], 1):
@@ -109,7 +110,7 @@ def test_what_is_in_a_shard(made):
 
 def test_the_index_has_a_row_a_sample(made):
     table = pq.read_table(io.BytesIO((made.folder / dataset_shards.INDEX).read_bytes())).to_pylist()
-    assert [row["k"] for row in table] == [0, 1, 2, 3]
+    assert [(row["seed"], row["k"]) for row in table] == [(5, 0), (5, 1), (5, 2), (5, 3)]
     assert [row["shard"] for row in table] == ["shard-00000.tar"] * 2 + ["shard-00001.tar"] * 2
 
 
@@ -142,5 +143,101 @@ def test_more_samples_may_be_asked_for_later(made, tmp_path):
     grown = Place(tmp_path / "set")
     shutil.copytree(made.folder, grown.folder)
     assert prepare(grown, settings(8)) == [2, 3]
-    with pytest.raises(InputError, match="samples: expected at least the 8"):
+    assert prepare(grown, settings(9)) == [2, 3, 4]
+    with pytest.raises(InputError, match="samples: expected at least the 9"):
         prepare(grown, settings(4))
+
+
+def test_a_range_is_a_part_of_the_whole(made, tmp_path):
+    """Samples 1 and 2 of another machine are those of the whole set, to the byte, and have its keys."""
+    part = Place(tmp_path / "set")
+    wanted = settings(2, first=1)
+    list(generate(part, wanted, prepare(part, wanted), Engine()))
+    write_index(part, wanted)
+    whole = {**members(made.shard(0)), **members(made.shard(1))}
+    there = {**members(part.shard(0)), **members(part.shard(1))}
+    assert {name.split(".")[0] for name in there} == {"5-00000001", "5-00000002"}
+    assert all(whole[name] == content for name, content in there.items())
+    assert pq.read_table(part.folder / dataset_shards.INDEX)["k"].to_pylist() == [1, 2]
+    assert prepare(part, wanted) == []
+    assert prepare(part, settings(3, first=1)) == [1]  # it has to grow
+    with pytest.raises(InputError, match="first: expected 0 as in this run, found 1"):
+        prepare(part, settings(3))
+
+
+def test_ranges_meet_without_gap_or_overlap():
+    """Whatever the shards' size, three ranges have each sample once, and but the shards between two are in two of them."""
+    parts = [settings(samples, first=first, shard=7) for first, samples in ((0, 10), (10, 18), (28, 2))]
+    samples = [k for part in parts for number in part.shards() for k in part.samples_of(number)]
+    assert samples == list(range(30))
+    numbers = [number for part in parts for number in part.shards()]
+    assert numbers == [0, 1, 1, 2, 3, 4]
+
+
+def test_a_folder_of_the_earlier_version_is_left_alone(tmp_path):
+    place = Place(tmp_path / "set")
+    prepare(place, settings())
+    kept = place.folder / dataset_shards.SETTINGS
+    told = json.loads(kept.read_text()) | {"version": 1}
+    del told["first"]
+    kept.write_text(json.dumps(told))
+    with pytest.raises(InputError, match="version: expected 2, found 1, whose keys lack the seed; it can be trained with"):
+        prepare(place, settings())
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"", b"[]", b"\xff\xfe", b"[" * 100_000, b'{"version": 2, "samples": "4"}', b'{"version": 2, "samples": NaN}'),
+        *(b'{"version": 2, "samples": 4, "rig": ' + b"9" * 10_000 + b"}", b'{"version": 2, "samples": 4, "rig": "a\\u0000\\nb"}'),
+    ],
+)
+def test_damaged_settings_are_refused_in_one_line(tmp_path, content):
+    place = Place(tmp_path / "set")
+    place.folder.mkdir()
+    kept = place.folder / dataset_shards.SETTINGS
+    kept.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        prepare(place, settings())
+    line = str(caught.value)
+    assert line.startswith(f"{kept}: ") and line.isprintable() and len(line) < 600
+    assert kept.read_bytes() == content
+
+
+@pytest.mark.parametrize("content", [b"", b"nothing", b"[]"])
+def test_a_damaged_shard_is_named_with_the_way_on(made, tmp_path, content):
+    """Also one that is whole but has another's truth."""
+    place = Place(tmp_path / "set")
+    shutil.copytree(made.folder, place.folder)
+    path = place.shard(1)
+    if content == b"[]":
+        with tarfile.open(path, "w") as archive:
+            for k in (2, 3):
+                entry = tarfile.TarInfo(f"5-{k:08d}.json")
+                entry.size = len(content)
+                archive.addfile(entry, io.BytesIO(content))
+        assert prepare(place, settings()) == []
+    else:
+        path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        assert prepare(place, settings()) == []
+        write_index(place, settings())
+    assert str(path) in str(caught.value) and "delete the file" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_many_shards_cost_no_more_each(tmp_path):
+    """A folder of a million samples is opened in a moment: what is asked of each shard doesn't depend on the others' number."""
+    place = Place(tmp_path / "set")
+    wanted = settings(200_000)
+    before = time.perf_counter()
+    assert len(prepare(place, wanted)) == len(wanted.shards()) == 100_000
+    assert time.perf_counter() - before < 10
+
+
+def test_the_index_is_written_piece_by_piece(made, monkeypatch, tmp_path):
+    place = Place(tmp_path / "set")
+    shutil.copytree(made.folder, place.folder)
+    monkeypatch.setattr(dataset_shards, "ROWS", 3)
+    write_index(place, settings())
+    written, whole = (pq.ParquetFile(one.folder / dataset_shards.INDEX) for one in (place, made))
+    assert written.num_row_groups == 2 and written.read().equals(whole.read())

@@ -1,0 +1,128 @@
+"""Truth of a data set's samples, as far as the networks learn from it: read strictly from a shard's JSON, then as arrays."""
+
+from collections.abc import Sequence
+from hashlib import blake2b
+from typing import Annotated, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from recon.errors import InputError, one_line
+
+CIRCLES = 3
+FARTHEST = 1e6  # px, or digital numbers: more is no measurement, and overflows in 32 bits
+
+Array = NDArray[np.float64]
+Value = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
+Length = Annotated[float, Field(ge=0, le=FARTHEST)]
+Share = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]
+Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
+Place = tuple[Value, Value]
+Ellipse = tuple[Value, Value, Length, Length, Value]
+Record = TypeVar("Record", bound="SampleTruth")
+
+
+class Strict(BaseModel):
+    """Numbers that are numbers, no text of digits; fields that the networks don't learn from may be there."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False, frozen=True)
+
+
+class Size(Strict):
+    """The part of a camera that matters here."""
+
+    size: tuple[Pixels, Pixels]  # width, height
+
+
+class ViewTruth(Strict):
+    """What one camera sees; without a target before it all but the camera may be null."""
+
+    camera: Size
+    centres: tuple[Place, Place, Place] | None
+    visible: tuple[Share, Share, Share] | None = None
+    inside: tuple[bool, bool, bool] | None = None
+    blur_px: tuple[Length, Length, Length] | None = None
+    white_dn: Length | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> "ViewTruth":
+        for name in ("visible", "inside", "blur_px") if self.centres is not None else ():
+            if getattr(self, name) is None:
+                raise ValueError(f"{name}: expected three values, as there are centres, found none")
+        return self
+
+
+class PatchTruth(ViewTruth):
+    """The same with the patches' places."""
+
+    patch_origins: tuple[Place, Place, Place]
+    ellipses: tuple[Ellipse, Ellipse, Ellipse] | None
+
+
+class SampleTruth(Strict):
+    """A sample by its views."""
+
+    k: Annotated[int, Field(ge=0)] | None = None
+    seed: Annotated[int, Field(ge=0)] | None = None
+    views: tuple[ViewTruth, ViewTruth]
+
+
+class PatchedTruth(SampleTruth):
+    """The same with the patches' places."""
+
+    views: tuple[PatchTruth, PatchTruth]
+
+
+def parse(place: str, content: bytes, model: type[Record]) -> Record:
+    """Read a sample's JSON; InputError in one line where it is damaged, or a field isn't what it should be."""
+    try:
+        return model.model_validate_json(content)
+    except ValidationError as error:
+        raise InputError(f"{place}: {one_line(error)}") from None
+
+
+def identity(truth: SampleTruth, content: bytes) -> int:
+    """A number that two samples share if they are the same one, which seed, k and all else agree on; 0 where it isn't known."""
+    known = truth.k is not None and truth.seed is not None
+    return int.from_bytes(blake2b(content, digest_size=8).digest(), "big") if known else 0
+
+
+class Facts(NamedTuple):
+    """What is known of n views. Without a target centres are NaN and the rest is 0."""
+
+    size: Array  # (n, 2) px, width and height in full resolution
+    centres: Array  # (n, 3, 2) px of full resolution
+    visible: Array  # (n, 3) fraction of each outer disc that is seen
+    inside: NDArray[np.bool_]  # (n, 3)
+    blur: Array  # (n, 3) px of full resolution
+    white: Array  # (n,) digital number of the target's white
+
+
+def facts(views: Sequence[ViewTruth]) -> Facts:
+    """Arrays of some views' truth."""
+    there = np.array([view.centres is not None for view in views])
+    nothing = (0.0,) * CIRCLES
+    centres = np.full((len(views), CIRCLES, 2), np.nan)
+    centres[there] = np.reshape([view.centres for view in views if view.centres is not None], (-1, CIRCLES, 2))
+    visible, inside, blur = (
+        np.array([getattr(view, name) or nothing for view in views], float) for name in ("visible", "inside", "blur_px")
+    )
+    return Facts(
+        np.array([view.camera.size for view in views], float),
+        centres,
+        np.where(there[:, None], visible, 0.0),
+        np.where(there[:, None], inside, 0.0).astype(bool),
+        np.where(there[:, None], blur, 0.0),
+        np.where(there, [view.white_dn or 0.0 for view in views], 0.0),
+    )
+
+
+def ellipses_in_patches(views: Sequence[PatchTruth]) -> Array:
+    """Ellipses (3 n, 5) of views' discs as their patches show them; NaN without a target."""
+    ellipses = np.full((len(views), CIRCLES, 5), np.nan)
+    for ellipse, view in zip(ellipses, views, strict=True):
+        if view.ellipses is not None:
+            ellipse[:] = view.ellipses
+            ellipse[:, :2] -= view.patch_origins
+    return ellipses.reshape(-1, 5)
