@@ -37,7 +37,7 @@ def _manifest(path: Path) -> object:
 
 
 def _shard(path: Path) -> object:
-    return shard_reader.read_views(path.parent)
+    return shard_reader.read_views([path.parent])
 
 
 def _sequence(path: Path) -> object:

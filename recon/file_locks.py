@@ -9,6 +9,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+LONGEST = 200  # characters of a line that says who holds a lock
 PATIENCE_S = 3.0  # after which a wait is announced
 
 
@@ -35,16 +36,22 @@ def held(path: Path, announce: Callable[[str], None] | None = None) -> Iterator[
         announce(holder(path))
         lock.acquire()
     with suppress(OSError):  # Windows lets nobody write to a file that is locked
-        path.write_text(f"process {os.getpid()} of {platform.node()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC\n")
+        path.write_text(this_process(), encoding="utf-8")
     try:
         yield
     finally:
         lock.release()
 
 
+def this_process() -> str:
+    """A line that says who holds a lock, and since when."""
+    return f"process {os.getpid()} on {platform.node()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC\n"
+
+
 def holder(path: Path) -> str:
-    """Who holds a lock, as it wrote into the lock's file: process, machine and start."""
+    """Who holds a lock, as of a file with its line, which may be missing yet, or cut short."""
     try:
-        return path.read_text(encoding="utf-8").strip() or "another process"
-    except (OSError, UnicodeDecodeError):
-        return "another process"
+        text = path.read_text(encoding="utf-8", errors="replace")[:LONGEST]
+    except OSError:
+        text = ""
+    return "".join(letter for letter in text.partition("\n")[0] if letter.isprintable()) or "another process"

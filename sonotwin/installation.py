@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from recon import cores
 from sonotwin import namesakes
 from twin import llvm
 
@@ -77,8 +78,7 @@ def _system() -> Iterator[Finding]:
     else:
         yield Finding("core", "Python", "problem", text, "install Python 3.11 or newer")
     yield Finding("machine", "system", "ok", _system_name())
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    text = f"{cores} cores"
+    text = f"{cores.usable()} cores"
     if hasattr(os, "sysconf"):  # not on Windows
         text += f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB of memory"
     yield Finding("machine", "size", "ok", text)

@@ -89,7 +89,8 @@ class _Told(Dataset["Batch | InputError"]):
 
 def _apart(_: int) -> None:
     """Signals to stop are for the process that trains; those that make its batches end with it."""
-    os.setpgrp()
+    if hasattr(os, "setpgrp"):  # not on Windows
+        os.setpgrp()
 
 
 def generator_of(seed: int, step: int) -> Generator:

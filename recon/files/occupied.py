@@ -9,20 +9,18 @@ daemon, SMB with its usual options. A disk without any locks is used without, an
 import errno
 import logging
 import os
-import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from datetime import UTC, datetime
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from recon import file_locks
 from recon.errors import InputError
 
 log = logging.getLogger(__name__)
 
 WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
-LONGEST = 200  # characters of what a file says about its writer
 
 
 @contextmanager
@@ -43,7 +41,7 @@ def occupied(folder: Path) -> Iterator[None]:
             after.enter_context(FileLock(mark, blocking=False, fallback_to_soft=False))
         except Timeout:
             raise InputError(
-                f"{folder}: expected a folder that no other run is writing, found {_told(who)} at work in it; "
+                f"{folder}: expected a folder that no other run is writing, found {file_locks.holder(who)} at work in it; "
                 "wait for its end, or choose another folder"
             ) from None
         except OSError as error:
@@ -51,9 +49,7 @@ def occupied(folder: Path) -> Iterator[None]:
                 raise
             log.warning("%s: this disk has no locks; see to it that no other run writes there", folder)
         after.callback(_remove, (who, mark))  # before the release, so that nobody waits for a name that then goes away
-        who.write_text(
-            f"process {os.getpid()} on {socket.gethostname()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC\n", encoding="utf-8"
-        )
+        who.write_text(file_locks.this_process(), encoding="utf-8")  # beside the locked file, which Windows lets nobody read
         yield
 
 
@@ -62,15 +58,6 @@ def _mark(folder: Path) -> Path:
     folder.parent.mkdir(parents=True, exist_ok=True)
     beside = folder.name and os.access(folder.parent, os.W_OK)
     return (folder.parent if beside else folder) / f".{folder.name}.occupied"
-
-
-def _told(who: Path) -> str:
-    """What a run says about itself; another one's file may be missing yet, or cut short."""
-    try:
-        text = who.read_text(encoding="utf-8", errors="replace")[:LONGEST]
-    except OSError:
-        text = ""
-    return "".join(letter for letter in text.partition("\n")[0] if letter.isprintable()) or "another one"
 
 
 def _remove(files: tuple[Path, ...]) -> None:

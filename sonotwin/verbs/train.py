@@ -15,7 +15,6 @@ hour to some hours are asked for; the published ones take 6 to 20 times as long.
 """
 
 import json
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +24,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from rich.console import Console
 from rich.progress import Progress
 
+from recon import cores
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown
@@ -131,7 +131,7 @@ def run(config: Config) -> None:
 
 def _train(config: Config, console: Console) -> None:
     goes_on = check_resumed(config)
-    torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
+    torch.set_num_threads(config.threads or cores.usable())
     torch.manual_seed(config.seed)
     module = network(config.network)
     if config.init is not None:

@@ -129,7 +129,7 @@ def test_one_process_writes_at_a_time(tmp_path, place):
     with ours as temporary:
         other = program(tmp_path, f"file_locks.PATIENCE_S = 0.0\nwith atomic.{theirs}")
         said = other.stderr.readline()
-        assert re.search(rf"out: waiting for process {os.getpid()} of .+ since 20.+ UTC, which is writing it", said)
+        assert re.search(rf"out: waiting for process {os.getpid()} on .+ since 20.+ UTC, which is writing it", said)
         (temporary / "mark" if place == "folder" else temporary).write_text("1")
     assert other.wait() == 0 and other.stderr.read() == ""
     assert (tmp_path / "out" / "mark" if place == "folder" else tmp_path / "out").read_text() == "12"

@@ -93,7 +93,7 @@ def test_a_damaged_note_is_no_trouble(tmp_path):
     folder = tmp_path / "out"
     with occupied(folder):
         note = next(path for path in tmp_path.iterdir() if path.suffix == ".txt")
-        for content, told in ((b"\xff\x00\x1b[2J" * 1000, r"\ufffd"), (b"", "another one")):
+        for content, told in ((b"\xff\x00\x1b[2J" * 1000, r"\ufffd"), (b"", "another process")):
             note.write_bytes(content)
             with pytest.raises(InputError, match=rf"found {told}") as caught, occupied(folder):
                 pass
