@@ -12,7 +12,7 @@ TWIN := .venv/.twin
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint slow docs accuracy benchmark paper clean
+.PHONY: help setup demo test lint slow docs accuracy benchmark campaign paper clean
 
 help:  ## show this
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -54,6 +54,10 @@ accuracy: setup  ## measure errors against the ground truth and the paper's figu
 
 benchmark: setup  ## measure speed
 	@$(BIN)/python -m benchmarks $(ONLY)
+
+# Hours; parts that have a table in outputs/campaign/ are kept, and ONLY=part does one anew.
+campaign: setup  ## attack every command: bad inputs, fuzzing, kills, full disks, two writers, long runs
+	@$(BIN)/python -m campaign $(ONLY) $(ARGS)
 
 # Hours; goes on where it was stopped. Trials are shared: planes, sphere and optics are figures of the same laboratories, and so are
 # probe and cylinders.

@@ -4,7 +4,6 @@ Parts: bad_inputs, fuzzing, kills, full_disk, two_writers, soak; all of them tak
 outputs/campaign/PART.md until it is asked for by name.
 """
 
-import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,8 +11,10 @@ from pathlib import Path
 
 from campaign import bad_inputs, full_disk, fuzzing, kills, soak, sources, two_writers
 from recon.files import atomic
+from twin.accuracy import table_rows
 
-OUT, DOCUMENT = Path("outputs/campaign"), Path("docs/trust.md")
+ROOT = Path(__file__).resolve().parents[1]
+OUT, DOCUMENT = ROOT / "outputs" / "campaign", ROOT / "docs" / "trust.md"
 WORKERS = 2
 
 
@@ -79,32 +80,18 @@ def main(arguments: Sequence[str]) -> int:
         print(f"campaign: {unknown.pop()}: expected one of {', '.join(PARTS)}", file=sys.stderr)
         return 2
     place = OUT / "sources"
-    sources.make(place.resolve())
+    sources.make(place)
     bad_inputs.clear(place)
     faults = 0
     for name in named or [name for name in PARTS if not (OUT / f"{name}.md").exists()]:
         part = PARTS[name]
-        lines, wrong = part.run(place.resolve(), counts[0] if counts else part.count)
+        lines, wrong = part.run(place, counts[0] if counts else part.count)
         faults += wrong
         with atomic.new_file(OUT / f"{name}.md") as path:
             path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        table_rows.refresh(DOCUMENT, name, "\n".join(lines))
         print(f"{name}: {wrong} faults", *lines, "", sep="\n")
-    _put_into(DOCUMENT, {name: OUT / f"{name}.md" for name in PARTS})
     return 1 if faults else 0
-
-
-def _put_into(document: Path, tables: dict[str, Path]) -> None:
-    """Put the tables that are there into the places <!-- NAME --> ... <!-- end --> of a page."""
-    if not document.exists():
-        return
-    text = document.read_text(encoding="utf-8")
-    for name, path in tables.items():
-        if path.exists():
-            lines = path.read_text(encoding="utf-8")
-            pattern = rf"(<!-- {name} -->\n)(.*?)(<!-- end -->)"
-            text = re.sub(pattern, lambda found, lines=lines: found[1] + lines + found[3], text, flags=re.DOTALL)
-    with atomic.new_file(document) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

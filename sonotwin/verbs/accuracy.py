@@ -26,7 +26,8 @@ from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
 Group = Literal[
-    "optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking", "session", "studies", "strangers"
+    "optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking", "session", "studies", "strangers",
+    "trust",
 ]  # fmt: skip
 MODULES = {
     "session": "sonotwin.session_accuracy",
