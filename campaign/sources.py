@@ -1,6 +1,6 @@
 """Valid inputs, small ones, made by the commands themselves, and the commands that read them."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -118,15 +118,15 @@ COMMANDS = (
 )  # fmt: skip
 
 
-def make(folder: Path) -> None:
-    """Make all sources that aren't there yet; raises RuntimeError if a command fails."""
+def make(folder: Path, names: Collection[str] | None = None) -> None:
+    """Make some sources, or all and what no command writes, as far as they aren't there; RuntimeError if a command fails."""
     folder.mkdir(parents=True, exist_ok=True)
     for line in MADE:
-        if not (folder / _out(line)).exists():
+        if (names is None or _out(line) in names) and not (folder / _out(line)).exists():
             outcome = commands.run(line, folder, LONGEST_S)
             if outcome.status:
                 raise RuntimeError(f"sonotwin {' '.join(line)}: {outcome.said}")
-    if not (folder / "study.yaml").exists():
+    if names is None and not (folder / "study.yaml").exists():
         _write_others(folder)
 
 

@@ -10,7 +10,7 @@ import pytest
 from sonotwin import installation
 
 ROOT = Path(__file__).resolve().parent.parent
-OURS = {"recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks", "tests"}
+OURS = {"recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks", "campaign", "tests"}
 RENDERER = {"mitsuba", "drjit"}
 NEEDS = {  # parts of the requirements, as they stand in pyproject.toml
     "recon": {"core"},

@@ -1,0 +1,61 @@
+"""A sample of the campaign; all of it takes hours and is run by `make campaign`."""
+
+from pathlib import Path
+
+import pytest
+
+from campaign import bad_inputs, full_disk, fuzzing, kills, soak, sources, two_writers
+from campaign.sources import COMMANDS
+
+NAMES = {"ball", "scan", "skin", "volume"}
+COUNT = 70
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("campaign") / "sources"
+    sources.make(folder, NAMES)
+    return folder
+
+
+@pytest.mark.slow
+def test_bad_inputs_are_refused(place):
+    """Some of every verb's whose sources are quickly made; how long they take isn't tested: machines are noisy."""
+    few = [command for command in COMMANDS if set(command.folders) <= NAMES and not command.minutes]
+    chosen = bad_inputs.chosen(bad_inputs.cases(place, few), COUNT, seed=21)
+    found = bad_inputs.run(chosen, place, workers=1)
+    wrong = {f"{one.case.command.verb} {one.case.fault}": (one.fault, one.outcome.said) for one in found if one.fault}
+    assert not {name: fault for name, fault in wrong.items() if fault[0] != "slow"}
+
+
+@pytest.mark.slow
+def test_killed_commands_lose_nothing(place):
+    tallies = kills.run(place, moments=4, seed=3, workers=1, only=["surface", "sweep"])
+    assert all(tally.good for tally in tallies), tallies
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not full_disk.can_mount(), reason="a small disk can't be mounted")
+def test_full_disks_are_named_and_old_results_kept(place):
+    found = full_disk.run(place, only=["freehand", "sweep"])
+    assert len(found) == 6 and all(one.good for one in found), full_disk.table(found)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not two_writers.can_part(), reason="no process namespaces")
+def test_two_writers_dont_mix(place):
+    pairs = two_writers.run(place, rounds=1, only=["surface"])
+    assert pairs and all(pair.good for pair in pairs), pairs
+
+
+@pytest.mark.slow
+def test_readers_survive_some_seconds_of_fuzzing(place):
+    pytest.importorskip("atheris")
+    found = fuzzing.run(place, 8.0, only=["manifest", "track", "image"], workers=1)
+    assert all(one.inputs > 100 and not one.faults for one in found), found
+
+
+@pytest.mark.slow
+def test_memory_stays_as_it_is(place):
+    found = soak.run(place, "freehand", 1500)
+    assert found.growth_mb < 20
