@@ -90,7 +90,7 @@ def main(name: str, place: Path, folder: Path, settings: Sequence[str]) -> None:
     reader = READERS[name]
     corpus = folder / "corpus"
     corpus.mkdir()
-    for number, seed in enumerate(reader.seeds):
+    for number, seed in enumerate(seed for seed in reader.seeds if (place / seed).exists()):
         (corpus / str(number)).write_bytes((place / seed).read_bytes())
     path = folder / "read" / reader.name
     path.parent.mkdir()
