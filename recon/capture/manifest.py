@@ -5,7 +5,6 @@ A capture holds one part or several: a surface, a board, a sweep or several with
 Everything is checked on load; a fault is an `InputError` of one line that names the file, what was expected and what was found.
 """
 
-import json
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from recon.errors import InputError, one_line
-from recon.files.regular import read_bytes
+from recon.files import json_text
 from recon.model.boards import Board
 from recon.model.patterns import Axis, Patterns
 
@@ -282,13 +281,7 @@ def read_manifest(folder: Path) -> Manifest:
         If it is missing, not JSON, of another version, or a field is wrong.
     """
     path = Path(folder) / MANIFEST
-    try:
-        content = json.loads(read_bytes(path), parse_constant=lambda value: _refuse_constant(path, value))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected JSON, found {error}") from None
-    except RecursionError:
-        raise InputError(f"{path}: expected JSON, found values nested too deeply") from None
-    return validated(Manifest, content, path)
+    return validated(Manifest, json_text.read(path), path)
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
@@ -306,10 +299,6 @@ def axes_not_encoded(patterns: Patterns) -> list[Axis]:
     """Axes of the projector along which a sequence has neither fringes nor Gray code; a board's needs both."""
     axes: tuple[Axis, Axis] = ("columns", "rows")
     return [axis for axis in axes if axis not in patterns.axes]
-
-
-def _refuse_constant(path: Path, value: str) -> None:
-    raise InputError(f"{path}: expected finite numbers, found {value}")
 
 
 def validated(model: type[Model], content: object, path: Path) -> Model:

@@ -13,14 +13,14 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from recon.capture import calibration_files
 from recon.capture.images import Size, image_files, read_grey, write_images
+from recon.capture.manifest import validated
 from recon.capture.surface_part import SurfaceCapture
-from recon.errors import InputError, one_line
-from recon.files import atomic
-from recon.files.regular import read_bytes
+from recon.errors import InputError
+from recon.files import atomic, json_text
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
 from recon.model.calibration import Calibration
@@ -123,10 +123,7 @@ def speed_of(folder: Path) -> float | None:
         If our file is damaged, or can't be read.
     """
     path = folder / MARKER
-    try:
-        return Mark.model_validate_json(read_bytes(path)).speed_m_s if path.is_file() else None
-    except ValidationError as error:
-        raise InputError(f"{path}: {one_line(error)}") from None
+    return validated(Mark, json_text.read(path), path).speed_m_s if path.is_file() else None
 
 
 def is_theirs(surface: SurfaceCapture) -> bool:
