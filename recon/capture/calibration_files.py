@@ -31,6 +31,7 @@ PAIR_MOTIONS = (("Rlr", "Tlr"), ("R", "T"))
 STEREO_KEYS = ("K1", "dist1", "K2", "dist2", "R", "t")
 OLD_KEYS = {"distCoeffs1": "dist1", "distCoeffs2": "dist2"}  # of the authors' first files
 FEW_DIGITS = 1.1e-5  # of a rotation's products, in any of the files: five decimals mostly pass
+LARGEST = 1e8  # px, of a focal length; and of any coefficient
 OWN_KEYS = ("schema", "parameters", "covariance")  # any other is a device
 
 
@@ -202,6 +203,9 @@ def _decimal(matrices: Mapping[str, NDArray]) -> dict[str, Array]:
 
 
 def _camera(path: Path, name: str, size: tuple[int, int], matrix: Array, distortion: Array, camera_from_world: Array) -> Camera:
+    for part, values in (("matrix", matrix), ("distortion", distortion)):
+        if (np.abs(values) > LARGEST).any():
+            raise InputError(f"{path}: {name}.{part}: expected numbers of up to {LARGEST:g}, found {np.abs(values).max():g}")
     if rigid.fault(camera_from_world, ROTATION) and not rigid.fault(camera_from_world, FEW_DIGITS):
         camera_from_world = rigid.nearest(camera_from_world)
     try:

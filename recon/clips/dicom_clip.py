@@ -15,11 +15,17 @@ from numpy.typing import NDArray
 from pydicom.errors import BytesLengthException, InvalidDicomError
 from pydicom.pixels import apply_color_lut, iter_pixels
 
+from recon.capture.image_formats import MOST_PX
 from recon.clips.clip import Box, Clip, checked_seconds
 from recon.errors import InputError
-from recon.files.regular import check_there
+from recon.files.regular import check_there, opened
 
 Dataset = Any
+
+MOST_FRAMES = 1_000_000
+MOST_BYTES = 1 << 33
+PREAMBLE, PREFIX = 128, b"DICM"
+DEFLATED, MOST_META = b"1.2.840.10008.1.2.1.99", 4096  # the transfer syntax, and bytes within which it is named
 
 TWO_D, TISSUE, CENTIMETRES = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits
 DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or compressed in ways that need other packages
@@ -40,9 +46,11 @@ def read(path: Path) -> Clip:
     try:
         header = _dataset(path, stop_before_pixels=True)
         count = int(header.get("NumberOfFrames") or 1)
-        if count < 1:
+        if not 1 <= count <= MOST_FRAMES:
             raise ValueError(f"NumberOfFrames {count}")
         size = int(header.Columns), int(header.Rows)
+        if not 0 < size[0] * size[1] <= MOST_PX:
+            raise ValueError(f"images of {size[0]}x{size[1]}")
         seconds, region = times(header, count), b_scan_region(header)
     except DAMAGED as error:
         raise InputError(f"{path}: expected a DICOM file, a video or a folder of images, found {_brief(error)}") from None
@@ -67,9 +75,13 @@ def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np
 
 def _dataset(path: Path, stop_before_pixels: bool = False) -> Dataset:
     """Read a file, without pydicom's warnings of values that break a rule that nothing here depends on."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), opened(path, MOST_BYTES) as stream:
         warnings.simplefilter("ignore")
-        return pydicom.dcmread(path, stop_before_pixels=stop_before_pixels)
+        stream.seek(PREAMBLE)
+        if stream.read(len(PREFIX)) == PREFIX and DEFLATED in stream.read(MOST_META):
+            raise ValueError("one that is packed as a whole")  # which may unpack to more than any memory
+        stream.seek(0)
+        return pydicom.dcmread(stream, stop_before_pixels=stop_before_pixels)
 
 
 def _grey(frame: NDArray, header: Dataset) -> NDArray[np.uint8]:

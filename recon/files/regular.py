@@ -13,6 +13,7 @@ Answer = TypeVar("Answer")
 
 MOST_BYTES = 1 << 30  # of a file that is read whole
 MOST_TEXT = 1 << 26  # bytes of a text whose values are all kept
+MOST_TABLE = 1 << 28  # of a table of poses: hours
 AT_ONCE = getattr(os, "O_NONBLOCK", 0)  # a pipe that nobody writes to would be waited for
 FLAGS = os.O_RDONLY | AT_ONCE | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
 KINDS = {
