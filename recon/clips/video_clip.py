@@ -13,6 +13,8 @@ from recon.clips.clip import Clip, checked_seconds
 from recon.errors import InputError
 from recon.files.regular import check_there
 
+# OpenCV's own reader of MJPEG writes lines to the console
+BACKEND = cv2.CAP_FFMPEG if cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG) else cv2.CAP_ANY
 LEAST_STEP_S = 1e-6  # between frames' time stamps; without them all are 0
 
 
@@ -44,7 +46,7 @@ def _frames(path: Path) -> Iterator[tuple[float, NDArray[np.uint8], float]]:
     """Time stamp in s, image : (h, w, 3) and the video's rate in frames/s, of each frame."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent: of a damaged video we say so ourselves, in one line
     os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")  # a file may name others, far away
-    video = cv2.VideoCapture(str(path))
+    video = cv2.VideoCapture(str(path), BACKEND)
     try:
         width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
         if not width * height <= MOST_PX:

@@ -78,8 +78,8 @@ def session(path: Path, interface: Interface, threads: int = 0) -> onnxruntime.I
     # threads that wait by spinning would take the cores from the fit of rims that follows: 75 ms from nothing instead of 41
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        opened = onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
-    except FAULTS as error:
+        opened = onnxruntime.InferenceSession(network, options, ["CPUExecutionProvider"], enable_fallback=0)
+    except (*FAULTS, ValueError) as error:  # the latter of texts in it
         raise InputError(f"{path}: expected an ONNX network, found {_brief(str(error))}") from None
     for what, expected, found in (("inputs", interface[0], opened.get_inputs()), ("outputs", interface[1], opened.get_outputs())):
         shapes = {node.name: tuple(node.shape) for node in found}
