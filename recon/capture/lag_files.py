@@ -3,19 +3,17 @@
 import json
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, field_validator
+from pydantic import field_validator
 
 from recon.capture.manifest import validated
 from recon.files import atomic, json_text
-from recon.model.rig import Finite, NotNegative
+from recon.model.rig import Finite, NotNegative, Part
 
 FILE = "lag.json"
 
 
-class LagFile(BaseModel):
+class LagFile(Part):
     """The lag of the scanner's images behind the cameras."""
-
-    model_config = ConfigDict(frozen=True)
 
     lag_s: Finite
     sigma_s: NotNegative

@@ -13,7 +13,6 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
 from recon.capture import calibration_files
 from recon.capture.images import Size, image_files, read_grey, write_images
@@ -26,6 +25,7 @@ from recon.geometry.camera import Array, Camera
 from recon.model.calibration import Calibration
 from recon.model.patterns import CentreLine, Fringes, Patterns, Uniform
 from recon.model.probe import Speed
+from recon.model.rig import Part
 
 STEPS = 8
 PITCH = 12.0  # projector px
@@ -86,10 +86,8 @@ def read_images(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[ND
     return images, sequence, mask
 
 
-class Mark(BaseModel):
+class Mark(Part):
     """Content of `MARKER`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     layout: Literal["meza2021"] = "meza2021"
     speed_m_s: Speed | None = None

@@ -6,12 +6,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.files.regular import MOST_TABLE, read_bytes
 from recon.geometry import rigid
+from recon.model.rig import Part
 from recon.model.tracks import Track
 
 Array = NDArray[np.float64]
@@ -26,10 +27,8 @@ MOST_OFF = 0.02  # of a rotation from the nearest exact one
 Names = tuple[str, ...]
 
 
-class Columns(BaseModel):
+class Columns(Part):
     """Names of a table's columns, and units of their values."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     time: str
     time_unit: Literal["s", "ms", "us", "ns"] = "s"
