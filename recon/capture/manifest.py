@@ -13,7 +13,7 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
-from recon.errors import InputError, one_line
+from recon.errors import InputError, one_line, short
 from recon.files import json_text
 from recon.model import rig
 from recon.model.boards import Board
@@ -301,9 +301,19 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write the manifest into a capture folder."""
-    text = manifest.model_dump_json(indent=2, by_alias=True, exclude_none=True, exclude=None if manifest.sweeps else {"sweeps"})
+    """Write the manifest into a capture folder; raises InputError if a name in it is none in UTF-8."""
+    left_out = None if manifest.sweeps else {"sweeps"}
+    try:
+        text = manifest.model_dump_json(indent=2, by_alias=True, exclude_none=True, exclude=left_out)
+    except ValueError:  # of half a letter
+        strange = next((name for name in (manifest.name, manifest.root) if not _is_whole(name)), "others")
+        raise InputError(f"{MANIFEST}: expected names of folders in UTF-8, found {short(strange)}: rename the folder") from None
     (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
+
+
+def _is_whole(name: str) -> bool:
+    """Whether a name is text, and holds no byte that isn't part of any."""
+    return name.encode("utf-8", "replace").decode("utf-8") == name
 
 
 def image_name(frame: int) -> str:

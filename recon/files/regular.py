@@ -53,7 +53,7 @@ def opened(path: Path, most: int | None = None, expected: str = "a file") -> Ite
 def read_bytes(path: Path, most: int = MOST_BYTES, expected: str = "a file") -> bytes:
     """Content of a regular file; raises InputError as `opened` does."""
     with opened(path, most, expected) as stream:
-        return _ask(path, expected, lambda: stream.read(most))
+        return _ask(path, expected, stream.read)
 
 
 def read_text(path: Path, most: int = MOST_TEXT, expected: str = "a text") -> str:

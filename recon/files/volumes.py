@@ -148,7 +148,10 @@ def _nrrd_content(path: Path) -> tuple[NDArray, nrrd.NRRDHeader]:
         most += max(header.get("byte skip", header.get("byteskip", 0)), 0)
         stream = io.BytesIO(unpacker[packing]().decompress(stream.read(), min(most, MOST_BYTES)))
         header["encoding"] = "raw"
-    return nrrd.read_data(header, stream, index_order="C"), header
+    voxels = nrrd.read_data(header, stream, index_order="C")
+    if stream.read(1):
+        raise fault(path, "sizes", "numbers of all voxels", f"{header['sizes']}, and more data")
+    return voxels, header
 
 
 def _read_metaimage(path: Path) -> Volume:
