@@ -1,8 +1,12 @@
 """The exception for a user's mistake, reported in one line."""
 
+from collections.abc import Iterator
+
 from pydantic import ValidationError
 
 OWN_WORDS = {"int_parsing_size": "a whole number of fewer digits", "path_type": "a path"}  # of kinds of pydantic's
+LONGEST = 60  # letters, of a found value in a message
+MOST_BITS = 256  # of a number that is shown
 
 
 class InputError(ValueError):
@@ -27,21 +31,54 @@ def one_line(error: ValidationError) -> str:
     elif kind == "union_tag_invalid":
         text = f"expected one of {first['ctx']['expected_tags']}, found {first['ctx']['tag']!r}"
     elif kind in ("model_type", "model_attributes_type"):
-        text = f"expected a map of fields, found {_brief(found)}"
+        text = f"expected a map of fields, found {_shown(found)}"
     elif kind == "extra_forbidden":
-        text = f"expected no such field, found {_brief(found)}"
+        text = f"expected no such field, found {_shown(found)}"
     elif kind in OWN_WORDS:
-        text = f"expected {OWN_WORDS[kind]}, found {_brief(found)}"
+        text = f"expected {OWN_WORDS[kind]}, found {_shown(found)}"
     elif kind == "value_error":
         text = message.removeprefix("Value error, ")
         if field and not text.startswith("expected"):  # a model's own check names the field within it
             return f"{field}.{text}"
     else:
         expected = message.removeprefix("Input should be ").removeprefix("a valid ")
-        text = f"expected {expected}, found {_brief(found)}"
+        text = f"expected {expected}, found {_shown(found)}"
     return f"{field}: {text}" if field else text
 
 
-def _brief(value: object) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else text[:57] + "..."
+def short(text: str) -> str:
+    """A text for a message: in one line, of letters that any console takes, and not longer than sixty."""
+    text = " ".join(text[:1000].split())
+    text = text if text.isprintable() else text.encode("unicode_escape", "surrogatepass").decode("ascii")
+    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
+
+
+def _shown(value: object) -> str:
+    """The `repr` of a value of any size, or its beginning."""
+    text = ""
+    for piece in _pieces(value):
+        text += piece
+        if len(text) > LONGEST:
+            break
+    return short(text)
+
+
+def _pieces(value: object) -> Iterator[str]:
+    """Pieces of a value's `repr`, none of them long."""
+    if isinstance(value, dict):
+        for number, (key, inner) in enumerate(value.items()):
+            yield ", " if number else "{"
+            yield from _pieces(key)
+            yield ": "
+            yield from _pieces(inner)
+        yield "}" if value else "{}"
+    elif isinstance(value, list | tuple):
+        begin, end = "[]" if isinstance(value, list) else "()"
+        for number, inner in enumerate(value):
+            yield ", " if number else begin
+            yield from _pieces(inner)
+        yield end if value else begin + end
+    elif isinstance(value, int) and value.bit_length() > MOST_BITS:
+        yield f"a number of {value.bit_length()} bits"
+    else:
+        yield repr(value[:LONGEST] + "..." if isinstance(value, str) and len(value) > LONGEST else value)

@@ -1,14 +1,10 @@
 """Read a rig or a pattern sequence of `conf/` by its name, or one of the user's own from a YAML file."""
 
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from recon.capture import surface_part
 from recon.capture.manifest import validated
-from recon.errors import InputError
-from recon.files.regular import read_bytes
+from recon.files import yaml_text
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 from sonotwin import config
@@ -28,15 +24,7 @@ def read_rig(source: str | Path = "meza2021") -> Rig:
         If there is no such file, it is not YAML, or a field is wrong.
     """
     path = _file("rig", source)
-    return validated(Rig, read_yaml(path), path)
-
-
-def read_yaml(path: Path) -> Any:
-    """Content of a YAML file; raises InputError if there is none."""
-    try:
-        return yaml.safe_load(read_bytes(path))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected YAML, found {' '.join(str(error).split())}") from None
+    return validated(Rig, yaml_text.read(path), path)
 
 
 def read_patterns(source: str | Path = "paper_surface") -> Patterns:

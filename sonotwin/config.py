@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from recon.errors import InputError, one_line
+from recon.errors import InputError, one_line, short
 
 MOST_NAMES = 12  # of keys in a message
 MOST_DIGITS = 1000  # of a number; Hydra's parser can't take more than Python's own limit of some thousands
@@ -142,6 +142,8 @@ def _literal_if_not_grammar(verb: str, override: str) -> str:
             raise InputError(f"{verb}: {key}: expected balanced brackets and quotes, found {value}") from error
         if value[:1] in ("[", "{", "'", '"') or not re.fullmatch(r"[+~]*[\w./@:-]+", key):
             raise InputError(f"{verb}: {override}: can't be read as field=value: {_first_line(error)}") from error
+    except (ValueError, RecursionError) as error:  # of numbers of thousands of digits, and of brackets as deep
+        raise InputError(f"{verb}: {key}: expected a value, found {short(value)}, which can't be read") from error
     return f"{key}='{_escape(value)}'"
 
 

@@ -16,7 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from recon.errors import InputError
-from recon.files import atomic, metrics
+from recon.files import atomic, json_text, metrics
 from sonotwin.config import load
 
 RECORD = "reconstruct.json"  # by which the folder of all steps is known
@@ -133,9 +133,9 @@ class KeptSteps:
 def _read(path: Path) -> dict[str, str]:
     """A record; an empty one where none is there, or a damaged one, which costs work and no more."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        content = json_text.read(path) if path.is_file() else {}
         return {name: str(digest) for name, digest in content.items()}
-    except (ValueError, AttributeError):
+    except (InputError, AttributeError):
         return {}
 
 

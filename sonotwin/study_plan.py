@@ -8,8 +8,8 @@ from pydantic import Field, ValidationError
 
 from recon.capture.manifest import validated
 from recon.errors import InputError, one_line
+from recon.files import yaml_text
 from recon.model.rig import Part
-from sonotwin.choices import read_yaml
 from sonotwin.config import folder
 from twin.studies import experiments, factors, study_runs
 from twin.studies.beside_paper import Figure
@@ -59,7 +59,7 @@ def read_study(name: object) -> Study | None:
     if path.suffix not in (".yaml", ".yml"):
         names = sorted(each.stem for each in known.parent.glob("*.yaml"))
         raise InputError(f"name: expected {SWEEP}, one of {', '.join(names)}, or a YAML file, found {name}")
-    return validated(Study, read_yaml(path), path)
+    return validated(Study, yaml_text.read(path), path)
 
 
 def trials(of: str, settings: Settings, points: Iterable[Point], seeds: Iterable[int]) -> list[Trial]:
@@ -94,7 +94,7 @@ def choice(name: str, value: str) -> Any:
     if not path.is_file():
         names = ", ".join(sorted(each.stem for each in path.parent.glob("*.yaml")))
         raise InputError(f"over: {name}: expected one of {names}, found {value}")
-    content = read_yaml(path)
+    content = yaml_text.read(path)
     if not part:
         return content
     if part not in content:

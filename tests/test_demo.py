@@ -305,7 +305,7 @@ def test_what_is_left_out_is_said():
 def test_missing_networks_are_told_before_any_work(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(networks.load, "__defaults__", (tmp_path, 0))
     assert main(["demo", f"out={tmp_path / 'demo'}"]) == 2
-    assert "detector.onnx: expected a network, found no file" in capsys.readouterr().err
+    assert "detector.onnx: expected a network, found none" in capsys.readouterr().err
     assert not (tmp_path / "demo").exists()
 
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from recon.capture.manifest import SweepNameOrNone
-from recon.model.rig import Rig
+from recon.model.rig import Part, Rig
 from scenes.catalogue import build_scene
 from scenes.scene_types import Scene
 from twin.conditions import Conditions, drifted, printed
@@ -27,10 +27,8 @@ if TYPE_CHECKING:
 Shown = Callable[[Iterable["Frames"], int], Iterable["Frames"]]
 
 
-class SweepSettings(BaseModel):
+class SweepSettings(Part):
     """All that a sweep is made from; as in `conf/sweep.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Rig
     scene: dict

@@ -22,7 +22,7 @@ from recon.capture import calibration_files
 from recon.capture.manifest import MANIFEST, OPTICS, SWEEP, PartName, Purpose, is_sweep, read_manifest
 from recon.capture.writer import CaptureWriter, check_kept
 from recon.errors import InputError
-from recon.files import atomic, npz
+from recon.files import atomic, json_text, npz
 from recon.geometry.camera import Camera
 from recon.model.calibration import Calibration
 from scenes.scene_types import Scene
@@ -191,15 +191,7 @@ def write_json(path: Path, content: object) -> None:
 
 def read_json(path: Path) -> dict:
     """Read a description or settings; InputError if the file is missing or damaged."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        found = "none" if isinstance(error, FileNotFoundError) else (error.strerror or "an unreadable one").lower()
-        raise InputError(f"{path}: expected a file of the twin's ground truth, found {found}") from None
-    except RecursionError:
-        raise InputError(f"{path}: expected JSON, found it damaged: values nested too deeply") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected JSON, found it damaged: {error}") from None
+    content = json_text.read(path, "a file of the twin's ground truth")
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object, found a {type(content).__name__}, damaged or of something else")
     return content

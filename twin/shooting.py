@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from recon.model.rig import Part, Positive
 
@@ -14,10 +14,8 @@ def power_of_two(value: int) -> int:
     return value
 
 
-class Quality(BaseModel):
+class Quality(Part):
     """Rays a pixel, powers of two."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     view: int = Field(default=1, ge=1, le=256)  # of each of the four camera pixels that make a view's pixel
     patch: int = Field(default=4, ge=2, le=1024)
@@ -26,10 +24,8 @@ class Quality(BaseModel):
     _power_of_two = field_validator("view", "patch", "window")(power_of_two)
 
 
-class FilmQuality(BaseModel):
+class FilmQuality(Part):
     """Rays a pixel of a film's frames, powers of two."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     view: int = Field(default=1, ge=1, le=256)  # of each cell
     disc: int = Field(default=2, ge=1, le=256)  # of the circles' pixels

@@ -8,7 +8,7 @@
   which device 2 is, the content doesn't say: the projector if the file's name has `proj` in it, else camera 2.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.capture.manifest import SCANNER, read_manifest
-from recon.errors import InputError
+from recon.errors import InputError, short
 from recon.files import matlab, npz, opencv_storage
+from recon.files.opencv_storage import Values
 from recon.geometry import rigid
 from recon.geometry.camera import ROTATION, Array, Camera
 from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
@@ -30,6 +31,7 @@ PAIR_MOTIONS = (("Rlr", "Tlr"), ("R", "T"))
 STEREO_KEYS = ("K1", "dist1", "K2", "dist2", "R", "t")
 OLD_KEYS = {"distCoeffs1": "dist1", "distCoeffs2": "dist2"}  # of the authors' first files
 FEW_DIGITS = 1.1e-5  # of a rotation's products, in any of the files: five decimals mostly pass
+LARGEST = 1e8  # px, of a focal length; and of any coefficient
 OWN_KEYS = ("schema", "parameters", "covariance")  # any other is a device
 
 
@@ -50,20 +52,19 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
     forms = dict.fromkeys(STEREO_KEYS, npz.Form("fiu"))
     if path.is_file() and matlab.is_matlab(path):
         return _stereo_pair(path, _decimal(matlab.read(path, forms, OLD_KEYS)), sizes or {})
-    with opencv_storage.opened(path, "a calibration file") as storage:
-        if storage is None:
-            return _stereo_pair(path, _decimal(npz.read(path, forms)), sizes or {})
-        keys = storage.root().keys() if storage.root().isMap() else []
-        if "schema" in keys:
-            return _own(path, storage)
-        if "K1" in keys or "K2" in keys:
-            return _stereo_pair(path, _matrices(path, storage, STEREO_KEYS), sizes or {})
-        if "M2" in keys and "M4" not in keys:
-            return _two_cameras(path, storage, keys, sizes or {})
-        if "M1" in keys or "M4" in keys:
-            return _slmaster(path, _matrices(path, storage, SLMASTER_KEYS), sizes or {})
-        found = ", ".join(keys) or "no keys"
-        raise InputError(f"{path}: expected schema, or M1 and M4, or M1 and M2, or K1 and K2, found {found}")
+    values = opencv_storage.read(path, "a calibration file")
+    if values is None:
+        return _stereo_pair(path, _decimal(npz.read(path, forms)), sizes or {})
+    if "schema" in values:
+        return _own(path, values)
+    if "K1" in values or "K2" in values:
+        return _stereo_pair(path, _matrices(path, values, STEREO_KEYS), sizes or {})
+    if "M2" in values and "M4" not in values:
+        return _two_cameras(path, values, sizes or {})
+    if "M1" in values or "M4" in values:
+        return _slmaster(path, _matrices(path, values, SLMASTER_KEYS), sizes or {})
+    found = short(", ".join(values)) or "no keys"
+    raise InputError(f"{path}: expected schema, or M1 and M4, or M1 and M2, or K1 and K2, found {found}")
 
 
 def of_capture(folder: Path, given: Path | None = None) -> Calibration | None:
@@ -132,34 +133,29 @@ def complete(path: Path, calibration: Calibration) -> None:
         write(path, Calibration({**before.cameras, **missing}, before.uncertainty))
 
 
-def _own(path: Path, storage: cv2.FileStorage) -> Calibration:
-    found = storage.getNode("schema").string() if storage.getNode("schema").isString() else "a value that is no text"
-    if found != SCHEMA:
+def _own(path: Path, values: Values) -> Calibration:
+    if values["schema"] != SCHEMA:
+        found = short(values["schema"]) if isinstance(values["schema"], str) else "a value that is no text"
         raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
     cameras = {}
-    for name in storage.root().keys():
-        if name in OWN_KEYS:
-            continue
-        node = storage.getNode(name)
-        if not node.isMap():
+    for name in [name for name in values if name not in OWN_KEYS]:
+        device = values[name]
+        if not isinstance(device, dict):
             raise InputError(f"{path}: {name}: expected size, matrix, distortion and camera_from_world, found something else")
-        values = {
-            key: opencv_storage.matrix(path, f"{name}.{key}", node.getNode(key))
-            for key in ("matrix", "distortion", "camera_from_world")
-        }
-        size = node.getNode("size")
-        lengths = [size.at(i) for i in range(size.size())] if size.isSeq() else []
-        if len(lengths) != 2 or not all(length.isInt() and length.real() > 0 for length in lengths):
+        matrix, distortion, pose = (
+            opencv_storage.matrix(path, f"{name}.{key}", device.get(key)) for key in ("matrix", "distortion", "camera_from_world")
+        )
+        size = device.get("size")
+        if not isinstance(size, list) or len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
             raise InputError(f"{path}: {name}.size: expected width and height in px, found something else")
-        width, height = (int(length.real()) for length in lengths)
-        cameras[name] = _camera(path, name, (width, height), values["matrix"], values["distortion"], values["camera_from_world"])
+        cameras[name] = _camera(path, name, (size[0], size[1]), matrix, distortion, pose)
     if not cameras:
         raise InputError(f"{path}: expected at least one device, found none")
-    return Calibration(cameras, _uncertainty(path, storage, cameras))
+    return Calibration(cameras, _uncertainty(path, values, cameras))
 
 
-def _uncertainty(path: Path, storage: cv2.FileStorage, cameras: Mapping[str, Camera]) -> Uncertainty | None:
-    names = opencv_storage.names(storage)
+def _uncertainty(path: Path, values: Values, cameras: Mapping[str, Camera]) -> Uncertainty | None:
+    names = opencv_storage.names(values)
     if names is None:
         return None
     if not names:
@@ -167,8 +163,8 @@ def _uncertainty(path: Path, storage: cv2.FileStorage, cameras: Mapping[str, Cam
     known = {f"{device}.{name}" for device in cameras for name in MATRIX + DISTORTION + (MOTION if device != WORLD else ())}
     wrong = next((name for k, name in enumerate(names) if name not in known or name in names[:k]), None)
     if wrong is not None:
-        raise InputError(f"{path}: parameters: expected a device's parameter like projector.fx, each once, found {wrong}")
-    return Uncertainty(names, opencv_storage.covariance(path, storage, len(names)))
+        raise InputError(f"{path}: parameters: expected a device's parameter like projector.fx, each once, found {short(wrong)}")
+    return Uncertainty(names, opencv_storage.covariance(path, values, len(names)))
 
 
 def _slmaster(path: Path, values: Mapping[str, Array], sizes: Mapping[str, tuple[int, int]]) -> Calibration:
@@ -181,14 +177,14 @@ def _slmaster(path: Path, values: Mapping[str, Array], sizes: Mapping[str, tuple
     return Calibration({"cam1": camera, "projector": projector})
 
 
-def _two_cameras(path: Path, storage: cv2.FileStorage, keys: Sequence[str], sizes: Mapping[str, tuple[int, int]]) -> Calibration:
-    motion = next((pair for pair in PAIR_MOTIONS if set(pair) <= set(keys)), None)
+def _two_cameras(path: Path, stored: Values, sizes: Mapping[str, tuple[int, int]]) -> Calibration:
+    motion = next((pair for pair in PAIR_MOTIONS if set(pair) <= stored.keys()), None)
     if motion is None:
         raise InputError(
-            f"{path}: expected Rlr and Tlr, or R and T, which take camera 1 to camera 2, found {', '.join(keys)}; "
+            f"{path}: expected Rlr and Tlr, or R and T, which take camera 1 to camera 2, found {short(', '.join(stored))}; "
             "OpenCV's stereo_calib leaves R and T in extrinsics.yml: copy them into this file"
         )
-    values = _matrices(path, storage, (*PAIR_KEYS, *motion))
+    values = _matrices(path, stored, (*PAIR_KEYS, *motion))
     first = _camera(path, "cam1", _size(path, "cam1", sizes), values["M1"], values["D1"], np.eye(4))
     second = _camera(path, "cam2", _size(path, "cam2", sizes), values["M2"], values["D2"], _rigid(path, values, *motion))
     return Calibration({"cam1": first, "cam2": second})
@@ -207,6 +203,9 @@ def _decimal(matrices: Mapping[str, NDArray]) -> dict[str, Array]:
 
 
 def _camera(path: Path, name: str, size: tuple[int, int], matrix: Array, distortion: Array, camera_from_world: Array) -> Camera:
+    for part, values in (("matrix", matrix), ("distortion", distortion)):
+        if (np.abs(values) > LARGEST).any():
+            raise InputError(f"{path}: {name}.{part}: expected numbers of up to {LARGEST:g}, found {np.abs(values).max():g}")
     if rigid.fault(camera_from_world, ROTATION) and not rigid.fault(camera_from_world, FEW_DIGITS):
         camera_from_world = rigid.nearest(camera_from_world)
     try:
@@ -228,5 +227,5 @@ def _size(path: Path, name: str, sizes: Mapping[str, tuple[int, int]]) -> tuple[
     return sizes[name]
 
 
-def _matrices(path: Path, storage: cv2.FileStorage, keys: tuple[str, ...]) -> dict[str, Array]:
-    return {key: opencv_storage.matrix(path, key, storage.getNode(key)) for key in keys}
+def _matrices(path: Path, values: Values, keys: tuple[str, ...]) -> dict[str, Array]:
+    return {key: opencv_storage.matrix(path, key, values.get(key)) for key in keys}

@@ -1,48 +1,130 @@
-"""Image files of any common kind, PNG, BMP, TIFF or JPEG, decoded whole or refused in one line that names the file."""
+"""Image files of any common kind, PNG, BMP, TIFF or JPEG, decoded whole or refused in one line that names the file.
 
+Pillow decodes JPEG, as OpenCV's library writes lines of its own to the console where a file is damaged; OpenCV the last two.
+"""
+
+import io
 import struct
+import warnings
 import zlib
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
 from recon.errors import InputError
+from recon.files import png_images
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 SUFFIXES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
+KINDS = f"an image ({', '.join(SUFFIXES)})"
 MOST_PX = 1 << 26  # of an image
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+MOST_CHANNELS = 4
 JPEG_BEGIN, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+READERS = {  # by the beginnings of files
+    png_images.SIGNATURE: PngImagePlugin.PngImageFile,
+    JPEG_BEGIN: JpegImagePlugin.JpegImageFile,
+    b"BM": BmpImagePlugin.BmpImageFile,
+}
+TIFF_BEGINNINGS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"
+TIFF_WIDTH, TIFF_HEIGHT, TIFF_CHANNELS = 256, 257, 277  # tags
 PADDING = 64  # bytes, that a camera may leave behind a JPEG's end
+DAMAGE = (  # what Pillow raises on files damaged at random
+    *(OSError, SyntaxError, ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError, EOFError),
+    *(RuntimeError, NotImplementedError, ZeroDivisionError, struct.error, zlib.error, Image.DecompressionBombError),
+)
 
 
 def decode_image(path: Path, data: bytes) -> Pixels:
     """Pixels of an image file : (h, w) grey or (h, w, 3) blue, green, red, as they are stored: no turn that a JPEG asks for.
 
-    Versions of OpenCV return an image, partly black, for a file that was cut short; so a PNG's chunks and their checksums, and a
-    JPEG's end, are checked here.
+    Libraries give an image, partly grey, for a JPEG that was cut short; so its end is checked here.
 
     Raises
     ------
     InputError
         If the data is of no such kind, cut short, damaged, of another depth than 8 or 16 bits, or larger than any camera's.
     """
-    kinds = ", ".join(SUFFIXES)
     if not data:
-        raise InputError(f"{path}: expected an image ({kinds}), found an empty file")
-    if data.startswith(PNG_SIGNATURE):
-        _check_chunks(path, data)
-    if data.startswith(JPEG_BEGIN) and JPEG_END not in data[-PADDING:]:
-        raise InputError(f"{path}: expected a whole JPEG image, found it cut short at {len(data)} bytes")
+        raise InputError(f"{path}: expected {KINDS}, found an empty file")
+    if data.startswith(png_images.SIGNATURE):
+        return png_images.decode(path, data, MOST_PX)
+    size_of(path, io.BytesIO(data))
+    if data.startswith(JPEG_BEGIN):
+        if JPEG_END not in data[-PADDING:]:
+            raise InputError(f"{path}: expected a whole JPEG image, found it cut short at {len(data)} bytes")
+        return _by_pillow(path, data)
+    return _by_opencv(path, data)
+
+
+def size_of(path: Path, stream: BinaryIO) -> tuple[int, int]:
+    """Width and height, px, of an image by the header of its file.
+
+    Raises
+    ------
+    InputError
+        If the data is of no such kind, damaged, or larger than any camera's.
+    """
+    start = stream.read(len(png_images.SIGNATURE))
+    stream.seek(0)
+    width, height = _size_of_tiff(path, stream) if start.startswith(TIFF_BEGINNINGS) else _opened(path, stream).size
+    if not 0 < width * height <= MOST_PX:
+        raise InputError(f"{path}: expected an image of up to {MOST_PX} px, found {width}x{height}")
+    return width, height
+
+
+def _opened(path: Path, stream: BinaryIO) -> Image.Image:
+    """The image of a file whose header was read, and no more."""
+    start = stream.read(len(png_images.SIGNATURE))
+    reader = next((reader for beginning, reader in READERS.items() if start.startswith(beginning)), None)
+    stream.seek(0)
+    try:
+        with warnings.catch_warnings():  # of fields that are odd, and of large images
+            warnings.simplefilter("ignore")
+            opened = None if reader is None else reader(stream)
+    except DAMAGE:
+        opened = None
+    if opened is None:
+        raise InputError(f"{path}: expected {KINDS}, found other or damaged data")
+    return opened
+
+
+def _size_of_tiff(path: Path, stream: BinaryIO) -> tuple[int, int]:
+    """Width and height of a TIFF file's first image, of any kind of pixels, those that Pillow doesn't know included."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            fields = TiffImagePlugin.ImageFileDirectory_v2(stream.read(8))
+            stream.seek(fields.next)
+            fields.load(stream)
+        width, height, channels = int(fields[TIFF_WIDTH]), int(fields[TIFF_HEIGHT]), int(fields.get(TIFF_CHANNELS, 1))
+    except DAMAGE:
+        width = height = channels = 0
+    if not (width > 0 and height > 0 and 0 < channels <= MOST_CHANNELS):
+        raise InputError(f"{path}: expected {KINDS}, found other or damaged data")
+    return width, height
+
+
+def _by_pillow(path: Path, data: bytes) -> Pixels:
+    image = _opened(path, io.BytesIO(data))
+    try:
+        pixels = np.array(image if image.mode in ("L", "RGB") else image.convert("RGB"))
+    except DAMAGE:
+        raise InputError(f"{path}: expected a whole image, found damaged data in it") from None
+    return np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels
+
+
+def _by_opencv(path: Path, data: bytes) -> Pixels:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:  # of images that are declared larger than OpenCV takes
+    except cv2.error:
         image = None
     if image is None or image.shape[0] * image.shape[1] > MOST_PX:
-        raise InputError(f"{path}: expected an image ({kinds}), found other or damaged data")
+        raise InputError(f"{path}: expected {KINDS}, found other or damaged data")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: expected 8 or 16 bits a pixel, found {image.dtype}")
     return image if image.ndim == 2 else image[..., :3]
@@ -58,23 +140,3 @@ def luma(image: Pixels, full: int) -> Pixels:
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     grey[(image >= full).any(axis=2)] = full
     return grey
-
-
-def _check_chunks(path: Path, data: bytes) -> None:
-    """Refuse a PNG file that is cut short, or of which a checksum doesn't fit."""
-    view, position, kind = memoryview(data), len(PNG_SIGNATURE), b""
-    while kind != b"IEND":
-        if position + 12 > len(data):
-            raise InputError(f"{path}: expected a whole PNG image, found it cut short at {len(data)} bytes")
-        length, kind = struct.unpack_from(">I4s", data, position)
-        end = position + 8 + length
-        if end + 4 > len(data):
-            raise InputError(f"{path}: expected a whole PNG image, found it cut short at {len(data)} bytes")
-        if zlib.crc32(view[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise InputError(f"{path}: expected a whole PNG image, found damaged data at byte {position}")
-        position = end + 4
-    if data[12:16] != b"IHDR":
-        raise InputError(f"{path}: expected a PNG image, found no header in it")
-    width, height = struct.unpack_from(">II", data, 16)
-    if width * height > MOST_PX:
-        raise InputError(f"{path}: expected an image of up to {MOST_PX} px, found {width}x{height}")

@@ -48,12 +48,16 @@ def read_images(paths: Sequence[Path], size: Size, bits: int) -> Images:
     InputError
         If one is missing, cut short, damaged, of another size or depth, or brighter than its bits allow.
     """
-    images = np.empty((len(paths), size[1], size[0]), np.uint8 if bits == 8 else np.uint16)
+    if not paths:
+        return np.empty((0, size[1], size[0]), np.uint8 if bits == 8 else np.uint16)
+    first = read_image(paths[0], size, bits)  # before memory is asked for, whose size is as someone says
+    images = np.empty((len(paths), *first.shape), first.dtype)
+    images[0] = first
 
     def read(i: int) -> None:
         images[i] = read_image(paths[i], size, bits)
 
-    list(mapped(read, range(len(paths))))
+    list(mapped(read, range(1, len(paths))))
     return images
 
 

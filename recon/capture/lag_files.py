@@ -3,20 +3,17 @@
 import json
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic import field_validator
 
-from recon.errors import InputError, one_line
-from recon.files import atomic
-from recon.files.regular import read_bytes
-from recon.model.rig import Finite, NotNegative
+from recon.capture.manifest import validated
+from recon.files import atomic, json_text
+from recon.model.rig import Finite, NotNegative, Part
 
 FILE = "lag.json"
 
 
-class LagFile(BaseModel):
+class LagFile(Part):
     """The lag of the scanner's images behind the cameras."""
-
-    model_config = ConfigDict(frozen=True)
 
     lag_s: Finite
     sigma_s: NotNegative
@@ -45,7 +42,4 @@ def read(path: Path) -> LagFile:
     InputError
         If the file is missing or damaged.
     """
-    try:
-        return LagFile.model_validate_json(read_bytes(path))
-    except ValidationError as error:
-        raise InputError(f"{path}: {one_line(error)}") from None
+    return validated(LagFile, json_text.read(path), path)

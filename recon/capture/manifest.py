@@ -5,16 +5,17 @@ A capture holds one part or several: a surface, a board, a sweep or several with
 Everything is checked on load; a fault is an `InputError` of one line that names the file, what was expected and what was found.
 """
 
-import json
+import re
 from collections.abc import Iterable, Iterator
 from itertools import chain
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
-from recon.errors import InputError, one_line
-from recon.files.regular import read_bytes
+from recon.errors import InputError, one_line, short
+from recon.files import json_text
+from recon.model import rig
 from recon.model.boards import Board
 from recon.model.patterns import Axis, Patterns
 
@@ -31,37 +32,49 @@ SCANNER = "us"
 
 PartName = str  # "surface", "board", "sweep", or "sweep/NAME": the folder of the part's images
 SWEEP: PartName = "sweep"
+
+
+def _inside(path: str) -> str:
+    """A path that stays below its folder: a manifest from others may name any file."""
+    if PurePosixPath(path).is_absolute() or PureWindowsPath(path).anchor or ".." in re.split(r"[/\\]", path):
+        raise ValueError(f"expected a path within the capture, without .., found {path}")
+    return path
+
+
+def _without_slash(name: str) -> str:
+    """A name that a file may have."""
+    if name in (".", "..") or not name.isprintable() or re.search(r"[/\\]", name):
+        raise ValueError(f"expected a name without slashes, found {name!r}")
+    return name
+
+
+Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_without_slash)]
+Inside = Annotated[str, Field(min_length=1), AfterValidator(_inside)]  # path below a folder
 SweepName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,63}$")]
 SweepNameOrNone = Annotated[str, Field(pattern=r"^([a-z][a-z0-9_-]{0,63})?$")]  # "" of the only one
 Purpose = Literal["probe", "latency", "volume"]  # of a sweep: crossed wires at rest, a flat bottom, or what is to be seen
 
 
-class Record(BaseModel):
-    """Base of the manifest's parts: immutable, and refuses unknown keys and numbers that are not finite."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Device(Record):
+class Device(rig.Part):
     """A camera or the projector, as it was set."""
 
-    size: tuple[Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)]]  # width, height, px
+    size: tuple[Annotated[int, Field(ge=8, le=20000)], Annotated[int, Field(ge=8, le=20000)]]  # width, height, px
     bits: Literal[8, 10, 12] = 8  # of the digital numbers; 10 and 12 are stored right-aligned in 16-bit PNG
     exposure_s: Annotated[float, Field(gt=0)] | None = None
     gain: Annotated[float, Field(gt=0)] | None = None  # linear; 1 is the sensor's base gain
 
 
-class Part(Record):
+class Part(rig.Part):
     """A part of a capture."""
 
-    devices: dict[str, Device] | None = None  # those that were set otherwise for this part than the capture's; of the same sizes
+    devices: dict[Name, Device] | None = None  # those that were set otherwise for this part than the capture's; of the same sizes
 
 
 class SurfacePart(Part):
     """The fringe sequence: the patterns, and each camera's images in the same order."""
 
     patterns: Patterns
-    images: dict[str, tuple[str, ...]]  # camera: paths relative to the manifest's root
+    images: dict[str, tuple[Inside, ...]]  # camera: paths relative to the manifest's root
 
     def paths(self) -> Iterator[str]:
         """All paths that are named."""
@@ -75,12 +88,14 @@ class SurfacePart(Part):
         return self
 
 
-class BoardPose(Record):
+class BoardPose(rig.Part):
     """Images of the calibration board in one pose."""
 
-    name: Annotated[str, Field(min_length=1)]
-    lit: dict[str, str] = {}  # camera: path of the image with the projector fully on; if not given, its fringes' mean serves
-    fringes: dict[str, tuple[str, ...]] = {}  # camera: paths in the order of the patterns
+    name: Name
+    lit: dict[str, Inside] = Field(
+        default_factory=dict
+    )  # camera: path of the image with the projector fully on; if not given, its fringes' mean serves
+    fringes: dict[str, tuple[Inside, ...]] = Field(default_factory=dict)  # camera: paths in the order of the patterns
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -135,7 +150,7 @@ class SweepPart(Part):
     """
 
     purpose: Purpose | None = None
-    images: Annotated[dict[str, str], Field(min_length=1)]  # device: folder of its images and timestamps.csv
+    images: Annotated[dict[str, Inside], Field(min_length=1)]  # device: folder of its images and timestamps.csv
     track: str | None = None  # path of the poses; none if they are still to be found in the cameras' images
 
     def paths(self) -> Iterator[str]:
@@ -145,19 +160,19 @@ class SweepPart(Part):
             yield self.track
 
 
-class Manifest(Record):
+class Manifest(rig.Part):
     """`manifest.json`. Parts are optional: a capture need not hold all of them."""
 
     version: Literal["sonotwin-capture/1"] = Field(alias="schema")
     name: str = ""
     root: str = "."  # folder of the images: absolute, or relative to the manifest
-    devices: dict[str, Device]
+    devices: dict[Name, Device]
     calibration: str | None = None  # of cameras and projector; relative to the manifest's folder
     probe: str | None = None  # the ultrasound probe's calibration; relative to the manifest's folder
     surface: SurfacePart | None = None
     board: BoardPart | None = None
     sweep: SweepPart | None = None  # the only one
-    sweeps: dict[SweepName, SweepPart] = {}  # or several, in the order in which they were taken
+    sweeps: dict[SweepName, SweepPart] = Field(default_factory=dict)  # or several, in the order in which they were taken
 
     @model_validator(mode="after")
     def _one_or_named(self) -> "Manifest":
@@ -282,19 +297,23 @@ def read_manifest(folder: Path) -> Manifest:
         If it is missing, not JSON, of another version, or a field is wrong.
     """
     path = Path(folder) / MANIFEST
-    try:
-        content = json.loads(read_bytes(path), parse_constant=lambda value: _refuse_constant(path, value))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected JSON, found {error}") from None
-    except RecursionError:
-        raise InputError(f"{path}: expected JSON, found values nested too deeply") from None
-    return validated(Manifest, content, path)
+    return validated(Manifest, json_text.read(path), path)
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write the manifest into a capture folder."""
-    text = manifest.model_dump_json(indent=2, by_alias=True, exclude_none=True, exclude=None if manifest.sweeps else {"sweeps"})
+    """Write the manifest into a capture folder; raises InputError if a name in it is none in UTF-8."""
+    left_out = None if manifest.sweeps else {"sweeps"}
+    try:
+        text = manifest.model_dump_json(indent=2, by_alias=True, exclude_none=True, exclude=left_out)
+    except ValueError:  # of half a letter
+        strange = next((name for name in (manifest.name, manifest.root) if not _is_whole(name)), "others")
+        raise InputError(f"{MANIFEST}: expected names of folders in UTF-8, found {short(strange)}: rename the folder") from None
     (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
+
+
+def _is_whole(name: str) -> bool:
+    """Whether a name is text, and holds no byte that isn't part of any."""
+    return name.encode("utf-8", "replace").decode("utf-8") == name
 
 
 def image_name(frame: int) -> str:
@@ -306,10 +325,6 @@ def axes_not_encoded(patterns: Patterns) -> list[Axis]:
     """Axes of the projector along which a sequence has neither fringes nor Gray code; a board's needs both."""
     axes: tuple[Axis, Axis] = ("columns", "rows")
     return [axis for axis in axes if axis not in patterns.axes]
-
-
-def _refuse_constant(path: Path, value: str) -> None:
-    raise InputError(f"{path}: expected finite numbers, found {value}")
 
 
 def validated(model: type[Model], content: object, path: Path) -> Model:

@@ -13,19 +13,19 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from recon.capture import calibration_files
 from recon.capture.images import Size, image_files, read_grey, write_images
+from recon.capture.manifest import validated
 from recon.capture.surface_part import SurfaceCapture
-from recon.errors import InputError, one_line
-from recon.files import atomic
-from recon.files.regular import read_bytes
+from recon.errors import InputError
+from recon.files import atomic, json_text
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
 from recon.model.calibration import Calibration
 from recon.model.patterns import CentreLine, Fringes, Patterns, Uniform
 from recon.model.probe import Speed
+from recon.model.rig import Part
 
 STEPS = 8
 PITCH = 12.0  # projector px
@@ -86,10 +86,8 @@ def read_images(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[ND
     return images, sequence, mask
 
 
-class Mark(BaseModel):
+class Mark(Part):
     """Content of `MARKER`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     layout: Literal["meza2021"] = "meza2021"
     speed_m_s: Speed | None = None
@@ -123,10 +121,7 @@ def speed_of(folder: Path) -> float | None:
         If our file is damaged, or can't be read.
     """
     path = folder / MARKER
-    try:
-        return Mark.model_validate_json(read_bytes(path)).speed_m_s if path.is_file() else None
-    except ValidationError as error:
-        raise InputError(f"{path}: {one_line(error)}") from None
+    return validated(Mark, json_text.read(path), path).speed_m_s if path.is_file() else None
 
 
 def is_theirs(surface: SurfaceCapture) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from recon.capture.images import image_files, read_grey, write_images
 from recon.errors import InputError
-from recon.files.regular import read_bytes
+from recon.files import npz
 from recon.geometry import rigid
 
 log = logging.getLogger(__name__)
@@ -128,11 +128,7 @@ def _rows(path: Path, shape: tuple[int, ...]) -> Array | None:
     """Numbers : (n, *shape) of an npy file; None without one."""
     if not path.exists():
         return None
-    read_bytes(path)  # a regular file
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise InputError(f"{path}: expected an array of numbers, found {' '.join(str(error).split())}") from None
+    rows = npz.read_npy(path)
     if rows.ndim != 1 + len(shape) or rows.shape[1:] != shape or rows.dtype.kind not in "fiu":
         expected = f"numbers of shape (n, {', '.join(map(str, shape))})"
         raise InputError(f"{path}: expected {expected}, found {rows.dtype} of shape {rows.shape}")

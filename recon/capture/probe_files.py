@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.capture import meza2021_sweep
-from recon.errors import InputError
+from recon.errors import InputError, short
 from recon.files import atomic, npz, opencv_storage
+from recon.files.opencv_storage import Values
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import SCANNER_SPEED, SPEEDS, ProbeCalibration
@@ -43,8 +44,8 @@ def read(path: Path, speed_m_s: float | None = None) -> ProbeCalibration:
         If the file is missing, damaged, of another kind, or a value is missing, not finite, no rotation, scale or speed of sound.
     """
     path = Path(path)
-    with opencv_storage.opened(path, "a probe's calibration") as storage:
-        return _authors(path, speed_m_s) if storage is None else _own(path, storage)
+    values = opencv_storage.read(path, "a probe's calibration")
+    return _authors(path, speed_m_s) if values is None else _own(path, values)
 
 
 def write(path: Path, calibration: ProbeCalibration) -> None:
@@ -92,18 +93,15 @@ def _authors(path: Path, speed_m_s: float | None) -> ProbeCalibration:
     return _checked(path, "T_I_T", ProbeCalibration(pose, scale, None, speed_m_s, face_row))
 
 
-def _own(path: Path, storage: cv2.FileStorage) -> ProbeCalibration:
-    node = storage.getNode("schema") if storage.root().isMap() else None
-    found = node.string() if node is not None and node.isString() else "none"
-    if found != SCHEMA:
+def _own(path: Path, values: Values) -> ProbeCalibration:
+    if values.get("schema") != SCHEMA:
+        found = short(values["schema"]) if isinstance(values.get("schema"), str) else "none"
         raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
-    pose, scale = (
-        opencv_storage.matrix(path, "target_from_image", storage.getNode("target_from_image")),
-        opencv_storage.matrix(path, "scale", storage.getNode("scale")).ravel(),
-    )
-    node = storage.getNode("face_row")
-    face_row = 0.0 if node.empty() else node.real() if node.isReal() or node.isInt() else np.nan
-    read = ProbeCalibration(pose, scale, _uncertainty(path, storage), _speed(path, storage), face_row)
+    pose = opencv_storage.matrix(path, "target_from_image", values.get("target_from_image"))
+    scale = opencv_storage.matrix(path, "scale", values.get("scale")).ravel()
+    face_row = values.get("face_row", 0.0)
+    face_row = float(face_row) if isinstance(face_row, int | float) else np.nan
+    read = ProbeCalibration(pose, scale, _uncertainty(path, values), _speed(path, values), face_row)
     return _checked(path, "target_from_image", read)
 
 
@@ -118,11 +116,9 @@ def _checked(path: Path, name: str, read: ProbeCalibration) -> ProbeCalibration:
     return read
 
 
-def _speed(path: Path, storage: cv2.FileStorage) -> float:
-    node = storage.getNode("speed_m_s")
-    if node.empty():
-        return SCANNER_SPEED
-    return _within_speeds(path, node.real() if node.isReal() or node.isInt() else None)
+def _speed(path: Path, values: Values) -> float:
+    value = values.get("speed_m_s", SCANNER_SPEED)
+    return _within_speeds(path, float(value) if isinstance(value, int | float) else None)
 
 
 def _within_speeds(path: Path, value: float | None) -> float:
@@ -132,10 +128,10 @@ def _within_speeds(path: Path, value: float | None) -> float:
     return value
 
 
-def _uncertainty(path: Path, storage: cv2.FileStorage) -> Uncertainty | None:
-    names = opencv_storage.names(storage)
+def _uncertainty(path: Path, values: Values) -> Uncertainty | None:
+    names = opencv_storage.names(values)
     if names is None:
         return None
     if not names or len(set(names)) < len(names) or not set(names) <= set(PARAMETERS):
         raise InputError(f"{path}: parameters: expected some of {' '.join(PARAMETERS)}, each once, found something else")
-    return Uncertainty(names, opencv_storage.covariance(path, storage, len(names)))
+    return Uncertainty(names, opencv_storage.covariance(path, values, len(names)))

@@ -6,13 +6,12 @@ Everything is checked on load; a fault is an `InputError` of one line that names
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from recon.capture import calibration_files
 from recon.capture.image_formats import decode_image
 from recon.capture.images import Images, image_files, read_images
 from recon.capture.manifest import MANIFEST, read_manifest, validated
 from recon.errors import InputError
+from recon.files import yaml_text
 from recon.files.regular import read_bytes
 from recon.model.calibration import Calibration
 from recon.model.patterns import Patterns
@@ -86,10 +85,4 @@ def read_patterns(path: Path) -> Patterns:
         If the file is missing, not YAML, or a field is wrong.
     """
     path = Path(path)
-    try:
-        content = yaml.safe_load(read_bytes(path))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected YAML, found {' '.join(str(error).split())}") from None
-    except RecursionError:
-        raise InputError(f"{path}: expected YAML, found values nested too deeply") from None
-    return validated(Patterns, content, path)
+    return validated(Patterns, yaml_text.read(path), path)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.files import atomic
-from recon.files.regular import read_bytes
+from recon.files.regular import MOST_TABLE, read_bytes
 from recon.geometry import rigid
 from recon.model.tracks import Track
 
@@ -126,7 +126,7 @@ def _read(path: Path, header: Sequence[str], *optional: Sequence[str]) -> tuple[
     optional : names that may follow, each group after those before it
     """
     try:
-        lines = read_bytes(path).decode("utf-8-sig").splitlines()
+        lines = read_bytes(path, MOST_TABLE).decode("utf-8-sig").splitlines()
         rows = [(k, [word.strip() for word in row]) for k, row in enumerate(csv.reader(lines), start=1) if row]
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: expected a table as CSV text, found other or damaged data") from None
@@ -187,7 +187,9 @@ def _covariance(path: Path, line: int, names: Sequence[str], words: Sequence[str
     matrix = upper + np.triu(upper, 1).T
     sigma = np.sqrt(np.abs(np.diag(matrix)))
     unit = np.where(sigma > 0, sigma, 1.0)
-    if np.linalg.eigvalsh(matrix / np.outer(unit, unit)).min() < -1e-6:
+    with np.errstate(over="ignore"):
+        correlations = matrix / np.outer(unit, unit)
+    if not np.abs(correlations).max() < 2 or np.linalg.eigvalsh(correlations).min() < -1e-6:
         raise InputError(f"{path}: line {line}: expected the upper triangle of a covariance, found a matrix that is none")
     return matrix
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from recon.errors import InputError, one_line
+from recon.errors import InputError, one_line, short
 from recon.files import opencv_storage
 from recon.model.circle_layout import LENGTHS
 from recon.model.rig import Target
@@ -43,19 +43,19 @@ def read(path: Path, design: Target) -> Target:
     InputError
         If the file is missing, damaged, of another kind, or a value is missing or can't be.
     """
-    with opencv_storage.opened(path, "a measured target") as storage:
-        node = storage.getNode("schema") if storage is not None and storage.root().isMap() else None
-        found = node.string() if node is not None and node.isString() else "none"
-        if storage is None or found != SCHEMA:
-            raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
-        values: dict[str, object] = {name: _number(path, name, storage) for name in LENGTHS_AND_DIAMETER}
-        curvature = opencv_storage.matrix(path, CURVATURE, storage.getNode(CURVATURE))
-        if curvature.size != 3 or not np.isfinite(curvature).all():
-            raise InputError(f"{path}: {CURVATURE}: expected three numbers, xx, xy and yy, found {curvature.tolist()}")
-        names = opencv_storage.names(storage)
-        if names is None or sorted(names) != sorted(PARAMETERS):
-            raise InputError(f"{path}: parameters: expected {' '.join(PARAMETERS)}, found {' '.join(names or ['none'])}")
-        covariance = opencv_storage.covariance(path, storage, len(names))
+    stored = opencv_storage.read(path, "a measured target") or {}
+    if stored.get("schema") != SCHEMA:
+        found = short(stored["schema"]) if isinstance(stored.get("schema"), str) else "none"
+        raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
+    values: dict[str, object] = {name: _number(path, name, stored.get(name)) for name in LENGTHS_AND_DIAMETER}
+    curvature = opencv_storage.matrix(path, CURVATURE, stored.get(CURVATURE))
+    if curvature.size != 3 or not np.isfinite(curvature).all():
+        raise InputError(f"{path}: {CURVATURE}: expected three numbers, xx, xy and yy, found {short(str(curvature.tolist()))}")
+    names = opencv_storage.names(stored)
+    if names is None or sorted(names) != sorted(PARAMETERS):
+        found = short(" ".join(names or ["none"]))
+        raise InputError(f"{path}: parameters: expected {' '.join(PARAMETERS)}, found {found}")
+    covariance = opencv_storage.covariance(path, stored, len(names))
     of_lengths = [names.index(name) for name in LENGTHS]
     values[CURVATURE] = curvature.ravel().tolist()
     values["covariance_mm2"] = covariance[np.ix_(of_lengths, of_lengths)].tolist()
@@ -65,8 +65,7 @@ def read(path: Path, design: Target) -> Target:
         raise InputError(f"{path}: {one_line(error)}") from None
 
 
-def _number(path: Path, name: str, storage: cv2.FileStorage) -> float:
-    node = storage.getNode(name)
-    if not (node.isReal() or node.isInt()):
-        raise InputError(f"{path}: {name}: expected a length in mm, found {'none' if node.empty() else 'something else'}")
-    return node.real()
+def _number(path: Path, name: str, value: object) -> float:
+    if not isinstance(value, int | float):
+        raise InputError(f"{path}: {name}: expected a length in mm, found {'none' if value is None else 'something else'}")
+    return float(value)

@@ -3,10 +3,12 @@
 Tags and units are those of DICOM PS3.3, C.8.5.5 (US region calibration) and C.7.6.5 (cine).
 """
 
+import struct
 import warnings
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -15,16 +17,23 @@ from numpy.typing import NDArray
 from pydicom.errors import BytesLengthException, InvalidDicomError
 from pydicom.pixels import apply_color_lut, iter_pixels
 
+from recon.capture.image_formats import MOST_PX
 from recon.clips.clip import Box, Clip, checked_seconds
 from recon.errors import InputError
-from recon.files.regular import check_there
+from recon.files.regular import check_there, opened
 
 Dataset = Any
+Result = TypeVar("Result")
+
+MOST_FRAMES = 1_000_000
+MOST_BYTES = 1 << 33
+PREAMBLE, PREFIX = 128, b"DICM"
+DEFLATED, MOST_META = b"1.2.840.10008.1.2.1.99", 4096  # the transfer syntax, and bytes within which it is named
 
 TWO_D, TISSUE, CENTIMETRES = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits
 DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or compressed in ways that need other packages
     *(InvalidDicomError, BytesLengthException, AttributeError, EOFError, LookupError, OSError, OverflowError),
-    *(RuntimeError, TypeError, ValueError),
+    *(RuntimeError, TypeError, ValueError, struct.error, zlib.error, MemoryError, NotImplementedError),
 )
 
 
@@ -38,14 +47,22 @@ def read(path: Path) -> Clip:
     """
     check_there([path])
     try:
-        header = _dataset(path, stop_before_pixels=True)
-        count = int(header.get("NumberOfFrames") or 1)
-        if count < 1:
-            raise ValueError(f"NumberOfFrames {count}")
-        size = int(header.Columns), int(header.Rows)
-        seconds, region = times(header, count), b_scan_region(header)
+        return _quietly(lambda: _clip(path))
+    except InputError:
+        raise
     except DAMAGED as error:
         raise InputError(f"{path}: expected a DICOM file, a video or a folder of images, found {_brief(error)}") from None
+
+
+def _clip(path: Path) -> Clip:
+    header = _dataset(path, stop_before_pixels=True)
+    count = int(header.get("NumberOfFrames") or 1)
+    if not 1 <= count <= MOST_FRAMES:
+        raise ValueError(f"NumberOfFrames {count}")
+    size = int(header.Columns), int(header.Rows)
+    if not 0 < size[0] * size[1] <= MOST_PX:
+        raise ValueError(f"images of {size[0]}x{size[1]}")
+    seconds, region = times(header, count), b_scan_region(header)
     image, scale = (None, None) if region is None else within(*region, size)
     timed = None if seconds is None else checked_seconds(path, seconds)
     return Clip(path.name, size, count, timed, lambda: images(path, size, count), image, scale)
@@ -55,9 +72,10 @@ def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np
     """Frames : (h, w), one by one; 16-bit ones scaled to 8 bits by their stored bits; InputError if one is damaged."""
     read = 0
     try:
-        header = _dataset(path)
-        for frame in iter_pixels(header):
-            yield _grey(frame, header)
+        header = _quietly(lambda: _dataset(path))
+        frames = iter_pixels(header)
+        while (image := _quietly(lambda: next((_grey(frame, header) for frame in frames), None))) is not None:
+            yield image
             read += 1
     except DAMAGED as error:
         raise InputError(f"{path}: frame {read}: expected an image of {size[0]}x{size[1]}, found {_brief(error)}") from None
@@ -66,10 +84,20 @@ def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np
 
 
 def _dataset(path: Path, stop_before_pixels: bool = False) -> Dataset:
-    """Read a file, without pydicom's warnings of values that break a rule that nothing here depends on."""
+    """Read a file, but none that is packed as a whole, which may unpack to more than any memory."""
+    with opened(path, MOST_BYTES) as stream:
+        stream.seek(PREAMBLE)
+        if stream.read(len(PREFIX)) == PREFIX and DEFLATED in stream.read(MOST_META):
+            raise ValueError("one that is packed as a whole")
+        stream.seek(0)
+        return pydicom.dcmread(stream, stop_before_pixels=stop_before_pixels)
+
+
+def _quietly(call: Callable[[], Result]) -> Result:
+    """The result of a call, without pydicom's warnings of values that break a rule that nothing here depends on."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return pydicom.dcmread(path, stop_before_pixels=stop_before_pixels)
+        return call()
 
 
 def _grey(frame: NDArray, header: Dataset) -> NDArray[np.uint8]:

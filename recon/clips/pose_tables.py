@@ -6,12 +6,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
-from recon.files.regular import read_bytes
+from recon.files.regular import MOST_TABLE, read_bytes
 from recon.geometry import rigid
+from recon.model.rig import Part
 from recon.model.tracks import Track
 
 Array = NDArray[np.float64]
@@ -21,16 +22,13 @@ MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 SEPARATORS = ",;\t"  # else blanks
 MOST_SECONDS = 9e9  # of a time stamp, that nanoseconds of 64 bits can hold
 LAST_ROW = 1e-6  # by which a matrix' last row may be off 0 0 0 1
-LAST_ROW = 1e-6  # by which a matrix' last row may be off 0 0 0 1
 MOST_OFF = 0.02  # of a rotation from the nearest exact one
 
 Names = tuple[str, ...]
 
 
-class Columns(BaseModel):
+class Columns(Part):
     """Names of a table's columns, and units of their values."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     time: str
     time_unit: Literal["s", "ms", "us", "ns"] = "s"
@@ -87,6 +85,8 @@ def read(path: Path, columns: Columns) -> Track:
 
 
 def _pose(path: Path, line: int, values: Array, columns: Columns) -> Array:
+    if (largest := np.abs(values).max()) > rigid.FARTHEST_MM:
+        raise InputError(f"{path}: line {line}: expected {rigid.RIGID}, found a value of {largest:g}: another unit?")
     pose = np.eye(4)
     if columns.matrix is not None and len(columns.matrix) > 9:
         pose[: len(values) // 4] = values.reshape(-1, 4)
@@ -114,7 +114,7 @@ def _rotation(path: Path, line: int, values: Array) -> Array:
 def _numbers(path: Path, names: Names) -> tuple[list[int], Array]:
     """Numbers of lines, and values : (n, k) of columns; NaN of empty cells, but of the first column none may be."""
     try:
-        text = read_bytes(path).decode("utf-8-sig")
+        text = read_bytes(path, MOST_TABLE).decode("utf-8-sig")
         first = text.partition("\n")[0]
         separator = next((one for one in SEPARATORS if one in first), " ")
         parsed = csv.reader(text.splitlines(), delimiter=separator, skipinitialspace=True)

@@ -1,5 +1,6 @@
 """Videos of a scanner's screen, by OpenCV."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -7,10 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.capture.image_formats import MOST_PX
 from recon.clips.clip import Clip, checked_seconds
 from recon.errors import InputError
 from recon.files.regular import check_there
 
+# OpenCV's own reader of MJPEG writes lines to the console
+BACKEND = cv2.CAP_FFMPEG if cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG) else cv2.CAP_ANY
 LEAST_STEP_S = 1e-6  # between frames' time stamps; without them all are 0
 
 
@@ -40,8 +44,13 @@ def _images(path: Path) -> Iterator[NDArray[np.uint8]]:
 
 def _frames(path: Path) -> Iterator[tuple[float, NDArray[np.uint8], float]]:
     """Time stamp in s, image : (h, w, 3) and the video's rate in frames/s, of each frame."""
-    video = cv2.VideoCapture(str(path))
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent: of a damaged video we say so ourselves, in one line
+    os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")  # a file may name others, far away
+    video = cv2.VideoCapture(str(path), BACKEND)
     try:
+        width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        if not width * height <= MOST_PX:
+            raise InputError(f"{path}: expected a video of up to {MOST_PX} px, found {width:g}x{height:g}")
         rate = float(video.get(cv2.CAP_PROP_FPS))
         while True:
             good, image = video.read()

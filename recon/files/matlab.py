@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.files.npz import Form, check_forms
-from recon.files.regular import read_bytes
+from recon.files.regular import opened, read_bytes
 
 BEGIN = b"MATLAB "  # of the header's text, in all versions from 5 on
 HDF5 = b"MATLAB 7.3"  # a file of another kind
@@ -27,12 +27,13 @@ MATRIX, COMPRESSED = 14, 15  # types of elements
 NUMERIC = range(6, 16)  # classes of arrays
 OBJECTS = (3, 17)
 COMPLEX = 0x800  # in an array's flags
-MOST = 1 << 28  # bytes, of an element once it is unpacked
+MOST = 1 << 24  # bytes, of an element once it is unpacked
 
 
 def is_matlab(path: Path) -> bool:
     """Whether a file is one of MATLAB's, by its first bytes; raises InputError if it can't be read."""
-    return read_bytes(path).startswith(BEGIN)
+    with opened(path) as stream:
+        return stream.read(len(BEGIN)) == BEGIN
 
 
 def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) -> dict[str, NDArray]:
@@ -56,7 +57,7 @@ def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) 
         for content in _arrays(data[HEADER:], order):
             kind, name, array = _array(content, order)
             objects |= kind in OBJECTS
-            if array is not None:
+            if array is not None and other_names.get(name, name) in forms:
                 arrays[other_names.get(name, name)] = array
     except (KeyError, IndexError, TypeError, ValueError, StopIteration, struct.error, zlib.error):
         raise InputError(f"{path}: expected a MATLAB file of version 5 to 7, found damaged data") from None

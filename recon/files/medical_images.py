@@ -6,6 +6,7 @@ memory at once.
 """
 
 import math
+import os
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import InputError
+from recon.errors import InputError, short
+from recon.files.regular import check_there, opened
 
 META_TYPES = {
     "MET_UCHAR": "u1",
@@ -33,6 +35,8 @@ NRRD_TYPES = {  # those of sequences, each with many names
     **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
 }
 NO_PIXELS = ("MET_OTHER", "MET_NONE", "")  # types, in either format, of PLUS's files without images
+MOST_WHOLE = 1 << 40  # of any number of a header
+MOST_HEADER = 1 << 28  # bytes; a sequence of five hours has half as many
 LONGEST_LINE = 1 << 20  # bytes; a file of another kind may have no line breaks at all
 READ_AT_ONCE = 1 << 18  # bytes
 MOST_UNPACKED = 1100  # times the packed size: deflate reaches 1032
@@ -63,8 +67,7 @@ class ImageFile:
 
 def fault(path: Path, field: str, expected: object, found: object) -> InputError:
     """The error of a field of a file; long values are shortened."""
-    text = str(found)
-    return InputError(f"{path}: {field}: expected {expected}, found {text if len(text) <= 60 else text[:57] + '...'}")
+    return InputError(f"{path}: {short(field)}: expected {expected}, found {short(str(found))}")
 
 
 def read_header(path: Path) -> ImageFile:
@@ -77,16 +80,11 @@ def read_header(path: Path) -> ImageFile:
         than the file can hold.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(4)
-            stream.seek(0)
-            file = _nrrd(path, stream) if start == b"NRRD" else _metaimage(path, stream)
-        _check_length(file)
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file, found none") from None
-    except OSError as error:
-        raise InputError(f"{path}: expected a file to read, found {error.strerror}") from None
+    with opened(path) as stream:
+        start = stream.read(4)
+        stream.seek(0)
+        file = _nrrd(path, stream) if start == b"NRRD" else _metaimage(path, stream)
+    _check_length(file)
     return file
 
 
@@ -123,7 +121,7 @@ def whole_numbers(path: Path, field: str, text: str, least: int = 0, pieces: int
         numbers = tuple(int(word) for word in text.split())
     except ValueError:
         numbers = ()
-    if not numbers or min(numbers) < least or len(numbers) != (pieces or len(numbers)):
+    if not numbers or min(numbers) < least or max(numbers) > MOST_WHOLE or len(numbers) != (pieces or len(numbers)):
         expected = "a whole number" if pieces == 1 else f"{pieces or ''} whole numbers".lstrip()
         raise fault(path, field, f"{expected} of at least {least}", repr(text))
     return numbers
@@ -204,6 +202,8 @@ def _nrrd(path: Path, stream: BinaryIO) -> ImageFile:
 
 def _line(path: Path, stream: BinaryIO) -> str:
     line = stream.readline(LONGEST_LINE)
+    if stream.tell() > MOST_HEADER:
+        raise InputError(f"{path}: expected a header of up to {MOST_HEADER >> 20} MiB, found a longer one")
     if len(line) == LONGEST_LINE:
         raise InputError(f"{path}: expected a MetaImage or NRRD header, found a line of {LONGEST_LINE} bytes")
     return line.decode("utf-8", "surrogateescape")
@@ -217,8 +217,8 @@ def _value(path: Path, fields: Mapping[str, str], name: str) -> str:
 
 def _check_length(file: ImageFile) -> None:
     """Refuse at once, before memory is asked for, what can't be complete."""
-    if "\0" in str(file.data_path) or not file.data_path.is_file():
-        raise file.fault("data file", "LOCAL or the name of a file that is there", repr(file.data_path.name))
+    if file.data_path != file.path:
+        check_beside(file.path, file.data_path)
     there = file.data_path.stat().st_size - file.data_offset
     if file.packed:
         said = file.fields.get("CompressedDataSize", "").split()
@@ -228,9 +228,20 @@ def _check_length(file: ImageFile) -> None:
         raise file.fault("pixels", f"{file.data_bytes} bytes", f"{there}, the file has been cut short or damaged")
 
 
+def check_beside(header: Path, data: Path) -> None:
+    """Refuse a file of pixels that lies elsewhere than its header, or below it: a header from others may name any file."""
+    try:
+        check_there([data])
+    except InputError:
+        raise fault(header, "data file", "LOCAL or the name of a file that is there", repr(data.name)) from None
+    beside = os.path.relpath(os.path.abspath(data), os.path.abspath(header.parent))
+    if beside.split(os.sep)[0] == os.pardir or os.path.isabs(beside):
+        raise fault(header, "data file", "LOCAL or the name of a file in the header's folder", repr(str(data)))
+
+
 def _pieces(file: ImageFile) -> Iterator[bytes]:
     unpacker = zlib.decompressobj(wbits=47) if file.packed else None  # 47: a zlib or a gzip stream
-    with file.data_path.open("rb") as stream:
+    with opened(file.data_path) as stream:
         stream.seek(file.data_offset)
         while raw := stream.read(READ_AT_ONCE):
             if unpacker is None:

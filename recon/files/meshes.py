@@ -1,5 +1,8 @@
 """Mesh files: binary PLY in mm with normals and per-vertex sigma, and GLB in metres for viewers."""
 
+import io
+import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +10,18 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.visual import ColorVisuals
 
-from recon.errors import InputError
+from recon.errors import InputError, short
 from recon.files import atomic
+from recon.files.regular import read_bytes
 
 # glTF is in metres with y up and the front towards +z; a camera's frame is in mm with y down and z away from it
 LUMA = np.array([0.299, 0.587, 0.114])  # BT.601
 PLACED = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha")  # of a vertex, for which meshes have their own places
+FARTHEST_MM = 1e7
+DAMAGE = (  # what trimesh raises on files damaged at random
+    *(ValueError, LookupError, TypeError, AttributeError, OverflowError, MemoryError, EOFError, RuntimeError),
+    *(NotImplementedError, AssertionError, ZeroDivisionError, struct.error),
+)
 GLTF_FROM_WORLD = np.diag([0.001, -0.001, -0.001, 1.0])
 
 
@@ -41,14 +50,20 @@ def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
     """
     if path.suffix.lower() != ".ply":
         raise InputError(f"{path}: expected {expected} as PLY, found {path.suffix or 'no suffix'}")
-    if not path.is_file():
-        raise InputError(f"{path}: expected {expected} as PLY, found none")
+    data = read_bytes(path, expected=f"{expected} as PLY")
     try:
-        mesh = trimesh.load(path, file_type="ply", process=False)
-    except (ValueError, IndexError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: expected {expected} as PLY, found a damaged one: {error}") from None
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
+    except DAMAGE as error:
+        raise InputError(f"{path}: expected {expected} as PLY, found a damaged one: {short(str(error))}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: expected {expected} of triangles, found none in it")
+    if not (np.abs(mesh.vertices) < FARTHEST_MM).all():
+        raise InputError(f"{path}: expected {expected} of finite places, below {FARTHEST_MM:g} mm, found others among them")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        found = f"one of {mesh.faces.min()} to {mesh.faces.max()}"
+        raise InputError(f"{path}: expected {expected} of triangles between its {len(mesh.vertices)} vertices, found {found}")
     stored = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     names = getattr(getattr(stored, "dtype", None), "names", None) or ()
     for name in (name for name in names if name not in PLACED):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from recon.errors import InputError
-from recon.files import atomic
+from recon.files import atomic, json_text
 
 FILE = "metrics.json"  # beside every result
 
@@ -28,13 +28,10 @@ def read(path: Path) -> Metrics:
     InputError
         If the file is missing or holds something else.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return {name: math.nan if value is None else value for name, value in content.items()}
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file of figures, found none") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError):
-        raise InputError(f"{path}: expected figures by name, found other or damaged data") from None
+    content = json_text.read(path, "a file of figures")
+    if not isinstance(content, dict) or not all(value is None or isinstance(value, int | float) for value in content.values()):
+        raise InputError(f"{path}: expected figures by name, found other or damaged data")
+    return {name: math.nan if value is None else value for name, value in content.items()}
 
 
 def shown(value: float, form: str, unit: str = "") -> str:

@@ -1,6 +1,8 @@
 """Arrays from npz files: read whole and checked, or refused in one line."""
 
+import io
 import tokenize
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -11,9 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
+from recon.files.regular import opened, read_bytes
 
 NUMBERS = {"f": "decimal numbers", "u": "whole numbers", "b": "true or false", "fiu": "numbers"}  # by letters of numpy's kinds
-DAMAGE = (  # what numpy raises on files damaged at random, in the archive or in an array's header; TypeError on a .npy file
+MOST_BYTES = 1 << 29  # of arrays, once they are unpacked
+PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+DAMAGE = (  # what numpy raises on files damaged at random, in the archive or in an array's header
     *(ValueError, TypeError, EOFError, OSError, OverflowError, MemoryError, RuntimeError, SyntaxError),
     *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
@@ -36,18 +41,44 @@ def read(path: Path, forms: Mapping[str, Form]) -> dict[str, NDArray]:
     InputError
         If the file is missing, damaged or of another kind, or an array is missing or of another form.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in forms if name in archive.files}
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file, found none") from None
-    except DAMAGE:
-        raise InputError(f"{path}: expected an npz file of plain arrays, found other or damaged data") from None
-    for name in arrays:
-        if not isinstance(arrays[name], np.ndarray):  # numpy gives the bytes of what it doesn't know
-            raise InputError(f"{path}: {name}: expected an array, found other or damaged data")
+    with opened(path, MOST_BYTES) as stream:
+        try:
+            with zipfile.ZipFile(stream) as archive:
+                entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+                arrays = _arrays(path, archive, {name: entries[name] for name in forms if name in entries})
+        except DAMAGE as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{path}: expected an npz file of plain arrays, found other or damaged data") from None
     check_forms(path, arrays, forms)
     return arrays
+
+
+def read_npy(path: Path) -> NDArray:
+    """Read the only array of an npy file; InputError if it is missing or damaged, or holds more than numbers and texts."""
+    data = read_bytes(path, MOST_BYTES)
+    try:
+        return _array(data)
+    except DAMAGE:
+        raise InputError(f"{path}: expected an array of numbers, found other or damaged data") from None
+
+
+def _arrays(path: Path, archive: zipfile.ZipFile, entries: Mapping[str, zipfile.ZipInfo]) -> dict[str, NDArray]:
+    if (size := sum(entry.file_size for entry in entries.values())) > MOST_BYTES:
+        raise InputError(f"{path}: expected arrays of up to {MOST_BYTES >> 20} MiB, found {size >> 20} MiB")
+    arrays = {}
+    for name, entry in entries.items():
+        if entry.compress_type not in PACKINGS:
+            raise zipfile.BadZipFile("packed in another way")
+        with archive.open(entry) as stream:
+            arrays[name] = _array(stream.read(entry.file_size))  # no more than it says, whatever is unpacked
+    return arrays
+
+
+def _array(data: bytes) -> NDArray:
+    with warnings.catch_warnings():  # of old files, and of odd types
+        warnings.simplefilter("ignore")
+        return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
 
 
 def check_forms(path: Path, arrays: Mapping[str, NDArray], forms: Mapping[str, Form]) -> None:

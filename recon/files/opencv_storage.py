@@ -1,24 +1,44 @@
-"""OpenCV FileStorage as calibrations are kept in it: opened, and its matrices read, or refused in one line."""
+"""OpenCV FileStorage as calibrations are kept in it, YAML, XML or JSON: values and matrices read, or refused in one line."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import base64
+import math
+import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from recon.errors import InputError
-from recon.files import atomic
+from recon.files import atomic, json_text, regular, xml_text, yaml_text
 
 Array = NDArray[np.float64]
 
+Values = dict[str, Any]  # texts, numbers, lists and maps; a matrix is a map of rows, cols, dt and data
+
 SYMMETRIC = 1e-9  # of a covariance, relative to the standard deviations: it comes from a text file
+DTYPES = {  # by OpenCV's letters
+    **{"u": "u1", "c": "i1", "w": "u2", "s": "i2", "i": "i4", "f": "f4", "d": "f8", "h": "f2"},
+    **{"b": "u1", "n": "u4", "I": "i8", "U": "u8"},  # of its version 5
+}
+DTYPE = re.compile(rf"(\d{{0,3}})([{''.join(DTYPES)}])")  # numbers an entry, and their letter
+BASE64, BASE64_HEADER = "$base64$", 24  # what packed numbers begin with, and bytes of it that name their type
+WHOLE = re.compile(r"[-+]?\d{1,18}")
+DECIMAL = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,9})?")
+ENDLESS = re.compile(r"([-+]?)\.(nan|inf)", re.IGNORECASE)
+WORD = re.compile(r'"([^"]*)"|(\S+)')  # of XML
+JSON_PIECE = re.compile(r'("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/|([-+.\w]+)', re.DOTALL)  # a text, a comment, or else a word
+HEADER = re.compile(r"^%YAML[^\n]*", re.MULTILINE)  # which other parsers don't take
 
 
-@contextmanager
-def opened(path: Path, expected: str) -> Iterator[cv2.FileStorage | None]:
-    """Give the storage in a file; None for an npz file.
+def read(path: Path, expected: str) -> Values | None:
+    """Values in a file; None for an npz file.
+
+    OpenCV's own reader believes what a matrix declares, and reads beyond its numbers; it is used to write only.
 
     Parameters
     ----------
@@ -29,49 +49,145 @@ def opened(path: Path, expected: str) -> Iterator[cv2.FileStorage | None]:
     InputError
         If there is no such file, or it is neither.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: expected {expected}, found {(error.strerror or 'none').lower()}") from None
+    data = regular.read_bytes(path, xml_text.MOST_BYTES, expected)
     if data.startswith(b"PK"):  # of any zip file
-        yield None
-        return
+        return None
+    kinds = "an npz file or OpenCV's YAML, XML or JSON"
+    if data.lstrip().startswith(b"<"):
+        return _map(_of_element(xml_text.parsed(path, data)))
     try:
-        storage = cv2.FileStorage(data.decode("utf-8"), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-    except (cv2.error, SystemError, UnicodeDecodeError):
-        raise InputError(f"{path}: expected an npz file or OpenCV's YAML, XML or JSON, found other or damaged data") from None
-    try:
-        yield storage
-    finally:
-        storage.release()
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: expected {kinds}, found other or damaged data") from None
+    if text.lstrip().startswith("{"):
+        return _map(json_text.parsed(path, JSON_PIECE.sub(_strict, text)))
+    if not text.startswith("%YAML"):
+        raise InputError(f"{path}: expected {kinds}, found other or damaged data")
+    documents = [_of_node(node) for node in yaml_text.composed(path, HEADER.sub("", text))]
+    return {key: value for document in reversed(documents) for key, value in _map(document).items()}  # as a file is extended
 
 
-def matrix(path: Path, name: str, node: cv2.FileNode) -> Array:
-    """A node's matrix.
+def _map(value: Any) -> Values:
+    return value if isinstance(value, dict) else {}
+
+
+def _of_node(node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return {str(key.value): _of_node(value) for key, value in node.value if isinstance(key, yaml.ScalarNode)}
+    if isinstance(node, yaml.SequenceNode):
+        return [_of_node(value) for value in node.value]
+    if node.tag == "tag:yaml.org,2002:binary":
+        return BASE64 + node.value
+    return node.value if getattr(node, "style", None) else _of_word(node.value)
+
+
+def _of_element(element: Element) -> Any:
+    inner = list(element)
+    if inner and all(child.tag == "_" for child in inner):
+        return [_of_element(child) for child in inner]
+    if inner:
+        return {child.tag: _of_element(child) for child in inner}
+    if element.get("type_id") == "binary":
+        return BASE64 + (element.text or "")
+    words = [_of_word(plain) if plain else quoted for quoted, plain in WORD.findall(element.text or "")]
+    return words[0] if len(words) == 1 else words
+
+
+def _of_word(word: str) -> int | float | str:
+    """A number, or else the word as it is."""
+    if WHOLE.fullmatch(word):
+        return int(word)
+    if DECIMAL.fullmatch(word):
+        return float(word)
+    endless = ENDLESS.fullmatch(word)
+    return float(endless[1] + endless[2]) if endless else word
+
+
+def _strict(piece: re.Match) -> str:
+    """A piece of OpenCV's JSON as others have it: without comments, and with digits on both sides of a point."""
+    if piece[1] is not None:
+        return piece[1]
+    word = piece[2] or ""
+    if ENDLESS.fullmatch(word):
+        return f'"{word}"'
+    return repr(float(word)) if "." in word and DECIMAL.fullmatch(word) else word
+
+
+def matrix(path: Path, name: str, value: Any) -> Array:
+    """A matrix : (rows, columns), or (rows, columns, channels), by its declaration; of other numbers of axes, too.
 
     Raises
     ------
     InputError
-        If there is none, or something else.
+        If there is none, or something else; or its numbers are more, less or others than it declares.
     """
-    if node.empty():
-        raise InputError(f"{path}: {name}: expected a matrix, found none")
-    try:
-        value = node.mat()
-    except (cv2.error, SystemError):
-        value = None
     if value is None:
+        raise InputError(f"{path}: {name}: expected a matrix, found none")
+    if not isinstance(value, dict) or not {"dt", "data"} <= value.keys():
         raise InputError(f"{path}: {name}: expected a matrix, found something else")
-    return np.asarray(value, float)
+    kind = DTYPE.fullmatch(str(value["dt"]))
+    if kind is None:
+        letters = ", ".join(DTYPES)
+        raise InputError(
+            f"{path}: {name}.dt: expected one of {letters}, perhaps after a number of channels, found {value['dt']!r:.40}"
+        )
+    channels, dtype = int(kind[1] or 1), np.dtype(DTYPES[kind[2]])
+    if "sizes" in value:
+        shape = tuple(_numbers(path, f"{name}.sizes", value["sizes"], np.dtype("i4")).tolist())
+    else:
+        shape = tuple(_length(path, f"{name}.{side}", value.get(side)) for side in ("rows", "cols"))
+    shape += (channels,) if channels != 1 else ()
+    numbers = _numbers(path, name, value["data"], dtype)
+    if min(shape, default=0) < 0 or numbers.size != math.prod(shape):
+        declared = " x ".join(map(str, shape)) or "no"
+        raise InputError(f"{path}: {name}: expected {declared} numbers, as it declares, found {numbers.size}")
+    return numbers.reshape(shape).astype(float)
 
 
-def names(storage: cv2.FileStorage) -> tuple[str, ...] | None:
+def _length(path: Path, name: str, value: Any) -> int:
+    if not isinstance(value, int) or value < 0:
+        raise InputError(f"{path}: {name}: expected a whole number, found {'none' if value is None else 'something else'}")
+    return value
+
+
+def _numbers(path: Path, name: str, value: Any, dtype: np.dtype) -> NDArray:
+    """Numbers : (n,) of a type, from a list, a single one, or packed ones."""
+    if isinstance(value, str) and value.startswith(BASE64):
+        return _unpacked(path, name, value, dtype)
+    listed = [_of_word(one) if isinstance(one, str) else one for one in (value if isinstance(value, list) else [value])]
+    wrong = next((one for one in listed if isinstance(one, bool) or not isinstance(one, int | float)), None)
+    if wrong is not None or None in listed:
+        raise InputError(f"{path}: {name}: expected a matrix of numbers, found {wrong!r:.40} among them")
+    numbers = np.array(listed, float)
+    if dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            return numbers.astype(dtype)
+    bounds = np.iinfo(dtype)
+    outside = (numbers != np.rint(numbers)) | (numbers < bounds.min) | (numbers > bounds.max) | ~np.isfinite(numbers)
+    if outside.any():
+        found = f"{numbers[outside.argmax()]:g}: should dt be d?"
+        raise InputError(f"{path}: {name}: expected whole numbers of {bounds.min} to {bounds.max}, as dt declares, found {found}")
+    return numbers.astype(dtype)
+
+
+def _unpacked(path: Path, name: str, text: str, dtype: np.dtype) -> NDArray:
+    """Numbers : (n,) of a type, packed as base64 after a header that names it."""
+    try:
+        data = base64.b64decode("".join(text.removeprefix(BASE64).split()), validate=True)
+        kind = DTYPE.fullmatch(data[:BASE64_HEADER].decode("ascii").strip())
+        if kind is None or np.dtype(DTYPES[kind[2]]) != dtype:
+            raise ValueError("another type")
+        return np.frombuffer(data[BASE64_HEADER:], dtype.newbyteorder("<")).astype(dtype)
+    except ValueError:
+        raise InputError(f"{path}: {name}: expected packed numbers of its type, found other or damaged data") from None
+
+
+def names(values: Values) -> tuple[str, ...] | None:
     """Names of a covariance's parameters; empty where they are no texts, None where there are neither names nor covariance."""
-    node = storage.getNode("parameters")
-    if node.empty() and storage.getNode("covariance").empty():
+    if not {"parameters", "covariance"} & values.keys():
         return None
-    entries = [node.at(i) for i in range(node.size())] if node.isSeq() else []
-    return tuple(entry.string() for entry in entries) if all(entry.isString() for entry in entries) else ()
+    entries = values.get("parameters")
+    return tuple(entries) if isinstance(entries, list) and all(isinstance(entry, str) for entry in entries) else ()
 
 
 def write_covariance(storage: cv2.FileStorage, names: Sequence[str], covariance: Array) -> None:
@@ -90,7 +206,7 @@ def save(path: Path, storage: cv2.FileStorage) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def covariance(path: Path, storage: cv2.FileStorage, count: int) -> Array:
+def covariance(path: Path, values: Values, count: int) -> Array:
     """The matrix `covariance` of a number of parameters, made exactly symmetric.
 
     Raises
@@ -98,16 +214,16 @@ def covariance(path: Path, storage: cv2.FileStorage, count: int) -> Array:
     InputError
         If it is missing, of another shape, not finite, not symmetric, or no covariance.
     """
-    values = matrix(path, "covariance", storage.getNode("covariance"))
+    found = matrix(path, "covariance", values.get("covariance"))
     expected = f"{path}: covariance: expected {count}x{count} variances and covariances of the parameters, found"
-    if values.shape != (count, count):
-        raise InputError(f"{expected} shape {values.shape}")
-    if not np.isfinite(values).all():
+    if found.shape != (count, count):
+        raise InputError(f"{expected} shape {found.shape}")
+    if not np.isfinite(found).all():
         raise InputError(f"{expected} values that are not finite")
-    sigma = np.sqrt(np.abs(np.diag(values)))
+    sigma = np.sqrt(np.abs(np.diag(found)))
     scale = np.outer(sigma, sigma) + np.finfo(float).tiny
-    if (np.abs(values - values.T) > SYMMETRIC * scale).any():
+    if (np.abs(found - found.T) > SYMMETRIC * scale).any():
         raise InputError(f"{expected} a matrix that is not symmetric")
-    if np.diag(values).min() < 0 or (np.abs(values) > (1 + SYMMETRIC) * scale).any():
+    if np.diag(found).min() < 0 or (np.abs(found) > (1 + SYMMETRIC) * scale).any():
         raise InputError(f"{expected} a variance below zero or a correlation beyond one")
-    return (values + values.T) / 2
+    return (found + found.T) / 2

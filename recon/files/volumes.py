@@ -5,7 +5,10 @@ negates x and y, of volumes and of PLY surfaces alike, and what lies together in
 LAS is turned to LPS when it is read. The same volume has the same bytes whenever it is written.
 """
 
-import os
+import bz2
+import io
+import math
+import warnings
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,12 +17,16 @@ import nrrd
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import InputError
+from recon.errors import InputError, short
 from recon.files import atomic, medical_images
 from recon.files.medical_images import fault
+from recon.files.regular import read_bytes
 
 Array = NDArray[np.float64]
 
+MOST_BYTES = 1 << 33  # of all voxels, and of a file of them
+LARGEST_VOXEL = 8  # bytes
+FARTHEST_MM = 1e9
 META_NAMES = {np.dtype(code): name for name, code in medical_images.META_TYPES.items()}
 NRRD_NAMES = {dtype: {"f4": "float", "f8": "double"}.get(dtype.str[1:], dtype.name) for dtype in META_NAMES}
 DAMAGE = (  # what pynrrd raises on headers and pixels damaged at random: it parses without checking
@@ -96,13 +103,13 @@ def write_volume(path: Path, volume: Volume) -> None:
 
 def _read_nrrd(path: Path) -> Volume:
     try:
-        voxels, header = nrrd.read(os.fspath(path), index_order="C")
-    except FileNotFoundError as error:
-        raise InputError(f"{error.filename}: expected a file, found none") from None
-    except OSError as error:
-        raise InputError(f"{path}: expected a file to read, found {error.strerror or error}") from None
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            voxels, header = _nrrd_content(path)
+    except InputError:
+        raise
     except DAMAGE as error:
-        raise InputError(f"{path}: expected an NRRD volume, found it damaged: {' '.join(str(error).split())[:100]}") from None
+        raise InputError(f"{path}: expected an NRRD volume, found it damaged: {short(str(error))}") from None
     if voxels.ndim != 3:
         raise fault(path, "dimension", "3 axes of one number a voxel", header["dimension"])
     space = str(header.get("space", "scanner-xyz")).lower()
@@ -120,6 +127,33 @@ def _read_nrrd(path: Path) -> Volume:
     return volume
 
 
+def _nrrd_content(path: Path) -> tuple[NDArray, nrrd.NRRDHeader]:
+    """Voxels and header by pynrrd, which is given no more bytes than the header has voxels."""
+    stream = io.BytesIO(read_bytes(path, MOST_BYTES))
+    header = nrrd.read_header(stream)
+    detached = header.pop("data file", header.pop("datafile", None))
+    if detached is not None:
+        medical_images.check_beside(path, path.parent / detached)
+        stream = io.BytesIO(read_bytes(path.parent / detached, MOST_BYTES))
+    most = LARGEST_VOXEL * math.prod(map(int, header["sizes"])) + 1
+    if not 1 < most <= MOST_BYTES:
+        raise fault(path, "sizes", f"numbers of voxels, up to {MOST_BYTES // LARGEST_VOXEL} in all", header["sizes"])
+    lines = header.pop("line skip", header.pop("lineskip", 0))
+    for _ in range(lines):
+        if not stream.readline():
+            raise fault(path, "line skip", "a number of lines that are there", lines)
+    unpacker = {"gz": lambda: zlib.decompressobj(31), "gzip": lambda: zlib.decompressobj(31), "bz2": bz2.BZ2Decompressor}
+    packing = header["encoding"].replace("bzip2", "bz2")
+    if packing in unpacker:
+        most += max(header.get("byte skip", header.get("byteskip", 0)), 0)
+        stream = io.BytesIO(unpacker[packing]().decompress(stream.read(), min(most, MOST_BYTES)))
+        header["encoding"] = "raw"
+    voxels = nrrd.read_data(header, stream, index_order="C")
+    if stream.read(1):
+        raise fault(path, "sizes", "numbers of all voxels", f"{header['sizes']}, and more data")
+    return voxels, header
+
+
 def _read_metaimage(path: Path) -> Volume:
     file = medical_images.read_header(path)
     if len(file.size) != 3 or 0 in file.size:
@@ -128,6 +162,8 @@ def _read_metaimage(path: Path) -> Volume:
         raise file.fault("ElementNumberOfChannels", 1, file.channels)
     if file.pixel.itemsize == 0:
         raise file.fault("ElementType", f"one of {', '.join(medical_images.META_TYPES)}", file.fields["ElementType"])
+    if file.data_bytes > MOST_BYTES:
+        raise file.fault("DimSize", f"voxels of up to {MOST_BYTES >> 30} GiB", " ".join(map(str, file.size)))
     (data,) = medical_images.blocks(file, file.data_bytes)
     fields = file.fields
     origin = fields.get("Offset", fields.get("Position", fields.get("Origin", "0 0 0")))
@@ -144,11 +180,11 @@ def _read_metaimage(path: Path) -> Volume:
 
 
 def _check_grid(path: Path, volume: Volume) -> None:
-    if np.shape(volume.origin) != (3,) or not np.isfinite(volume.origin).all():
-        raise fault(path, "origin", "3 finite numbers", volume.origin)
-    if np.shape(volume.spacing) != (3,) or not (np.isfinite(volume.spacing).all() and np.min(volume.spacing) > 0):
-        raise fault(path, "spacing", "3 lengths above 0", volume.spacing)
-    if np.shape(volume.directions) != (3, 3) or not np.isfinite(volume.directions).all():
+    if np.shape(volume.origin) != (3,) or not (np.abs(volume.origin) < FARTHEST_MM).all():
+        raise fault(path, "origin", "3 finite numbers", f"{volume.origin}, beyond {FARTHEST_MM:g} mm or none")
+    if np.shape(volume.spacing) != (3,) or not ((volume.spacing > 0) & (volume.spacing < FARTHEST_MM)).all():
+        raise fault(path, "spacing", "3 lengths above 0", f"{volume.spacing}, beyond {FARTHEST_MM:g} mm or none")
+    if np.shape(volume.directions) != (3, 3) or not (np.abs(volume.directions) < 2).all():
         raise fault(path, "directions", "3 unit vectors", np.ravel(volume.directions))
     if abs(abs(np.linalg.det(volume.directions)) - 1) > 1e-3:
         raise fault(path, "directions", "3 unit vectors at right angles", np.ravel(volume.directions))

@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
-from recon.files import medical_images
+from recon.files import medical_images, xml_text
 from recon.files.medical_images import fault
 from recon.freehand import scans as freehand_scans
 from recon.freehand import sequences
@@ -47,14 +46,7 @@ def read_config(path: Path) -> PlusConfig:
         If the file is missing or has neither, or has settings unknown here: another way of compounding or of filling holes.
     """
     path = Path(path)
-    try:
-        root = ElementTree.parse(path).getroot()
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a file, found none") from None
-    except OSError as error:
-        raise InputError(f"{path}: expected a file to read, found {error.strerror}") from None
-    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter of encodings
-        raise InputError(f"{path}: expected XML, found it broken: {error}") from None
+    root = xml_text.read(path)
     transforms = _transforms(path, root)
     element = root if root.tag == "VolumeReconstruction" else root.find(".//VolumeReconstruction")
     if element is None and not transforms:

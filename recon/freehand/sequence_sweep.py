@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, model_validator
+from pydantic import model_validator
 
 from recon.capture.images import Size
 from recon.errors import InputError
@@ -18,6 +18,7 @@ from recon.freehand import sequences
 from recon.freehand.sequences import FrameName, FrameNames
 from recon.geometry import rigid
 from recon.model import tracks
+from recon.model.rig import Part
 from recon.model.tracks import MAX_GAP_S, Track
 
 Array = NDArray[np.float64]
@@ -25,7 +26,7 @@ Array = NDArray[np.float64]
 MOST_SECONDS = 9e9  # that nanoseconds of 64 bits can hold
 
 
-class SequenceFields(BaseModel):
+class SequenceFields(Part):
     """Fields of a verb that takes a sequence in place of a capture."""
 
     sequence: Path | None = None

@@ -55,6 +55,8 @@ STRUCTURE = {  # fields given by the images and the format, in either of the two
     ),
     *("data file", "datafile", "ultrasound image orientation", "ultrasound image type"),
 }
+MOST_EMPTY, FEW_FRAMES = 10, 10_000  # times the fields that are there, which all frames may lack; frames of a file without any
+FARTHEST_MM = 1e7
 FRAME_STRUCTURE = {"Timestamp", "ImageStatus", "Status", ""}
 RAS, LPS = "RAS", "LPS"
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # and LPS from RAS
@@ -263,6 +265,9 @@ def _without_images(file: ImageFile) -> Frames:
 
 def _frame_table(file: ImageFile, count: int) -> dict[str, list[str]]:
     table: dict[str, list[str]] = {}
+    names = {match[2] for name in file.fields if (match := FRAME_FIELD.fullmatch(name))}
+    if (len(names) + 1) * count > MOST_EMPTY * (len(file.fields) + FEW_FRAMES):
+        raise file.fault("DimSize", f"frames of which most have fields, as {len(file.fields)} are there", f"{count} frames")
     for name, text in file.fields.items():
         if match := FRAME_FIELD.fullmatch(name):
             if int(match[1]) >= count:
@@ -287,7 +292,7 @@ def _matrices(file: ImageFile, key: str, texts: list[str], words: list[str]) -> 
 
 def is_usable(matrix: Array) -> bool:
     """Whether a matrix (4, 4) is an invertible affine transform."""
-    upright = np.abs(matrix[3] - (0, 0, 0, 1)).max() < 1e-6
+    upright = np.abs(matrix[3] - (0, 0, 0, 1)).max() < 1e-6 and np.abs(matrix).max() < FARTHEST_MM
     return bool(upright and np.linalg.cond(matrix[:3, :3]) < 1e6)
 
 

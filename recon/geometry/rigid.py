@@ -8,6 +8,7 @@ Array = NDArray[np.float64]
 
 RIGID = "a rigid transform of a right-handed frame"  # which `fault` expects
 EXACT = 1e-9  # of matrix entries that are zero or one by definition: any file has them with all digits
+FARTHEST_MM = 1e7  # that any device or pose lies from the origin
 FEW_DIGITS = 1e-3  # of a rotation's products, as text files with few digits have them
 
 
@@ -49,8 +50,10 @@ def fault(pose: Array, tolerance: float = FEW_DIGITS) -> str | None:
         return "another shape than 4x4, or values that are not finite"
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > EXACT:
         return f"another last row than 0 0 0 1: {_row(pose[3])}"
+    if (farthest := np.abs(pose[:3, 3]).max()) > FARTHEST_MM:
+        return f"a shift by {farthest:.3g} mm: another unit?"
     rotation = pose[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > tolerance:
+    if np.abs(rotation).max() > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > tolerance:
         return f"a matrix that is no rotation: {'; '.join(map(_row, rotation))}"
     if np.linalg.det(rotation) < 0:
         return "a left-handed frame: two axes swapped or one mirrored"

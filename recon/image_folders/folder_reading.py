@@ -7,7 +7,7 @@ from pathlib import Path
 
 from recon.capture.image_formats import SUFFIXES
 from recon.capture.images import natural_key
-from recon.errors import InputError
+from recon.errors import InputError, short
 from recon.image_folders import file_templates
 from recon.image_folders.file_templates import FIRST, Name, Words
 
@@ -84,6 +84,8 @@ def image_paths(folder: Path) -> list[str]:
         raise InputError(f"{folder}: expected a folder of images, found {'a file' if folder.exists() else 'nothing'}")
     relative = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()]
     paths = [path.as_posix() for path in relative if not any(part.startswith(".") for part in path.parts)]
+    if strange := next((path for path in paths if path.encode("utf-8", "replace").decode("utf-8") != path), None):
+        raise InputError(f"{folder}: expected names of images in UTF-8, found {short(strange)}: rename it")
     if not paths:
         raise InputError(f"{folder}: expected images ({', '.join(SUFFIXES)}), found none")
     return sorted(paths, key=_natural)

@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
-from recon.capture.image_formats import decode_image
+from recon.capture.image_formats import decode_image, size_of
 from recon.capture.images import Size
 from recon.errors import InputError
-from recon.files.regular import read_bytes
+from recon.files.regular import opened, read_bytes
 
 Bits = Literal[8, 10, 12]
 
@@ -49,8 +48,5 @@ def bits(paths: Sequence[Path]) -> Bits:
 
 
 def _size(path: Path) -> Size:
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError):
-        raise InputError(f"{path}: expected an image, found other or damaged data") from None
+    with opened(path) as stream:
+        return size_of(path, stream)

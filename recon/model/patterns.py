@@ -26,8 +26,8 @@ class Fringes(Part):
     kind: Literal["fringes"] = "fringes"
     axis: Axis = "columns"
     pitch: float = Field(gt=1)  # projector px a period
-    steps: int = Field(ge=3)  # phase shifts
-    first: int = 0  # index of the first shift: shift_k = 2 pi (first + k) / steps, k = 0 .. steps-1
+    steps: int = Field(ge=3, le=1000)  # phase shifts
+    first: Annotated[int, Field(ge=-1000, le=1000)] = 0  # of the first shift: shift_k = 2 pi (first + k) / steps, k < steps
     backwards: bool | None = None  # whether that shift is negative; left out of files if it isn't, so that 0.1.0 reads them
     origin: float | None = None  # projector px where the phase is zero; the centre of the axis if not given
     waveform: Literal["sine", "binary"] = "sine"  # binary fringes become sinusoidal by defocus; see `profiles` for their origin
@@ -164,7 +164,7 @@ class Patterns(Part):
 
     projector_size: tuple[Side, Side]  # width, height, px
     unwrap: Unwrapping
-    parts: tuple[AnyPart, ...] = Field(min_length=1)
+    parts: tuple[AnyPart, ...] = Field(min_length=1, max_length=100)
 
     @model_validator(mode="after")
     def _consistent(self) -> "Patterns":

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from recon.errors import InputError
 from recon.model.probe import SPEEDS, ProbeCalibration, Speed, SpeedSigma
-from recon.model.rig import Finite, NotNegative, Probe
+from recon.model.rig import Finite, NotNegative, Part, Probe
 from recon.probe_calibration import point_calibration, probe_checks, sound_in_water, wires
 from recon.probe_calibration.cross_wire import Appearance
 from recon.probe_calibration.crossing_frames import CrossingFrames
@@ -19,10 +19,8 @@ ORDINARY_C = 22.0  # of water, where no temperature is given
 SAME_WIDTH = 0.05  # relative difference of sx, which no sound changes, within which a B-scan is of the rig's scanner
 
 
-class Settings(BaseModel):
+class Settings(Part):
     """The water, the wires, the scanner's assumption, and settings of the method."""
-
-    model_config = ConfigDict(extra="forbid")
 
     temperature_c: Finite | None = None
     temperature_sigma_c: NotNegative = 1.0

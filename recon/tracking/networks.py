@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as runtime  # pyrefly: ignore[missing-module-attribute]
 
 from recon.errors import InputError
+from recon.files.regular import read_bytes
 
 Floats = NDArray[np.float32]
 
 WEIGHTS = Path(__file__).parent / "weights"
 DETECTOR_SIZE = (320, 240)  # width, height, px
+MOST_BYTES = 1 << 28  # of a network
 CELL = 8  # px, of the detector's output
 PATCH = 120  # px
 Interface = tuple[dict[str, tuple[int | None, ...]], dict[str, tuple[int | None, ...]]]
@@ -70,15 +72,14 @@ def load(folder: Path = WEIGHTS, threads: int = 0) -> OnnxNetworks:
 
 def session(path: Path, interface: Interface, threads: int = 0) -> onnxruntime.InferenceSession:
     """Open a network, and check that it takes and gives what is expected."""
-    if not path.is_file():
-        raise InputError(f"{path}: expected a network, found no file")
+    network = read_bytes(path, MOST_BYTES, "a network")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = threads, 4
     # threads that wait by spinning would take the cores from the fit of rims that follows: 75 ms from nothing instead of 41
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        opened = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except FAULTS as error:
+        opened = onnxruntime.InferenceSession(network, options, ["CPUExecutionProvider"], enable_fallback=0)
+    except (*FAULTS, ValueError) as error:  # the latter of texts in it
         raise InputError(f"{path}: expected an ONNX network, found {_brief(str(error))}") from None
     for what, expected, found in (("inputs", interface[0], opened.get_inputs()), ("outputs", interface[1], opened.get_outputs())):
         shapes = {node.name: tuple(node.shape) for node in found}

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
 from recon.capture.surface_part import read_patterns
 from recon.errors import InputError
-from recon.model.rig import Rig
+from recon.model.rig import Part, Rig
 from sonotwin.config import folder
 from twin.accuracy import table_rows
 from twin.conditions import Conditions
@@ -35,10 +34,8 @@ MODULES = {
 }  # of the others twin.accuracy.GROUP_accuracy
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/accuracy.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Rig
     only: Group | None

@@ -13,7 +13,7 @@ tracking the film.
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from rich.console import Console
 from rich.progress import Progress
 
@@ -22,7 +22,7 @@ from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
-from recon.model.rig import Rig
+from recon.model.rig import Part, Rig
 from recon.target_calibration import target_bundle, target_figures, target_poses
 from recon.target_calibration.target_poses import Seen
 from recon.tracking import networks
@@ -32,10 +32,8 @@ TARGET = "target.yaml"  # by which the folder of a target is known
 NO_COVARIANCE = "the cameras' calibration has no covariance: its errors are not in these uncertainties"
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/calibrate-target.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Rig
     capture: Path

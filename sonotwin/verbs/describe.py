@@ -18,7 +18,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError, field_validator
 
 from recon.capture import calibration_files, manifest
 from recon.capture.manifest import OPTICS, BoardPart, BoardPose, Device, Manifest, SurfacePart
@@ -29,16 +29,17 @@ from recon.image_folders.file_templates import CAMERAS, Words
 from recon.image_folders.folder_reading import Expected, Reading
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
+from recon.model.rig import Part
 from sonotwin import choices
 
 Camera = Literal["cam1", "cam2"]
 LEAST_PX = 8  # of an image's shorter side
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/describe.yaml`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, coerce_numbers_to_str=True)
+    model_config = ConfigDict(coerce_numbers_to_str=True)
 
     folder: Path
     out: Path
@@ -49,6 +50,14 @@ class Config(BaseModel):
     cameras: dict[Camera, str] | None = None
     lit: tuple[str, ...] = ("lit", "white")
     bits: Literal[8, 10, 12] | None = None
+
+    @field_validator("cameras")
+    @classmethod
+    def _one_word_each(cls, value: dict[Camera, str] | None) -> dict[Camera, str] | None:
+        words = [word.lower() for word in (value or {}).values()]
+        if len(set(words)) < len(words):
+            raise ValueError(f"expected another word for each camera, found {words[0]} for both")
+        return value
 
 
 def run(config: Config) -> None:

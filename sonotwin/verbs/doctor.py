@@ -6,19 +6,17 @@ to be tried. Takes some seconds. Exit status 0 if the core can be used, else 2; 
     sonotwin doctor
 """
 
-from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
 from recon.errors import InputError
+from recon.model.rig import Part
 from sonotwin import installation
 
 STYLES = {"ok": "green", "absent": "yellow", "unused": "dim", "problem": "bold red"}
 
 
-class Config(BaseModel):
+class Config(Part):
     """The verb takes no fields."""
-
-    model_config = ConfigDict(extra="forbid")
 
 
 def run(config: Config) -> None:

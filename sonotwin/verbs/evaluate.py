@@ -8,10 +8,9 @@ error_map.png into the folder `out`, by default evaluation/ in the surface's fol
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict
-
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown
+from recon.model.rig import Part
 from recon.reports import figures
 from sonotwin.verbs.surface import POINTS
 from twin.evaluation import surface_errors
@@ -19,10 +18,8 @@ from twin.evaluation import surface_errors
 ERROR_MAP = "error_map.png"  # by which the folder of an evaluation is known
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/evaluate.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     surface: Path
     truth: Path

@@ -18,7 +18,6 @@ from typing import Literal
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
 from recon.capture import (
@@ -39,6 +38,7 @@ from recon.errors import InputError
 from recon.files import atomic, npz
 from recon.freehand import scans as freehand_scans
 from recon.model.probe import Speed
+from recon.model.rig import Part
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.segmentation import mass_files
@@ -46,10 +46,8 @@ from recon.segmentation.scan_masks import mask_of
 from sonotwin.verbs.surface import POINTS
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/export.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     layout: Literal["meza2021"] = "meza2021"
     capture: Path

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import yaml
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from rich.console import Console
 from rich.progress import Progress
 
@@ -34,8 +34,6 @@ from twin.tracking.sampling_ranges import DataRanges
 
 class Config(film_session.Filming):
     """Fields of `conf/film.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Rig
     conditions: Conditions = Conditions()

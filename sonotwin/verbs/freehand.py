@@ -20,7 +20,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from rich.console import Console
 
 from recon.capture import probe_files, sweep_part
@@ -43,8 +43,6 @@ SIGMA, SEQUENCE = "sigma.nrrd", "sequence.igs.mha"
 
 class Config(ScansFields):
     """Fields of `conf/freehand.yaml`: sources, target, and settings of the volume."""
-
-    model_config = ConfigDict(extra="forbid")
 
     out: Path
     spacing_mm: Annotated[float, Field(ge=0.01, le=100)] | None = None

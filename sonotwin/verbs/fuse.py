@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from rich.console import Console
 
 from recon.capture import calibration_files, sweep_part
@@ -28,7 +28,7 @@ from recon.fusion.fused_scene import FusedScene
 from recon.fusion.skin import Parted
 from recon.model.calibration import Calibration
 from recon.model.probe import Speed
-from recon.model.rig import Rig
+from recon.model.rig import Part, Rig
 from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, mass_files
 from sonotwin.verbs import freehand
@@ -36,10 +36,8 @@ from sonotwin.verbs import freehand
 SCENE, PAGE, SLICER = "scene.glb", "scene.html", "slicer"  # the first is what the folder of a scene is known by
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/fuse.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Rig
     capture: Path

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from rich.console import Console
 
 from recon.capture import calibration_files, manifest, meza2021, meza2021_sweep, probe_files, sweep_tables
@@ -30,17 +30,15 @@ from recon.files import atomic
 from recon.model.calibration import Calibration
 from recon.model.patterns import Patterns
 from recon.model.probe import ProbeCalibration, Speed
-from recon.model.rig import Positive
+from recon.model.rig import Part, Positive
 from recon.model.tracks import Track
 
 PAIRS = "pairs.csv"
 Pixels = Annotated[int, Field(ge=8, le=20000)]
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/import.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     layout: Literal["meza2021"] = "meza2021"
     folder: Path

@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from rich.console import Console
 
 from recon.capture import manifest
@@ -28,16 +28,15 @@ from recon.clips.pose_tables import MOST_SECONDS, Columns
 from recon.errors import InputError
 from recon.files import atomic
 from recon.freehand import volume_compounding
+from recon.model.rig import Part
 from recon.model.tracks import Track
 
 Least = Annotated[int, Field(ge=0)]
 Size = Annotated[int, Field(ge=8)]
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/import-sweep.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     clip: Path
     poses: Path

@@ -17,7 +17,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from recon.capture import lag_files, sweep_part, sweep_tables
@@ -46,8 +46,6 @@ Array = NDArray[np.float64]
 
 class Config(SequenceFields):
     """Fields of `conf/measure-lag.yaml`."""
-
-    model_config = ConfigDict(extra="forbid")
 
     out: Path
     capture: Path | None = None

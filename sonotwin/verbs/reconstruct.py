@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 from rich.console import Console
 
 from recon.capture import manifest
@@ -29,7 +29,7 @@ from recon.errors import InputError
 from recon.files import metrics
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE
 from recon.model.probe import Speed, SpeedSigma
-from recon.model.rig import Finite, NotNegative, Positive, Rig
+from recon.model.rig import Finite, NotNegative, Part, Positive, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
@@ -47,10 +47,8 @@ NO_LAG = "latency failed; give lag_s"
 SKIN = "surface.ply"
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/reconstruct.yaml`: source, target, and what is known beforehand."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Rig
     capture: Path

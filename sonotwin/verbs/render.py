@@ -17,7 +17,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
@@ -25,7 +25,7 @@ from recon.capture.manifest import axes_not_encoded
 from recon.files import atomic
 from recon.geometry.rigid import Array
 from recon.model.patterns import Patterns
-from recon.model.rig import Rig
+from recon.model.rig import Part, Rig
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene, parse_scene
 from twin import board_session
@@ -35,10 +35,8 @@ from twin.optics.light_transport import Tracing
 from twin.session import Session
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/render.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Rig
     scene: dict
@@ -58,6 +56,8 @@ class Config(BaseModel):
         if shown != raster:
             raise ValueError(f"patterns.projector_size: expected the rig's {list(raster)}, found {list(shown)}")
         for camera in self.cameras:
+            if self.cameras.count(camera) > 1:
+                raise ValueError(f"cameras: expected each once, found {camera} {self.cameras.count(camera)} times")
             adc = getattr(self.rig, camera).sensor.adc_bits
             if self.shooting.bits > adc:
                 raise ValueError(f"shooting.bits: expected at most the {adc} of {camera}'s ADC, found {self.shooting.bits}")

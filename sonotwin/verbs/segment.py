@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 
 import cv2
 import trimesh
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from rich.console import Console
 
 from recon.capture import probe_files, sweep_part
@@ -38,7 +38,7 @@ from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
 from recon.segmentation.segmented_scans import Segmented
 from recon.segmentation.tube_wall import Appearance
 
-Spread = Annotated[float, Field(ge=0, le=MOST_MM)]
+Spread = Annotated[float, Field(gt=0, le=MOST_MM)]
 Spreads = tuple[Spread, Spread]  # along the array and in depth
 
 
@@ -54,8 +54,6 @@ Slice = Annotated[tuple[tuple[NotNegative, Spread], ...] | None, AfterValidator(
 
 class Config(ScansFields):
     """Fields of `conf/segment.yaml`."""
-
-    model_config = ConfigDict(extra="forbid")
 
     out: Path
     kind: Literal["masses", "tube"] = "masses"

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 from rich.console import Console
 
+from recon.model.rig import Part
 from sonotwin import study_steps
 from sonotwin.config import compose, folder
 from sonotwin.study_plan import SWEEP, Points, Seeds, read_study
@@ -28,10 +29,8 @@ from twin.studies.factors import Filling
 from twin.studies.rig_search import Goal
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/study.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(coerce_numbers_to_str=True)]
     out: Path

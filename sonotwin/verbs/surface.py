@@ -17,13 +17,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from recon.capture import surface_part
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
 from recon.files.metrics import shown
+from recon.model.rig import Part
 from recon.structured_light import decode, surface_figures, surface_mesh
 from recon.structured_light.triangulate import PointMap, Triangulator
 from sonotwin import config as configuration
@@ -31,10 +31,8 @@ from sonotwin import config as configuration
 POINTS = "points.npz"  # by which the folder of a surface is known
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/surface.yaml`: sources, target, and limits of the surface."""
-
-    model_config = ConfigDict(extra="forbid")
 
     out: Path
     capture: Path | None = None

@@ -21,7 +21,7 @@ from time import perf_counter
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from rich.console import Console
 from rich.progress import Progress
 
@@ -30,16 +30,14 @@ from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
-from recon.model.rig import Rig
+from recon.model.rig import Part, Rig
 from recon.tracking import networks, results, track_figures
 from recon.tracking.results import Step
 from recon.tracking.tracker import Tracker
 
 
-class Config(BaseModel):
+class Config(Part):
     """Fields of `conf/track.yaml`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Rig
     capture: Path

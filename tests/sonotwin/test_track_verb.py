@@ -53,7 +53,7 @@ def test_what_is_wrong_is_said_in_one_line(drawn, tmp_path, capsys):
         (line,) = capsys.readouterr().err.splitlines()
         return line.removeprefix("sonotwin: ")
 
-    assert complaint(f"networks={tmp_path}") == f"{tmp_path}/detector.onnx: expected a network, found no file"
+    assert complaint(f"networks={tmp_path}") == f"{tmp_path}/detector.onnx: expected a network, found none"
     assert complaint(f"capture={tmp_path}") == f"{tmp_path}/manifest.json: expected a file, found none"
     assert complaint(f"calibration={tmp_path / 'none.yaml'}").startswith(f"{tmp_path}/none.yaml: expected a calibration file")
     assert complaint("threads=-1").startswith("track: threads: expected")

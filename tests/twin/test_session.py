@@ -298,7 +298,7 @@ def test_damaged_truth_is_named(tmp_path, name, content, complaint):
 
 def test_truth_that_cannot_be_read_is_named(tmp_path):
     (tmp_path / SETTINGS).mkdir()
-    with pytest.raises(InputError, match=r"settings\.json: expected a file of the twin's ground truth, found is a directory"):
+    with pytest.raises(InputError, match=r"settings\.json: expected a file of the twin's ground truth, found a folder"):
         TruthFolder(tmp_path, "board").settings()
 
 

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 
+from recon.capture.images import read_grey
 from recon.capture.manifest import image_name, sweep_part
 from recon.errors import InputError, one_line
 from recon.files import npz
@@ -54,10 +54,7 @@ class SweepTruth:
 
     def shown(self, frame: int) -> NDArray[np.uint8]:
         """Label of each pixel of a B-scan : (h, w), as of `twin.ultrasound.bscan_truth.labels`; InputError if it is missing."""
-        found = cv2.imread(str(self.labels[frame]), cv2.IMREAD_UNCHANGED)
-        if found is None:
-            raise InputError(f"{self.labels[frame]}: expected an image of labels, found none")
-        return found
+        return read_grey(self.labels[frame])
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
-from recon.model.rig import NotNegative
+from recon.model.rig import NotNegative, Part
 from twin.optics.instruments import CameraOptics, ProjectorOptics, light_point, sample_rays
 from twin.optics.light_spread import LightSpread, Translucent
 from twin.optics.raster import Light, LightTable
@@ -22,10 +22,8 @@ Images = NDArray[np.float32]
 LUMENS_PER_WATT = 542.0  # photopic efficacy at 525 nm (683 lm/W, CIE V = 0.793), to turn room light in lux into W/mm^2
 
 
-class Tracing(BaseModel):
+class Tracing(Part):
     """Settings of the path tracer."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     samples: int = Field(default=16, ge=2, le=65536)  # paths a pixel, a power of two
     bounces: int = Field(default=1, ge=1, le=16)  # reflections between projector and camera; 1 is direct light

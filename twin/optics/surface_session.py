@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from recon.capture.manifest import Device
 from recon.errors import InputError
 from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes, Patterns
-from recon.model.rig import CameraDevice, Positive, Rig
+from recon.model.rig import CameraDevice, Part, Positive, Rig
 from scenes.scene_types import Scene
 from twin.conditions import IDEAL, Conditions, as_skin, draw
 from twin.optics.disturbed_light import emitted, with_stray
@@ -26,10 +26,8 @@ from twin.session import Session, describe
 CameraName = Literal["cam1", "cam2"]
 
 
-class Shooting(BaseModel):
+class Shooting(Part):
     """Settings of the cameras' shots."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     exposure_s: Positive | None = None  # if not given, set for the scene: see level
     level: Annotated[float, Field(gt=0, le=1)] = 0.9  # of full scale, for the brightest thousandth of the pixels

@@ -14,6 +14,7 @@ from recon.capture.sweep_part import SweepCapture
 from recon.files import volumes
 from recon.files.metrics import FILE, Metrics, shown
 from recon.files.metrics import read as read_figures
+from recon.files.regular import read_text
 from recon.files.volumes import Volume
 from recon.freehand import sequences
 from recon.geometry import rigid
@@ -339,8 +340,7 @@ def probe_table(metrics: Metrics, story: Inside) -> str:
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+    return list(csv.DictReader(read_text(path).splitlines()))
 
 
 def _beside(found: float, true: float, form: str) -> str:

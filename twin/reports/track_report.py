@@ -11,6 +11,7 @@ import numpy as np
 
 from recon.errors import InputError
 from recon.files.metrics import Metrics, shown
+from recon.files.regular import read_text
 from recon.reports import figures, page
 from recon.reports.figures import Colours
 from recon.reports.page import Section
@@ -44,8 +45,7 @@ def read(film: Path, track: Path) -> Tracked:
     """
     expected = track_errors.read_truth(film / "truth")
     errors = track_errors.compare(track_errors.read_track(track / results.POSES, expected), expected)
-    with (track / results.FRAMES).open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader(read_text(track / results.FRAMES).splitlines()))
     if len(rows) != len(expected.times):
         raise InputError(f"{track / results.FRAMES}: expected {len(expected.times)} frames, found {len(rows)}")
     pictures = tuple(track / results.OVERLAYS / results.overlay_name(int(row["frame_cam1"])) for row in rows)

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from recon.errors import InputError
-from recon.files import atomic
+from recon.files import atomic, json_text
 from recon.files.metrics import Metrics
 from twin.engine import Engine, results
 from twin.studies import experiments
@@ -85,10 +85,10 @@ class StudyFolder:
         """A trial that was done before, if it is whole."""
         path = self._path(trial.key)
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json_text.read(path)
             figures = content["figures"].items()
             return Done(trial, {name: math.nan if value is None else float(value) for name, value in figures})
-        except (OSError, ValueError, KeyError, AttributeError, TypeError):  # none, or damaged: done again
+        except (InputError, ValueError, KeyError, AttributeError, TypeError):  # none, or damaged: done again
             return None
 
     def keep(self, done: Done) -> None:
@@ -110,11 +110,11 @@ class StudyFolder:
 
 def _check_mark(path: Path) -> None:
     """Refuse a file that isn't a study's description, as another program may have one of this name; raises InputError."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists():
         return
-    except (ValueError, RecursionError):  # other text, or no text at all
+    try:
+        found = json_text.read(path)
+    except InputError:  # other text, or no text at all
         found = None
     if not (isinstance(found, dict) and all(name in found for name in MARKS)):
         raise InputError(f"{path}: expected a study's description to replace, found other or damaged data; choose another out")

@@ -2,17 +2,15 @@
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from recon.model.rig import Fraction, NotNegative, Positive
+from recon.model.rig import Fraction, NotNegative, Part, Positive
 
 Share = Fraction
 
 
-class Ranges(BaseModel):
+class Ranges(Part):
     """Base: immutable, refuses unknown keys, and every pair is (least, most)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     @model_validator(mode="after")
     def _ordered(self) -> "Ranges":

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, label, sum_labels
 
 from recon.compiled import njit
+from recon.errors import InputError
 from recon.geometry.primitives import Cylinder
 from recon.geometry.surface_tree import surface_tree
 from scenes.acoustics import BACKSCATTER, Tissue, faster, surroundings, tissue_of
@@ -26,6 +27,7 @@ Array = NDArray[np.float64]
 
 SPACING_MM = (0.5, 1.0)  # of the grids, of small and of large solids
 LARGE_MM = 60.0  # greatest extent of a small one
+MOST_POINTS = 3e8  # of a grid
 MARGIN_MM = 3.0  # of the grids, around the solid
 SAG_MM = 0.001  # by which a rod's wall lies within the true one: of a chord between the points of its grid
 BAND_MM = 3.0  # from a mesh, beyond which only the sign of its distance counts
@@ -172,8 +174,14 @@ def _grid(thing: Thing, steps: Array) -> tuple[Array, Array]:
     """Points : (nx, ny, nz, 3) around a thing, and the first of them."""
     low, high = thing.mesh.bounds[0] - MARGIN_MM, thing.mesh.bounds[1] + MARGIN_MM
     counts = np.ceil((high - low) / steps).astype(int) + 1
+    _check_count(thing.name, counts)
     axes = [low[k] + steps[k] * np.arange(counts[k]) for k in range(3)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), low
+
+
+def _check_count(name: str, counts: Array) -> None:
+    if (points := np.prod(counts.astype(float))) > MOST_POINTS:
+        raise InputError(f"scene: {name}: expected a thing whose grid has up to {MOST_POINTS:g} points, found {points:.2g}")
 
 
 def _sampled(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array], steps: Array) -> Solid:

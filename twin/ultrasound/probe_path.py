@@ -23,6 +23,7 @@ from twin.ultrasound.transducer import Transducer
 Array = NDArray[np.float64]
 
 RATE_HZ = 100.0  # of the poses that make up a path
+MOST_S = 3600.0  # of a path
 SEARCH_MM = 0.1  # steps in which the surface is looked for
 FOOT_MM = 8.0  # width of the probe's foot across the array
 FOOT_POINTS = (21, 5)  # of the foot, along and across the array
@@ -36,7 +37,7 @@ class Hand(Part):
 
     shift_mm: NotNegative = 0.15  # standard deviation
     turn_deg: NotNegative = 0.6
-    correlation_s: Annotated[float, Field(gt=0.01)] = 0.15  # of the Gaussian that smooths them: drift below 3 Hz
+    correlation_s: Annotated[float, Field(gt=0.01, le=60)] = 0.15  # of the Gaussian that smooths them: drift below 3 Hz
 
 
 class SurfacePath(Part):
@@ -63,7 +64,7 @@ class Bob(Part):
     middle_mm: tuple[Finite, Finite, Finite] = (4.0, -2.0, 672.0)  # of the array's face, in the world
     turn_deg: Finite = 0.0
     height_mm: Positive = 8.0  # amplitude
-    seconds: Positive = 12.0
+    seconds: Annotated[float, Field(gt=0, le=MOST_S)] = 12.0
     hand: Hand = Hand()
 
 
@@ -93,6 +94,9 @@ def along_surface(path: SurfacePath, solid: Solid, transducer: Transducer, seed:
     """
     start, end = np.array(path.start_mm), np.array(path.end_mm)
     duration = float(np.linalg.norm(end - start)) / path.speed_mm_s
+    if path.strokes * duration > MOST_S:
+        found = f"{path.strokes * duration:.3g} s at {path.speed_mm_s:g} mm/s"
+        raise InputError(f"path.speed_mm_s: expected strokes of up to {MOST_S:g} s in all, found {found}")
     if duration < 2 / RATE_HZ:
         raise InputError(f"path.end_mm: expected a stroke of some length, found {np.linalg.norm(end - start):g} mm")
     aside = path.stroke_step_mm * _upright(path.turn_deg)[:2, 0]

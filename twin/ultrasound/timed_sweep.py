@@ -1,15 +1,17 @@
 """A freehand sweep: the scanner's images and the cameras' poses, each by its own clock, and their truth."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model import tracks
-from recon.model.rig import Finite, NotNegative, Part, Positive, Probe
-from recon.model.tracks import Track
+from recon.model.rig import NotNegative, Part, Positive, Probe
+from recon.model.tracks import LagSeconds, Track
 from twin import conditions
 from twin.ultrasound.bscan import scans
 from twin.ultrasound.bscan_truth import labels
@@ -19,6 +21,8 @@ from twin.ultrasound.transducer import Transducer
 Array = NDArray[np.float64]
 
 STILL = conditions.Motion()
+MOST_MOMENTS = 1_000_000  # of a sweep
+Jitter = Annotated[float, Field(ge=0, le=1)]  # s
 
 
 class Clocks(Part):
@@ -26,9 +30,9 @@ class Clocks(Part):
 
     scanner_hz: Positive = 20.0
     camera_hz: Positive = 40.0
-    lag_s: Finite = 0.05  # of the scanner's stamps: stamped t, an image shows the probe as it stood at t - lag
-    scanner_jitter_s: NotNegative = 0.002  # standard deviation of a stamp
-    camera_jitter_s: NotNegative = 0.0
+    lag_s: LagSeconds = 0.05  # of the scanner's stamps: stamped t, an image shows the probe as it stood at t - lag
+    scanner_jitter_s: Jitter = 0.002  # standard deviation of a stamp
+    camera_jitter_s: Jitter = 0.0
 
 
 class PoseNoise(Part):
@@ -98,6 +102,9 @@ def sweep(
 def moments(path: Track, rate_hz: float) -> NDArray[np.int64]:
     """Moments : (n,) ns on a path, at an even rate from its start."""
     length = (path.times[-1] - path.times[0]) * 1e-9
+    if length * rate_hz > MOST_MOMENTS:
+        found = f"{length * rate_hz:.3g} at {rate_hz:g} Hz over {length:g} s"
+        raise InputError(f"clocks: expected up to {MOST_MOMENTS} images, found {found}")
     return path.times[0] + np.rint(np.arange(int(length * rate_hz) + 1) * 1e9 / rate_hz).astype(np.int64)
 
 

@@ -154,7 +154,7 @@ FAULTS = {
     "lost image": (lambda f: (f / "board/02/cam2/lit.png").unlink(), "02/cam2/lit.png: expected a file, found none"),
     "folder for an image": (
         lambda f: ((f / "board/02/cam1/0000.png").unlink(), (f / "board/02/cam1/0000.png").mkdir()),
-        "02/cam1/0000.png: expected a file, found something else",
+        "02/cam1/0000.png: expected a file, found a folder",
     ),
 }
 

@@ -320,7 +320,7 @@ def test_a_file_of_ours_without_devices_is_refused(tmp_path, content, complaint)
 
 
 def test_a_missing_file_or_size_is_named(optics, tmp_path):
-    with pytest.raises(InputError, match=r"none\.yaml: expected a calibration file, found no such file"):
+    with pytest.raises(InputError, match=r"none\.yaml: expected a calibration file, found none"):
         calibration_files.read(tmp_path / "none.yaml")
     write_storage(tmp_path / "c.yml", slmaster(optics))
     with pytest.raises(InputError, match="expected a file that stores the image size of projector"):

@@ -17,10 +17,10 @@ def test_a_lag_is_read_as_it_was_written(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "Invalid JSON"),
+        ("", "expected JSON, found it damaged"),
         ("[1]", "a map of fields"),
         ('{"lag_s": 0.05}', "sigma_s"),
-        ('{"lag_s": NaN, "sigma_s": 0, "interval_s": [0, 1], "coverage": 0.95}', "lag_s"),
+        ('{"lag_s": NaN, "sigma_s": 0, "interval_s": [0, 1], "coverage": 0.95}', "expected finite numbers, found NaN"),
         ('{"lag_s": 0.05, "sigma_s": -1, "interval_s": [0, 1], "coverage": 0.95}', "sigma_s"),
         ('{"lag_s": 0.05, "sigma_s": 0, "interval_s": [0], "coverage": 0.95}', "interval_s"),
         ('{"lag_s": 0.05, "sigma_s": 0, "interval_s": [0.06, 0.04], "coverage": 0.95}', "interval_s: .*low, then high"),

@@ -92,7 +92,7 @@ def test_values_that_are_no_probe_are_refused(tmp_path, change, named):
 
 
 def test_no_file_and_no_matrix_are_refused(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="found none"):
         probe_files.read(tmp_path / "none.yaml")
     (tmp_path / "list.yaml").write_text("%YAML:1.0\n---\n- 1\n")
     with pytest.raises(InputError, match=r"list\.yaml"):

@@ -149,7 +149,7 @@ FAULTS = {
     ),
     "lost calibration": (
         lambda f: (f / "calibration" / "optics.yaml").unlink(),
-        "optics.yaml: expected a calibration file, found no such file",
+        "optics.yaml: expected a calibration file, found none",
     ),
     "nested": (
         lambda f: (f / "manifest.json").write_text("[" * 100_000),
@@ -174,7 +174,7 @@ FAULTS = {
     "missing image": (lambda f: image(f).unlink(), "0002.png: expected a file, found none"),
     "empty image": (lambda f: image(f).write_bytes(b""), f"0002.png: {AN_IMAGE}, found an empty file"),
     "no image": (lambda f: image(f).write_bytes(b"hello"), f"0002.png: {AN_IMAGE}, found other or damaged data"),
-    "folder": (lambda f: (image(f).unlink(), image(f).mkdir()), "0002.png: expected a readable file, found Is a directory"),
+    "folder": (lambda f: (image(f).unlink(), image(f).mkdir()), "0002.png: expected a file, found a folder"),
     "size": (lambda f: rewrite(f, np.zeros((40, 64), np.uint8)), "0002.png: expected 64x48 8-bit, found 64x40 8-bit"),
     "16 bits": (lambda f: rewrite(f, np.zeros((48, 64), np.uint16)), "0002.png: expected 64x48 8-bit, found 64x48 16-bit"),
 }

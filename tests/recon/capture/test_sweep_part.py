@@ -178,7 +178,7 @@ FAULTS = {
     "version": (manifest_with(lambda m: m.update(schema="sonotwin-capture/2")), "schema: expected 'sonotwin-capture/1'"),
     "lost probe": (
         lambda f: (f / "calibration/probe.yaml").unlink(),
-        "probe.yaml: expected a probe's calibration, found no such",
+        "probe.yaml: expected a probe's calibration, found none",
     ),
     "lost image": (lambda f: (f / "sweep/us/0003.png").unlink(), "us/0003.png: expected a file, found none"),
     "lost stamps": (lambda f: (f / "sweep" / STAMPS).unlink(), "timestamps.csv: expected a file, found none"),

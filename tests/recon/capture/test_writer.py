@@ -277,7 +277,8 @@ def test_a_manifest_of_the_fewest_keys_is_added_to(whole):
 
 @pytest.mark.parametrize("part", ["surface", "board", "sweep"])
 @pytest.mark.parametrize(
-    ("place", "complaint"), [("{}/x", "expected none of its files in"), ("../x", "holds all"), ("/x", "holds all")]
+    ("place", "complaint"),
+    [("{}/x", "expected none of its files in"), ("../x", "(holds all|within)"), ("/x", "(holds all|within)")],
 )
 def test_files_that_would_be_lost_are_refused_before_anything_is_written(whole, part, place, complaint):
     """A manifest written by hand may name files in another part's folder, or outside the capture."""
@@ -291,7 +292,7 @@ def test_files_that_would_be_lost_are_refused_before_anything_is_written(whole, 
     moved[part](place.format(replaced))
     path.write_text(json.dumps(read))
     before = contents(whole)
-    with pytest.raises(InputError, match=rf"manifest\.json: {part}: .*{complaint}"), new_capture(whole, add=replaced):
+    with pytest.raises(InputError, match=rf"manifest\.json: {part}[:.].*{complaint}"), new_capture(whole, add=replaced):
         pass
     assert contents(whole) == before
 

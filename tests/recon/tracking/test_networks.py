@@ -51,7 +51,7 @@ def test_wrong_files_are_refused_in_one_line(folder):
     with pytest.raises(InputError, match="expected an ONNX network"):
         networks.load(folder)
     (folder / "segmenter.onnx").unlink()
-    with pytest.raises(InputError, match="found no file"):
+    with pytest.raises(InputError, match="expected a network, found none"):
         networks.load(folder)
 
 
