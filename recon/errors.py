@@ -31,18 +31,18 @@ def one_line(error: ValidationError) -> str:
     elif kind == "union_tag_invalid":
         text = f"expected one of {first['ctx']['expected_tags']}, found {first['ctx']['tag']!r}"
     elif kind in ("model_type", "model_attributes_type"):
-        text = f"expected a map of fields, found {_shown(found)}"
+        text = f"expected a map of fields, found {brief(found)}"
     elif kind == "extra_forbidden":
-        text = f"expected no such field, found {_shown(found)}"
+        text = f"expected no such field, found {brief(found)}"
     elif kind in OWN_WORDS:
-        text = f"expected {OWN_WORDS[kind]}, found {_shown(found)}"
+        text = f"expected {OWN_WORDS[kind]}, found {brief(found)}"
     elif kind == "value_error":
         text = message.removeprefix("Value error, ")
         if field and not text.startswith("expected"):  # a model's own check names the field within it
             return f"{field}.{text}"
     else:
         expected = message.removeprefix("Input should be ").removeprefix("a valid ")
-        text = f"expected {expected}, found {_shown(found)}"
+        text = f"expected {expected}, found {brief(found)}"
     return f"{field}: {text}" if field else text
 
 
@@ -53,7 +53,7 @@ def short(text: str) -> str:
     return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
 
 
-def _shown(value: object) -> str:
+def brief(value: object) -> str:
     """The `repr` of a value of any size, or its beginning."""
     text = ""
     for piece in _pieces(value):

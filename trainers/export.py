@@ -3,7 +3,7 @@
 import io
 import struct
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -15,7 +15,7 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from recon.errors import InputError
+from recon.errors import InputError, brief, short
 from recon.files import atomic
 from trainers.architectures import Name, is_detector, weights_of
 from trainers.shard_reader import PATCH, VIEW
@@ -158,14 +158,8 @@ def _check(path: Path, network: nn.Module, example: Tensor) -> None:
 
 
 def _first(error: Exception) -> str:
-    return _brief((str(error).strip().splitlines() or [type(error).__name__])[0], str)
+    return short((str(error).strip().splitlines() or [type(error).__name__])[0])
 
 
-def _brief(value: object, shown: Callable[[object], str] = repr) -> str:
-    """A value from a file in a message: one line, and not all of it if it is long."""
-    try:
-        text = "a tensor" if isinstance(value, Tensor) else shown(value)
-    except (ValueError, RecursionError):  # whole numbers of thousands of digits, dictionaries in themselves
-        text = f"a {type(value).__name__}"
-    text = "".join(letter if letter.isprintable() else "?" for letter in text)
-    return text if len(text) <= 100 else f"{text[:97]}..."
+def _brief(value: object) -> str:
+    return "a tensor" if isinstance(value, Tensor) else brief(value)

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from recon.capture.image_formats import decode_image
 from recon.errors import InputError, one_line
 from recon.files import tar_members
 from recon.files.regular import read_bytes
-from trainers import grey_png
 from trainers.shard_truth import (
     CIRCLES,
     Array,
@@ -279,10 +279,19 @@ def _promised(folder: Path) -> int | None:
 
 def _view(place: str, content: bytes) -> Grey:
     """A view of 320x240, or a full frame as the tracker makes it smaller : (1, 240, 320)."""
-    image = grey_png.decode(place, content, None)
+    image = _grey_image(place, content, None)
     return (image if image.shape[::-1] == VIEW else cv2.resize(image, VIEW))[None]
 
 
 def _patches(place: str, content: bytes) -> Grey:
     """Patches or masks of one view : (3, 120, 120)."""
-    return grey_png.decode(place, content, (PATCH, CIRCLES * PATCH)).reshape(CIRCLES, PATCH, PATCH)
+    return _grey_image(place, content, (PATCH, CIRCLES * PATCH)).reshape(CIRCLES, PATCH, PATCH)
+
+
+def _grey_image(place: str, content: bytes, size: tuple[int, int] | None) -> Grey:
+    image = decode_image(Path(place), content)
+    if image.dtype != np.uint8 or image.ndim != 2 or (size is not None and image.shape[::-1] != size):
+        wanted = "" if size is None else f"{size[0]}x{size[1]} "
+        found = f"{image.shape[1]}x{image.shape[0]} {image.dtype}" + (" in colour" if image.ndim > 2 else "")
+        raise InputError(f"{place}: expected {wanted}8-bit grey, found {found}")
+    return image

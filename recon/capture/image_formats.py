@@ -1,6 +1,7 @@
 """Image files of any common kind, PNG, BMP, TIFF or JPEG, decoded whole or refused in one line that names the file.
 
-Pillow decodes JPEG, as OpenCV's library writes lines of its own to the console where a file is damaged; OpenCV the last two.
+Pillow decodes PNG and JPEG, as OpenCV's libraries write lines of their own to the console where a file is damaged; OpenCV the
+other two, and colours of 16 bits, which Pillow makes 8 of.
 """
 
 import io
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
 from recon.errors import InputError
-from recon.files import png_images
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -24,14 +24,19 @@ SUFFIXES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 KINDS = f"an image ({', '.join(SUFFIXES)})"
 MOST_PX = 1 << 26  # of an image
 MOST_CHANNELS = 4
+PNG_BEGIN = b"\x89PNG\r\n\x1a\n"
+PNG_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND")  # that pixels are made of
+PNG_DEPTH, PNG_COLOUR = 24, 25  # places of bytes
+PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # numbers a pixel, by the kind of colour
 JPEG_BEGIN, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 READERS = {  # by the beginnings of files
-    png_images.SIGNATURE: PngImagePlugin.PngImageFile,
+    PNG_BEGIN: PngImagePlugin.PngImageFile,
     JPEG_BEGIN: JpegImagePlugin.JpegImageFile,
     b"BM": BmpImagePlugin.BmpImageFile,
 }
 TIFF_BEGINNINGS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_CHANNELS = 256, 257, 277  # tags
+MODES = {"1": "L", "LA": "L"}  # of Pillow's, that become grey; all others become colours
 PADDING = 64  # bytes, that a camera may leave behind a JPEG's end
 DAMAGE = (  # what Pillow raises on files damaged at random
     *(OSError, SyntaxError, ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError, EOFError),
@@ -51,9 +56,15 @@ def decode_image(path: Path, data: bytes) -> Pixels:
     """
     if not data:
         raise InputError(f"{path}: expected {KINDS}, found an empty file")
-    if data.startswith(png_images.SIGNATURE):
-        return png_images.decode(path, data, MOST_PX)
+    if data.startswith(PNG_BEGIN):
+        data = _without_remarks(path, data)
     size_of(path, io.BytesIO(data))
+    if data.startswith(PNG_BEGIN):
+        pixels = _by_pillow(path, data)
+        if not pixels[-1].any():
+            _check_rows(path, data)
+        deep = data[PNG_DEPTH] == 16 and data[PNG_COLOUR] != 0
+        return _by_opencv(path, data) if deep else pixels  # which was whole, so that OpenCV's library has nothing to say
     if data.startswith(JPEG_BEGIN):
         if JPEG_END not in data[-PADDING:]:
             raise InputError(f"{path}: expected a whole JPEG image, found it cut short at {len(data)} bytes")
@@ -69,7 +80,7 @@ def size_of(path: Path, stream: BinaryIO) -> tuple[int, int]:
     InputError
         If the data is of no such kind, damaged, or larger than any camera's.
     """
-    start = stream.read(len(png_images.SIGNATURE))
+    start = stream.read(len(PNG_BEGIN))
     stream.seek(0)
     width, height = _size_of_tiff(path, stream) if start.startswith(TIFF_BEGINNINGS) else _opened(path, stream).size
     if not 0 < width * height <= MOST_PX:
@@ -79,7 +90,7 @@ def size_of(path: Path, stream: BinaryIO) -> tuple[int, int]:
 
 def _opened(path: Path, stream: BinaryIO) -> Image.Image:
     """The image of a file whose header was read, and no more."""
-    start = stream.read(len(png_images.SIGNATURE))
+    start = stream.read(len(PNG_BEGIN))
     reader = next((reader for beginning, reader in READERS.items() if start.startswith(beginning)), None)
     stream.seek(0)
     try:
@@ -91,6 +102,40 @@ def _opened(path: Path, stream: BinaryIO) -> Image.Image:
     if opened is None:
         raise InputError(f"{path}: expected {KINDS}, found other or damaged data")
     return opened
+
+
+def _without_remarks(path: Path, data: bytes) -> bytes:
+    """The PNG with the chunks that pixels are made of alone; refused if it is cut short, or a checksum doesn't fit.
+
+    Others may be odd, or unpack to any size. Source: W3C, Portable Network Graphics, third edition.
+    """
+    kept, position, kind = [PNG_BEGIN], len(PNG_BEGIN), b""
+    while kind != b"IEND":
+        length, kind = struct.unpack_from(">I4s", data.ljust(position + 8, b"\0"), position)
+        end = position + 12 + length
+        if end > len(data):
+            raise InputError(f"{path}: expected a whole PNG image, found it cut short at {len(data)} bytes")
+        if zlib.crc32(memoryview(data)[position + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            raise InputError(f"{path}: expected a whole PNG image, found damaged data at byte {position}")
+        if kind in PNG_CHUNKS:
+            kept.append(data[position:end])
+        position = end
+    return b"".join(kept)
+
+
+def _check_rows(path: Path, data: bytes) -> None:
+    """Refuse a PNG, without remarks, of fewer rows than its header has: Pillow leaves those that are missing black."""
+    width, height, depth, colour, *_, interlaced = struct.unpack_from(">IIBBBBB", data, 16)
+    wanted = height * (1 + -(-width * PNG_CHANNELS[colour] * depth // 8))
+    stream, position = zlib.decompressobj(), len(PNG_BEGIN)
+    found = 0
+    while not interlaced and position < len(data) and found < wanted:
+        length, kind = struct.unpack_from(">I4s", data, position)
+        if kind == b"IDAT":
+            found += len(stream.decompress(data[position + 8 : position + 8 + length], wanted - found))
+        position += 12 + length
+    if not interlaced and found < wanted:
+        raise InputError(f"{path}: expected a whole image, found damaged data in it: {found} bytes of {wanted}")
 
 
 def _size_of_tiff(path: Path, stream: BinaryIO) -> tuple[int, int]:
@@ -112,7 +157,7 @@ def _size_of_tiff(path: Path, stream: BinaryIO) -> tuple[int, int]:
 def _by_pillow(path: Path, data: bytes) -> Pixels:
     image = _opened(path, io.BytesIO(data))
     try:
-        pixels = np.array(image if image.mode in ("L", "RGB") else image.convert("RGB"))
+        pixels = np.array(image if image.mode in ("L", "RGB", "I;16") else image.convert(MODES.get(image.mode, "RGB")))
     except DAMAGE:
         raise InputError(f"{path}: expected a whole image, found damaged data in it") from None
     return np.ascontiguousarray(pixels[..., ::-1]) if pixels.ndim == 3 else pixels

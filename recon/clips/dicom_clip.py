@@ -19,7 +19,7 @@ from pydicom.pixels import apply_color_lut, iter_pixels
 
 from recon.capture.image_formats import MOST_PX
 from recon.clips.clip import Box, Clip, checked_seconds
-from recon.errors import InputError
+from recon.errors import InputError, short
 from recon.files.regular import check_there, opened
 
 Dataset = Any
@@ -51,7 +51,9 @@ def read(path: Path) -> Clip:
     except InputError:
         raise
     except DAMAGED as error:
-        raise InputError(f"{path}: expected a DICOM file, a video or a folder of images, found {_brief(error)}") from None
+        raise InputError(
+            f"{path}: expected a DICOM file, a video or a folder of images, found {short(str(error) or type(error).__name__)}"
+        ) from None
 
 
 def _clip(path: Path) -> Clip:
@@ -78,7 +80,9 @@ def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np
             yield image
             read += 1
     except DAMAGED as error:
-        raise InputError(f"{path}: frame {read}: expected an image of {size[0]}x{size[1]}, found {_brief(error)}") from None
+        raise InputError(
+            f"{path}: frame {read}: expected an image of {size[0]}x{size[1]}, found {short(str(error) or type(error).__name__)}"
+        ) from None
     if read != count:
         raise InputError(f"{path}: expected {count} frames, as NumberOfFrames says, found {read}")
 
@@ -153,7 +157,3 @@ def within(region: Box, scale: tuple[float, float] | None, size: tuple[int, int]
     if beyond > 1:
         return region, None
     return (u, v, min(width, size[0] - u), min(height, size[1] - v)), scale
-
-
-def _brief(error: BaseException) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -56,9 +56,10 @@ def new_folder(path: Path, marker: str) -> Iterator[Path]:
 def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
     """Give temporary folders to fill, one a place; on success all take their places, on failure all old folders stay.
 
-    Each is exchanged with the old one at once, so that at every moment an old or a new one can be read. Where a path is a link,
-    the folder that it leads to is replaced. Waits until no other process writes one of them; what stands there then doesn't
-    change before the end.
+    The last folder is exchanged with the old one at once, so that at every moment an old or a new one can be read. The others are
+    set aside before and put in place after it, so that none stands beside another age of the last. Where a path is a link, the
+    folder that it leads to is replaced. Waits until no other process writes one of them; what stands there then doesn't change
+    before the end.
 
     Parameters
     ----------
@@ -91,15 +92,24 @@ def _named_in_errors(path: Path) -> Iterator[None]:
 @contextmanager
 def _exchanged(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
     """Give temporary folders, as `new_folders`, which holds the locks."""
-    temporaries = list[Path]()
-    with ExitStack() as undone, ExitStack() as removed:
-        for path in paths:
-            temporaries.append(_temporary_folder(path))
-            removed.callback(shutil.rmtree, temporaries[-1], ignore_errors=True)
-        yield tuple(temporaries)
-        for path, temporary in zip(paths, temporaries, strict=True):
-            _exchange(temporary, path)
-            undone.callback(_exchange, path, temporary)
+    *others, last = paths
+    with ExitStack() as removed, ExitStack() as undone:
+        made = dict[Path, Path]()
+        for path in reversed(paths):  # that of the last is there as long as one of the others is: `_put_back` relies on it
+            made[path] = _temporary_folder(path)
+            removed.callback(shutil.rmtree, made[path], ignore_errors=True)
+        yield tuple(made[path] for path in paths)
+        for path in others:
+            if path.exists():
+                aside = _beside(path, "old")
+                removed.callback(shutil.rmtree, aside, ignore_errors=True)
+                path.rename(aside)
+                undone.callback(aside.rename, path)
+        _exchange(made[last], last)
+        undone.callback(_exchange, last, made[last])
+        for path in others:
+            made[path].rename(path)
+            undone.callback(path.rename, made[path])
         undone.pop_all()
 
 
@@ -107,7 +117,11 @@ def _temporary_folder(path: Path) -> Path:
     """Make a folder beside `path` with its inode in its name: one of another inode is what stood at `path` before an exchange."""
     made = _beside(path, "begun")
     made.mkdir()
-    return made.rename(path.with_name(f".{path.stem}.{made.stat().st_ino}.new{path.suffix}"))
+    try:
+        return made.rename(path.with_name(f".{path.stem}.{made.stat().st_ino}.new{path.suffix}"))
+    except BaseException:
+        made.rmdir()
+        raise
 
 
 def _exchange(folder: Path, path: Path) -> None:
@@ -136,14 +150,13 @@ def restore(paths: Sequence[Path]) -> None:
 
 def _put_back(paths: Sequence[Path]) -> None:
     """As `restore`, for a process that holds the locks."""
-    for path in paths:
-        for aside in [] if path.exists() else _leftovers(path, "old"):
-            aside.rename(path)
-    pairs = [(path, folder) for path in paths for folder in _leftovers(path)]
-    before = [(path, folder) for path, folder in pairs if _stood_before(path, folder)]
-    if len(before) < len(pairs):  # some are still to come: the process was killed before it had exchanged all
-        for path, folder in before:
-            _exchange(folder, path)
+    *others, last = paths
+    for aside in [] if last.exists() else _leftovers(last, "old"):
+        aside.rename(last)
+    placed = last.exists() and all(_stood_before(last, folder) for folder in _leftovers(last))
+    for path in others:
+        for folder in [] if path.exists() else _leftovers(path, "new" if placed else "old"):
+            folder.rename(path)
     for path in paths:
         _remove(_leftovers(path))
 

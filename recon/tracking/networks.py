@@ -9,7 +9,7 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as runtime  # pyrefly: ignore[missing-module-attribute]
 
-from recon.errors import InputError
+from recon.errors import InputError, short
 from recon.files.regular import read_bytes
 
 Floats = NDArray[np.float32]
@@ -80,7 +80,7 @@ def session(path: Path, interface: Interface, threads: int = 0) -> onnxruntime.I
     try:
         opened = onnxruntime.InferenceSession(network, options, ["CPUExecutionProvider"], enable_fallback=0)
     except (*FAULTS, ValueError) as error:  # the latter of texts in it
-        raise InputError(f"{path}: expected an ONNX network, found {_brief(str(error))}") from None
+        raise InputError(f"{path}: expected an ONNX network, found {short(str(error))}") from None
     for what, expected, found in (("inputs", interface[0], opened.get_inputs()), ("outputs", interface[1], opened.get_outputs())):
         shapes = {node.name: tuple(node.shape) for node in found}
         if not all(name in shapes and _fits(shapes[name], shape) for name, shape in expected.items()) or (
@@ -100,8 +100,3 @@ def _fits(found: tuple[object, ...], expected: tuple[int | None, ...]) -> bool:
 def _listed(shapes: dict) -> str:
     sizes = {name: "x".join("n" if size is None else str(size) for size in shape) for name, shape in shapes.items()}
     return ", ".join(f"{name} ({size})" for name, size in sizes.items())
-
-
-def _brief(text: str) -> str:
-    line = " ".join(text.split())
-    return line if len(line) <= 80 else line[:77] + "..."

@@ -26,10 +26,9 @@ from rich.progress import Progress
 
 from recon import cores
 from recon.errors import InputError
-from recon.files import atomic, metrics
+from recon.files import atomic, json_text, metrics
 from recon.files.metrics import Metrics, shown
 from recon.files.occupied import occupied
-from recon.files.regular import read_bytes
 from trainers import export, fit, free_memory, shard_reader
 from trainers.architectures import Name, is_detector, network
 from trainers.fit import Fitted, Plan, Precision
@@ -158,7 +157,7 @@ def check_resumed(config: Config) -> bool:
     if not config.resume or not checkpoint.is_file():
         return False
     try:
-        before = json.loads(read_bytes(marker))
+        before = json_text.read(marker)
         before |= {name: _listed(before[name]) for name in LISTS}  # runs of earlier versions had one folder
         differing = [name for name, value in settings(config).items() if name not in MAY_CHANGE and before[name] != value]
         expected = [f"{name}={given(before[name])}" for name in differing]

@@ -208,7 +208,7 @@ def test_the_true_calibration_keeps_devices_that_other_parts_need(tmp_path):
 @pytest.mark.parametrize("add", [False, True])
 @pytest.mark.parametrize("step", range(4))
 def test_a_rendering_that_stops_while_folders_change_places_changes_nothing(tmp_path, monkeypatch, step, add):
-    """Two folders are set aside and two put in their places: whichever of these fails, the old pair stands."""
+    """Two folders are begun, one is set aside and one put in its place: whichever of these fails, the old pair stands."""
     render(tmp_path, "surface", 1)
     if add:
         render(tmp_path, "board", 2, add=True)
@@ -231,18 +231,19 @@ def test_a_rendering_that_stops_while_folders_change_places_changes_nothing(tmp_
 
 
 def test_never_does_a_capture_stand_beside_another_truth(tmp_path, monkeypatch):
-    """Whenever a folder has changed its place: no capture, or one with its own truth."""
+    """Whenever a folder has changed its place: a capture with its own truth, or with none."""
     render(tmp_path, "surface", 1)
     seen, rename = [], Path.rename
 
     def watched(self, target):
         done = rename(self, target)
-        seen.append(seeds(tmp_path) if (tmp_path / "capture").is_dir() else None)
+        assert (tmp_path / "capture").is_dir()
+        seen.append(seeds(tmp_path) if (tmp_path / "truth").is_dir() else None)
         return done
 
     monkeypatch.setattr(Path, "rename", watched)
     render(tmp_path, "surface", 2)
-    assert seen == [None, None, None, {"surface": 2}]
+    assert [each for k, each in enumerate(seen) if k == 0 or each != seen[k - 1]] == [{"surface": 1}, None, {"surface": 2}]
 
 
 @pytest.mark.parametrize("add", [False, True])

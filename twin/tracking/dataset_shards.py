@@ -22,9 +22,8 @@ import pyarrow.parquet as pq
 import webdataset as wds
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from recon.errors import InputError, one_line
-from recon.files import atomic, tar_members
-from recon.files.regular import read_bytes
+from recon.errors import InputError, brief, one_line
+from recon.files import atomic, json_text, tar_members
 from recon.model.rig import Rig
 from twin.engine import Engine, results
 from twin.session import first_difference
@@ -118,19 +117,17 @@ def prepare(place: Place, settings: Settings) -> list[int]:
     _remove_leftovers(place)
     missing = [number for number in settings.shards() if not _complete(place, settings, number)]
     with atomic.new_file(told) as path:
-        path.write_text(json.dumps(written, indent=1))
+        path.write_text(json.dumps(written, indent=1), encoding="utf-8")
     return missing
 
 
 def _check_same(told: Path, written: Mapping[str, Any]) -> None:
     """Refuse a folder whose data set isn't this one, or a longer one."""
-    content = read_bytes(told)
+    found = json_text.read(told)
     try:
-        found, there = json.loads(content), Written.model_validate_json(content)
+        there = Written.model_validate(found)
     except ValidationError as error:
         raise InputError(f"{told}: {one_line(error)}; expected a data set's settings, or another out") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{told}: expected a data set's settings as JSON, found damaged data: {error}") from None
     if there.version != VERSION:
         keys = ", whose keys lack the seed" if there.version < VERSION else ""
         raise InputError(
@@ -142,13 +139,8 @@ def _check_same(told: Path, written: Mapping[str, Any]) -> None:
         raise InputError(f"{told}: samples: {expected}, found {written['samples']}")
     name, wanted, other = first_difference(written, found | {"samples": written["samples"]})
     if name:
-        expected = f"expected {_brief(wanted)} as in this run, found {_brief(other)}, another data set"
+        expected = f"expected {brief(wanted)} as in this run, found {brief(other)}, another data set"
         raise InputError(f"{told}: {name}: {expected}; choose another out")
-
-
-def _brief(value: object) -> str:
-    text = "".join(letter if letter.isprintable() else "?" for letter in str(value))
-    return text if len(text) <= 100 else f"{text[:97]}..."
 
 
 def _entries(folder: Path) -> Iterable[Path]:
