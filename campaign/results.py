@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 TIMES = re.compile(
-    r"(metrics\.json|log\.jsonl|checkpoint\.pt|training\.json|reconstruct\.json|.*\.html)$"
-)  # that hold times or paths
+    r"(metrics|training|reconstruct)\.json|log\.jsonl|checkpoint\.pt|curves\.png|.*\.html"
+)  # files that hold times or paths
 HIDDEN = re.compile(r"\..*\.(new|old|begun)(\..*)?$|\..*\.lock$")  # temporaries and locks
 
 

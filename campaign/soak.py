@@ -16,7 +16,6 @@ from rich.progress import track
 from campaign import commands
 
 COUNTS = {"dataset": 10_000, "track": 5_000, "freehand": 2_000, "sweep": 2_000}
-WARM = 0.1  # of the run, in which caches fill; memory and pace are counted from its end on
 SHARD = 50  # samples
 LOOK_S = 0.5  # between two looks at the memory
 
@@ -26,8 +25,8 @@ class Soak:
     """Times and memory of a run."""
 
     verb: str
-    times_s: np.ndarray  # (n,) at the end of each item
-    memory_mb: np.ndarray  # (n,) of the process and its children
+    used_s: np.ndarray  # (n,) of processors, at the end of each item: what else the machine does counts less
+    memory_mb: np.ndarray  # (n,) resident
     size: int = 1  # samples an item
 
     @property
@@ -38,38 +37,27 @@ class Soak:
 
     @property
     def slowing(self) -> float:
-        """Median duration of an item in the last tenth over that in the second tenth, less 1."""
-        took, tenth = np.diff(self.times_s), max(len(self.times_s) // 10, 1)
+        """Median processor's time of an item in the last tenth over that in the second tenth, less 1."""
+        took, tenth = np.diff(self.used_s), max(len(self.used_s) // 10, 1)
         return float(np.median(took[-tenth:]) / np.median(took[tenth : 2 * tenth]) - 1)
 
     @property
-    def rate_hz(self) -> float:
-        """Samples a second, over all."""
-        return self.size * (len(self.times_s) - 1) / float(self.times_s[-1] - self.times_s[0])
+    def sample_s(self) -> float:
+        """Processor's time of a sample, over all."""
+        return float(self.used_s[-1] - self.used_s[0]) / (self.size * (len(self.used_s) - 1))
 
 
 def run(place: Path, verb: str, count: int) -> Soak:
     """Let one verb's work go on over many items."""
     with TemporaryDirectory(dir=place.parent, ignore_cleanup_errors=True) as name:
         items, size = WORK[verb](place, count, Path(name))
-        times, memory, looked, held = list[float](), list[float](), 0.0, 0.0
+        used, memory, looked, held = list[float](), list[float](), 0.0, 0.0
         for _ in track(items, verb, count // size):
-            times.append(time.perf_counter())
-            if times[-1] - looked > LOOK_S:
-                looked, held = times[-1], _memory_mb()
+            used.append(time.process_time())
+            if (now := time.perf_counter()) - looked > LOOK_S:
+                looked, held = now, commands.memory_mb(os.getpid(), "VmRSS")
             memory.append(held)
-    return Soak(verb, np.array(times), np.array(memory), size)
-
-
-def _memory_mb() -> float:
-    """Resident memory of this process and its children."""
-    own = os.getpid()
-    return commands.memory_mb(own, "VmRSS") + sum(commands.memory_mb(child, "VmRSS") for child in _children(own))
-
-
-def _children(process: int) -> list[int]:
-    path = Path(f"/proc/{process}/task/{process}/children")
-    return [int(number) for number in path.read_text(encoding="ascii").split()] if path.exists() else []
+    return Soak(verb, np.array(used), np.array(memory), size)
 
 
 def _dataset(place: Path, count: int, folder: Path) -> tuple[Iterator[object], int]:
@@ -77,7 +65,7 @@ def _dataset(place: Path, count: int, folder: Path) -> tuple[Iterator[object], i
     from sonotwin.verbs import dataset
     from twin.tracking import dataset_shards
 
-    fields = [f"out={folder / 'data'}", f"samples={count}", f"shard={SHARD}", "engine.workers=2"]
+    fields = [f"out={folder / 'data'}", f"samples={count}", f"shard={SHARD}", "engine.workers=1"]
     settings = config.load("dataset", fields, dataset.Config)
     target = dataset_shards.Place(settings.out)
     missing = dataset_shards.prepare(target, settings.settings())
@@ -142,8 +130,13 @@ WORK = {"dataset": _dataset, "track": _track, "freehand": _freehand, "sweep": _s
 
 def table(found: Sequence[Soak]) -> list[str]:
     """Lines of Markdown: a row a verb."""
-    lines = ["| verb | items | a second | memory in the end, MB | growth, MB | slower in the last tenth |", "|---" * 6 + "|"]
+    lines = ["| verb | items | processor's time of one, ms | memory, MB | growth, MB | slower in the end |", "|---" * 6 + "|"]
     for one in found:
-        figures = [f"{one.rate_hz:.1f}", f"{one.memory_mb[-1]:.0f}", f"{one.growth_mb:+.0f}", f"{100 * one.slowing:+.1f} %"]
-        lines.append(f"| {one.verb} | {one.size * len(one.times_s)} | {' | '.join(figures)} |")
+        figures = [
+            f"{1e3 * one.sample_s:.1f}",
+            f"{one.memory_mb[-1]:.0f}",
+            f"{one.growth_mb:+.0f}",
+            f"{100 * one.slowing:+.1f} %",
+        ]
+        lines.append(f"| {one.verb} | {one.size * len(one.used_s)} | {' | '.join(figures)} |")
     return lines

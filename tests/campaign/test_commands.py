@@ -70,4 +70,4 @@ def test_growth_and_pace_are_of_the_last_tenth():
     found = soak.Soak("x", np.cumsum(took), np.arange(100.0))
     assert found.growth_mb == pytest.approx(80.0) and found.slowing == pytest.approx(1.0)
     flat = soak.Soak("x", np.arange(100.0), np.full(100, 300.0))
-    assert flat.growth_mb == 0 and flat.slowing == 0 and flat.rate_hz == pytest.approx(1.0)
+    assert flat.growth_mb == 0 and flat.slowing == 0 and flat.sample_s == pytest.approx(1.0)
