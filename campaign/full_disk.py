@@ -79,7 +79,7 @@ def fill(place: Path, command: Command, folder: Path) -> list[Full]:
     sources.lay_out(folder, place, command.folders)
     disk = folder / "disk"
     disk.mkdir()
-    line = (command.verb, *command.fields, "out=disk/new")
+    line = (command.verb, *command.fields, f"out=disk/{command.out}")
     with small_disk(disk, 1 << 32):
         first = commands.run(line, folder, LONGEST_S)
         if first.status:

@@ -39,18 +39,19 @@ MADE = (  # command lines in the order in which they are run
 
 @dataclass(frozen=True)
 class Command:
-    """A valid command, as it is run in a folder that holds copies of some sources; its result goes to `new`."""
+    """A valid command, as it is run in a folder that holds copies of some sources."""
 
     verb: str
     fields: tuple[str, ...] = ()
     folders: tuple[str, ...] = ()  # sources that it needs
     reads: tuple[str, ...] = ()  # files of those that it must refuse if they are damaged
     minutes: bool = False  # that it takes without a fault: it isn't tried without one
+    out: str = "new"
 
     @property
     def line(self) -> tuple[str, ...]:
         """The whole command line."""
-        return (self.verb, *self.fields, "out=new")
+        return (self.verb, *self.fields, f"out={self.out}")
 
 
 def _sweep(name: str, number: int = 3) -> tuple[str, ...]:
@@ -112,6 +113,8 @@ COMMANDS = (
     Command("sweep", STROKE),
     Command("film", ("frames=1",)),
     Command("dataset", ("samples=1",)),
+    Command("print", ("part=board",), out="new.pdf"),
+    Command("patterns", ("patterns=paper_surface",)),
     Command("study", ("name=study.yaml", "of=tracking", "film.frames=1"), ("study.yaml",), ("study.yaml",)),
     Command("demo", ("scene=sphere", "path=none", "poses=none", "board=boards", "film_frames=0")),
     Command("accuracy", ("only=optics",), minutes=True),
