@@ -129,10 +129,11 @@ def _kill_once(folder: Path, line: tuple[str, ...], number: signal.Signals, afte
 
 
 def _torn(found: dict[str, str], old: dict[str, str], new: dict[str, str], grows: bool) -> list[str]:
-    """Files that are neither of the old result nor of the new; of a folder that is exchanged as a whole, also of a mixture."""
+    """Files that are neither of the old result nor of the new, or gone; a mixture, of a folder that is exchanged as a whole."""
     if not grows:
         return [] if found in (old, new) else ["a mixture"]
-    return [path for path, digest in found.items() if digest not in (old.get(path), new.get(path))]
+    lost = [path for path in old.keys() & new.keys() if path not in found]
+    return lost + [path for path, digest in found.items() if digest not in (old.get(path), new.get(path))]
 
 
 def table(tallies: Sequence[Tally]) -> list[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 TIMES = re.compile(
     r"(metrics|training|reconstruct)\.json|log\.jsonl|checkpoint\.pt|curves\.png|.*\.html"
 )  # files that hold times or paths
-HIDDEN = re.compile(r"\..*\.(new|old|begun)(\..*)?$|\..*\.lock$")  # temporaries and locks
+HIDDEN = re.compile(r"\..*\.(new|old)(\..*)?$|\..*\.(lock|occupied)$")  # temporaries and locks
 
 
 def digests(folder: Path) -> dict[str, str]:

@@ -1,16 +1,27 @@
-"""Locks that one process at a time holds, and who holds them; the system releases one when its holder ends, however it ends."""
+"""Locks that one process at a time holds, and who holds them; the system releases one when its holder ends, however it ends.
 
+Relied upon is the system's lock of a file (`flock`; `LockFileEx` on Windows). NFS 4 hands such locks to its server and so keeps
+other machines out too; NFS 3 does with its lock daemon, SMB with its usual options. A disk without any locks is used without, and
+a warning says so. A process number, which means nothing on another machine, is only told, never looked up.
+"""
+
+import errno
+import logging
 import os
 import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+log = logging.getLogger(__name__)
+
 LONGEST = 200  # characters of a line that says who holds a lock
 PATIENCE_S = 3.0  # after which a wait is announced
+WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
 
 @contextmanager
@@ -27,20 +38,39 @@ def held(path: Path, announce: Callable[[str], None] | None = None) -> Iterator[
     Timeout
         If another one holds it, and there is no wait.
     """
-    lock = FileLock(path)
+    lock = FileLock(path, fallback_to_soft=False)
     try:
-        lock.acquire(timeout=0 if announce is None else PATIENCE_S)
+        _acquire(lock, 0.0 if announce is None else PATIENCE_S)
     except Timeout:
         if announce is None:
             raise
         announce(holder(path))
-        lock.acquire()
-    with suppress(OSError):  # Windows lets nobody write to a file that is locked
+        _acquire(lock, -1.0)
+    with suppress(OSError):  # Windows lets nobody write to a file that is locked; a note isn't worth an error
         path.write_text(this_process(), encoding="utf-8")
     try:
         yield
     finally:
         lock.release()
+
+
+def _acquire(lock: FileLock, timeout_s: float) -> None:
+    """Acquire a lock; go on without where the disk has none."""
+    while True:
+        try:
+            lock.acquire(timeout=timeout_s)
+        except OSError as error:
+            if error.errno == errno.ESTALE:  # on NFS: its file went away with the holder before
+                continue
+            if error.errno not in WITHOUT_LOCKS:
+                raise
+            _warn(Path(lock.lock_file).parent)
+        return
+
+
+@cache
+def _warn(folder: Path) -> None:
+    log.warning("%s: this disk has no locks; see to it that no other run writes there", folder)
 
 
 def this_process() -> str:
@@ -49,7 +79,7 @@ def this_process() -> str:
 
 
 def holder(path: Path) -> str:
-    """Who holds a lock, as of a file with its line, which may be missing yet, or cut short."""
+    """Who holds a lock, as of its file, which may be missing by now, or not be written yet."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")[:LONGEST]
     except OSError:

@@ -2,10 +2,7 @@
 
 import json
 import math
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +15,7 @@ from lightning_fabric import Fabric
 from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
+from recon import interrupts
 from recon.errors import InputError, one_line
 from recon.files import atomic
 from recon.files.regular import read_bytes
@@ -77,7 +75,7 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
     Raises
     ------
     KeyboardInterrupt
-        On SIGTERM or Ctrl+C, once the checkpoint is written.
+        On Ctrl-C, or whatever the handlers of SIGTERM and SIGHUP raise, once the checkpoint is written.
     """
     fabric = Fabric(accelerator="auto", devices=1, precision=precision_of(plan.precision))
     plain = start.to(memory_format=torch.channels_last)  # pyrefly: ignore[no-matching-overload]
@@ -97,7 +95,7 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
         checkpoints.write(folder / CHECKPOINT, networks, optimizer, samples, step, seconds)
 
     batches = Batches(train, plan.batch, plan.crop_px, plan.seed).since(step, plan.loaders)
-    with _stops() as stopped:
+    with interrupts.held_back() as came:
         seconds = before
         while (done := progress(plan, step, seconds)) < 1:
             for group in optimizer.param_groups:
@@ -119,7 +117,7 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
                 row = {"step": step, "seconds": round(seconds, 2), "loss": float(np.mean(losses)), "rate": rate(done)}
                 _append(folder / LOG, row)
                 losses.clear()
-            if stopped.is_set():
+            if came:
                 save()
                 raise KeyboardInterrupt
             if perf_counter() - written > 60 * plan.checkpoint_minutes:
@@ -212,7 +210,7 @@ def _blend(average: nn.Module, module: nn.Module, stays: float) -> None:
 
 def _append(path: Path, row: Mapping[str, float | int]) -> None:
     finite = {name: value if math.isfinite(value) else None for name, value in row.items()}
-    with path.open("a", encoding="utf-8") as file:
+    with atomic.named_in_errors(path), path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(finite) + "\n")
 
 
@@ -222,19 +220,3 @@ def _forget_later(folder: Path, step: int) -> None:
         kept = [row for row in read_log(folder) if (row["step"] or 0) <= step]
         with atomic.new_file(folder / LOG) as temporary:
             temporary.write_text("".join(f"{json.dumps(row)}\n" for row in kept), encoding="utf-8")
-
-
-@contextmanager
-def _stops() -> Iterator[threading.Event]:
-    """An event that SIGTERM and Ctrl+C set, so that a step and the checkpoint after it come to their end."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
-        yield event
-        return
-    kinds = (signal.SIGTERM, signal.SIGINT)
-    before = {kind: signal.signal(kind, lambda number, frame: event.set()) for kind in kinds}
-    try:
-        yield event
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)

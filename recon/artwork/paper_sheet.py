@@ -106,6 +106,11 @@ def write(path: Path, card: Card, sheet: Sheet, margin_mm: float, title: str, li
     canvas.save()
 
 
+def is_sheet(path: Path) -> bool:
+    """Whether a file is a sheet that `write` has written."""
+    return b"/Creator (sonotwin)" in path.read_bytes()
+
+
 def _draw_card(canvas: Canvas, card: Card, at: Size) -> None:
     canvas.saveState()
     canvas.translate(*at)

@@ -17,11 +17,13 @@ from tempfile import TemporaryDirectory
 
 from filelock import Timeout
 
-from recon import file_locks
+from recon import file_locks, interrupts
 from recon.errors import InputError
 from recon.files import renaming
 
 log = logging.getLogger(__name__)
+
+UNPLACED = ".unplaced"  # in the last of several new folders, until all are in place
 
 
 @contextmanager
@@ -34,7 +36,7 @@ def new_file(path: Path) -> Iterator[Path]:
     if not path.parent.is_dir():  # the lock's file would make it
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
     temporary = _beside(path, "new")
-    with _named_in_errors(path), alone(path):
+    with named_in_errors(path), alone(path):
         try:
             yield temporary
             os.replace(temporary, path)
@@ -74,12 +76,12 @@ def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
         _put_back(paths)
         for path, marker in zip(paths, places.values(), strict=True):
             check_folder(path, marker)
-        with _named_in_errors(paths[-1]), _exchanged(paths) as temporaries:
+        with named_in_errors(paths[-1]), _exchanged(paths) as temporaries:
             yield temporaries
 
 
 @contextmanager
-def _named_in_errors(path: Path) -> Iterator[None]:
+def named_in_errors(path: Path) -> Iterator[None]:
     """Name what is being written in an error of the system that names nothing, such as that of a full disk."""
     try:
         yield
@@ -91,37 +93,25 @@ def _named_in_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _exchanged(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
-    """Give temporary folders, as `new_folders`, which holds the locks."""
+    """Give temporary folders, as `new_folders`, which holds the locks; nothing old is deleted before all new are in place."""
     *others, last = paths
-    with ExitStack() as removed, ExitStack() as undone:
-        made = dict[Path, Path]()
-        for path in reversed(paths):  # that of the last is there as long as one of the others is: `_put_back` relies on it
-            made[path] = _temporary_folder(path)
-            removed.callback(shutil.rmtree, made[path], ignore_errors=True)
-        yield tuple(made[path] for path in paths)
-        for path in others:
-            if path.exists():
-                aside = _beside(path, "old")
-                removed.callback(shutil.rmtree, aside, ignore_errors=True)
-                path.rename(aside)
-                undone.callback(aside.rename, path)
-        _exchange(made[last], last)
-        undone.callback(_exchange, last, made[last])
-        for path in others:
-            made[path].rename(path)
-            undone.callback(path.rename, made[path])
-        undone.pop_all()
-
-
-def _temporary_folder(path: Path) -> Path:
-    """Make a folder beside `path` with its inode in its name: one of another inode is what stood at `path` before an exchange."""
-    made = _beside(path, "begun")
-    made.mkdir()
+    made = [_beside(path, "new") for path in paths]
     try:
-        return made.rename(path.with_name(f".{path.stem}.{made.stat().st_ino}.new{path.suffix}"))
-    except BaseException:
-        made.rmdir()
-        raise
+        for folder in made:
+            folder.mkdir()
+        yield tuple(made)
+        with interrupts.held_back():
+            if others:
+                (made[-1] / UNPLACED).touch()
+            for path in others:
+                if path.exists():
+                    path.rename(_beside(path, "old"))
+            _exchange(made[-1], last)
+            for folder, path in zip(made, others, strict=False):
+                folder.rename(path)
+    finally:
+        with interrupts.held_back():
+            _put_back(paths)
 
 
 def _exchange(folder: Path, path: Path) -> None:
@@ -149,22 +139,20 @@ def restore(paths: Sequence[Path]) -> None:
 
 
 def _put_back(paths: Sequence[Path]) -> None:
-    """As `restore`, for a process that holds the locks."""
+    """As `restore`, for a process that holds the locks: folders become all new, where the last is, or all old.
+
+    The last new folder holds a mark until all are in place, by which it is known wherever it stands.
+    """
     *others, last = paths
     for aside in [] if last.exists() else _leftovers(last, "old"):
         aside.rename(last)
-    placed = last.exists() and all(_stood_before(last, folder) for folder in _leftovers(last))
+    state = "new" if (last / UNPLACED).exists() else "old"
     for path in others:
-        for folder in [] if path.exists() else _leftovers(path, "new" if placed else "old"):
+        for folder in [] if path.exists() else _leftovers(path, state):
             folder.rename(path)
+    (last / UNPLACED).unlink(missing_ok=True)
     for path in paths:
         _remove(_leftovers(path))
-
-
-def _stood_before(path: Path, folder: Path) -> bool:
-    """Whether a leftover of `path` is what stood there before an exchange."""
-    number, state = folder.name.removesuffix(path.suffix).split(".")[-2:]
-    return state == "old" or (state == "new" and folder.stat().st_ino != int(number))
 
 
 def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> None:
@@ -256,7 +244,7 @@ def alone(path: Path, wait: bool = True) -> Iterator[None]:
                 place.unlink()  # before the release: whoever waits then sees that its file is gone, and makes a new one
 
 
-def _leftovers(path: Path, states: str = "begun|new|old") -> list[Path]:
+def _leftovers(path: Path, states: str = "new|old") -> list[Path]:
     """Hidden names beside `path` in one of the states, of any process."""
     name = re.compile(rf"\.{re.escape(path.stem)}\.\d+\.({states}){re.escape(path.suffix)}")
     entries = list(path.parent.iterdir()) if path.parent.is_dir() else []

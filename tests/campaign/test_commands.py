@@ -50,7 +50,9 @@ def test_half_a_result_is_seen():
     old, new = {"a": "1", "b": "2"}, {"a": "3", "b": "4"}
     assert kills._torn(old, old, new, False) == kills._torn(new, old, new, False) == []
     assert kills._torn({"a": "1", "b": "4"}, old, new, False) and kills._torn({}, old, new, False)
-    assert kills._torn({"a": "1"}, old, new, True) == [] and kills._torn({"a": "5"}, old, new, True) == ["a"]
+    assert kills._torn({"a": "1", "b": "4"}, old, new, True) == []
+    assert kills._torn({"a": "5", "b": "4"}, old, new, True) == ["a"] and kills._torn({"a": "1"}, old, new, True) == ["b"]
+    assert kills._torn({"a": "1"}, {"a": "1"}, new, True) == []  # the rest is still to come
 
 
 def test_leftovers_and_orphans_are_found(tmp_path):

@@ -75,3 +75,13 @@ def test_a_board_too_large_is_refused_with_paper_and_lengths_that_fit(place, cap
 def test_mistakes_are_refused(fields, said, place, capsys):
     assert refusal(capsys, *fields) == said
     assert not list(place.iterdir())
+
+
+def test_a_pdf_of_others_is_left_alone(tmp_path, capsys):
+    """One of ours is replaced."""
+    (tmp_path / "thesis.pdf").write_bytes(b"%PDF-1.4 years of work")
+    assert main(["print", "part=board", f"out={tmp_path / 'thesis.pdf'}"]) == 2
+    assert "thesis.pdf: expected nothing or a sheet to replace, found a file of others" in capsys.readouterr().err
+    assert (tmp_path / "thesis.pdf").read_bytes() == b"%PDF-1.4 years of work"
+    for _ in range(2):
+        assert main(["print", "part=board", f"out={tmp_path / 'board.pdf'}"]) == 0

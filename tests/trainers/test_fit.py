@@ -60,8 +60,10 @@ def test_an_interrupted_training_ends_with_the_same_weights(name, data_set, tmp_
         if step == 5:
             os.kill(os.getpid(), signal.SIGTERM)
 
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     with pytest.raises(KeyboardInterrupt):
         fit.fit(small(name), *data, asked, paths[1], stop)
+    signal.signal(signal.SIGTERM, before)
 
     def fail(step, done, loss):
         if step == 7:

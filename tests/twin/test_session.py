@@ -206,9 +206,9 @@ def test_the_true_calibration_keeps_devices_that_other_parts_need(tmp_path):
 
 
 @pytest.mark.parametrize("add", [False, True])
-@pytest.mark.parametrize("step", range(4))
-def test_a_rendering_that_stops_while_folders_change_places_changes_nothing(tmp_path, monkeypatch, step, add):
-    """Two folders are begun, one is set aside and one put in its place: whichever of these fails, the old pair stands."""
+@pytest.mark.parametrize("step", range(2))
+def test_a_rendering_that_stops_while_folders_change_places_leaves_a_pair(tmp_path, monkeypatch, step, add):
+    """The truth is set aside, and the new one put in its place: where the first fails the old pair stands, else the new one."""
     render(tmp_path, "surface", 1)
     if add:
         render(tmp_path, "board", 2, add=True)
@@ -223,11 +223,13 @@ def test_a_rendering_that_stops_while_folders_change_places_changes_nothing(tmp_
     monkeypatch.setattr(Path, "rename", fails)
     with pytest.raises(KeyboardInterrupt):
         render(tmp_path, "surface", 3, add=add)
-    assert contents(tmp_path) == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "truth"]
+    assert (contents(tmp_path) == before) == (step == 0)
+    others = {"board": 2} if add else {}
+    assert seeds(tmp_path) == {"surface": 3 if step else 1} | others
     monkeypatch.undo()
     render(tmp_path, "surface", 3, add=add)
-    assert seeds(tmp_path) == ({"surface": 3, "board": 2} if add else {"surface": 3})
+    assert seeds(tmp_path) == {"surface": 3} | others
 
 
 def test_never_does_a_capture_stand_beside_another_truth(tmp_path, monkeypatch):
@@ -243,7 +245,7 @@ def test_never_does_a_capture_stand_beside_another_truth(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "rename", watched)
     render(tmp_path, "surface", 2)
-    assert [each for k, each in enumerate(seen) if k == 0 or each != seen[k - 1]] == [{"surface": 1}, None, {"surface": 2}]
+    assert [each for k, each in enumerate(seen) if k == 0 or each != seen[k - 1]] == [None, {"surface": 2}]
 
 
 @pytest.mark.parametrize("add", [False, True])
