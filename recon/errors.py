@@ -53,6 +53,11 @@ def short(text: str) -> str:
     return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
 
 
+def reason(error: Exception) -> str:
+    """The words of another library's exception for a message, or the exception's kind where it has none."""
+    return short(str(error).strip() or type(error).__name__)
+
+
 def brief(value: object) -> str:
     """The `repr` of a value of any size, or its beginning."""
     text = ""
