@@ -10,7 +10,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-from recon.errors import InputError
+from recon.errors import InputError, reason
 from recon.files.regular import opened
 
 MOST_BYTES = 1 << 28  # of a member; a full frame's PNG has a few MB
@@ -57,7 +57,7 @@ def members(path: Path) -> Iterator[Member]:
     except InputError:
         raise
     except DAMAGE as error:
-        raise InputError(f"{path}: expected a tar file, found a damaged one: {' '.join(str(error).split())}") from None
+        raise InputError(f"{path}: expected a tar file, found a damaged one: {reason(error)}") from None
 
 
 def samples(path: Path) -> Iterator[Sample]:
