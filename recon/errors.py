@@ -1,11 +1,18 @@
 """The exception for a user's mistake, reported in one line."""
 
 from collections.abc import Iterator
+from typing import TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-OWN_WORDS = {"int_parsing_size": "a whole number of fewer digits", "path_type": "a path"}  # of kinds of pydantic's
+Model = TypeVar("Model", bound=BaseModel)
+OWN_WORDS = {  # of kinds of pydantic's
+    "int_parsing_size": "a whole number of fewer digits",
+    "path_type": "a path",
+    "tuple_type": "a list",
+}
 LONGEST = 60  # letters, of a found value in a message
+MOST_LETTERS = 1000  # of a text that are looked at
 MOST_BITS = 256  # of a number that is shown
 
 
@@ -46,11 +53,24 @@ def one_line(error: ValidationError) -> str:
     return f"{field}: {text}" if field else text
 
 
-def short(text: str) -> str:
-    """A text for a message: in one line, of letters that any console takes, and not longer than sixty."""
-    text = " ".join(text[:1000].split())
+def validated(model: type[Model], content: object, place: object) -> Model:
+    """A record from the content of a file; raises InputError with the place, the field, what was expected and found."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise InputError(f"{place}: {one_line(error)}") from None
+
+
+def short(text: str, longest: int = LONGEST) -> str:
+    """A text for a message: in one line, of letters that any console takes, and not longer than a number of them."""
+    text = " ".join(text[:MOST_LETTERS].split())
     text = text if text.isprintable() else text.encode("unicode_escape", "surrogatepass").decode("ascii")
-    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
+    return text if len(text) <= longest else text[: longest - 3] + "..."
+
+
+def reason(error: Exception) -> str:
+    """The words of another library's exception for a message, or the exception's kind where it has none."""
+    return short(str(error).strip() or type(error).__name__)
 
 
 def brief(value: object) -> str:

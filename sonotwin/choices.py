@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from recon.capture import surface_part
-from recon.capture.manifest import validated
+from recon.errors import validated
 from recon.files import yaml_text
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig

@@ -6,8 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
-from recon.capture.manifest import validated
-from recon.errors import InputError, one_line
+from recon.errors import InputError, one_line, validated
 from recon.files import yaml_text
 from recon.model.rig import Part
 from sonotwin.config import folder

@@ -15,7 +15,7 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from recon.errors import InputError, brief, short
+from recon.errors import InputError, brief, reason
 from recon.files import atomic
 from trainers.architectures import Name, is_detector, weights_of
 from trainers.shard_reader import PATCH, VIEW
@@ -61,20 +61,20 @@ def load(path: Path, network: nn.Module) -> None:
     unknown = next((name for name in weights if name not in expected), None)
     check_tensors(path, "weights", weights, expected)
     if unknown is not None:
-        raise InputError(f"{path}: expected weights of a {type(network).__name__}, found {_brief(unknown)} too")
+        raise InputError(f"{path}: expected weights of a {type(network).__name__}, found {brief(unknown)} too")
     network.load_state_dict(weights)
 
 
 def check_tensors(path: Path, kind: str, found: object, expected: Mapping[Any, Tensor]) -> None:
     """Refuse, in one line, a dictionary that hasn't all expected tensors: of their shapes, in memory, of finite numbers."""
     if not isinstance(found, Mapping):
-        raise InputError(f"{path}: expected {kind}, a dictionary of tensors, found {_brief(found)}")
+        raise InputError(f"{path}: expected {kind}, a dictionary of tensors, found {brief(found)}")
     for name, value in expected.items():
         there, wanted = found.get(name), f"{path}: expected {kind} {name} of shape {list(value.shape)}"
         if there is None:
             raise InputError(f"{wanted}, found none")
         if not isinstance(there, Tensor):
-            raise InputError(f"{wanted}, found {_brief(there)}")
+            raise InputError(f"{wanted}, found {brief(there)}")
         if there.shape != value.shape:
             raise InputError(f"{wanted}, found {list(there.shape)}")
         plain = there.layout == torch.strided and there.device.type == "cpu" and not (there.is_quantized or there.is_nested)
@@ -98,7 +98,7 @@ def read_state(path: Path) -> dict:
     except UnpicklingError:
         raise InputError(f"{path}: expected a state dictionary of torch, found something else") from None
     except DAMAGE as error:
-        raise InputError(f"{path}: expected a file that torch saved, found a damaged one: {_first(error)}") from None
+        raise InputError(f"{path}: expected a file that torch saved, found a damaged one: {reason(error)}") from None
     if not isinstance(state, dict):
         raise InputError(f"{path}: expected a state dictionary of torch, found something else")
     return state
@@ -112,7 +112,7 @@ def _read(path: Path) -> dict[Any, Any]:
     try:
         return safetensors.torch.load_file(path)
     except (SafetensorError, *DAMAGE) as error:
-        raise InputError(f"{path}: expected weights as safetensors, found a damaged file: {_first(error)}") from None
+        raise InputError(f"{path}: expected weights as safetensors, found a damaged file: {reason(error)}") from None
 
 
 def save_onnx(path: Path, network: nn.Module, name: Name) -> None:
@@ -155,11 +155,3 @@ def _check(path: Path, network: nn.Module, example: Tensor) -> None:
         difference = float(np.abs(one - other.numpy()).max() / max(float(other.abs().max()), 1.0))
         if difference > AGREEMENT:
             raise RuntimeError(f"{path}: ONNX Runtime differs from torch by {difference:.2g}")
-
-
-def _first(error: Exception) -> str:
-    return short((str(error).strip().splitlines() or [type(error).__name__])[0])
-
-
-def _brief(value: object) -> str:
-    return "a tensor" if isinstance(value, Tensor) else brief(value)

@@ -12,12 +12,12 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 from lightning_fabric import Fabric
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, RootModel
 from torch import Tensor, nn
 
 from recon import interrupts
-from recon.errors import InputError, one_line
-from recon.files import atomic
+from recon.errors import InputError, validated
+from recon.files import atomic, json_text
 from recon.files.regular import read_bytes
 from trainers import checkpoints
 from trainers.architectures import Name, is_detector
@@ -34,7 +34,10 @@ AVERAGE = 0.998  # of the averaged weights that stays in a step, once there were
 
 Precision = Literal["auto", "32-true", "bf16-mixed"]
 Row = dict[str, Annotated[int | float, Field(allow_inf_nan=False)] | None]
-ROW = TypeAdapter(Row)
+
+
+class _Row(RootModel[Row]):
+    model_config = ConfigDict(strict=True)
 
 
 @dataclass(frozen=True)
@@ -175,9 +178,9 @@ def read_log(folder: Path) -> list[Row]:
 
 def _row(place: str, line: bytes) -> Row:
     try:
-        row = ROW.validate_json(line, strict=True)
-    except ValidationError as error:
-        raise InputError(f"{place}: {one_line(error)}; resume=false starts anew") from None
+        row = validated(_Row, json_text.of_bytes(Path(place), line), place).root
+    except InputError as error:
+        raise InputError(f"{error}; resume=false starts anew") from None
     if not isinstance(row.get("step"), int):
         raise InputError(f"{place}: expected a row with its step, a whole number, found none; resume=false starts anew")
     return row

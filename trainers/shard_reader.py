@@ -7,25 +7,24 @@ by its place: the same images either way, whatever the order.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
 
 from recon.capture.image_formats import decode_image
-from recon.errors import InputError, one_line
-from recon.files import tar_members
-from recon.files.regular import read_bytes
+from recon.errors import InputError, validated
+from recon.files import json_text, tar_members
 from trainers.shard_truth import (
     CIRCLES,
     Array,
+    Count,
     Facts,
+    Known,
     PatchedTruth,
     PatchTruth,
     SampleTruth,
-    Strict,
     ViewTruth,
     ellipses_in_patches,
     facts,
@@ -262,8 +261,8 @@ def _check_apart(shards: Sequence[Path], parts: Sequence[_Shard]) -> None:
         )
 
 
-class _Promise(Strict):
-    samples: Annotated[int, Field(ge=0)] | None = None
+class _Promise(Known):
+    samples: Count | None = None
 
 
 def _promised(folder: Path) -> int | None:
@@ -272,9 +271,9 @@ def _promised(folder: Path) -> int | None:
     if not path.is_file():
         return None
     try:
-        return _Promise.model_validate_json(read_bytes(path)).samples
-    except ValidationError as error:
-        raise InputError(f"{path}: {one_line(error)}; expected a data set's settings") from None
+        return validated(_Promise, json_text.read(path), path).samples
+    except InputError as error:
+        raise InputError(f"{error}; expected a data set's settings") from None
 
 
 def _view(place: str, content: bytes) -> Grey:

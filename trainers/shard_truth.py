@@ -2,46 +2,49 @@
 
 from collections.abc import Sequence
 from hashlib import blake2b
+from pathlib import Path
 from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
 
-from recon.errors import InputError, one_line
+from recon.errors import validated
+from recon.files import json_text
 
 CIRCLES = 3
 FARTHEST = 1e6  # px, or digital numbers: more is no measurement, and overflows in 32 bits
 
 Array = NDArray[np.float64]
-Value = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
-Length = Annotated[float, Field(ge=0, le=FARTHEST)]
-Share = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]
-Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
+Value = Annotated[float, Field(strict=True, ge=-FARTHEST, le=FARTHEST)]
+Length = Annotated[float, Field(strict=True, ge=0, le=FARTHEST)]
+Share = Annotated[float, Field(strict=True, ge=-1e-6, le=1 + 1e-6)]
+Pixels = Annotated[int, Field(strict=True, ge=1, le=1 << 16)]
+Count = Annotated[int, Field(strict=True, ge=0)]
 Place = tuple[Value, Value]
 Ellipse = tuple[Value, Value, Length, Length, Value]
 Record = TypeVar("Record", bound="SampleTruth")
 
 
-class Strict(BaseModel):
-    """Numbers that are numbers, no text of digits; fields that the networks don't learn from may be there."""
+class Known(BaseModel):
+    """Finite numbers; fields that the networks don't learn from may be there."""
 
-    model_config = ConfigDict(strict=True, allow_inf_nan=False, frozen=True)
+    model_config = ConfigDict(allow_inf_nan=False, frozen=True)
 
 
-class Size(Strict):
+class Size(Known):
     """The part of a camera that matters here."""
 
     size: tuple[Pixels, Pixels]  # width, height
 
 
-class ViewTruth(Strict):
+class ViewTruth(Known):
     """What one camera sees; without a target before it all but the camera may be null."""
 
     camera: Size
     centres: tuple[Place, Place, Place] | None
     visible: tuple[Share, Share, Share] | None = None
-    inside: tuple[bool, bool, bool] | None = None
+    inside: tuple[StrictBool, StrictBool, StrictBool] | None = None
     blur_px: tuple[Length, Length, Length] | None = None
     white_dn: Length | None = None
 
@@ -60,11 +63,11 @@ class PatchTruth(ViewTruth):
     ellipses: tuple[Ellipse, Ellipse, Ellipse] | None
 
 
-class SampleTruth(Strict):
+class SampleTruth(Known):
     """A sample by its views."""
 
-    k: Annotated[int, Field(ge=0)] | None = None
-    seed: Annotated[int, Field(ge=0)] | None = None
+    k: Count | None = None
+    seed: Count | None = None
     views: tuple[ViewTruth, ViewTruth]
 
 
@@ -76,10 +79,7 @@ class PatchedTruth(SampleTruth):
 
 def parse(place: str, content: bytes, model: type[Record]) -> Record:
     """Read a sample's JSON; InputError in one line where it is damaged, or a field isn't what it should be."""
-    try:
-        return model.model_validate_json(content)
-    except ValidationError as error:
-        raise InputError(f"{place}: {one_line(error)}") from None
+    return validated(model, json_text.of_bytes(Path(place), content), place)
 
 
 def identity(truth: SampleTruth, content: bytes) -> int:

@@ -25,10 +25,15 @@ def card_of(board: Board) -> Card:
 def in_words(board: Board) -> str:
     """A board's design on one line, such as `asymmetric_circles, 4 x 11, spacing 15 mm, diameter 9 mm`."""
     fields = board.model_dump(exclude={"kind", "columns", "rows"}, exclude_defaults=True)
-    lengths = [f"{name.removesuffix('_mm')} {value:g} mm" for name, value in fields.items() if name.endswith("_mm")]
     others = [name if value is True else str(value) for name, value in fields.items() if not name.endswith("_mm")]
     dictionary = [board.dictionary] if isinstance(board, Charuco) and board.dictionary not in others else []
-    return ", ".join([board.kind, f"{board.columns} x {board.rows}", *lengths, *dictionary, *others])
+    return ", ".join([board.kind, f"{board.columns} x {board.rows}", lengths_in_words(board), *dictionary, *others])
+
+
+def lengths_in_words(board: Board) -> str:
+    """A board's lengths on one line, such as `spacing 15 mm, diameter 9 mm`."""
+    fields = board.model_dump(exclude_defaults=True)
+    return ", ".join(f"{name.removesuffix('_mm')} {value:g} mm" for name, value in fields.items() if name.endswith("_mm"))
 
 
 def as_field(board: Board) -> str:

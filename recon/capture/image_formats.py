@@ -5,6 +5,7 @@ other two, and colours of 16 bits, which Pillow makes 8 of.
 """
 
 import io
+import re
 import struct
 import warnings
 import zlib
@@ -14,7 +15,7 @@ from typing import BinaryIO
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
+from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin
 
 from recon.errors import InputError
 
@@ -28,16 +29,18 @@ PNG_BEGIN = b"\x89PNG\r\n\x1a\n"
 PNG_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND")  # that pixels are made of
 PNG_DEPTH, PNG_COLOUR = 24, 25  # places of bytes
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # numbers a pixel, by the kind of colour
-JPEG_BEGIN, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+JPEG_BEGIN, NEXT_IMAGE, JPEG_END = b"\xff\xd8\xff", b"\xd8", b"\xd9"
+JPEG_MARKER = re.compile(rb"\xff+([\x02-\xcf\xd8-\xfe])")  # neither a number of the pixels' nor a mark between these
 READERS = {  # by the beginnings of files
     PNG_BEGIN: PngImagePlugin.PngImageFile,
     JPEG_BEGIN: JpegImagePlugin.JpegImageFile,
     b"BM": BmpImagePlugin.BmpImageFile,
 }
-TIFF_BEGINNINGS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"
+TIFF_BEGINNINGS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"  # the last two of BigTIFF, with places of 64 bits
+TIFF_NUMBERS = {3: "H", 4: "L", 16: "Q"}  # by the type of a field
+MOST_FIELDS = 4096
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_CHANNELS = 256, 257, 277  # tags
 MODES = {"1": "L", "LA": "L"}  # of Pillow's, that become grey; all others become colours
-PADDING = 64  # bytes, that a camera may leave behind a JPEG's end
 DAMAGE = (  # what Pillow raises on files damaged at random
     *(OSError, SyntaxError, ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError, EOFError),
     *(RuntimeError, NotImplementedError, ZeroDivisionError, struct.error, zlib.error, Image.DecompressionBombError),
@@ -47,7 +50,7 @@ DAMAGE = (  # what Pillow raises on files damaged at random
 def decode_image(path: Path, data: bytes) -> Pixels:
     """Pixels of an image file : (h, w) grey or (h, w, 3) blue, green, red, as they are stored: no turn that a JPEG asks for.
 
-    Libraries give an image, partly grey, for a JPEG that was cut short; so its end is checked here.
+    Libraries give an image, partly grey, for a JPEG whose end was lost and filled up; so its end is looked for here.
 
     Raises
     ------
@@ -66,10 +69,23 @@ def decode_image(path: Path, data: bytes) -> Pixels:
         deep = data[PNG_DEPTH] == 16 and data[PNG_COLOUR] != 0
         return _by_opencv(path, data) if deep else pixels  # which was whole, so that OpenCV's library has nothing to say
     if data.startswith(JPEG_BEGIN):
-        if JPEG_END not in data[-PADDING:]:
+        if not _ends(data):
             raise InputError(f"{path}: expected a whole JPEG image, found it cut short at {len(data)} bytes")
         return _by_pillow(path, data)
     return _by_opencv(path, data)
+
+
+def _ends(data: bytes) -> bool:
+    """Whether a JPEG has its end, which one that stands in a preview before it, or in a phone's trailer behind it, is not.
+
+    Source: ITU-T T.81, B.1.
+    """
+    position = len(JPEG_BEGIN) - 1
+    while marker := JPEG_MARKER.search(data, position):
+        if marker[1] in (JPEG_END, NEXT_IMAGE):
+            return marker[1] == JPEG_END
+        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")  # of the segment, not of pixels
+    return False
 
 
 def size_of(path: Path, stream: BinaryIO) -> tuple[int, int]:
@@ -141,17 +157,33 @@ def _check_rows(path: Path, data: bytes) -> None:
 def _size_of_tiff(path: Path, stream: BinaryIO) -> tuple[int, int]:
     """Width and height of a TIFF file's first image, of any kind of pixels, those that Pillow doesn't know included."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            fields = TiffImagePlugin.ImageFileDirectory_v2(stream.read(8))
-            stream.seek(fields.next)
-            fields.load(stream)
-        width, height, channels = int(fields[TIFF_WIDTH]), int(fields[TIFF_HEIGHT]), int(fields.get(TIFF_CHANNELS, 1))
-    except DAMAGE:
-        width = height = channels = 0
+        fields = _fields_of_tiff(stream)
+    except (struct.error, OverflowError, ValueError, OSError):
+        fields = {}
+    width, height, channels = fields.get(TIFF_WIDTH, 0), fields.get(TIFF_HEIGHT, 0), fields.get(TIFF_CHANNELS, 1)
     if not (width > 0 and height > 0 and 0 < channels <= MOST_CHANNELS):
         raise InputError(f"{path}: expected {KINDS}, found other or damaged data")
     return width, height
+
+
+def _fields_of_tiff(stream: BinaryIO) -> dict[int, int]:
+    """Fields of one whole number each, by their tags; of the first image of a TIFF or BigTIFF file.
+
+    Sources: Adobe, TIFF revision 6.0; the same with places of 64 bits, BigTIFF, Library of Congress fdd000328.
+    """
+    start = stream.read(16)
+    order, big = "<" if start.startswith(b"II") else ">", b"+" in start[2:4]
+    place, length, field = ("Q", "Q", "HHQ8s") if big else ("L", "H", "HHL4s")
+    stream.seek(struct.unpack_from(order + place, start, 8 if big else 4)[0])
+    (count,) = struct.unpack(order + length, stream.read(struct.calcsize(order + length)))
+    size = struct.calcsize(order + field)
+    entries = stream.read(min(count, MOST_FIELDS) * size)
+    entries = entries[: len(entries) // size * size]
+    return {
+        tag: struct.unpack_from(order + TIFF_NUMBERS[kind], value)[0]
+        for tag, kind, numbers, value in struct.iter_unpack(order + field, entries)
+        if numbers == 1 and kind in TIFF_NUMBERS and struct.calcsize(order + TIFF_NUMBERS[kind]) <= len(value)
+    }
 
 
 def _by_pillow(path: Path, data: bytes) -> Pixels:

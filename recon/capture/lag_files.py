@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pydantic import field_validator
 
-from recon.capture.manifest import validated
+from recon.errors import validated
 from recon.files import atomic, json_text
 from recon.model.rig import Finite, NotNegative, Part
 

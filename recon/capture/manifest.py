@@ -9,17 +9,15 @@ import re
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from recon.errors import InputError, one_line, short
+from recon.errors import InputError, short, validated
 from recon.files import json_text
 from recon.model import rig
 from recon.model.boards import Board
 from recon.model.patterns import Axis, Patterns
-
-Model = TypeVar("Model", bound=BaseModel)
 
 SCHEMA: Literal["sonotwin-capture/1"] = "sonotwin-capture/1"
 MANIFEST = "manifest.json"
@@ -325,11 +323,3 @@ def axes_not_encoded(patterns: Patterns) -> list[Axis]:
     """Axes of the projector along which a sequence has neither fringes nor Gray code; a board's needs both."""
     axes: tuple[Axis, Axis] = ("columns", "rows")
     return [axis for axis in axes if axis not in patterns.axes]
-
-
-def validated(model: type[Model], content: object, path: Path) -> Model:
-    """A record from the content of a file; raises InputError with the file, the field, what was expected and found."""
-    try:
-        return model.model_validate(content)
-    except ValidationError as error:
-        raise InputError(f"{path}: {one_line(error)}") from None

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from recon.capture import calibration_files
 from recon.capture.images import Size, image_files, read_grey, write_images
-from recon.capture.manifest import validated
 from recon.capture.surface_part import SurfaceCapture
-from recon.errors import InputError
+from recon.errors import InputError, validated
 from recon.files import atomic, json_text
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera

@@ -9,8 +9,8 @@ from pathlib import Path
 from recon.capture import calibration_files
 from recon.capture.image_formats import decode_image
 from recon.capture.images import Images, image_files, read_images
-from recon.capture.manifest import MANIFEST, read_manifest, validated
-from recon.errors import InputError
+from recon.capture.manifest import MANIFEST, read_manifest
+from recon.errors import InputError, validated
 from recon.files import yaml_text
 from recon.files.regular import read_bytes
 from recon.model.calibration import Calibration

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import InputError
+from recon.errors import InputError, brief, short
 from recon.files import atomic
 from recon.files.regular import MOST_TABLE, read_bytes
 from recon.geometry import rigid
@@ -73,7 +73,7 @@ def read_track(path: Path) -> Track:
     covariances = [np.full((len(rows), 6, 6), np.nan) for _ in range(first, len(header), len(COVARIANCE))]
     for i, (k, row) in enumerate(rows):
         if row[1] not in ("0", "1"):
-            raise InputError(f"{path}: line {k}: found: expected 0 or 1, found {row[1]!r}")
+            raise InputError(f"{path}: line {k}: found: expected 0 or 1, found {brief(row[1])}")
         if row[1] == "0":
             continue
         poses[i] = _pose(path, k, row[2:first])
@@ -132,8 +132,9 @@ def _read(path: Path, header: Sequence[str], *optional: Sequence[str]) -> tuple[
         raise InputError(f"{path}: expected a table as CSV text, found other or damaged data") from None
     found = rows[0][1] if rows else []
     if found not in [[*header, *chain(*optional[:count])] for count in range(len(optional) + 1)]:
-        expected = f"a header {_brief(header)}" + "".join(f", perhaps followed by {_brief(names)}" for names in optional)
-        raise InputError(f"{path}: line 1: expected {expected}, found {_brief(found) or 'none'}")
+        expected, *more, there = (short(",".join(names)) for names in (header, *optional, found))
+        expected += "".join(f", perhaps followed by {names}" for names in more)
+        raise InputError(f"{path}: line 1: expected a header {expected}, found {there or 'none'}")
     for k, row in rows[1:]:
         if len(row) != len(found):
             raise InputError(f"{path}: line {k}: expected {len(found)} columns, found {len(row)}")
@@ -148,7 +149,7 @@ def _whole(path: Path, line: int, name: str, word: str) -> int:
     except ValueError:
         value = LONGEST_NS
     if abs(value) >= LONGEST_NS:
-        raise InputError(f"{path}: line {line}: {name}: expected a whole number, found {word[:40]!r}")
+        raise InputError(f"{path}: line {line}: {name}: expected a whole number, found {brief(word)}")
     return value
 
 
@@ -158,7 +159,7 @@ def _number(path: Path, line: int, name: str, word: str) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise InputError(f"{path}: line {line}: {name}: expected a finite number, found {word[:40]!r}")
+        raise InputError(f"{path}: line {line}: {name}: expected a finite number, found {brief(word)}")
     return value
 
 
@@ -192,8 +193,3 @@ def _covariance(path: Path, line: int, names: Sequence[str], words: Sequence[str
     if not np.abs(correlations).max() < 2 or np.linalg.eigvalsh(correlations).min() < -1e-6:
         raise InputError(f"{path}: line {line}: expected the upper triangle of a covariance, found a matrix that is none")
     return matrix
-
-
-def _brief(names: Sequence[str]) -> str:
-    text = ",".join(names)
-    return text if len(text) <= 60 else f"{text[:28]}...{text[-28:]}"

@@ -3,23 +3,27 @@
 Tags and units are those of DICOM PS3.3, C.8.5.5 (US region calibration) and C.7.6.5 (cine).
 """
 
+import io
 import struct
 import warnings
 import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import cv2
 import numpy as np
 import pydicom
 from numpy.typing import NDArray
 from pydicom.errors import BytesLengthException, InvalidDicomError
+from pydicom.filereader import read_dataset
 from pydicom.pixels import apply_color_lut, iter_pixels
+from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian
 
 from recon.capture.image_formats import MOST_PX
 from recon.clips.clip import Box, Clip, checked_seconds
-from recon.errors import InputError, short
+from recon.errors import InputError, reason
 from recon.files.regular import check_there, opened
 
 Dataset = Any
@@ -27,8 +31,9 @@ Result = TypeVar("Result")
 
 MOST_FRAMES = 1_000_000
 MOST_BYTES = 1 << 33
+MOST_UNPACKED = 1 << 30  # bytes, of a file that is packed as a whole
 PREAMBLE, PREFIX = 128, b"DICM"
-DEFLATED, MOST_META = b"1.2.840.10008.1.2.1.99", 4096  # the transfer syntax, and bytes within which it is named
+META = 2  # group of the tags before the part that may be packed
 
 TWO_D, TISSUE, CENTIMETRES = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits
 DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or compressed in ways that need other packages
@@ -51,9 +56,7 @@ def read(path: Path) -> Clip:
     except InputError:
         raise
     except DAMAGED as error:
-        raise InputError(
-            f"{path}: expected a DICOM file, a video or a folder of images, found {short(str(error) or type(error).__name__)}"
-        ) from None
+        raise InputError(f"{path}: expected a DICOM file, a video or a folder of images, found {reason(error)}") from None
 
 
 def _clip(path: Path) -> Clip:
@@ -76,25 +79,45 @@ def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np
     try:
         header = _quietly(lambda: _dataset(path))
         frames = iter_pixels(header)
-        while (image := _quietly(lambda: next((_grey(frame, header) for frame in frames), None))) is not None:
-            yield image
+        while True:
+            frame = _quietly(lambda: next(frames, None))
+            if frame is None:
+                break
+            yield _quietly(partial(_grey, frame, header))
             read += 1
+    except InputError:
+        raise
     except DAMAGED as error:
-        raise InputError(
-            f"{path}: frame {read}: expected an image of {size[0]}x{size[1]}, found {short(str(error) or type(error).__name__)}"
-        ) from None
+        raise InputError(f"{path}: frame {read}: expected an image of {size[0]}x{size[1]}, found {reason(error)}") from None
     if read != count:
         raise InputError(f"{path}: expected {count} frames, as NumberOfFrames says, found {read}")
 
 
 def _dataset(path: Path, stop_before_pixels: bool = False) -> Dataset:
-    """Read a file, but none that is packed as a whole, which may unpack to more than any memory."""
+    """Read a file; one that is packed as a whole, which may unpack to more than any memory, up to a bound."""
     with opened(path, MOST_BYTES) as stream:
-        stream.seek(PREAMBLE)
-        if stream.read(len(PREFIX)) == PREFIX and DEFLATED in stream.read(MOST_META):
-            raise ValueError("one that is packed as a whole")
-        stream.seek(0)
-        return pydicom.dcmread(stream, stop_before_pixels=stop_before_pixels)
+        return pydicom.dcmread(_plain(path, stream), stop_before_pixels=stop_before_pixels)
+
+
+def _plain(path: Path, stream: BinaryIO) -> BinaryIO:
+    """A file from its beginning on, with what is packed as a whole unpacked; InputError if that is too large.
+
+    Source: DICOM PS3.5, A.5: raw deflate behind the tags of group 2.
+    """
+    stream.seek(PREAMBLE)
+    if stream.read(len(PREFIX)) == PREFIX:
+        meta = read_dataset(stream, is_implicit_VR=False, is_little_endian=True, stop_when=lambda tag, *_: tag.group != META)
+        if meta.get("TransferSyntaxUID") == DeflatedExplicitVRLittleEndian:
+            length = stream.tell()
+            content = zlib.decompressobj(-zlib.MAX_WBITS).decompress(stream.read(), MOST_UNPACKED + 1)
+            if len(content) > MOST_UNPACKED:
+                expected = f"expected up to {MOST_UNPACKED >> 20} MiB in a DICOM file that is deflated, found more"
+                raise InputError(f"{path}: {expected}: save it uncompressed")
+            stream.seek(0)
+            packed, plain = (str(syntax).encode() for syntax in (DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian))
+            return io.BytesIO(stream.read(length).replace(packed, plain.ljust(len(packed), b"\0")) + content)
+    stream.seek(0)
+    return stream
 
 
 def _quietly(call: Callable[[], Result]) -> Result:

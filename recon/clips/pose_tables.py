@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from recon.errors import InputError
+from recon.errors import InputError, brief
 from recon.files.regular import MOST_TABLE, read_bytes
 from recon.geometry import rigid
 from recon.model.rig import Part
@@ -141,4 +141,4 @@ def _number(path: Path, line: int, name: str, word: str) -> float:
     try:
         return float(word) if word.strip() else np.nan
     except ValueError:
-        raise InputError(f"{path}: line {line}: {name}: expected a number, found {word[:40]!r}") from None
+        raise InputError(f"{path}: line {line}: {name}: expected a number, found {brief(word)}") from None

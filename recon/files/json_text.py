@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from recon.errors import InputError
+from recon.errors import InputError, brief
 from recon.files.regular import read_bytes, shown
 
 MOST_BYTES = 1 << 24
@@ -31,8 +31,13 @@ def read(path: Path, expected: str = "a file", most: int = MOST_BYTES) -> Any:
         If the file is missing, no regular one or no JSON, or has keys twice, numbers that aren't finite or of very many digits,
         half letters (lone surrogates), or values nested too deeply.
     """
+    return of_bytes(path, read_bytes(path, most, expected))
+
+
+def of_bytes(path: Path, data: bytes) -> Any:
+    """Values of JSON in UTF-8 that stood in a file; raises InputError as `read` does."""
     try:
-        text = read_bytes(path, most, expected).decode("utf-8-sig")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{shown(path)}: expected JSON, found it damaged: no UTF-8 at byte {error.start}") from None
     return parsed(path, text)
@@ -85,7 +90,7 @@ def _object(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in pairs:
         if key in found:
-            raise ValueError(f"the key {key[:60]!r} twice in one object")
+            raise ValueError(f"the key {brief(key)} twice in one object")
         found[key] = value
     return found
 

@@ -9,6 +9,7 @@ Source: MathWorks, MAT-File Level 5 File Format.
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,11 @@ from recon.errors import InputError
 from recon.files.npz import Form, check_forms
 from recon.files.regular import opened, read_bytes
 
+Buffer = bytes | memoryview
+
 BEGIN = b"MATLAB "  # of the header's text, in all versions from 5 on
 HDF5 = b"MATLAB 7.3"  # a file of another kind
+TAG = 8  # bytes, of an element's type and size
 HEADER = 128  # bytes, the order of bytes in the last two
 ORDERS = {b"IM": "<", b"MI": ">"}
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # by type of an element
@@ -27,7 +31,8 @@ MATRIX, COMPRESSED = 14, 15  # types of elements
 NUMERIC = range(6, 16)  # classes of arrays
 OBJECTS = (3, 17)
 COMPLEX = 0x800  # in an array's flags
-MOST = 1 << 24  # bytes, of an element once it is unpacked
+MOST = 1 << 24  # bytes, of a matrix that is read
+HEAD = 1 << 12  # bytes within which an array's flags, shape and name stand
 
 
 def is_matlab(path: Path) -> bool:
@@ -46,7 +51,8 @@ def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) 
     Raises
     ------
     InputError
-        If the file is damaged, of version 7.3, holds objects in place of matrices, or one is missing or of another form.
+        If the file is damaged, of version 7.3, holds objects in place of matrices, or one is missing, too large or of another
+        form.
     """
     data = read_bytes(path)
     if data.startswith(HDF5):
@@ -54,11 +60,18 @@ def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) 
     arrays, objects = {}, False
     try:
         order = ORDERS[data[HEADER - 2 : HEADER]]
-        for content in _arrays(data[HEADER:], order):
-            kind, name, array = _array(content, order)
+        for element in _elements(memoryview(data)[HEADER:], order):
+            size, head = _unpacked(*element, order, HEAD)
+            kind, name = _described(head, order)
             objects |= kind in OBJECTS
-            if array is not None and other_names.get(name, name) in forms:
-                arrays[other_names.get(name, name)] = array
+            name = other_names.get(name, name)
+            if name not in forms:
+                continue
+            if size > MOST:
+                raise InputError(f"{path}: {name}: expected a matrix of up to {MOST >> 20} MiB, found {-(-size >> 20)} MiB")
+            arrays[name] = _matrix(_unpacked(*element, order, size)[1], order)
+    except InputError:
+        raise
     except (KeyError, IndexError, TypeError, ValueError, StopIteration, struct.error, zlib.error):
         raise InputError(f"{path}: expected a MATLAB file of version 5 to 7, found damaged data") from None
     if objects and not forms.keys() & arrays.keys():
@@ -68,39 +81,46 @@ def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) 
     return arrays
 
 
-def _arrays(data: bytes, order: str) -> Iterator[bytes]:
-    """Contents of the arrays of a file."""
-    for kind, content in _elements(data, order):
-        if kind == COMPRESSED:
-            kind, content = next(_elements(zlib.decompressobj().decompress(content, MOST), order), (0, b""))
-        if kind == MATRIX:
-            yield content
+def _unpacked(kind: int, content: Buffer, order: str, most: int) -> tuple[int, Buffer]:
+    """Bytes of the array in an element, and the first ones of them, unpacked if need be; 0 and none of anything else."""
+    if kind != COMPRESSED:
+        return (len(content), content[:most]) if kind == MATRIX else (0, b"")
+    unpacked = zlib.decompressobj().decompress(content, TAG + most)
+    kind, size = struct.unpack_from(f"{order}II", unpacked)
+    return (size, unpacked[TAG : TAG + size]) if kind == MATRIX else (0, b"")
 
 
-def _array(content: bytes, order: str) -> tuple[int, str, NDArray | None]:
-    """Class and name of an array, and its numbers; these are None, and the name is empty, if it doesn't hold real ones."""
-    elements = _elements(content, order)
+def _described(head: Buffer, order: str) -> tuple[int, str]:
+    """Class and name of an array by its beginning; the name is empty if it doesn't hold real numbers, or isn't one."""
+    if not head:
+        return 0, ""
+    elements = _elements(head, order)
     flags = int(_numbers(*next(elements), order)[0])
     if flags & 0xFF not in NUMERIC or flags & COMPLEX:
-        return flags & 0xFF, "", None
-    shape = _numbers(*next(elements), order).tolist()
-    name = next(elements)[1].decode("ascii")
-    return flags & 0xFF, name, _numbers(*next(elements), order).reshape(shape, order="F")
+        return flags & 0xFF, ""
+    next(elements)  # the shape
+    return flags & 0xFF, bytes(next(elements)[1]).decode("ascii")
 
 
-def _numbers(kind: int, content: bytes, order: str) -> NDArray:
+def _matrix(content: Buffer, order: str) -> NDArray:
+    """Numbers of an array."""
+    _, shape, _, numbers = islice(_elements(content, order), 4)
+    return _numbers(*numbers, order).reshape(_numbers(*shape, order).tolist(), order="F")
+
+
+def _numbers(kind: int, content: Buffer, order: str) -> NDArray:
     return np.frombuffer(content, np.dtype(NUMBERS[kind]).newbyteorder(order))
 
 
-def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+def _elements(data: Buffer, order: str) -> Iterator[tuple[int, Buffer]]:
     """Types and contents of the elements that follow each other; ValueError if one is cut short."""
     at = 0
     while at < len(data):
         kind, size = struct.unpack_from(f"{order}II", data, at)
-        begin, small = at + 8, kind >> 16
+        begin, small = at + TAG, kind >> 16
         if small:  # up to four bytes lie in the tag itself
             kind, size, begin = kind & 0xFFFF, small, at + 4
         if begin + size > len(data) or small > 4:
             raise ValueError("an element is cut short")
         yield kind, data[begin : begin + size]
-        at = begin + size if kind == COMPRESSED else begin + -(-size // 8) * 8 if not small else at + 8
+        at = begin + size if kind == COMPRESSED else begin + -(-size // 8) * 8 if not small else at + TAG

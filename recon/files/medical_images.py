@@ -16,7 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import InputError, short
+from recon.errors import InputError, brief, short
 from recon.files.regular import check_there, opened
 
 META_TYPES = {
@@ -146,7 +146,7 @@ def _metaimage(path: Path, stream: BinaryIO) -> ImageFile:
             raise fault(path, "ElementDataFile", "a value at the header's end", "the end of the file")
         name, sign, value = line.partition("=")
         if not sign:
-            raise InputError(f"{path}: expected lines of a MetaImage header, 'name = value', found {line.strip()[:40]!r}")
+            raise InputError(f"{path}: expected lines of a MetaImage header, 'name = value', found {brief(line.strip())}")
         fields[name.strip()] = value.strip()
     size = whole_numbers(path, "DimSize", _value(path, fields, "DimSize"))
     dimensions = whole_numbers(path, "NDims", fields.get("NDims", str(len(size))))
@@ -181,7 +181,7 @@ def _nrrd(path: Path, stream: BinaryIO) -> ImageFile:
             continue
         name, sign, value = line.partition(":")
         if not sign:
-            raise InputError(f"{path}: expected lines of an NRRD header, 'name: value', found {line.strip()[:40]!r}")
+            raise InputError(f"{path}: expected lines of an NRRD header, 'name: value', found {brief(line.strip())}")
         fields[name.strip()] = value.removeprefix("=").strip()  # PLUS writes some fields of its own with ":", some with ":="
     detached = fields.get("data file", fields.get("datafile"))
     if not line and not detached:

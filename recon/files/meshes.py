@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.visual import ColorVisuals
 
-from recon.errors import InputError, short
+from recon.errors import InputError, reason
 from recon.files import atomic
 from recon.files.regular import read_bytes
 
@@ -56,7 +56,7 @@ def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
             warnings.simplefilter("ignore")
             mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
     except DAMAGE as error:
-        raise InputError(f"{path}: expected {expected} as PLY, found a damaged one: {short(str(error))}") from None
+        raise InputError(f"{path}: expected {expected} as PLY, found a damaged one: {reason(error)}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: expected {expected} of triangles, found none in it")
     if not (np.abs(mesh.vertices) < FARTHEST_MM).all():

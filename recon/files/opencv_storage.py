@@ -3,7 +3,7 @@
 import base64
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -12,12 +12,14 @@ import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, DocumentStartEvent, ScalarEvent, SequenceStartEvent
 
-from recon.errors import InputError
+from recon.errors import InputError, brief
 from recon.files import atomic, json_text, regular, xml_text, yaml_text
 
 Array = NDArray[np.float64]
 
+MOST_BYTES = xml_text.MOST_BYTES
 Values = dict[str, Any]  # texts, numbers, lists and maps; a matrix is a map of rows, cols, dt and data
 
 SYMMETRIC = 1e-9  # of a covariance, relative to the standard deviations: it comes from a text file
@@ -47,11 +49,14 @@ def read(path: Path, expected: str) -> Values | None:
     Raises
     ------
     InputError
-        If there is no such file, or it is neither.
+        If there is no such file, or it is neither, or too large.
     """
-    data = regular.read_bytes(path, xml_text.MOST_BYTES, expected)
+    data = regular.read_bytes(path, expected=expected)
     if data.startswith(b"PK"):  # of any zip file
         return None
+    if len(data) > MOST_BYTES:
+        found = "found more: leave out the images' points and maps, or give the matrices as npz"
+        raise InputError(f"{regular.shown(path)}: expected {expected} of up to {MOST_BYTES >> 20} MiB, {found}")
     kinds = "an npz file or OpenCV's YAML, XML or JSON"
     if data.lstrip().startswith(b"<"):
         return _map(_of_element(xml_text.parsed(path, data)))
@@ -63,7 +68,8 @@ def read(path: Path, expected: str) -> Values | None:
         return _map(json_text.parsed(path, JSON_PIECE.sub(_strict, text)))
     if not text.startswith("%YAML"):
         raise InputError(f"{path}: expected {kinds}, found other or damaged data")
-    documents = [_of_node(node) for node in yaml_text.composed(path, HEADER.sub("", text))]
+    most = max(len(text), yaml_text.MOST_VALUES)  # by what is written, which aliases can't multiply
+    documents = _of_events(yaml_text.events(path, HEADER.sub("", text), most))
     return {key: value for document in reversed(documents) for key, value in _map(document).items()}  # as a file is extended
 
 
@@ -71,14 +77,42 @@ def _map(value: Any) -> Values:
     return value if isinstance(value, dict) else {}
 
 
-def _of_node(node: yaml.Node) -> Any:
-    if isinstance(node, yaml.MappingNode):
-        return {str(key.value): _of_node(value) for key, value in node.value if isinstance(key, yaml.ScalarNode)}
-    if isinstance(node, yaml.SequenceNode):
-        return [_of_node(value) for value in node.value]
-    if node.tag == "tag:yaml.org,2002:binary":
-        return BASE64 + node.value
-    return node.value if getattr(node, "style", None) else _of_word(node.value)
+def _of_events(events: Iterable[yaml.Event]) -> list[Any]:
+    """Values of a text's documents, at once: nodes of PyYAML's between would take some hundred bytes a number."""
+    documents: list[Any] = []
+    open_ones: list[tuple[CollectionStartEvent, list[Any]]] = []
+    anchored: dict[str, Any] = {}
+    for event in events:
+        if isinstance(event, CollectionStartEvent):
+            open_ones.append((event, []))
+            continue
+        if isinstance(event, DocumentStartEvent):
+            anchored.clear()
+        if isinstance(event, AliasEvent):
+            anchor, value = None, anchored[event.anchor]
+        elif isinstance(event, ScalarEvent):
+            key = open_ones and not isinstance(open_ones[-1][0], SequenceStartEvent) and len(open_ones[-1][1]) % 2 == 0
+            anchor, value = event.anchor, event.value if key else _of_scalar(event)
+        elif isinstance(event, CollectionEndEvent):
+            start, inner = open_ones.pop()
+            anchor, value = start.anchor, inner if isinstance(start, SequenceStartEvent) else _of_pairs(inner)
+        else:
+            continue
+        if anchor is not None:
+            anchored[anchor] = value
+        (open_ones[-1][1] if open_ones else documents).append(value)
+    return documents
+
+
+def _of_pairs(keys_and_values: Sequence[Any]) -> Values:
+    pairs = zip(keys_and_values[::2], keys_and_values[1::2], strict=True)
+    return {key: value for key, value in pairs if isinstance(key, str)}
+
+
+def _of_scalar(scalar: ScalarEvent) -> Any:
+    if scalar.tag == "tag:yaml.org,2002:binary":
+        return BASE64 + scalar.value
+    return scalar.value if scalar.style else _of_word(scalar.value)
 
 
 def _of_element(element: Element) -> Any:
@@ -129,7 +163,7 @@ def matrix(path: Path, name: str, value: Any) -> Array:
     if kind is None:
         letters = ", ".join(DTYPES)
         raise InputError(
-            f"{path}: {name}.dt: expected one of {letters}, perhaps after a number of channels, found {value['dt']!r:.40}"
+            f"{path}: {name}.dt: expected one of {letters}, perhaps after a number of channels, found {brief(value['dt'])}"
         )
     channels, dtype = int(kind[1] or 1), np.dtype(DTYPES[kind[2]])
     if "sizes" in value:
@@ -157,7 +191,7 @@ def _numbers(path: Path, name: str, value: Any, dtype: np.dtype) -> NDArray:
     listed = [_of_word(one) if isinstance(one, str) else one for one in (value if isinstance(value, list) else [value])]
     wrong = next((one for one in listed if isinstance(one, bool) or not isinstance(one, int | float)), None)
     if wrong is not None or None in listed:
-        raise InputError(f"{path}: {name}: expected a matrix of numbers, found {wrong!r:.40} among them")
+        raise InputError(f"{path}: {name}: expected a matrix of numbers, found {brief(wrong)} among them")
     numbers = np.array(listed, float)
     if dtype.kind == "f":
         with np.errstate(over="ignore"):

@@ -3,13 +3,15 @@
 Samples lie in WebDataset's layout: members of one sample follow each other, and their names agree up to the first dot.
 """
 
+import os
 import tarfile
 from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-from recon.errors import InputError
+from recon.errors import InputError, reason
+from recon.files.regular import opened
 
 MOST_BYTES = 1 << 28  # of a member; a full frame's PNG has a few MB
 DAMAGE = (tarfile.TarError, EOFError, ValueError, OverflowError, RecursionError)  # what the headers of damaged files end in
@@ -32,12 +34,12 @@ def members(path: Path) -> Iterator[Member]:
     Raises
     ------
     InputError
-        If there is no such file, or it is damaged, cut short, or has a file with holes or one that is too large.
+        If there is no such file, it isn't a regular one, or it is damaged, cut short, or has a file with holes or one that is
+        too large.
     """
     try:
-        end = path.stat().st_size
-        with tarfile.open(path, "r:") as archive:
-            last = -1
+        with opened(path, expected="a tar file") as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
+            end, last = os.fstat(stream.fileno()).st_size, -1
             for entry in archive:
                 if entry.offset <= last:  # sizes below 0 lead back
                     raise InputError(f"{path}: expected a tar file, found a damaged one: {entry.name!r} has {entry.size} bytes")
@@ -50,14 +52,12 @@ def members(path: Path) -> Iterator[Member]:
                 if entry.offset_data + entry.size > end:
                     raise InputError(f"{path}: {entry.name!r}: expected {entry.size} bytes, found the tar file cut short")
                 yield Member(entry.name, entry.offset_data, entry.size)
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a tar file, found none") from None
     except OSError as error:
         raise InputError(f"{path}: expected a readable tar file, found {error.strerror or error}") from None
     except InputError:
         raise
     except DAMAGE as error:
-        raise InputError(f"{path}: expected a tar file, found a damaged one: {' '.join(str(error).split())}") from None
+        raise InputError(f"{path}: expected a tar file, found a damaged one: {reason(error)}") from None
 
 
 def samples(path: Path) -> Iterator[Sample]:
@@ -72,12 +72,12 @@ def read(path: Path, offset: int, size: int) -> bytes:
     Raises
     ------
     InputError
-        If the file is gone or has become shorter.
+        If the file is gone, isn't a regular one, or has become shorter.
     """
     try:
-        with path.open("rb") as file:
-            file.seek(offset)
-            content = file.read(size)
+        with opened(path, expected="a tar file") as stream:
+            stream.seek(offset)
+            content = stream.read(size)
     except OSError as error:
         raise InputError(f"{path}: expected a readable tar file, found {error.strerror}") from None
     if len(content) < size:

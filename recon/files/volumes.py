@@ -17,7 +17,7 @@ import nrrd
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import InputError, short
+from recon.errors import InputError, reason
 from recon.files import atomic, medical_images
 from recon.files.medical_images import fault
 from recon.files.regular import read_bytes
@@ -109,7 +109,7 @@ def _read_nrrd(path: Path) -> Volume:
     except InputError:
         raise
     except DAMAGE as error:
-        raise InputError(f"{path}: expected an NRRD volume, found it damaged: {short(str(error))}") from None
+        raise InputError(f"{path}: expected an NRRD volume, found it damaged: {reason(error)}") from None
     if voxels.ndim != 3:
         raise fault(path, "dimension", "3 axes of one number a voxel", header["dimension"])
     space = str(header.get("space", "scanner-xyz")).lower()

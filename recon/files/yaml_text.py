@@ -4,14 +4,15 @@ An alias stands for a whole value, so a few hundred bytes may stand for more val
 Therefore values are counted as if each alias were written out, before any is made.
 """
 
-from collections.abc import Callable, Hashable
+from collections import deque
+from collections.abc import Hashable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import yaml
-from yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, ScalarEvent
+from yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, DocumentStartEvent, ScalarEvent
 
-from recon.errors import InputError
+from recon.errors import InputError, brief, reason, short
 from recon.files.regular import read_text, shown
 
 MOST_BYTES = 1 << 22
@@ -19,11 +20,9 @@ MOST_VALUES = 100_000  # with those for which aliases stand
 MOST_DEPTH = 64  # of lists and maps within each other
 MOST_DIGITS = 40  # of a whole number
 PLAIN = ("null", "bool", "int", "float", "str", "seq", "map", "merge")
-SOURCE = ' in "<unicode string>"'  # as PyYAML names a text in its messages
 FAULTS = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, RecursionError)  # of tags that don't fit, too
 PREFIX = "tag:yaml.org,2002:"
 
-Result = TypeVar("Result")
 Base: type[yaml.SafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -44,7 +43,7 @@ class PlainLoader(Base):
                 continue
             place = key.tag, key.value
             if place in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"the key {place[1][:60]!r} twice", key.start_mark)
+                raise yaml.constructor.ConstructorError(None, None, f"the key {brief(place[1])} twice", key.start_mark)
             seen.add(place)
         return super().construct_mapping(node, deep)
 
@@ -75,37 +74,27 @@ def read(path: Path, expected: str = "a file") -> Any:
 
 def loaded(path: Path, text: str) -> Any:
     """Values of a YAML text that stood in a file; raises InputError as `read` does."""
-    return _understood(path, lambda: yaml.load(text, Loader=PlainLoader) if _checked(path, text) else None)
-
-
-def composed(path: Path, text: str) -> list[yaml.Node]:
-    """Nodes of the documents of a YAML text, with tags and values as they are written; raises InputError as `read` does."""
-    return _understood(path, lambda: list(yaml.compose_all(text, Loader=PlainLoader)) if _checked(path, text) else [])
-
-
-def _understood(path: Path, load: Callable[[], Result]) -> Result:
+    deque(events(path, text, MOST_VALUES), maxlen=0)
     try:
-        return load()
-    except InputError:
-        raise
+        return yaml.load(text, Loader=PlainLoader)
     except FAULTS as error:
-        text = " ".join(str(error).replace(SOURCE, "").split())
-        raise InputError(f"{shown(path)}: expected YAML, found {text[:300]}") from None
+        raise _fault(path, error) from None
 
 
-def _checked(path: Path, text: str) -> bool:
-    """True of a text whose values are few enough, and not too deeply nested; raises InputError else.
+def events(path: Path, text: str, most: int) -> Iterator[yaml.Event]:
+    """Events of the parser, one by one, of a text whose values are not too deeply nested, and not more than a number.
 
-    The parser's events come one by one, and no value is made of them.
+    No value is made of them. Raises InputError as `read` does.
     """
     sizes: dict[str, int | None] = {}  # values below an anchor; None while it is open
     open_ones: list[tuple[str | None, int]] = []  # anchor, and values before it
     values = 0
-    for event in yaml.parse(text, Loader=PlainLoader):
+    for event in _parsed(path, text):
         if isinstance(event, AliasEvent):
-            size = sizes.get(event.anchor, 1)
-            if size is None:
-                raise InputError(f"{shown(path)}: expected YAML, found a value that holds itself, *{event.anchor}")
+            size = sizes.get(event.anchor, 0)
+            if not size:
+                found = "a value that holds itself" if size is None else "the name of no value"
+                raise InputError(f"{shown(path)}: expected YAML, found {found}, *{short(event.anchor)}")
             values += size
         elif isinstance(event, ScalarEvent):
             values += 1
@@ -122,8 +111,25 @@ def _checked(path: Path, text: str) -> bool:
             anchor, before = open_ones.pop()
             if anchor is not None:
                 sizes[anchor] = values - before
+        elif isinstance(event, DocumentStartEvent):
+            sizes.clear()
         if len(open_ones) > MOST_DEPTH:
             raise InputError(f"{shown(path)}: expected YAML, found values nested too deeply")
-        if values > MOST_VALUES:
-            raise InputError(f"{shown(path)}: expected YAML of up to {MOST_VALUES} values, found more, written out or as aliases")
-    return True
+        if values > most:
+            raise InputError(f"{shown(path)}: expected YAML of up to {most} values, found more, written out or as aliases")
+        yield event
+
+
+def _parsed(path: Path, text: str) -> Iterator[yaml.Event]:
+    try:
+        yield from yaml.parse(text, Loader=PlainLoader)
+    except FAULTS as error:
+        raise _fault(path, error) from None
+
+
+def _fault(path: Path, error: Exception) -> InputError:
+    """A parser's complaint, with its place in the text."""
+    mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    found = reason(error) if problem is None else short(problem)
+    place = "" if problem is None or mark is None else f" in line {mark.line + 1}, column {mark.column + 1}"
+    return InputError(f"{shown(path)}: expected YAML, found {found}{place}")

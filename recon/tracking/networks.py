@@ -9,7 +9,7 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as runtime  # pyrefly: ignore[missing-module-attribute]
 
-from recon.errors import InputError, short
+from recon.errors import InputError, reason
 from recon.files.regular import read_bytes
 
 Floats = NDArray[np.float32]
@@ -80,7 +80,7 @@ def session(path: Path, interface: Interface, threads: int = 0) -> onnxruntime.I
     try:
         opened = onnxruntime.InferenceSession(network, options, ["CPUExecutionProvider"], enable_fallback=0)
     except (*FAULTS, ValueError) as error:  # the latter of texts in it
-        raise InputError(f"{path}: expected an ONNX network, found {short(str(error))}") from None
+        raise InputError(f"{path}: expected an ONNX network, found {reason(error)}") from None
     for what, expected, found in (("inputs", interface[0], opened.get_inputs()), ("outputs", interface[1], opened.get_outputs())):
         shapes = {node.name: tuple(node.shape) for node in found}
         if not all(name in shapes and _fits(shapes[name], shape) for name, shape in expected.items()) or (

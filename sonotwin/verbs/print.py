@@ -124,7 +124,7 @@ def shorter_board(config: Config, board: Board) -> str:
         least, most = (middle, most) if fits else (least, middle)
     if least == LEAST_SCALE:
         return ""
-    return "at most " + board_drawing.in_words(board_drawing.scaled(board, least)).partition(f"{board.rows}, ")[2]
+    return f"at most {board_drawing.lengths_in_words(board_drawing.scaled(board, least))}"
 
 
 def write(config: Config, card: Card, sheet: Sheet, words: str, notes: list[str]) -> None:

@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon import cores
-from recon.errors import InputError
+from recon.errors import InputError, short
 from recon.files import atomic, json_text, metrics
 from recon.files.metrics import Metrics, shown
 from recon.files.occupied import occupied
@@ -39,6 +39,7 @@ MARKER = "training.json"  # what a run was asked for
 MAY_CHANGE = {"out", "resume", "steps", "max_minutes", "checkpoint_minutes"}  # when a run goes on
 MAY_CHANGE |= {"threads", "loaders", "memory_gb"}  # which change no batch
 LISTS = ("data", "validation_data")  # of folders; one may be given by itself
+LONGEST_FIELD = 300  # letters, of a value that a message asks for, such as folders
 MEMORY_SHARE = 0.5  # of what is free, for images, if memory_gb isn't given
 
 
@@ -174,8 +175,7 @@ def check_resumed(config: Config) -> bool:
 def given(value: object) -> str:
     """A field's value in the command's own words, where they are short."""
     values = value if isinstance(value, list) else [value]
-    text = str(values[0]) if len(values) == 1 else f"[{','.join(map(str, values))}]"
-    return "".join(letter if letter.isprintable() else "?" for letter in text[:300])
+    return short(str(values[0]) if len(values) == 1 else f"[{','.join(map(str, values))}]", LONGEST_FIELD)
 
 
 def settings(config: Config) -> dict:

@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from recon.errors import one_line
+from recon.errors import LONGEST, brief, one_line, reason, short
 from recon.model.patterns import Patterns
 
 GOOD = {"projector_size": (128, 80), "unwrap": "centre_line", "parts": [{"kind": "centre_line"}]}
@@ -35,3 +35,11 @@ def test_something_that_is_no_map(content):
     with pytest.raises(ValidationError) as fault:
         Patterns.model_validate(content)
     assert one_line(fault.value) == f"expected a map of fields, found {content!r}"
+
+
+def test_whatever_was_found_is_shown_in_one_short_line():
+    """By a text, a value's `repr` or a library's exception, as none of them is known beforehand."""
+    for text in ("a\nb\x1b[31m" + "c" * 9000, brief({"a": ["\n" * 9000]}), reason(OSError("e\n" * 9000))):
+        assert short(text).isprintable() and len(short(text)) <= LONGEST
+    assert len(short("folder/" * 40, 200)) == 200
+    assert brief("\0'") == repr("\0'") and reason(KeyError()) == "KeyError" and reason(ValueError("no\n number")) == "no number"

@@ -1,5 +1,7 @@
 """`sonotwin print`: sheets are written whole, said how to be used, and refused with a way on where they don't fit."""
 
+import re
+
 import pytest
 
 from sonotwin.cli import main
@@ -47,6 +49,12 @@ def test_a_board_too_large_is_refused_with_paper_and_lengths_that_fit(place, cap
     refusal(capsys, "part=board", WIDE.replace("25", f"{side + 0.1:.1f}"), "out=other.pdf")
     assert main(["print", "part=board", WIDE, "paper=a3", "out=board.pdf"]) == 0
     assert main(["print", "part=board", WIDE, "paper=[240,320]", "out=board.pdf"]) == 0
+
+
+def test_of_a_board_too_large_the_lengths_alone_are_offered(capsys):
+    """A dictionary, which stands in the board's words too, changes nothing about its size."""
+    board = "board={kind: charuco, columns: 12, rows: 9, square_mm: 30, marker_mm: 22}"
+    assert re.search(r"or at most square [\d.]+ mm, marker [\d.]+ mm$", refusal(capsys, "part=board", board, "out=board.pdf"))
 
 
 @pytest.mark.parametrize(

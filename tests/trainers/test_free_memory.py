@@ -22,3 +22,24 @@ def test_the_least_bound_counts(tmp_path, monkeypatch):
     (tmp_path / "memory" / "old").mkdir(parents=True)
     (tmp_path / "memory" / "old" / "memory.limit_in_bytes").write_text("2000000\n")
     assert free_memory.free_bytes() == 2_000_000
+
+
+@pytest.mark.parametrize(
+    ("line", "folder", "bound", "used", "idle"),
+    [
+        ("0::/job", "job", "memory.max", "memory.current", "inactive_file"),
+        ("5:memory:/job", "memory/job", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    ],
+)
+def test_what_a_group_uses_is_not_free(tmp_path, monkeypatch, line, folder, bound, used, idle):
+    """Less the pages of files that are given back on demand, in both versions of control groups; never below nothing."""
+    monkeypatch.setattr(free_memory, "GROUPS", tmp_path)
+    monkeypatch.setattr(free_memory, "_groups", lambda: [line])
+    (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / folder / bound).write_text("5000000\n")
+    (tmp_path / folder / used).write_text("4000000\n")
+    assert free_memory.free_bytes() == 1_000_000
+    (tmp_path / folder / "memory.stat").write_text(f"anon 7\n{idle} 2500000\n")
+    assert free_memory.free_bytes() == 3_500_000
+    (tmp_path / folder / used).write_text("9000000\n")
+    assert free_memory.free_bytes() == 0

@@ -109,20 +109,20 @@ def _truth(change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda truth: truth.update(views={"1": {}, "2": {}}), "views: expected array"),
+        (lambda truth: truth.update(views={"1": {}, "2": {}}), "views: expected a list"),
         (lambda truth: truth["views"].append(truth["views"][0]), "views: expected"),
         (
             lambda truth: truth["views"][0].update(centres=[["1", "2"]] * 3),
             r"views\.0\.centres\.0\.0: expected number, found '1'",
         ),
         (lambda truth: truth["views"][0].update(centres=[[1e308, 0]] * 3), r"views\.0\.centres\.0\.0: expected less than"),
-        (lambda truth: truth["views"][1].update(visible=[float("nan")] * 3), r"views\.1\.visible\.0: expected a finite number"),
+        (lambda truth: truth["views"][1].update(visible=[float("nan")] * 3), "expected finite numbers, found NaN"),
         (lambda truth: truth["views"][1].update(visible=[1.0, 1.0]), r"views\.1\.visible\.2: expected a value, found none"),
         (lambda truth: truth["views"][1].update(visible=None), r"views\.1\.visible: expected three values, as there are centres"),
-        (lambda truth: truth["views"][1].update(white_dn="BIG"), "expected JSON, found damaged data: number out of range"),
+        (lambda truth: truth["views"][1].update(white_dn="BIG"), "expected JSON, found it damaged: a number of 10000 digits"),
         (lambda truth: truth["views"][1]["camera"].update(size=[0, 1024]), r"views\.1\.camera\.size\.0: expected greater than"),
         (lambda truth: truth["views"][1].update(ellipses=[[1, 2, -3, 4, 5]] * 3), r"views\.1\.ellipses\.0\.2: expected greater"),
-        (lambda truth: truth["views"][1].update(patch_origins=None), r"views\.1\.patch_origins: expected array, found None"),
+        (lambda truth: truth["views"][1].update(patch_origins=None), r"views\.1\.patch_origins: expected a list, found None"),
         (lambda truth: truth.update(k="0"), "k: expected integer, found '0'"),
     ],
 )
@@ -143,8 +143,20 @@ def test_json_that_is_none_is_said(data_set, tmp_path, content):
     assert str(caught.value).isprintable()
 
 
+def test_a_key_that_stands_twice_is_refused(data_set, tmp_path):
+    """As in all other JSON: which of two values was meant?"""
+    folder = shutil.copytree(data_set, tmp_path / "set")
+    rewritten(folder, lambda name, old: old.replace(b'"k":', b'"k": 7, "k":') if name.endswith("3.json") else old)
+    with pytest.raises(InputError, match=r"0-00000003\.json: expected JSON, found it damaged: the key 'k' twice in one object$"):
+        read_views([folder])
+
+
 @pytest.mark.parametrize(
-    "content", [b"", b"[]", b"[" * 100_000, b'{"samples": "24"}', b'{"samples": -1}', b'{"samples": NaN}', b"\xff"]
+    "content",
+    [
+        *(b"", b"[]", b"[" * 100_000, b"\xff"),
+        *(b'{"samples": "24"}', b'{"samples": -1}', b'{"samples": NaN}', b'{"samples": 24, "samples": 6}'),
+    ],
 )
 def test_a_damaged_promise_is_said(data_set, tmp_path, content):
     folder = shutil.copytree(data_set, tmp_path / "set")

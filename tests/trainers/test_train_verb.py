@@ -114,6 +114,7 @@ def test_a_run_of_the_earlier_version_goes_on(data_set, trained, tmp_path):
             for content in (b"", b"[]", b"3", b"\xff", b"[" * 100_000, b'{"seed": ' + b"9" * 10_000 + b"}")
         ),
         *(("log.jsonl", content) for content in (b"[1]\n", b"x}\n", b'{"step": NaN}\n', b'{"step": "1"}\n', b'{"loss": 1}\n')),
+        ("log.jsonl", b'{"step": 1, "step": 1}\n'),
         *(("log.jsonl", content) for content in (b"\xff}\n", b'{"step": {"a": 1}}\n', b'{"step": ' + b"9" * 10_000 + b"}\n")),
         *(("checkpoint.pt", content) for content in (b"", b"nothing", b"PK\x03\x04" + b"\0" * 100)),
     ],

@@ -28,7 +28,7 @@ class CalibrationPart:
     """What an estimated calibration adds to the errors."""
 
     error: Map  # (h, w) mm, positive outwards; NaN where the truth isn't lit
-    sigma_mm: float  # RMS of its predicted standard deviation; NaN where the calibration has no covariance
+    sigma_mm: float  # RMS of its predicted standard deviation where points count; NaN where the calibration has no covariance
 
 
 @dataclass(frozen=True)
@@ -56,18 +56,20 @@ class ErrorParts:
     known: Mask  # (h, w) points that count
 
 
-def of_calibration(found: ProjectorMap, truth: Truth, estimated: Calibration, camera: str) -> CalibrationPart:
+def of_calibration(found: ProjectorMap, truth: Truth, estimated: Calibration, camera: str, known: Mask) -> CalibrationPart:
     """The calibration's part: points of the true projector coordinates, by the estimated cameras, against the true points.
 
     Parameters
     ----------
     found : ProjectorMap
         Which axes are decoded, and their weights.
+    known : (h, w)
+        Points that count: those with a prediction.
     """
     pair = estimated.cameras[camera], estimated.cameras[PROJECTOR]
     points = triangulate.triangulate(_true_coordinates(found, truth), *pair).points
     error = np.where(truth.lit, ((points - truth.points) * truth.normals).sum(axis=-1), np.nan)
-    return CalibrationPart(np.float32(error), _predicted(found, truth, estimated, camera))
+    return CalibrationPart(np.float32(error), _predicted(found, truth, estimated, camera, known & np.isfinite(error)))
 
 
 def split(comparison: Comparison, calibration: CalibrationPart | None) -> ErrorParts:
@@ -101,12 +103,12 @@ def _true_coordinates(found: ProjectorMap, truth: Truth) -> ProjectorMap:
     )
 
 
-def _predicted(found: ProjectorMap, truth: Truth, estimated: Calibration, camera: str) -> float:
-    """RMS of the standard deviations along the normals that the calibration's covariance gives points of the surface."""
-    if estimated.uncertainty is None:
+def _predicted(found: ProjectorMap, truth: Truth, estimated: Calibration, camera: str, known: Mask) -> float:
+    """RMS of the standard deviations along the normals that the calibration's covariance gives known points of the surface."""
+    counted = np.flatnonzero(known)
+    if estimated.uncertainty is None or not len(counted):
         return np.nan
-    lit = np.flatnonzero(truth.lit)
-    chosen = lit[:: max(1, len(lit) // MOST_POINTS)]
+    chosen = counted[:: max(1, len(counted) // MOST_POINTS)]
     points, normals = (np.float64(part.reshape(-1, 3)[chosen]) for part in (truth.points, truth.normals))
     decoded = [1.0 if axis is not None else np.inf for axis in (found.columns, found.rows)]
     spread = uncertainty.triangulation(estimated, camera, PROJECTOR, points, (1.0, decoded))

@@ -70,7 +70,10 @@ def read(captured: Path, truth: Path, points: Path, camera: str = "cam1", calibr
     measured, sigma = surface_errors.read_points(points)
     comparison = surface_errors.compare(measured, sigma, expected)
     found = decode.decode(shots.images, shots.patterns, bits=shots.bits, name=shots.name)
-    by_calibration = None if calibration is None else error_parts.of_calibration(found, expected, calibration, camera)
+    by_calibration = None
+    if calibration is not None:
+        known = surface_errors.points_with_prediction(comparison)
+        by_calibration = error_parts.of_calibration(found, expected, calibration, camera, known)
     parts = error_parts.split(comparison, by_calibration)
     return Measurement(read_manifest(captured), shots, camera, found, measured, expected, comparison, parts)
 

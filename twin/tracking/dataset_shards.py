@@ -257,7 +257,7 @@ def truths(path: Path) -> Iterator[dict]:
     for key, files in tar_members.samples(path):
         try:
             _, offset, size = files["json"]
-            yield json.loads(tar_members.read(path, offset, size))
+            yield json_text.of_bytes(Path(f"{path}: {key}.json"), tar_members.read(path, offset, size))
         except (KeyError, ValueError, RecursionError):
             raise InputError(f"{path}: {key}: expected its truth, found none or damaged data; {MADE_ANEW}") from None
 

@@ -58,6 +58,15 @@ def filtered(kind: int) -> bytes:
     return chunks(header(40, 24, 8, 6), (b"IDAT", zlib.compress(rows.tobytes())), (b"IEND", b""))
 
 
+def big_endian(grey: np.ndarray) -> bytes:
+    """A BigTIFF file of grey levels, in the order of bytes that Pillow doesn't write."""
+    height, width = grey.shape
+    fields = (256, width), (257, height), (258, 8), (259, 1), (262, 1), (273, 16), (277, 1), (278, height), (279, grey.size)
+    table = b"".join(struct.pack(">HHQHxxxxxx", tag, 3, 1, value) for tag, value in fields)
+    end = struct.pack(">Q", len(fields)) + table + bytes(8)
+    return struct.pack(">2sHHHQ", b"MM", 43, 8, 0, 16 + grey.size) + grey.tobytes() + end
+
+
 FILES = {
     **{f"grey{suffix}": opencv(GREY, suffix) for suffix in (".png", ".bmp", ".tif", ".jpg")},
     **{f"colour{suffix}": opencv(COLOUR, suffix) for suffix in (".png", ".bmp", ".tif", ".jpg")},
@@ -74,6 +83,10 @@ FILES = {
     "filtered.png": pillow(np.repeat(np.arange(40, dtype=np.uint8)[None], 24, 0), "png", optimize=True),
     "progressive.jpg": pillow(COLOUR, "jpeg", progressive=True, quality=95),
     "packed.tif": pillow(GREY, "tiff", compression="tiff_lzw"),
+    "big.tif": pillow(GREY, "tiff", big_tiff=True),
+    "big deep.tif": pillow(DEEP, "tiff", big_tiff=True),
+    "big, the other order.tif": big_endian(GREY),
+    "trailer.jpg": opencv(GREY, ".jpg") + b"SEFT of a phone, with a preview " + opencv(GREY[:8, :8], ".jpg") + bytes(500),
 }
 
 
@@ -123,6 +136,23 @@ def test_images_that_are_none_are_refused_in_one_line(data, complaint, capfd):
         decode_image(PLACE, data)
     assert str(refusal.value).startswith(f"image: {complaint}"), refusal.value
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("more", [{}, {"progressive": True}, {"restart_marker_rows": 1}])
+@pytest.mark.parametrize("filled", [b"", bytes(4000), b"\xff" * 500, b"a trailer" * 60, opencv(GREY, ".jpg")])
+def test_a_jpeg_cut_short_is_refused_whatever_follows(more, filled):
+    """Pillow alone takes zeros, or another image, for the rest of the pixels; an end in a preview before them is none."""
+    preview = opencv(GREY[:8, :8], ".jpg")
+    image = Image.fromarray(COLOUR)
+    stream = BytesIO()
+    image.save(stream, "jpeg", quality=90, exif=b"Exif\0\0" + preview, **more)
+    whole = stream.getvalue()
+    assert decode_image(PLACE, whole + b"a trailer" * 60).shape == COLOUR.shape
+    for cut in (1, 2, 3, 17, len(whole) // 3):
+        if cut == 1 and filled[:1] == b"\xff":
+            continue  # no bytes of the end but these
+        with pytest.raises(InputError, match="expected a whole "):
+            decode_image(PLACE, whole[:-cut] + filled)
 
 
 def test_what_no_pixel_is_made_of_is_left_alone(capfd):

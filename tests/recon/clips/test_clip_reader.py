@@ -1,13 +1,15 @@
 """DICOM files, videos and folders of images give the frames, times, B-scan's part and scale that were written."""
 
+import os
+
 import cv2
 import numpy as np
 import pydicom
 import pytest
 from pydicom.encaps import encapsulate
-from pydicom.uid import JPEGBaseline8Bit, JPEGLSLossless
+from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGLSLossless
 
-from recon.clips import clip_reader, image_region, video_clip
+from recon.clips import clip_reader, dicom_clip, image_region, video_clip
 from recon.errors import InputError
 from tests.recon.clips import made_clips
 from tests.recon.clips.made_clips import BOX, SCREEN
@@ -106,6 +108,22 @@ def test_jpeg_in_a_dicom_file_is_read(tmp_path):
     assert np.abs(np.int32(frames_of(clip_reader.read(tmp_path / "scan.dcm"))) - smooth).max() <= 4
 
 
+def test_a_file_that_is_deflated_is_unpacked_up_to_a_bound(tmp_path, monkeypatch):
+    """All of it but the first tags is packed."""
+    shown = made_clips.screens(made_clips.scans(5))
+    made_clips.write_dicom(tmp_path / "scan.dcm", shown, FrameTime=50.0)
+    held = pydicom.dcmread(tmp_path / "scan.dcm")
+    held.file_meta.TransferSyntaxUID = DeflatedExplicitVRLittleEndian
+    held.save_as(tmp_path / "deflated.dcm")
+    assert (tmp_path / "deflated.dcm").stat().st_size < (tmp_path / "scan.dcm").stat().st_size
+    clip = clip_reader.read(tmp_path / "deflated.dcm")
+    assert clip.image == BOX and (frames_of(clip) == shown).all()
+    monkeypatch.setattr(dicom_clip, "MOST_UNPACKED", shown.nbytes)  # the tags come on top
+    for attempt in (lambda: clip_reader.read(tmp_path / "deflated.dcm"), lambda: frames_of(clip)):
+        with pytest.raises(InputError, match=r"deflated\.dcm: expected up to 0 MiB .* found more: save it uncompressed$"):
+            attempt()
+
+
 def test_a_compression_that_cant_be_read_is_named(tmp_path):
     compressed(tmp_path / "scan.dcm", made_clips.scans(3), JPEGLSLossless)
     with pytest.raises(InputError, match=r"scan\.dcm: frame 0: .* found .*JPEG-LS"):
@@ -153,6 +171,33 @@ def test_a_video_gives_its_frames_and_times(tmp_path):
     (tmp_path / "none.mp4").write_bytes(b"none")
     with pytest.raises(InputError, match=r"none\.mp4: expected a video"):
         clip_reader.read(tmp_path / "none.mp4")
+
+
+@pytest.mark.parametrize(
+    ("given", "used"),
+    [
+        (None, "protocol_whitelist;file"),
+        ("threads;1|flags;low_delay", "threads;1|flags;low_delay|protocol_whitelist;file"),
+        ("protocol_whitelist;file,crypto", "protocol_whitelist;file,crypto"),
+    ],
+)
+def test_a_video_names_no_files_far_away_whatever_else_is_asked_for(given, used, tmp_path, monkeypatch):
+    """And the environment, which other processes inherit, stays as it was."""
+    if given is None:
+        monkeypatch.delenv(video_clip.OPTIONS, raising=False)
+    else:
+        monkeypatch.setenv(video_clip.OPTIONS, given)
+    made_clips.write_video(tmp_path / "screen.avi", made_clips.screens(made_clips.scans(2)))
+    seen, plain = [], cv2.VideoCapture
+
+    def opened(*arguments):
+        seen.append(os.environ.get(video_clip.OPTIONS))
+        return plain(*arguments)
+
+    monkeypatch.setattr(cv2, "VideoCapture", opened)
+    before = dict(os.environ)
+    assert len(frames_of(clip_reader.read(tmp_path / "screen.avi"))) == 2
+    assert set(seen) == {used} and dict(os.environ) == before
 
 
 def test_a_folder_of_images_is_a_clip_without_times(tmp_path):

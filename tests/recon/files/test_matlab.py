@@ -42,6 +42,18 @@ def test_matrices_come_back(tmp_path, packed):
         assert values.dtype.kind == MATRICES[name].dtype.kind and np.array_equal(values, MATRICES[name]), name
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_other_variables_may_have_any_size(tmp_path, packed):
+    """Frames beside the matrices, of more than is ever unpacked; a wanted matrix of that size is named with it."""
+    path, large = tmp_path / "a.mat", np.zeros((5, 700, 700))
+    file = io.BytesIO()
+    savemat(file, {"frames": large, **MATRICES, "zlast": large}, do_compression=packed)
+    path.write_bytes(file.getvalue())
+    assert np.array_equal(matlab.read(path, FORMS, {})["K"], MATRICES["K"])
+    with pytest.raises(InputError, match=r"a\.mat: frames: expected a matrix of up to 16 MiB, found 19 MiB$"):
+        matlab.read(path, {"frames": Form("f")}, {})
+
+
 def test_an_old_name_is_taken_for_the_new_one(tmp_path):
     path = tmp_path / "a.mat"
     path.write_bytes(saved())

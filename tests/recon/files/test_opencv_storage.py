@@ -92,6 +92,38 @@ def test_older_files_and_those_of_other_programs_are_read(read, text):
     np.testing.assert_array_equal(opencv_storage.matrix(path, "M", values["M"]), [[1, 0.5]])
 
 
+def test_a_calibration_with_its_images_points_is_read(read):
+    """1000 views of 54 corners, as OpenCV's calibration sample stores them: the same from YAML as from XML."""
+    points = np.random.default_rng(0).uniform(0, 1280, (1000, 54, 2)).astype(np.float32)
+    found = {}
+    for suffix in (".yaml", ".xml"):
+        storage = cv2.FileStorage(suffix, cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+        storage.write("image_points", points)
+        storage.write("camera_matrix", np.eye(3))
+        values, path = read(storage.releaseAndGetString())
+        found[suffix] = opencv_storage.matrix(path, "image_points", values["image_points"])
+    np.testing.assert_array_equal(found[".yaml"], points)
+    np.testing.assert_array_equal(found[".yaml"], found[".xml"])
+
+
+def test_aliases_stand_for_values_but_not_for_more_than_a_file_has_bytes(read):
+    values, _ = read("%YAML:1.0\n---\na: &a [1, 2]\nb: *a\nc: {d: *a, *a : 3}\n1e3: x\n")
+    assert values == {"a": [1, 2], "b": [1, 2], "c": {"d": [1, 2]}, "1e3": "x"}
+    bomb = "%YAML:1.0\n---\na: &a [l, o, l, l, l, l, l, l, l]\n" + "".join(
+        f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+    )
+    with pytest.raises(InputError, match=r"expected YAML of up to \d+ values, found more, written out or as aliases$"):
+        read(bomb)
+
+
+def test_a_file_that_is_too_large_is_refused_with_a_way_on(read, monkeypatch):
+    """An npz file may be larger: its own reader bounds it."""
+    monkeypatch.setattr(opencv_storage, "MOST_BYTES", 50)
+    with pytest.raises(InputError, match=r"expected a file of up to 0 MiB, found more: leave out .* as npz$"):
+        read(MATRIX)
+    assert read(b"PK" + bytes(200))[0] is None
+
+
 MATRIX = "%YAML:1.0\n---\nM: !!opencv-matrix\n   rows: 1\n   cols: 2\n   dt: d\n   data: [ 3320., 0.5 ]\n"
 
 

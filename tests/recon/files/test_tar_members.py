@@ -1,6 +1,7 @@
 """Members are found where their bytes are, and whatever a tar file claims costs one line."""
 
 import io
+import os
 import tarfile
 
 import numpy as np
@@ -121,11 +122,20 @@ def test_a_missing_file_and_a_folder_are_said(tmp_path):
     for path in (tmp_path / "nowhere.tar", tmp_path):
         with pytest.raises(InputError, match=f"^{path}: expected a"):
             list(members(path))
-    with pytest.raises(InputError, match="expected a readable tar file"):
+    with pytest.raises(InputError, match="expected a tar file, found none"):
         read(tmp_path / "nowhere.tar", 0, 1)
     (tmp_path / "short.tar").write_bytes(b"abc")
     with pytest.raises(InputError, match="expected 5 bytes at 1, found 2; was it changed meanwhile"):
         read(tmp_path / "short.tar", 1, 5)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
+    """Nobody writes to it."""
+    os.mkfifo(tmp_path / "shard-00000.tar")
+    for attempt in (lambda path: list(members(path)), lambda path: read(path, 0, 1)):
+        with pytest.raises(InputError, match=r"shard-00000\.tar: expected a tar file, found a pipe$"):
+            attempt(tmp_path / "shard-00000.tar")
 
 
 def test_bytes_are_where_they_are_said_to_be(tmp_path):

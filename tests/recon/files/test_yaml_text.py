@@ -50,7 +50,7 @@ def test_aliases_merges_and_odd_words():
         ("a: " + "9" * 5000, "expected YAML, found a number of 5000 digits"),
         ("a: 0x" + "f" * 5000, "expected YAML, found a number of 5002 digits"),
         ("a: 1\na: 2", "expected YAML, found the key 'a' twice"),
-        ("{[1]: 2}", "expected YAML, found while constructing a mapping"),
+        ("{[1]: 2}", "expected YAML, found found unhashable key in line 1, column 2"),
         ("!!python/object/apply:os.system [id]", "expected YAML, found could not determine a constructor"),
         ("!!binary aGVsbG8=", "expected YAML, found could not determine a constructor"),
         ("!!set {a, b}", "expected YAML, found could not determine a constructor"),

@@ -45,11 +45,16 @@ def seen_by(estimated, found, truth, rng):
     return surface_errors.compare(noisy, np.full(truth.lit.shape, NOISE_MM, np.float32), truth)
 
 
+def by_calibration(found, truth, estimated, comparison):
+    """The calibration's part, of the points that have a prediction."""
+    return error_parts.of_calibration(found, truth, estimated, "cam1", surface_errors.points_with_prediction(comparison))
+
+
 def test_calibration_and_noise_come_apart(found, truth, known, rng):
     """Noise to 2 %; the rest is the noise's mean over 225 px, a fifteenth of it, which noise lacks in turn."""
     moved = uncertainty.apply(known, 2 * SIGMAS)
     comparison = seen_by(moved, found, truth, rng)
-    split = error_parts.split(comparison, error_parts.of_calibration(found, truth, moved, "cam1"))
+    split = error_parts.split(comparison, by_calibration(found, truth, moved, comparison))
     assert list(split.parts) == ["calibration", "rest", "noise"]
     assert split.parts["noise"].rms_mm == pytest.approx(NOISE_MM, rel=0.02)
     assert split.parts["noise"].predicted_mm == pytest.approx(NOISE_MM, rel=0.03), "by the cosine of the ray"
@@ -59,7 +64,8 @@ def test_calibration_and_noise_come_apart(found, truth, known, rng):
 
 def test_the_parts_add_up(found, truth, known, rng):
     moved = uncertainty.apply(known, 2 * SIGMAS)
-    split = error_parts.split(seen_by(moved, found, truth, rng), error_parts.of_calibration(found, truth, moved, "cam1"))
+    comparison = seen_by(moved, found, truth, rng)
+    split = error_parts.split(comparison, by_calibration(found, truth, moved, comparison))
     parts, whole = split.parts.values(), split.whole
     assert sum(part.mean_mm for part in parts) == pytest.approx(whole.mean_mm, abs=1e-6)
     assert sum(part.scatter_mm**2 for part in parts) == pytest.approx(whole.scatter_mm**2, rel=0.05)
@@ -67,7 +73,7 @@ def test_the_parts_add_up(found, truth, known, rng):
 
 
 def test_the_true_calibration_has_no_part(found, truth, known, rng):
-    exact = error_parts.of_calibration(found, truth, known, "cam1")
+    exact = error_parts.of_calibration(found, truth, known, "cam1", truth.lit)
     assert np.nanmax(np.abs(exact.error)) < 3e-4, "float32 at 700 mm, seen obliquely"
     split = error_parts.split(seen_by(known, found, truth, rng), None)
     assert list(split.parts) == ["rest", "noise"]
@@ -77,7 +83,7 @@ def test_what_neighbours_share_beside_it_is_the_rest(found, truth, known, rng):
     """A surface that is 0.1 mm too high everywhere, as by no calibration."""
     comparison = seen_by(known, found, truth, rng)
     raised = replace(comparison, error=comparison.error + np.float32(0.1))
-    split = error_parts.split(raised, error_parts.of_calibration(found, truth, known, "cam1"))
+    split = error_parts.split(raised, by_calibration(found, truth, known, comparison))
     assert split.parts["rest"].mean_mm == pytest.approx(0.1, abs=0.002)
     assert abs(split.parts["calibration"].mean_mm) < 1e-4
 
@@ -87,7 +93,24 @@ def test_the_calibrations_prediction_is_the_scatter_of_calibrations(found, truth
     draws = rng.multivariate_normal(np.zeros(len(NAMES)), known.uncertainty.covariance, 40)
     squares = []
     for change in draws:
-        part = error_parts.of_calibration(found, truth, uncertainty.apply(known, change), "cam1")
+        part = error_parts.of_calibration(found, truth, uncertainty.apply(known, change), "cam1", truth.lit)
         squares.append(np.nanmean(np.float64(part.error) ** 2))
-    predicted = error_parts.of_calibration(found, truth, known, "cam1").sigma_mm
+    predicted = error_parts.of_calibration(found, truth, known, "cam1", truth.lit).sigma_mm
     assert np.sqrt(np.mean(squares)) == pytest.approx(predicted, rel=4 / np.sqrt(2 * len(draws)))
+
+
+def test_the_prediction_is_that_of_the_points_that_count(found, truth, known, rng):
+    """The wall and the ball apart: mean squares by their numbers of points give the whole's, to 5 % of 2000 samples' spread."""
+    comparison = seen_by(known, found, truth, rng)
+    wall = truth.points[..., 2] > 705
+    squares, counts = {}, {}
+    for name, some in {"whole": truth.lit, "wall": truth.lit & wall, "ball": truth.lit & ~wall}.items():
+        chosen = replace(comparison, predicted=np.where(some, comparison.predicted, np.float32(np.nan)))
+        split = error_parts.split(chosen, by_calibration(found, truth, known, chosen))
+        squares[name], counts[name] = split.parts["calibration"].predicted_mm ** 2, split.known.sum()
+    assert counts["wall"] + counts["ball"] == counts["whole"]
+    together = sum(counts[name] * squares[name] for name in ("wall", "ball")) / counts["whole"]
+    assert together == pytest.approx(squares["whole"], rel=0.05)
+    assert abs(squares["wall"] / squares["ball"] - 1) > 0.2, squares
+    nothing = replace(comparison, predicted=np.full_like(comparison.predicted, np.nan))
+    assert np.isnan(by_calibration(found, truth, known, nothing).sigma_mm)
