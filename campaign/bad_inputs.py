@@ -76,8 +76,8 @@ def _of_fields(command: Command) -> Iterator[Case]:
 
 
 def _of_files(command: Command, place: Path) -> Iterator[Case]:
-    for name in command.reads:
-        for fault in _faults(place / name):
+    for name in (*command.reads, *command.reads_in_part):
+        for fault in _faults(place / name) if name in command.reads else faults_of_any_file(place / name):
             yield Case(command, f"{name}: {fault.name}", damage=partial(_damage, name, fault.name))
 
 

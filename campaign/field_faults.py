@@ -19,7 +19,9 @@ NONSENSE = {  # type of the field's value -> values that no field of the type ca
 }
 FREE = {"over"}  # fields whose values are other fields and theirs
 FOREIGN, FILE, LOOP = "foreign", "there.txt", "loop"
-OUT = ("", "/dev/null", "/dev/null/below", "/proc/below", FILE, f"{FILE}/below", FOREIGN, LOOP, "x" * 300)
+OUT = ("/dev/null", "/dev/null/below", "/proc/below", FILE, f"{FILE}/below", LOOP, "x" * 300)
+TAKEN = ("", FOREIGN)  # of folders with files of others, which verbs that replace the whole folder refuse
+BESIDE = ("render", "sweep", "film", "accuracy")  # verbs that write folders or files of their own into a folder
 IN = ("", "nowhere", "/dev/zero", FILE, FOREIGN, LOOP, "x" * 300, "x" * 5000, "caf\udce9")
 
 
@@ -35,7 +37,7 @@ def overrides(verb: str, fields: Sequence[str], inputs: Sequence[str]) -> Iterat
         if way not in {"out", *inputs, *FREE}:
             yield from (f"{way}={nonsense}" for nonsense in NONSENSE.get(type(value), ()))
     yield from ("unknown=1", "rig.unknown=1", "=1", "out", "--out=x", "~unknown", "+unknown=1", "out=[a", "out={a: b}")
-    yield from (f"out={place}" for place in OUT)
+    yield from (f"out={place}" for place in (*OUT, *(() if verb in BESIDE else TAKEN)))
     for name in inputs:
         yield from (f"{name}={place}" for place in IN)
         yield f"out={next(field.partition('=')[2] for field in fields if field.startswith(f'{name}='))}"  # what is read

@@ -45,6 +45,7 @@ class Command:
     fields: tuple[str, ...] = ()
     folders: tuple[str, ...] = ()  # sources that it needs
     reads: tuple[str, ...] = ()  # files of those that it must refuse if they are damaged
+    reads_in_part: tuple[str, ...] = ()  # files of which some fields or pixels don't matter to it: it must refuse other files
     minutes: bool = False  # that it takes without a fault: it isn't tried without one
     out: str = "new"
 
@@ -76,10 +77,11 @@ COMMANDS = (
     Command("surface", ("images=shots", "patterns=paper_surface", "calibration=optics/cam1_proj_params.npz"),
             ("shots", "optics"), ("optics/cam1_proj_params.npz",)),
     Command("evaluate", ("surface=skin", "truth=ball/truth"), ("skin", "ball"),
-            ("skin/points.npz", "ball/truth/scene.json", "ball/truth/calibration/optics.yaml", "ball/truth/surface/cam1.npz")),
+            ("skin/points.npz", "ball/truth/calibration/optics.yaml", "ball/truth/surface/cam1.npz"), ("ball/truth/scene.json",)),
     Command("calibrate-optics", ("capture=board/capture",), ("board",),
             ("board/capture/manifest.json", "board/capture/board/01/cam1/0003.png", "board/capture/board/02/cam2/lit.png")),
-    Command("calibrate-optics", ("capture=board/capture", "truth=board/truth"), ("board",), ("board/truth/board.npz",)),
+    Command("calibrate-optics", ("capture=board/capture", "truth=board/truth"), ("board",),
+            ("board/truth/calibration/optics.yaml",)),
     Command("calibrate-probe", ("capture=wires/capture", "earlier=probe/probe.yaml"), ("wires", "probe"),
             (*_sweep("wires"), "probe/probe.yaml")),
     Command("calibrate-probe", ("pairs=pairs.csv",), ("pairs.csv",), ("pairs.csv",)),
@@ -96,17 +98,17 @@ COMMANDS = (
     Command("fuse", ("capture=scan/capture", "surface=skin/surface.ply", "volume=volume", "part_table=false"),
             ("scan", "skin", "volume"), (*SCAN, "skin/surface.ply", "volume/volume.nrrd")),
     Command("reconstruct", ("capture=scan/capture", "probe=probe/probe.yaml"), ("scan", "probe"),
-            ("scan/capture/manifest.json", "probe/probe.yaml")),
+            ("probe/probe.yaml",), ("scan/capture/manifest.json",)),
     Command("export", ("capture=ball/capture", "surface=skin"), ("ball", "skin"), (*BALL, "skin/points.npz")),
     Command("import", ("folder=published",), ("published",),
-            ("published/cam1_proj_params.npz", "published/SLdata/images/3.png")),
+            ("published/SLdata/images/3.png",)),
     Command("import-sweep", ("clip=scan.dcm", "poses=poses.csv", "starts_s=100", *POSES), ("scan.dcm", "poses.csv"),
             ("scan.dcm", "poses.csv")),
     Command("import-sweep", ("clip=screen.avi", "poses=poses.csv", *POSES), ("screen.avi", "poses.csv"), ("screen.avi",)),
     Command("describe", ("folder=shots", "patterns=patterns.yaml", "calibration=optics/optics.yaml"),
-            ("shots", "patterns.yaml", "optics"), ("shots/0003.png", "patterns.yaml", "optics/optics.yaml")),
+            ("shots", "patterns.yaml", "optics"), ("patterns.yaml", "optics/optics.yaml"), ("shots/0003.png",)),
     Command("train", ("network=detector", "data=data", "init=net/detector.safetensors", "steps=2", "batch=2", "crop_px=64"),
-            ("data", "net"), ("data/shard-00001.tar", "data/dataset.json", "net/detector.safetensors")),
+            ("data", "net"), ("data/shard-00001.tar", "net/detector.safetensors"), ("data/dataset.json",)),
     Command("train", ("network=detector", "data=data", "init=net/detector.pt", "steps=2", "batch=2", "crop_px=64"),
             ("data", "net"), ("net/detector.pt",)),
     Command("render", ("scene=sphere", "tracing.samples=2")),

@@ -21,7 +21,7 @@ TEXT_NONSENSE = {  # of a field that is text: a path, a kind, a version
     "out of the folder": '"../../../../etc/passwd"',
     "a device": '"/dev/zero"',
 }
-NUMBER_NONSENSE = {"a word": '"many"', "1e308": "1e308", "-1e308": "-1e308", "none": "null"}
+NUMBER_NONSENSE = {"a word": '"many"', "1e308": "1e308", "-1e308": "-1e308"}
 FREE_TEXT = {"name"}  # fields of which any text is right
 BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
     f"{b}: &{b} [{','.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefghi", "bcdefghij", strict=True)
@@ -117,9 +117,12 @@ def table_faults(content: bytes) -> Iterator[tuple[str, bytes]]:
     yield "half a row", with_row(",".join(cells[: max(len(cells) // 2, 1)]) if len(cells) > 1 else "")
     yield "other letters", content.decode().encode("utf-16")
     yield "one line of 50 MB", header.encode() + b"\n" + b"1" * 50_000_000
-    for name, value in (("a word", "many"), ("not a number", "nan"), ("1e308", "1e308"), ("ten thousand digits", DIGITS),
-                        ("a zero byte", "1\0"), ("beyond all numbers", "1e999")):  # fmt: skip
-        for place in sorted({0, len(cells) - 1}):
+    last = len(cells) - 1
+    for name, value, places in (  # a row without a pose may hold anything that is no finite number
+        ("a word", "many", {0, last}), ("1e308", "1e308", {0, last}), ("ten thousand digits", DIGITS, {0, last}),
+        ("a zero byte", "1\0", {0, last}), ("not a number", "nan", {0}), ("beyond all numbers", "1e999", {0}),
+    ):  # fmt: skip
+        for place in sorted(places):
             yield f"{name} in column {place}", with_row(",".join(value if k == place else cell for k, cell in enumerate(cells)))
 
 
@@ -133,7 +136,6 @@ def xml_faults(content: bytes) -> Iterator[tuple[str, bytes]]:
     )
     stolen = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]><PlusConfiguration>&a;</PlusConfiguration>'
     yield "a file from elsewhere", stolen.encode()
-    yield "another root", content.replace(b"PlusConfiguration", b"Unknown")
     for value in (b"many", b"nan nan nan", b"-1 -1 -1", b"1e-9 1e-9 1e-9", DIGITS.encode()):
         yield f"a spacing of {value[:20].decode()}", content.replace(b"0.5 0.5 0.5", value)
     yield "nested 100 000 deep", b"<PlusConfiguration>" + b"<a>" * 100_000

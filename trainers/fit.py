@@ -1,6 +1,7 @@
 """Training loop, resumable at any step: a step's batch depends on the seed and the step's number alone."""
 
 import json
+import logging
 import math
 from collections.abc import Callable, Mapping
 from copy import deepcopy
@@ -80,6 +81,8 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
     KeyboardInterrupt
         On Ctrl-C, or whatever the handlers of SIGTERM and SIGHUP raise, once the checkpoint is written.
     """
+    for name in ("lightning_utilities.core.rank_zero", "lightning_fabric.utilities.rank_zero"):
+        logging.getLogger(name).setLevel(logging.WARNING)  # it would say which precision it takes
     fabric = Fabric(accelerator="auto", devices=1, precision=precision_of(plan.precision))
     plain = start.to(memory_format=torch.channels_last)  # pyrefly: ignore[no-matching-overload]
     optimizer = torch.optim.AdamW(_groups(plain, plan.weight_decay), lr=plan.learning_rate)

@@ -21,6 +21,7 @@ from recon.capture import calibration_files
 from recon.files import atomic
 from recon.files.metrics import Metrics, shown
 from recon.tracking import networks
+from scenes.catalogue import parse_scene
 from sonotwin import latency_fields, pipeline
 from sonotwin.config import load
 from sonotwin.demo_config import CALIBRATION, Config
@@ -77,6 +78,7 @@ def run(config: Config) -> None:
     if config.looks_inside or config.film_frames:
         networks.load()  # before minutes of work
     atomic.check_folder(config.out, pipeline.MARKER)
+    parse_scene(config.scene)
     if config.poses is not None:
         board_session.check_place(config.board)
     steps = [each if isinstance(each, Step) else each.step() for each in verb_steps(config.out, config, config._overrides)]

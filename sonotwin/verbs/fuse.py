@@ -22,6 +22,7 @@ from recon.capture import calibration_files, sweep_part
 from recon.capture.images import read_grey
 from recon.errors import InputError
 from recon.files import atomic, layers, metrics
+from recon.files.volumes import read_volume
 from recon.freehand import scans as freehand_scans
 from recon.fusion import fused_scene, scene_page, skin, slicer_folder
 from recon.fusion.fused_scene import FusedScene
@@ -137,4 +138,6 @@ def volumes(config: Config) -> dict[str, Path]:
     found = {Path(name).stem: config.volume / name for name in names if (config.volume / name).is_file()}
     if Path(freehand.VOLUME).stem not in found:
         raise InputError(f"{config.volume}: expected a folder of `sonotwin freehand`, found no {freehand.VOLUME} in it")
+    for path in found.values():
+        read_volume(path)  # damaged ones are refused here, not by who opens the result
     return found

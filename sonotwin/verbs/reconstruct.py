@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, model_validator
 from rich.console import Console
 
-from recon.capture import manifest
+from recon.capture import calibration_files, manifest, probe_files, target_files
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPart, is_sweep, sweep_part
 from recon.errors import InputError
 from recon.files import metrics
@@ -143,13 +143,20 @@ def check(sources: Sources) -> None:
     Raises
     ------
     InputError
-        If a given file is missing, the capture has no part, its fringes are of another camera, or water has no such temperature.
+        If a given file is missing or damaged, the capture has no part, its fringes are of another camera, or water has no such
+        temperature.
     """
     config, held = sources.config, sources.held
     for key in ("calibration", "target", "probe"):
         given: Path | None = getattr(config, key)
         if given is not None and not given.is_file():
             raise InputError(f"{key}: expected a file, found {'a folder' if given.is_dir() else 'nothing'} at {given}")
+    if config.calibration is not None:
+        calibration_files.read(config.calibration)
+    if config.target is not None:
+        target_files.read(config.target, config.rig.target)
+    if config.probe is not None:
+        probe_files.read(config.probe)
     if config.networks is not None and not config.networks.exists():
         raise InputError(f"networks: expected a folder or a file, found nothing at {config.networks}")
     path = config.capture / MANIFEST
