@@ -4,6 +4,7 @@ The disk is a small file system in memory, which only root can mount.
 """
 
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -120,7 +121,7 @@ def table(found: Sequence[Full]) -> list[str]:
     """Lines of Markdown: a row a case."""
     lines = ["| verb | room beside the old result | status | old result kept | leftovers | said |", "|---|---|---|---|---|---|"]
     for one in found:
-        (said,) = one.outcome.said.strip().splitlines()[-1:] or [""]
+        (said,) = re.findall(r"disk/.*", re.sub(r"\.\d+\.new", ".N.new", one.outcome.said))[-1:] or [""]
         cells = [one.verb, f"{100 * one.share:.0f} %", one.outcome.status, "yes" if one.kept else "**no**", len(one.left)]
         lines.append(f"| {' | '.join(map(str, cells))} | `{said[-90:]}` |")
     return lines
