@@ -157,11 +157,14 @@ def _run(arguments: list[str]) -> int:
     for override in overrides:
         if override.startswith("-"):
             raise InputError(f"{verb.name}: {override}: unknown option; fields are given as field=value")
+    from recon import interrupts
     from sonotwin import config, first_use
 
     first_use.announce()  # imports may compile, too
-    module = import_module(verb.module)
-    return module.run(config.load(verb.name, overrides, module.Config)) or 0
+    with interrupts.held_back():  # an interrupt leaves extensions half imported, and other libraries' errors would hide it
+        module = import_module(verb.module)
+        settings = config.load(verb.name, overrides, module.Config)
+    return module.run(settings) or 0
 
 
 def _find(name: str) -> Verb:

@@ -26,6 +26,7 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
+from recon import interrupts
 from recon.errors import InputError
 
 PACKAGE = "libllvm19"  # of Debian and Ubuntu
@@ -183,9 +184,10 @@ def load_mitsuba() -> ModuleType:
     """
     importlib.metadata.version("mitsuba")  # a missing package is to be reported before a missing LLVM
     variant = prepare()
-    import mitsuba
+    with interrupts.held_back():  # an interrupt within these would be lost, or leave the extension half loaded
+        import mitsuba
 
-    mitsuba.set_variant(variant)
+        mitsuba.set_variant(variant)
     if threads := os.environ.get("SONOTWIN_THREADS"):
         import drjit
 

@@ -1,6 +1,7 @@
 """JSON of any origin: plain values of bounded size and depth, or refused in one line."""
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from functools import partial
@@ -12,7 +13,6 @@ from recon.files.regular import read_bytes, shown
 
 MOST_BYTES = 1 << 24
 MOST_DEPTH = 64  # of lists and objects within each other
-LARGEST = 1e100  # number, whose square is one, too
 MOST_DIGITS = 40  # of a whole number
 ODD_LETTER = re.compile(r"\\u(?:0000|[dD][89a-fA-F][0-9a-fA-F]{2})")  # a zero, or half of a pair of surrogates
 PAIR = re.compile(r"\\u[dD][89abAB][0-9a-fA-F]{2}\\u[dD][c-fC-F][0-9a-fA-F]{2}")
@@ -49,7 +49,7 @@ def parsed(path: Path, text: str) -> Any:
 
     def decimal(word: str) -> float:
         value = float(word)
-        return value if abs(value) <= LARGEST else endless(word)
+        return value if math.isfinite(value) else endless(word)
 
     try:
         value = json.loads(text, parse_constant=endless, parse_int=_whole, parse_float=decimal, object_pairs_hook=_object)

@@ -93,7 +93,8 @@ def run(config: Config) -> None:
             writer.writerow(COLUMNS)
             writer.writerows(sheet_rows(config, names))
         (folder / SEQUENCE).write_text(sequence_text(config.patterns), encoding="utf-8")
-        (folder / "README.txt").write_text("\n".join(readme(config)) + "\n", encoding="utf-8")
+        text = "\n".join(readme(config)) + "\n"
+        (folder / "README.txt").write_text(text, encoding="utf-8", errors="backslashreplace")  # names may be no text
     for line in lines(config):
         print(line)
 

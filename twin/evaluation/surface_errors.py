@@ -303,12 +303,15 @@ def _angle_deg(first: Array, second: Array) -> float:
     return float(np.rad2deg(np.arccos(min(abs(float(first @ second)), 1.0))))
 
 
+FARTHEST_MM = 1e7  # of a shape in a scene
+
+
 def _shape(entry: Mapping) -> Shape:
     """A shape as `scene.json` has it; KeyError, TypeError or ValueError if it is none."""
 
     def vector(field: str) -> Array:
         value = np.asarray(entry[field], float)
-        if value.shape != (3,) or not np.isfinite(value).all():
+        if value.shape != (3,) or not (np.abs(value) <= FARTHEST_MM).all():
             raise ValueError(f"{field} {entry[field]}")
         return value
 

@@ -23,9 +23,12 @@ import os, sys, time
 from pathlib import Path
 from recon.files.occupied import occupied
 with occupied(Path(sys.argv[1])):
-    if len(sys.argv) > 2 and os.fork() == 0:
-        time.sleep(60)
-    print("held", flush=True)
+    if len(sys.argv) > 2:
+        if os.fork() == 0:
+            print("held", flush=True)  # once the child has given up what it has of its parent's lock
+            time.sleep(60)
+    else:
+        print("held", flush=True)
     time.sleep(60)
 """
 
