@@ -61,10 +61,14 @@ def validated(model: type[Model], content: object, place: object) -> Model:
         raise InputError(f"{place}: {one_line(error)}") from None
 
 
+def printable(text: str) -> str:
+    """A text of letters that any console takes: if it has others, all of them are escaped."""
+    return text if text.isprintable() else text.encode("unicode_escape", "surrogatepass").decode("ascii")
+
+
 def short(text: str, longest: int = LONGEST) -> str:
     """A text for a message: in one line, of letters that any console takes, and not longer than a number of them."""
-    text = " ".join(text[:MOST_LETTERS].split())
-    text = text if text.isprintable() else text.encode("unicode_escape", "surrogatepass").decode("ascii")
+    text = printable(" ".join(text[:MOST_LETTERS].split()))
     return text if len(text) <= longest else text[: longest - 3] + "..."
 
 

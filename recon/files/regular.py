@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from recon.errors import InputError
+from recon.errors import InputError, printable
 
 Answer = TypeVar("Answer")
 
@@ -73,8 +73,7 @@ def check_there(paths: Iterable[Path], expected: str = "a file") -> None:
 
 def shown(path: Path) -> str:
     """A path for messages: in one line, and of letters that any console takes."""
-    text = str(path)
-    return text if text.isprintable() else text.encode("unicode_escape", "surrogatepass").decode("ascii")
+    return printable(str(path))
 
 
 def _ask(path: Path, expected: str, call: Callable[[], Answer]) -> Answer:

@@ -18,7 +18,6 @@ from pathlib import Path
 from rich.console import Console
 
 from recon.capture import calibration_files
-from recon.files import atomic
 from recon.files.metrics import Metrics, shown
 from recon.tracking import networks
 from scenes.catalogue import parse_scene
@@ -77,7 +76,6 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     if config.looks_inside or config.film_frames:
         networks.load()  # before minutes of work
-    atomic.check_folder(config.out, pipeline.MARKER)
     parse_scene(config.scene)
     if config.poses is not None:
         board_session.check_place(config.board)
