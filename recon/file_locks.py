@@ -26,7 +26,7 @@ WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
 @contextmanager
 def held(path: Path, announce: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Hold the lock in a file.
+    """Hold the lock in a file, which goes away with it.
 
     Parameters
     ----------
@@ -51,6 +51,8 @@ def held(path: Path, announce: Callable[[str], None] | None = None) -> Iterator[
     try:
         yield
     finally:
+        with suppress(OSError):  # Windows refuses, and removes it on release
+            path.unlink()  # before the release: whoever waits then sees that its file is gone, and makes a new one
         lock.release()
 
 

@@ -237,11 +237,7 @@ def alone(path: Path, wait: bool = True) -> Iterator[None]:
         log.warning("%s: waiting for %s, which is writing it", path, holder)
 
     with file_locks.held(place, announce if wait else None):
-        try:
-            yield
-        finally:
-            with suppress(OSError):  # Windows refuses, and removes it on release
-                place.unlink()  # before the release: whoever waits then sees that its file is gone, and makes a new one
+        yield
 
 
 def _leftovers(path: Path, states: str = "new|old") -> list[Path]:

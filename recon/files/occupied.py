@@ -32,7 +32,6 @@ def occupied(folder: Path) -> Iterator[None]:
                 f"{folder}: expected a folder that no other run is writing, found {file_locks.holder(mark)} at work in it; "
                 "wait for its end, or choose another folder"
             ) from None
-        after.callback(_remove, mark)  # before the release, so that nobody waits for a name that then goes away
         yield
 
 
@@ -41,11 +40,6 @@ def _mark(folder: Path) -> Path:
     folder.parent.mkdir(parents=True, exist_ok=True)
     beside = folder.name and os.access(folder.parent, os.W_OK)
     return (folder.parent if beside else folder) / f".{folder.name}.occupied"
-
-
-def _remove(file: Path) -> None:
-    with suppress(OSError):  # Windows refuses while a file is open, and removes a lock on release
-        file.unlink()
 
 
 def _remove_empty(folders: list[Path]) -> None:
