@@ -1,15 +1,17 @@
 """Coverage-guided fuzzing of each reader (atheris, libFuzzer): whatever the bytes, it gives a value or an InputError.
 
 Each reader is fuzzed in a process of its own, as `python -m campaign.fuzzing READER FOLDER`, begun again after each finding.
+Readers that are done are kept until all are, so that a killed run goes on.
 """
 
+import json
 import re
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -37,7 +39,26 @@ def run(place: Path, seconds: float, only: Sequence[str] = (), workers: int = 2)
     """Fuzz readers for some seconds each."""
     names = [name for name in NAMES if not only or name in only]
     with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(lambda name: fuzz(place, name, seconds), names))
+        found = list(pool.map(lambda name: _kept(place, name, seconds), names))
+    for name in names:
+        _row_file(place, name).unlink()
+    return found
+
+
+def _kept(place: Path, name: str, seconds: float) -> Fuzzed:
+    """What came of a reader before a run was killed; else fuzz it."""
+    from recon.files import atomic  # not on top: a process that fuzzes instruments what it imports
+
+    file = _row_file(place, name)
+    if not file.exists():
+        found = fuzz(place, name, seconds)
+        with atomic.new_file(file) as temporary:
+            temporary.write_text(json.dumps(asdict(found)), encoding="utf-8")
+    return Fuzzed(**json.loads(file.read_text(encoding="utf-8")))
+
+
+def _row_file(place: Path, name: str) -> Path:
+    return place.parent / "fuzzing" / f"{name}.json"
 
 
 def fuzz(place: Path, name: str, seconds: float) -> Fuzzed:
