@@ -1,5 +1,6 @@
 """The exception for a user's mistake, reported in one line."""
 
+import re
 from collections.abc import Iterator
 from typing import TypeVar
 
@@ -30,7 +31,9 @@ def one_line(error: ValidationError) -> str:
     place, kind, message, found = first["loc"], first["type"], first["msg"], first["input"]
     if kind.startswith("union_tag"):  # at fault is the field that tells which of several models is meant
         place += (first["ctx"]["discriminator"].strip("'"),)
-    field = ".".join(str(piece) for piece in place)
+    field = ".".join(
+        str(piece) for piece in place if not re.match(r"\w+\[", str(piece))
+    )  # `literal[...]`: a choice of several types
     if kind in ("missing", "union_tag_not_found"):
         text = "expected a value, found none"
     elif kind == "json_invalid":

@@ -61,6 +61,8 @@ def run(config: Config) -> None:
     """
     if config.out.suffix.lower() != ".pdf":
         raise InputError(f"out: expected the name of a PDF, such as {config.part}.pdf, found {config.out}")
+    if blocking := next((each for each in config.out.parents if each.exists() and not each.is_dir()), None):
+        raise InputError(f"{config.out}: expected a place in a folder, found {blocking} to be a file")
     if config.out.is_file() and not paper_sheet.is_sheet(config.out):
         raise InputError(f"{config.out}: expected nothing or a sheet to replace, found a file of others; choose another out")
     if config.part == "target":

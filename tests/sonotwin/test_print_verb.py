@@ -61,6 +61,10 @@ def test_of_a_board_too_large_the_lengths_alone_are_offered(capsys):
     ("fields", "said"),
     [
         (["part=target", WIDE, "out=x.pdf"], "print: board: expected none with part=target, which draws rig.target"),
+        (
+            ["part=board", "out=x.pdf", "paper=a9"],
+            "print: paper: expected 'a4', 'letter', 'a3', 'tabloid', 'a2', 'a1' or 'a0', found 'a9' (and 1 more)",
+        ),
         (["part=board", "out=x.png"], "out: expected the name of a PDF, such as board.pdf, found x.png"),
         (
             ["part=board", "out=x.pdf", "board={kind: symmetric_circles, columns: 4, rows: 4, spacing_mm: 9, diameter_mm: 9}"],
@@ -83,6 +87,11 @@ def test_of_a_board_too_large_the_lengths_alone_are_offered(capsys):
 def test_mistakes_are_refused(fields, said, place, capsys):
     assert refusal(capsys, *fields) == said
     assert not list(place.iterdir())
+
+
+def test_a_file_isnt_taken_for_a_folder(place, capsys):
+    (place / "text").write_text("a note")
+    assert refusal(capsys, "part=target", "out=text/x.pdf") == "text/x.pdf: expected a place in a folder, found text to be a file"
 
 
 def test_a_pdf_of_others_is_left_alone(tmp_path, capsys):
