@@ -1,7 +1,8 @@
 """Pairs of frames from which the target is measured: both cameras see all three circles whole, in poses that differ."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ Array = NDArray[np.float64]
 
 APART_MM, APART_DEG = 2.0, 1.0  # of poses that differ: a rim in the same pixels errs in the same way
 LEAST = 8  # pairs
+Fault = Literal["without a pose", "with a covered circle", "with a rim in uneven light or shadow"]
 
 
 @dataclass(frozen=True)
@@ -26,13 +28,15 @@ class Seen:
     world_from_target: Array  # (4, 4) mm, as the tracker found it
 
 
-def whole(found: Tracking, cameras: tuple[Camera, Camera]) -> Seen | None:
-    """The pair if all six rims are whole, evenly lit and sharp; else None."""
-    if not (found.found and found.pose.used.all()):
-        return None
+def whole(found: Tracking, cameras: tuple[Camera, Camera]) -> Seen | Fault:
+    """The pair if all six rims are whole, evenly lit and sharp; else the fault."""
+    if not found.found:
+        return "without a pose"
+    if not found.pose.used.all():
+        return "with a covered circle"
     first, second = (view.outlines.sighting(camera) for view, camera in zip(found.views, cameras, strict=True))
     if first.doubtful.any() or second.doubtful.any():
-        return None
+        return "with a rim in uneven light or shadow"
     return Seen((first, second), found.pose.world_from_target)
 
 
@@ -73,8 +77,12 @@ def range_mm(pairs: Sequence[Seen]) -> float:
     return float(np.ptp(depths))
 
 
-def check(pairs: Sequence[Seen], name: str, of: int, least_tilt_deg: float, least_range_mm: float) -> None:
+def check(pairs: Sequence[Seen], name: str, faults: Mapping[Fault, int], least_tilt_deg: float, least_range_mm: float) -> None:
     """Refuse pairs that don't show the target from enough sides.
+
+    Parameters
+    ----------
+    faults : numbers of the film's other pairs, but for those in much the same pose
 
     Raises
     ------
@@ -82,8 +90,9 @@ def check(pairs: Sequence[Seen], name: str, of: int, least_tilt_deg: float, leas
         If pairs, tilts or distances are missing, with what to do.
     """
     if len(pairs) < LEAST:
-        found = f"{len(pairs)} of {of} pairs"
-        raise InputError(f"{name}: expected {LEAST} poses in which both cameras see all three circles whole, found {found}")
+        others = "".join(f", {count} pairs {fault}" for fault, count in faults.items())
+        expected = f"{LEAST} poses in which both cameras see all three circles whole and evenly lit"
+        raise InputError(f"{name}: expected {expected}, found {len(pairs)}{others}")
     missing = []
     if (tilt := tilt_deg(pairs)) < least_tilt_deg:
         missing.append(f"tilts that differ by {least_tilt_deg:g} deg (standard deviation; to all sides), found {tilt:.1f}")

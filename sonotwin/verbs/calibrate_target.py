@@ -10,6 +10,7 @@ tracking the film.
     sonotwin track capture=outputs/film/capture target=outputs/target/target.yaml out=outputs/track
 """
 
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +25,7 @@ from recon.files import atomic, metrics
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
 from recon.model.rig import Part, Rig
 from recon.target_calibration import target_bundle, target_figures, target_poses
-from recon.target_calibration.target_poses import Seen
+from recon.target_calibration.target_poses import Fault, Seen
 from recon.tracking import networks
 from recon.tracking.tracker import Tracker
 
@@ -65,10 +66,10 @@ def run(config: Config) -> None:
     optics = in_use(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale, config.drift_px)
     loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
     tracker = Tracker(film.cameras, design, loaded, film.bits, optics)
-    seen = collect(film, tracker, console)
+    seen, faults = collect(film, tracker, console)
     pairs = target_poses.spread(target_poses.distinct(seen), config.most_poses)
     console.print(f"found       {len(seen)} of {len(film.times)} pairs whole, {len(pairs)} poses that differ", markup=False)
-    target_poses.check(pairs, film.name, len(film.times), config.least_tilt_deg, config.least_range_mm)
+    target_poses.check(pairs, film.name, faults, config.least_tilt_deg, config.least_range_mm)
     with console.status("adjusting"):
         adjusted = target_bundle.adjust(pairs, design, optics)
     figures = target_figures.measure(adjusted, pairs, design)
@@ -82,11 +83,12 @@ def run(config: Config) -> None:
     console.print(f"wrote       {config.out}/{{{TARGET},{metrics.FILE}}}", markup=False)
 
 
-def collect(film: Film, tracker: Tracker, console: Console) -> list[Seen]:
-    """Pairs of a film in which all six circles are whole."""
-    seen = []
+def collect(film: Film, tracker: Tracker, console: Console) -> tuple[list[Seen], Counter[Fault]]:
+    """Pairs of a film in which all six circles are whole, and numbers of the others by their fault."""
+    seen, faults = list[Seen](), Counter[Fault]()
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         pairs = progress.track(film.pairs(), total=len(film.times), description="tracking")
         for time, pair in zip(film.times.tolist(), pairs, strict=True):
-            seen.append(target_poses.whole(tracker.step(*pair, time * 1e-9), film.cameras))
-    return [one for one in seen if one is not None]
+            found = target_poses.whole(tracker.step(*pair, time * 1e-9), film.cameras)
+            seen.append(found) if isinstance(found, Seen) else faults.update([found])
+    return seen, faults

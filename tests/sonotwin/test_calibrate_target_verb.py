@@ -87,4 +87,4 @@ def test_what_is_wrong_is_said_in_one_line(drawn, told, tmp_path, capsys):
 def test_a_film_too_short_is_refused(rig, told, tmp_path, capsys):
     capture = films.film(tmp_path / "capture", rig, np.random.default_rng(4), count=2)
     assert main(["calibrate-target", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 2
-    assert "expected 8 poses in which both cameras see all three circles whole, found" in capsys.readouterr().err
+    assert "expected 8 poses in which both cameras see all three circles whole and evenly lit, found" in capsys.readouterr().err

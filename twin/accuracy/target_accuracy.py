@@ -98,7 +98,7 @@ def misprinted(actual: Target, seed: int) -> Target:
 def seen(shown: Sequence[Shown], design: Target, networks: Networks) -> list[target_poses.Seen]:
     """Pairs that the target can be measured from."""
     found = (target_poses.whole(_step(one, design, networks), cameras_of(one[0])) for one in shown)
-    return target_poses.distinct([one for one in found if one is not None])
+    return target_poses.distinct([one for one in found if isinstance(one, target_poses.Seen)])
 
 
 def tracked(shown: Sequence[Shown], design: Target, networks: Networks) -> Tracked:
