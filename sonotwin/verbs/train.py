@@ -35,6 +35,7 @@ from trainers.fit import Fitted, Plan, Precision
 from trainers.shard_reader import Data
 from trainers.stored_images import StoredImages
 
+CURVES = "curves.png"
 MARKER = "training.json"  # what a run was asked for
 MAY_CHANGE = {"out", "resume", "steps", "max_minutes", "checkpoint_minutes"}  # when a run goes on
 MAY_CHANGE |= {"threads", "loaders", "memory_gb"}  # which change no batch
@@ -148,8 +149,8 @@ def _train(config: Config, console: Console) -> None:
         figures = fit.measure(fitted.network, validation)
     console.print(f"validate    {describe(figures)}", markup=False)
     with console.status("writing"):
-        names = write(config, fitted, figures)
-    console.print(f"wrote       {config.out}/{{{','.join(names)}}}", markup=False)
+        write(config, fitted, figures)
+    console.print(f"wrote       {config.out}/{{{','.join(names_of(config))}}}", markup=False)
 
 
 def check_resumed(config: Config) -> bool:
@@ -188,9 +189,10 @@ def settings(config: Config) -> dict:
 def prepare(config: Config, goes_on: bool) -> None:
     """Make the folder, without what an earlier run left if this one starts anew."""
     config.out.mkdir(parents=True, exist_ok=True)
-    atomic.remove_leftovers(config.out / fit.CHECKPOINT)
+    for name in [MARKER, *names_of(config)]:
+        atomic.remove_leftovers(config.out / name)
     if not goes_on:
-        for name in (fit.CHECKPOINT, fit.LOG, metrics.FILE, "curves.png"):
+        for name in (fit.CHECKPOINT, fit.LOG, metrics.FILE, CURVES):
             (config.out / name).unlink(missing_ok=True)
     with atomic.new_file(config.out / MARKER) as temporary:
         temporary.write_text(json.dumps(settings(config), indent=2) + "\n", encoding="utf-8")
@@ -242,21 +244,25 @@ def describe(figures: Metrics) -> str:
     )
 
 
-def write(config: Config, fitted: Fitted, figures: Metrics) -> list[str]:
-    """Write the network, its figures and curves; gives the files' names."""
-    stem = config.network.removeprefix("published_")
-    export.save_onnx(config.out / f"{stem}.onnx", fitted.network, config.network)
+def names_of(config: Config) -> list[str]:
+    """Names of the files that a training writes, its settings apart."""
+    weights = [weights_file(config, suffix).name for suffix in (".onnx", ".safetensors", ".pt")]
+    return [*weights, metrics.FILE, CURVES, fit.LOG, fit.CHECKPOINT]
+
+
+def weights_file(config: Config, suffix: str) -> Path:
+    """The file of the trained network, of one kind."""
+    return (config.out / config.network.removeprefix("published_")).with_suffix(suffix)
+
+
+def write(config: Config, fitted: Fitted, figures: Metrics) -> None:
+    """Write the network, its figures and curves."""
+    export.save_onnx(weights_file(config, ".onnx"), fitted.network, config.network)
     for suffix in (".safetensors", ".pt"):
-        export.save((config.out / stem).with_suffix(suffix), fitted.network)
+        export.save(weights_file(config, suffix), fitted.network)
     metrics.write(config.out / metrics.FILE, figures | {"steps": fitted.steps, "seconds_train": round(fitted.seconds, 1)})
-    with atomic.new_file(config.out / "curves.png") as temporary:
+    with atomic.new_file(config.out / CURVES) as temporary:
         curves(fit.read_log(config.out)).savefig(temporary, dpi=120)
-    return [f"{stem}{suffix}" for suffix in (".onnx", ".safetensors", ".pt")] + [
-        metrics.FILE,
-        "curves.png",
-        fit.LOG,
-        fit.CHECKPOINT,
-    ]
 
 
 def curves(rows: list[fit.Row]) -> Figure:
