@@ -121,17 +121,28 @@ class CameraPair:
         self.cameras = cameras
         self._within_s = within_s
         self._held = held
+        self._called: list[Camera] = []  # cameras that wait for a call
         self._begin()
 
-    def start(self, trigger: Trigger) -> None:
-        """Begin to take frames with both, the second first: it is ready when the first one's exposures trigger it by wire."""
+    def start(self, trigger: Trigger, second: Trigger | None = None) -> None:
+        """Begin to take frames with both.
+
+        Parameters
+        ----------
+        trigger : Trigger
+            Of both cameras, or of the first only.
+        second : Trigger, optional
+            Of the second: `hardware` if the first one's exposures trigger it by wire. It is started first, so as to miss none.
+        """
         self._begin()
-        for camera in reversed(self.cameras):
-            camera.start(trigger)
+        triggers = trigger, second or trigger
+        self._called = [camera for camera, how in zip(self.cameras, triggers, strict=True) if how == "software"]
+        for camera, how in reversed(list(zip(self.cameras, triggers, strict=True))):
+            camera.start(how)
 
     def trigger(self) -> None:
         """Expose a pair now, one camera right after the other: some tenths of a millisecond, no matter for what stands still."""
-        for camera in self.cameras:
+        for camera in self._called:
             camera.trigger()
 
     def pair(self, timeout_s: float) -> Pair | None:

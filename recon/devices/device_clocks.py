@@ -23,7 +23,7 @@ FEWEST_BLOCKS = 4  # for a rate
 WINDOW = 512  # frames that are looked back on: some seconds, in which a crystal's rate stays as it is
 REFIT = 16  # frames between two fits
 READINGS = 8  # of a device's clock, of which the fastest counts
-LATE = 64  # frames in a row that come late, the fastest of each quarter by the same time: no accident
+LATE = 64  # frames in a row that come late, most of them by the same time: no accident
 
 
 @dataclass(frozen=True)
@@ -207,14 +207,14 @@ class ClockFollower:
         return replace(edge, computer_ns=edge.computer_ns - round(transfer), sigma_ns=float(np.hypot(edge.sigma_ns, sigma)))
 
     def _set_back(self, clock: ClockMap) -> Jump | None:
-        """Jump if enough frames are late by the same time; under load, the fastest of some frames differ by much more."""
+        """Jump if most of the late frames are late by the same time; under load, they differ by much more."""
         if len(self._late) < LATE:
             return None
         steps = np.array([device - clock.back(arrived) for device, arrived in self._late])
-        fastest = steps.reshape(4, -1).max(axis=1)
-        if np.ptp(fastest) > self._least_ns / 5:
+        fastest = int(steps.max())
+        if fastest - np.median(steps) > self._least_ns:
             return None
-        return self._begin_anew(list(self._late), int(fastest.max()))
+        return self._begin_anew(list(self._late), fastest)
 
     def _begin_anew(self, frames: list[tuple[int, int]], step_ns: int) -> Jump:
         self._frames.clear()

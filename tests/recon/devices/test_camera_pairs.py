@@ -173,6 +173,10 @@ def test_both_cameras_are_driven_together():
     pair.close()
     assert order == [("cam2", "software"), ("cam1", "software")]
     assert [camera.calls for camera in cameras] == [["triggered", "stopped", "closed"]] * 2
+    pair.start("software", "hardware")
+    pair.trigger()
+    assert order[2:] == [("cam2", "hardware"), ("cam1", "software")]
+    assert [camera.calls.count("triggered") for camera in cameras] == [2, 1]
 
 
 def test_a_new_start_counts_anew():
