@@ -46,7 +46,7 @@ class Finding:
 
 def examine() -> list[Finding]:
     """Look at everything; takes some seconds, most of them for importing the packages in another process."""
-    return [*_system(), *_own_packages(), *_packages(), *_llvm(), *_gpu(), *_folders()]
+    return [*_system(), *_own_packages(), *_packages(), *_llvm(), *_gpu(), *_cameras(), *_folders()]
 
 
 def extra_of(module: str) -> str | None:
@@ -182,6 +182,20 @@ def _gpu() -> Iterator[Finding]:
     else:
         remedy = f"unset SONOTWIN_VARIANT, or set it to {' or '.join(llvm.VARIANTS)}"
         yield Finding("twin", "variant", "problem", f"SONOTWIN_VARIANT={variant}", remedy)
+
+
+def _cameras() -> Iterator[Finding]:
+    """Look for Basler cameras in another process: drivers of cameras may crash, and emulate some where an environment says so."""
+    if _version("pypylon") is None:
+        return
+    program = "from recon.devices import basler_listing\nfor camera in basler_listing.find_cameras(): print(camera)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    if done.returncode:
+        yield Finding("live", "Basler cameras", "problem", f"the search ended with status {done.returncode}", "reinstall pypylon")
+    elif not done.stdout:
+        yield Finding("live", "Basler cameras", "absent", "none found at this computer")
+    for line in done.stdout.splitlines():
+        yield Finding("live", "Basler camera", "ok", line)
 
 
 def _folders() -> Iterator[Finding]:
