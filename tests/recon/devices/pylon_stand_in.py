@@ -77,6 +77,7 @@ class Result:
     TimeStamp: int
     Array: np.ndarray
     ChunkExposureTime: Node
+    chunks: tuple[str, ...]
     whole: bool = True
     ErrorDescription: str = ""
 
@@ -101,10 +102,10 @@ class Result:
         return True
 
     def IsChunkDataAvailable(self):
-        return True
+        return bool(self.chunks)
 
     def HasCRC(self):
-        return True
+        return "PayloadCRC16" in self.chunks
 
     def CheckCRC(self):
         return self.whole
@@ -215,8 +216,10 @@ class PylonStandIn:
         if lost:
             return
         image = np.full(self.size[::-1], block % 256, np.uint8)
-        exposure = Node(self.nodes["ExposureTimeAbs" if self.gige else "ExposureTime"].value)
-        self.results.append(Result(block, self._ticks(at_ns), image, exposure, whole))
+        sent = tuple(name for name, on in self.nodes["ChunkEnable"].values.items() if on and self.nodes["ChunkModeActive"].value)
+        exposure = self.nodes["ExposureTimeAbs" if self.gige else "ExposureTime"].value
+        own = Node(exposure, usable="ExposureTime" in sent)
+        self.results.append(Result(block, self._ticks(at_ns), image, own, sent, whole))
 
     def _ticks(self, at_ns):
         return (at_ns + self.offset_ns) // (8 if self.gige else 1)

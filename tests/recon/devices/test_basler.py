@@ -136,13 +136,26 @@ def test_an_unplugged_camera_is_named_and_comes_back(opened):
     pull_out(camera)
     with pytest.raises(DeviceError, match=r"^cam1: unplugged; check cable and power, then open it again$"):
         numbers(camera, 1000)
-    with pytest.raises(DeviceError, match="cam1: The camera device has been physically removed"):
+    with pytest.raises(DeviceError, match=r"^cam1: The camera device has been physically removed\.$"):
         camera.start("free")
     camera.reopen(1.0)
     camera.start("free")
     frame = camera.frame(2.0)
     assert (frame.number, frame.image.dtype) == (0, np.uint16)
     assert frame.arrived_ns - frame.time_ns == pytest.approx(1.5e6)  # half the exposure
+
+
+def test_a_pair_goes_on_after_one_camera_was_away(opened):
+    pair = CameraPair((opened(), opened(serial=SERIALS[1], name="cam2")))
+    pair.start("free")
+    assert pair.pair(2.0)
+    pull_out(pair.cameras[1])
+    with pytest.raises(DeviceError, match="cam2: unplugged"):
+        while pair.pair(2.0):
+            pass
+    pair.cameras[1].reopen(1.0)
+    pair.start("free")
+    assert [(one.number, one.lost) for one in (pair.pair(2.0) for _ in range(5))] == [(k, ()) for k in range(5)]
 
 
 def test_a_camera_that_doesnt_come_back_in_time_is_named():
