@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.devices.interfaces import Camera
+from recon.devices.interfaces import Camera, Scanner
 
 LOG = logging.getLogger(__name__)
 CRYSTAL = 1e-4  # standard deviation of a rate about 1; quartz oscillators are within some tens of parts in a million
@@ -165,6 +165,7 @@ class ClockFollower:
         self._least_ns = round(1e9 * least_jump_s)
         self._edge: ClockMap | None = None  # `clock` with the least transfer in it
         self._transfer: tuple[float, float] = 0.0, 0.0  # and its standard deviation, ns
+        self._readings: list[ClockReading] = []
         self._frames = deque[tuple[int, int]](maxlen=WINDOW)  # device time, arrival
         self._late = deque[tuple[int, int]](maxlen=LATE)
         self._until_fit = FEWEST
@@ -198,11 +199,14 @@ class ClockFollower:
             self._until_fit = REFIT if len(self._frames) > 2 * REFIT else FEWEST // 2
 
     def _without_transfer(self, edge: ClockMap) -> ClockMap:
-        """Take the least transfer out, which is measured once: a map that moved later would tear frames apart."""
+        """Take the least transfer out, by readings of the first moments; it is held when the window is full, or after a jump."""
         if self._read is not None:
-            readings = [reading for reading in (self._read() for _ in range(READINGS)) if reading is not None]
-            self._transfer = least_transfer(edge, readings) if readings else (0.0, 0.0)
+            self._readings = [reading for reading in (self._read() for _ in range(READINGS)) if reading is not None]
             self._read = None
+        if self._readings:
+            self._transfer = least_transfer(edge, self._readings)
+        if len(self._frames) == WINDOW:
+            self._readings = []
         transfer, sigma = self._transfer
         return replace(edge, computer_ns=edge.computer_ns - round(transfer), sigma_ns=float(np.hypot(edge.sigma_ns, sigma)))
 
@@ -217,17 +221,19 @@ class ClockFollower:
         return self._begin_anew(list(self._late), fastest)
 
     def _begin_anew(self, frames: list[tuple[int, int]], step_ns: int) -> Jump:
+        jump = Jump(self.device, frames[0][0], step_ns)
+        if self.clock:  # a device without a clock jumps with each frame
+            LOG.warning("%s", jump)
         self._frames.clear()
         self._late.clear()
         self.clock = self._edge = None
+        self._readings = []
         self._until_fit = FEWEST
-        jump = Jump(self.device, frames[0][0], step_ns)
-        LOG.warning("%s", jump)
         for device_ns, arrived_ns in frames:
             self._take(device_ns, arrived_ns)
         return jump
 
 
-def follow(camera: Camera) -> ClockFollower:
-    """Follower of a camera's clock, which reads that clock if the camera offers `read_clock`."""
-    return ClockFollower(camera.name, getattr(camera, "read_clock", None))
+def follow(device: Camera | Scanner) -> ClockFollower:
+    """Follower of a device's clock, which reads that clock if the device offers `read_clock`."""
+    return ClockFollower(device.name, getattr(device, "read_clock", None))
