@@ -20,6 +20,7 @@ from twin.accuracy.table_rows import Measurement, Row
 PAIRS = 1000
 SIZE = (1280, 1024)
 SERIALS = ("0815-0000", "0815-0001")  # of the emulator's first cameras
+HELD = 256  # frames; where the cores limit the rate, one emulated camera runs ahead of the other by some
 SERVED = (7, 11)  # images that each camera serves in turn: frames of different pairs differ in their hashes
 WHAT = f"{PAIRS} pairs 1280x1024 of two emulated Basler cameras"
 
@@ -38,7 +39,7 @@ def free_running() -> list[Row]:
     return [
         Row("a", f"{WHAT}, free-running: frames lost", lost, 0, None, ""),
         Row("a", f"{WHAT}, free-running: frames with another hash than that served", wrong, 0, None, ""),
-        Row("a", f"{WHAT}, free-running (peer: pylon's own loop, hashes too)", rate, 0.8 * bare, bare, "pairs/s", True),
+        Row("a", f"{WHAT}, free-running (peer: pylon's own loop, hashes too)", rate, 0.7 * bare, bare, "pairs/s", True),
     ]
 
 
@@ -65,7 +66,7 @@ def served() -> Iterator[tuple[list[BaslerSettings], list[list[str]]]]:
             for k, image in enumerate(images):
                 cv2.imwrite(str(place / f"{k:04}.bmp"), image)
             features = {"TestImageSelector": "Off", "ImageFilename": str(place), "ImageFileMode": "On"}
-            settings.append(BaslerSettings(SIZE, features=features))
+            settings.append(BaslerSettings(SIZE, held=HELD, features=features))
             hashes.append([digest(image) for image in images])
         yield settings, hashes
 
