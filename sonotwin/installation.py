@@ -16,7 +16,7 @@ from sonotwin import namesakes
 from twin import llvm
 
 OLDEST_PYTHON = (3, 11)
-EXTRAS = ("twin", "study", "train", "dev", "docs")
+EXTRAS = ("twin", "study", "live", "train", "dev", "docs")
 MODULES = {  # where a package isn't imported by the name that it is installed by
     "hydra-core": "hydra",
     "import-linter": "importlinter",
@@ -37,7 +37,7 @@ BROUGHT_BY = {"drjit": "mitsuba", "omegaconf": "hydra"}  # imported by us, requi
 class Finding:
     """One thing that was looked at."""
 
-    part: str  # core, twin, train, dev, docs: who needs it; or machine
+    part: str  # core, twin, live, train, dev, docs: who needs it; or machine
     what: str
     state: Literal["ok", "absent", "unused", "problem"]  # absent: not there, and the core does without
     found: str
@@ -46,7 +46,7 @@ class Finding:
 
 def examine() -> list[Finding]:
     """Look at everything; takes some seconds, most of them for importing the packages in another process."""
-    return [*_system(), *_own_packages(), *_packages(), *_llvm(), *_gpu(), *_folders()]
+    return [*_system(), *_own_packages(), *_packages(), *_llvm(), *_gpu(), *_cameras(), *_folders()]
 
 
 def extra_of(module: str) -> str | None:
@@ -182,6 +182,20 @@ def _gpu() -> Iterator[Finding]:
     else:
         remedy = f"unset SONOTWIN_VARIANT, or set it to {' or '.join(llvm.VARIANTS)}"
         yield Finding("twin", "variant", "problem", f"SONOTWIN_VARIANT={variant}", remedy)
+
+
+def _cameras() -> Iterator[Finding]:
+    """Look for Basler cameras in another process: drivers of cameras may crash, and emulate some where an environment says so."""
+    if _version("pypylon") is None:
+        return
+    program = "from recon.devices import basler_listing\nfor camera in basler_listing.find_cameras(): print(camera)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    if done.returncode:
+        yield Finding("live", "Basler cameras", "problem", f"the search ended with status {done.returncode}", "reinstall pypylon")
+    elif not done.stdout:
+        yield Finding("live", "Basler cameras", "absent", "none found at this computer")
+    for line in done.stdout.splitlines():
+        yield Finding("live", "Basler camera", "ok", line)
 
 
 def _folders() -> Iterator[Finding]:

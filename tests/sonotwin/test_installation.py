@@ -60,6 +60,14 @@ def test_a_missing_core_package_is_status_2(others_work, monkeypatch, capsys):
     assert "core scipy: pip install '.' in sonotwin's folder" in captured.out
 
 
+def test_cameras_are_listed(monkeypatch):
+    pytest.importorskip("pypylon")
+    monkeypatch.setenv("PYLON_CAMEMU", "1")
+    assert [one.found for one in installation._cameras()] == ["0815-0000: Emulation, CamEmu, free"]
+    monkeypatch.setenv("PYLON_CAMEMU", "0")
+    assert [one.state for one in installation._cameras()] == ["absent"]
+
+
 def test_a_missing_twin_is_status_0(others_work, monkeypatch, capsys):
     real = installation._version
     monkeypatch.setattr(installation, "_version", lambda name: None if name in ("mitsuba", "drjit") else real(name))
