@@ -1,6 +1,7 @@
 """A view in the browser: skin, masses, probe and B-scan in space, with distances, latency and what is wrong, as they come."""
 
 import socket
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from io import StringIO
 from time import monotonic
@@ -12,17 +13,22 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
+from recon.geometry import rigid
+from recon.navigation.mass_distances import MassDistance
 from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import Moment, StillScene
 
 Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
 
 LOOPBACK = "127.0.0.1"
 M = 0.001  # the view is in metres: its nearest and farthest depth suit them
-SKIN, MASS, CUT, BODY, INK = (224, 187, 165), (200, 60, 60), (255, 210, 60), (235, 235, 235), (20, 20, 20)
-WORDS_S = 0.2  # between two texts: faster ones can't be read
-AWAY_MM = (-180.0, -130.0, -330.0)  # from the scene's middle to the viewer, in the world: camera 1's side, from above
-AHEAD_MM = 680.0  # from camera 1 to the scene's middle, where there is neither skin nor mass
+SKIN, MASS, BODY, INK = (224, 187, 165), (200, 60, 60), (235, 235, 235), (20, 20, 20)
+OUTLINE = (255, 210, 60)  # of masses that a B-scan cuts, drawn into it
+WORDS_S = 0.1  # between two texts, and pictures beside them: faster ones can't be read
+ASIDE = np.array([-0.5, -0.6, -0.7]) / np.sqrt(1.1)  # direction from the scene to the viewer: camera 1's side, from above
+FIELD_RAD, DISTANCE = 0.8, 3.0  # of the view, upright; and from where, as a multiple of the scene's half diagonal
+SPACE_MM = np.array([[-100.0, -100.0, 600.0], [100.0, 100.0, 760.0]])  # that is looked at where there is neither skin nor mass
 QUALITY = 85  # of JPEG
 
 
@@ -40,9 +46,9 @@ class BrowserView:
             self._server = viser.ViserServer(host=host, port=port, label="sonotwin", verbose=False)
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._bodies = _add_scene(self._server, scene)
-        self._scan = None  # handle of the image, as soon as there is one
+        self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
+        self._beside: viser.GuiImageHandle | None = None  # and beside it
         self._shown: PlacedScan | None = None
-        self._outlines = {}
         self._words, self._written = self._server.gui.add_markdown("waiting for the first frames"), 0.0
 
     @property
@@ -53,11 +59,14 @@ class BrowserView:
 
     def publish(self, moment: Moment) -> None:
         """Show a moment; see `Publisher`."""
+        picture = None if moment.scan is None else outlined(moment.scan, moment.distances)
         with self._server.atomic():
             self._show_probe(moment.world_from_target)
-            self._show_scan(moment)
+            self._show_scan(moment.scan, picture)
         if monotonic() - self._written > WORDS_S:
-            self._words.content, self._written = words_of(moment), monotonic()
+            self._written = monotonic()
+            self._words.content = words_of(moment)
+            self._show_beside(picture)
         self._server.flush()
 
     def close(self) -> None:
@@ -70,39 +79,45 @@ class BrowserView:
         if world_from_target is not None:
             self._bodies.wxyz, self._bodies.position = turn_of(world_from_target), world_from_target[:3, 3] * M
 
-    def _show_scan(self, moment: Moment) -> None:
-        scan = moment.scan
-        if scan is not None and scan is not self._shown:
-            self._place(scan)
-            self._draw_outlines(moment)
-        for handle in (self._scan, *self._outlines.values()):
-            if handle is not None:
-                handle.visible = scan is not None
+    def _show_scan(self, scan: PlacedScan | None, picture: Picture | None) -> None:
+        if scan is not None and picture is not None and scan is not self._shown:
+            self._place(scan, picture)
+        if self._scan is not None:
+            self._scan.visible = scan is not None
         self._shown = scan
 
-    def _place(self, scan: PlacedScan) -> None:
+    def _place(self, scan: PlacedScan, picture: Picture) -> None:
         """Show a B-scan where it was taken, to the borders of its outer pixels."""
-        (height, width), colour = scan.image.shape, cv2.cvtColor(scan.image, cv2.COLOR_GRAY2RGB)
-        middle, turn = scan.corners.mean(axis=0) * M, turn_of(scan.world_from_pixel)
-        image = self._scan
-        if image is None:
-            across, down = np.linalg.norm(scan.world_from_pixel[:3, :2], axis=0) * M
-            image = self._server.scene.add_image(
-                "/scan", colour, width * across, height * down, jpeg_quality=QUALITY, cast_shadow=False, receive_shadow=False
+        handle = self._scan
+        if handle is None:
+            (height, width), (across, down) = scan.image.shape, np.linalg.norm(scan.world_from_pixel[:3, :2], axis=0) * M
+            handle = self._server.scene.add_image(
+                "/scan", picture, width * across, height * down, jpeg_quality=QUALITY, cast_shadow=False, receive_shadow=False
             )
         else:
-            image.image = colour
-        image.wxyz, image.position = turn, middle
-        self._scan = image
+            handle.image = picture
+        handle.wxyz, handle.position = turn_of(scan.world_from_pixel), scan.corners.mean(axis=0) * M
+        self._scan = handle
 
-    def _draw_outlines(self, moment: Moment) -> None:
-        for each in moment.distances:
-            if each.name in self._outlines:
-                self._outlines.pop(each.name).remove()
-            if each.cut:
-                self._outlines[each.name] = self._server.scene.add_line_segments(
-                    f"/outlines/{each.name}", each.outline * M, CUT, thickness=2.0, thickness_units="screen"
-                )
+    def _show_beside(self, picture: Picture | None) -> None:
+        """Show the B-scan flat, under the text."""
+        if self._beside is not None:
+            self._beside.visible = picture is not None
+        if picture is not None and self._beside is None:
+            self._beside = self._server.gui.add_image(picture, jpeg_quality=QUALITY)
+        elif picture is not None and self._beside is not None:
+            self._beside.image = picture
+
+
+def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:
+    """A B-scan : (h, w, 3) with the outlines of masses that it cuts."""
+    picture = cv2.cvtColor(scan.image, cv2.COLOR_GRAY2RGB)
+    pixel_from_world = np.linalg.inv(scan.world_from_pixel)
+    for each in distances:
+        if each.in_image:
+            pieces = np.rint(rigid.apply(pixel_from_world, each.outline)[..., :2]).astype(np.int32)
+            cv2.polylines(picture, list(pieces), False, OUTLINE, 1, cv2.LINE_AA)
+    return picture
 
 
 def turn_of(to_from: Array) -> Array:
@@ -135,8 +150,8 @@ def _where(cut: bool, in_image: bool) -> str:
 def _add_scene(server, scene: StillScene):
     """Add what stands still; returns the handle of the probe, which moves."""
     for name, mesh, colour, opacity in (
-        ("skin", scene.skin, SKIN, 0.45),
-        *((f"masses/{name}", mesh, MASS, 0.7) for name, mesh in scene.masses.items()),
+        ("skin", scene.skin, SKIN, 0.35),
+        *((f"masses/{name}", mesh, MASS, None) for name, mesh in scene.masses.items()),
     ):
         if mesh is not None:
             _add_mesh(server, f"/{name}", mesh, colour, opacity)
@@ -145,10 +160,12 @@ def _add_scene(server, scene: StillScene):
         if mesh is not None:
             _add_mesh(server, f"/probe/{name}", mesh, colour, None)
     server.scene.set_up_direction((0.0, -1.0, 0.0))
-    middle = _middle(scene)
+    server.scene.add_light_ambient("/light", intensity=0.8)
+    middle, radius = _looked_at(scene)
+    server.initial_camera.position = (middle + DISTANCE * radius * ASIDE) * M
     server.initial_camera.look_at = middle * M
-    server.initial_camera.position = (middle + AWAY_MM) * M
     server.initial_camera.up = (0.0, -1.0, 0.0)
+    server.initial_camera.fov = FIELD_RAD
     return handle
 
 
@@ -159,9 +176,11 @@ def _add_mesh(server, name: str, mesh: trimesh.Trimesh, colour: tuple[int, int, 
     )
 
 
-def _middle(scene: StillScene) -> Array:
-    known = [mesh for mesh in (scene.skin, *scene.masses.values()) if mesh is not None]
-    return np.array([0.0, 0.0, AHEAD_MM]) if not known else np.asarray(known[0].bounds, float).mean(axis=0)
+def _looked_at(scene: StillScene) -> tuple[Array, float]:
+    """Middle : (3,) mm of what stands still, and half its diagonal."""
+    known = [np.asarray(mesh.bounds, float) for mesh in (scene.skin, *scene.masses.values()) if mesh is not None]
+    low, high = known[0] if known else SPACE_MM
+    return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
 
 def _check_free(host: str, port: int) -> None:

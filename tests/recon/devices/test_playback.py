@@ -70,7 +70,7 @@ def test_nothing_comes_before_its_time(recorded):
 def test_a_recording_refuses_what_only_a_camera_can_do(recorded):
     camera = PlayedCamera(recorded, line_of(recorded))
     for refused in (lambda: camera.set_exposure(0.01, 1.0), lambda: camera.start("software"), camera.trigger):
-        with pytest.raises(DeviceError, match="^us: expected"):
+        with pytest.raises(DeviceError, match=r"^us: expected"):
             refused()
     camera.start("hardware")
     camera.close()
