@@ -16,7 +16,7 @@ from sonotwin import namesakes
 from twin import llvm
 
 OLDEST_PYTHON = (3, 11)
-EXTRAS = ("twin", "study", "train", "dev", "docs")
+EXTRAS = ("twin", "study", "live", "train", "dev", "docs")
 MODULES = {  # where a package isn't imported by the name that it is installed by
     "hydra-core": "hydra",
     "import-linter": "importlinter",
@@ -37,7 +37,7 @@ BROUGHT_BY = {"drjit": "mitsuba", "omegaconf": "hydra"}  # imported by us, requi
 class Finding:
     """One thing that was looked at."""
 
-    part: str  # core, twin, train, dev, docs: who needs it; or machine
+    part: str  # core, twin, live, train, dev, docs: who needs it; or machine
     what: str
     state: Literal["ok", "absent", "unused", "problem"]  # absent: not there, and the core does without
     found: str

@@ -7,7 +7,7 @@ from threading import Lock
 from recon.navigation.feeds import Arrival
 from recon.navigation.newest import Newest
 
-TOGETHER_NS = 4_000_000  # between the exposures of a pair: more than unsure clocks differ by, less than half of any period in use
+TOGETHER_NS = 8_000_000  # between the exposures of a pair: more than unsure clocks differ by, less than half of usual periods
 REMEMBERED = 4  # frames of a camera that wait for their partner
 
 
