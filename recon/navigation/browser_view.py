@@ -49,24 +49,23 @@ class BrowserView:
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
         self._beside: viser.GuiImageHandle | None = None  # and beside it
         self._shown: PlacedScan | None = None
+        self._picture: Picture | None = None  # of that
         self._words, self._written = self._server.gui.add_markdown("waiting for the first frames"), 0.0
 
     @property
     def address(self) -> str:
         """Of the page."""
-        host = self._server.get_host()
-        return f"http://{'localhost' if host == LOOPBACK else host}:{self._server.get_port()}"
+        return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
     def publish(self, moment: Moment) -> None:
         """Show a moment; see `Publisher`."""
-        picture = None if moment.scan is None else outlined(moment.scan, moment.distances)
         with self._server.atomic():
             self._show_probe(moment.world_from_target)
-            self._show_scan(moment.scan, picture)
+            self._show_scan(moment.scan, moment.distances)
         if monotonic() - self._written > WORDS_S:
             self._written = monotonic()
             self._words.content = words_of(moment)
-            self._show_beside(picture)
+            self._show_beside()
         self._server.flush()
 
     def close(self) -> None:
@@ -79,34 +78,33 @@ class BrowserView:
         if world_from_target is not None:
             self._bodies.wxyz, self._bodies.position = turn_of(world_from_target), world_from_target[:3, 3] * M
 
-    def _show_scan(self, scan: PlacedScan | None, picture: Picture | None) -> None:
-        if scan is not None and picture is not None and scan is not self._shown:
-            self._place(scan, picture)
+    def _show_scan(self, scan: PlacedScan | None, distances: Sequence[MassDistance]) -> None:
+        if scan is not self._shown:
+            self._shown, self._picture = scan, None if scan is None else outlined(scan, distances)
+            if scan is not None and self._picture is not None:
+                self._place(scan, self._picture)
         if self._scan is not None:
             self._scan.visible = scan is not None
-        self._shown = scan
 
     def _place(self, scan: PlacedScan, picture: Picture) -> None:
         """Show a B-scan where it was taken, to the borders of its outer pixels."""
-        handle = self._scan
-        if handle is None:
-            (height, width), (across, down) = scan.image.shape, np.linalg.norm(scan.world_from_pixel[:3, :2], axis=0) * M
-            handle = self._server.scene.add_image(
+        (height, width), (across, down) = scan.image.shape, np.linalg.norm(scan.world_from_pixel[:3, :2], axis=0) * M
+        if self._scan is None or self._scan.image.shape != picture.shape:
+            self._scan = self._server.scene.add_image(
                 "/scan", picture, width * across, height * down, jpeg_quality=QUALITY, cast_shadow=False, receive_shadow=False
             )
         else:
-            handle.image = picture
-        handle.wxyz, handle.position = turn_of(scan.world_from_pixel), scan.corners.mean(axis=0) * M
-        self._scan = handle
+            self._scan.image = picture
+        self._scan.wxyz, self._scan.position = turn_of(scan.world_from_pixel), scan.corners.mean(axis=0) * M
 
-    def _show_beside(self, picture: Picture | None) -> None:
+    def _show_beside(self) -> None:
         """Show the B-scan flat, under the text."""
-        if self._beside is not None:
-            self._beside.visible = picture is not None
-        if picture is not None and self._beside is None:
-            self._beside = self._server.gui.add_image(picture, jpeg_quality=QUALITY)
-        elif picture is not None and self._beside is not None:
-            self._beside.image = picture
+        if self._beside is None:
+            self._beside = None if self._picture is None else self._server.gui.add_image(self._picture, jpeg_quality=QUALITY)
+            return
+        self._beside.visible = self._picture is not None
+        if self._picture is not None:
+            self._beside.image = self._picture
 
 
 def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:

@@ -83,8 +83,8 @@ class Navigator:
 
     @property
     def running(self) -> bool:
-        """Whether it tracks."""
-        return self._thread is not None and self._thread.is_alive()
+        """Whether all of it goes on; a part that has ended by itself has a fault, which it has told."""
+        return self._thread is not None and self._thread.is_alive() and all(each.alive for each in (*self.feeds, *self.outlets))
 
     def _run(self) -> None:
         number, scan, distances = 0, None, ()

@@ -90,6 +90,11 @@ class Outlet:
             self._thread.join()
         self.publisher.close()
 
+    @property
+    def alive(self) -> bool:
+        """Whether it goes on."""
+        return self._thread is not None and self._thread.is_alive()
+
     def _run(self) -> None:
         shown = None
         while not self._ended:

@@ -83,9 +83,9 @@ def run(config: Config) -> int:
         scene = still_scene.read_scene(
             config.skin, config.masses, tracker.target, probe, recorded[SCANNER].size[0], config.part_table
         )
-    view = BrowserView(scene, config.view.port, config.view.host)
     with console.status("getting ready to track"):
         warm_up(tracker)
+    view = BrowserView(scene, config.view.port, config.view.host)
     cam1, cam2, scanner = played(recorded, config.speed)
     navigator = Navigator((cam1, cam2), scanner, tracker, probe, config.lag_s, mass_distances.bodies_of(scene.masses), [view])
     console.print(f"view        {view.address}", markup=False)
@@ -94,14 +94,18 @@ def run(config: Config) -> int:
         until = monotonic() + (config.seconds or float("inf"))
         while navigator.running and monotonic() < until:
             sleep(LOOK_S)
-        ended = not navigator.running
+        return int(not navigator.running)
     finally:
         navigator.stop()
+        tell(navigator, console)
+
+
+def tell(navigator: Navigator, console: Console) -> None:
+    """Print how often and how late each publisher was, at last."""
     for outlet in navigator.outlets:
         if (late := outlet.latencies.figures()) is not None:
             figures = f"{late.median_ms:.0f} ms after the exposure, 99 % within {late.high_ms:.0f} ms"
             console.print(f"{outlet.publisher.name:11} {late.rate_hz:.1f} poses a second, {figures}", markup=False)
-    return int(ended)
 
 
 def probe_of(config: Config) -> ProbeCalibration:

@@ -65,7 +65,7 @@ def test_a_recording_is_navigated(recorded, moments, tmp_path, capsys):
     fields = [f"skin={skin}", f"masses={masses}", f"lag_s={LAG_S}", f"view.port={port}", "seconds=6", "speed=0.5"]
     assert main(["navigate", f"capture={recorded}", *fields]) == 0
     told = capsys.readouterr().out.splitlines()
-    assert told[0] == f"view        http://localhost:{port}"
+    assert told[0] == f"view        http://127.0.0.1:{port}"
     assert told[1].startswith("browser     ") and "poses a second" in told[1]
     found = [moment.world_from_target for moment in moments if moment.world_from_target is not None]
     known = films.places(COUNT)[:, :3, 3]

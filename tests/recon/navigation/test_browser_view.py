@@ -105,12 +105,11 @@ def test_the_page_shows_the_b_scan_in_place(tmp_path):
     """One corner of the image is white: on the page it is where a camera of the view's own place and field sees that corner."""
     image = np.full(SHAPE, 40, np.uint8)
     image[:24, :24] = 255
-    turn = browser_view_turn()
+    turn = upright() @ Rotation.from_euler("z", 30, degrees=True).as_matrix()
     middle = np.array([0.0, 0.0, 700.0])
     half = MM_PER_PX * (np.array(SHAPE[::-1]) - 1) / 2
     placed = rigid.transform(turn, middle - turn[:, :2] @ half) @ np.diag([MM_PER_PX, MM_PER_PX, MM_PER_PX, 1])
-    far = StillScene(np.eye(4), masses={"mass0": BALL}, probe=BALL)
-    view = BrowserView(far, free_port())
+    view = BrowserView(StillScene(np.eye(4), masses={"mass0": BALL}), free_port())
     view._server.scene.remove_by_name("/masses/mass0")  # it only sets where one looks from
     try:
         with headless_browser.opened(view.address, tmp_path / "profile") as page:
@@ -132,24 +131,19 @@ def test_the_page_shows_the_b_scan_in_place(tmp_path):
     assert np.hypot(u.mean() - expected[0], v.mean() - expected[1]) < 6
 
 
-def browser_view_turn():
-    """Directions of an image that faces the viewer, turned by 30 degrees."""
+def upright():
+    """Directions of a camera at the view's place : columns across, down and ahead; y of the world is down."""
     ahead = -browser_view.ASIDE
     across = np.cross([0, 1, 0], ahead)
     across /= np.linalg.norm(across)
-    upright = np.column_stack([across, np.cross(ahead, across), ahead])
-    return upright @ Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    return np.column_stack([across, np.cross(ahead, across), ahead])
 
 
 def on_screen(point, middle, radius, size):
-    """Pixel of a point, seen from the view's place with y down."""
-    ahead = -browser_view.ASIDE
-    across = np.cross([0, 1, 0], ahead)
-    across /= np.linalg.norm(across)
-    down = np.cross(ahead, across)
-    away = point - (middle + browser_view.DISTANCE * radius * browser_view.ASIDE)
+    """Pixel of a point, seen from the view's place."""
+    x, y, z = upright().T @ (point - (middle + browser_view.DISTANCE * radius * browser_view.ASIDE))
     scale = size[1] / 2 / np.tan(browser_view.FIELD_RAD / 2)
-    return np.array(size) / 2 + scale * np.array([away @ across, away @ down]) / (away @ ahead)
+    return np.array(size) / 2 + scale * np.array([x, y]) / z
 
 
 def white_of_scene(shot):

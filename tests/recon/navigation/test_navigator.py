@@ -163,3 +163,15 @@ def test_an_end_closes_devices_and_publishers(navigate):
     until(lambda: len(devices) == 3)
     navigator.stop()
     assert kept.closed and all(device.closed for device in devices) and not navigator.running
+
+
+def test_a_publisher_that_fails_ends_it_all(navigate, monkeypatch):
+    """Its fault is printed by its thread; nobody goes on to look at a picture that stands still."""
+
+    class Failing(Kept):
+        def publish(self, moment):
+            raise RuntimeError("a fault in the program")
+
+    monkeypatch.setattr("threading.excepthook", lambda fault: None)
+    navigator = navigate([Failing()])
+    until(lambda: not navigator.running)
