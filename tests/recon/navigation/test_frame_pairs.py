@@ -35,6 +35,10 @@ def test_a_camera_that_is_ahead_by_some_frames_loses_none():
     assert paired([(0, 0), (0, 1), (1, 1)]) == [(1, 1)]
 
 
+def test_no_pair_comes_after_a_newer_one():
+    assert paired([(0, 0), (0, 1), (1, 1), (1, 0), (0, 2), (1, 2)]) == [(1, 1), (2, 2)]
+
+
 def test_frames_without_a_partner_are_left_out():
     assert paired([(0, 0), (1, 1), (0, 2), (1, 2), (0, 3), (0, 4), (1, 4)]) == [(2, 2), (4, 4)]
 
