@@ -33,7 +33,7 @@ class Device:
 
     name: str
     open: Callable[[], Source]  # DeviceError if it isn't there
-    clock: Callable[[], Exposed] = ArrivalClock  # makes a clock each time that the device was opened
+    clock: Callable[[Source], Exposed] = lambda source: ArrivalClock()  # of the device, each time that it was opened
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Feed:
                 self._stopped.wait(self.again_s)
 
     def _hand_on(self, source: Source) -> None:
-        exposed, expected, heard = self.device.clock(), None, monotonic()
+        exposed, expected, heard = self.device.clock(source), None, monotonic()
         while not self._stopped.is_set():
             frame = source.frame(WAIT_S)
             if frame is None:

@@ -135,7 +135,7 @@ def played(recorded: Mapping[str, Recorded], speed: float) -> tuple[Device, Devi
     line = playback.timeline_of(recorded, speed)
 
     def device(name: str, kind: type[PlayedCamera] | type[PlayedScanner]) -> Device:
-        return Device(name, lambda: kind(recorded[name], line), lambda: lambda frame: line.clock_of(frame.time_ns))
+        return Device(name, lambda: kind(recorded[name], line), lambda source: lambda frame: line.clock_of(frame.time_ns))
 
     cam1, cam2 = (device(name, PlayedCamera) for name in CAMERAS)
     return cam1, cam2, device(SCANNER, PlayedScanner)

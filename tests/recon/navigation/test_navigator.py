@@ -17,7 +17,6 @@ from tests.recon import probe_motions
 from tests.recon.navigation.live_stand_ins import Kept, Ticking, until
 
 PERIOD_S = 0.02
-CLOCK = Device("", lambda: None, lambda: lambda frame: frame.time_ns).clock  # the devices here have this computer's own
 
 
 @dataclass
@@ -49,6 +48,11 @@ class Steady:
         return Found(Posed(rigid.transform(np.eye(3), [10 * time_s, 0, 650])), "predicted")
 
 
+def own_clock(source):
+    """The devices here have this computer's."""
+    return lambda frame: frame.time_ns
+
+
 @pytest.fixture
 def navigate(rig):
     """Start a navigator of devices that share a clock; all are stopped in the end."""
@@ -56,7 +60,7 @@ def navigate(rig):
 
     def begin(publishers, tracker=None, opener=lambda name: None, masses=None):
         def device(name):
-            return Device(name, lambda: opener(name) or Ticking(start, PERIOD_S), CLOCK)
+            return Device(name, lambda: opener(name) or Ticking(start, PERIOD_S), own_clock)
 
         cam1, cam2, us = map(device, ("cam1", "cam2", "us"))
         probe = probe_motions.true_probe(rig)
