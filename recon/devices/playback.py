@@ -23,7 +23,7 @@ from recon.files.regular import check_there
 
 DELIVERY_NS = 10_000_000  # from the middle of an exposure to the image in memory: half of 10 ms, and 1.3 MB over USB 3
 BUFFERED = 4  # frames that wait to be fetched
-MOST_KEPT = 1 << 29  # bytes of a device's images that are kept in memory, so that later rounds read none
+MOST_KEPT = 1 << 28  # bytes of a device's images that are kept in memory, so that later rounds read none
 
 
 @dataclass(frozen=True)
@@ -100,20 +100,16 @@ class _Played:
 
     recorded: Recorded
     timeline: Timeline
+    name: str = field(init=False)
+    size: Size = field(init=False)
+    bits: int = field(init=False)
     _begun: int | None = None  # number, over all rounds, of the first frame that was given
     _next: int = 0  # and of the one that is to be given
     _kept: dict[int, Image] = field(default_factory=dict)
     _closed: Event = field(default_factory=Event)
 
-    @property
-    def name(self) -> str:
-        """Name of the device."""
-        return self.recorded.name
-
-    @property
-    def size(self) -> Size:
-        """Width, height, px."""
-        return self.recorded.size
+    def __post_init__(self) -> None:
+        self.name, self.size, self.bits = self.recorded.name, self.recorded.size, self.recorded.bits
 
     def frame(self, timeout_s: float) -> Frame | None:
         """Wait for the next frame, in order; None if none came in time. DeviceError if its image is damaged, or after `close`."""
@@ -167,11 +163,6 @@ class _Played:
 
 class PlayedCamera(_Played):
     """A `Camera` that plays a recording; exposure, gain and trigger are those it was recorded with."""
-
-    @property
-    def bits(self) -> int:
-        """Of the digital numbers."""
-        return self.recorded.bits
 
     def set_exposure(self, exposure_s: float, gain: float) -> None:
         """Refuse: the exposure was set when this was recorded."""
