@@ -8,11 +8,12 @@ ARGS ?=
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 TWIN := .venv/.twin
+LIVE := outputs/live
 # Each worker takes one half of the tests, so that few make the same fixtures; who is done helps the other.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint slow docs accuracy benchmark campaign paper clean
+.PHONY: help setup demo live test lint slow docs accuracy benchmark campaign paper clean
 
 help:  ## show this
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -31,6 +32,16 @@ $(TWIN): pyproject.toml constraints.txt .ci/setup
 
 demo: $(TWIN)  ## render a phantom, reconstruct its surface, compare with the truth
 	@$(BIN)/sonotwin demo
+
+live: $(LIVE)/result/metrics.json  ## play a rendered scene as the rig would, live in the browser; needs no hardware
+	@$(BIN)/sonotwin navigate capture=$(LIVE)/capture lag_s=0.05 skin=$(LIVE)/result/surface/surface.ply \
+		masses=$(LIVE)/result/masses/scan $(ARGS)
+
+# Skin, a filmed sweep, and what is found in them: minutes, once.
+$(LIVE)/result/metrics.json: | setup
+	@$(BIN)/sonotwin render scene=breast add=true out=$(LIVE)
+	@$(BIN)/sonotwin sweep scene=breast path=raster filmed=true clocks.camera_hz=25 name=scan add=true out=$(LIVE)
+	@$(BIN)/sonotwin reconstruct capture=$(LIVE)/capture lag_s=0.05 out=$(LIVE)/result
 
 test: setup  ## check style, types and arrows, then run the fast tests
 	@bash .ci/browser & browser=$$!; $(MAKE) --no-print-directory lint && wait $$browser

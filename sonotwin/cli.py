@@ -57,6 +57,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("segment", "find masses or a tube in tracked B-scans, as closed surfaces in the world"),
     Verb("fuse", "put skin, masses and B-scans into one picture with layers"),
     Verb("reconstruct", "reconstruct all that a capture holds: calibrations, skin, volumes, masses"),
+    Verb("navigate", "follow the probe live: the B-scan in place, skin and masses around it"),
     Verb("import", "read another group's data set into a capture"),
     Verb("import-sweep", "read a scanner's clip and a tracker's poses into a capture"),
     Verb("export", "write a capture in another group's layout"),

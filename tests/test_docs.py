@@ -59,6 +59,8 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
     "recordings.md": {"photographs", "procam", "L", "relief.yaml", "caliInfo.yml", "spine.xml", "poses.csv"}
     | {"examples_ybr_color.dcm"}
     | {f"{name}.igs.mha" for name in ("SpinePhantomFreehand", "WaterTankBottomTranslationCombined")},
+    "live-navigate.md": {"session/capture", "result/surface/surface.ply", "result/masses/scan"}
+    | {"result/optics/optics.yaml", "result/probe/probe.yaml"},
     "rig-software.md": {"board", "surface"},
     "tracking.md": {"session", "probe.yaml"},
 }

@@ -1,0 +1,192 @@
+"""A view in the browser: skin, masses, probe and B-scan in space, with distances, latency and what is wrong, as they come."""
+
+import socket
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from io import StringIO
+from time import monotonic
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.navigation.mass_distances import MassDistance
+from recon.navigation.placed_scans import PlacedScan
+from recon.navigation.publishing import Moment, StillScene
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+LOOPBACK = "127.0.0.1"
+M = 0.001  # the view is in metres: its nearest and farthest depth suit them
+SKIN, MASS, BODY, INK = (224, 187, 165), (200, 60, 60), (235, 235, 235), (20, 20, 20)
+OUTLINE = (255, 210, 60)  # of masses that a B-scan cuts, drawn into it
+WORDS_S = 0.1  # between two texts, and pictures beside them: faster ones can't be read
+ASIDE = np.array([-0.5, -0.6, -0.7]) / np.sqrt(1.1)  # direction from the scene to the viewer: camera 1's side, from above
+FIELD_RAD, DISTANCE = 0.8, 3.0  # of the view, upright; and from where, as a multiple of the scene's half diagonal
+SPACE_MM = np.array([[-100.0, -100.0, 600.0], [100.0, 100.0, 760.0]])  # that is looked at where there is neither skin nor mass
+QUALITY = 85  # of JPEG
+
+
+class BrowserView:
+    """A publisher that serves a page; whoever opens it sees the newest moment, and a slow browser fewer of them."""
+
+    name = "browser"
+
+    def __init__(self, scene: StillScene, port: int = 8080, host: str = LOOPBACK) -> None:
+        """Serve the page of a scene. InputError if the port can't be had; ModuleNotFoundError without viser."""
+        import viser  # of the extra `live`
+
+        _check_free(host, port)
+        with redirect_stdout(StringIO()):  # it prints, even so
+            self._server = viser.ViserServer(host=host, port=port, label="sonotwin", verbose=False)
+        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._bodies = _add_scene(self._server, scene)
+        self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
+        self._beside: viser.GuiImageHandle | None = None  # and beside it
+        self._shown: PlacedScan | None = None
+        self._picture: Picture | None = None  # of that
+        self._words, self._written = self._server.gui.add_markdown("waiting for the first frames"), 0.0
+
+    @property
+    def address(self) -> str:
+        """Of the page."""
+        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+
+    def publish(self, moment: Moment) -> None:
+        """Show a moment; see `Publisher`."""
+        with self._server.atomic():
+            self._show_probe(moment.world_from_target)
+            self._show_scan(moment.scan, moment.distances)
+        if monotonic() - self._written > WORDS_S:
+            self._written = monotonic()
+            self._words.content = words_of(moment)
+            self._show_beside()
+        self._server.flush()
+
+    def close(self) -> None:
+        """End."""
+        with redirect_stdout(StringIO()):
+            self._server.stop()
+
+    def _show_probe(self, world_from_target: Array | None) -> None:
+        self._bodies.visible = world_from_target is not None
+        if world_from_target is not None:
+            self._bodies.wxyz, self._bodies.position = turn_of(world_from_target), world_from_target[:3, 3] * M
+
+    def _show_scan(self, scan: PlacedScan | None, distances: Sequence[MassDistance]) -> None:
+        if scan is not self._shown:
+            self._shown, self._picture = scan, None if scan is None else outlined(scan, distances)
+            if scan is not None and self._picture is not None:
+                self._place(scan, self._picture)
+        if self._scan is not None:
+            self._scan.visible = scan is not None
+
+    def _place(self, scan: PlacedScan, picture: Picture) -> None:
+        """Show a B-scan where it was taken, to the borders of its outer pixels."""
+        (height, width), (across, down) = scan.image.shape, np.linalg.norm(scan.world_from_pixel[:3, :2], axis=0) * M
+        if self._scan is None or self._scan.image.shape != picture.shape:
+            self._scan = self._server.scene.add_image(
+                "/scan", picture, width * across, height * down, jpeg_quality=QUALITY, cast_shadow=False, receive_shadow=False
+            )
+        else:
+            self._scan.image = picture
+        self._scan.wxyz, self._scan.position = turn_of(scan.world_from_pixel), scan.corners.mean(axis=0) * M
+
+    def _show_beside(self) -> None:
+        """Show the B-scan flat, under the text."""
+        if self._beside is None:
+            self._beside = None if self._picture is None else self._server.gui.add_image(self._picture, jpeg_quality=QUALITY)
+            return
+        self._beside.visible = self._picture is not None
+        if self._picture is not None:
+            self._beside.image = self._picture
+
+
+def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:
+    """A B-scan : (h, w, 3) with the outlines of masses that it cuts."""
+    picture = cv2.cvtColor(scan.image, cv2.COLOR_GRAY2RGB)
+    pixel_from_world = np.linalg.inv(scan.world_from_pixel)
+    for each in distances:
+        if each.in_image:
+            pieces = np.rint(rigid.apply(pixel_from_world, each.outline)[..., :2]).astype(np.int32)
+            cv2.polylines(picture, list(pieces), False, OUTLINE, 1, cv2.LINE_AA)
+    return picture
+
+
+def turn_of(to_from: Array) -> Array:
+    """Quaternion : (4,) wxyz of the directions of a matrix : (4, 4), whose first two columns may have any length."""
+    x, y = (to_from[:3, axis] / np.linalg.norm(to_from[:3, axis]) for axis in (0, 1))
+    return np.roll(Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)])).as_quat(), 1)
+
+
+def words_of(moment: Moment) -> str:
+    """The text of a moment, as Markdown."""
+    lines = [f"**{'Tracking' if moment.world_from_target is not None else 'Not tracking'}:** {moment.state}"]
+    lines += [f"**Device:** {trouble}" for trouble in moment.troubles]
+    if moment.latency is not None:
+        late = moment.latency
+        lines.append(f"**From exposure to published pose:** {late.median_ms:.0f} ms, 99 % below {late.high_ms:.0f} ms")
+        lines.append(f"**Poses:** {late.rate_hz:.0f} a second")
+    lines.append("**B-scan:** in place" if moment.scan is not None else "**B-scan:** none in place")
+    if moment.distances:
+        rows = [f"| {each.name} | {each.distance_mm:.1f} | {_where(each.cut, each.in_image)} |" for each in moment.distances]
+        lines.append("\n".join(["| mass | plane, mm | |", "|---|---:|---|", *rows]))
+    return "\n\n".join(lines)
+
+
+def _where(cut: bool, in_image: bool) -> str:
+    if not cut:
+        return ""
+    return "cut, in the image" if in_image else "cut beside the image"
+
+
+def _add_scene(server, scene: StillScene):
+    """Add what stands still; returns the handle of the probe, which moves."""
+    for name, mesh, colour, opacity in (
+        ("skin", scene.skin, SKIN, 0.35),
+        *((f"masses/{name}", mesh, MASS, None) for name, mesh in scene.masses.items()),
+    ):
+        if mesh is not None:
+            _add_mesh(server, f"/{name}", mesh, colour, opacity)
+    handle = server.scene.add_frame("/probe", show_axes=False, visible=False)
+    for name, mesh, colour in (("body", scene.probe, BODY), ("circles", scene.circles, INK)):
+        if mesh is not None:
+            _add_mesh(server, f"/probe/{name}", mesh, colour, None)
+    server.scene.set_up_direction((0.0, -1.0, 0.0))
+    server.scene.add_light_ambient("/light", intensity=0.8)
+    middle, radius = _looked_at(scene)
+    server.initial_camera.position = (middle + DISTANCE * radius * ASIDE) * M
+    server.initial_camera.look_at = middle * M
+    server.initial_camera.up = (0.0, -1.0, 0.0)
+    server.initial_camera.fov = FIELD_RAD
+    return handle
+
+
+def _add_mesh(server, name: str, mesh: trimesh.Trimesh, colour: tuple[int, int, int], opacity: float | None) -> None:
+    vertices = np.asarray(mesh.vertices) * M
+    server.scene.add_mesh_simple(
+        name, vertices, np.asarray(mesh.faces), color=colour, opacity=opacity, side="double", cast_shadow=False
+    )
+
+
+def _looked_at(scene: StillScene) -> tuple[Array, float]:
+    """Middle : (3,) mm of what stands still, and half its diagonal."""
+    known = [np.asarray(mesh.bounds, float) for mesh in (scene.skin, *scene.masses.values()) if mesh is not None]
+    low, high = known[0] if known else SPACE_MM
+    return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+
+
+def _check_free(host: str, port: int) -> None:
+    """Refuse a port that another program has: the server would silently take the next."""
+    with socket.socket() as trial:
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind((host, port))
+        except OSError as error:
+            found = f"found it refused: {error.strerror}; give another view.port, or close the other program"
+            raise InputError(f"view: expected to listen on {host}:{port}, {found}") from None

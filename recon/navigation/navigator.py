@@ -1,0 +1,118 @@
+"""The navigator: frames of both cameras and B-scans in, moments out, as they come.
+
+A feed a device, a thread that tracks, a thread a publisher. Between them stands one place for the newest thing, never a queue:
+where something is slow, what is shown is less often new, but never older.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from threading import Event, Thread
+from time import monotonic_ns
+
+import numpy as np
+
+from recon.geometry import rigid
+from recon.model.probe import ProbeCalibration
+from recon.navigation import mass_distances
+from recon.navigation.feeds import Device, Feed
+from recon.navigation.frame_pairs import FramePair, Pairing
+from recon.navigation.mass_distances import Body, MassDistance
+from recon.navigation.newest import Newest
+from recon.navigation.placed_scans import PlacedScan, ScanPlacing
+from recon.navigation.publishing import Moment, Outlet, Publisher
+from recon.tracking.tracker import Tracker, Tracking
+
+WAIT_S = 0.5  # for a pair of frames, until it is told that there are none
+STALE_NS = 500_000_000  # beyond the lag, after which a B-scan is shown no more
+NO_POSE = np.full((4, 4), np.nan)
+FACING = rigid.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 650.0])  # a target before camera 1
+
+
+def warm_up(tracker: Tracker) -> None:
+    """Run all that a tracker's first frames need once, on dark ones: it may have to be compiled, which takes some seconds."""
+    left, right = (np.zeros(camera.size[::-1], np.uint8) for camera in tracker.cameras)
+    tracker.remember(FACING, 0.0)
+    tracker.step(left, right, 0.01)
+    tracker.forget()
+
+
+@dataclass
+class Navigator:
+    """Follows the probe live. `start`, then `stop`; the first publisher's latency is the one that is told."""
+
+    cameras: tuple[Device, Device]
+    scanner: Device | None
+    tracker: Tracker
+    probe: ProbeCalibration
+    lag_s: float
+    bodies: dict[str, Body]
+    publishers: Sequence[Publisher]
+    again_s: float = 1.0  # until a device that was lost is opened again
+    outlets: list[Outlet] = field(init=False)
+    feeds: list[Feed] = field(init=False)
+    pairs: Newest[FramePair] = field(default_factory=Newest, init=False)
+    _stopped: Event = field(default_factory=Event, init=False)
+    _thread: Thread | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        pairing = Pairing(self.pairs)
+        self._placing = ScanPlacing(self.probe, self.lag_s)
+        self.outlets = [Outlet(publisher) for publisher in self.publishers]
+        self.feeds = [
+            Feed(self.cameras[0], lambda arrival: pairing.add(0, arrival), self.again_s),
+            Feed(self.cameras[1], lambda arrival: pairing.add(1, arrival), self.again_s),
+        ]
+        if self.scanner is not None:
+            self.feeds.append(Feed(self.scanner, self._placing.add_scan, self.again_s))
+
+    def start(self) -> None:
+        """Open the devices, and begin."""
+        for each in (*self.outlets, *self.feeds):
+            each.start()
+        self._thread = Thread(target=self._run, name="tracking", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End all threads, and give devices and publishers back."""
+        self._stopped.set()
+        self.pairs.close()
+        if self._thread is not None:
+            self._thread.join()
+        for each in (*self.feeds, *self.outlets):
+            each.stop()
+
+    @property
+    def running(self) -> bool:
+        """Whether all of it goes on; a part that has ended by itself has a fault, which it has told."""
+        return self._thread is not None and self._thread.is_alive() and all(each.alive for each in (*self.feeds, *self.outlets))
+
+    def _run(self) -> None:
+        number, scan, distances = 0, None, ()
+        while not self._stopped.is_set():
+            pair = self.pairs.take(WAIT_S)
+            if pair is None:
+                self._publish(Moment(number, monotonic_ns(), None, "no frames of both cameras", troubles=self._troubles()))
+                continue
+            number += 1
+            found = self.tracker.step(pair.left.frame.image, pair.right.frame.image, pair.exposed_ns * 1e-9)
+            self._placing.add_pose(pair.exposed_ns, found.pose.world_from_target if found.found else NO_POSE)
+            if (newer := self._placing.newest()) is not None:
+                scan, distances = newer, mass_distances.distances(self.bodies, newer)
+            elif scan is not None and pair.exposed_ns - scan.taken_ns > STALE_NS + self.lag_s * 1e9:
+                scan, distances = None, ()
+            self._publish(self._moment(number, pair, found, scan, distances))
+
+    def _moment(
+        self, number: int, pair: FramePair, found: Tracking, scan: PlacedScan | None, distances: tuple[MassDistance, ...]
+    ) -> Moment:
+        pose = found.pose.world_from_target if found.found else None
+        state = f"target {found.how}" if found.found else f"target not found: {found.pose.reason}"
+        latency = self.outlets[0].latencies.figures() if self.outlets else None
+        return Moment(number, pair.exposed_ns, pose, state, scan, distances, self._troubles(), latency)
+
+    def _troubles(self) -> tuple[str, ...]:
+        return tuple(feed.trouble for feed in self.feeds if feed.trouble is not None)
+
+    def _publish(self, moment: Moment) -> None:
+        for outlet in self.outlets:
+            outlet.newest.put(moment)

@@ -1,0 +1,110 @@
+"""What is published: a scene that stands still, and moments; and a thread a publisher, so that none waits for another."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from threading import Thread
+from time import monotonic_ns
+from typing import Protocol
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from recon.navigation.latencies import Latencies, Latency
+from recon.navigation.mass_distances import MassDistance
+from recon.navigation.newest import Newest
+from recon.navigation.placed_scans import PlacedScan
+
+Array = NDArray[np.float64]
+
+WAIT_S = 0.2  # for a moment, before looking whether to end
+
+
+@dataclass(frozen=True, eq=False)
+class StillScene:
+    """What is known before, in the world, but for the probe, which is in the target's frame."""
+
+    target_from_image: Array  # (4, 4), mm
+    skin: trimesh.Trimesh | None = None
+    masses: Mapping[str, trimesh.Trimesh] = field(default_factory=dict)
+    probe: trimesh.Trimesh | None = None
+    circles: trimesh.Trimesh | None = None  # of the target
+
+
+@dataclass(frozen=True)
+class Moment:
+    """All that is known at one pair of frames."""
+
+    number: int
+    exposed_ns: int  # monotonic time of the frames
+    world_from_target: Array | None  # (4, 4), mm; None where it isn't found
+    state: str  # of tracking: how it was found, or why it wasn't
+    scan: PlacedScan | None = None  # the newest, which may be that of an earlier moment
+    distances: tuple[MassDistance, ...] = ()  # of that B-scan
+    troubles: tuple[str, ...] = ()  # of devices, a line each
+    latency: Latency | None = None  # of the moments before
+
+    @property
+    def status(self) -> str:
+        """One line for whoever watches."""
+        parts = [self.state, *self.troubles]
+        if self.latency is not None:
+            figures = self.latency
+            parts.append(f"{figures.rate_hz:.0f} a second, {figures.median_ms:.0f} ms late, 99 % below {figures.high_ms:.0f} ms")
+        return "; ".join(parts)
+
+
+class Publisher(Protocol):
+    """Whatever shows or sends moments; used by one thread."""
+
+    name: str
+
+    def publish(self, moment: Moment) -> None:
+        """Show or send a moment."""
+
+    def close(self) -> None:
+        """End."""
+
+
+@dataclass
+class Outlet:
+    """Gives a publisher the newest moment whenever it is done with the last, from a thread of its own."""
+
+    publisher: Publisher
+    latencies: Latencies = field(default_factory=Latencies)  # from exposure to the end of `publish`
+    scans: Latencies = field(default_factory=Latencies)  # the same of each B-scan's first moment
+    newest: Newest[Moment] = field(default_factory=Newest)
+    _ended: bool = False
+    _thread: Thread | None = None
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread = Thread(target=self._run, name=f"to {self.publisher.name}", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, and close the publisher."""
+        self._ended = True
+        self.newest.close()
+        if self._thread is not None:
+            self._thread.join()
+        self.publisher.close()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it goes on."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def _run(self) -> None:
+        shown = None
+        while not self._ended:
+            moment = self.newest.take(WAIT_S)
+            if moment is None:
+                continue
+            self.publisher.publish(moment)
+            now = monotonic_ns()
+            if moment.world_from_target is not None:
+                self.latencies.add(moment.exposed_ns, now)
+            if moment.scan is not None and moment.scan is not shown:
+                shown = moment.scan
+                self.scans.add(moment.scan.taken_ns, now)

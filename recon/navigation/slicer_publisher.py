@@ -1,0 +1,88 @@
+"""Moments for 3D Slicer over OpenIGTLink: what it shows at once, without any setting.
+
+Slicer puts whatever comes into its own frame RAS, from which the world is half a turn: the same as of files declared LPS
+(`recon.freehand.sequences`). So everything is sent in RAS: the transforms of target and image, each B-scan with its pose, skin
+and masses as models, and a line of text.
+"""
+
+from time import monotonic_ns, time_ns
+from typing import Protocol
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from recon.freehand.sequences import RAS_FROM_LPS
+from recon.geometry import rigid
+from recon.navigation.placed_scans import PlacedScan
+from recon.navigation.publishing import Moment, StillScene
+
+Array = NDArray[np.float64]
+
+TARGET, PROBE = "TargetToRAS", "ProbeToRAS"
+SCAN, STATUS, SKIN, DISTANCES = "BScan", "Status", "Skin", "Distances"
+PROBE_BODY = "Probe"  # a model in the target's frame, to be put under its transform
+
+
+class Sender(Protocol):
+    """An OpenIGTLink server: gives each name's newest message to its clients, at once to those that connect later."""
+
+    def transform(self, name: str, ras_from_frame: Array, time_ns: int) -> None:
+        """Send a transform : (4, 4) mm; times in ns since 1970."""
+
+    def image(self, name: str, levels: NDArray[np.uint8], ras_from_index: Array, time_ns: int) -> None:
+        """Send an image : (h, w), and the matrix : (4, 4) that takes [u, v, 0, 1] of its pixels' centres to mm."""
+
+    def model(self, name: str, points: Array, triangles: NDArray[np.int64]) -> None:
+        """Send a surface of points : (n, 3) mm, and triangles : (m, 3)."""
+
+    def text(self, name: str, text: str, time_ns: int) -> None:
+        """Send a line of text."""
+
+    def close(self) -> None:
+        """End."""
+
+
+class SlicerPublisher:
+    """A publisher that sends moments to 3D Slicer."""
+
+    name = "OpenIGTLink"
+
+    def __init__(self, scene: StillScene, sender: Sender) -> None:
+        self._sender, self._scene = sender, scene
+        self._since_1970 = time_ns() - monotonic_ns()
+        self._sent: PlacedScan | None = None
+        self._status = ""
+        for name, mesh in ((SKIN, scene.skin), *((name.capitalize(), mesh) for name, mesh in scene.masses.items())):
+            if mesh is not None:
+                self._send_model(name, mesh, RAS_FROM_LPS)
+        if scene.probe is not None:
+            self._send_model(PROBE_BODY, scene.probe, np.eye(4))
+
+    def publish(self, moment: Moment) -> None:
+        """Send a moment; see `Publisher`. What hasn't changed isn't sent again."""
+        now = moment.exposed_ns + self._since_1970
+        if moment.world_from_target is not None:
+            ras_from_target = RAS_FROM_LPS @ moment.world_from_target
+            self._sender.transform(TARGET, ras_from_target, now)
+            self._sender.transform(PROBE, ras_from_target @ self._scene.target_from_image, now)
+        if moment.scan is not None and moment.scan is not self._sent:
+            self._sent = moment.scan
+            taken = moment.scan.taken_ns + self._since_1970
+            self._sender.image(SCAN, moment.scan.image, RAS_FROM_LPS @ moment.scan.world_from_pixel, taken)
+            self._sender.text(DISTANCES, distances_line(moment), taken)
+        if moment.status != self._status:
+            self._status = moment.status
+            self._sender.text(STATUS, self._status, now)
+
+    def close(self) -> None:
+        """End."""
+        self._sender.close()
+
+    def _send_model(self, name: str, mesh: trimesh.Trimesh, ras_from_mesh: Array) -> None:
+        self._sender.model(name, rigid.apply(ras_from_mesh, np.asarray(mesh.vertices)), np.asarray(mesh.faces, np.int64))
+
+
+def distances_line(moment: Moment) -> str:
+    """Distances of the B-scan's plane from the masses, as one line."""
+    return "; ".join(f"{each.name} {each.distance_mm:.1f} mm{', cut' * each.cut}" for each in moment.distances)

@@ -1,0 +1,46 @@
+"""The scene that stands still, from files: skin and masses, as coarse as a live picture needs them, and the probe as a body."""
+
+from pathlib import Path
+
+import trimesh
+
+from recon.fusion import fused_scene, probe_shape, skin
+from recon.model.probe import ProbeCalibration
+from recon.model.rig import Target
+from recon.navigation.publishing import StillScene
+from recon.segmentation import containment, mass_files
+
+STEP_MM = 2.0  # of the skin's vertices, which are merged to that: 20 000 triangles of a breast
+
+
+def read_scene(
+    skin_file: Path | None, masses: Path | None, target: Target, probe: ProbeCalibration, width: int, part_table: bool = True
+) -> StillScene:
+    """Read what is known beforehand.
+
+    Parameters
+    ----------
+    skin_file, masses : a surface as PLY, a folder of `sonotwin segment`
+    width : of the B-scans, px
+    part_table : leave out the plane that the skin stands on
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged, or the folder has no masses of `sonotwin segment`.
+    """
+    body, rings = probe_shape.of(target, probe, width)
+    found = {} if masses is None else mass_files.read_masses(masses)
+    return StillScene(
+        probe.target_from_image,
+        None if skin_file is None else _coarse(skin_file, part_table),
+        {name: mass.mesh for name, mass in found.items()},
+        body,
+        rings,
+    )
+
+
+def _coarse(path: Path, part_table: bool) -> trimesh.Trimesh:
+    whole = containment.read_skin(path)
+    parted = skin.by_plane(whole).skin if part_table else whole
+    return fused_scene.merged(whole if parted is None else parted, STEP_MM)

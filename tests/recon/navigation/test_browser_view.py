@@ -1,0 +1,160 @@
+"""The view: what it says of a moment, and a page that opens and shows the B-scan where it is."""
+
+import socket
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.navigation import browser_view
+from recon.navigation.browser_view import LOOPBACK, BrowserView
+from recon.navigation.latencies import Latency
+from recon.navigation.mass_distances import MassDistance, bodies_of, distances
+from recon.navigation.placed_scans import PlacedScan
+from recon.navigation.publishing import Moment, StillScene
+from tests.recon.navigation import headless_browser
+
+pytest.importorskip("viser")
+
+BALL = trimesh.creation.icosphere(3, 60.0).apply_translation([0, 0, 700])
+POSE = rigid.transform(np.eye(3), [0, 0, 640])
+SHAPE, MM_PER_PX = (120, 80), 0.5
+
+
+def free_port():
+    with socket.socket() as any_port:
+        any_port.bind((LOOPBACK, 0))
+        return any_port.getsockname()[1]
+
+
+def scan_of(image, world_from_pixel=None):
+    placed = np.diag([MM_PER_PX, MM_PER_PX, MM_PER_PX, 1]) if world_from_pixel is None else world_from_pixel
+    return PlacedScan(image, 1, 10**9, placed)
+
+
+def test_a_moment_in_words():
+    near = (
+        MassDistance("mass0", -1.26, 0.5, np.zeros((1, 2, 3)), True),
+        MassDistance("mass1", -3.0, 0.5, np.zeros((1, 2, 3)), False),
+        MassDistance("mass2", 12.34, -20, np.empty((0, 2, 3)), False),
+    )
+    scan = scan_of(np.zeros(SHAPE, np.uint8))
+    words = browser_view.words_of(Moment(4, 0, POSE, "target predicted", scan, near, ("us: silent",), Latency(31.4, 58.0, 24.9)))
+    for line in (
+        "**Tracking:** target predicted",
+        "**Device:** us: silent",
+        "**From exposure to published pose:** 31 ms, 99 % below 58 ms",
+        "| mass0 | -1.3 | cut, in the image |",
+        "| mass1 | -3.0 | cut beside the image |",
+        "| mass2 | 12.3 |  |",
+    ):
+        assert line in words.splitlines()
+    lost = browser_view.words_of(Moment(5, 0, None, "target not found: camera 1: 2 of 3 circles"))
+    assert lost.splitlines()[0] == "**Not tracking:** target not found: camera 1: 2 of 3 circles"
+    assert "**B-scan:** none in place" in lost
+
+
+def test_directions_become_a_quaternion(rng):
+    turn = Rotation.random(random_state=rng)
+    matrix = rigid.transform(turn.as_matrix(), [1, 2, 3]) @ np.diag([0.12, 0.15, 0.13, 1])
+    x, y, z, w = turn.as_quat()
+    found = browser_view.turn_of(matrix)
+    np.testing.assert_allclose(found * np.sign(found[0]), np.array([w, x, y, z]) * np.sign(w), atol=1e-12)
+
+
+def test_a_mass_is_outlined_where_the_plane_cuts_it():
+    """A ball about the image's pixel (30, 70), of 20 px."""
+    ball = trimesh.creation.icosphere(4, 20 * MM_PER_PX).apply_translation([30 * MM_PER_PX, 70 * MM_PER_PX, 0.1])
+    scan = scan_of(np.full(SHAPE, 90, np.uint8))
+    picture = browser_view.outlined(scan, distances(bodies_of({"ball": ball}), scan))
+    v, u = np.nonzero((picture != 90).any(axis=-1))
+    away = np.hypot(u - 30, v - 70)
+    assert len(u) > 100 and (np.abs(away - 20) < 2.5).all()
+    assert (scan.image == 90).all(), "drawn into a copy"
+
+
+def test_a_taken_port_is_refused_in_one_line():
+    with socket.socket() as other:
+        other.bind((LOOPBACK, 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(InputError, match=f"view: expected to listen on 127.0.0.1:{port}, found it refused"):
+            BrowserView(StillScene(np.eye(4)), port)
+
+
+def test_it_listens_on_this_computer_alone():
+    view = BrowserView(StillScene(np.eye(4)), free_port())
+    try:
+        listening = {address for address in ("127.0.0.1", "127.0.0.2") if reached(address, view._server.get_port())}
+    finally:
+        view.close()
+    assert listening == {"127.0.0.1"}
+
+
+def reached(address, port):
+    with socket.socket() as client:
+        return client.connect_ex((address, port)) == 0
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_b_scan_in_place(tmp_path):
+    """One corner of the image is white: on the page it is where a camera of the view's own place and field sees that corner."""
+    image = np.full(SHAPE, 40, np.uint8)
+    image[:24, :24] = 255
+    turn = upright() @ Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    middle = np.array([0.0, 0.0, 700.0])
+    half = MM_PER_PX * (np.array(SHAPE[::-1]) - 1) / 2
+    placed = rigid.transform(turn, middle - turn[:, :2] @ half) @ np.diag([MM_PER_PX, MM_PER_PX, MM_PER_PX, 1])
+    view = BrowserView(StillScene(np.eye(4), masses={"mass0": BALL}), free_port())
+    view._server.scene.remove_by_name("/masses/mass0")  # it only sets where one looks from
+    try:
+        with headless_browser.opened(view.address, tmp_path / "profile") as page:
+            page.until(lambda page: "waiting for the first frames" in (page.run("document.body.innerText") or ""))
+            view.publish(Moment(1, 0, None, "target not found", scan_of(image, placed), (), (), Latency(30, 50, 25)))
+            page.until(lambda page: "99 % below 50 ms" in page.run("document.body.innerText"))
+            shot = page.until(seen)
+            cv2.imwrite(str(tmp_path / "page.png"), shot)
+            height, width = shot.shape[:2]
+            drawn = page.run("[...document.querySelectorAll('canvas')].map(each => each.width + ' ' + each.height).join()")
+            assert page.complaints == []
+            assert all(address.startswith(view.address) for address in page.fetched), "a hospital's PC may have no network"
+    finally:
+        view.close()
+    assert f"{width} {height}" in drawn.split(",")
+    corner = placed[:3, :3] @ [12, 12, 0] + placed[:3, 3]
+    expected = on_screen(corner, middle, np.linalg.norm(np.ptp(BALL.bounds, axis=0)) / 2, (width, height))
+    v, u = np.nonzero(white_of_scene(shot))
+    assert np.hypot(u.mean() - expected[0], v.mean() - expected[1]) < 6
+
+
+def upright():
+    """Directions of a camera at the view's place : columns across, down and ahead; y of the world is down."""
+    ahead = -browser_view.ASIDE
+    across = np.cross([0, 1, 0], ahead)
+    across /= np.linalg.norm(across)
+    return np.column_stack([across, np.cross(ahead, across), ahead])
+
+
+def on_screen(point, middle, radius, size):
+    """Pixel of a point, seen from the view's place."""
+    x, y, z = upright().T @ (point - (middle + browser_view.DISTANCE * radius * browser_view.ASIDE))
+    scale = size[1] / 2 / np.tan(browser_view.FIELD_RAD / 2)
+    return np.array(size) / 2 + scale * np.array([x, y]) / z
+
+
+def white_of_scene(shot):
+    """White pixels left of the panel, below the browser's own note on its graphics."""
+    white = (shot > 200).all(axis=-1)
+    white[:200, :330] = False
+    white[:, 660:] = False
+    return white
+
+
+def seen(page):
+    """A picture with the white corner in it, or None."""
+    shot = page.picture()
+    return shot if white_of_scene(shot).sum() > 200 else None

@@ -1,0 +1,32 @@
+"""The newest wins: a slow reader never sees what a newer thing has replaced."""
+
+from threading import Thread
+from time import monotonic, sleep
+
+from recon.navigation.newest import Newest
+
+
+def test_a_slow_reader_takes_the_newest_of_all_that_came():
+    place = Newest()
+    for k in range(100):
+        place.put(k)
+    assert place.take(0.1) == 99
+    assert place.replaced == 99
+    assert place.take(0.0) is None
+
+
+def test_a_reader_waits_for_what_comes_and_no_longer_than_it_said():
+    place = Newest()
+    Thread(target=lambda: (sleep(0.05), place.put("now"))).start()
+    assert place.take(5.0) == "now"
+    start = monotonic()
+    assert place.take(0.05) is None
+    assert 0.05 <= monotonic() - start < 2.0
+
+
+def test_an_end_wakes_who_waits():
+    place = Newest()
+    Thread(target=lambda: (sleep(0.05), place.close())).start()
+    start = monotonic()
+    assert place.take(60.0) is None
+    assert monotonic() - start < 5.0

@@ -1,0 +1,98 @@
+"""What 3D Slicer gets lies in its frame where the files that we write for it lie."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from recon.freehand import sequences
+from recon.geometry import rigid
+from recon.navigation import slicer_publisher
+from recon.navigation.mass_distances import MassDistance
+from recon.navigation.placed_scans import PlacedScan
+from recon.navigation.publishing import Moment, StillScene
+from recon.navigation.slicer_publisher import SlicerPublisher
+from tests.recon import probe_motions
+
+POSE = rigid.from_rotation_vector([2.8, 0.3, -0.4], [30, -12, 655])
+
+
+class Sent:
+    """A sender that keeps all that it is given, by kind and name."""
+
+    def __init__(self):
+        self.messages, self.closed = [], False
+
+    def transform(self, name, ras_from_frame, time_ns):
+        self.messages.append(("transform", name, ras_from_frame, time_ns))
+
+    def image(self, name, levels, ras_from_index, time_ns):
+        self.messages.append(("image", name, (levels, ras_from_index), time_ns))
+
+    def model(self, name, points, triangles):
+        self.messages.append(("model", name, (points, triangles), 0))
+
+    def text(self, name, text, time_ns):
+        self.messages.append(("text", name, text, time_ns))
+
+    def close(self):
+        self.closed = True
+
+    def of(self, name):
+        return [message[2] for message in self.messages if message[1] == name]
+
+
+@pytest.fixture
+def scene(rig):
+    probe = probe_motions.true_probe(rig)
+    ball = trimesh.creation.icosphere(1, 5.0).apply_translation([1, 2, 700])
+    return StillScene(probe.target_from_image, ball, {"mass0": ball}, ball)
+
+
+def moment_of(probe, number=1):
+    image = np.arange(20, dtype=np.uint8).reshape(4, 5)
+    scan = PlacedScan(image, number, 10**9, POSE @ sequences.target_from_pixel(probe))
+    distance = MassDistance("mass0", -1.25, 3.0, np.empty((0, 2, 3)), True)
+    return Moment(number, 10**9, POSE, "target predicted", scan, (distance,))
+
+
+def test_images_and_transforms_lie_where_a_sequence_of_ours_lies(rig, scene):
+    probe, sent = probe_motions.true_probe(rig), Sent()
+    moment = moment_of(probe)
+    SlicerPublisher(scene, sent).publish(moment)
+    written = sequences.sequence_of(moment.scan.image[None], POSE[None], probe, [0.0])
+    levels, ras_from_index = sent.of(slicer_publisher.SCAN)[0]
+    np.testing.assert_allclose(ras_from_index, written.transforms["ImageToPhysical"][0], atol=1e-12)
+    np.testing.assert_array_equal(levels, moment.scan.image)
+    (ras_from_target,), (ras_from_image,) = sent.of(slicer_publisher.TARGET), sent.of(slicer_publisher.PROBE)
+    np.testing.assert_allclose(ras_from_target, written.transforms["ReferenceToRAS"][0] @ POSE, atol=1e-12)
+    corner = rigid.apply(ras_from_image, [4 * probe.scale[0], 3 * probe.scale[1], 0])
+    np.testing.assert_allclose(corner, rigid.apply(ras_from_index, [4, 3, 0]), atol=1e-9)
+
+
+def test_models_lie_in_the_same_frame_and_the_probe_in_the_targets(scene):
+    sent = Sent()
+    SlicerPublisher(scene, sent)
+    for name, expected in (("Skin", [-1, -2, 700]), ("Mass0", [-1, -2, 700]), ("Probe", [1, 2, 700])):
+        ((points, triangles),) = sent.of(name)
+        np.testing.assert_allclose(points.mean(axis=0), expected, atol=1e-9)
+        assert triangles.max() == len(points) - 1
+
+
+def test_what_has_not_changed_is_not_sent_again(rig, scene):
+    sent = Sent()
+    publisher, moment = SlicerPublisher(scene, sent), moment_of(probe_motions.true_probe(rig))
+    for _ in range(3):
+        publisher.publish(moment)
+    assert len(sent.of(slicer_publisher.TARGET)) == 3
+    assert len(sent.of(slicer_publisher.SCAN)) == 1
+    assert sent.of(slicer_publisher.STATUS) == ["target predicted"]
+    assert sent.of(slicer_publisher.DISTANCES) == ["mass0 -1.2 mm, cut"]
+    publisher.close()
+    assert sent.closed
+
+
+def test_a_lost_target_sends_no_pose_but_says_why(scene):
+    sent = Sent()
+    SlicerPublisher(scene, sent).publish(Moment(1, 5, None, "target not found", troubles=("cam2: unplugged",)))
+    assert not sent.of(slicer_publisher.TARGET) and not sent.of(slicer_publisher.SCAN)
+    assert sent.of(slicer_publisher.STATUS) == ["target not found; cam2: unplugged"]
