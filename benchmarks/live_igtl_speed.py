@@ -54,13 +54,18 @@ def to_pyigtl() -> list[Row]:
             pose, levels, time_ns = drawn(rng)
             server.publish(Message(f"Probe{k}ToWorld", Transform(pose), time_ns))
             server.publish(Message(f"Image{k}", Image(levels, np.eye(4)), time_ns))
-            transform, image = client.wait_for_message(f"Probe{k}ToWorld", WAIT_S), client.wait_for_message(f"Image{k}", WAIT_S)
+            transform, image = (wait(client, name) for name in (f"Probe{k}ToWorld", f"Image{k}"))
             errors.append(off(transform.matrix, pose))
             late += [abs(one.timestamp - time_ns / 1e9) for one in (transform, image)]
             wrong += not np.array_equal(image.image[0], levels)
         client.stop()
         server.close()
     return rows("our server to pyigtl's client", errors, wrong, late)
+
+
+def wait(client: Any, name: str) -> Any:
+    """The next message of a name."""
+    return client.wait_for_message(name, WAIT_S)
 
 
 def from_pyigtl() -> list[Row]:

@@ -13,7 +13,7 @@ from recon.devices import igtl_header, igtl_messages
 from recon.devices.igtl_header import MOST_BODY_BYTES, Header
 from recon.devices.igtl_messages import Message
 from recon.devices.igtl_server import LOOPBACK, PORT
-from recon.devices.igtl_stream import Complaints, Pace, Splitter, any_kind
+from recon.devices.igtl_stream import Complaints, Pace, Splitter, any_kind, checked_port
 from recon.devices.interfaces import DeviceError
 from recon.errors import InputError
 
@@ -55,13 +55,19 @@ class Client:
         first : messages that are sent at each connection, such as queries for a stream
         most_bytes : of a body; who announces more is given up
         check : whether checksums must be right; some senders write none
+
+        Raises
+        ------
+        DeviceError
+            If the port is none.
         """
         self.name = f"OpenIGTLink {host}:{port}"
         self.state = "not connected yet"
         self.connected = False
+        self.fault = ""  # of the last message or connection that was bad
         self.lost = 0  # messages that nobody has fetched in time
         self._seen: dict[str, None] = {}  # names of what came, in order
-        self._address = (host, port)
+        self._address = (host, checked_port(port))
         self._splitter = lambda: Splitter(self._wants, most_bytes, check)
         self._wanted, self._first = wanted, first
         self._waiting: deque[tuple[Received, int]] = deque()  # messages and their sizes
@@ -97,8 +103,8 @@ class Client:
         while not self._ends.is_set():
             try:
                 self._listen(complaints)
-            except (OSError, InputError) as error:
-                self.state = str(error) if isinstance(error, InputError) else error.strerror or str(error)
+            except (OSError, UnicodeError, InputError) as error:  # the second of a host's name that is none
+                self.state = self.fault = getattr(error, "strerror", None) or str(error)
                 complaints.add(f"{self.state}; connecting again")
             if self.connected:
                 self.connected = False
@@ -126,6 +132,7 @@ class Client:
         arrived_ns = time.monotonic_ns()
         for found, size in splitter.feed(data):
             if isinstance(found, InputError):
+                self.fault = str(found)
                 complaints.add(found)
             else:
                 self._put(found, arrived_ns, size)

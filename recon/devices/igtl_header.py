@@ -74,7 +74,8 @@ def read_header(data: bytes, most_bytes: int = MOST_BODY_BYTES) -> Header:
 def checked(header: Header, body: bytes) -> bytes:
     """The body, if it is the one that the header was written for; InputError if not."""
     if (found := crc64(body)) != header.checksum:
-        raise InputError(f"{header.name}: expected the checksum {header.checksum:016x}, found {found:016x}: a damaged message")
+        cause = "a damaged message" if header.checksum else "a sender without checksums? give check=False"
+        raise InputError(f"{header.name}: expected the checksum {header.checksum:016x}, found {found:016x}: {cause}")
     return body
 
 

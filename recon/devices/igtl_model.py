@@ -11,7 +11,7 @@ from recon.devices import igtl_header
 from recon.errors import InputError
 
 HEAD = struct.Struct(">10I")  # points; number and bytes of vertices, lines, polygons and strips; attributes
-MOST_CELLS = 1_000_000  # other than triangles, which are read one by one
+MOST_CELLS = 100_000  # other than triangles, which are read one by one
 
 
 @dataclass(frozen=True)

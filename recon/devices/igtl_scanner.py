@@ -34,12 +34,14 @@ class IgtlScanner:
         device: str | None = None,
         view: ScanView | None = None,
         bits: int = 8,
+        check: bool = True,
         first_s: float = FIRST_S,
     ) -> None:
         """Connect, and wait for an image.
 
         device : name of the images, such as Image or Image_Reference; None takes those of the first that comes
         bits : of grey levels that come as 16-bit numbers; the upper eight are taken
+        check : whether checksums must be right
 
         Raises
         ------
@@ -49,7 +51,7 @@ class IgtlScanner:
         if not PRESENT[0] <= bits <= PRESENT[1]:
             raise DeviceError(f"scanner {name}: bits: expected {PRESENT[0]} to {PRESENT[1]}, found {bits}")
         self.name, self._device, self._view, self._bits = name, device, view or ScanView(), bits
-        self._client = Client(host, port, self._is_ours)
+        self._client = Client(host, port, self._is_ours, check=check)
         first = self._client.receive(first_s)
         if first is None:
             fault = self._fault(f"an image within {first_s:g} s", self._instead())
@@ -112,8 +114,8 @@ class IgtlScanner:
         return plain if plain.ndim == 2 else np.asarray(cv2.cvtColor(plain[..., :3].copy(), cv2.COLOR_RGB2GRAY), np.uint8)
 
     def _instead(self) -> str:
-        if not self._client.connected:
-            return f"{self._client.state}: is the source running, and on this port?"
+        if fault := self._client.fault:
+            return f"{fault}: is the source running, and on this port?"
         seen = self._client.seen
         if not seen:
             return "nothing: is the source sending?"

@@ -18,9 +18,9 @@ from contextlib import suppress
 from recon.devices import igtl_header, igtl_messages
 from recon.devices.igtl_header import Header
 from recon.devices.igtl_messages import Message, Raw, Status
-from recon.devices.igtl_stream import Complaints, Pace, Splitter
+from recon.devices.igtl_stream import Complaints, Pace, Splitter, checked_port
 from recon.devices.interfaces import DeviceError
-from recon.errors import InputError
+from recon.errors import InputError, reason
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ class Server:
         self._newest: dict[Key, bytes] = {}
         self._clients: list[_Client] = []
         self._lock = threading.Lock()  # over the two above
-        self._ends = False
+        self._ends = threading.Event()
         self._listener = _listener(host, port)
         self.port: int = self._listener.getsockname()[1]
         igtl_header.crc64(b"")  # is compiled now, not within the first message
@@ -67,8 +67,7 @@ class Server:
     def clients(self) -> int:
         """Number of clients that are connected."""
         with self._lock:
-            self._clients = [client for client in self._clients if client.connected]
-            return len(self._clients)
+            return len(self._connected())
 
     def publish(self, message: Message) -> None:
         """Send a message to all clients, in place of an older one of its name that they haven't got yet; returns at once.
@@ -83,24 +82,34 @@ class Server:
             if key not in self._newest and len(self._newest) >= MOST_NAMES:
                 raise InputError(f"OpenIGTLink: {key[0]} of {key[1]!r}: expected at most {MOST_NAMES} names, found one more")
             self._newest[key] = data
-            for client in self._clients:
+            for client in self._connected():
                 client.put({key: data})
 
     def close(self) -> None:
         """Drop all clients and listen no more."""
-        self._ends = True
+        self._ends.set()
         self._thread.join()
         with self._lock:
             clients, self._clients = self._clients, []
         for client in clients:
             client.close()
 
+    def _connected(self) -> "list[_Client]":
+        """Clients that aren't gone; of the others nothing is kept. To be called with the lock."""
+        self._clients = [client for client in self._clients if client.connected]
+        return self._clients
+
     def _accept_all(self) -> None:
         """The loop of the server's thread."""
         with self._listener as listener:
-            while not self._ends:
-                with suppress(TimeoutError, ConnectionError):
+            while not self._ends.is_set():
+                try:
                     self._accept(*listener.accept())
+                except TimeoutError:
+                    continue
+                except OSError as error:  # gone again, or this process has no more files
+                    log.warning("OpenIGTLink server %d: a client couldn't connect: %s", self.port, error.strerror)
+                    self._ends.wait(LOOK_S)
 
     def _accept(self, connection: socket.socket, address: tuple) -> None:
         name = f"OpenIGTLink client {address[0]}:{address[1]}"
@@ -215,12 +224,12 @@ def _is_query(header: Header) -> bool:
 def _listener(host: str, port: int) -> socket.socket:
     """A socket that listens."""
     try:
-        listener = socket.create_server((host, port))
-    except OSError as error:
-        cause = "another server, such as PlusServer, uses it; give another port" if error.errno == errno.EADDRINUSE else ""
-        fault = f"OpenIGTLink server {host}:{port}: expected a free port of this computer, found: {error.strerror}"
-        raise DeviceError(f"{fault}; {cause}" if cause else fault) from None
+        listener = socket.create_server((host, checked_port(port, least=0)))
+    except (OSError, UnicodeError) as error:  # the second of a host's name that is none
+        used = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
+        found = "one that another server uses, such as PlusServer; give another port" if used else reason(error)
+        raise DeviceError(f"OpenIGTLink server {host}:{port}: expected a free port of this computer, found {found}") from None
     listener.settimeout(LOOK_S)
-    if host != LOOPBACK:
+    if not listener.getsockname()[0].startswith("127."):
         log.warning("OpenIGTLink server %s:%d: anybody who reaches this computer can read what is published", host, port)
     return listener

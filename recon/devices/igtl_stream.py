@@ -9,8 +9,10 @@ from typing import NamedTuple
 from recon.devices import igtl_header, igtl_messages
 from recon.devices.igtl_header import HEADER, MOST_BODY_BYTES, Header
 from recon.devices.igtl_messages import Message
+from recon.devices.interfaces import DeviceError
 from recon.errors import InputError
 
+MOST_PORT = 65535
 MOST_MESSAGES_S = 2000  # of a peer: twenty times what a rig sends
 MOST_BYTES_S = 512 << 20  # of a peer
 MOST_BAD = 10  # damaged messages one after the other, after which the peer is given up
@@ -20,6 +22,13 @@ SILENT_S = 30.0  # after a line about a peer, in which it gets no other
 def any_kind(header: Header) -> bool:
     """Whether a message is wanted: each one is."""
     return True
+
+
+def checked_port(port: int, least: int = 1) -> int:
+    """A port's number, if it is one; DeviceError if not."""
+    if not least <= port <= MOST_PORT:
+        raise DeviceError(f"OpenIGTLink: port: expected {least} to {MOST_PORT}, found {port}")
+    return port
 
 
 class Arrival(NamedTuple):

@@ -14,6 +14,7 @@ from recon.devices import igtl_client, igtl_header, igtl_messages
 from recon.devices.igtl_client import Client
 from recon.devices.igtl_messages import Message, Raw, Text, Transform
 from recon.devices.igtl_server import Server
+from recon.devices.interfaces import DeviceError
 from tests.recon.devices.igtl_peers import TIME_NS, plus_frame, plus_image, pose, served
 
 WAIT_S = 10.0
@@ -160,6 +161,18 @@ def test_a_stream_is_asked_for_at_each_connection():
         kinds = {receive(ours).kind, receive(ours).kind}
     server.close()
     assert kinds == {"TRANSFORM", "RTS_TRANS"}
+
+
+@pytest.mark.parametrize("host", ["nowhere.invalid", "a" * 70, "127.0.0.1\0"])
+def test_hosts_that_are_none_are_named(host):
+    with client(18944, host=host) as ours:
+        assert ours.receive(0.3) is None
+        assert len(ours.state.splitlines()) == 1 and ours._thread.is_alive()
+
+
+def test_ports_that_are_none_are_refused():
+    with pytest.raises(DeviceError, match="port: expected 1 to 65535, found 70000"):
+        Client(port=70000)
 
 
 def test_a_place_without_a_server_is_named():

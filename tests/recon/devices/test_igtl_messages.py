@@ -74,6 +74,11 @@ def test_tools_with_quaternions_are_the_same_tools():
     np.testing.assert_allclose(found.tracker_from_tool[0, :3, 1], [0, 0, 1], atol=1e-6)  # y goes to z
 
 
+def test_a_million_tools_are_refused_before_they_take_memory():
+    with pytest.raises(InputError, match="at most 10000 records of 70 bytes"):
+        unpacked("TDATA", bytes(70 * 10_001))
+
+
 def test_an_empty_body_says_that_there_is_nothing():
     assert unpacked("TRANSFORM", b"") == Raw("TRANSFORM")
 

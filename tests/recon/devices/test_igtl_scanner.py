@@ -116,6 +116,17 @@ def test_what_gives_no_images_is_named(server, content, fields, match):
     assert len(str(caught.value).splitlines()) == 1
 
 
+def test_senders_without_checksums_are_named_and_read_on_demand():
+    data = bytearray(plus_image(np.full((3, 4), 5, np.uint8)))
+    data[50:58] = bytes(8)
+    with served(bytes(data) * 2) as (port, _):
+        with pytest.raises(DeviceError, match=r"a sender without checksums\? give check=False"):
+            IgtlScanner("us", port=port, first_s=0.3)
+        scanner = IgtlScanner("us", port=port, check=False)
+        assert (frame(scanner).image == 5).all()
+        scanner.close()
+
+
 def test_a_lost_scanner_is_named_and_comes_back(server, monkeypatch):
     monkeypatch.setattr(igtl_client, "AGAIN_S", 0.05)
     image = np.zeros((4, 5), np.uint8)

@@ -187,6 +187,26 @@ def test_a_used_port_is_named(server):
         Server(port=server.port)
 
 
+@pytest.mark.parametrize("host", ["203.0.113.7", "a" * 70])  # an address for documentation, which is nobody's
+def test_addresses_of_others_are_named(host):
+    with pytest.raises(DeviceError, match="expected a free port of this computer, found") as caught:
+        Server(host, port=0)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_an_open_address_is_told(caplog):
+    Server("0.0.0.0", port=0).close()
+    assert "anybody who reaches this computer can read" in caplog.text
+
+
+def test_gone_clients_hold_nothing(server):
+    connection = connected(server)
+    connection.close()
+    assert until(lambda: server.clients == 0)
+    server.publish(Message("State", Text("to nobody")))
+    assert not server._clients
+
+
 def test_names_are_bounded(server, monkeypatch):
     monkeypatch.setattr(igtl_server, "MOST_NAMES", 2)
     server.publish(Message("a", Text("")))
