@@ -46,8 +46,8 @@ class Soak:
 
     def tenth(self, which: int) -> np.ndarray:
         """Medians over a tenth of the run."""
-        size = max(len(self.held) // 10, 1)
-        return np.median(self.held[which * size : (which + 1) * size], axis=0)
+        begin, end = which * len(self.held) // 10, (which + 1) * len(self.held) // 10
+        return np.median(self.held[begin : max(end, begin + 1)], axis=0)
 
     @property
     def growth_mb(self) -> float:
@@ -86,7 +86,7 @@ def run(seconds: float, rate_hz: float) -> Soak:
         time.sleep(1 / rate_hz)  # no burst makes up for a late one
         _publish(server, images[count % len(images)], count)
         count += 1
-        if count % round(rate_hz) == 0:
+        if time.monotonic() - begun > len(held):  # each second
             server.publish(Message("Skin", model))
             _come_badly(server.port)
             held.append(_held(time.monotonic() - begun))

@@ -133,7 +133,7 @@ class Client:
         for found, size in splitter.feed(data):
             if isinstance(found, InputError):
                 self.fault = str(found)
-                complaints.add(found)
+                complaints.add(self.fault)
             else:
                 self._put(found, arrived_ns, size)
         if pause := pace.pause(splitter.count, len(data)):

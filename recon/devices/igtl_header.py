@@ -124,7 +124,7 @@ def fixed_point(time_ns: int | None) -> int:
     if not 0 <= time_ns < LAST_SECOND * SECOND:
         raise InputError(f"OpenIGTLink: expected a time of 1970 to 2106, found {time_ns} ns since 1970")
     seconds, rest = divmod(time_ns, SECOND)
-    return (seconds << 32) + ((rest << 32) + SECOND // 2) // SECOND  # one of 4.3e9 parts is shorter than 1 ns: it reads back
+    return (seconds << 32) + (rest << 32) // SECOND  # one of 4.3e9 parts is shorter than 1 ns: it reads back
 
 
 def nanoseconds(time: int) -> int:

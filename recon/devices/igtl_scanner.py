@@ -114,13 +114,11 @@ class IgtlScanner:
         return plain if plain.ndim == 2 else np.asarray(cv2.cvtColor(plain[..., :3].copy(), cv2.COLOR_RGB2GRAY), np.uint8)
 
     def _instead(self) -> str:
-        if fault := self._client.fault:
-            return f"{fault}: is the source running, and on this port?"
-        seen = self._client.seen
+        seen, fault = self._client.seen, self._client.fault
         if not seen:
-            return "nothing: is the source sending?"
-        hint = "; let the source send IMAGE" if not any(name.startswith("IMAGE") for name in seen) else "; give device=..."
-        return short(", ".join(seen), 200) + hint
+            return f"{fault or 'nothing'}: is the source running and sending, on this port?"
+        others = "give device=..." if any(name.startswith("IMAGE") for name in seen) else "let the source send IMAGE"
+        return f"{short(', '.join(seen), 200)}; {fault or others}"
 
     def _fault(self, expected: str, found: str) -> DeviceError:
         device = f" {short(self._device)!r}" if self._device else ""

@@ -32,6 +32,7 @@ STALLED_S = 30.0  # for one message, after which a client that takes nothing is 
 UNSENT_BYTES = 1 << 18  # in the system's memory: what lies there is no longer the newest
 PIECE = 1 << 16  # bytes that are read at once
 LOOK_S = 0.5  # between two looks at whether to end
+MOST_QUERY_BYTES = 1 << 16
 QUERIES = ("GET_", "STT_", "STP_")
 
 Key = tuple[str, str]  # kind and device
@@ -59,6 +60,7 @@ class Server:
         self._ends = threading.Event()
         self._listener = _listener(host, port)
         self.port: int = self._listener.getsockname()[1]
+        self._complaints = Complaints(log, f"OpenIGTLink server {host}:{self.port}")
         igtl_header.crc64(b"")  # is compiled now, not within the first message
         self._thread = threading.Thread(target=self._accept_all, name="OpenIGTLink server", daemon=True)
         self._thread.start()
@@ -108,17 +110,17 @@ class Server:
                 except TimeoutError:
                     continue
                 except OSError as error:  # gone again, or this process has no more files
-                    log.warning("OpenIGTLink server %d: a client couldn't connect: %s", self.port, error.strerror)
+                    self._complaints.add(f"a client couldn't connect: {error.strerror}")
                     self._ends.wait(LOOK_S)
 
     def _accept(self, connection: socket.socket, address: tuple) -> None:
-        name = f"OpenIGTLink client {address[0]}:{address[1]}"
+        name = f"client {address[0]}:{address[1]}"
         if self.clients >= MOST_CLIENTS:
-            log.warning("%s: refused: %d others are connected", name, MOST_CLIENTS)
+            self._complaints.add(f"{name} is refused: {MOST_CLIENTS} others are connected")
             connection.close()
             return
         with self._lock:
-            self._clients.append(_Client(connection, name, self._newest, self._answer))
+            self._clients.append(_Client(connection, name, self._newest, self._answer, self._complaints))
 
     def _answer(self, query: Message) -> Mapping[Key, bytes]:
         """Answer GET_ by the newest message, and STT_ and STP_ by whether there are messages of that kind: they come anyway."""
@@ -143,16 +145,17 @@ class Server:
 class _Client:
     """A connection: a thread that sends what waits, and one that reads queries."""
 
-    def __init__(self, connection: socket.socket, name: str, first: Mapping[Key, bytes], answer: Answer) -> None:
+    def __init__(
+        self, connection: socket.socket, name: str, first: Mapping[Key, bytes], answer: Answer, complaints: Complaints
+    ) -> None:
         connection.settimeout(STALLED_S)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, UNSENT_BYTES)
-        self._connection, self._answer = connection, answer
-        self._complaints = Complaints(log, name)
+        self._connection, self._name, self._answer, self._complaints = connection, name, answer, complaints
         self._waiting = dict(first)
         self._change = threading.Condition()  # of the two beside it
         self.connected = True
-        log.info("%s: connected", name)
+        log.info("OpenIGTLink %s: connected", name)
         for loop in (self._send_all, self._read_all):
             threading.Thread(target=loop, name=name, daemon=True).start()
 
@@ -162,15 +165,15 @@ class _Client:
             self._waiting.update(messages)
             self._change.notify()
 
-    def close(self, reason: str = "") -> None:
-        """End the connection, and say why if there is a reason."""
+    def close(self, fault: str = "") -> None:
+        """End the connection, and say why if the client is at fault."""
         with self._change:
             if not self.connected:
                 return
             self.connected = False
             self._change.notify()
-        if reason:
-            self._complaints.add(f"dropped: {reason}")
+        if fault:
+            self._complaints.add(f"{self._name} is dropped: {fault}")
         with suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)  # wakes the other thread
         self._connection.close()
@@ -211,14 +214,16 @@ class _Client:
             return
         for query, _ in splitter.feed(data):
             if isinstance(query, InputError):
-                self._complaints.add(query)
+                self._complaints.add(f"{self._name}: {query}")
             else:
                 self.put(self._answer(query))
+        if len(self._waiting) > 2 * MOST_NAMES:
+            raise InputError(f"expected a client that takes its answers, found {len(self._waiting)} that wait")
         time.sleep(pace.pause(splitter.count, len(data)))
 
 
 def _is_query(header: Header) -> bool:
-    return header.kind.startswith(QUERIES)
+    return header.kind.startswith(QUERIES) and header.size <= MOST_QUERY_BYTES
 
 
 def _listener(host: str, port: int) -> socket.socket:

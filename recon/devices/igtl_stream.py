@@ -16,7 +16,8 @@ MOST_PORT = 65535
 MOST_MESSAGES_S = 2000  # of a peer: twenty times what a rig sends
 MOST_BYTES_S = 512 << 20  # of a peer
 MOST_BAD = 10  # damaged messages one after the other, after which the peer is given up
-SILENT_S = 30.0  # after a line about a peer, in which it gets no other
+SILENT_S = 30.0  # in which nothing is said twice
+MOST_LINES = 10  # in that time
 
 
 def any_kind(header: Header) -> bool:
@@ -120,17 +121,20 @@ class Pace:
 
 
 class Complaints:
-    """Lines about one peer, so few that they fill no disk."""
+    """Lines about peers, so few that they fill no disk: in half a minute each text once, and ten at most."""
 
-    def __init__(self, log: Logger, peer: str) -> None:
-        self._log, self._peer = log, peer
-        self._last, self._left_out = -SILENT_S, 0
+    def __init__(self, log: Logger, name: str) -> None:
+        self._log, self._name = log, name
+        self._begun, self._said, self._left_out = -SILENT_S, set[str](), 0
 
-    def add(self, text: object) -> None:
-        """Log a line, unless the last one was just before."""
-        if time.monotonic() - self._last < SILENT_S:
+    def add(self, text: str) -> None:
+        """Log a line, unless there were enough just before."""
+        if time.monotonic() - self._begun >= SILENT_S:
+            self._begun, self._said = time.monotonic(), set()
+        if text in self._said or len(self._said) >= MOST_LINES:
             self._left_out += 1
             return
-        more = f" ({self._left_out} more since the last line)" if self._left_out else ""
-        self._log.warning("%s: %s%s", self._peer, text, more)
-        self._last, self._left_out = time.monotonic(), 0
+        more = f" ({self._left_out} more such lines)" if self._left_out else ""
+        self._log.warning("%s: %s%s", self._name, text, more)
+        self._said.add(text)
+        self._left_out = 0

@@ -93,7 +93,7 @@ def test_a_source_that_comes_back_is_connected_to_again(caplog, monkeypatch):
         second.close()
     assert (before.message.content, after.message.content) == (Text("before"), Text("after"))
     assert after.number == before.number + 2  # a gap
-    assert len(caplog.records) == 1  # of one that stays away, a line each half a minute
+    assert 1 <= len(caplog.records) <= 2  # that it has gone, and that it stays away
 
 
 @pytest.mark.parametrize(

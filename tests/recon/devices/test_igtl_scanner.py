@@ -95,10 +95,19 @@ def test_the_first_stream_of_several_is_kept(server):
     scanner.close()
 
 
+def test_images_of_others_that_came_with_the_first_are_left_out():
+    pieces = [(b"Image", 1), (b"Doppler", 2), (b"Image", 3)]
+    data = b"".join(plus_image(np.full((3, 4), level, np.uint8), device) for device, level in pieces)
+    with served(data) as (port, _):
+        scanner = IgtlScanner("us", port=port)
+        assert (frame(scanner).image == 3).all()
+        scanner.close()
+
+
 @pytest.mark.parametrize(
     ("content", "fields", "match"),
     [
-        (None, {}, "within 0.3 s, found nothing: is the source sending"),
+        (None, {}, "within 0.3 s, found nothing: is the source running"),
         (Message("State", Text("on")), {}, "found STRING of 'State'; let the source send IMAGE"),
         (SMALL, {"device": "Us"}, "'Us': .* IMAGE of 'Image'; give device="),
         (Message("Image", Image(np.zeros((3, 4, 5), np.uint8), np.eye(4))), {}, "images of one plane, found volumes of 3"),

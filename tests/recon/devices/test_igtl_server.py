@@ -142,7 +142,7 @@ def test_clients_that_send_garbage_are_dropped_with_one_line(server, caplog, gar
         with suppress(ConnectionResetError):
             assert bad.recv(100) == b""
         assert until(lambda: server.clients == 1)
-    assert len(caplog.records) == 1 and "dropped: " in caplog.text
+    assert len(caplog.records) == 1 and " is dropped: " in caplog.text
     server.publish(Message("State", Text("still here")))
     assert received(good, 1)[0].content == Text("still here")
 
@@ -164,6 +164,25 @@ def test_queries_are_answered(server):
     assert ask(connection, "GET_TRANS", "ProbeToTracker").device == "ProbeToTracker"
     assert ask(connection, "GET_TRANS", "Other").content == Raw("TRANSFORM")
     assert ask(connection, "STT_TRANS").content == Raw("RTS_TRANS", b"\0")
+
+
+def test_a_client_that_asks_without_end_is_dropped(server, monkeypatch, caplog):
+    """Each answer waits under a name of its own; the client takes none."""
+    monkeypatch.setattr(igtl_server, "MOST_NAMES", 4)
+    monkeypatch.setattr(igtl_server._Client, "_send_all", lambda self: None)
+    connection = connected(server)
+    connection.sendall(b"".join(igtl_messages.pack(Message(str(k), Raw("GET_STATUS")), version=1) for k in range(20)))
+    assert until(lambda: server.clients == 0)
+    assert "that takes its answers" in caplog.text
+
+
+def test_a_stream_of_bad_clients_fills_no_log(server, caplog):
+    for _ in range(30):
+        with socket.create_connection(("127.0.0.1", server.port), WAIT_S) as connection, suppress(OSError):
+            connection.sendall(bytes(100))
+            connection.recv(1)
+    assert until(lambda: server.clients == 0)
+    assert len(caplog.records) <= 10
 
 
 def test_what_clients_publish_is_left_out(server, rng):

@@ -97,3 +97,6 @@ def test_a_peer_fills_no_log(caplog):
     for _ in range(1000):
         complaints.add("garbage")
     assert [record.getMessage() for record in caplog.records] == ["peer: garbage"]
+    for k in range(1000):
+        complaints.add(str(k))
+    assert len(caplog.records) == igtl_stream.MOST_LINES
