@@ -19,13 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from campaign import commands
-from recon.devices.igtl_client import Client
-from recon.devices.igtl_header import HEADER
-from recon.devices.igtl_image import Image
-from recon.devices.igtl_messages import Message, Status, Transform
-from recon.devices.igtl_model import Model
 from recon.devices.igtl_scanner import IgtlScanner
-from recon.devices.igtl_server import LOOPBACK, Server
+from recon.devices.openigtlink.igtl_client import Client
+from recon.devices.openigtlink.igtl_header import HEADER
+from recon.devices.openigtlink.igtl_image import Image
+from recon.devices.openigtlink.igtl_messages import Message, Status, Transform
+from recon.devices.openigtlink.igtl_model import Model
+from recon.devices.openigtlink.igtl_server import LOOPBACK, Server
 
 MOST_MB = 20.0
 MOST_MORE = 5  # threads or files: a bad client's may be there as they are counted

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks import live_igtl_soak
-from recon.devices import igtl_messages
-from recon.devices.igtl_client import Client
-from recon.devices.igtl_image import Image
-from recon.devices.igtl_messages import Message, Transform
-from recon.devices.igtl_server import LOOPBACK, Server
+from recon.devices.openigtlink import igtl_messages
+from recon.devices.openigtlink.igtl_client import Client
+from recon.devices.openigtlink.igtl_image import Image
+from recon.devices.openigtlink.igtl_messages import Message, Transform
+from recon.devices.openigtlink.igtl_server import LOOPBACK, Server
 from twin.accuracy.table_rows import Measurement, Row
 
 DRAWS = 50  # transforms and images each way

@@ -8,7 +8,7 @@ from recon.capture import calibration_files, images, lag_files, manifest, probe_
 from recon.capture.surface_part import read_patterns
 from recon.clips import dicom_clip, pose_tables, video_clip
 from recon.clips.pose_tables import Columns
-from recon.devices.igtl_stream import Splitter
+from recon.devices.openigtlink.igtl_stream import Splitter
 from recon.errors import InputError
 from recon.files import meshes, metrics, npz, volumes
 from recon.freehand import plus_config, sequences

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from campaign import commands
 from recon.capture import probe_files, surface_part
-from recon.devices import igtl_messages
+from recon.devices.openigtlink import igtl_messages
 from recon.files import atomic
 from recon.geometry import rigid
 from tests.recon.clips import made_clips
-from tests.recon.devices import igtl_peers
+from tests.recon.devices.openigtlink import igtl_peers
 
 LONGEST_S = 600.0
 STROKE = ("path.start_mm=[-18,-2]", "path.end_mm=[-18,8]", "path.speed_mm_s=20")

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.devices.igtl_client import Client, Received
-from recon.devices.igtl_header import Header
-from recon.devices.igtl_image import Image
-from recon.devices.igtl_server import LOOPBACK, PORT
 from recon.devices.interfaces import DeviceError, Frame
+from recon.devices.openigtlink.igtl_client import Client, Received
+from recon.devices.openigtlink.igtl_header import Header
+from recon.devices.openigtlink.igtl_image import Image
+from recon.devices.openigtlink.igtl_server import LOOPBACK, PORT
 from recon.devices.scan_view import ScanView
 from recon.errors import short
 

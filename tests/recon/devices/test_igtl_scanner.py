@@ -3,14 +3,14 @@ import time
 import numpy as np
 import pytest
 
-from recon.devices import igtl_client
-from recon.devices.igtl_image import Image
-from recon.devices.igtl_messages import Message, Raw, Text
 from recon.devices.igtl_scanner import IgtlScanner
-from recon.devices.igtl_server import Server
 from recon.devices.interfaces import DeviceError, Scanner
+from recon.devices.openigtlink import igtl_client
+from recon.devices.openigtlink.igtl_image import Image
+from recon.devices.openigtlink.igtl_messages import Message, Raw, Text
+from recon.devices.openigtlink.igtl_server import Server
 from recon.devices.scan_view import ScanView
-from tests.recon.devices.igtl_peers import TIME_NS, plus_frame, plus_image, served
+from tests.recon.devices.openigtlink.igtl_peers import TIME_NS, plus_frame, plus_image, served
 
 WAIT_S = 10.0
 SMALL = Message("Image", Image(np.zeros((4, 5), np.uint8), np.eye(4)))

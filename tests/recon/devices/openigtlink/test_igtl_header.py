@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from recon.devices import igtl_header
-from recon.devices.igtl_header import Body, Header
+from recon.devices.openigtlink import igtl_header
+from recon.devices.openigtlink.igtl_header import Body, Header
 from recon.errors import InputError
-from tests.recon.devices.igtl_peers import TIME_NS, plus_frame, slow_crc64
+from tests.recon.devices.openigtlink.igtl_peers import TIME_NS, plus_frame, slow_crc64
 
 
 @pytest.mark.parametrize("size", [0, 1, 7, 8, 9, 64, 1001])

@@ -3,8 +3,8 @@ import struct
 import numpy as np
 import pytest
 
-from recon.devices import igtl_model
-from recon.devices.igtl_model import Model
+from recon.devices.openigtlink import igtl_model
+from recon.devices.openigtlink.igtl_model import Model
 from recon.errors import InputError
 
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from logging import Logger
 from typing import NamedTuple
 
-from recon.devices import igtl_header, igtl_messages
-from recon.devices.igtl_header import HEADER, MOST_BODY_BYTES, Header
-from recon.devices.igtl_messages import Message
 from recon.devices.interfaces import DeviceError
+from recon.devices.openigtlink import igtl_header, igtl_messages
+from recon.devices.openigtlink.igtl_header import HEADER, MOST_BODY_BYTES, Header
+from recon.devices.openigtlink.igtl_messages import Message
 from recon.errors import InputError
 
 MOST_PORT = 65535

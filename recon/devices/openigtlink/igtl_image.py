@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.devices import igtl_header
+from recon.devices.openigtlink import igtl_header
 from recon.errors import InputError
 
 Array = NDArray[np.float64]

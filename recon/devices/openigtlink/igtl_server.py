@@ -15,11 +15,11 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
-from recon.devices import igtl_header, igtl_messages
-from recon.devices.igtl_header import Header
-from recon.devices.igtl_messages import Message, Raw, Status
-from recon.devices.igtl_stream import Complaints, Pace, Splitter, checked_port
 from recon.devices.interfaces import DeviceError
+from recon.devices.openigtlink import igtl_header, igtl_messages
+from recon.devices.openigtlink.igtl_header import Header
+from recon.devices.openigtlink.igtl_messages import Message, Raw, Status
+from recon.devices.openigtlink.igtl_stream import Complaints, Pace, Splitter, checked_port
 from recon.errors import InputError, reason
 
 log = logging.getLogger(__name__)

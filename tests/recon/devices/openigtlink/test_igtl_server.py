@@ -9,15 +9,15 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from recon.devices import igtl_header, igtl_messages, igtl_server
-from recon.devices.igtl_image import Image
-from recon.devices.igtl_messages import Message, Points, Raw, Status, Text, Transform
-from recon.devices.igtl_model import Model
-from recon.devices.igtl_server import Server
-from recon.devices.igtl_stream import Splitter
 from recon.devices.interfaces import DeviceError
+from recon.devices.openigtlink import igtl_header, igtl_messages, igtl_server
+from recon.devices.openigtlink.igtl_image import Image
+from recon.devices.openigtlink.igtl_messages import Message, Points, Raw, Status, Text, Transform
+from recon.devices.openigtlink.igtl_model import Model
+from recon.devices.openigtlink.igtl_server import Server
+from recon.devices.openigtlink.igtl_stream import Splitter
 from recon.errors import InputError
-from tests.recon.devices.igtl_peers import TIME_NS, pose
+from tests.recon.devices.openigtlink.igtl_peers import TIME_NS, pose
 
 WAIT_S = 10.0
 

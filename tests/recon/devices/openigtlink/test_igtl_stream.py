@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.devices import igtl_header, igtl_messages, igtl_stream
-from recon.devices.igtl_header import Body
-from recon.devices.igtl_messages import Message, Text
-from recon.devices.igtl_stream import Complaints, Pace, Splitter
+from recon.devices.openigtlink import igtl_header, igtl_messages, igtl_stream
+from recon.devices.openigtlink.igtl_header import Body
+from recon.devices.openigtlink.igtl_messages import Message, Text
+from recon.devices.openigtlink.igtl_stream import Complaints, Pace, Splitter
 from recon.errors import InputError
-from tests.recon.devices.igtl_peers import all_kinds, same
+from tests.recon.devices.openigtlink.igtl_peers import all_kinds, same
 
 
 def texts(splitter: Splitter, data: bytes) -> list[str]:

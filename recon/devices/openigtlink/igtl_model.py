@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.devices import igtl_header
+from recon.devices.openigtlink import igtl_header
 from recon.errors import InputError
 
 HEAD = struct.Struct(">10I")  # points; number and bytes of vertices, lines, polygons and strips; attributes

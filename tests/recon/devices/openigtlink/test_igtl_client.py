@@ -10,12 +10,12 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from recon.devices import igtl_client, igtl_header, igtl_messages
-from recon.devices.igtl_client import Client
-from recon.devices.igtl_messages import Message, Raw, Text, Transform
-from recon.devices.igtl_server import Server
 from recon.devices.interfaces import DeviceError
-from tests.recon.devices.igtl_peers import TIME_NS, plus_frame, plus_image, pose, served
+from recon.devices.openigtlink import igtl_client, igtl_header, igtl_messages
+from recon.devices.openigtlink.igtl_client import Client
+from recon.devices.openigtlink.igtl_messages import Message, Raw, Text, Transform
+from recon.devices.openigtlink.igtl_server import Server
+from tests.recon.devices.openigtlink.igtl_peers import TIME_NS, plus_frame, plus_image, pose, served
 
 WAIT_S = 10.0
 

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.devices import igtl_header, igtl_messages
-from recon.devices.igtl_header import Header
-from recon.devices.igtl_messages import Message, Raw, Status, Text, Tools, Transform
+from recon.devices.openigtlink import igtl_header, igtl_messages
+from recon.devices.openigtlink.igtl_header import Header
+from recon.devices.openigtlink.igtl_messages import Message, Raw, Status, Text, Tools, Transform
 from recon.errors import InputError
-from tests.recon.devices.igtl_peers import TIME_NS, all_kinds, pose, same
+from tests.recon.devices.openigtlink.igtl_peers import TIME_NS, all_kinds, pose, same
 
 KINDS = [*igtl_messages.READERS, "GET_STATUS", "CLIENTINFO"]
 REFERENCE = np.array([  # the transform of the protocol's own test messages

@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from recon.devices import igtl_header, igtl_messages
-from recon.devices.igtl_header import MOST_BODY_BYTES, Header
-from recon.devices.igtl_messages import Message
-from recon.devices.igtl_server import LOOPBACK, PORT
-from recon.devices.igtl_stream import Complaints, Pace, Splitter, any_kind, checked_port
 from recon.devices.interfaces import DeviceError
+from recon.devices.openigtlink import igtl_header, igtl_messages
+from recon.devices.openigtlink.igtl_header import MOST_BODY_BYTES, Header
+from recon.devices.openigtlink.igtl_messages import Message
+from recon.devices.openigtlink.igtl_server import LOOPBACK, PORT
+from recon.devices.openigtlink.igtl_stream import Complaints, Pace, Splitter, any_kind, checked_port
 from recon.errors import InputError
 
 log = logging.getLogger(__name__)

@@ -3,10 +3,10 @@ import struct
 import numpy as np
 import pytest
 
-from recon.devices import igtl_image
-from recon.devices.igtl_image import Image
+from recon.devices.openigtlink import igtl_image
+from recon.devices.openigtlink.igtl_image import Image
 from recon.errors import InputError
-from tests.recon.devices.igtl_peers import pose
+from tests.recon.devices.openigtlink.igtl_peers import pose
 
 
 def test_the_message_has_the_middle_between_the_outermost_pixels_centres():

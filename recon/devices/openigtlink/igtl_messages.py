@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.devices import igtl_header, igtl_image, igtl_model
-from recon.devices.igtl_header import Body, Header
-from recon.devices.igtl_image import Image
-from recon.devices.igtl_model import Model
+from recon.devices.openigtlink import igtl_header, igtl_image, igtl_model
+from recon.devices.openigtlink.igtl_header import Body, Header
+from recon.devices.openigtlink.igtl_image import Image
+from recon.devices.openigtlink.igtl_model import Model
 from recon.errors import InputError, reason, short
 
 Array = NDArray[np.float64]

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from recon.devices.igtl_image import Image
-from recon.devices.igtl_messages import Message, Points, Raw, Status, Text, Tools, Transform
-from recon.devices.igtl_model import Model
+from recon.devices.openigtlink.igtl_image import Image
+from recon.devices.openigtlink.igtl_messages import Message, Points, Raw, Status, Text, Tools, Transform
+from recon.devices.openigtlink.igtl_model import Model
 
 TIME_NS = 1_790_000_000_123_456_789
 
