@@ -17,7 +17,7 @@ from recon.errors import short
 log = logging.getLogger(__name__)
 
 FIRST_S = 5.0  # in which an image must come after the scanner was opened
-PRESENT = (8, 16)  # bits of grey levels
+DEPTHS = (8, 16)  # bits of grey levels
 
 
 class IgtlScanner:
@@ -48,8 +48,8 @@ class IgtlScanner:
         DeviceError
             If none comes in time; the message says what came instead.
         """
-        if not PRESENT[0] <= bits <= PRESENT[1]:
-            raise DeviceError(f"scanner {name}: bits: expected {PRESENT[0]} to {PRESENT[1]}, found {bits}")
+        if not DEPTHS[0] <= bits <= DEPTHS[1]:
+            raise DeviceError(f"scanner {name}: bits: expected {DEPTHS[0]} to {DEPTHS[1]}, found {bits}")
         self.name, self._device, self._view, self._bits = name, device, view or ScanView(), bits
         self._client = Client(host, port, self._is_ours, check=check)
         first = self._client.receive(first_s)

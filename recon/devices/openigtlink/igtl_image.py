@@ -55,7 +55,7 @@ def write(image: Image) -> bytes:
     if np.shape(image.ras_from_index) != (4, 4):
         raise InputError(f"expected a matrix of 4 x 4 as the image's place, found {np.shape(image.ras_from_index)}")
     size = (width, height, depth)
-    place = (image.ras_from_index @ np.column_stack([np.eye(4)[:, :3], _middle(size)]))[:3].T
+    place = (_thick(image.ras_from_index) @ np.column_stack([np.eye(4)[:, :3], _middle(size)]))[:3].T
     head = HEAD.pack(1, channels, code, LITTLE, RAS, *size, *igtl_header.finite(place).ravel().tolist(), 0, 0, 0, *size)
     return head + levels.astype(levels.dtype.newbyteorder("<"), copy=False).tobytes()
 
@@ -83,6 +83,16 @@ def read(content: memoryview) -> Image:
     levels = np.frombuffer(content, pixel, offset=HEAD.size).reshape(*size[::-1], channels)
     grey = levels[..., 0] if channels == 1 else levels
     return Image(grey[0] if grey.shape[0] == 1 and channels == 1 else grey, _ras_from_index(place, size, space))
+
+
+def _thick(matrix: Array) -> Array:
+    """A place whose planes are 1 mm apart if it has them at no distance, by which Slicer would divide."""
+    if matrix[:3, 2].any():
+        return matrix
+    normal = np.cross(matrix[:3, 0], matrix[:3, 1])
+    thick = matrix.copy()
+    thick[:3, 2] = normal / max(float(np.linalg.norm(normal)), 1e-30)
+    return thick
 
 
 def _ras_from_index(place: Array, size: list[int], space: int) -> Array:

@@ -21,13 +21,7 @@ from recon.errors import InputError, reason, short
 
 Array = NDArray[np.float64]
 
-OK = 1  # of a status; what else there is stands in STATES
-STATES = {
-    0: "invalid", 1: "OK", 2: "unknown error", 3: "emergency", 4: "not found", 5: "access denied", 6: "busy",
-    7: "connection lost", 8: "overflow", 9: "checksum error", 10: "configuration error", 11: "not enough resources",
-    12: "unknown instruction", 13: "not ready", 14: "manual mode", 15: "disabled", 16: "not present", 17: "unknown version",
-    18: "hardware failure", 19: "shutting down",
-}  # fmt: skip
+OK = 1  # of a status; others are 2 unknown error, 4 not found, 6 busy, 7 connection lost, 13 not ready, 18 hardware failure
 STATE = struct.Struct(">Hq20s")
 ROWS = 12  # numbers of a transform: its columns, less the last row
 TOOL = struct.Struct(f">20sBx{4 * ROWS}s")
@@ -107,6 +101,11 @@ class Message:
         """The kind in the header."""
         return self.content.kind if isinstance(self.content, Raw) else KINDS[type(self.content)]
 
+    @property
+    def name(self) -> str:
+        """The message's name in lines for people."""
+        return f"{self.kind} of {short(self.device)!r}"
+
 
 def pack(message: Message, version: int = 2) -> bytes:
     """Write a message with a header of version 1, which any receiver reads, or 2, which has metadata.
@@ -119,9 +118,9 @@ def pack(message: Message, version: int = 2) -> bytes:
     try:
         content = _write(message.content)
     except (struct.error, OverflowError) as error:
-        raise InputError(
-            f"OpenIGTLink: {message.kind}: expected numbers that its fields have room for: {reason(error)}"
-        ) from None
+        raise InputError(f"{message.name}: expected numbers that its fields have room for: {reason(error)}") from None
+    except InputError as error:
+        raise InputError(f"{message.name}: {error}") from None
     return igtl_header.join(
         version, message.kind, message.device, message.time_ns, Body(memoryview(content), message.number, message.metadata)
     )
@@ -167,15 +166,15 @@ def _write(content: Content) -> bytes:
 
 def _columns(matrix: Array) -> bytes:
     """A transform's upper rows, column by column; the last row is 0 0 0 1."""
-    if np.shape(matrix) != (4, 4) or not np.isfinite(matrix).all() or np.abs(np.subtract(matrix[3], (0, 0, 0, 1))).max() > 1e-9:
-        raise InputError(f"OpenIGTLink: expected a finite matrix of 4 x 4 whose last row is 0 0 0 1, found {short(repr(matrix))}")
-    return np.asarray(matrix)[:3].T.astype(">f4").tobytes()
+    if np.shape(matrix) != (4, 4) or not np.allclose(matrix[3], (0, 0, 0, 1), rtol=0, atol=1e-9):
+        raise InputError(f"expected a matrix of 4 x 4 whose last row is 0 0 0 1, found {short(repr(matrix))}")
+    return igtl_header.finite(np.asarray(matrix)[:3].T).astype(">f4").tobytes()
 
 
 def _text_bytes(text: str) -> bytes:
     code, letters = igtl_header.encoded(text)
     if len(letters) > 0xFFFF:
-        raise InputError(f"OpenIGTLink: expected a text of at most 65535 bytes, found one of {len(letters)}")
+        raise InputError(f"expected a text of at most 65535 bytes, found one of {len(letters)}")
     return struct.pack(">HH", code, len(letters)) + letters
 
 
@@ -190,7 +189,7 @@ def _point_bytes(content: Points) -> Iterator[bytes]:
 
 def _name(name: str, most: int) -> bytes:
     if len(letters := name.encode()) > most:
-        raise InputError(f"OpenIGTLink: expected a name of at most {most} bytes, found {short(name)!r}")
+        raise InputError(f"expected a name of at most {most} bytes, found {short(name)!r}")
     return letters
 
 

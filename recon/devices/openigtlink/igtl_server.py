@@ -82,7 +82,7 @@ class Server:
         key, data = (message.kind, message.device), igtl_messages.pack(message, self._version)
         with self._lock:
             if key not in self._newest and len(self._newest) >= MOST_NAMES:
-                raise InputError(f"OpenIGTLink: {key[0]} of {key[1]!r}: expected at most {MOST_NAMES} names, found one more")
+                raise InputError(f"{message.name}: expected at most {MOST_NAMES} names, found one more")
             self._newest[key] = data
             for client in self._connected():
                 client.put({key: data})

@@ -79,3 +79,10 @@ def test_a_pixel_keeps_its_place(rng):
     found = igtl_image.read(memoryview(igtl_image.write(image))).ras_from_index
     pixel = [320, 407, 0, 1]
     np.testing.assert_allclose(found @ pixel, ras_from_index @ pixel, rtol=1e-6, atol=2e-4)
+
+
+def test_a_plane_without_a_thickness_gets_a_normal():
+    """2 mm columns along x, 3 mm rows along y: the normal is z, and the pixels stay where they are."""
+    flat = np.diag([2.0, 3.0, 0.0, 1.0])
+    found = igtl_image.read(memoryview(igtl_image.write(Image(np.zeros((4, 6), np.uint8), flat)))).ras_from_index
+    np.testing.assert_allclose(found, np.diag([2.0, 3.0, 1.0, 1.0]), atol=1e-6)
