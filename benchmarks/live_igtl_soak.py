@@ -13,6 +13,7 @@ import socket
 import sys
 import threading
 import time
+from array import array
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -76,14 +77,14 @@ def run(seconds: float, rate_hz: float) -> Soak:
     poses = Client(port=server.port, wanted=lambda header: header.kind == "TRANSFORM")
     stalled = socket.create_connection((LOOPBACK, server.port))
     assert poses.receive(10.0) is not None
-    late, counted, ends = list[float](), [0], threading.Event()
+    late, counted, ends = array("d"), [0], threading.Event()
     readers = [threading.Thread(target=_read_images, args=(scanner, late, ends)),
                threading.Thread(target=_read_poses, args=(poses, counted, ends))]  # fmt: skip
     for reader in readers:
         reader.start()
     held, begun, count = [_held(0.0)], time.monotonic(), 1
     while time.monotonic() < begun + seconds:
-        time.sleep(1 / rate_hz)  # no burst makes up for a late one
+        time.sleep(1 / rate_hz - (time.monotonic() - begun) % (1 / rate_hz))  # no burst makes up for a late one
         _publish(server, images[count % len(images)], count)
         count += 1
         if time.monotonic() - begun > len(held):  # each second
@@ -110,7 +111,7 @@ def _publish(server: Server, image: np.ndarray, k: int) -> None:
     server.publish(Message("State", Status(text=f"frame {k}"), now))
 
 
-def _read_images(scanner: IgtlScanner, late: list[float], ends: threading.Event) -> None:
+def _read_images(scanner: IgtlScanner, late: array, ends: threading.Event) -> None:
     while not ends.is_set():
         if frame := scanner.frame(0.2):
             late.append((time.time_ns() - frame.time_ns) / 1e9)
