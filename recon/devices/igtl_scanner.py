@@ -1,7 +1,5 @@
 """An ultrasound scanner whose B-scans come over OpenIGTLink: from PLUS, or from scanners that send it themselves."""
 
-import logging
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +11,6 @@ from recon.devices.openigtlink.igtl_image import Image
 from recon.devices.openigtlink.igtl_server import LOOPBACK, PORT
 from recon.devices.scan_view import ScanView
 from recon.errors import short
-
-log = logging.getLogger(__name__)
 
 FIRST_S = 5.0  # in which an image must come after the scanner was opened
 DEPTHS = (8, 16)  # bits of grey levels
