@@ -19,8 +19,8 @@ MOST_MB, LONGEST_S = 2000, 10
 MOST_FAULTS = 5  # of one reader, after which it isn't fuzzed on
 NAMES = (
     "manifest", "calibration", "calibration_xml", "calibration_npz", "probe", "target", "lag", "stamps", "track", "pairs",
-    "pose_table", "image", "mesh", "volume_nrrd", "volume_mha", "sequence", "plus_config", "dicom", "video", "patterns",
-    "metrics", "truth", "points", "shard", "checkpoint", "network",
+    "pose_table", "image", "mesh", "volume_nrrd", "volume_mha", "sequence", "plus_config", "messages", "dicom", "video",
+    "patterns", "metrics", "truth", "points", "shard", "checkpoint", "network",
 )  # fmt: skip
 
 

@@ -8,6 +8,8 @@ from recon.capture import calibration_files, images, lag_files, manifest, probe_
 from recon.capture.surface_part import read_patterns
 from recon.clips import dicom_clip, pose_tables, video_clip
 from recon.clips.pose_tables import Columns
+from recon.devices.openigtlink.igtl_stream import Splitter
+from recon.errors import InputError
 from recon.files import meshes, metrics, npz, volumes
 from recon.freehand import plus_config, sequences
 from recon.model.rig import Target
@@ -44,6 +46,14 @@ def _sequence(path: Path) -> object:
     return sequences.read_tracking(path), sum(1 for _ in sequences.stream_images(path))
 
 
+def _messages(path: Path) -> object:
+    """Messages of a stream, whose checksums would keep most faults from what reads them."""
+    found = [one for one, _ in Splitter(check=False).feed(path.read_bytes())]
+    for fault in [one for one in found if isinstance(one, InputError)]:
+        raise fault
+    return found
+
+
 COLUMNS = Columns(time="t", translation=("x", "y", "z"), quaternion=("qx", "qy", "qz", "qw"))
 POINTS = {"points": npz.Form("f", (None, 3)), "pixels": npz.Form("f", (None, 2))}
 
@@ -66,6 +76,7 @@ READERS = {
     "volume_mha": Reader(volumes.read_volume, ("small.mha",), "file.mha"),
     "sequence": Reader(_sequence, ("small.igs.mha",), "file.igs.mha"),
     "plus_config": Reader(plus_config.read_config, ("plus.xml",)),
+    "messages": Reader(_messages, ("small.igtl",), "file.igtl"),
     "dicom": Reader(dicom_clip.read, ("scan.dcm",), "file.dcm"),
     "video": Reader(video_clip.read, ("screen.avi",), "file.avi"),
     "patterns": Reader(read_patterns, ("patterns.yaml",), "file.yaml"),

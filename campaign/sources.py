@@ -9,9 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from campaign import commands
 from recon.capture import probe_files, surface_part
+from recon.devices.openigtlink import igtl_messages
 from recon.files import atomic
 from recon.geometry import rigid
 from tests.recon.clips import made_clips
+from tests.recon.devices.openigtlink import igtl_peers
 
 LONGEST_S = 600.0
 STROKE = ("path.start_mm=[-18,-2]", "path.end_mm=[-18,8]", "path.speed_mm_s=20")
@@ -179,6 +181,8 @@ def _write_small_ones(folder: Path) -> None:
     poses = np.tile(np.eye(4), (4, 1, 1))
     sequences.write_sequence(folder / "small.igs.mha", sequences.sequence_of(voxels, poses, probe, np.arange(4.0)))
     np.savez(folder / "small.npz", points=np.zeros((7, 3)), pixels=np.zeros((7, 2)))
+    messages = igtl_peers.all_kinds(np.random.default_rng(0))
+    (folder / "small.igtl").write_bytes(b"".join(igtl_messages.pack(one, 1 + k % 2) for k, one in enumerate(messages)))
     torch.save({"weight": torch.zeros(3, 2), "bias": torch.zeros(3)}, folder / "small.pt")
 
 

@@ -11,6 +11,7 @@ PARTS = {  # the modules' beginnings, what the console calls them, and the secon
     "recon.freehand": ("volume from B-scans", 5),
     "recon.segmentation": ("search for masses", 5),
     "recon.geometry": ("cameras", 5),
+    "recon.devices": ("checksums of messages", 1),
     "twin.ultrasound": ("the rendered scanner", 45),
     "twin.optics": ("light transport", 5),
     "twin": ("the rendered sensor", 3),

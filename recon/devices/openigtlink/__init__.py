@@ -1,0 +1,1 @@
+"""OpenIGTLink: its messages, a server and a client."""
