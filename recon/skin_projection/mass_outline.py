@@ -49,10 +49,21 @@ def on_skin(name: str, mass: trimesh.Trimesh, skin: trimesh.Trimesh, sight: Sigh
 
 
 def sight_of(points: ArrayLike, skin: trimesh.Trimesh, eye_mm: ArrayLike | None = None) -> Sight:
-    """Lines of sight to points : (n, 3) mm under the skin: from an eye : (3,) mm, or along the skin's normal over them."""
+    """Lines of sight to points : (n, 3) mm under the skin: from an eye : (3,) mm, or along the skin's normal over them.
+
+    Raises
+    ------
+    InputError
+        If the eye is on the other side of the skin.
+    """
     points = np.asarray(points, float)
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    return Sight.along(-normal_over(points, skin), middle) if eye_mm is None else Sight.from_eye(eye_mm, middle)
+    middle, normal = (points.min(axis=0) + points.max(axis=0)) / 2, normal_over(points, skin)
+    if eye_mm is None:
+        return Sight.along(-normal, middle)
+    eye = np.asarray(eye_mm, float)
+    if (eye - middle) @ normal <= 0:
+        raise InputError(f"eye_mm: expected a place before the skin, found {eye.tolist()} behind it; z grows away from camera 1")
+    return Sight.from_eye(eye, middle)
 
 
 def normal_over(points: ArrayLike, skin: trimesh.Trimesh) -> Array:

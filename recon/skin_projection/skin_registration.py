@@ -30,7 +30,7 @@ WIDTHS = 4.685  # robust standard deviations at which Tukey's weight ends, 95 % 
 SETTLED = np.array([1e-7] * 3 + [1e-5] * 3)  # step, rad and mm, after which it is done
 LEAST_SHARE = 0.4  # of the patches with a partner
 LEAST_TURN = 0.8  # cosine between the normals of partners
-SHARED_NOISE = 2.0 * OVERLAP  # patches of one noise: those that overlap, and as many more by fringes and in each other's skin
+SHARED_NOISE = 4.0 * OVERLAP  # patches of one error: those that overlap, and as fringes' errors reach over some of them
 
 
 class Patches(NamedTuple):

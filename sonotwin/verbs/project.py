@@ -112,6 +112,8 @@ def run(config: Config) -> None:
     curves = [*mass_outline.outlines(masses, skin, config.eye_mm).values()]
     curves += [planned_cut.on_skin(f"cut{k}", chain, skin, config.eye_mm) for k, chain in enumerate(cuts)]
     curves += [] if held is None else [held.line]
+    if not curves:
+        raise InputError(f"{config.masses}: expected masses to draw, found none in it; give a cut or a capture, too")
     dark = None if held is None else probe_shadow.shadow(held.body, cameras["projector"], config.margin_mm)
     drawing = projector_image.draw(curves, skin, cameras["projector"], config.rig.projector.gamma, config.lines, dark)
     seconds = round(time.perf_counter() - start, 3)

@@ -102,12 +102,16 @@ def test_the_probe_gets_a_line_and_no_light(given, rig, tmp_path):
     ("masses=HERE/masses skin=none.ply", "none.ply: expected"),
     ("masses=HERE/masses lines.mass.width_mm=0", "lines.mass.width_mm: expected"),
     ("masses=HERE/masses eye_mm=[1,2]", "eye_mm"),
+    ("masses=HERE/masses eye_mm=[0,0,1000]", "eye_mm: expected a place before the skin, found [0.0, 0.0, 1000.0] behind it"),
+    ("masses=HERE/none", "none: expected masses to draw, found none in it"),
     ("cut=HERE/skin.ply", "skin.ply: expected"),
     ("masses=HERE/masses earlier_skin=HERE/far.ply", "expected the earlier skin, moved by up to 15 mm, found"),
     ("masses=HERE/far", "mass0: expected skin over it, found none"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(given, tmp_path, capsys, fields, complaint):
     meshes.write_ply(tmp_path / "far.ply", bent(rigid.from_rotation_vector([0, 0, 0], [0, 0, 60.0])))
+    (tmp_path / "none").mkdir()
+    (tmp_path / "none" / "metrics.json").write_text("{}")
     (tmp_path / "far").mkdir()
     meshes.write_ply(tmp_path / "far" / "mass0.ply", trimesh.creation.icosphere(2, 8.0).apply_translation([300.0, 0, 700]))
     assert main(["project", *given, *fields.replace("HERE", str(tmp_path)).split()]) == 2
