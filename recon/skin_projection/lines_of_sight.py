@@ -19,6 +19,7 @@ from recon.threads import in_threads
 Array = NDArray[np.float64]
 
 CELLS = 256  # of the chart along each axis, in which places are sorted
+EDGE = 1e-9  # of a triangle, that belongs to both at an edge: rounding loses no line between them
 NOWHERE = -1  # number of the triangle where a line meets none
 
 
@@ -123,7 +124,7 @@ def _fill_hits(charted, faces, places, order, starts, low, cell, nearness, found
                 x, y = places[n, 0] - a[0], places[n, 1] - a[1]
                 second = (x * (c[1] - a[1]) - y * (c[0] - a[0])) / area
                 third = ((b[0] - a[0]) * y - (b[1] - a[1]) * x) / area
-                if second < 0 or third < 0 or second + third > 1:
+                if second < -EDGE or third < -EDGE or second + third > 1 + EDGE:
                     continue
                 near = a[2] + second * (b[2] - a[2]) + third * (c[2] - a[2])
                 if near > nearness[n]:

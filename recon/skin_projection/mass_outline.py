@@ -67,7 +67,7 @@ def sight_of(points: ArrayLike, skin: trimesh.Trimesh, eye_mm: ArrayLike | None 
 
 
 def normal_over(points: ArrayLike, skin: trimesh.Trimesh) -> Array:
-    """The skin's normal over points : (n, 3) mm, outwards : (3,), the mean of a patch as broad as they are.
+    """The skin's normal over points : (n, 3) mm, towards camera 1 : (3,), the mean of a patch as broad as they are.
 
     Of a patch rather than of a place, so that a nipple or the skin's relief doesn't turn it. The patch lies about the line from
     the points' middle along the normal, which is sought from the skin's nearest place on.
@@ -76,17 +76,19 @@ def normal_over(points: ArrayLike, skin: trimesh.Trimesh) -> Array:
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     away = np.asarray(skin.vertices) - middle
     distance = np.sqrt(np.einsum("ij,ij->i", away, away))
-    nearest = int(np.argmin(distance))
-    reach = max(np.linalg.norm(points - middle, axis=1).max(), distance[nearest] / 2)
-    around = distance < distance[nearest] + 2 * reach
-    normal = away[nearest] / distance[nearest]
+    nearest = float(distance.min())
+    reach = max(float(np.linalg.norm(points - middle, axis=1).max()), nearest / 2)
+    around = np.flatnonzero(distance <= nearest + 2 * reach)
     away, normals = away[around], np.asarray(skin.vertex_normals)[around]
+    behind = np.einsum("ij,ij->i", away + middle, normals) > 0  # as the winding of another program may have them
+    normals = np.where(behind[:, None], -normals, normals)
+    normal = normals[distance[around].argmin()]
     for _ in range(PATCHES):
         height = away @ normal
-        patch = (height > 0) & (np.linalg.norm(away - height[:, None] * normal, axis=1) <= reach)
+        patch = (height > -reach) & (np.linalg.norm(away - height[:, None] * normal, axis=1) <= reach)
         if not patch.any():  # no skin over them: what is nearest will do
             break
-        total = np.where(normals[patch] @ normal < 0, -1.0, 1.0) @ normals[patch]
+        total = normals[patch].sum(axis=0)
         normal = total / np.linalg.norm(total)
     return normal
 

@@ -21,7 +21,7 @@ from recon.skin_projection.skin_curve import SkinCurve
 
 Array = NDArray[np.float64]
 
-LPS_FROM = {"LPS": np.ones(3), "0": np.ones(3), "RAS": np.array([-1.0, -1.0, 1.0]), "1": np.array([-1.0, -1.0, 1.0])}
+LPS_FROM = {"LPS": np.ones(3), "RAS": np.array([-1.0, -1.0, 1.0])}
 FINE = 20  # points of a spline from one control point to the next
 
 
@@ -36,7 +36,7 @@ class Markup(BaseModel):
     """A curve or line of 3D Slicer's markups."""
 
     type: Literal["Line", "Curve", "ClosedCurve"]
-    coordinateSystem: Literal["LPS", "RAS", "0", "1"] = "LPS"
+    coordinateSystem: Literal["LPS", "RAS"] = "LPS"
     coordinateUnits: Literal["mm"] = "mm"
     controlPoints: list[ControlPoint] = Field(min_length=2, max_length=10_000)
 

@@ -30,6 +30,7 @@ WIDTHS = 4.685  # robust standard deviations at which Tukey's weight ends, 95 % 
 SETTLED = np.array([1e-7] * 3 + [1e-5] * 3)  # step, rad and mm, after which it is done
 LEAST_SHARE = 0.4  # of the patches with a partner
 LEAST_TURN = 0.8  # cosine between the normals of partners
+LEAST_SLACK = 1e-9  # see `slack`: less is a plane or another shape without any noise, whose equations have no solution
 SHARED_NOISE = 4.0 * OVERLAP  # patches of one error: those that overlap, and as fringes' errors reach over some of them
 
 
@@ -61,9 +62,11 @@ def register(old: trimesh.Trimesh, new: trimesh.Trimesh) -> SkinShift:
     Raises
     ------
     InputError
-        If too little of the old skin lies on the new one.
+        If too little of the old skin lies on the new one, or its shape leaves the motion open, as a plane's does.
     """
     before, after = patches(old), patches(new)
+    if not len(after.middles) or slack(before) < LEAST_SLACK:
+        raise InputError("skin: expected one that is bent in all directions, found one that slides in itself: measure more of it")
     tree, pose, reach = surface_tree(after.middles), np.eye(4), FIRST_MM
     for _ in range(ROUNDS):
         moved, turned = rigid.apply(pose, before.middles), rigid.rotate(pose, before.normals)
@@ -88,6 +91,16 @@ def register(old: trimesh.Trimesh, new: trimesh.Trimesh) -> SkinShift:
             break
     variance = float((weights * off**2).sum() / max(weights.sum() - 6, 1))
     return SkinShift(pose, SHARED_NOISE * variance * np.linalg.inv(squares), float(np.sqrt(variance)), share)
+
+
+def slack(skin: Patches) -> float:
+    """How far a skin is from sliding in itself: the least mean square of its ways along its normals, in any motion of size 1."""
+    if len(skin.middles) < len(SETTLED):
+        return 0.0
+    arms = skin.middles - skin.middles.mean(axis=0)
+    arms /= np.linalg.norm(arms, axis=1).mean()
+    slopes = np.column_stack([np.cross(arms, skin.normals), skin.normals])
+    return float(np.linalg.eigvalsh(slopes.T @ slopes / len(slopes))[0])
 
 
 def patches(skin: trimesh.Trimesh) -> Patches:

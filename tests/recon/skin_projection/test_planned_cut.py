@@ -7,7 +7,7 @@ import pytest
 
 from recon.errors import InputError
 from recon.skin_projection import planned_cut
-from tests.recon.skin_projection.skin_shapes import DOME_MM, PLANE_MM, dome
+from tests.recon.skin_projection.skin_shapes import DOME_MM, PLANE_MM, dome, plane
 
 ARC = [[-20.0, 10.0, 665.0], [0.0, 14.0, 662.0], [20.0, 10.0, 665.0]]
 
@@ -57,6 +57,14 @@ def _even(chain):
 
     points = evenly(chain)
     return points[:, :2] / points[:, 2:]
+
+
+def test_a_cut_that_touches_the_skin_has_a_normal(tmp_path):
+    """Through a vertex of a plane, where there is no way from the cut to the skin."""
+    skin, eye = plane(), [0.0, 0, 0]
+    for seen_from in (None, eye):
+        curve = planned_cut.on_skin("cut0", [[-10.0, 0, PLANE_MM], [10.0, 0, PLANE_MM]], skin, seen_from)
+        assert curve.on_skin == 1 and curve.length_mm == pytest.approx(20) and np.allclose(curve.normals, [0, 0, -1])
 
 
 def test_a_cut_that_nothing_lies_under_is_refused():

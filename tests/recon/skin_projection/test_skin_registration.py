@@ -8,7 +8,7 @@ from recon.errors import InputError
 from recon.geometry import rigid
 from recon.skin_projection.skin_registration import PATCH, register
 from scenes.solid_meshes import grid
-from tests.recon.skin_projection.skin_shapes import PLANE_MM, dome
+from tests.recon.skin_projection.skin_shapes import PLANE_MM, dome, plane
 
 NOISE_MM, STEP_MM = 0.05, 1.0
 MASS = np.array([10.0, 5.0, PLANE_MM + 25])
@@ -61,6 +61,13 @@ def test_a_bump_of_its_own_does_not_pull(rng):
     new.vertices[out, 2] -= 5.0
     found = register(old, new)
     assert np.linalg.norm(rigid.apply(found.new_from_old, MASS) - MASS) < 3 * found.sigma_mm(MASS) < 0.2
+
+
+def test_a_plane_is_refused_and_so_is_next_to_nothing():
+    flat, points = plane(), np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    for skin in (flat, trimesh.Trimesh(points, [[0, 1, 2]], process=False)):
+        with pytest.raises(InputError, match="expected one that is bent in all directions"):
+            register(skin, flat)
 
 
 def test_another_skin_is_refused(rng):
