@@ -56,6 +56,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("freehand", "put tracked B-scans into a volume, for 3D Slicer too"),
     Verb("segment", "find masses or a tube in tracked B-scans, as closed surfaces in the world"),
     Verb("fuse", "put skin, masses and B-scans into one picture with layers"),
+    Verb("project", "draw masses, a planned cut and the B-scan's line for the projector, onto the skin"),
     Verb("reconstruct", "reconstruct all that a capture holds: calibrations, skin, volumes, masses"),
     Verb("navigate", "follow the probe live: the B-scan in place, skin and masses around it"),
     Verb("import", "read another group's data set into a capture"),

@@ -56,6 +56,8 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
     "freehand.md": {f"{folder}/capture" for folder in ("wires", "bottom", "sweep", "tank")}
     | {"scan.dcm", "poses.csv", "pairs.csv", "config.xml", "probe/probe.yaml", "surface/surface.ply"}
     | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires")},
+    "live-skin.md": {"result/surface/surface.ply", "result/masses/scan", "result/optics/optics.yaml"}
+    | {"now.ply", "before.ply", "masses", "optics.yaml"},
     "recordings.md": {"photographs", "procam", "L", "relief.yaml", "caliInfo.yml", "spine.xml", "poses.csv"}
     | {"examples_ybr_color.dcm"}
     | {f"{name}.igs.mha" for name in ("SpinePhantomFreehand", "WaterTankBottomTranslationCombined")},

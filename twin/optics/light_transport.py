@@ -14,6 +14,7 @@ from pydantic import Field, field_validator
 from recon.model.rig import NotNegative, Part
 from twin.optics.instruments import CameraOptics, ProjectorOptics, light_point, sample_rays
 from twin.optics.light_spread import LightSpread, Translucent
+from twin.optics.projected_image import ImageLight, ImageTable
 from twin.optics.raster import Light, LightTable
 from twin.optics.sampling import PairedPoints
 
@@ -46,7 +47,7 @@ def render(
     scene: mi.Scene,
     camera: CameraOptics,
     projector: ProjectorOptics,
-    light: Light,
+    light: Light | ImageLight,
     tracing: Tracing,
     seed: int,
     translucent: Translucent = (),
@@ -57,8 +58,8 @@ def render(
     ----------
     scene : mitsuba.Scene
         Shapes in the world, mm; its emitters are not used.
-    light : Light
-        The sequence of n patterns as the projector shows it.
+    light : Light or ImageLight
+        The sequence of n patterns as the projector shows it, or an image, n = 1.
     seed : int
         The same seed gives the same images.
     translucent : sequence of shapes with lengths, mm
@@ -68,6 +69,11 @@ def render(
     -------
     (n, h, w) float32
         Radiance that arrives at each pixel, W/mm^2/sr, times the lens's transmission.
+
+    Raises
+    ------
+    ValueError
+        If an image is to spread beneath a shape, which patterns along one axis can alone.
     """
     width, height = camera.camera.size
     everywhere = np.arange(width * height, dtype=np.uint32)
@@ -80,7 +86,7 @@ def render_pixels(
     scene: mi.Scene,
     camera: CameraOptics,
     projector: ProjectorOptics,
-    light: Light,
+    light: Light | ImageLight,
     tracing: Tracing,
     seed: int,
     pixels: NDArray[np.uint32],
@@ -92,7 +98,7 @@ def render_pixels(
 
     Light that leaves a convex body meets nothing again: for a scene that is one, shadows needn't be looked for.
     """
-    table, spread = LightTable.of(light), LightSpread.of(translucent, light) if translucent else None
+    table, spread = _tables(light, translucent)
     pixel = mi.UInt32(pixels)
     centre, across, down = camera.tables
     tables = dr.gather(mi.Point2f, centre, pixel), dr.gather(mi.Vector2f, across, pixel), dr.gather(mi.Vector2f, down, pixel)
@@ -116,6 +122,15 @@ def render_pixels(
     return radiance
 
 
+def _tables(light: Light | ImageLight, translucent: Translucent) -> tuple[LightTable | ImageTable, LightSpread | None]:
+    """A projector's light as the ray tracer reads it, and after its spread beneath translucent shapes."""
+    if isinstance(light, Light):
+        return LightTable.of(light), LightSpread.of(translucent, light) if translucent else None
+    if translucent:
+        raise ValueError("light: expected patterns along one axis, which alone spread beneath a shape, found an image")
+    return light.table, None
+
+
 def meets_something(scene: mi.Scene, camera: CameraOptics) -> NDArray[np.bool_]:
     """Whether the ray through the middle of each pixel : (h, w) and of the lens meets any shape."""
     middle = sample_rays(camera, camera.tables, mi.Point2f(0), mi.Point2f(0))
@@ -131,7 +146,7 @@ def pixel_offset(camera: CameraOptics, points: PairedPoints) -> mi.Point2f:
 def trace(
     scene: mi.Scene,
     projector: ProjectorOptics,
-    light: tuple[LightTable, LightSpread | None],
+    light: tuple[LightTable | ImageTable, LightSpread | None],
     tracing: Tracing,
     points: PairedPoints,
     ray: mi.Ray3f,

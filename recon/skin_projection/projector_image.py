@@ -1,0 +1,133 @@
+"""The projector's image that draws curves on the skin: lines of a width in mm there, hidden where the projector can't reach.
+
+The projector is a camera run backwards, so a strip on the skin is projected into its image, lens distortion included, and filled.
+Coverage is light, so the image's values are its root by the projector's gamma.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.geometry.camera import Camera
+from recon.skin_projection import skin_curve
+from recon.skin_projection.lines_of_sight import Sight, first_hits
+from recon.skin_projection.skin_curve import SkinCurve
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Length = Annotated[float, Field(ge=0.5, le=100)]
+
+FINE = 8  # parts of a pixel along each axis, by which its coverage is counted
+SHIFT = 4  # binary digits behind the point, of corners for OpenCV
+HIDDEN_MM = 0.5  # that something stands before a point of the skin, to hide it: far above the noise of a surface
+
+
+@dataclass(frozen=True)
+class Line:
+    """The look of a kind of curve on the skin."""
+
+    width_mm: Annotated[float, Field(ge=0.1, le=20)]
+    light: Annotated[float, Field(gt=0, le=1)] = 1.0  # of the projector's full light
+    dash_mm: tuple[Length, Length] | None = None  # drawn and left out, in turn; None is a whole line
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The look of each kind of curve."""
+
+    mass: Line = Line(1.0)
+    cut: Line = Line(1.0, 1.0, (4.0, 2.0))
+    scan: Line = Line(0.7, 0.7)
+
+    def of(self, curve: SkinCurve) -> Line:
+        """That of a curve."""
+        return {"mass": self.mass, "cut": self.cut, "scan": self.scan}[curve.kind]
+
+
+USUAL = Lines()
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """An image for a projector, and the share of each curve that it shows, dashes and gaps alike."""
+
+    image: Image  # (h, w)
+    shown: Mapping[str, float]  # of the curve's points on the skin, by its name
+
+
+def draw(
+    curves: Sequence[SkinCurve],
+    skin: trimesh.Trimesh,
+    projector: Camera,
+    gamma: float = 1.0,
+    lines: Lines = USUAL,
+    dark: NDArray[np.bool_] | None = None,
+) -> Drawing:
+    """Draw curves on the skin.
+
+    Parameters
+    ----------
+    gamma : float
+        Of the projector: light = value ** gamma.
+    dark : (h, w)
+        Pixels that are to stay dark, as of `probe_shadow.shadow`.
+    """
+    light, shown = np.zeros(projector.size[::-1], np.float32), {}
+    together = np.concatenate([np.zeros((0, 3)), *(curve.points for curve in curves)])  # so that the skin is looked at once
+    lit = visible(together, skin, projector)
+    if dark is not None:
+        u, v = np.rint(projector.project(together[lit])).astype(int).T
+        lit[lit] = ~dark[v, u]
+    parts = np.split(lit, np.cumsum([len(curve.points) for curve in curves]))
+    for curve, reached in zip(curves, parts, strict=False):  # an empty part is left
+        on_skin = np.isfinite(curve.points).all(axis=1)
+        shown[curve.name] = float(reached.sum() / max(on_skin.sum(), 1))
+        line = lines.of(curve)
+        pieces = skin_curve.dashed(curve, line.dash_mm) & reached[:-1] & reached[1:]
+        corners = quadrilaterals(curve, line.width_mm, projector)
+        whole = pieces & np.isfinite(corners).all(axis=(1, 2))
+        np.maximum(light, line.light * coverage(corners[whole], projector.size), out=light)
+    if dark is not None:
+        light[dark] = 0
+    return Drawing(np.uint8(np.rint(255 * light ** (1 / gamma))), shown)
+
+
+def visible(points: Array, skin: trimesh.Trimesh, device: Camera) -> NDArray[np.bool_]:
+    """Whether a device's light reaches points : (n, 3) mm of the skin : (n,), within its image and past the skin itself."""
+    pixels, (width, height) = device.project(points), device.size
+    with np.errstate(invalid="ignore"):
+        within = (pixels > -0.5).all(axis=1) & (pixels[:, 0] < width - 0.5) & (pixels[:, 1] < height - 0.5)
+    sight = Sight.of_device(device)
+    hits = first_hits(sight, np.where(within[:, None], sight.chart(points)[:, :2], np.nan), skin).points
+    before = np.linalg.norm(points - device.centre, axis=1) - np.linalg.norm(hits - device.centre, axis=1)
+    return within & ~(before > HIDDEN_MM)
+
+
+def quadrilaterals(curve: SkinCurve, width_mm: float, device: Camera) -> Array:
+    """Each piece of a curve between two points as wide as a line, in a device's image : (n - 1, 4, 2) px, NaN where broken."""
+    left, right = (device.project(edge) for edge in skin_curve.edges(curve, width_mm))
+    return np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)
+
+
+def coverage(corners: Array, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Share of each pixel of an image of a size (width, height) that convex quadrilaterals : (n, 4, 2) px cover : (h, w)."""
+    width, height = size
+    result = np.zeros((height, width), np.float32)
+    if not len(corners):
+        return result
+    low = np.clip(np.floor(corners.min(axis=(0, 1))).astype(int), 0, [width - 1, height - 1])
+    high = np.clip(np.ceil(corners.max(axis=(0, 1))).astype(int), low, [width - 1, height - 1])
+    columns, rows = (high - low + 1).tolist()
+    fine = np.zeros((rows * FINE, columns * FINE), np.uint8)
+    inner = (corners - low + 0.5) * FINE - 0.5
+    for corner in np.rint(inner * 2**SHIFT).astype(np.int32):
+        cv2.fillConvexPoly(fine, corner, 255, shift=SHIFT)
+    share = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA)
+    result[low[1] : high[1] + 1, low[0] : high[0] + 1] = share.astype(np.float32) / 255
+    return result

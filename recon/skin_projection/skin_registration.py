@@ -1,0 +1,121 @@
+"""The rigid motion of a body from its skin, measured before and after: masses that were found before are moved along.
+
+Symmetric point to plane [Rusinkiewicz 2019], with robust weights: the distance of two points along the mean of their normals,
+which is zero for any two points of one arc, so that sampling adds no error of its own. Points and normals are those of small
+patches of the skins: normals of single triangles are mostly noise, which would pass for knowledge of motions along the skin. The
+uncertainty is that of the weighted least squares; motions by which the skin slides in itself, as a sphere turns about its middle,
+are uncertain by it, and so are masses far from that.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.geometry.surface_tree import surface_tree
+
+Array = NDArray[np.float64]
+
+VERTICES = 60_000  # of a skin, evenly chosen
+PATCH = 40  # of them in a patch: some 3 mm about its middle, on a breast
+OVERLAP = 3  # patches that a vertex is in
+ONE_SIDED = 0.3  # of a patch's radius, that its middle is off the vertex about which it lies: it lies at the rim
+ROUNDS = 60
+FIRST_MM, LAST_MM = 15.0, 4.0  # farthest pair, at first and at last
+WIDTHS = 4.685  # robust standard deviations at which Tukey's weight ends, 95 % efficient for normal errors
+SETTLED = np.array([1e-7] * 3 + [1e-5] * 3)  # step, rad and mm, after which it is done
+LEAST_SHARE = 0.4  # of the patches with a partner
+LEAST_TURN = 0.8  # cosine between the normals of partners
+LEAST_SLACK = 1e-9  # see `slack`: less is a plane or another shape without any noise, whose equations have no solution
+SHARED_NOISE = 4.0 * OVERLAP  # patches of one error: those that overlap, and as fringes' errors reach over some of them
+
+
+class Patches(NamedTuple):
+    """Small pieces of a skin."""
+
+    middles: Array  # (n, 3) mm
+    normals: Array  # (n, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class SkinShift:
+    """The rigid motion between two measurements of one skin."""
+
+    new_from_old: Array  # (4, 4)
+    covariance: Array  # (6, 6) of the step as in `rigid.moved`, rad and mm
+    rms_mm: float  # of the distances along the normals that are left: noise, and any change of shape
+    share: float  # of the old skin's points that the new one has, too
+
+    def sigma_mm(self, point: ArrayLike) -> float:
+        """Standard deviation of the place to which a point : (3,) mm is moved, along the direction where it is largest."""
+        slopes = rigid.slopes(rigid.rotate(self.new_from_old, point))
+        return float(np.sqrt(np.linalg.eigvalsh(slopes @ self.covariance @ slopes.T)[-1]))
+
+
+def register(old: trimesh.Trimesh, new: trimesh.Trimesh) -> SkinShift:
+    """The motion from an old skin to a new one, both without the table, up to about 15 mm and some degrees.
+
+    Raises
+    ------
+    InputError
+        If too little of the old skin lies on the new one, or its shape leaves the motion open, as a plane's does.
+    """
+    before, after = patches(old), patches(new)
+    if not len(after.middles) or slack(before) < LEAST_SLACK:
+        raise InputError("skin: expected one that is bent in all directions, found one that slides in itself: measure more of it")
+    tree, pose, reach = surface_tree(after.middles), np.eye(4), FIRST_MM
+    for _ in range(ROUNDS):
+        moved, turned = rigid.apply(pose, before.middles), rigid.rotate(pose, before.normals)
+        distance, nearest = tree.query(moved)
+        others = after.normals[nearest]
+        paired = (distance < reach) & ((others * turned).sum(axis=1) > LEAST_TURN)
+        share = float(paired.mean())
+        if share < LEAST_SHARE:
+            raise InputError(
+                f"skin: expected the earlier skin, moved by up to {FIRST_MM:g} mm, found {share:.0%} of it on the new one: "
+                "is it another body, or did it move farther? then find the masses anew"
+            )
+        between = (turned + others)[paired] / 2
+        off = ((after.middles[nearest] - moved)[paired] * between).sum(axis=1)
+        slopes = np.column_stack([np.cross(rigid.rotate(pose, before.middles[paired]), between), between])
+        scale = max(1.4826 * float(np.median(np.abs(off))), 1e-6)
+        weights = np.maximum(1 - (off / (WIDTHS * scale)) ** 2, 0) ** 2
+        squares = slopes.T @ (weights[:, None] * slopes)
+        change = np.linalg.solve(squares, slopes.T @ (weights * off))
+        pose, reach = rigid.moved(pose, change), max(reach / 2, LAST_MM)
+        if (np.abs(change) < SETTLED).all():
+            break
+    variance = float((weights * off**2).sum() / max(weights.sum() - 6, 1))
+    return SkinShift(pose, SHARED_NOISE * variance * np.linalg.inv(squares), float(np.sqrt(variance)), share)
+
+
+def slack(skin: Patches) -> float:
+    """How far a skin is from sliding in itself: the least mean square of its ways along its normals, in any motion of size 1."""
+    if len(skin.middles) < len(SETTLED):
+        return 0.0
+    arms = skin.middles - skin.middles.mean(axis=0)
+    arms /= np.linalg.norm(arms, axis=1).mean()
+    slopes = np.column_stack([np.cross(arms, skin.normals), skin.normals])
+    return float(np.linalg.eigvalsh(slopes.T @ slopes / len(slopes))[0])
+
+
+def patches(skin: trimesh.Trimesh) -> Patches:
+    """Pieces of a skin all over it but at its rim, each the mean and the plane of its nearest vertices."""
+    step = max(1, len(skin.vertices) // VERTICES)
+    vertices, normals = np.asarray(skin.vertices)[::step], np.asarray(skin.vertex_normals)[::step]
+    chosen = np.arange(0, len(vertices), max(1, PATCH // OVERLAP))
+    _, near = surface_tree(vertices).query(vertices[chosen], min(PATCH, len(vertices)))
+    middles = vertices[near].mean(axis=1)
+    arms = vertices[near] - middles[:, None]
+    radius = np.sqrt(2 * np.einsum("nki,nki->n", arms, arms) / near.shape[1])  # of a disc with that second moment
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", arms, arms))
+    planes = axes[:, :, 0]
+    planes *= np.where((planes * normals[chosen]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    aside = middles - vertices[chosen]
+    aside -= (aside * planes).sum(axis=1)[:, None] * planes
+    whole = np.linalg.norm(aside, axis=1) < ONE_SIDED * radius
+    return Patches(middles[whole], planes[whole])

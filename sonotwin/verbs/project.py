@@ -1,0 +1,232 @@
+"""Draw masses, a planned cut and the B-scan's line for the projector, so that its light shows them on the skin where they are.
+
+Reads the skin as it lies now (`sonotwin surface`), masses of `sonotwin segment`, a cut drawn in 3D Slicer (.mrk.json), and a
+capture's sweep with poses, as far as each is given. The outline of a mass is where the lines that touch it come through the skin:
+parallel lines along the skin's normal over it, or those of the surgeon's eye (`eye_mm`). Where the body has moved since, give the
+skin of that time as `earlier_skin`, and masses and cut move along. Writes into `out`: projector.png, to be shown pixel by pixel;
+curves.json (mm) and curves.ply, the curves on the skin; scene.glb with skin, masses and curves; expected_cam1.png, what camera 1
+should see of it; and metrics.json. Takes some seconds, less than one of them to draw.
+
+    sonotwin project skin=result/surface/surface.ply masses=result/masses/scan calibration=result/optics/optics.yaml out=light
+    sonotwin project skin=now.ply earlier_skin=before.ply masses=masses calibration=optics.yaml eye_mm=[0,300,100] out=light
+"""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import cv2
+import numpy as np
+import trimesh
+from pydantic import Field
+from rich.console import Console
+
+from recon.capture import calibration_files, sweep_part
+from recon.errors import InputError
+from recon.files import atomic, layers, metrics
+from recon.files.metrics import Metrics
+from recon.freehand import scans as freehand_scans
+from recon.fusion import fused_scene, probe_shape
+from recon.fusion import skin as skin_parts
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.model.rig import NotNegative, Part, Rig, Vector
+from recon.model.tracks import LagSeconds
+from recon.segmentation import containment, mass_files
+from recon.skin_projection import (
+    curve_files,
+    expected_view,
+    mass_outline,
+    planned_cut,
+    probe_shadow,
+    projector_image,
+    scan_line,
+    skin_registration,
+)
+from recon.skin_projection.projector_image import Drawing, Lines
+from recon.skin_projection.skin_curve import SkinCurve
+from recon.skin_projection.skin_registration import SkinShift
+
+PICTURE, CURVES, STRIPS, SCENE, EXPECTED = "projector.png", "curves.json", "curves.ply", "scene.glb", "expected_cam1.png"
+LIGHT = (60, 220, 120, 255)  # colour of curves in scene.glb
+UNSURE_MM = 0.5  # of a moved mass, beyond which a warning is due
+RESHAPED_MM = 0.5  # of a moved skin's distances that are left, the same
+
+
+class Config(Part):
+    """Fields of `conf/project.yaml`."""
+
+    rig: Rig
+    skin: Path
+    calibration: Path
+    out: Path
+    masses: Path | None = None
+    cut: Path | None = None
+    eye_mm: Vector | None = None
+    earlier_skin: Path | None = None
+    part_table: bool = True
+    capture: Path | None = None
+    sweep: str = ""
+    scan: Annotated[int, Field(ge=0)] = 0
+    probe: Path | None = None
+    lag_s: LagSeconds = 0.0
+    margin_mm: NotNegative = probe_shadow.MARGIN_MM
+    lines: Lines = Lines()
+
+
+class Held(NamedTuple):
+    """The probe where it was held."""
+
+    line: SkinCurve  # of its B-scan
+    body: trimesh.Trimesh  # in the world
+
+
+def run(config: Config) -> None:
+    """Read what is given, draw, and write.
+
+    Raises
+    ------
+    InputError
+        If nothing is given to draw, a file is missing or damaged, or nothing of it can be lit; or `out` can't be written to.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    given = (config.skin, config.calibration, config.masses, config.cut, config.earlier_skin, config.capture, config.probe)
+    atomic.check_folder(config.out, PICTURE, inputs=[path for path in given if path is not None])
+    if config.masses is None and config.cut is None and config.capture is None:
+        raise InputError("project: expected masses, a cut or a capture to draw, found none of them")
+    cameras = calibration_files.read(config.calibration).cameras
+    if "projector" not in cameras:
+        raise InputError(f"{config.calibration}: expected the projector, found {', '.join(cameras)}")
+
+    with console.status("reading"):
+        skin, shift = read_skin(config.skin, config.part_table), None
+        if config.earlier_skin is not None:
+            shift = skin_registration.register(read_skin(config.earlier_skin, config.part_table), skin)
+        new_from_old = np.eye(4) if shift is None else shift.new_from_old
+        masses = {name: mass.copy().apply_transform(new_from_old) for name, mass in read_masses(config).items()}
+        cuts = [] if config.cut is None else [rigid.apply(new_from_old, chain) for chain in planned_cut.read(config.cut)]
+        held = None if config.capture is None else read_probe(config, skin)
+
+    start = time.perf_counter()
+    curves = [*mass_outline.outlines(masses, skin, config.eye_mm).values()]
+    curves += [planned_cut.on_skin(f"cut{k}", chain, skin, config.eye_mm) for k, chain in enumerate(cuts)]
+    curves += [] if held is None else [held.line]
+    if not curves:
+        raise InputError(f"{config.masses}: expected masses to draw, found none in it; give a cut or a capture, too")
+    dark = None if held is None else probe_shadow.shadow(held.body, cameras["projector"], config.margin_mm)
+    drawing = projector_image.draw(curves, skin, cameras["projector"], config.rig.projector.gamma, config.lines, dark)
+    seconds = round(time.perf_counter() - start, 3)
+    if not drawing.image.any():
+        found = "none: is the calibration that of this rig, and the probe not before all of it?"
+        raise InputError(f"{config.skin}: expected some of the curves in the projector's reach, found {found}")
+
+    figures = measure(curves, drawing, masses, shift) | {"seconds_drawing": seconds}
+    with console.status("writing"), atomic.new_folder(config.out, PICTURE) as folder:
+        written = write(folder, curves, drawing, skin, masses, cameras, config.lines)
+        metrics.write(folder / metrics.FILE, figures)
+    for line in described(curves, drawing, masses, shift):
+        console.print(line, markup=False)
+    console.print(f"wrote       {config.out}/{{{','.join([*written, metrics.FILE])}}}", markup=False)
+
+
+def read_skin(path: Path, part_table: bool) -> trimesh.Trimesh:
+    """A skin, parted from the plane that it stands on; raises InputError if it is missing or damaged."""
+    whole = containment.read_skin(path)
+    return (skin_parts.by_plane(whole).skin or whole) if part_table else whole
+
+
+def read_masses(config: Config) -> dict[str, trimesh.Trimesh]:
+    """The masses by name; there may be none."""
+    return {} if config.masses is None else {name: mass.mesh for name, mass in mass_files.read_masses(config.masses).items()}
+
+
+def read_probe(config: Config, skin: trimesh.Trimesh) -> Held:
+    """The probe as it was held for a B-scan of the capture, and the B-scan's line.
+
+    Raises
+    ------
+    InputError
+        If the capture is incomplete or damaged, there is no such B-scan, or it has no pose.
+    """
+    assert config.capture is not None
+    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
+    probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
+    scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, None)
+    count = len(scans.world_from_pixel)
+    if config.scan >= count:
+        raise InputError(f"project: scan: expected a B-scan of {config.capture}, 0 to {count - 1}, found {config.scan}")
+    matrix, width = scans.world_from_pixel[config.scan], scans.shape[1]
+    if not np.isfinite(matrix).all():
+        raise InputError(f"project: scan: expected a B-scan with a pose, found none of {config.scan}; give another")
+    body, _ = probe_shape.of(config.rig.target, probe, width)
+    line = scan_line.on_skin(f"scan{config.scan:04d}", matrix, width, skin)
+    return Held(line, body.apply_transform(sweep.poses(config.lag_s)[config.scan]))
+
+
+def measure(
+    curves: Sequence[SkinCurve], drawing: Drawing, masses: Mapping[str, trimesh.Trimesh], shift: SkinShift | None
+) -> Metrics:
+    """Figures of the curves, and of the skin's motion if there was one."""
+    found: Metrics = {"curves": len(curves)}
+    for curve in curves:
+        found |= {
+            f"{curve.name}_length_mm": curve.length_mm,
+            f"{curve.name}_on_skin": curve.on_skin,
+            f"{curve.name}_lit": drawing.shown[curve.name],
+        }
+    if shift is not None:
+        turn = rigid.difference(np.eye(4), shift.new_from_old)[:3]
+        found |= {"shift_turn_deg": float(np.rad2deg(np.linalg.norm(turn))), "shift_residual_mm": shift.rms_mm}
+        found |= {f"{name}_{key}": value for name, mass in masses.items() for key, value in moved_by(shift, mass).items()}
+    return found
+
+
+def moved_by(shift: SkinShift, mass: trimesh.Trimesh) -> Metrics:
+    """Way of a mass that was moved, and the standard deviation of its place by that."""
+    before = rigid.apply(rigid.invert(shift.new_from_old), mass.center_mass)
+    return {"moved_mm": float(np.linalg.norm(mass.center_mass - before)), "moved_sigma_mm": shift.sigma_mm(before)}
+
+
+def described(
+    curves: Sequence[SkinCurve], drawing: Drawing, masses: Mapping[str, trimesh.Trimesh], shift: SkinShift | None
+) -> Iterator[str]:
+    """Lines for the console."""
+    if shift is not None:
+        yield f"shift       {shift.share:.0%} of the earlier skin found again, {shift.rms_mm:.3f} mm off its place"
+        if shift.rms_mm > RESHAPED_MM:
+            yield "warning     the skin has changed its shape, too: find the masses anew"
+        for name, mass in masses.items():
+            way = moved_by(shift, mass)
+            yield f"{name:12}moved by {way['moved_mm']:.2f} mm, known to {way['moved_sigma_mm']:.2f} mm"
+            if way["moved_sigma_mm"] > UNSURE_MM:
+                yield f"warning     the skin may slide in itself: {name} is uncertain by it; measure more of the skin"
+    for curve in curves:
+        lit = drawing.shown[curve.name]
+        yield f"{curve.name:12}{curve.length_mm:.1f} mm on the skin, {lit:.0%} of it in the projector's reach"
+        if curve.on_skin < 1:
+            yield f"warning     {1 - curve.on_skin:.0%} of {curve.name} is left out: there is no skin measured"
+
+
+def write(
+    folder: Path,
+    curves: Sequence[SkinCurve],
+    drawing: Drawing,
+    skin: trimesh.Trimesh,
+    masses: Mapping[str, trimesh.Trimesh],
+    cameras: Mapping[str, Camera],
+    lines: Lines,
+) -> list[str]:
+    """Write all files but the figures; returns their names."""
+    pictures = {PICTURE: drawing.image}
+    if "cam1" in cameras:
+        pictures[EXPECTED] = expected_view.expected(curves, skin, cameras["cam1"], lines)
+    for name, image in pictures.items():
+        (folder / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    curve_files.write_json(folder / CURVES, curves)
+    curve_files.write_ply(folder / STRIPS, curves, lines)
+    shown = {"skin": fused_scene.surface_layer(skin, fused_scene.SKIN, fused_scene.GREY_SKIN)}
+    shown |= {name: layers.painted(mass, fused_scene.MASS) for name, mass in masses.items()}
+    shown |= {f"{name}_light": layers.painted(strip, LIGHT) for name, strip in curve_files.strips(curves, lines).items()}
+    layers.write_layers(folder / SCENE, shown)
+    return [*pictures, CURVES, STRIPS, SCENE]
