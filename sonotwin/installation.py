@@ -16,7 +16,7 @@ from sonotwin import namesakes
 from twin import llvm
 
 OLDEST_PYTHON = (3, 11)
-EXTRAS = ("twin", "study", "train", "dev", "docs")
+EXTRAS = ("twin", "study", "live", "train", "dev", "docs")
 MODULES = {  # where a package isn't imported by the name that it is installed by
     "hydra-core": "hydra",
     "import-linter": "importlinter",

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 OURS = {"recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks", "campaign", "tests"}
 RENDERER = {"mitsuba", "drjit"}
 NEEDS = {  # parts of the requirements, as they stand in pyproject.toml
-    "recon": {"core"},
+    "recon": {"core", "live"},
     "sonotwin": {"core", "train"},
     "scenes": {"core"},
     "twin": {"core", "twin", "study"},
