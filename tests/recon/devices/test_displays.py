@@ -33,7 +33,7 @@ def test_without_a_desktop_the_way_on_is_named(monkeypatch, named):
 @pytest.mark.parametrize(
     ("found", "index", "message"),
     [
-        ([LAPTOP], 1, r"expected display 1, found 0 \(eDP-1, 1920x1080 px at 0, 0, 60 Hz\): is the projector switched on"),
+        ([LAPTOP], 1, r"expected display 1, found 0 \(eDP-1, 1920x1080 px at 0, 0, 60 Hz\): is the projector on"),
         ([LAPTOP, PROJECTOR], -1, "expected display -1"),
         ([LAPTOP, PROJECTOR], 0, r"expected a display of 1280x800 px.*found display 0.*choose another display"),
         ([Display(0, "HDMI-1", (1280, 800), (1920, 1200), (0, 0), 60.0)], 0, "signal of 1280x800 px, found one of 1920x1200 px"),
