@@ -117,7 +117,8 @@ def refuse_doubled(shot: Shot, cameras: Sequence[Camera]) -> None:
         if change < DOUBLED:
             raise DeviceError(
                 f"{camera.name}: expected another image of pattern {shot.number} than of the one before, found the same in "
-                f"{TRIES} tries: is the projector's image frozen, its delay longer than was measured, or this part of it out of view?"
+                f"{TRIES} tries: is the projector's image frozen, its delay longer than was measured, or this "
+                "part of it out of view?"
             )
 
 
@@ -152,9 +153,7 @@ def _measure_light(projector: Projector, cameras: Sequence[Camera], taking: Taki
     dark = _all_frames(cameras, taking, projector.show(black), "black")
     lit = _all_frames(cameras, taking, projector.show(white), "white")
     again = _all_frames(cameras, taking, time.monotonic_ns(), "white")
-    lights = [
-        pattern_changes.measure_light(*(frame.image for frame in frames)) for frames in zip(dark, lit, again, strict=True)
-    ]
+    lights = [pattern_changes.measure_light(*(frame.image for frame in frames)) for frames in zip(dark, lit, again, strict=True)]
     for camera, light in zip(cameras, lights, strict=True):
         if light.power < max(LEAST_LIGHT_DN**2, light.noise):
             raise DeviceError(

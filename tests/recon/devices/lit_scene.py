@@ -8,6 +8,7 @@ import numpy as np
 from recon.devices.interfaces import DeviceError, Frame
 
 GAIN, AMBIENT = 0.8, 10.0  # DN a level, DN
+LATE_NS = 110_000_000
 
 
 class Wall:
@@ -47,7 +48,7 @@ class WallCamera:
     bits = 8
 
     def __init__(self, wall, rng, name="cam1", exposure_s=0.002, period_s=0.004, lost=(), late=(), noise=1.0, gain=GAIN):
-        """`lost` : numbers of exposures that never arrive; `late` : of those that arrive after the time to wait."""
+        """`lost` : numbers of exposures that never arrive; `late` : of those that arrive among those of the next patterns."""
         self.wall, self.rng, self.name, self.size = wall, rng, name, wall.size
         self.exposure_s, self.period_s, self.noise, self.gain = exposure_s, period_s, noise, gain
         self.lost, self.late = set(lost), set(late)
@@ -73,8 +74,10 @@ class WallCamera:
         while True:
             if self.mode != "software":
                 self._catch_up()
-            if self.queue and self.queue[0][0] <= time.monotonic_ns():
-                return self._image(*self.queue.popleft())
+            if self.queue and min(self.queue)[0] <= time.monotonic_ns():
+                first = min(self.queue)
+                self.queue.remove(first)
+                return self._image(*first)
             if time.monotonic() >= end:
                 return None
             time.sleep(0.0005)
@@ -97,10 +100,9 @@ class WallCamera:
         exposure, self.exposures = self.exposures, self.exposures + 1
         if exposure in self.lost:
             return
-        arrives = end_ns + (150_000_000 if exposure in self.late else 500_000)
+        arrives = end_ns + (LATE_NS if exposure in self.late else 500_000)
         self.queue.append((arrives, number, begin_ns, end_ns))
 
     def _image(self, arrives, number, begin_ns, end_ns):
         level = AMBIENT + self.gain * self.wall.light(begin_ns, end_ns) + self.noise * self.rng.standard_normal(self.size[::-1])
         return Frame(np.uint8(np.clip(np.rint(level), 0, 255)), number, (begin_ns + end_ns) // 2, arrives)
-

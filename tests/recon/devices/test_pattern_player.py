@@ -60,7 +60,7 @@ def test_a_projector_that_stays_frozen_is_told_from_one_that_was_late(rng):
     shots = list(play(wall, IMAGES[:4], cameras, Triggered()))
     assert [shot.doubled for shot in shots] == [False, False, True, True]
     refuse_doubled(shots[1], cameras)
-    with pytest.raises(DeviceError, match="^cam1: expected another image of pattern 2 than of the one before, found the same"):
+    with pytest.raises(DeviceError, match=r"^cam1: expected another image of pattern 2 than of the one before"):
         refuse_doubled(shots[2], cameras)
 
 
