@@ -168,6 +168,7 @@ def _all_frames(cameras: Sequence[Camera], taking: Taking, lit_ns: int, what: st
 
     A camera that gave none is started anew, so that an image which comes late isn't taken for that of the next pattern.
     """
+    lost: list[Camera] = []
     for _ in range(TRIES):
         frames = taking.take(cameras, lit_ns)
         lost = [camera for camera, frame in zip(cameras, frames, strict=True) if frame is None]
