@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,7 @@ class Triggered:
     """Software triggers: all cameras at once, as soon as the light is there."""
 
     timeout_s: float = 1.0
-    trigger: ClassVar[Trigger] = "software"
+    trigger: Literal["software"] = "software"
 
     def take(self, cameras: Sequence[Camera], lit_ns: int) -> list[Frame | None]:
         """Trigger all, then collect."""

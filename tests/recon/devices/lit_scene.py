@@ -1,43 +1,57 @@
-"""A projector and cameras that see its light on a wall, with the faults that real ones have."""
+"""A projector and cameras that see its light on a wall, with the faults that real ones have, in a time of their own."""
 
-import time
 from collections import deque
 
 import numpy as np
 
+from recon.devices import pattern_player, projector_delay
 from recon.devices.interfaces import DeviceError, Frame
 
 GAIN, AMBIENT = 0.8, 10.0  # DN a level, DN
-LATE_NS = 110_000_000
+CALL_NS, TRANSFER_NS, LATE_NS = 1_000, 500_000, 110_000_000
+
+
+class Clock:
+    """Stands for the module `time`: it goes on by calls and waits alone, however busy the machine is."""
+
+    def __init__(self, monkeypatch):
+        self.now_ns = 10**9
+        for module in (pattern_player, projector_delay):
+            monkeypatch.setattr(module, "time", self)
+
+    def monotonic_ns(self):
+        self.now_ns += CALL_NS
+        return self.now_ns
+
+    def monotonic(self):
+        return self.monotonic_ns() / 1e9
+
+    def sleep(self, seconds):
+        self.now_ns += round(1e9 * seconds)
 
 
 class Wall:
     """A projector's light over time, on a wall."""
 
-    def __init__(self, size=(96, 64), delay_s=0.0, gamma=1.0, frozen=()):
+    def __init__(self, clock, size=(96, 64), delay_s=0.0, gamma=1.0, frozen=()):
         """`frozen` : numbers of calls of `show` that have no effect."""
-        self.size = size
-        self.delay_s = delay_s
-        self.gamma = gamma
-        self.frozen = set(frozen)
+        self.clock, self.size, self.delay_s, self.gamma, self.frozen = clock, size, delay_s, gamma, set(frozen)
         self.calls = 0
         self.history = deque([(0, np.zeros(size[::-1], np.uint8))], maxlen=8)
-        self.closed = False
 
     def show(self, pattern):
-        now = time.monotonic_ns()
+        now = self.clock.monotonic_ns()
         if self.calls not in self.frozen:
             self.history.append((now + round(1e9 * self.delay_s), pattern))
         self.calls += 1
         return now
 
     def close(self):
-        self.closed = True
+        pass
 
     def light(self, begin_ns, end_ns):
         """Mean light (h, w), 0 to 255, from a time to a later one."""
-        changes = [at for at, _ in self.history]
-        times = np.clip([*changes, np.inf], begin_ns, end_ns)
+        times = np.clip([*(at for at, _ in self.history), np.inf], begin_ns, end_ns)
         shares = np.diff(times) / (end_ns - begin_ns)
         return sum(share * 255 * (pattern / 255) ** self.gamma for share, (_, pattern) in zip(shares, self.history, strict=True))
 
@@ -50,59 +64,49 @@ class WallCamera:
     def __init__(self, wall, rng, name="cam1", exposure_s=0.002, period_s=0.004, lost=(), late=(), noise=1.0, gain=GAIN):
         """`lost` : numbers of exposures that never arrive; `late` : of those that arrive among those of the next patterns."""
         self.wall, self.rng, self.name, self.size = wall, rng, name, wall.size
-        self.exposure_s, self.period_s, self.noise, self.gain = exposure_s, period_s, noise, gain
+        self.exposure_ns, self.period_ns, self.noise, self.gain = round(1e9 * exposure_s), round(1e9 * period_s), noise, gain
         self.lost, self.late = set(lost), set(late)
         self.exposures = 0
-        self.starts = 0
         self.unplugged = False
 
     def set_exposure(self, exposure_s, gain):
-        self.exposure_s = exposure_s
+        self.exposure_ns = round(1e9 * exposure_s)
 
     def start(self, trigger):
-        self.mode, self.began_ns, self.number, self.queue = trigger, time.monotonic_ns(), 0, deque()
-        self.starts += 1
+        self.mode, self.began_ns, self.number, self.queue = trigger, self.wall.clock.monotonic_ns(), 0, []
 
     def trigger(self):
         assert self.mode == "software"
-        self._expose(time.monotonic_ns())
+        self._expose(self.wall.clock.monotonic_ns())
 
     def frame(self, timeout_s):
         if self.unplugged:
             raise DeviceError(f"{self.name}: expected a camera, found none")
-        end = time.monotonic() + timeout_s
-        while True:
-            if self.mode != "software":
-                self._catch_up()
-            if self.queue and min(self.queue)[0] <= time.monotonic_ns():
-                first = min(self.queue)
-                self.queue.remove(first)
-                return self._image(*first)
-            if time.monotonic() >= end:
-                return None
-            time.sleep(0.0005)
+        clock = self.wall.clock
+        end = clock.monotonic_ns() + round(1e9 * timeout_s)
+        while self.mode != "software" and self.began_ns + self.number * self.period_ns <= end:
+            self._expose(self.began_ns + self.number * self.period_ns)
+        first = min(self.queue, default=None)
+        if first is None or first[0] > end:
+            clock.now_ns = end
+            return None
+        self.queue.remove(first)
+        arrives, number, begin = first
+        clock.now_ns = max(clock.now_ns, arrives)
+        light = self.wall.light(begin, begin + self.exposure_ns)
+        level = AMBIENT + self.gain * light + self.noise * self.rng.standard_normal(self.size[::-1])
+        image = np.uint8(np.clip(np.rint(level), 0, 255))
+        return Frame(image, number, begin + self.exposure_ns // 2, arrives)
 
     def stop(self):
-        self.queue = deque()
+        self.queue = []
 
     def close(self):
         pass
 
-    def _catch_up(self):
-        """Expose all images that a free camera has begun and ended by now."""
-        period, exposure = round(1e9 * self.period_s), round(1e9 * self.exposure_s)
-        while self.began_ns + self.number * period + exposure <= time.monotonic_ns():
-            self._expose(self.began_ns + self.number * period)
-
     def _expose(self, begin_ns):
-        end_ns = begin_ns + round(1e9 * self.exposure_s)
         number, self.number = self.number, self.number + 1
         exposure, self.exposures = self.exposures, self.exposures + 1
-        if exposure in self.lost:
-            return
-        arrives = end_ns + (LATE_NS if exposure in self.late else 500_000)
-        self.queue.append((arrives, number, begin_ns, end_ns))
-
-    def _image(self, arrives, number, begin_ns, end_ns):
-        level = AMBIENT + self.gain * self.wall.light(begin_ns, end_ns) + self.noise * self.rng.standard_normal(self.size[::-1])
-        return Frame(np.uint8(np.clip(np.rint(level), 0, 255)), number, (begin_ns + end_ns) // 2, arrives)
+        if exposure not in self.lost:
+            delay = LATE_NS if exposure in self.late else TRANSFER_NS
+            self.queue.append((begin_ns + self.exposure_ns + delay, number, begin_ns))

@@ -15,9 +15,9 @@ LEVELS = np.linspace(0, 1, 17)
 
 
 @pytest.mark.parametrize("gamma", [1.0, 1.8, 2.2, 2.6])
-def test_gamma_is_measured(rng, gamma):
+def test_gamma_is_measured(clock, rng, gamma):
     """Of 6144 pixels with 1 DN of noise and rounding of 1/16 of the range apart: 0.5 % of the exponent."""
-    wall = Wall(gamma=gamma)
+    wall = Wall(clock, gamma=gamma)
     found = projector_response.measure(wall, WallCamera(wall, rng), Triggered())
     assert found.gamma == pytest.approx(gamma, abs=0.005 * gamma)
     assert found.light == pytest.approx(found.levels**gamma, abs=0.003)
@@ -25,8 +25,8 @@ def test_gamma_is_measured(rng, gamma):
     assert wall.calls == 17 + 2  # no step was taken for one that isn't shown
 
 
-def test_saturated_white_is_refused(rng):
-    wall = Wall()
+def test_saturated_white_is_refused(clock, rng):
+    wall = Wall(clock)
     with pytest.raises(DeviceError, match=r"^cam1: expected white below 250 DN, found it saturated: shorten the exposure"):
         projector_response.measure(wall, WallCamera(wall, rng, gain=1.2), Triggered())
 

@@ -1,9 +1,6 @@
-"""A screen of X11 without a monitor, screenshots of it, and what may happen to a desktop."""
+"""What may happen to a desktop, on a screen without a monitor."""
 
 import ctypes
-import os
-import shutil
-import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -12,30 +9,16 @@ import pytest
 from numpy.typing import NDArray
 from pyglet.libs.x11 import xlib, xrandr
 
-ALL_PLANES, Z_PIXMAP = 0xFFFFFFFFFFFFFFFF, 2  # of Xlib.h
+from twin.accuracy import virtual_screen
 
 
 @contextmanager
 def x_server(*screens: str) -> Iterator[str]:
-    """Run Xvfb with screens such as 1280x800x24, and give its display; skips the test where it isn't installed."""
-    program = shutil.which("Xvfb")
-    if program is None:
+    """A desktop of screens such as 1280x800x24; skips the test where Xvfb isn't installed."""
+    if virtual_screen.installed() is None:
         pytest.skip("no Xvfb; `apt-get install xvfb` brings it")
-    receive, send = os.pipe()
-    options = [word for number, screen in enumerate(screens) for word in ("-screen", str(number), screen)]
-    server = subprocess.Popen(
-        [program, "-displayfd", str(send), *options, "-nolisten", "tcp", "-noreset"], pass_fds=(send,), stderr=subprocess.DEVNULL
-    )
-    os.close(send)
-    try:
-        with os.fdopen(receive) as answer:
-            number = answer.readline().strip()
-        if not number:
-            pytest.skip("Xvfb does not start here")
-        yield f":{number}"
-    finally:
-        server.terminate()
-        server.wait(10)
+    with virtual_screen.running(*screens) as display:
+        yield display
 
 
 @contextmanager
@@ -46,18 +29,6 @@ def connected(display: str) -> Iterator[tuple[ctypes.c_void_p, int]]:
         yield connection, xlib.XDefaultRootWindow(connection)
     finally:
         xlib.XCloseDisplay(connection)
-
-
-def screenshot(display: str) -> NDArray[np.uint8]:
-    """The screen of a display : (h, w, 3), blue, green, red."""
-    with connected(display) as (connection, root):
-        number = xlib.XDefaultScreen(connection)
-        width, height = xlib.XDisplayWidth(connection, number), xlib.XDisplayHeight(connection, number)
-        image = xlib.XGetImage(connection, root, 0, 0, width, height, ALL_PLANES, Z_PIXMAP).contents
-        place = ctypes.c_void_p.from_buffer(image, type(image).data.offset)
-        levels = np.frombuffer(ctypes.string_at(place.value, image.bytes_per_line * height), np.uint8)
-        xlib.XFree(place)
-        return levels.reshape(height, -1, 4)[:, :width, :3]
 
 
 @contextmanager
