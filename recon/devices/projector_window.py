@@ -203,11 +203,15 @@ class _Canvas:
 def _opened(screen: "Screen", display: Display) -> "pyglet.window.Window":
     """A window over a whole display, by images of 8 bits or more a colour."""
     try:
-        config = pyglet.gl.Config(double_buffer=True, red_size=8, green_size=8, blue_size=8, depth_size=0, stencil_size=0)
-        return pyglet.window.Window(
+        from pyglet import gl, window
+    except ImportError as error:  # of OpenGL itself
+        raise DeviceError(f"projector: a library of the system is missing, {reason(error)}: install OpenGL (libgl1)") from None
+    config = gl.Config(double_buffer=True, red_size=8, green_size=8, blue_size=8, depth_size=0, stencil_size=0)
+    try:
+        return window.Window(
             fullscreen=True, screen=screen, display=screen.display, config=config, vsync=True, caption="projector"
         )
-    except (ImportError, pyglet.window.WindowException, pyglet.gl.ContextException) as error:
+    except (window.WindowException, gl.ContextException) as error:
         raise DeviceError(
             f"projector: expected OpenGL 3.3 with 24 bits of colour on display {display}, found {reason(error)}: install the "
             "graphics card's driver or Mesa (libgl1), and set the display to 24 bits"

@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pyglet
 import pytest
 
 from recon.artwork import projected_images
@@ -120,6 +121,15 @@ def test_levels_that_a_display_cannot_show_are_refused(monkeypatch):
         monkeypatch.setenv("DISPLAY", desktop)
         with pytest.raises(DeviceError, match="expected 24 bits of colour, found 16 on display 0"):
             ProjectorWindow((320, 240), 0, delay_s=0)
+
+
+def test_a_graphics_card_without_opengl_is_refused(desktop, monkeypatch):
+    def refuse(**_):
+        raise pyglet.window.NoSuchConfigException("No standard config is available.")
+
+    monkeypatch.setattr(pyglet.window, "Window", refuse)
+    with pytest.raises(DeviceError, match=r"expected OpenGL 3.3 .* found No standard config is available.: install the graphics"):
+        ProjectorWindow((1280, 800), 1)
 
 
 def test_a_bent_ramp_is_warned_of(monkeypatch, caplog):
