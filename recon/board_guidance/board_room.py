@@ -15,7 +15,7 @@ from recon.model.rig import Lens, Optics, Rig
 
 Array = NDArray[np.float64]
 
-BLUR_PX = {"camera": 2.0, "projector": 5.0}  # disc of a point out of focus; the paper's fringes have 2.3 to 5.2 (conf/rig)
+BLUR_PX = {"camera": 2.5, "projector": 5.0}  # disc of a point out of focus; the paper's fringes have 2.3 to 5.2 (conf/rig)
 SHARP_PX = {"camera": 1.0, "projector": 5.0}  # where things are measured, not just calibrated
 FARTHEST = 3.0  # times the distance in focus, however small the aperture
 LEVELS = 3  # of distance: both ends of the reach tell most, and the middle

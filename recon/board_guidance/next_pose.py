@@ -15,13 +15,9 @@ from recon.model.boards import Board
 from recon.model.calibration import Calibration
 from recon.model.rig import Rig
 
-CANDIDATES = 200  # from which the best one is chosen
+CANDIDATES = 300  # from which the best one is chosen
 FEW_POINTS = 24  # of a board: so many stand for all of a larger one
-NOISE_PX = {
-    "cam1": 0.01,
-    "cam2": 0.01,
-    "projector": 0.01,
-}  # of a sighting, before any was measured; of rendered boards half of it
+NOISE_PX = {"cam1": 0.01, "cam2": 0.01, "projector": 0.01}  # of a sighting before any was measured; rendered boards have half
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,8 @@ def _adjusted(so_far: SoFar) -> SoFar:
         return so_far
     if not _is_sure(found.calibration):
         return so_far
-    misfit = np.nanmedian(np.where(observations.seen, found.normalised, np.nan), axis=1)
+    nothing = ~observations.seen.any(axis=1, keepdims=True)  # of a pose that was kept though a device doesn't see it
+    misfit = np.nanmedian(np.where(nothing, 0.0, found.normalised), axis=1)
     return replace(so_far, calibration=found.calibration, poses=found.poses, noise=_noise(observations, found), misfit=misfit)
 
 

@@ -14,7 +14,7 @@ from recon.board_guidance.pose_progress import BAD_POSE, SoFar, held, with_sight
 from recon.geometry.camera import Array
 from recon.optical_calibration.sightings import Sighting
 
-LEAST_SHARE = 0.7  # of what the best pose would add; an earlier pose once more adds half of it, by averaging noise
+LEAST_SHARE = 0.7  # of what the asked pose would add; an earlier pose once more adds half of it, by averaging noise
 ALIKE_MM, ALIKE_DEG = 10.0, 4.0  # from an earlier pose: what isn't noise, as the board's bend, errs in the same way there
 BLURRED_PX = 3.0  # standard deviation, in the softest direction
 SMEARED = 2.0, 0.5  # softest over sharpest direction, and px on top: beyond, the board moved while the camera exposed
@@ -28,6 +28,7 @@ class Observation:
     sighting: Sighting
     lit: Mapping[str, NDArray] = field(default_factory=dict)  # camera: (h, w), the images that it was found in
     again: Mapping[str, Array] = field(default_factory=dict)  # camera: (n, 2) px, found once more after the last frame
+    asked_gain: float | None = None  # of the pose that was asked for; that of the best of many if none was
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def judge(observation: Observation, so_far: SoFar, reach: Reach | None = None) -
     gain = _gains(pose[None], so_far, reach)[0]
     if fault:
         return Verdict(False, fault, gain, so_far)
-    if alike := _too_alike(pose, so_far, gain, reach):
+    if alike := _too_alike(pose, so_far, gain, observation.asked_gain, reach):
         return Verdict(False, alike, gain, so_far)
     extended = with_sighting(so_far, observation.sighting)
     if disagreeing := _disagreement(extended):
@@ -94,20 +95,25 @@ def _gains(poses: Array, so_far: SoFar, reach: Reach) -> list[float]:
     return known.gains(poses, few(so_far.board.points())).tolist()
 
 
-def _too_alike(pose: Array, so_far: SoFar, gain: float, reach: Reach) -> str | None:
+def _too_alike(pose: Array, so_far: SoFar, gain: float, asked: float | None, reach: Reach) -> str | None:
     """Refusal of a pose that adds little, or that stands where an earlier one stood."""
     if len(so_far.poses) == 0:
         return None
     apart_mm = np.linalg.norm(middles(so_far.poses, so_far.board) - middles(pose[None], so_far.board), axis=1)
     apart_deg = np.rad2deg(Rotation.from_matrix(so_far.poses[:, :3, :3] @ pose[:3, :3].T).magnitude())
     nearest = int(np.argmin(apart_mm / ALIKE_MM + apart_deg / ALIKE_DEG))
-    choice = candidates(so_far.board, so_far.cameras, reach, CANDIDATES, np.random.default_rng(len(so_far.poses)))
-    best = max(_gains(choice, so_far, reach))
+    best = _best_gain(so_far, reach) if asked is None else asked
     adds = f"adds {100 * gain:.1f} % where {100 * best:.1f} % is possible"
     if apart_mm[nearest] < ALIKE_MM and apart_deg[nearest] < ALIKE_DEG:
         away = f"{apart_mm[nearest]:.0f} mm and {apart_deg[nearest]:.0f} deg from it"
         return f"too like pose {so_far.sightings[nearest].name}, {away}: {adds}; hold it as shown"
     return None if gain >= LEAST_SHARE * best else f"{adds}; hold it as shown"
+
+
+def _best_gain(so_far: SoFar, reach: Reach) -> float:
+    """Gain of the best of many poses; the same for the same sightings."""
+    choice = candidates(so_far.board, so_far.cameras, reach, CANDIDATES, np.random.default_rng(len(so_far.poses)))
+    return max(_gains(choice, so_far, reach))
 
 
 def _disagreement(extended: SoFar) -> str | None:

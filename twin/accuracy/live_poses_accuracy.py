@@ -123,14 +123,14 @@ def guided(session: Session) -> Guided:
     """Hold the board where it is asked for, as well as a person can, until enough poses are kept."""
     rng, design = np.random.default_rng([session.seed, 32]), board.design(board.Config())
     so_far, refused, seconds = SoFar(session.rig, design), 0, []
-    asked = suggest(None, so_far.poses, session.rig, design, rng).world_from_board
+    asked = suggest(None, so_far.poses, session.rig, design, rng)
     while len(so_far.sightings) < GUIDED:
-        pose = held_about(asked, session, rng)
-        seen = Observation(session.sighting(pose, len(so_far.sightings)))
+        pose = held_about(asked.world_from_board, session, rng)
+        seen = Observation(session.sighting(pose, len(so_far.sightings)), asked_gain=asked.gain)
         start = perf_counter()
         verdict = judge(seen, so_far)
         so_far, refused = verdict.so_far, refused + (not verdict.accepted)
-        asked = suggest(so_far.calibration, so_far.poses, session.rig, design, rng, noise=so_far.noise).world_from_board
+        asked = suggest(so_far.calibration, so_far.poses, session.rig, design, rng, noise=so_far.noise)
         seconds.append(perf_counter() - start)
     return Guided(so_far.sightings, refused, tuple(seconds))
 

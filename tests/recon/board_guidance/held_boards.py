@@ -1,4 +1,4 @@
-"""Sightings of a board in poses of the tests' choice, as all devices of the rig find it."""
+"""Sightings and photographs of a board in poses of the tests' choice."""
 
 from dataclasses import replace
 
@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from recon.board_guidance.board_room import middle
 from recon.board_guidance.pose_progress import SoFar, with_sighting
 from recon.geometry import rigid
+from tests.recon import board_views
 from tests.recon.board_sets import BOARD, devices, random_poses, sightings
 
 
@@ -33,3 +34,11 @@ def kept(rig, poses, rng):
 def spread(rig, count, rng):
     """Poses that all devices see."""
     return random_poses(devices(rig), count, rng)
+
+
+def photograph(camera, board, pose, rng):
+    """A sharp view of a board by a camera without distortion, DN, with noise."""
+    to_board = np.linalg.inv(camera.matrix @ np.column_stack([pose[:3, :2], pose[:3, 3]]))
+    mapped = np.dstack([camera.pixel_grid(), np.ones(camera.size[::-1])]) @ to_board.T
+    white = board_views.shares(board, mapped[..., :2] / mapped[..., 2:], footprint=pose[2, 3] / camera.matrix[0, 0])
+    return np.float32(30 + 150 * white + 0.5 * rng.standard_normal(white.shape))

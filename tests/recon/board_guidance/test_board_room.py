@@ -50,7 +50,7 @@ def test_depths_end_where_a_lens_blurs_too_much(rig):
     """At both ends the worst device has just the allowed disc of confusion, by the thin lens's exact formula."""
     for z in reach_of(rig).depth_mm:
         shares = []
-        for part, most in ((rig.cam1, 2.0), (rig.cam2, 2.0), (rig.projector, 5.0)):
+        for part, most in ((rig.cam1, 2.5), (rig.cam2, 2.5), (rig.projector, 5.0)):
             f, focus = part.lens.focal_length_mm, part.lens.focus_mm
             disc_mm = part.lens.aperture_mm * f * abs(z - focus) / (z * (focus - f))  # on the sensor
             pitch_mm = f / part.optics.focal_px[0]

@@ -14,7 +14,7 @@ from tests.recon.board_guidance.held_boards import posed, spread
 from tests.recon.board_sets import BOARD, DEVICES, NOISE, devices, observe
 
 DEPTHS = (606.0, 713.0)
-BROWN = {device: MODELS["brown"] for device in DEVICES}
+BROWN = dict.fromkeys(DEVICES, MODELS["brown"])
 NONE = np.zeros((0, 4, 4))
 
 
@@ -22,7 +22,9 @@ def test_the_sum_of_informations_is_the_bundle_adjustment_s(rig, rng):
     """Slow and plain: the normal equations of the adjustment itself, its poses eliminated."""
     cameras, poses, free = devices(rig), spread(rig, 4, rng), free_parameters(DEVICES, BROWN)
     exact = observe(cameras, poses, rng, noise=dict.fromkeys(DEVICES, 0.0))
-    system = linearised(Problem(exact, np.zeros_like(exact.pixels), free), Estimate(cameras, poses, BOARD.points()), np.ones(3), False)
+    system = linearised(
+        Problem(exact, np.zeros_like(exact.pixels), free), Estimate(cameras, poses, BOARD.points()), np.ones(3), False
+    )
     expected = without_poses(system)[0]
     found = informations(cameras, free, NOISE, poses, BOARD.points()).sum(axis=0)
     scale = np.sqrt(np.diag(expected))

@@ -1,0 +1,60 @@
+"""The pose that is asked for adds more than others, lies in all views, and can be shown to a person."""
+
+import numpy as np
+
+from recon.board_guidance.board_room import candidates, fits, reach_of
+from recon.board_guidance.next_pose import NOISE_PX, few, knowledge, suggest
+from recon.model.boards import Chessboard
+from tests.recon.board_guidance.held_boards import kept, posed, spread
+from tests.recon.board_sets import BOARD, devices
+
+NONE = np.zeros((0, 4, 4))
+
+
+def test_the_first_pose_needs_no_calibration(rig, rng):
+    asked = suggest(None, NONE, rig, BOARD, rng)
+    assert fits(asked.world_from_board[None], BOARD, devices(rig), reach_of(rig))[0]
+    assert 0 < asked.gain < 1 and asked.words.startswith("hold it at ")
+
+
+def test_after_boards_all_straight_a_tilted_one_is_asked_for(rig, rng):
+    """Focal length and distance can't be told apart by parallel boards."""
+    straight = np.array([posed((x, 0, 660)) for x in (-30, 0, 30)])
+    asked = suggest(None, straight, rig, BOARD, rng).world_from_board
+    assert np.rad2deg(np.arccos(asked[2, 2])) > 15
+
+
+def test_the_asked_pose_adds_more_than_a_random_one_and_far_more_than_an_old_one(rig, rng):
+    so_far = kept(rig, spread(rig, 5, rng), rng)
+    asked = suggest(so_far.calibration, so_far.poses, rig, BOARD, rng, noise=so_far.noise)
+    known = knowledge(so_far.calibration, so_far.poses, rig, BOARD, reach_of(rig), so_far.noise)
+    others = known.gains(candidates(BOARD, devices(rig), reach_of(rig), 50, rng), few(BOARD.points()))
+    again = known.gains(so_far.poses, few(BOARD.points()))
+    assert asked.gain > np.quantile(others, 0.9)
+    assert asked.gain > 1.3 * np.median(again)
+
+
+def test_few_points_stand_for_all_of_a_board(rig, rng):
+    """A chessboard of 400 corners in a coarse and in a fine copy: gains of the thinned one within a few percent."""
+    board = Chessboard(columns=20, rows=20, square_mm=7)
+    poses = candidates(board, devices(rig), reach_of(rig), 8, rng)
+    known = knowledge(None, poses[:4], rig, board, reach_of(rig), NOISE_PX)
+    thinned, scale = few(board.points()), np.sqrt(len(board.points()) / len(few(board.points())))
+    whole = knowledge(None, NONE, rig, board, reach_of(rig), {name: scale * sigma for name, sigma in NOISE_PX.items()})
+    gains = known.gains(poses[4:], thinned)
+    assert len(thinned) < 50 and (gains > 0).all()
+    np.testing.assert_allclose(whole.gains(poses[4:], board.points()), whole.gains(poses[4:], board.points()[::-1]), rtol=1e-6)
+
+
+def test_the_drawing_is_where_camera_1_would_see_the_board(rig, rng):
+    asked = suggest(None, NONE, rig, BOARD, rng)
+    width, height = devices(rig)["cam1"].size
+    assert (asked.outline >= 0).all() and (asked.outline <= [width, height]).all()
+    assert (asked.outline[0] == asked.outline[-1]).all()
+    low, high = asked.outline.min(axis=0), asked.outline.max(axis=0)
+    assert asked.points.shape == (44, 2) and (asked.points > low).all() and (asked.points < high).all()
+
+
+def test_the_same_generator_asks_for_the_same_pose(rig):
+    first, second = (suggest(None, NONE, rig, BOARD, np.random.default_rng(3)).world_from_board for _ in range(2))
+    np.testing.assert_array_equal(first, second)
