@@ -21,6 +21,7 @@ FARTHEST = 3.0  # times the distance in focus, however small the aperture
 LEVELS = 3  # of distance: both ends of the reach tell most, and the middle
 FULL = 0.5  # share of candidates that are tilted as far as allowed; the rest half as much, or not at all
 WAYS = 8  # directions to tilt to
+ALIKE_MM, ALIKE_DEG = 10.0, 4.0  # from an earlier pose: what isn't noise, as the board's bend, errs in the same way there
 BATCH, BATCHES = 1000, 20  # places drawn at once, and times at most
 STEPS = 8  # points a side of an outline: lenses bend it
 
@@ -107,6 +108,13 @@ def fits(poses: Array, board: Board, cameras: Mapping[str, Camera], reach: Reach
 def middles(poses: Array, board: Board) -> Array:
     """The middle of the board in the world : (p, 3) mm."""
     return poses[:, :3, :3] @ middle(board) + poses[:, :3, 3]
+
+
+def apart(first: Array, second: Array, board: Board) -> tuple[Array, Array]:
+    """Distances of the board's middles, mm, and angles, deg, between poses : (p, 4, 4) and (q, 4, 4), both as (p, q)."""
+    shift = middles(first, board)[:, None] - middles(second, board)
+    trace = np.einsum("pij,qij->pq", first[:, :3, :3], second[:, :3, :3])
+    return np.linalg.norm(shift, axis=-1), np.rad2deg(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
 
 
 def candidates(board: Board, cameras: Mapping[str, Camera], reach: Reach, count: int, rng: np.random.Generator) -> Array:

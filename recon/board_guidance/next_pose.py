@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon.board_guidance import pose_information
-from recon.board_guidance.board_room import Array, Reach, candidates, outline, reach_of
+from recon.board_guidance.board_room import ALIKE_DEG, ALIKE_MM, Array, Reach, apart, candidates, outline, reach_of
 from recon.board_guidance.pose_information import Knowledge
 from recon.board_guidance.pose_words import placed
 from recon.geometry import rigid
@@ -16,6 +16,7 @@ from recon.model.calibration import Calibration
 from recon.model.rig import Rig
 
 CANDIDATES = 300  # from which the best one is chosen
+OFF = 2.5  # times the distance of poses that are alike: that of asked poses from earlier ones
 FEW_POINTS = 24  # of a board: so many stand for all of a larger one
 NOISE_PX = {"cam1": 0.01, "cam2": 0.01, "projector": 0.01}  # of a sighting before any was measured; rendered boards have half
 
@@ -62,6 +63,7 @@ def suggest(
     reach = reach or reach_of(rig)
     known = knowledge(calibration, poses, rig, board, reach, noise)
     choice = candidates(board, known.cameras, reach, CANDIDATES, rng)
+    choice = _unlike(choice, np.reshape(poses, (-1, 4, 4)), board)
     gains = known.gains(choice, few(board.points()))
     best = int(np.argmax(gains))
     camera = next(iter(known.cameras.values()))
@@ -84,6 +86,13 @@ def knowledge(
 def described(rig: Rig) -> dict[str, Camera]:
     """The devices as the rig's description has them."""
     return {"cam1": rig.cam1.optics.camera(), "cam2": rig.cam2.optics.camera(), "projector": rig.projector.optics.camera()}
+
+
+def _unlike(choice: Array, poses: Array, board: Board) -> Array:
+    """Those of poses : (m, 4, 4) to choose from that are unlike all earlier ones : (p, 4, 4), though held a little off."""
+    apart_mm, apart_deg = apart(choice, poses, board)
+    new = ((apart_mm > OFF * ALIKE_MM) | (apart_deg > OFF * ALIKE_DEG)).all(axis=1)
+    return choice[new] if new.any() else choice
 
 
 def few(points: Array) -> Array:

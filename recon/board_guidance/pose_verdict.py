@@ -5,17 +5,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from recon.board_guidance.board_blur import blur
-from recon.board_guidance.board_room import Reach, candidates, middles, reach_of
+from recon.board_guidance.board_room import ALIKE_DEG, ALIKE_MM, Reach, apart, candidates, reach_of
 from recon.board_guidance.next_pose import CANDIDATES, few, knowledge
 from recon.board_guidance.pose_progress import BAD_POSE, SoFar, held, with_sighting
 from recon.geometry.camera import Array
 from recon.optical_calibration.sightings import Sighting
 
 LEAST_SHARE = 0.7  # of what the asked pose would add; an earlier pose once more adds half of it, by averaging noise
-ALIKE_MM, ALIKE_DEG = 10.0, 4.0  # from an earlier pose: what isn't noise, as the board's bend, errs in the same way there
 BLURRED_PX = 3.0  # standard deviation, in the softest direction
 SMEARED = 2.0, 0.5  # softest over sharpest direction, and px on top: beyond, the board moved while the camera exposed
 MOVED_PX = 0.1  # median of the points, from the first frame to the last: twenty times the noise of a disc's centre
@@ -59,7 +57,7 @@ def judge(observation: Observation, so_far: SoFar, reach: Reach | None = None) -
     if alike := _too_alike(pose, so_far, gain, observation.asked_gain, reach):
         return Verdict(False, alike, gain, so_far)
     extended = with_sighting(so_far, observation.sighting)
-    if disagreeing := _disagreement(extended):
+    if disagreeing := _disagreement(so_far, extended):
         return Verdict(False, disagreeing, gain, so_far)
     return Verdict(True, f"adds {100 * gain:.1f} %", gain, extended)
 
@@ -99,8 +97,7 @@ def _too_alike(pose: Array, so_far: SoFar, gain: float, asked: float | None, rea
     """Refusal of a pose that adds little, or that stands where an earlier one stood."""
     if len(so_far.poses) == 0:
         return None
-    apart_mm = np.linalg.norm(middles(so_far.poses, so_far.board) - middles(pose[None], so_far.board), axis=1)
-    apart_deg = np.rad2deg(Rotation.from_matrix(so_far.poses[:, :3, :3] @ pose[:3, :3].T).magnitude())
+    apart_mm, apart_deg = (each[:, 0] for each in apart(so_far.poses, pose[None], so_far.board))
     nearest = int(np.argmin(apart_mm / ALIKE_MM + apart_deg / ALIKE_DEG))
     best = _best_gain(so_far, reach) if asked is None else asked
     adds = f"adds {100 * gain:.1f} % where {100 * best:.1f} % is possible"
@@ -116,9 +113,13 @@ def _best_gain(so_far: SoFar, reach: Reach) -> float:
     return max(_gains(choice, so_far, reach))
 
 
-def _disagreement(extended: SoFar) -> str | None:
-    """Whether the latest pose contradicts the others."""
-    if extended.calibration is None or not (misfit := np.nan_to_num(extended.misfit[-1])).max() > BAD_POSE:
+def _disagreement(so_far: SoFar, extended: SoFar) -> str | None:
+    """Whether the latest pose contradicts the others: by its own residuals, or those of all, as few poses bend towards it."""
+    if so_far.calibration is None or extended.calibration is None:
         return None
-    device, times = list(extended.sizes)[int(np.argmax(misfit))], misfit.max()
-    return f"{device}: contradicts the other poses by {times:.0f} times the noise: the board moved between the frames; rest it"
+    spread = [extended.noise[device] / so_far.noise[device] for device in so_far.sizes]
+    times = np.maximum(extended.misfit[-1], spread)
+    if times.max() < BAD_POSE:
+        return None
+    device = list(so_far.sizes)[int(np.argmax(times))]
+    return f"{device}: contradicts the other poses by {times.max():.0f} times the noise: the board moved between frames; rest it"

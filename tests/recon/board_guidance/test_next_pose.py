@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from recon.board_guidance.board_room import candidates, fits, reach_of
+from recon.board_guidance.board_room import ALIKE_DEG, ALIKE_MM, apart, candidates, fits, reach_of
 from recon.board_guidance.next_pose import NOISE_PX, few, knowledge, suggest
 from recon.model.boards import Chessboard
 from tests.recon.board_guidance.held_boards import kept, posed, spread
@@ -58,3 +58,13 @@ def test_the_drawing_is_where_camera_1_would_see_the_board(rig, rng):
 def test_the_same_generator_asks_for_the_same_pose(rig):
     first, second = (suggest(None, NONE, rig, BOARD, np.random.default_rng(3)).world_from_board for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+def test_no_pose_is_asked_for_twice(rig, rng):
+    """Each asked pose is held exactly; none of the later ones would be refused as like it."""
+    asked = NONE
+    for _ in range(10):
+        pose = suggest(None, asked, rig, BOARD, rng).world_from_board[None]
+        apart_mm, apart_deg = apart(pose, asked, BOARD)
+        assert ((apart_mm > 2 * ALIKE_MM) | (apart_deg > 2 * ALIKE_DEG)).all()
+        asked = np.concatenate([asked, pose])
