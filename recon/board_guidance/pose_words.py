@@ -77,10 +77,10 @@ def _tilts(right: float, low: float) -> list[str]:
     ]
 
 
-def _turned(turn: float, reversed_: str) -> str:
+def _turned(turn: float, half: str) -> str:
     """Words for a turn in the image's plane, deg, of a board whose long side lies down or stands."""
     quarter = round(turn / 90) % 4
-    return ("", "turned clockwise by 90 deg", reversed_, "turned anticlockwise by 90 deg")[quarter]
+    return ("", "turned clockwise by 90 deg", half, "turned anticlockwise by 90 deg")[quarter]
 
 
 def _amount(value: float, unit: str, way: str, what: str = "") -> str:
