@@ -120,6 +120,18 @@ def scale(
     return float(np.sqrt(max(variance, 0.0)))  # rounding may leave a zero below zero
 
 
+def mean_squares(calibration: Calibration, first: str, second: str, volume: Array) -> tuple[Array, Array]:
+    """Quadratic forms : (g, g) that turn a covariance of the parameters into mean variances of points over a volume : (k, 3) mm.
+
+    The trace of a form's product with any covariance of the same parameters is the mean over the volume of the summed variances
+    of a point, mm^2: the first form's of `triangulation`, the second's of `shape`. The calibration's own covariance isn't used.
+    """
+    slopes = _point_slopes(calibration, first, second, volume, (1.0, 1.0))
+    within = slopes - rigid_modes(volume) @ _fit(rigid_modes(volume), slopes)
+    forms = [np.einsum("kig,kih->gh", part, part) / len(volume) for part in (slopes, within)]
+    return forms[0], forms[1]
+
+
 def projection(calibration: Calibration, device: str, points: Array, volume: Array) -> Array:
     """Uncertainty of where a device sees a point, the motion of the world's frame taken out.
 

@@ -1,0 +1,125 @@
+"""Whether a pose of the board is worth keeping, and if not, the reason and the way on."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.board_guidance.board_blur import blur
+from recon.board_guidance.board_room import ALIKE_DEG, ALIKE_MM, Reach, apart, candidates, reach_of
+from recon.board_guidance.next_pose import CANDIDATES, few, knowledge
+from recon.board_guidance.pose_progress import BAD_POSE, SoFar, held, with_sighting
+from recon.geometry.camera import Array
+from recon.optical_calibration.sightings import Sighting
+
+LEAST_SHARE = 0.7  # of what the asked pose would add; an earlier pose once more adds half of it, by averaging noise
+BLURRED_PX = 3.0  # standard deviation, in the softest direction
+SMEARED = 2.0, 0.5  # softest over sharpest direction, and px on top: beyond, the board moved while the camera exposed
+MOVED_PX = 0.1  # median of the points, from the first frame to the last: twenty times the noise of a disc's centre
+
+
+@dataclass(frozen=True)
+class Observation:
+    """All that was seen of the board in one pose."""
+
+    sighting: Sighting
+    lit: Mapping[str, NDArray] = field(default_factory=dict)  # camera: (h, w), the images that it was found in
+    again: Mapping[str, Array] = field(default_factory=dict)  # camera: (n, 2) px, found once more after the last frame
+    asked_gain: float | None = None  # of the pose that was asked for; that of the best of many if none was
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A verdict on one pose."""
+
+    accepted: bool
+    reason: str  # of a refusal, with the way on; else what it adds
+    gain: float  # relative reduction of the points' standard deviations by the pose; 0 if it has no place
+    so_far: SoFar  # with the pose, if it was accepted
+
+
+def judge(observation: Observation, so_far: SoFar, reach: Reach | None = None) -> Verdict:
+    """Judge a pose: all devices must see the board, sharp and at rest, in agreement with the poses so far, and add to these.
+
+    Whoever wants to keep a pose that was refused takes `pose_progress.with_sighting` instead.
+
+    reach : the limits, of which the volume counts here; those of the rig's lenses if not given.
+    """
+    fault = next(_faults(observation, so_far), None)
+    pose = held(observation.sighting, so_far)
+    if pose is None:
+        return Verdict(False, fault or "cam1: the board has no place; show all of it to camera 1", 0.0, so_far)
+    reach = reach or reach_of(so_far.rig)
+    gain = _gains(pose[None], so_far, reach)[0]
+    if fault:
+        return Verdict(False, fault, gain, so_far)
+    if alike := _too_alike(pose, so_far, gain, observation.asked_gain, reach):
+        return Verdict(False, alike, gain, so_far)
+    extended = with_sighting(so_far, observation.sighting)
+    if disagreeing := _disagreement(so_far, extended):
+        return Verdict(False, disagreeing, gain, so_far)
+    return Verdict(True, f"adds {100 * gain:.1f} %", gain, extended)
+
+
+def _faults(observation: Observation, so_far: SoFar) -> Iterator[str]:
+    """What is wrong with the images, the gravest first."""
+    sighting = observation.sighting
+    for device in so_far.sizes:
+        if device not in sighting.pixels:
+            reason = sighting.failures.get(device)
+            yield f"{device}: board not found{f': {reason}' if reason else ''}; {_way_in(device)}"
+    for device, image in observation.lit.items():
+        found = blur(image, sighting.pixels[device])
+        if found.most > SMEARED[0] * found.least + SMEARED[1]:
+            yield f"{device}: smeared by {found.most:.1f} px: the board moved during the exposure; rest it, or expose shorter"
+        elif found.most > BLURRED_PX:
+            yield f"{device}: blurred by {found.most:.1f} px: out of focus; hold it nearer to the middle distance, or focus"
+    for device, pixels in observation.again.items():
+        moved = float(np.nanmedian(np.linalg.norm(pixels - sighting.pixels[device], axis=1)))
+        if moved > MOVED_PX:
+            yield f"{device}: the board moved by {moved:.2f} px between the first frame and the last; rest it on something"
+
+
+def _way_in(device: str) -> str:
+    if device == "projector":
+        return "hold it so that all of it lies in the projector's light, and nothing shades it"
+    return f"hold it so that {device} sees all of it, evenly lit"
+
+
+def _gains(poses: Array, so_far: SoFar, reach: Reach) -> list[float]:
+    """Relative reductions of the points' standard deviations by each of poses : (p, 4, 4)."""
+    known = knowledge(so_far.calibration, so_far.poses, so_far.rig, so_far.board, reach, so_far.noise)
+    return known.gains(poses, few(so_far.board.points())).tolist()
+
+
+def _too_alike(pose: Array, so_far: SoFar, gain: float, asked: float | None, reach: Reach) -> str | None:
+    """Refusal of a pose that adds little, or that stands where an earlier one stood."""
+    if len(so_far.poses) == 0:
+        return None
+    apart_mm, apart_deg = (each[:, 0] for each in apart(so_far.poses, pose[None], so_far.board))
+    nearest = int(np.argmin(apart_mm / ALIKE_MM + apart_deg / ALIKE_DEG))
+    best = _best_gain(so_far, reach) if asked is None else asked
+    adds = f"adds {100 * gain:.1f} % where {100 * best:.1f} % is possible"
+    if apart_mm[nearest] < ALIKE_MM and apart_deg[nearest] < ALIKE_DEG:
+        away = f"{apart_mm[nearest]:.0f} mm and {apart_deg[nearest]:.0f} deg from it"
+        return f"too like pose {so_far.sightings[nearest].name}, {away}: {adds}; hold it as shown"
+    return None if gain >= LEAST_SHARE * best else f"{adds}; hold it as shown"
+
+
+def _best_gain(so_far: SoFar, reach: Reach) -> float:
+    """Gain of the best of many poses; the same for the same sightings."""
+    choice = candidates(so_far.board, so_far.cameras, reach, CANDIDATES, np.random.default_rng(len(so_far.poses)))
+    return max(_gains(choice, so_far, reach))
+
+
+def _disagreement(so_far: SoFar, extended: SoFar) -> str | None:
+    """Whether the latest pose contradicts the others: by its own residuals, or those of all, as few poses bend towards it."""
+    if so_far.calibration is None or extended.calibration is None:
+        return None
+    spread = [extended.noise[device] / so_far.noise[device] for device in so_far.sizes]
+    times = np.maximum(extended.misfit[-1], spread)
+    if times.max() < BAD_POSE:
+        return None
+    device = list(so_far.sizes)[int(np.argmax(times))]
+    return f"{device}: contradicts the other poses by {times.max():.0f} times the noise: the board moved between frames; rest it"
