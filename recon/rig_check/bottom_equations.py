@@ -2,11 +2,14 @@
 
 An image's line of the bottom gives two numbers. Unknown are the plane's three, the clock's lag and a motion of the probe against
 its target. A shift of the probe along its own depth is the height of an unknown plane: it shows by the tilts alone, and hardly.
-Tilts to all sides show the other shifts and two turns; the third, within the image, shows where the probe is turned about its depth.
+Tilts to all sides show the other shifts and two turns; the third, within the image, shows where the probe is turned about its
+depth.
 
-What errs alike in all poses, by the cameras' and the target's calibration, erred so when the probe was calibrated, and is left out.
+What errs alike in all poses, by the cameras' and the target's calibration, erred so when the probe was calibrated, and is left
+out.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +21,7 @@ from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model import tracks
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
-from recon.probe_calibration import point_equation
+from recon.probe_calibration import latency, point_equation
 from recon.probe_calibration.point_calibration import NAMES
 from recon.rig_check import fault_tests
 from recon.rig_check.fault_tests import Equations, Fault
@@ -32,8 +35,9 @@ SEARCH_S, STEP_S = 0.4, 0.01  # of the lag, about the one that is known
 ROUNDS = 10
 RATE_S = 0.02  # before and after a moment, over which a velocity is taken
 OUTLYING = 4.0  # standard deviations
+LEAST_SPREAD_MM = 0.01  # of distances from the plane
 LEAST = 20  # B-scans
-DEPTH_PX = 0.5  # standard deviation of a line's row at either point, before it is measured
+DEPTH_PX = 0.3  # standard deviation of a line's row at either point, before it is measured
 ASSUMED = np.diag(np.repeat([np.deg2rad(0.05), 0.03], 3) ** 2)  # of a tracked pose, rad and mm, where a track has no covariance
 SETTLED_S = 1e-6
 JITTER_S = 0.002  # standard deviation of the scanner's stamps
@@ -62,7 +66,6 @@ class Bottom(NamedTuple):
     normal: Array  # (3,) in the world, towards the bottom
     offset_mm: float
     used: NDArray[np.bool_]  # (n,) B-scans with a line and a pose, and no outlier
-    residuals: Array  # (n, 2) mm, NaN without
 
 
 class _Placed(NamedTuple):
@@ -77,6 +80,18 @@ def columns(size: tuple[int, int]) -> Array:
     """Columns : (2,) px at which a line's rows err independently: a standard deviation of even columns from the middle."""
     width = size[0]
     return (width - 1) / 2 + width / np.sqrt(12) * np.array([-1.0, 1.0])
+
+
+def lines_of(images: Iterable[NDArray], times: NDArray[np.int64], size: tuple[int, int], top_px: int) -> Lines:
+    """Find the bottom in n B-scans : (h, w), of which at most 400, evenly chosen, are looked at."""
+    chosen = set(np.unique(np.linspace(0, len(times) - 1, min(MOST, len(times))).round().astype(int)).tolist())
+    found = np.full((len(times), 2), np.nan)
+    for k, image in enumerate(images):
+        if k in chosen:
+            found[k] = latency.bottom_line(image, top_px)
+    across = columns(size)
+    rows = found[:, :1] + found[:, 1:] * (across - (size[0] - 1) / 2)
+    return Lines(times, np.stack([np.broadcast_to(across, rows.shape), rows], axis=-1))
 
 
 def fit(lines: Lines, track: Track, known: Known) -> Bottom:
@@ -96,28 +111,29 @@ def fit(lines: Lines, track: Track, known: Known) -> Bottom:
     best = int(np.nanargmin(misfits))
     if best in (0, len(lags) - 1):
         found = f"the best at its end, {lags[best]:.2f} s"
-        raise InputError(f"bottom: expected a lag within {SEARCH_S:g} s of {known.lag_s:g} s, found {found}; measure-lag finds it")
-    lag, spread = float(lags[best]), np.inf
+        raise InputError(
+            f"bottom: expected a lag within {SEARCH_S:g} s of {known.lag_s:g} s, found {found}; measure-lag finds it"
+        )
+    lag = float(lags[best])
+    placed = _placed(lines, track, known.probe, lag)
+    normal, offset = _plane(placed.points)
     for _ in range(ROUNDS):
-        placed = _placed(lines, track, known.probe, lag)
-        if not np.isfinite(spread):
-            normal, offset = _plane(placed.points)
-            residuals = placed.points @ normal - offset
-            spread = NORMAL_MAD * np.nanmedian(np.abs(residuals))
-        used = np.abs(residuals).max(axis=1) < OUTLYING * max(spread, 1e-9)
+        residuals = placed.points @ normal - offset
+        spread = NORMAL_MAD * np.nanmedian(np.abs(residuals))
+        used = np.abs(residuals).max(axis=1) < OUTLYING * max(spread, LEAST_SPREAD_MM)
         used &= np.isfinite(placed.velocities).all(axis=(1, 2))
         if used.sum() < LEAST:
             raise InputError(f"bottom: expected at least {LEAST} B-scans that agree on one plane, found {used.sum()}")
         normal, offset = _plane(placed.points[used])
         slopes = np.column_stack([placed.points[used].reshape(-1, 3), -np.ones(2 * used.sum())])
         slopes = np.column_stack([slopes @ _tangents(normal), -(placed.velocities[used] @ normal).ravel()])
-        residuals = placed.points @ normal - offset
-        step = -np.linalg.lstsq(slopes, residuals[used].ravel())[0]
-        lag += float(np.clip(step[-1], -STEP_S, STEP_S))
-        spread = NORMAL_MAD * np.median(np.abs(residuals[used]))
-        if abs(step[-1]) < SETTLED_S:
+        left = placed.points[used] @ normal - offset
+        step = -float(np.linalg.lstsq(slopes, left.ravel())[0][-1])
+        if abs(step) < SETTLED_S:
             break
-    return Bottom(lag, normal, offset, used, residuals)
+        lag += float(np.clip(step, -STEP_S, STEP_S))
+        placed = _placed(lines, track, known.probe, lag)
+    return Bottom(lag, normal, offset, used)
 
 
 def equations(lines: Lines, track: Track, known: Known, bottom: Bottom) -> Equations:
@@ -180,7 +196,7 @@ def _points(poses: Array, probe: ProbeCalibration, lines: Lines) -> Array:
 
 
 def _plane(points: Array) -> tuple[Array, float]:
-    """Normal and offset of the plane of least squares through points : (n, 2, 3), NaN where there is none; away from the origin."""
+    """Normal, away from the origin, and offset of the plane of least squares through points : (n, 2, 3), some of them NaN."""
     known = points[np.isfinite(points).all(axis=-1)]
     middle = known.mean(axis=0)
     normal = np.linalg.svd(known - middle, full_matrices=False)[2][-1]

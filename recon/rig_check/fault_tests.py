@@ -1,10 +1,11 @@
-"""Tests of faults on linear equations with normal errors: which of several parts has moved, if any, and which can't be told apart.
+"""Tests of faults on linear equations with normal errors: which of several parts has moved, if any, and which can't be told
+apart.
 
-Measured are residuals `y = F_h d_h + H e + n`: the motion d_h of a part h, free; errors e of the calibration, with their covariance
-C; and noise n of variance 1. A part is tested by the generalised likelihood ratio, the squared length of its estimated motion in
-standard deviations: chi-square with as many degrees of freedom as its motion has where nothing moved, so that an error that the
-calibration admits is no alarm. Which part moved is told by the evidence, in which a motion has a usual size: a part of more
-freedom explains more, and has to (MacKay 1992, Bayesian interpolation).
+Measured are residuals `y = F_h d_h + H e + n`: the motion d_h of a part h, free; errors e of the calibration, with their
+covariance C; and noise n of variance 1. A part is tested by the generalised likelihood ratio, the squared length of its estimated
+motion in standard deviations: chi-square with as many degrees of freedom as its motion has where nothing moved, so that an error
+that the calibration admits is no alarm. Which part moved is told by the evidence, in which a motion has a usual size: a part of
+more freedom explains more, and has to (MacKay 1992, Bayesian interpolation).
 """
 
 from collections.abc import Mapping, Sequence
@@ -93,7 +94,7 @@ def _scaled(equations: Equations) -> Array:
 
 
 def find(equations: Equations, alarm_sigma: float) -> dict[str, Finding]:
-    """Test all parts. The likeliest is named as long as some part is beyond `alarm_sigma`; the others are tested beside those named.
+    """Test all parts. While some part is beyond `alarm_sigma` the likeliest is named, and the others are tested beside it.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """Equations of cameras and projector against each other: a target moved about before both cameras, and fringes that both see.
 
-Each pair of frames gives twelve numbers for a pose of six; each point of a surface two pixels and the projector's coordinates in both
-cameras' maps, for a place of three. The rest tells whether the devices are where they were calibrated. Vertical fringes show neither a
-motion of the projector along them nor that of camera 2 across its epipolar lines; the latter the target shows.
+Each pair of frames gives twelve numbers for a pose of six; each point of a surface two pixels and the projector's coordinates in
+both cameras' maps, for a place of three. The rest tells whether the devices are where they were calibrated. Vertical fringes show
+neither a motion of the projector along them nor that of camera 2 across its epipolar lines; the latter the target shows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,6 +18,7 @@ from recon.geometry.circle_outline import ellipses_of, slopes_at
 from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model import circle_layout
 from recon.model.calibration import Calibration, Uncertainty, projection_slopes
+from recon.model.circle_layout import Circles
 from recon.model.rig import Target
 from recon.rig_check import fault_tests
 from recon.rig_check.fault_tests import Equations, Fault
@@ -48,7 +49,9 @@ class Matches(NamedTuple):
 
     def some(self, chosen: NDArray) -> "Matches":
         """Those of a mask or of numbers."""
-        return Matches(*(each[chosen] for each in self[:-1]), self.axes)
+        arrays = (self.pixels, self.first, self.seen_at, self.second, self.gradient, self.sigma)
+        first, *others = (each[chosen] for each in arrays)
+        return Matches(first, *others, axes=self.axes)
 
 
 class Rows(NamedTuple):
@@ -84,15 +87,23 @@ def _of_pair(pair: tuple[Sighting, Sighting], target: Target, names: Sequence[st
     for k, noise in enumerate(one for view in pair for one in view.covariance):
         whiten[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.linalg.inv(np.linalg.cholesky(noise))
     for _ in range(ROUNDS):
-        points, arms = rigid.apply(pose, circles.centres), rigid.rotate(pose, circles.centres)
-        by_point = np.concatenate([slopes_at(view.camera, points) for view in pair])  # (6, 2, 3)
-        by_pose = (by_point @ np.concatenate([rigid.slopes(arms)] * 2)).reshape(12, 6)
-        missing = np.concatenate([(view.centres - ellipses_of(view.camera, pose, *circles)[0]).ravel() for view in pair])
+        by_pose, missing = _by_pose(pair, pose, circles)
         pose = rigid.moved(pose, np.linalg.lstsq(whiten @ by_pose, whiten @ missing)[0])
+    by_pose, missing = _by_pose(pair, pose, circles)
+    points = rigid.apply(pose, circles.centres)
+    by_point = np.concatenate([slopes_at(view.camera, points) for view in pair])  # (6, 2, 3)
     by_length = (by_point @ np.concatenate([pose[:3, :3] @ circle_layout.BY_LENGTH] * 2)).reshape(12, 3)
     cameras = {name: view.camera for name, view in zip(CAMERAS, pair, strict=True)}
     by_optics = projection_slopes(cameras, [points, points], names)
     return whiten @ by_pose, whiten @ np.column_stack([missing, by_optics, by_length])
+
+
+def _by_pose(pair: tuple[Sighting, Sighting], pose: Array, circles: Circles) -> tuple[Array, Array]:
+    """Slopes : (12, 6) of the ellipses' centres by the pose, and their residuals : (12,) px."""
+    points, arms = rigid.apply(pose, circles.centres), rigid.rotate(pose, circles.centres)
+    slopes = [slopes_at(view.camera, points) @ rigid.slopes(arms) for view in pair]
+    missing = [view.centres - ellipses_of(view.camera, pose, *circles)[0] for view in pair]
+    return np.concatenate(slopes).reshape(12, 6), np.concatenate(missing).ravel()
 
 
 def of_fringes(matches: Matches, cameras: Mapping[str, Camera], names: Sequence[str]) -> Rows:
@@ -149,7 +160,7 @@ def _equations(rows: Rows, target: Target, known: Uncertainty, names: Sequence[s
 
 
 def agreeing(rows: Rows, target: Target, known: Uncertainty, names: Sequence[str], each: int) -> Rows:
-    """Groups of `each` equations that agree with most others, whatever has moved: edges, and light that came another way, don't."""
+    """Groups of `each` equations that agree with most others, whatever has moved: edges and stray light are left out."""
     equations = _equations(rows, target, known, names)
     used = np.ones(len(rows.residuals) // each, bool)
     for _ in range(TRIMS):

@@ -1,7 +1,7 @@
 """Checks of drawn rigs: what detectors would find of a rig that is as calibrated, or of which one part has moved.
 
-A rig is drawn from a calibration and its covariance, so that each has another error of it, and the drift that is usual. Film, fringes
-and the bottom's echoes are drawn from the true rig, by its full models; the software has the calibration alone.
+A rig is drawn from a calibration and its covariance, so that each has another error of it, and the drift that is usual. Film,
+fringes and the bottom's echoes are drawn from the true rig, by its full models; the software has the calibration alone.
 """
 
 from collections.abc import Mapping
@@ -15,9 +15,8 @@ from recon.geometry import camera_jacobian, rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import MOTION
 from recon.geometry.circle_outline import ellipses_of
-from recon.model import circle_layout
+from recon.model import circle_layout, tracks
 from recon.model.calibration import Uncertainty
-from recon.model import tracks
 from recon.model.rig import Target
 from recon.model.tracks import Track
 from recon.rig_check import bottom_equations
@@ -37,9 +36,9 @@ GROUND_MM, HEIGHT_MM, WIDTH_MM = 700.0, 45.0, 45.0  # of a mound under the fring
 VIEW_PX = 60  # that the points keep from camera 1's border
 WINDOW_PX = 2.0  # to both sides, over which a map's gradient is taken
 BOTTOM_MM = 700.0  # z of the tank's bottom
-SWINGS_HZ, ROCK_DEG, ROLL_DEG = (0.37, 0.23, 0.11), 15.0, 60.0  # of tilts forward and sideways, and of the roll
+SWINGS_HZ, ROCK_DEG, ROLL_DEG = (0.37, 0.23, 0.11), 20.0, 75.0  # of tilts forward and sideways, and of the roll
 BOB_MM, BOB_HZ, SCANNER_HZ = 6.0, 0.35, 20.0
-ROW_PX = 0.5  # standard deviation of the bottom's row
+ROW_PX = 0.3  # standard deviation of the bottom's row
 COLUMN_PX = 0.02  # standard deviation of the projector's coordinate at a point
 
 
@@ -60,7 +59,7 @@ def drawn_rig(cameras: Devices, known: Uncertainty, rng: np.random.Generator) ->
     return true
 
 
-def turned(devices: Devices, device: str, angle_deg: float, rng: np.random.Generator) -> dict[str, Camera]:
+def turned(devices: Devices, rng: np.random.Generator, device: str, angle_deg: float) -> dict[str, Camera]:
     """Devices of which one has turned about its centre, about an axis of any direction."""
     axis = rng.standard_normal(3)
     turn = np.deg2rad(angle_deg) * axis / np.linalg.norm(axis)
