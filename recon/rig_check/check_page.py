@@ -38,7 +38,7 @@ READING = (
     "A part has moved where its deviation, had nothing moved, would come by chance in one check of two thousand. Where another "
     "part explains the measurements as well, both are named.",
     "In mm stands the deviation found, and its standard deviation: what is smaller than some of these is not found by this "
-    "check. A part is open where that is more than a millimetre, or where cameras that moved have tracked it.",
+    "check. A part is open where the check shows hardly any motion of it, or where cameras that moved have tracked it.",
     "Motions of all devices together, a projector's along its fringes, and a probe's along its own depth do not show. The first "
     "two do no harm; the third the crossed wires show.",
 )

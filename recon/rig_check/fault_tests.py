@@ -48,6 +48,7 @@ class Finding:
     freedom: int
     motion: Array  # (k,) most likely one, of usual size
     covariance: Array  # (k, k) of it
+    usual: Array  # (k,) as of the fault
     named: bool  # whether it is told to have moved
     rivals: tuple[str, ...] = ()  # that explain all as well
 
@@ -132,8 +133,9 @@ def _tested(equations: Equations, fault: Fault) -> tuple[Finding, float]:
     posterior = np.linalg.inv(information + np.eye(len(right)))
     motion = posterior @ right
     evidence = 0.5 * float(right @ motion - np.sum(np.log1p(np.maximum(values, 0))))
-    scaled = posterior * np.outer(fault.usual, fault.usual)
-    return Finding(as_sigma(statistic, int(shown.sum())), int(shown.sum()), fault.usual * motion, scaled, False), evidence
+    freedom, sizes = int(shown.sum()), fault.usual
+    covariance = posterior * np.outer(sizes, sizes)
+    return Finding(as_sigma(statistic, freedom), freedom, sizes * motion, covariance, sizes, named=False), evidence
 
 
 def as_sigma(statistic: float, freedom: int) -> float:

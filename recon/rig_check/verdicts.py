@@ -36,7 +36,7 @@ ANEW = {
 }
 GRID = (3, 3)  # pixels of a B-scan at which a probe's motion counts
 STEP = 1e-3  # rad and mm, of slopes of displacements
-BLIND_MM = 1.0  # standard deviation of a part's effect: a check that leaves so much open says nothing
+BLIND = 0.7  # of the effect of a usual motion, that is left open: beyond, a check says nothing of the part
 
 
 class Verdict(NamedTuple):
@@ -119,7 +119,8 @@ def _verdicts(findings: Mapping[str, Finding], effects: Mapping[str, Array], par
         count = len(effects[part])
         mm = float(np.sqrt(np.sum((effect @ finding.motion) ** 2) / count))
         sigma = float(np.sqrt(np.einsum("ni,ij,nj->", effect, finding.covariance, effect) / count))
-        state: State = "moved" if finding.named else "maybe" if part in doubtful else "open" if sigma > BLIND_MM else "good"
+        usual = float(np.sqrt(np.sum((effect * finding.usual) ** 2) / count))
+        state: State = "moved" if finding.named else "maybe" if part in doubtful else "open" if sigma > BLIND * usual else "good"
         verdicts.append(Verdict(part, state, finding.sigma, mm, sigma, described(part, finding.motion), finding.rivals))
     return verdicts
 

@@ -1,4 +1,4 @@
-"""How often the check of a rig finds and names what has moved, and how often it tells so in vain: rows of the table of accuracy."""
+"""Rates at which the check of a rig finds and names what has moved, and of its false alarms: rows of the table of accuracy."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -90,7 +90,7 @@ def rates(rig: Rig, life: Conditions, transducer: Transducer, rigs: int) -> Rate
         for number, (move, change) in enumerate(moves.items()):
             rng = np.random.default_rng([SEED, k, 1, number])
             axes = COLUMNS if move.endswith("columns") else BOTH
-            told[move] = _optics(rig, life, optics, change(true, rng=rng), axes, rng)
+            told[move] = _optics(rig, life, optics, change(true, rng), axes, rng)
         told |= _tank(rig, life, optics, true, transducer, k)
         for move, seen in told.items():
             moved = {one.part for one in seen if one.state == "moved"}
