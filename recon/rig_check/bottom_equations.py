@@ -40,6 +40,7 @@ LEAST = 20  # B-scans
 DEPTH_PX = 0.3  # standard deviation of a line's row at either point, before it is measured
 ASSUMED = np.diag(np.repeat([np.deg2rad(0.05), 0.03], 3) ** 2)  # of a tracked pose, rad and mm, where a track has no covariance
 SETTLED_S = 1e-6
+FLAT = 0.03  # of the places' spread along the array, that across it must have to tell a slope
 JITTER_S = 0.002  # standard deviation of the scanner's stamps
 MOST = 400  # B-scans that are used
 
@@ -73,7 +74,6 @@ class _Placed(NamedTuple):
 
     points: Array  # (n, 2, 3) mm
     poses: Array  # (n, 4, 4) world_from_target
-    velocities: Array  # (n, 2, 3) mm/s
 
 
 def columns(size: tuple[int, int]) -> Array:
@@ -116,17 +116,18 @@ def fit(lines: Lines, track: Track, known: Known) -> Bottom:
         )
     lag = float(lags[best])
     placed = _placed(lines, track, known.probe, lag)
-    normal, offset = _plane(placed.points)
+    normal, offset = _plane(placed, known.probe, _whole(placed))
     for _ in range(ROUNDS):
         residuals = placed.points @ normal - offset
         spread = NORMAL_MAD * np.nanmedian(np.abs(residuals))
         used = np.abs(residuals).max(axis=1) < OUTLYING * max(spread, LEAST_SPREAD_MM)
-        used &= np.isfinite(placed.velocities).all(axis=(1, 2))
+        velocities = _velocities(lines, track, known.probe, lag)
+        used &= np.isfinite(velocities).all(axis=(1, 2))
         if used.sum() < LEAST:
             raise InputError(f"bottom: expected at least {LEAST} B-scans that agree on one plane, found {used.sum()}")
-        normal, offset = _plane(placed.points[used])
+        normal, offset = _plane(placed, known.probe, used)
         slopes = np.column_stack([placed.points[used].reshape(-1, 3), -np.ones(2 * used.sum())])
-        slopes = np.column_stack([slopes @ _tangents(normal), -(placed.velocities[used] @ normal).ravel()])
+        slopes = np.column_stack([slopes @ _tangents(normal), -(velocities[used] @ normal).ravel()])
         left = placed.points[used] @ normal - offset
         step = -float(np.linalg.lstsq(slopes, left.ravel())[0][-1])
         if abs(step) < SETTLED_S:
@@ -141,7 +142,7 @@ def equations(lines: Lines, track: Track, known: Known, bottom: Bottom) -> Equat
     used, probe, normal = bottom.used, known.probe, bottom.normal
     placed, n = _placed(lines, track, probe, bottom.lag_s), int(bottom.used.sum())
     points, turns = placed.points[used], placed.poses[used][:, :3, :3]
-    by_lag = -(placed.velocities[used] @ normal)
+    by_lag = -(_velocities(lines, track, probe, bottom.lag_s)[used] @ normal)
     jacobian = point_equation.point_jacobian(probe.target_from_image, probe.scale, lines.pixels[used].reshape(-1, 2))
     by_probe = np.einsum("k,nkl,njlp->njp", normal, turns, jacobian.reshape(n, 2, 3, -1))
     by_plane = np.concatenate([points, -np.ones((n, 2, 1))], axis=2) @ _tangents(normal)
@@ -176,18 +177,27 @@ def _noise(placed: _Placed, lines: Lines, track: Track, known: Known, bottom: Bo
 
 def _misfit(lines: Lines, track: Track, probe: ProbeCalibration, lag_s: float) -> float:
     """Median distance, mm, from the plane at a lag; NaN where too few B-scans have a pose."""
-    poses = tracks.poses_at(track, lines.times, lag_s)
-    points = _points(poses, probe, lines)
-    if np.isfinite(points).all(axis=(1, 2)).sum() < LEAST:
+    placed = _placed(lines, track, probe, lag_s)
+    if (whole := _whole(placed)).sum() < LEAST:
         return np.nan
-    normal, offset = _plane(points)
-    return float(np.nanmedian(np.abs(points @ normal - offset)))
+    normal, offset = _plane(placed, probe, whole)
+    return float(np.median(np.abs(placed.points[whole] @ normal - offset)))
+
+
+def _whole(placed: _Placed) -> NDArray[np.bool_]:
+    """B-scans : (n,) with a line and a pose."""
+    return np.isfinite(placed.points).all(axis=(1, 2))
 
 
 def _placed(lines: Lines, track: Track, probe: ProbeCalibration, lag_s: float) -> _Placed:
-    at, before, after = (tracks.poses_at(track, lines.times, lag_s + step) for step in (0.0, RATE_S, -RATE_S))
-    velocities = (_points(after, probe, lines) - _points(before, probe, lines)) / (2 * RATE_S)
-    return _Placed(_points(at, probe, lines), at, velocities)
+    poses = tracks.poses_at(track, lines.times, lag_s)
+    return _Placed(_points(poses, probe, lines), poses)
+
+
+def _velocities(lines: Lines, track: Track, probe: ProbeCalibration, lag_s: float) -> Array:
+    """Of the lines' points : (n, 2, 3) mm/s."""
+    before, after = (_points(tracks.poses_at(track, lines.times, lag_s + step), probe, lines) for step in (RATE_S, -RATE_S))
+    return (after - before) / (2 * RATE_S)
 
 
 def _points(poses: Array, probe: ProbeCalibration, lines: Lines) -> Array:
@@ -195,12 +205,19 @@ def _points(poses: Array, probe: ProbeCalibration, lines: Lines) -> Array:
     return np.einsum("nij,nkj->nki", poses[:, :3, :3], probe.to_target(lines.pixels)) + poses[:, None, :3, 3]
 
 
-def _plane(points: Array) -> tuple[Array, float]:
-    """Normal, away from the origin, and offset of the plane of least squares through points : (n, 2, 3), some of them NaN."""
-    known = points[np.isfinite(points).all(axis=-1)]
-    middle = known.mean(axis=0)
-    normal = np.linalg.svd(known - middle, full_matrices=False)[2][-1]
-    normal = normal * np.sign(normal @ middle)
+def _plane(placed: _Placed, probe: ProbeCalibration, used: NDArray[np.bool_]) -> tuple[Array, float]:
+    """Normal, downwards, and offset of the plane of least squares through the points of some B-scans : (n,).
+
+    Heights are fitted over the places across: a probe that is moved straight up and down shows one place, and any upright plane
+    is through all its points.
+    """
+    points = placed.points[used].reshape(-1, 3)
+    down = (placed.poses[used][:, :3, :3] @ probe.target_from_image[:3, 1]).mean(axis=0)
+    down /= np.linalg.norm(down)
+    middle, across = points.mean(axis=0), np.linalg.svd(down[None])[2][1:]
+    slopes = np.linalg.lstsq((points - middle) @ across.T, (points - middle) @ down, FLAT)[0]
+    normal = down - slopes @ across
+    normal /= np.linalg.norm(normal)
     return normal, float(normal @ middle)
 
 

@@ -25,8 +25,6 @@ def bottom(tmp_path_factory):
     for name, lag in (("lag", LAG_S), ("early", LAG_S - 0.02)):
         measured = LagFile(lag_s=lag, sigma_s=0.001, interval_s=(lag - 0.002, lag + 0.002), coverage=0.95)
         lag_files.write(folder / f"{name}.json", measured)
-            folder / f"{name}.json", LagFile(lag_s=lag, sigma_s=0.001, interval_s=(lag - 0.002, lag + 0.002), coverage=0.95)
-        )
     return folder
 
 
@@ -61,10 +59,8 @@ def test_a_clock_that_is_off_is_told_and_logged(bottom, tmp_path, capsys, lag, s
     assert main(["check", f"capture={bottom / 'capture'}", f"out={tmp_path / 'out'}", *files]) == status
     made = json.loads((tmp_path / "out/check.json").read_text())
     states = {one["part"]: one["state"] for one in made["parts"]}
-    assert (
-        states["clock"] == ("moved" if status else "good") and states["cam1"] == "unseen"
+    assert states["clock"] == ("moved" if status else "good") and states["cam1"] == "unseen"
     assert states["probe"] in ("open", "good")
-    )
     assert len((tmp_path / "rig.jsonl").read_text().splitlines()) == 1
     page, said = (tmp_path / "out/check.html").read_text(encoding="utf-8"), capsys.readouterr().out
     assert ("Run measure-lag." in page) == bool(status) == ("Moved: scanner's clock. Run measure-lag." in said)
