@@ -101,8 +101,8 @@ def run(config: Config) -> int:
         or_else = f" (or {', '.join(map(TITLES.__getitem__, one.rivals))})" if one.rivals else ""
         console.print(f"{TITLES[one.part]:22}{check_page.WORDS[one.state]:15}{shown}{or_else}", markup=False)
     console.print(f"verdict     {check_page.summary(made.parts)}", markup=False)
-    log = [made] if config.log is None else check_log.add(config.log, made)
     with atomic.new_folder(config.out, CHECK) as folder:
+        log = [made] if config.log is None else check_log.add(config.log, made)
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
         (folder / PAGE).write_text(check_page.write_text(made, log, config.alarm_sigma), encoding="utf-8")
     console.print(f"wrote       {config.out}/{{{CHECK},{PAGE}}}", markup=False)
