@@ -110,7 +110,12 @@ def measure(depths: Array, found: Lag) -> Metrics:
 
 
 def bottom_depth(image: NDArray, top_px: int = 40, part: NDArray[np.bool_] | None = None) -> float:
-    """Depth in px of a flat bottom at the middle column of a B-scan : (h, w), 8-bit; NaN if there is none.
+    """Depth in px of a flat bottom at the middle column of a B-scan : (h, w), 8-bit; NaN if there is none. See `bottom_line`."""
+    return bottom_line(image, top_px, part)[0]
+
+
+def bottom_line(image: NDArray, top_px: int = 40, part: NDArray[np.bool_] | None = None) -> tuple[float, float]:
+    """Depth in px of a flat bottom at the middle column of a B-scan : (h, w), 8-bit, and its slope; NaN if there is none.
 
     Columns are averaged in blocks, and the brightest echo of each below `top_px`, where reverberation at the probe's face ends,
     is taken; the line is that through most of these echoes. Of a `part` : (h, w), such as a fan, the face is where it begins, and
@@ -129,7 +134,7 @@ def bottom_depth(image: NDArray, top_px: int = 40, part: NDArray[np.bool_] | Non
     below[-1:] = False
     columns = np.flatnonzero(below.sum(axis=0) >= 8)
     if len(columns) < 4:
-        return np.nan
+        return np.nan, np.nan
     rows = np.where(below, profiles, -1).argmax(axis=0)[columns]
     before, peak, after = profiles[rows - 1, columns], profiles[rows, columns], profiles[rows + 1, columns]
     bend = np.minimum(before - 2 * peak + after, -1e-3)
@@ -138,20 +143,21 @@ def bottom_depth(image: NDArray, top_px: int = 40, part: NDArray[np.bool_] | Non
     usual = np.nanmedian(np.where(seen, profiles, np.nan)[:, columns], axis=0)
     clear = (peak - usual > BOTTOM_CONTRAST) & (rows > face[columns])
     if clear.sum() < BOTTOM_SHARE * len(columns):
-        return np.nan
-    return _line_at_zero(u[clear], v[clear], len(columns))
+        return np.nan, np.nan
+    return _line(u[clear], v[clear], len(columns))
 
 
-def _line_at_zero(u: Array, v: Array, blocks: int) -> float:
-    """Height at u = 0 of the line near most of the points; NaN if these are too few."""
+def _line(u: Array, v: Array, blocks: int) -> tuple[float, float]:
+    """Height at u = 0, and slope, of the line near most of the points; NaN if these are too few."""
     first, second = np.triu_indices(len(u), 1)
     slopes = (v[second] - v[first]) / (u[second] - u[first])
     starts = v[first] - slopes * u[first]
     near = np.abs(v - starts[:, None] - slopes[:, None] * u) < BOTTOM_NEAR_PX
     agreed = near[near.sum(axis=1).argmax()]
     if agreed.sum() < BOTTOM_SHARE * blocks:
-        return np.nan
-    return float(np.polynomial.polynomial.polyfit(u[agreed], v[agreed], 1)[0])
+        return np.nan, np.nan
+    height, slope = np.polynomial.polynomial.polyfit(u[agreed], v[agreed], 1).tolist()
+    return height, slope
 
 
 def _coordinates(track: Track) -> Array:

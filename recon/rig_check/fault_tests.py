@@ -1,0 +1,149 @@
+"""Tests of faults on linear equations with normal errors: which of several parts has moved, if any, and which can't be told
+apart.
+
+Measured are residuals `y = F_h d_h + H e + n`: the motion d_h of a part h, free; errors e of the calibration, with their
+covariance C; and noise n of variance 1. A part is tested by the generalised likelihood ratio, the squared length of its estimated
+motion in standard deviations: chi-square with as many degrees of freedom as its motion has where nothing moved, so that an error
+that the calibration admits is no alarm. Which part moved is told by the evidence, in which a motion has a usual size: a part of
+more freedom explains more, and has to (MacKay 1992, Bayesian interpolation).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+
+RIVAL = np.log(20.0)  # of evidence, below the best one's: another part that may be it
+UNSEEN = 1e-6  # of the largest eigenvalue: a direction of motion that measurements don't show
+SMALLEST = -600.0  # logarithm of a chance, below which numbers have no digits left
+MOST_NAMED = 3  # parts: beyond, all is to be calibrated anew anyway
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A part that may have moved."""
+
+    slopes: Array  # (m, k) of the residuals by its motion
+    usual: Array  # (k,) size of a usual motion, in its units
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Residuals and what they may be made of, all in standard deviations of their noise."""
+
+    residuals: Array  # (m,)
+    spread: Array  # (m, j) by independent standard normal numbers: what is uncertain, and not tested
+    faults: Mapping[str, Fault]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The outcome for one part."""
+
+    sigma: float  # of a normal number as unlikely as the motion found, had nothing moved
+    freedom: int
+    motion: Array  # (k,) most likely one, of usual size
+    covariance: Array  # (k, k) of it
+    usual: Array  # (k,) as of the fault
+    named: bool  # whether it is told to have moved
+    rivals: tuple[str, ...] = ()  # that explain all as well
+
+
+def eliminated(own: Array, rest: Array) -> Array:
+    """Combinations : (n, k - p, q) of n groups of k equations that are free of their own p unknowns.
+
+    own, rest : (n, k, p) of full rank, and (n, k, q), in standard deviations: the noise of the combinations has variance 1, too.
+    """
+    basis = np.linalg.qr(own, mode="complete")[0][..., own.shape[-1] :]
+    return np.swapaxes(basis, -1, -2) @ rest
+
+
+def root(covariance: Array) -> Array:
+    """A matrix : (g, j) whose product with its transpose is a covariance : (g, g), of any rank and units."""
+    sigma = np.sqrt(np.diag(covariance))
+    unit = np.where(sigma > 0, sigma, 1.0)
+    variances, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
+    kept = variances > 0
+    return unit[:, None] * axes[:, kept] * np.sqrt(variances[kept])
+
+
+def unexplained(equations: Equations, used: NDArray[np.bool_]) -> Array:
+    """Residuals : (m,) that no error and no motion explains, whatever their sizes, as fitted to those of a mask : (m,)."""
+    explained = _scaled(equations)
+    return equations.residuals - explained @ np.linalg.lstsq(explained[used], equations.residuals[used], UNSEEN)[0]
+
+
+def noise_factor(equations: Equations) -> float:
+    """Standard deviation of the residuals that no error and no motion explains, over the predicted one; at least 1."""
+    explained = _scaled(equations)
+    freedom = len(explained) - int(np.linalg.matrix_rank(explained, rtol=UNSEEN))
+    if freedom < 1:
+        return 1.0
+    left = unexplained(equations, np.ones(len(explained), bool))
+    return max(float(np.sqrt(left @ left / freedom)), 1.0)
+
+
+def _scaled(equations: Equations) -> Array:
+    """Slopes : (m, p) by all errors and motions, of unit length."""
+    slopes = np.column_stack([equations.spread, *(fault.slopes for fault in equations.faults.values())])
+    length = np.linalg.norm(slopes, axis=0)
+    return slopes[:, length > 0] / length[length > 0]
+
+
+def find(equations: Equations, alarm_sigma: float) -> dict[str, Finding]:
+    """Test all parts. While some part is beyond `alarm_sigma` the likeliest is named, and the others are tested beside it.
+
+    Returns
+    -------
+    By part; those that no equation shows are left out.
+    """
+    found: dict[str, Finding] = {}
+    seen = {name: fault for name, fault in equations.faults.items() if np.abs(fault.slopes).max(initial=0) > 0}
+    equations = replace(equations, faults=seen)
+    while True:
+        tests = {name: _tested(equations, fault) for name, fault in equations.faults.items()}
+        if len(found) == MOST_NAMED or not any(finding.sigma > alarm_sigma for finding, _ in tests.values()):
+            return found | {name: finding for name, (finding, _) in tests.items()}
+        best = max(tests, key=lambda name: tests[name][1])
+        rivals = tuple(name for name in tests if name != best and tests[name][1] > tests[best][1] - RIVAL)
+        found[best] = replace(tests[best][0], named=True, rivals=rivals)
+        equations = _beside(equations, best)
+
+
+def _beside(equations: Equations, name: str) -> Equations:
+    """Equations in which a part's motion is uncertain, and not tested any more."""
+    fault = equations.faults[name]
+    others = {other: each for other, each in equations.faults.items() if other != name}
+    return Equations(equations.residuals, np.column_stack([equations.spread, fault.slopes * (10 * fault.usual)]), others)
+
+
+def _tested(equations: Equations, fault: Fault) -> tuple[Finding, float]:
+    """A part by itself, and the logarithm of its evidence over that of nothing having moved."""
+    slopes, y, spread = fault.slopes * fault.usual, equations.residuals, equations.spread
+    weighed = slopes - spread @ np.linalg.solve(np.eye(spread.shape[1]) + spread.T @ spread, spread.T @ slopes)  # Woodbury
+    information, right = weighed.T @ slopes, weighed.T @ y
+    information = (information + information.T) / 2
+    values, axes = np.linalg.eigh(information)
+    shown = values > UNSEEN * values.max()
+    statistic = float(np.sum((axes[:, shown].T @ right) ** 2 / values[shown]))
+    posterior = np.linalg.inv(information + np.eye(len(right)))
+    motion = posterior @ right
+    evidence = 0.5 * float(right @ motion - np.sum(np.log1p(np.maximum(values, 0))))
+    freedom, sizes = int(shown.sum()), fault.usual
+    covariance = posterior * np.outer(sizes, sizes)
+    return Finding(as_sigma(statistic, freedom), freedom, sizes * motion, covariance, sizes, named=False), evidence
+
+
+def as_sigma(statistic: float, freedom: int) -> float:
+    """Standard deviations of a normal number that is as seldom as large, either way, as chi-square is as large as a statistic."""
+    chance = float(stats.chi2.logsf(statistic, freedom))
+    return float(stats.norm.isf(np.exp(chance) / 2)) if chance > SMALLEST else float(np.sqrt(statistic))
+
+
+def named(findings: Mapping[str, Finding]) -> Sequence[str]:
+    """Parts that are told to have moved, with those that may have instead."""
+    return list(dict.fromkeys(one for name, each in findings.items() if each.named for one in (name, *each.rivals)))

@@ -1,0 +1,84 @@
+"""Points of a smooth surface that both cameras see under the same fringes: the projector's coordinates there, and how they
+change.
+
+A point of camera 1 is put in space by the fringes; there camera 2 must see the same fringe. Maps are read by planes through small
+windows, so that a pixel's noise, and a surface's grain, count little.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.geometry.camera import Camera
+from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, Matches, points_by_light
+from recon.structured_light.decode import ProjectorMap
+
+Array = NDArray[np.float64]
+
+MOST = 200  # points
+LEAST = 30
+HALF = 3  # px of a window, to each side of its middle
+CANDIDATES = 20  # pixels tried, for one that is used
+FLAT_PX = 0.5  # projector px from a window's plane: beyond, an edge runs through it
+FLOOR_PX = 0.01  # projector px: errors of a map that a window's pixels share
+SHARED = 9  # pixels of a window whose errors go together: the optics' blur
+
+
+def match(maps: tuple[ProjectorMap, ProjectorMap], cameras: Mapping[str, Camera], rng: np.random.Generator, name: str) -> Matches:
+    """Choose points, at random over all that both cameras see.
+
+    Parameters
+    ----------
+    maps : of cameras 1 and 2.
+
+    Raises
+    ------
+    InputError
+        If the maps have no axis in common, or fewer than 30 points are seen by both.
+    """
+    layers = [[(one.columns, one.sigma_columns), (one.rows, one.sigma_rows)] for one in maps]
+    axes = tuple(k for k in (0, 1) if all(camera[k][0] is not None for camera in layers))
+    if not axes:
+        raise InputError(f"{name}: expected both cameras' images of one sequence, found no axis of the projector in both")
+    values, sigmas = ([[camera[k][part] for k in axes] for camera in layers] for part in (0, 1))
+    seen = np.isfinite(values[0]).all(axis=0)
+    inner = np.flatnonzero(seen.ravel())
+    chosen = rng.permutation(inner)[: CANDIDATES * MOST]
+    pixels = np.column_stack([chosen % seen.shape[1], chosen // seen.shape[1]]).astype(float)
+    first, _, first_sigma = _read(values[0], sigmas[0], pixels)
+    good = np.isfinite(first).all(axis=1)
+    pixels, first, first_sigma = pixels[good], first[good], first_sigma[good]
+    seen_at = cameras["cam2"].project(points_by_light(pixels, first, axes, cameras))
+    second, gradient, second_sigma = _read(values[1], sigmas[1], seen_at)
+    both = np.flatnonzero(np.isfinite(second).all(axis=1))[:MOST]
+    if len(both) < LEAST:
+        found = f"{len(both)}: a smooth thing in the middle of both views, or {' and '.join(CAMERAS)} under other names?"
+        raise InputError(f"{name}: expected {LEAST} points that both cameras see under the {PROJECTOR}'s fringes, found {found}")
+    sigma = np.stack([first_sigma, second_sigma], axis=1)
+    return Matches(pixels, first, seen_at, second, gradient, sigma, axes).some(both)
+
+
+def _read(layers: list[NDArray], sigmas: list[NDArray | None], places: Array) -> tuple[Array, Array, Array]:
+    """Values : (m, k), gradients : (m, k, 2), sigmas : (m, k) of k layers at places : (m, 2) px; NaN where a window is bent."""
+    height, width = layers[0].shape
+    with np.errstate(invalid="ignore"):
+        inside = ((places >= HALF) & (places <= np.array([width, height]) - 1 - HALF)).all(axis=1)
+    middle = np.where(inside[:, None], np.rint(places), HALF).astype(int)
+    across, down = (steps.ravel() for steps in np.meshgrid(*2 * (np.arange(-HALF, HALF + 1),)))
+    columns, rows = middle[:, :1] + across, middle[:, 1:] + down
+    planes = np.linalg.pinv(np.column_stack([np.ones(len(across)), across, down]))
+    values, gradients, noises = [], [], []
+    for layer, sigma in zip(layers, sigmas, strict=True):
+        window = layer[rows, columns].astype(float)
+        plane = window @ planes.T
+        left = window - plane @ np.vstack([np.ones(len(across)), across, down])
+        with np.errstate(invalid="ignore"):
+            flat = inside & (np.abs(left).max(axis=1) < FLAT_PX)
+        value = plane[:, 0] + np.einsum("mi,mi->m", plane[:, 1:], places - middle)
+        claimed = np.sqrt(np.mean(left**2, axis=1)) if sigma is None else sigma[rows, columns].mean(axis=1)
+        values.append(np.where(flat, value, np.nan))
+        gradients.append(plane[:, 1:])
+        noises.append(np.hypot(FLOOR_PX, claimed * np.sqrt(SHARED / len(across))))
+    return np.stack(values, axis=1), np.stack(gradients, axis=1), np.stack(noises, axis=1)

@@ -1,0 +1,183 @@
+"""Equations of cameras and projector against each other: a target moved about before both cameras, and fringes that both see.
+
+Each pair of frames gives twelve numbers for a pose of six; each point of a surface two pixels and the projector's coordinates in
+both cameras' maps, for a place of three. The rest tells whether the devices are where they were calibrated. Vertical fringes show
+neither a motion of the projector along them nor that of camera 2 across its epipolar lines; the latter the target shows.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.geometry.camera_jacobian import MOTION, moved
+from recon.geometry.circle_outline import ellipses_of, slopes_at
+from recon.geometry.order_statistics import NORMAL_MAD
+from recon.model import circle_layout
+from recon.model.calibration import Calibration, Uncertainty, projection_slopes
+from recon.model.circle_layout import Circles
+from recon.model.rig import Target
+from recon.rig_check import fault_tests
+from recon.rig_check.fault_tests import Equations, Fault
+from recon.tracking.pose import aligned
+from recon.tracking.pose_fit import Sighting, meet
+
+Array = NDArray[np.float64]
+
+CAMERAS, PROJECTOR, TARGET = ("cam1", "cam2"), "projector", "target"
+USUAL_MOTION = np.repeat([np.deg2rad(0.03), 0.1], 3)  # rad and mm: a mount that creeps, a touch; larger ones show all the better
+USUAL_LENGTHS = np.full(3, 0.3)  # mm: another print, a bent board
+EXACT_PX = 1e-4  # of a camera's pixel at which a map is read
+ROUNDS = 3  # of a pose's fit
+OUTLYING = 5.0  # standard deviations, after the scale of all
+TRIMS = 4  # rounds in which points that disagree are left out
+
+
+class Matches(NamedTuple):
+    """m points of a surface, seen under fringes by both cameras."""
+
+    pixels: Array  # (m, 2) px of camera 1
+    first: Array  # (m, k) projector px along each axis that is encoded, at those pixels
+    seen_at: Array  # (m, 2) px of camera 2, where the points are to be seen by the calibration
+    second: Array  # (m, k) projector px there
+    gradient: Array  # (m, k, 2) of camera 2's map there
+    sigma: Array  # (m, 2, k) projector px, of first and second
+    axes: tuple[int, ...]  # (k,) 0 of columns, 1 of rows
+
+    def some(self, chosen: NDArray) -> "Matches":
+        """Those of a mask or of numbers."""
+        arrays = (self.pixels, self.first, self.seen_at, self.second, self.gradient, self.sigma)
+        first, *others = (each[chosen] for each in arrays)
+        return Matches(first, *others, axes=self.axes)
+
+
+class Rows(NamedTuple):
+    """Equations free of poses and points."""
+
+    residuals: Array  # (m,)
+    by_optics: Array  # (m, g) by the calibration's parameters and all motions
+    by_length: Array  # (m, 3) by the target's lengths, mm
+
+    def over(self, factor: float) -> "Rows":
+        """The same with noise that is larger by a factor."""
+        return Rows(*(each / factor for each in self))
+
+
+def parameters(known: Uncertainty, devices: Sequence[str]) -> tuple[str, ...]:
+    """Names of the calibration's parameters, and of the motions of all devices."""
+    motions = (f"{device}.{name}" for device in devices for name in MOTION)
+    return tuple(dict.fromkeys((*known.names, *motions)))
+
+
+def of_film(pairs: Sequence[tuple[Sighting, Sighting]], target: Target, names: Sequence[str]) -> Rows:
+    """Equations of n pairs of frames that show all six circles: six each."""
+    rows = [_of_pair(pair, target, names) for pair in pairs]
+    free = fault_tests.eliminated(*(np.stack(each) for each in zip(*rows, strict=True)))
+    return Rows(free[..., 0].ravel(), free[..., 1 : 1 + len(names)].reshape(-1, len(names)), free[..., -3:].reshape(-1, 3))
+
+
+def _of_pair(pair: tuple[Sighting, Sighting], target: Target, names: Sequence[str]) -> tuple[Array, Array]:
+    """Slopes by the pose : (12, 6), and the rest : (12, 1 + g + 3), in standard deviations."""
+    model, circles = circle_layout.circle_centres(target), circle_layout.circles(target)
+    pose = aligned(model, meet([view.camera for view in pair], [view.centres for view in pair])[0])
+    whiten = np.zeros((12, 12))
+    for k, noise in enumerate(one for view in pair for one in view.covariance):
+        whiten[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.linalg.inv(np.linalg.cholesky(noise))
+    for _ in range(ROUNDS):
+        by_pose, missing = _by_pose(pair, pose, circles)
+        pose = rigid.moved(pose, np.linalg.lstsq(whiten @ by_pose, whiten @ missing)[0])
+    by_pose, missing = _by_pose(pair, pose, circles)
+    points = rigid.apply(pose, circles.centres)
+    by_point = np.concatenate([slopes_at(view.camera, points) for view in pair])  # (6, 2, 3)
+    by_length = (by_point @ np.concatenate([pose[:3, :3] @ circle_layout.BY_LENGTH] * 2)).reshape(12, 3)
+    cameras = {name: view.camera for name, view in zip(CAMERAS, pair, strict=True)}
+    by_optics = projection_slopes(cameras, [points, points], names)
+    return whiten @ by_pose, whiten @ np.column_stack([missing, by_optics, by_length])
+
+
+def _by_pose(pair: tuple[Sighting, Sighting], pose: Array, circles: Circles) -> tuple[Array, Array]:
+    """Slopes : (12, 6) of the ellipses' centres by the pose, and their residuals : (12,) px."""
+    points, arms = rigid.apply(pose, circles.centres), rigid.rotate(pose, circles.centres)
+    slopes = [slopes_at(view.camera, points) @ rigid.slopes(arms) for view in pair]
+    missing = [view.centres - ellipses_of(view.camera, pose, *circles)[0] for view in pair]
+    return np.concatenate(slopes).reshape(12, 6), np.concatenate(missing).ravel()
+
+
+def of_fringes(matches: Matches, cameras: Mapping[str, Camera], names: Sequence[str]) -> Rows:
+    """Equations of m points: one each with fringes along one axis of the projector, three with both."""
+    axes, (m, k) = list(matches.axes), matches.first.shape
+    points = points_by_light(matches.pixels, matches.first, matches.axes, cameras)
+    by_point = {name: slopes_at(cameras[name], points) for name in (*CAMERAS, PROJECTOR)}
+    by_optics = {
+        name: projection_slopes({name: cameras[name]}, [points], names).reshape(m, 2, -1) for name in (*CAMERAS, PROJECTOR)
+    }
+    shown = cameras[PROJECTOR].project(points)[:, axes]
+    rows = []
+    for slopes in (by_point, by_optics):  # a map is read at camera 2's predicted pixel, not at that of the point
+        light = slopes[PROJECTOR][:, axes]
+        rows.append(np.concatenate([slopes["cam1"], light, light - matches.gradient @ slopes["cam2"]], axis=1))
+    elsewhere = np.einsum("mki,mi->mk", matches.gradient, matches.seen_at - cameras["cam2"].project(points))
+    missing = np.concatenate([np.zeros((m, 2)), matches.first - shown, matches.second - shown - elsewhere], axis=1)
+    sigma = np.concatenate([np.full((m, 2), EXACT_PX), matches.sigma.reshape(m, 2 * k)], axis=1)[..., None]
+    free = fault_tests.eliminated(rows[0] / sigma, np.concatenate([missing[..., None], rows[1]], axis=2) / sigma)
+    by_optics = free[..., 1:].reshape(-1, len(names))
+    return Rows(free[..., 0].ravel(), by_optics, np.zeros((len(by_optics), 3)))
+
+
+def points_by_light(pixels: Array, shown: Array, axes: Sequence[int], cameras: Mapping[str, Camera]) -> Array:
+    """Points : (m, 3) mm on camera 1's rays at which the projector's coordinate of the first axis is as decoded."""
+    camera, projector, axis = cameras["cam1"], cameras[PROJECTOR], axes[0]
+    rays, depth = camera.rays(pixels), np.full(len(pixels), float(np.linalg.norm(projector.centre - camera.centre)) * 4)
+    for _ in range(20):
+        points = camera.centre + depth[:, None] * rays
+        slope = np.einsum("mi,mi->m", slopes_at(projector, points)[:, axis], rays)
+        depth = depth + (shown[:, 0] - projector.project(points)[:, axis]) / slope
+    return camera.centre + depth[:, None] * rays
+
+
+def assembled(film: Rows | None, fringes: Rows | None, target: Target, known: Uncertainty, names: Sequence[str]) -> Equations:
+    """All equations with their faults: a motion of each device, and a target of other lengths.
+
+    Noise that is larger than predicted is taken as found, of film and fringes each by itself.
+    """
+    parts = [rows for rows in (film, fringes) if rows is not None]
+    parts = [rows.over(fault_tests.noise_factor(_equations(rows, target, known, names))) for rows in parts]
+    return _equations(Rows(*map(np.concatenate, zip(*parts, strict=True))), target, known, names)
+
+
+def _equations(rows: Rows, target: Target, known: Uncertainty, names: Sequence[str]) -> Equations:
+    lengths = fault_tests.root(circle_layout.length_covariance(target))
+    spread = np.column_stack([rows.by_optics @ fault_tests.root(known.ordered(names)), rows.by_length @ lengths])
+    faults = {}
+    for device in (*CAMERAS, PROJECTOR):
+        columns = [list(names).index(f"{device}.{name}") for name in MOTION if f"{device}.{name}" in names]
+        if columns:
+            faults[device] = Fault(rows.by_optics[:, columns], USUAL_MOTION)
+    return Equations(rows.residuals, spread, faults | {TARGET: Fault(rows.by_length, USUAL_LENGTHS)})
+
+
+def agreeing(rows: Rows, target: Target, known: Uncertainty, names: Sequence[str], each: int) -> Rows:
+    """Groups of `each` equations that agree with most others, whatever has moved: edges and stray light are left out."""
+    equations = _equations(rows, target, known, names)
+    used = np.ones(len(rows.residuals) // each, bool)
+    for _ in range(TRIMS):
+        left = fault_tests.unexplained(equations, np.repeat(used, each))
+        worst = np.abs(left.reshape(-1, each)).max(axis=1)
+        used = worst < OUTLYING * max(NORMAL_MAD * float(np.median(np.abs(left))), 1e-12)
+    return Rows(*(part[np.repeat(used, each)] for part in rows))
+
+
+def displacements(device: str, motion: Array, calibration: Calibration, points: Array, axes: Sequence[int]) -> Array:
+    """By which points : (n, 3) mm are measured elsewhere where a device has moved by a motion : (6,), as (n, 3) mm.
+
+    Of a camera points that both cameras measure; of the projector those that camera 1 measures by its light.
+    """
+    cameras = calibration.cameras
+    used = {**cameras, device: moved(cameras[device], MOTION, motion)}
+    if device == PROJECTOR:
+        shown = used[PROJECTOR].project(points)[:, list(axes)]
+        return points_by_light(cameras["cam1"].project(points), shown, axes, cameras) - points
+    return meet([cameras[name] for name in CAMERAS], [used[name].project(points) for name in CAMERAS])[0] - points

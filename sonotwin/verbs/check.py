@@ -1,0 +1,224 @@
+"""Check whether the rig is still as it was calibrated: cameras, projector, target, probe and the scanner's clock.
+
+Reads a capture folder with the calibrations in use and any of three parts, taken before a session in two minutes: a film in which
+both cameras see the target moved about, tilted to all sides; a fringe sequence of anything smooth, seen by both cameras, best
+with fringes along both axes; and ten seconds of tracked B-scans over a flat, rough bottom in water, the probe rolled, tilted and
+moved up and down. Writes into the folder `out` check.html, the verdicts with their course over the days of `log`, and check.json.
+An error that the calibrations admit by their covariance, and usual drift, are no alarm. Exit status 1 if something has moved.
+Takes some seconds.
+
+    sonotwin check capture=outputs/morning/capture out=outputs/check log=outputs/rig.jsonl lag=outputs/lag/lag.json
+"""
+
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from pydantic import Field
+from rich.console import Console
+from rich.progress import Progress
+
+from recon.capture import calibration_files, lag_files, manifest, probe_files, stereo_frames, surface_part, sweep_part
+from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
+from recon.capture.target_files import read as read_target
+from recon.errors import InputError
+from recon.files import atomic
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Calibration, in_use
+from recon.model.probe import ProbeCalibration
+from recon.model.rig import NotNegative, Part, Positive, Rig, Target
+from recon.probe_calibration import sound_in_water
+from recon.rig_check import bottom_equations, check_log, check_page, fringe_matches, verdicts
+from recon.rig_check.bottom_equations import Known
+from recon.rig_check.optics_equations import PROJECTOR, Matches
+from recon.rig_check.verdicts import TITLES, Optics, Verdict
+from recon.structured_light import decode
+from recon.target_calibration import target_poses
+from recon.tracking import networks
+from recon.tracking.pose_fit import Sighting
+from recon.tracking.tracker import Tracker
+
+CHECK, PAGE = "check.json", "check.html"  # the first is that by which the folder of a check is known
+SEARCH_PX = 5.0  # of the cameras' principal points: the tracker is to find the target by cameras that have moved, too
+UNKNOWN_LAG_S = 1.0  # standard deviation of a lag that wasn't measured
+LEAST_POSES = 3
+SEED = 0  # of the points under the fringes
+
+
+class Config(Part):
+    """Fields of `conf/check.yaml`."""
+
+    rig: Rig
+    capture: Path
+    out: Path
+    log: Path | None = None
+    film: manifest.SweepNameOrNone = ""
+    bottom: manifest.SweepNameOrNone = ""
+    calibration: Path | None = None
+    probe: Path | None = None
+    lag: Path | None = None
+    target: Path | None = None
+    alarm_sigma: Annotated[float, Field(ge=1, le=20)] = 3.5
+    drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
+    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
+    water_c: Annotated[float, Field(ge=0, le=95)] = 22.0
+    water_sigma_c: NotNegative = 1.0
+    top_px: Annotated[int, Field(ge=0)] = 40
+    speed_mm_s: Positive = 10.0
+    most_poses: Annotated[int, Field(ge=LEAST_POSES, le=10_000)] = 40
+    networks: Path | None = None
+    threads: Annotated[int, Field(ge=0, le=1024)] = 0
+
+
+class Held(NamedTuple):
+    """Parts of the capture that can be checked: names of sweeps, None where there is none."""
+
+    film: str | None
+    fringes: bool
+    bottom: str | None
+
+
+def run(config: Config) -> int:
+    """Read, test and write; returns 1 if something has moved.
+
+    Raises
+    ------
+    InputError
+        If the capture is incomplete or damaged or holds nothing that can be checked, or a place can't be written to.
+    """
+    console = Console(soft_wrap=True, highlight=False)
+    inputs = [path for path in (config.capture, config.calibration, config.probe, config.lag, config.target) if path is not None]
+    atomic.check_folder(config.out, CHECK, inputs=inputs)
+    if config.log is not None and config.log.exists():
+        check_log.read(config.log)
+    listed = manifest.read_manifest(config.capture)
+    held = parts_of(config, listed)
+    found = [*optics(config, listed, held, console)]
+    found += verdicts.doubted(tank(config, held, console), found)
+    made = check_log.check(listed.name or config.capture.resolve().name, found)
+    for one, entry in zip(found, made.parts, strict=True):
+        sigma, mm = check_page.deviation(entry)
+        shown = "" if one.state == "unseen" else f"{sigma}, {mm}; {one.motion}"
+        or_else = f" (or {', '.join(map(TITLES.__getitem__, one.rivals))})" if one.rivals else ""
+        console.print(f"{TITLES[one.part]:22}{check_page.WORDS[one.state]:15}{shown}{or_else}", markup=False)
+    console.print(f"verdict     {check_page.summary(made.parts)}", markup=False)
+    with atomic.new_folder(config.out, CHECK) as folder:
+        log = [made] if config.log is None else check_log.add(config.log, made)
+        (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        (folder / PAGE).write_text(check_page.write_text(made, log, config.alarm_sigma), encoding="utf-8")
+    console.print(f"wrote       {config.out}/{{{CHECK},{PAGE}}}", markup=False)
+    return int(any(one.state == "moved" for one in found))
+
+
+def parts_of(config: Config, listed: Manifest) -> Held:
+    """Parts that can be checked.
+
+    Raises
+    ------
+    InputError
+        If there is none, or a sweep that is named.
+    """
+    sweeps = dict(listed.sweeps) if listed.sweep is None else {"": listed.sweep}
+    for field, name in (("film", config.film), ("bottom", config.bottom)):
+        if name and name not in sweeps:
+            found = ", ".join(sweeps) or "no sweep"
+            raise InputError(f"{config.capture / MANIFEST}: {field}: expected one of its sweeps, found {name} beside {found}")
+    films = [name for name, part in sweeps.items() if set(CAMERAS) <= part.images.keys() and SCANNER not in part.images]
+    bottoms = [name for name, part in sweeps.items() if SCANNER in part.images and part.track is not None]
+    wanted = [name for name in bottoms if sweeps[name].purpose == "latency"] or bottoms
+    film, bottom = ([name] if name else found for name, found in ((config.film, films), (config.bottom, wanted)))
+    for field, found in (("film", film), ("bottom", bottom)):
+        if len(found) > 1:
+            raise InputError(
+                f"{config.capture / MANIFEST}: expected one sweep for this, found {', '.join(found)}; give {field}=NAME"
+            )
+    fringes = listed.surface is not None and set(CAMERAS) <= listed.surface.images.keys()
+    if not (film or bottom or fringes):
+        expected = "frames of the target, fringes before both cameras, or tracked B-scans of a bottom"
+        raise InputError(
+            f"{config.capture / MANIFEST}: expected {expected}, found none of them; sweeps are tracked by sonotwin track"
+        )
+    return Held(film[0] if film else None, fringes, bottom[0] if bottom else None)
+
+
+def optics(config: Config, listed: Manifest, held: Held, console: Console) -> list[Verdict]:
+    """Verdicts on cameras, projector and target."""
+    if held.film is None and not held.fringes:
+        return [Verdict(part, "unseen") for part in (*CAMERAS, PROJECTOR, "target")]
+    file = config.calibration or (None if listed.calibration is None else config.capture / listed.calibration)
+    if file is None:
+        raise InputError(f"{config.capture / MANIFEST}: expected calibration, the path of a calibration file, found none")
+    wanted = [*CAMERAS, *([PROJECTOR] if held.fringes else [])]
+    sizes = {name: device.size for name, device in listed.devices.items() if name in wanted}
+    calibration = calibration_files.read_for(file, sizes)
+    if calibration.uncertainty is None:
+        console.print(f"warning     {file}: no covariance: an error of the calibration is taken for a motion", markup=False)
+    target = config.rig.target if config.target is None else read_target(config.target, config.rig.target)
+    film = None if held.film is None else filmed(config, held.film, target, calibration, console)
+    matches = matched(config, calibration, console) if held.fringes else None
+    known = in_use(calibration.uncertainty, calibration.cameras, config.board_scale, config.drift_px)
+    if known is None:
+        raise InputError("drift_px: expected more than 0 beside a calibration without covariance, found 0")
+    return verdicts.of_optics(Optics(film, matches), calibration, known, target, config.alarm_sigma)
+
+
+def filmed(
+    config: Config, name: str, target: Target, calibration: Calibration, console: Console
+) -> list[tuple[Sighting, Sighting]]:
+    """Pairs of frames in which both cameras see the target whole, in poses that differ."""
+    film = stereo_frames.read_film(config.capture, config.calibration, name)
+    wide = in_use(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale, SEARCH_PX)
+    tracker = Tracker(film.cameras, target, networks.load(config.networks or networks.WEIGHTS, config.threads), film.bits, wide)
+    seen = []
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        pairs = progress.track(film.pairs(), total=len(film.times), description="tracking")
+        for time, pair in zip(film.times.tolist(), pairs, strict=True):
+            seen.append(target_poses.whole(tracker.step(*pair, time * 1e-9), film.cameras))
+    poses = target_poses.spread(target_poses.distinct([one for one in seen if one is not None]), config.most_poses)
+    if len(poses) < LEAST_POSES:
+        found = f"{len(poses)} in {len(film.times)} pairs: move it about, uncovered and well lit"
+        raise InputError(f"{film.name}: expected {LEAST_POSES} poses in which both cameras see all circles whole, found {found}")
+    tilt, reach = target_poses.tilt_deg(poses), target_poses.range_mm(poses)
+    console.print(
+        f"film        {len(poses)} poses, tilts of {tilt:.0f} deg (1 sigma), over {reach:.0f} mm of depth", markup=False
+    )
+    return [one.views for one in poses]
+
+
+def matched(config: Config, calibration: Calibration, console: Console) -> Matches:
+    """Points of the surface that both cameras see."""
+    maps = []
+    for camera in CAMERAS:
+        shots = surface_part.read_surface(config.capture, camera, config.calibration)
+        maps.append(decode.decode(shots.images, shots.patterns, bits=shots.bits, name=f"{shots.name}: {camera}"))
+    matches = fringe_matches.match((maps[0], maps[1]), calibration.cameras, np.random.default_rng(SEED), str(config.capture))
+    axes = " and ".join(("columns", "rows")[k] for k in matches.axes)
+    console.print(f"fringes     {len(matches.pixels)} points in both cameras, {axes}", markup=False)
+    return matches
+
+
+def tank(config: Config, held: Held, console: Console) -> list[Verdict]:
+    """Verdicts on probe and clock."""
+    parts = (bottom_equations.PROBE, bottom_equations.CLOCK)
+    if held.bottom is None:
+        return [Verdict(part, "unseen") for part in parts]
+    sweep = sweep_part.read_sweep(config.capture, held.bottom)
+    probe = sweep.probe if config.probe is None else probe_files.read(config.probe)
+    if probe is None:
+        raise InputError(
+            f"{config.capture / MANIFEST}: expected probe, the path of the probe's calibration, found none; or give probe"
+        )
+    if probe.uncertainty is None:
+        console.print("warning     probe: no covariance: an error of its calibration is taken for a bent bracket", markup=False)
+    lag = None if config.lag is None else lag_files.read(config.lag)
+    known = Known(in_water(probe, config), *((lag.lag_s, lag.sigma_s) if lag else (0.0, UNKNOWN_LAG_S)))
+    lines = bottom_equations.lines_of(sweep.images(), sweep.times, sweep.size, config.top_px)
+    found, lag_s = verdicts.of_bottom(lines, sweep.track, known, sweep.size, config.speed_mm_s, config.alarm_sigma)
+    shown = int(np.isfinite(lines.pixels).all(axis=(1, 2)).sum())
+    console.print(f"bottom      in {shown} of {len(sweep.times)} B-scans, lag {1e3 * lag_s:.1f} ms", markup=False)
+    return found if lag else [one for one in found if one.part != bottom_equations.CLOCK] + [Verdict(parts[1], "unseen")]
+
+
+def in_water(probe: ProbeCalibration, config: Config) -> ProbeCalibration:
+    """The calibration for the tank's water, with the thermometer's error."""
+    speed = float(sound_in_water.speed_of_sound(config.water_c))
+    return sound_in_water.for_tissue(probe, speed, float(sound_in_water.speed_sigma(config.water_c, config.water_sigma_c)))

@@ -1,0 +1,92 @@
+"""Parts that moved are found and named by their equations; errors that the calibration admits are no alarm."""
+
+import numpy as np
+import pytest
+
+from recon.rig_check import fault_tests
+from recon.rig_check.fault_tests import Equations, Fault
+
+
+@pytest.fixture
+def equations(rng) -> Equations:
+    """Forty measurements, three uncertain parameters, and two parts of six and of two motions."""
+    faults = {
+        "first": Fault(rng.standard_normal((40, 6)), np.full(6, 10.0)),
+        "second": Fault(rng.standard_normal((40, 2)), np.full(2, 10.0)),
+    }
+    return Equations(np.zeros(40), 30 * rng.standard_normal((40, 3)), faults)
+
+
+def measured(equations: Equations, rng, motion=(), part="first") -> Equations:
+    """Noise of 1, errors of the calibration, and a motion."""
+    residuals = rng.standard_normal(40) + equations.spread @ rng.standard_normal(3)
+    slopes = equations.faults[part].slopes
+    return Equations(residuals + slopes[:, : len(motion)] @ np.array(motion), equations.spread, equations.faults)
+
+
+def test_alarms_are_as_seldom_as_they_claim(equations, rng):
+    """Beyond 2 sigma 4.6 % of 1000 checks, for each part, to 5 standard deviations of a count, with errors 30 times the noise."""
+    sigmas = np.array([[one.sigma for one in fault_tests.find(measured(equations, rng), 50.0).values()] for _ in range(1000)])
+    assert (sigmas > 2).mean(axis=0) == pytest.approx(0.0455, abs=5 * np.sqrt(0.0455 / 1000))
+
+
+@pytest.mark.parametrize("part", ["first", "second"])
+def test_what_moved_is_named_and_its_motion_found(equations, rng, part):
+    """By the motion's own covariance, to five standard deviations; the other part stays as it is."""
+    found = fault_tests.find(measured(equations, rng, (5.0, -4.0), part), 3.5)
+    assert fault_tests.named(found) == [part] and found[part].sigma > 10
+    off = found[part].motion[:2] - [5.0, -4.0]
+    assert (np.abs(off) < 5 * np.sqrt(np.diag(found[part].covariance))[:2]).all()
+
+
+def test_two_that_moved_are_both_named(equations, rng):
+    once = measured(equations, rng, (6.0, -6.0), "first")
+    both = Equations(once.residuals + equations.faults["second"].slopes @ [6.0, 6.0], once.spread, once.faults)
+    assert set(fault_tests.named(fault_tests.find(both, 3.5))) == {"first", "second"}
+
+
+def test_parts_that_explain_the_same_are_rivals(equations, rng):
+    """A part with the same slopes can't be told from the first."""
+    moved = measured(equations, rng, (5.0, 5.0))
+    twins = Equations(moved.residuals, moved.spread, {**moved.faults, "twin": moved.faults["first"]})
+    assert set(fault_tests.named(fault_tests.find(twins, 3.5))) == {"first", "twin"}
+
+
+def test_a_part_that_nothing_shows_is_left_out(equations, rng):
+    unseen = {**equations.faults, "unseen": Fault(np.zeros((40, 6)), np.ones(6))}
+    assert "unseen" not in fault_tests.find(Equations(rng.standard_normal(40), equations.spread, unseen), 3.5)
+
+
+def test_an_error_within_the_calibration_is_no_alarm(equations, rng):
+    """Along a direction that is uncertain by 30 the part seems to have moved by 30, with no sigma in it."""
+    faults = {"first": Fault(equations.spread / 30, np.full(3, 100.0))}
+    residuals = rng.standard_normal(40) + equations.spread @ [1.0, -1.0, 0.5]
+    assert fault_tests.find(Equations(residuals, equations.spread, faults), 3.5)["first"].sigma < 3
+
+
+def test_larger_noise_is_measured(equations, rng):
+    """Three times the predicted, whatever moved and erred, to 5 standard deviations of 29 degrees of freedom."""
+    moved = measured(equations, rng, (1e3, -1e3))
+    noisy = Equations(moved.residuals + np.sqrt(8) * rng.standard_normal(40), moved.spread, moved.faults)
+    assert fault_tests.noise_factor(noisy) == pytest.approx(3, rel=5 / np.sqrt(2 * 29))
+    assert fault_tests.noise_factor(Equations(1e-3 * noisy.residuals, moved.spread, moved.faults)) == 1
+
+
+def test_own_unknowns_are_eliminated_and_noise_stays_one(rng):
+    """Of 500 groups of 5 equations with 2 unknowns of any size each, three remain: variance 1 to 5 standard deviations."""
+    own = rng.standard_normal((500, 5, 2))
+    noise = rng.standard_normal((500, 5, 1))
+    free = fault_tests.eliminated(own, own @ (1e3 * rng.standard_normal((500, 2, 1))) + noise)
+    assert free.shape == (500, 3, 1) and free.var() == pytest.approx(1, abs=5 * np.sqrt(2 / 1500))
+
+
+@pytest.mark.parametrize(("statistic", "freedom", "sigma"), [(9.0, 1, 3.0), (22.4577, 6, 3.2905), (1e4, 1, 100.0)])
+def test_statistics_in_standard_deviations(statistic, freedom, sigma):
+    """Of one degree of freedom the root; of six, 22.4577 has a chance of 0.001 (tables of chi-square)."""
+    assert fault_tests.as_sigma(statistic, freedom) == pytest.approx(sigma, rel=1e-3)
+
+
+def test_a_root_gives_a_covariance_of_any_units(rng):
+    factor = rng.standard_normal((4, 2)) * np.array([[1e-5], [1.0], [100.0], [0.0]])
+    root = fault_tests.root(factor @ factor.T)
+    assert root @ root.T == pytest.approx(factor @ factor.T, rel=1e-6)
