@@ -6,7 +6,7 @@ from pathlib import Path
 
 from twin.accuracy import table_rows
 
-GROUPS = ("optics", "surface", "calibration", "ultrasound", "tracking", "studies", "demo")
+GROUPS = ("optics", "surface", "calibration", "ultrasound", "tracking", "studies", "live", "demo")
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "benchmarks.md"
 
 

@@ -26,7 +26,7 @@ from twin.ultrasound.transducer import Transducer
 
 Group = Literal[
     "optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking", "session", "studies", "strangers",
-    "trust",
+    "trust", "live",
 ]  # fmt: skip
 MODULES = {
     "session": "sonotwin.session_accuracy",
