@@ -150,6 +150,13 @@ class Recording:
         _write_whole(self.folder / manifest.MANIFEST, manifest.manifest_text(new).encode())
         self._manifest = new
 
+    def _remove(self) -> None:
+        """Remove a new capture into which nothing was recorded."""
+        shutil.rmtree(self.folder / Path(manifest.OPTICS).parent, ignore_errors=True)
+        (self.folder / manifest.MANIFEST).unlink()
+        with suppress(OSError):  # of a sweep of which a frame was written, but not entered
+            self.folder.rmdir()
+
     def _tidy_surface(self) -> None:
         """Remove takes of the surface that the manifest doesn't name."""
         named = {path for paths in (self._manifest.surface.images.values() if self._manifest.surface else ()) for path in paths}
@@ -235,8 +242,12 @@ def open_recording(folder: Path, name: str = "") -> Iterator[Recording]:
         recording = Recording(folder, read)
         if new:
             recording._exchange(read)
-        recording._tidy()
-        yield recording
+        try:
+            recording._tidy()
+            yield recording
+        finally:
+            if new and not recording.contents.contents:
+                recording._remove()
 
 
 def _write_whole(path: Path, data: bytes | np.ndarray) -> None:

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from recon.model.rig import Target
 from recon.tracking import photographs
 from recon.tracking.networks import Networks
+from recon.tracking.rims import WHOLE
 
 MOST_MOTION_PX = 8.0  # of a circle over an exposure: what the tracker was measured with, and some more
-WHOLE = 0.98  # share of a rim that is seen of a circle that nothing covers
 Judged = tuple[str, tuple[str, ...]]  # figures, and faults with the ways to mend them
 Judge = Callable[[NDArray, int], Judged]  # of an image : (h, w) and its bits
 

@@ -17,7 +17,6 @@ from twin.devices.virtual_rig import TRANSFER_NS
 from twin.filmed_sweep import PlannedSweep
 from twin.tracking.sampling_ranges import DataRanges
 
-
 PAIR = "cameras"
 
 

@@ -84,6 +84,12 @@ def test_what_would_be_lost_or_mixed_is_refused(tmp_path, rng):
         pass
 
 
+def test_nothing_is_left_of_a_recording_of_nothing(tmp_path):
+    with pytest.raises(InputError, match="optics"), recording.open_recording(tmp_path / "out") as capture:
+        capture.add_calibration(tmp_path / "optics.yaml", {})
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_torn_row_is_mended_and_said(tmp_path, rng, caplog):
     out = tmp_path / "out"
     with recording.open_recording(out) as capture, capture.sweep("", None, {"us": CAMERA}) as sweep:
