@@ -75,6 +75,7 @@ class LiveDevices(Part):
     cameras: dict[Name, Annotated[BaslerDevice, Field(discriminator="kind")]]
     projector: Annotated[WindowDevice, Field(discriminator="kind")] | None = None
     scanner: Annotated[IgtlDevice | VideoDevice, Field(discriminator="kind")] | None = None
+    sweep_triggers: tuple[Literal["free", "hardware"], Literal["free", "hardware"]] = ("free", "hardware")  # of cam1 and cam2
     pairs_within_s: Positive | None = None  # of frames that belong together; None: those of one number, triggered by one wire
 
 

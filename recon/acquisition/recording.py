@@ -83,10 +83,13 @@ class Recording:
         takes = [int(name[1]) for entry in _entries(self.folder / SURFACE) if (name := re.fullmatch(r"take(\d+)", entry.name))]
         place = f"{SURFACE}/take{max(takes, default=0) + 1:02d}"
         paths = {camera: tuple(f"{place}/{camera}/{image_name(k)}" for k in range(patterns.count)) for camera in images}
-        for camera, stack in images.items():
-            write_images([self.folder / path for path in paths[camera]], stack)
-        self._enter(SURFACE, SurfacePart(patterns=patterns, images=paths), devices)
-        self._tidy_surface()
+        try:
+            with atomic.named_in_errors(self.folder / place):
+                for camera, stack in images.items():
+                    write_images([self.folder / path for path in paths[camera]], stack)
+            self._enter(SURFACE, SurfacePart(patterns=patterns, images=paths), devices)
+        finally:
+            self._tidy_surface()
 
     def add_pose(
         self,

@@ -52,8 +52,8 @@ class PairOfFrames(Protocol):
 class PairSource(Protocol):
     """Two cameras that take pairs of frames."""
 
-    def start(self, trigger: Trigger) -> None:
-        """Begin to take frames."""
+    def start(self, trigger: Trigger, second: Trigger | None = None) -> None:
+        """Begin to take frames; the second camera's trigger may be another than the first one's."""
 
     def pair(self, timeout_s: float) -> PairOfFrames | None:
         """Wait for the next pair; None if none came in time. DeviceError if a camera is gone."""
@@ -68,7 +68,7 @@ class SweepPlan:
 
     name: str
     purpose: Purpose | None
-    trigger: Trigger
+    triggers: tuple[Trigger, Trigger]  # of camera 1 and camera 2; free or hardware
     seconds: float | None  # after which it ends by itself
     silent_s: float  # without a frame of a device, after which it counts as gone
     limits: Limits
@@ -144,7 +144,7 @@ def record_sweep(
             return counts
         operator.ask(Step("recording; end it when you are through"))
         if pairs is not None:
-            pairs.start(plan.trigger)
+            pairs.start(*plan.triggers)
         streams = [FrameStream(read, _writer(sweep, counts), plan.silent_s, say) for read in _readers(pairs, scanner, say)]
         try:
             _follow(streams, operator, plan, _Shown(show, say, judges, plan.limits, devices))

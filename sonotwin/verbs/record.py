@@ -177,7 +177,8 @@ def sweep(config: Config, recording: Recording, console: Console, say: Say, show
     """Record a sweep."""
     exposure_s = config.exposing.exposure_s or SWEEP_EXPOSURE_S
     silent_s = config.silent_s * (1 if isinstance(config.devices, LiveDevices) else SLOWER)
-    plan = SweepPlan(config.name, config.purpose, config.triggering.by, config.seconds, silent_s, config.limits)
+    triggers = config.devices.sweep_triggers if isinstance(config.devices, LiveDevices) else ("hardware", "hardware")
+    plan = SweepPlan(config.name, config.purpose, triggers, config.seconds, silent_s, config.limits)
     with sweep_devices(config, exposure_s, console) as (opened, operator, cameras):
         devices = dict(cameras)
         calibrations(config, recording, {name: device.size for name, device in devices.items()})

