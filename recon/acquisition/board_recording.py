@@ -15,10 +15,11 @@ from recon.acquisition.pictures import Say, Show
 from recon.acquisition.recording import Recording
 from recon.acquisition.still_session import StillSession
 from recon.board_detection.detect import BoardNotFound, detect
-from recon.capture.board_part import FRINGE_CAMERA
+from recon.capture.board_part import FRINGE_CAMERA, read_board
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
 
+HEADROOM = 0.75  # of the level, at the first pose: others come nearer, and turn to the projector
 HELD_PX = 0.3  # by which the board's points may move, in the mean, while the fringes are taken
 
 
@@ -37,9 +38,17 @@ class BoardPlan:
 def record_board(
     recording: Recording, stage: Stage, operator: Operator, guide: BoardGuide, plan: BoardPlan, say: Say, show: Show
 ) -> list[str]:
-    """Record poses until there are enough, or the operator ends; returns their names. Each is kept as soon as it is whole."""
+    """Record poses until there are enough, or the operator ends; returns their names. Each is kept as soon as it is whole.
+
+    Poses that the capture has already are shown to the guide first.
+    """
     names: list[str] = []
-    session = StillSession(stage, plan.exposing, plan.limits, say, show)
+    darker = plan.exposing.model_copy(update={"level": HEADROOM * plan.exposing.level})
+    session = StillSession(stage, darker, plan.limits, say, show)
+    if recording.contents.board is not None:
+        captured = read_board(recording.folder)
+        for number in range(len(captured.poses)):
+            guide.accept(captured.pose(number).lit)
     stage.start()
     try:
         operator.ask(guide.suggest())
@@ -70,11 +79,10 @@ def _recorded(
     verdict = guide.judge(lit)
     if not verdict.accepted:
         return f"not kept: {verdict.text}"
-    fringes = session.stage.sequence(plan.shown, [FRINGE_CAMERA], session.seen)
+    fringes = session.stage.sequence(plan.shown, [FRINGE_CAMERA], session.passing)
     bits = session.stage.cameras[FRINGE_CAMERA].bits
-    if faults := frame_checks.fringe_faults(
-        frame_checks.contrast(fringes[FRINGE_CAMERA], plan.patterns, bits, plan.limits), plan.limits
-    ):
+    contrast = frame_checks.contrast(fringes[FRINGE_CAMERA], plan.patterns, bits, plan.limits)
+    if faults := frame_checks.fringe_faults(contrast, plan.limits):
         return f"not kept: {sentence(faults)}"
     after = session.look()
     moved = moved_px(lit[FRINGE_CAMERA], after[FRINGE_CAMERA], plan.board, 2**bits - 1)

@@ -79,12 +79,9 @@ class EvenGuide:
 
     def judge(self, lit: Mapping[str, NDArray]) -> Verdict:
         """Look at the board as each camera sees it lit : camera -> (h, w)."""
-        points = dict[str, Array]()
-        for camera, image in lit.items():
-            try:
-                points[camera] = detect(image, self.board, full=self.full).pixels
-            except BoardNotFound as error:
-                return Verdict(False, f"{camera} doesn't find the board: {error}")
+        points, missing = self._points(lit)
+        if missing:
+            return Verdict(False, next(iter(missing.values())))
         nearest = min((self._moved(points, before, lit) for before in self._before), default=np.inf)
         if nearest < MOVED:
             return Verdict(False, f"nearly a pose that is there already, {100 * nearest:.1f} % of the image away")
@@ -92,7 +89,17 @@ class EvenGuide:
 
     def accept(self, lit: Mapping[str, NDArray]) -> None:
         """Take note of a pose that was recorded."""
-        self._before.append({camera: detect(image, self.board, full=self.full).pixels for camera, image in lit.items()})
+        self._before.append(self._points(lit)[0])
+
+    def _points(self, lit: Mapping[str, NDArray]) -> tuple[dict[str, Array], dict[str, str]]:
+        """The board's points in px by camera, and of cameras that don't find it the reason."""
+        points, missing = dict[str, Array](), dict[str, str]()
+        for camera, image in lit.items():
+            try:
+                points[camera] = detect(image, self.board, full=self.full).pixels
+            except BoardNotFound as error:
+                missing[camera] = f"{camera} doesn't find the board: {error}"
+        return points, missing
 
     def _moved(self, points: Mapping[str, Array], before: Mapping[str, Array], lit: Mapping[str, NDArray]) -> float:
         """RMS displacement of the points, of the image's width; the largest of all cameras."""
@@ -101,22 +108,6 @@ class EvenGuide:
             for name in points.keys() & before.keys()
         ]
         return float(max(away, default=np.inf))
-
-
-@dataclass
-class Listed:
-    """An operator that takes each of some steps at once, and then ends: for scripts."""
-
-    most: int
-    asked: list[Step] = field(default_factory=list)
-
-    def ask(self, step: Step) -> None:
-        """Note the step."""
-        self.asked.append(step)
-
-    def answer(self) -> Answer:
-        """Take until there were enough."""
-        return "take" if len(self.asked) <= self.most else "end"
 
 
 def sentence(faults: Sequence[str]) -> str:

@@ -1,6 +1,6 @@
 """What a preview shows: the latest image of each device, its figures, and its faults."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ class Picture(NamedTuple):
 
 Show = Callable[[Picture], None]
 Say = Callable[[str], None]
-Texts = Mapping[str, str]
 
 
 def hidden(picture: Picture) -> None:

@@ -48,7 +48,7 @@ def record_surface(recording: Recording, stage: Stage, operator: Operator, plan:
             if answer == "end":
                 break
             lit = session.expose()
-            taken = stage.sequence(plan.shown, list(stage.cameras), session.seen)
+            taken = stage.sequence(plan.shown, list(stage.cameras), session.passing)
             faults = [*session.faults(lit), *_faults(session, plan, taken), *_moved(lit, session.look())]
             if not faults:
                 break

@@ -77,7 +77,13 @@ def test_poses_that_add_something_are_kept(tmp_path):
     captured = read_board(tmp_path / "out")
     assert captured.poses == ("00", "01", "02") and captured.pose(1).fringes.shape[0] == patterns().count
     device = read_manifest(tmp_path / "out").devices["cam1"]
-    assert device.exposure_s == pytest.approx(0.0111, rel=0.1) and len(shown) > 30
+    assert device.exposure_s == pytest.approx(0.75 * 0.0111, rel=0.1) and len(shown) > 30
+
+
+def test_a_recording_that_goes_on_refuses_poses_of_the_one_before(tmp_path):
+    made, stage = bench()
+    assert record(tmp_path, stage, Scripted(["take"], [at(made, 0, 0)]), count=1) == ["00"]
+    assert record(tmp_path, stage, Scripted(["take"] * 2, [at(made, 2, 0), at(made, 60, 20)])) == ["01"]
 
 
 def test_a_board_that_moves_under_the_fringes_isnt_kept(tmp_path):
