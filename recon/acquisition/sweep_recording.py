@@ -88,7 +88,7 @@ class _Shown:
 
     def look(self, latest: Mapping[str, Frame]) -> None:
         """Look at the latest frames, at most once in a while, and say what is wrong with them."""
-        if monotonic() - self._looked < LOOK_S:
+        if not latest or monotonic() - self._looked < LOOK_S:
             return
         for device, frame in latest.items():
             bits = self.devices[device].bits
@@ -137,17 +137,16 @@ def record_sweep(
     """
     counts = dict.fromkeys(devices, 0)
     with recording.sweep(plan.name, plan.purpose, devices) as sweep:
+        shown = _Shown(show, say, judges, plan.limits, devices)
         operator.ask(Step(WORDS[plan.purpose]))
-        while (answer := operator.answer()) == "wait":
-            sleep(POLL_S)
-        if answer == "end":
+        if not _rehearsed(pairs, scanner, operator, plan, shown):
             return counts
         operator.ask(Step("recording; end it when you are through"))
         if pairs is not None:
             pairs.start(*plan.triggers)
         streams = [FrameStream(read, _writer(sweep, counts), plan.silent_s, say) for read in _readers(pairs, scanner, say)]
         try:
-            _follow(streams, operator, plan, _Shown(show, say, judges, plan.limits, devices))
+            _follow(streams, operator, plan, shown)
         finally:
             for stream in streams:
                 stream.end()
@@ -157,6 +156,26 @@ def record_sweep(
         for stream in streams:
             stream.check()
     return counts
+
+
+def _rehearsed(pairs: PairSource | None, scanner: Scanner | None, operator: Operator, plan: SweepPlan, shown: _Shown) -> bool:
+    """Show what the devices see until the operator is ready; whether it is to be recorded then."""
+    answer = operator.answer()
+    if answer != "wait":
+        return answer == "take"
+    if pairs is not None:
+        pairs.start(*plan.triggers)
+    while answer == "wait":
+        latest = dict[str, Frame]()
+        if pairs is not None and (pair := pairs.pair(POLL_S)) is not None:
+            latest |= dict(zip(CAMERAS, pair.frames, strict=True))
+        if scanner is not None and (frame := scanner.frame(POLL_S)) is not None:
+            latest[scanner.name] = frame
+        shown.look(latest)
+        answer = operator.answer()
+    if pairs is not None:
+        pairs.stop()
+    return answer == "take"
 
 
 def _follow(streams: Sequence[FrameStream], operator: Operator, plan: SweepPlan, shown: _Shown) -> None:

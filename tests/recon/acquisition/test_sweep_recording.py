@@ -16,6 +16,7 @@ from recon.capture import sweep_tables
 from recon.capture.images import read_image
 from recon.capture.manifest import Device
 from recon.devices.interfaces import DeviceError, Frame
+from tests.recon.acquisition.stand_ins import Scripted
 from twin.devices.virtual_operator import OneTake
 from twin.devices.virtual_sweep import FramePair
 
@@ -129,6 +130,17 @@ def test_a_recording_ends_after_its_time(tmp_path):
     begun = time.monotonic()
     counts = record(tmp_path, scanner=Source(10_000), seconds=0.2)
     assert time.monotonic() - begun < 5 and 0 < counts["us"] < 1000
+
+
+def test_what_is_seen_before_the_start_is_shown_and_not_kept(tmp_path):
+    shown: list[Picture] = []
+    plan = SweepPlan("", None, ("free", "hardware"), None, 5.0, Limits())
+    source = Source(10_000)
+    with open_recording(tmp_path / "out") as recording:
+        operator = Scripted([*["wait"] * 5, "take", *["wait"] * 5])
+        counts = record_sweep(recording, None, source, {"us": DEVICES["us"]}, operator, plan, {}, print, shown.append)
+    numbers = sweep_tables.read_stamps(tmp_path / "out/sweep/us/timestamps.csv")[0]
+    assert numbers[0] == 5 and len(numbers) == counts["us"] > 0 and shown[0].image[0, 0] == 0
 
 
 def test_the_preview_gets_every_device(tmp_path):
