@@ -109,7 +109,7 @@ def _next(camera: Camera, timeout_s: float) -> Frame:
     frame = camera.frame(timeout_s)
     if frame is None:
         raise LostFrame(
-            f"{camera.name}: expected a frame within {timeout_s:g} s, found none; is its trigger wired? see trigger.by"
+            f"{camera.name}: expected a frame within {timeout_s:g} s, found none; is its trigger wired? see triggering.by"
         )
     return frame
 
@@ -119,4 +119,4 @@ def _drain(camera: Camera) -> None:
     for _ in range(MOST_WAITING):
         if camera.frame(0.0) is None:
             return
-    raise DeviceError(f"{camera.name}: expected one frame a pattern, found them without end; does it run free? see trigger.by")
+    raise DeviceError(f"{camera.name}: expected one frame a pattern, found them without end; does it run free? see triggering.by")

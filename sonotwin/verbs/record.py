@@ -38,6 +38,7 @@ from recon.acquisition.target_checks import target_judge
 from recon.artwork import projected_images
 from recon.capture.board_part import FRINGE_CAMERA
 from recon.capture.manifest import SCANNER, Device, Purpose, SweepNameOrNone, axes_not_encoded, sweep_part
+from recon.errors import validated
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
@@ -110,7 +111,8 @@ def run(config: Config) -> None:
             sweep(config, recording, console, say, show)
         else:
             still(config, recording, console, say, show)
-    console.print(f"wrote       {config.out}", markup=False)
+    if config.out.is_dir():  # nothing is left where nothing was kept
+        console.print(f"wrote       {config.out}", markup=False)
 
 
 @contextmanager
@@ -163,7 +165,7 @@ def still_devices(config: Config, patterns: list[Pattern], console: Console) -> 
     from twin.devices import virtual_session  # loads the ray tracer
     from twin.optics.light_transport import Tracing
 
-    tracing = Tracing.model_validate(config.tracing)
+    tracing = validated(Tracing, config.tracing, "record: tracing")
     settings = virtual_session.StillSettings(config.rig, tracing, names, config.devices.bits, config.devices.paced, config.seed)
     with console.status("setting up the scene"):
         if config.part == "surface":
@@ -206,8 +208,8 @@ def sweep_devices(config: Config, exposure_s: float, console: Console) -> Iterat
     frames = config.frames.model_copy(
         update={"exposure_s": exposure_s, "gain": config.exposing.gain, "white_dn": config.frames.white_dn * brighter}
     )
-    fields = {"scene": config.scene, "ultrasound": config.ultrasound, "path": config.path, "clocks": config.clocks}
-    settings = SweepSettings(rig=config.rig, **fields, name=config.name, filmed=True, frames=frames, seed=config.seed)
+    fields = {field: getattr(config, field) for field in ("rig", "scene", "ultrasound", "path", "clocks", "name", "seed")}
+    settings = validated(SweepSettings, fields | {"filmed": True, "frames": frames}, "record")
     with console.status("setting up the scene"):
         virtual = virtual_session.during_sweep(settings, ranges(), config.devices.paced)
     yield Opened(scanner=virtual.scanner, pairs=virtual.pairs), virtual.operator, dict(virtual.pairs.devices())

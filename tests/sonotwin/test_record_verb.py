@@ -69,6 +69,8 @@ def test_the_laboratorys_choice_is_valid():
         (["exposing.level=2"], "exposing.level: expected less than 1"),
         (["scene=board", "scene.kind=nothing"], "scene: kind: expected one of"),
         (["calibration=missing.yaml", "scene=plane"], "missing.yaml"),
+        (["tracing.samples=3"], "record: tracing: samples: expected a power of two"),
+        (["part=sweep", "path=none"], "record: path: expected one that leads the probe"),
     ],
 )
 def test_mistakes_are_named_in_one_line(tmp_path, capsys, overrides, reason):
