@@ -30,11 +30,13 @@ class Killed:
     grows: bool = (
         False  # file by file: each of the result's is old, new or not there yet; else the folder is old or new as a whole
     )
+    recorded: bool = False  # a capture whose files grow: what it names is whole; which frames it has depends on the moment
 
 
 FILM = ("film", "frames=4", "path.turn_deg=20", "white_dn=120")
 SWEEP = ("sweep", *sources.STROKE)
 TRAIN = ("train", "network=detector", "data=data", "batch=2", "crop_px=64", "threads=1", "checkpoint_minutes=0.01")
+RECORD = ("record", "part=surface", "scene=sphere", "cameras=[cam1]", "tracing.samples=2", "preview.serve=false")
 KILLED = (
     Killed("surface", ("surface", "capture=ball/capture", "limits.max_sigma=2", "out=new"),
            ("surface", "capture=ball/capture", "out=new"), ("ball",)),
@@ -45,6 +47,7 @@ KILLED = (
     Killed("train", (), (*TRAIN, "steps=40", "out=new"), ("data",), grows=True),
     Killed("reconstruct", ("reconstruct", "capture=scan/capture", "spacing_mm=1.0", "out=new"),
            ("reconstruct", "capture=scan/capture", "spacing_mm=0.5", "out=new"), ("scan",), grows=True),
+    Killed("record", (*RECORD, "seed=1", "out=new"), (*RECORD, "seed=2", "out=new"), recorded=True),
 )  # fmt: skip
 
 
@@ -92,14 +95,16 @@ def kill(place: Path, killed: Killed, number: signal.Signals, moments: int, seed
             shutil.copytree(kept, folder / "new")
             for _ in range(min(IN_A_ROW, moments - tally.kills)):
                 _kill_once(folder, killed.then, number, rng.uniform(0.0, 1.05 * seconds), tally)
-                torn = _torn(results.digests(folder / "new"), old, new, killed.grows)
-                tally.torn += torn if torn else []
+                tally.torn += _faults(folder / "new", killed, old, new)
             outcome = commands.run(killed.then, folder, LONGEST_S)
             if outcome.status:
                 tally.failed.append(outcome.said.strip())
                 continue
             found = results.digests(folder / "new")
-            tally.other_bytes += sorted(path for path in found.keys() | new.keys() if found.get(path) != new.get(path))
+            if killed.recorded:
+                tally.torn += results.unread(folder / "new")
+            else:
+                tally.other_bytes += sorted(path for path in found.keys() | new.keys() if found.get(path) != new.get(path))
             tally.left += results.leftovers(folder)
     return tally
 
@@ -126,6 +131,11 @@ def _kill_once(folder: Path, line: tuple[str, ...], number: signal.Signals, afte
         time.sleep(0.05)
     tally.orphans += len(alive)
     results.end(alive)
+
+
+def _faults(folder: Path, killed: Killed, old: dict[str, str], new: dict[str, str]) -> list[str]:
+    """What isn't whole of a result whose command was killed."""
+    return results.unread(folder) if killed.recorded else _torn(results.digests(folder), old, new, killed.grows)
 
 
 def _torn(found: dict[str, str], old: dict[str, str], new: dict[str, str], grows: bool) -> list[str]:

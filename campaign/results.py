@@ -6,10 +6,16 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from recon.capture.board_part import read_board
+from recon.capture.images import read_images
+from recon.capture.manifest import STAMPS, BoardPart, Manifest, PartName, SurfacePart, image_name, read_manifest
+from recon.capture.sweep_tables import read_stamps
+from recon.errors import InputError
+
 TIMES = re.compile(
     r"(metrics|training|reconstruct)\.json|log\.jsonl|checkpoint\.pt|curves\.png|.*\.html"
 )  # files that hold times or paths
-HIDDEN = re.compile(r"\..*\.(new|old)(\..*)?$|\..*\.(lock|occupied)$")  # temporaries and locks
+HIDDEN = re.compile(r"\..*\.(new|old)(\..*)?$|\..*\.(lock|occupied|part)$")  # temporaries and locks
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -20,6 +26,34 @@ def digests(folder: Path) -> dict[str, str]:
         if path.is_file() and not TIMES.fullmatch(path.name) and not any(part.startswith(".") for part in Path(name).parts):
             found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found
+
+
+def unread(capture: Path) -> list[str]:
+    """Parts of a capture that the ordinary readers refuse, each with their line."""
+    try:
+        read = read_manifest(capture)
+        for part in read.contents:
+            _read_part(capture, read, part)
+    except InputError as error:
+        return [str(error)]
+    return []
+
+
+def _read_part(capture: Path, read: Manifest, part: PartName) -> None:
+    """Read all images and tables of a part; InputError at the first that is wrong."""
+    devices, content = read.devices_of(part), read.part(part)
+    if isinstance(content, SurfacePart):
+        for device, paths in content.images.items():
+            read_images([capture / path for path in paths], devices[device].size, devices[device].bits)
+    elif isinstance(content, BoardPart):
+        captured = read_board(capture)
+        for number in range(len(captured.poses)):
+            captured.pose(number)
+    else:
+        for device, folder in content.images.items():
+            frames, _ = read_stamps(capture / folder / STAMPS)
+            paths = [capture / folder / image_name(frame) for frame in frames.tolist()]
+            read_images(paths, devices[device].size, devices[device].bits)
 
 
 def leftovers(folder: Path) -> list[str]:

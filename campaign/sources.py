@@ -118,6 +118,7 @@ COMMANDS = (
     Command("film", ("frames=1",)),
     Command("dataset", ("samples=1",)),
     Command("print", ("part=board",), out="new.pdf"),
+    Command("record", ("part=surface", "scene=sphere", "cameras=[cam1]", "tracing.samples=2", "preview.serve=false")),
     Command("patterns", ("patterns=paper_surface",)),
     Command("study", ("name=study.yaml", "of=tracking", "film.frames=1"), ("study.yaml",), ("study.yaml",)),
     Command("demo", ("scene=sphere", "path=none", "poses=none", "board=boards", "film_frames=0")),

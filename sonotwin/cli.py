@@ -46,6 +46,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("film", "render a film of the moving target with its ground truth"),
     Verb("print", "draw a calibration board or the probe's target for a printer, true to scale"),
     Verb("patterns", "write the patterns as images for a projector, with a timing sheet"),
+    Verb("record", "record a board, a surface or a sweep from cameras, projector and scanner, or virtual ones"),
     Verb("describe", "write the manifest of images recorded elsewhere, of a board or a surface"),
     Verb("calibrate-optics", "calibrate cameras and projector from images of a board, rendered or real"),
     Verb("calibrate-target", "measure the probe's target as it was printed, from any film of it"),

@@ -80,7 +80,7 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
             composed = hydra_compose(name, quoted)
             for override in plain:
                 field, _, value = override.partition("=")
-                OmegaConf.update(composed, field, None if value == "null" else value.strip("'\""))
+                OmegaConf.update(composed, field, _plain_value(verb, field, value))
             result = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         except MissingConfigException as error:
             raise InputError(f"{verb}: {_missing_choice(verb, str(error.missing_cfg_file))}") from error
@@ -108,6 +108,18 @@ def _fields_named_like_groups(verb: str) -> set[str]:
     path = folder() / f"{verb}.yaml"
     fields = yaml.safe_load(path.read_text(encoding="utf-8")) or {} if path.is_file() else {}
     return {field for field in fields if (folder() / field).is_dir()} - set(groups(verb))
+
+
+def _plain_value(verb: str, field: str, value: str) -> object:
+    """The value of a field that Hydra isn't given: null, a list or map in brackets, or else text."""
+    import yaml
+
+    if value[:1] not in ("[", "{"):
+        return None if value == "null" else value.strip("'\"")
+    try:
+        return yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise InputError(f"{verb}: {field}: expected balanced brackets and quotes, found {short(value)}") from error
 
 
 def describe(error: ValidationError, model: type[BaseModel]) -> str:

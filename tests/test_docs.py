@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 PAGES += sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "users").glob("*.md")])
 MADE = {  # what a verb writes into its folder `out`, for those that read it; "" is the folder itself
+    "record": {""},
     "render": {"capture", "truth"},
     "film": {"capture", "truth"},
     "sweep": {"capture", "truth"},

@@ -299,14 +299,19 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write the manifest into a capture folder; raises InputError if a name in it is none in UTF-8."""
+    """Write the manifest into a capture folder; raises InputError as of `manifest_text`."""
+    (folder / MANIFEST).write_text(manifest_text(manifest), encoding="utf-8")
+
+
+def manifest_text(manifest: Manifest) -> str:
+    """The manifest as JSON; raises InputError if a name in it is none in UTF-8."""
     left_out = None if manifest.sweeps else {"sweeps"}
     try:
         text = manifest.model_dump_json(indent=2, by_alias=True, exclude_none=True, exclude=left_out)
     except ValueError:  # of half a letter
         strange = next((name for name in (manifest.name, manifest.root) if not _is_whole(name)), "others")
         raise InputError(f"{MANIFEST}: expected names of folders in UTF-8, found {short(strange)}: rename the folder") from None
-    (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
+    return text + "\n"
 
 
 def _is_whole(name: str) -> bool:

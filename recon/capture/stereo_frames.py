@@ -72,7 +72,8 @@ def read_film(folder: Path, calibration_file: Path | None = None, sweep: str = "
     Raises
     ------
     InputError
-        If the manifest, the calibration or a table is wrong, a camera or a frame is missing, or frames have no partner.
+        If the manifest, the calibration or a table is wrong, a camera or a frame is missing, or frames have no partner. The very
+        last frame needs none: a recording may have been ended between both cameras.
     """
     folder = Path(folder)
     read = manifest.read_manifest(folder)
@@ -104,6 +105,7 @@ def _partners(
     places: Sequence[Path], tables: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows : (n,), (n,) of both tables that belong together: each the other's nearest in time, within half a period."""
+    tables = _without_a_last_one(tables)
     times = [table[1] for table in tables]
     periods = [float(np.median(np.diff(each))) for each in times if len(each) > 1]
     allowed = (min(periods) if periods else ALONE_NS) / 2
@@ -121,6 +123,15 @@ def _partners(
                 f"in {counts}); leave frames without a partner out of both tables"
             )
     return np.arange(len(times[0])), nearest[0]
+
+
+def _without_a_last_one(
+    tables: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]],
+) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """The tables, less a frame at the end that one camera has more than the other: a recording that was cut off there."""
+    counts = [len(frames) for frames, _ in tables]
+    most = min(counts) if max(counts) - min(counts) == 1 and min(counts) > 0 else max(counts)
+    return [(frames[:most], times[:most]) for frames, times in tables]
 
 
 def _nearest(wanted: NDArray[np.int64], times: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -166,18 +166,32 @@ class CaptureWriter:
         manifest.write_manifest(self.folder, self._manifest)
 
     def _add(self, name: PartName, part: Part, devices: Mapping[str, Device]) -> None:
-        """Enter a part; devices that were set otherwise for the parts before it are entered with it alone."""
-        there = self._manifest.devices
-        own = {device: setting for device, setting in devices.items() if there.get(device, setting) != setting}
-        part = part.model_copy(update={"devices": own}) if own else part
-        folder, _, named = name.partition("/")
-        entry = {"sweeps": self._manifest.sweeps | {named: part}} if named else {folder: part}
-        self._change(**entry, devices={**there, **devices, **there})
+        self._manifest = with_part(self._manifest, name, part, devices)
 
     def _change(self, **fields: object) -> None:
-        """Change fields of the manifest; ValueError if they don't fit together."""
-        unchanged = {name: value for name, value in self._manifest if name != "version"}
-        self._manifest = Manifest.model_validate({"schema": manifest.SCHEMA, **unchanged, **fields})
+        self._manifest = changed(self._manifest, **fields)
+
+
+def with_part(before: Manifest, name: PartName, part: Part, devices: Mapping[str, Device]) -> Manifest:
+    """A manifest with one more part; devices that were set otherwise for the parts before it are entered with it alone.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        If they don't fit together.
+    """
+    there = before.devices
+    own = {device: setting for device, setting in devices.items() if there.get(device, setting) != setting}
+    part = part.model_copy(update={"devices": own}) if own else part
+    folder, _, named = name.partition("/")
+    entry = {"sweeps": before.sweeps | {named: part}} if named else {folder: part}
+    return changed(before, **entry, devices={**there, **devices, **there})
+
+
+def changed(before: Manifest, **fields: object) -> Manifest:
+    """A manifest with other values of some fields; pydantic.ValidationError if they don't fit together."""
+    unchanged = {name: value for name, value in before if name != "version"}
+    return Manifest.model_validate({"schema": manifest.SCHEMA, **unchanged, **fields})
 
 
 @contextmanager
@@ -258,8 +272,8 @@ def write_pose(folder: Path, name: str, lit: Mapping[str, Images], fringes: Mapp
     return record
 
 
-def check_kept(source: Path, read: Manifest, replaced: PartName) -> None:
-    """Check that the other parts of a capture can stay when one is written anew; its manifest may have been written by hand.
+def check_kept(source: Path, read: Manifest, replaced: PartName | None) -> None:
+    """Check that the other parts of a capture can stay when one is written anew, or none; its manifest may be written by hand.
 
     Raises
     ------
@@ -274,12 +288,12 @@ def check_kept(source: Path, read: Manifest, replaced: PartName) -> None:
     ):
         if there is not None and os.path.normpath(there) != os.path.normpath(here):
             raise InputError(f"{path}: {field}: expected {here}, as in a capture that holds all its files, found {there}")
-    for part in sorted(read.contents.keys() - {replaced}):
+    for part in sorted(read.contents.keys() - {replaced or ""}):
         for name in read.part(part).paths():
             inside = Path(os.path.normpath(name))
             if inside.is_absolute() or inside.parts[:1] == ("..",):
                 raise InputError(f"{path}: {manifest.field_of(part)}: expected a capture that holds all its files, found {name}")
-            if inside.is_relative_to(replaced):
+            if replaced is not None and inside.is_relative_to(replaced):
                 expected = f"none of its files in {replaced}/, which is written anew"
                 raise InputError(f"{path}: {manifest.field_of(part)}: expected {expected}, found {name}")
 

@@ -85,10 +85,15 @@ def complaint(folder: Path) -> str:
 
 
 def test_a_frame_without_a_partner_is_named(copy):
-    sweep_tables.write_stamps(copy / "sweep/cam2/timestamps.csv", films.stamps(2))
+    sweep_tables.write_stamps(copy / "sweep/cam2/timestamps.csv", films.stamps(3)[1:])
     assert complaint(copy).startswith(
-        "sweep/cam2/timestamps.csv: expected a frame of its own within 16.7 ms of cam1's frame 2, found the nearest 33.3 ms away"
+        "sweep/cam2/timestamps.csv: expected a frame of its own within 16.7 ms of cam1's frame 0, found the nearest 33.3 ms away"
     )
+
+
+def test_a_recording_that_was_cut_off_between_the_cameras_is_read(copy):
+    sweep_tables.write_stamps(copy / "sweep/cam2/timestamps.csv", films.stamps(2))
+    assert stereo_frames.read_film(copy).frames.tolist() == [[0, 0], [1, 1]]
 
 
 def test_clocks_that_differ_are_told(copy):

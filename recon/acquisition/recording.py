@@ -1,0 +1,270 @@
+"""A capture folder that grows while devices record: at every moment all that was recorded before is whole and readable.
+
+An image gets its name when it is whole; its row in a sweep's table follows it, so that a table names whole images alone; and the
+manifest, exchanged in one step, names a part as soon as there is something of it. So a process may be ended at any moment, by
+`kill -9` too, and the ordinary readers read the folder as it stands. What a killed process has left besides is removed when the
+folder is opened for the next recording.
+"""
+
+import logging
+import os
+import re
+import shutil
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import cv2
+import numpy as np
+from pydantic import ValidationError
+
+from recon.acquisition.growing_table import GrowingTable, mend
+from recon.capture import calibration_files, manifest, probe_files, writer
+from recon.capture.images import PNG_ENCODER, Images, Size, write_images
+from recon.capture.manifest import BoardPart, Device, Manifest, PartName, Purpose, SurfacePart, SweepPart, image_name
+from recon.errors import InputError, one_line
+from recon.files import atomic
+from recon.model.boards import Board
+from recon.model.patterns import Patterns
+
+log = logging.getLogger(__name__)
+
+SURFACE, BOARD = "surface", "board"
+
+
+class Recording:
+    """A capture folder that is being recorded into, by one process at a time; `open_recording` gives one."""
+
+    def __init__(self, folder: Path, read: Manifest) -> None:
+        self.folder = folder
+        self._manifest = read
+
+    @property
+    def contents(self) -> Manifest:
+        """The capture's manifest, as it stands."""
+        return self._manifest
+
+    def check_new(self, part: PartName) -> None:
+        """Check that the capture has no sweep of that name yet, and room for one; InputError else."""
+        path = self.folder / manifest.MANIFEST
+        there = [name for name in self._manifest.contents if manifest.is_sweep(name)]
+        if part in there:
+            raise InputError(
+                f"{path}: expected no {manifest.field_of(part)} yet, found one; give another name=NAME or out=FOLDER"
+            )
+        if there and manifest.SWEEP in (part, *there):
+            found = ", ".join(there)
+            raise InputError(f"{path}: expected sweeps that all have names, found {found}; give name=NAME, or another out=FOLDER")
+
+    def add_calibration(self, file: Path, sizes: Mapping[str, Size]) -> None:
+        """Copy the calibration of cameras and projector, of any dialect; InputError if it isn't one of devices of these sizes."""
+        optics = calibration_files.read_for(file, sizes)
+        place = self.folder / manifest.OPTICS
+        place.parent.mkdir(exist_ok=True)
+        with atomic.new_file(place) as temporary:
+            calibration_files.write(temporary, optics)
+        self._exchange(writer.changed(self._manifest, calibration=manifest.OPTICS))
+
+    def add_probe(self, file: Path) -> None:
+        """Copy the calibration of the ultrasound probe, of any dialect; InputError if it can't be read."""
+        probe = probe_files.read(file)
+        place = self.folder / manifest.PROBE
+        place.parent.mkdir(exist_ok=True)
+        with atomic.new_file(place) as temporary:
+            probe_files.write(temporary, probe)
+        self._exchange(writer.changed(self._manifest, probe=manifest.PROBE))
+
+    def add_surface(self, images: Mapping[str, Images], patterns: Patterns, devices: Mapping[str, Device]) -> None:
+        """Add a fringe sequence, or put it in the place of an earlier one, which stays until the new one is whole.
+
+        images : camera -> (n, h, w), one image a pattern
+        """
+        takes = [int(name[1]) for entry in _entries(self.folder / SURFACE) if (name := re.fullmatch(r"take(\d+)", entry.name))]
+        place = f"{SURFACE}/take{max(takes, default=0) + 1:02d}"
+        paths = {camera: tuple(f"{place}/{camera}/{image_name(k)}" for k in range(patterns.count)) for camera in images}
+        try:
+            with atomic.named_in_errors(self.folder / place):
+                for camera, stack in images.items():
+                    write_images([self.folder / path for path in paths[camera]], stack)
+            self._enter(SURFACE, SurfacePart(patterns=patterns, images=paths), devices)
+        finally:
+            self._tidy_surface()
+
+    def add_pose(
+        self,
+        lit: Mapping[str, Images],
+        fringes: Mapping[str, Images],
+        board: Board,
+        patterns: Patterns | None,
+        devices: Mapping[str, Device],
+    ) -> str:
+        """Add a pose of a calibration board to those that are there; returns its name.
+
+        Parameters
+        ----------
+        lit : camera -> (h, w)
+        fringes : camera -> (n, h, w), one image a pattern
+
+        Raises
+        ------
+        InputError
+            If the poses before it show another board or other patterns.
+        """
+        before = self._manifest.board
+        for field, there, given in (
+            ("board", before and before.board, board),
+            ("patterns", before and before.patterns, patterns),
+        ):
+            if before is not None and there != given:
+                path = self.folder / manifest.MANIFEST
+                raise InputError(f"{path}: board.{field}: expected the same as given, found another; give another out=FOLDER")
+        poses = before.poses if before else ()
+        name = f"{max((int(pose.name) for pose in poses if pose.name.isdecimal()), default=-1) + 1:02d}"
+        shutil.rmtree(self.folder / BOARD / name, ignore_errors=True)  # of a pose that was never entered
+        pose = writer.write_pose(self.folder, name, lit, fringes)
+        self._enter(BOARD, BoardPart(board=board, patterns=patterns, poses=(*poses, pose)), devices)
+        return name
+
+    @contextmanager
+    def sweep(self, name: str, purpose: Purpose | None, devices: Mapping[str, Device]) -> Iterator["GrowingSweep"]:
+        """Give a sweep to add frames to, from any thread; InputError as of `check_new`."""
+        place = manifest.sweep_part(name)
+        self.check_new(place)
+        for device in devices:  # of a sweep that was never entered
+            shutil.rmtree(self.folder / place / device, ignore_errors=True)
+        growing = GrowingSweep(self, place, purpose, devices)
+        try:
+            yield growing
+        finally:
+            growing.close()
+
+    def _enter(self, name: PartName, part: manifest.Part, devices: Mapping[str, Device]) -> None:
+        """Enter a part into the manifest; InputError if its devices are others than those of the capture's other parts."""
+        try:
+            self._exchange(writer.with_part(self._manifest, name, part, devices))
+        except ValidationError as error:
+            raise InputError(
+                f"{self.folder / manifest.MANIFEST}: {one_line(error)}; another rig? give another out=FOLDER"
+            ) from None
+
+    def _exchange(self, new: Manifest) -> None:
+        """Exchange the manifest in one step."""
+        _write_whole(self.folder / manifest.MANIFEST, manifest.manifest_text(new).encode())
+        self._manifest = new
+
+    def _remove(self) -> None:
+        """Remove a new capture into which nothing was recorded."""
+        shutil.rmtree(self.folder / Path(manifest.OPTICS).parent, ignore_errors=True)
+        (self.folder / manifest.MANIFEST).unlink()
+        with suppress(OSError):  # of a sweep of which a frame was written, but not entered
+            self.folder.rmdir()
+
+    def _tidy_surface(self) -> None:
+        """Remove takes of the surface that the manifest doesn't name."""
+        named = {path for paths in (self._manifest.surface.images.values() if self._manifest.surface else ()) for path in paths}
+        for entry in _entries(self.folder / SURFACE):
+            if re.fullmatch(r"take\d+", entry.name) and not any(path.startswith(f"{SURFACE}/{entry.name}/") for path in named):
+                shutil.rmtree(entry)
+
+    def _tidy(self) -> None:
+        """Mend what a process that was killed has left."""
+        self._tidy_surface()
+        for file in (manifest.OPTICS, manifest.PROBE):
+            atomic.remove_leftovers(self.folder / file)
+        for leftover in self.folder.glob(".*.part"):
+            leftover.unlink()
+        for part in filter(manifest.is_sweep, self._manifest.contents):
+            for folder in self._manifest.part(part).paths():
+                for leftover in (self.folder / folder).glob(".*.part"):
+                    leftover.unlink()
+                table = self.folder / folder / manifest.STAMPS
+                if table.is_file() and (torn := mend(table)):
+                    log.warning("%s: mended: the last row, of which %d bytes had been written, is left out", table, torn)
+
+
+class GrowingSweep:
+    """A sweep that is being recorded. Each device's frames are added by one thread at a time, different devices' by any."""
+
+    def __init__(self, recording: Recording, place: PartName, purpose: Purpose | None, devices: Mapping[str, Device]) -> None:
+        self.place, self._recording, self._purpose, self._devices = place, recording, purpose, devices
+        self._tables: dict[str, GrowingTable] = {}
+        self._entering = threading.Lock()
+
+    def add(self, device: str, number: int, time_ns: int, image: Images) -> None:
+        """Add a frame, by its number and time of the device's clock, both larger than those before.
+
+        Raises
+        ------
+        OSError
+            If it can't be written, as on a full disk; all frames before it stay as they are.
+        """
+        folder = self._recording.folder / self.place / device
+        folder.mkdir(parents=True, exist_ok=True)
+        encoded, data = cv2.imencode(".png", image, PNG_ENCODER)
+        if not encoded:
+            raise OSError(f"{folder}: the PNG encoder failed")
+        _write_whole(folder / image_name(number), data)
+        if device in self._tables:
+            self._tables[device].append(number, time_ns)
+            return
+        self._tables[device] = GrowingTable(folder / manifest.STAMPS)
+        self._tables[device].append(number, time_ns)
+        self._enter()
+
+    def close(self) -> None:
+        """End the tables."""
+        for table in self._tables.values():
+            table.close()
+
+    def _enter(self) -> None:
+        """Name those devices in the manifest that have a frame."""
+        with self._entering:
+            seen = [device for device in self._devices if device in self._tables]
+            part = SweepPart(purpose=self._purpose, images={device: f"{self.place}/{device}" for device in seen})
+            self._recording._enter(self.place, part, {device: self._devices[device] for device in seen})
+
+
+@contextmanager
+def open_recording(folder: Path, name: str = "") -> Iterator[Recording]:
+    """Open a capture folder to record into, a new one or one that grows on; waits for another process that records into it.
+
+    Raises
+    ------
+    InputError
+        If the place is taken by something that is not a capture, can't be written to, or its capture's files lie elsewhere.
+    """
+    folder = Path(os.path.realpath(folder))
+    atomic.check_folder(folder, manifest.MANIFEST)
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic.alone(folder):
+        path = folder / manifest.MANIFEST
+        new = not path.is_file()
+        read = Manifest(schema=manifest.SCHEMA, name=name, devices={}) if new else manifest.read_manifest(folder)
+        writer.check_kept(folder, read, None)
+        recording = Recording(folder, read)
+        if new:
+            recording._exchange(read)
+        try:
+            recording._tidy()
+            yield recording
+        finally:
+            if new and not recording.contents.contents:
+                recording._remove()
+
+
+def _write_whole(path: Path, data: bytes | np.ndarray) -> None:
+    """Write a file that appears whole or not at all; it needs no lock of its own, as one process alone writes the folder."""
+    temporary = path.with_name(f".{path.name}.part")
+    with atomic.named_in_errors(path):
+        try:
+            temporary.write_bytes(data)
+            os.replace(temporary, path)
+        except OSError:
+            with suppress(OSError):
+                temporary.unlink()
+            raise
+
+
+def _entries(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir()) if folder.is_dir() else []

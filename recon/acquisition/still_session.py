@@ -1,0 +1,81 @@
+"""What recordings of things at rest share: looks at what is lit, exposures, and the cameras as they are set."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from numpy.typing import NDArray
+
+from recon.acquisition import frame_checks
+from recon.acquisition.exposure_setting import Exposing, set_exposure
+from recon.acquisition.frame_checks import Limits
+from recon.acquisition.lit_frames import Stage
+from recon.acquisition.pictures import Picture, Say, Show
+from recon.capture.manifest import Device
+from recon.devices.interfaces import Camera, Frame, Size
+
+
+@dataclass
+class StillSession:
+    """Cameras and projector before something at rest. Its state is the exposures."""
+
+    stage: Stage
+    exposing: Exposing
+    limits: Limits
+    say: Say
+    show: Show
+    _exposures: dict[str, float] = field(default_factory=dict)  # s, by camera
+
+    def look(self) -> dict[str, NDArray]:
+        """Take an image of each camera under even light, and show it : camera -> (h, w)."""
+        if not self._exposures:
+            return self.expose()
+        return self._lit()
+
+    def expose(self) -> dict[str, NDArray]:
+        """Set exposures for what is seen, and look."""
+        white = self.stage.white()
+        for name, camera in self.stage.cameras.items():
+            self._exposures[name] = set_exposure(camera, lambda name=name: self.stage.take(white)[name].image, self.exposing)
+        times = ", ".join(f"{name} {1e3 * seconds:.3g} ms" for name, seconds in self._exposures.items())
+        self.say(f"exposure {times}")
+        return self._lit()
+
+    def _lit(self) -> dict[str, NDArray]:
+        frames = self.stage.take(self.stage.white())
+        self.seen(frames)
+        return {name: frame.image for name, frame in frames.items()}
+
+    def faults(self, images: Mapping[str, NDArray]) -> list[str]:
+        """Faults of images : camera -> (h, w), each with its camera and the way to mend it."""
+        return [
+            f"{name} {fault}"
+            for name, image in images.items()
+            for fault in frame_checks.frame_faults(frame_checks.look(image, self.stage.cameras[name].bits), self.limits)
+        ]
+
+    def seen(self, frames: Mapping[str, Frame]) -> None:
+        """Show frames as they come."""
+        for name, frame in frames.items():
+            bits = self.stage.cameras[name].bits
+            found = frame_checks.look(frame.image, bits)
+            faults = frame_checks.frame_faults(found, self.limits)
+            self.show(Picture(name, frame.image, bits, found.text, tuple(faults)))
+
+    def passing(self, frames: Mapping[str, Frame]) -> None:
+        """Show frames of a sequence as they come, without a look at each: the sequence is judged as a whole."""
+        for name, frame in frames.items():
+            self.show(Picture(name, frame.image, self.stage.cameras[name].bits, "under a pattern"))
+
+    def devices(self, projector: Size) -> dict[str, Device]:
+        """Cameras and projector as a capture describes them."""
+        cameras = {
+            name: as_set({name: camera}, self._exposures[name], self.exposing.gain)[name]
+            for name, camera in self.stage.cameras.items()
+        }
+        return cameras | {"projector": Device(size=projector)}
+
+
+def as_set(cameras: Mapping[str, Camera], exposure_s: float, gain: float) -> dict[str, Device]:
+    """Cameras as a capture describes them, with one exposure."""
+    settings = {"exposure_s": exposure_s, "gain": gain}
+    return {name: Device.model_validate({"size": one.size, "bits": one.bits, **settings}) for name, one in cameras.items()}

@@ -1,0 +1,219 @@
+"""Recording of a freehand sweep: pairs of camera frames and B-scans, each as it comes, by threads of their own.
+
+Frames wait for the disk in bounded queues. What a device or the disk lost is counted and named; a device that is gone, or a clock
+that jumps, ends the recording, and what came before it is kept.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from time import monotonic, sleep
+from typing import Protocol
+
+from recon.acquisition import frame_checks
+from recon.acquisition.frame_checks import Limits
+from recon.acquisition.frame_stream import FrameStream, Read, Taken
+from recon.acquisition.guidance import Operator, Step
+from recon.acquisition.pictures import Picture, Say, Show
+from recon.acquisition.recording import GrowingSweep, Recording
+from recon.acquisition.target_checks import Judge
+from recon.capture.manifest import CAMERAS, Device, Purpose
+from recon.devices.interfaces import Frame, Scanner, Trigger
+
+POLL_S = 0.05  # of what the operator says, and of streams that ended
+LOOK_S = 1.0  # between two looks at the frames, which cost a tenth of a second each
+AGAIN_S = 5.0  # before the same fault is said again
+WORDS: dict[Purpose | None, str] = {
+    "probe": "lead the probe about the crossed wires: from many sides, tilted and turned, the crossing in the image",
+    "latency": "move the probe up and down over the tank's flat bottom, quickly, for ten seconds",
+    "volume": "lead the probe slowly over what is to be seen, the target's face to both cameras",
+    None: "lead the probe, the target's face to both cameras",
+}
+
+
+class PairOfFrames(Protocol):
+    """Frames of both cameras of one moment."""
+
+    @property
+    def frames(self) -> tuple[Frame, Frame]:
+        """Camera 1's and camera 2's."""
+        ...
+
+    @property
+    def apart_ns(self) -> int:
+        """Time of the second after the first."""
+        ...
+
+    @property
+    def lost(self) -> Sequence[object]:
+        """Frames without a partner since the pair before, each in words by `str`."""
+        ...
+
+
+class PairSource(Protocol):
+    """Two cameras that take pairs of frames."""
+
+    def start(self, trigger: Trigger, second: Trigger | None = None) -> None:
+        """Begin to take frames; the second camera's trigger may be another than the first one's."""
+
+    def pair(self, timeout_s: float) -> PairOfFrames | None:
+        """Wait for the next pair; None if none came in time. DeviceError if a camera is gone."""
+
+    def stop(self) -> object:
+        """Take no more frames."""
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """What is to be recorded."""
+
+    name: str
+    purpose: Purpose | None
+    triggers: tuple[Trigger, Trigger]  # of camera 1 and camera 2; free or hardware
+    seconds: float | None  # after which it ends by itself
+    silent_s: float  # without a frame of a device, after which it counts as gone
+    limits: Limits
+
+
+@dataclass
+class _Shown:
+    """When frames were looked at, and what was said of them."""
+
+    show: Show
+    say: Say
+    judges: Mapping[str, Judge]
+    limits: Limits
+    devices: Mapping[str, Device]
+    _looked: float = 0.0
+    _said: dict[str, float] = field(default_factory=dict)
+
+    def look(self, latest: Mapping[str, Frame]) -> None:
+        """Look at the latest frames, at most once in a while, and say what is wrong with them."""
+        if not latest or monotonic() - self._looked < LOOK_S:
+            return
+        for device, frame in latest.items():
+            bits = self.devices[device].bits
+            faults: tuple[str, ...] = ()
+            text = f"frame {frame.number}"
+            if device in self.judges:
+                found = frame_checks.look(frame.image, bits)
+                target, faults = self.judges[device](frame.image, bits)
+                text = f"{text}, {found.text}, {target}"
+            self.show(Picture(device, frame.image, bits, text, faults))
+            for fault in faults:
+                self._say(f"{device} {fault}")
+        self._looked = monotonic()
+
+    def _say(self, fault: str) -> None:
+        kind = fault.partition(":")[0]
+        if monotonic() - self._said.get(kind, -AGAIN_S) >= AGAIN_S:
+            self._said[kind] = monotonic()
+            self.say(fault)
+
+
+def record_sweep(
+    recording: Recording,
+    pairs: PairSource | None,
+    scanner: Scanner | None,
+    devices: Mapping[str, Device],
+    operator: Operator,
+    plan: SweepPlan,
+    judges: Mapping[str, Judge],
+    say: Say,
+    show: Show,
+) -> dict[str, int]:
+    """Record until the operator ends, the time is over or a device is gone; returns the number of frames of each device.
+
+    Parameters
+    ----------
+    devices : of those that are recorded
+    judges : camera -> what says whether its frame shows the target
+
+    Raises
+    ------
+    DeviceError
+        If a device is gone or its clock jumps; what came before is kept.
+    OSError
+        If a frame can't be written; likewise.
+    """
+    counts = dict.fromkeys(devices, 0)
+    with recording.sweep(plan.name, plan.purpose, devices) as sweep:
+        shown = _Shown(show, say, judges, plan.limits, devices)
+        operator.ask(Step(WORDS[plan.purpose]))
+        if not _rehearsed(pairs, scanner, operator, plan, shown):
+            return counts
+        operator.ask(Step("recording; end it when you are through"))
+        if pairs is not None:
+            pairs.start(*plan.triggers)
+        streams = [FrameStream(read, _writer(sweep, counts), plan.silent_s, say) for read in _readers(pairs, scanner, say)]
+        try:
+            _follow(streams, operator, plan, shown)
+        finally:
+            for stream in streams:
+                stream.end()
+            if pairs is not None:
+                pairs.stop()
+            say("recorded " + ", ".join(f"{count} frames of {device}" for device, count in counts.items()))
+        for stream in streams:
+            stream.check()
+    return counts
+
+
+def _rehearsed(pairs: PairSource | None, scanner: Scanner | None, operator: Operator, plan: SweepPlan, shown: _Shown) -> bool:
+    """Show what the devices see until the operator is ready; whether it is to be recorded then."""
+    answer = operator.answer()
+    if answer != "wait":
+        return answer == "take"
+    if pairs is not None:
+        pairs.start(*plan.triggers)
+    while answer == "wait":
+        latest = dict[str, Frame]()
+        if pairs is not None and (pair := pairs.pair(POLL_S)) is not None:
+            latest |= dict(zip(CAMERAS, pair.frames, strict=True))
+        if scanner is not None and (frame := scanner.frame(POLL_S)) is not None:
+            latest[scanner.name] = frame
+        shown.look(latest)
+        answer = operator.answer()
+    if pairs is not None:
+        pairs.stop()
+    return answer == "take"
+
+
+def _follow(streams: Sequence[FrameStream], operator: Operator, plan: SweepPlan, shown: _Shown) -> None:
+    """Wait for the end of a recording, and show how it goes."""
+    begun = monotonic()
+    while all(stream.alive for stream in streams) and operator.answer() == "wait":
+        if plan.seconds is not None and monotonic() - begun >= plan.seconds:
+            break
+        shown.look({device: frame for stream in streams for device, frame in stream.latest.items()})
+        sleep(POLL_S)
+
+
+def _readers(pairs: PairSource | None, scanner: Scanner | None, say: Say) -> list[Read]:
+    """What reads each stream's next frames."""
+
+    def both(timeout_s: float) -> list[Taken] | None:
+        assert pairs is not None
+        pair = pairs.pair(timeout_s)
+        if pair is None:
+            return None
+        for lost in pair.lost:
+            say(f"lost {lost}")
+        first = pair.frames[0]
+        times = first.time_ns, first.time_ns + pair.apart_ns  # both by camera 1's clock
+        return [Taken(name, frame, time) for name, frame, time in zip(CAMERAS, pair.frames, times, strict=True)]
+
+    def scan(timeout_s: float) -> list[Taken] | None:
+        assert scanner is not None
+        frame = scanner.frame(timeout_s)
+        return None if frame is None else [Taken(scanner.name, frame, frame.time_ns)]
+
+    reads: list[tuple[object, Read]] = [(pairs, both), (scanner, scan)]
+    return [read for source, read in reads if source is not None]
+
+
+def _writer(sweep: GrowingSweep, counts: dict[str, int]) -> Callable[[Taken], None]:
+    def write(taken: Taken) -> None:
+        sweep.add(taken.device, taken.frame.number, taken.time_ns, taken.frame.image)
+        counts[taken.device] += 1
+
+    return write

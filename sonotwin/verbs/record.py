@@ -1,0 +1,223 @@
+"""Record a part of a capture from devices: the calibration board pose by pose, a surface under fringes, a freehand sweep.
+
+Guides at the terminal, and shows in a browser, at the address that it prints, what each device sees: exposure, saturation,
+focus, fringes, whether the target is found, what is wrong and how to mend it. OUT is a capture folder, a new one or one that
+grows: poses are added to those that are there, sweeps have names, a new surface takes the place of the old one. All that was
+recorded is on the disk at once and whole, whether the command is ended by Ctrl-C, by the system or by a lost cable; give it again
+to go on.
+
+`devices=virtual` has the twin stand in for every device, and for the person: `scene`, `path` and the other fields at the end of
+conf/record.yaml say what is before them. It takes as long as rendering takes: ten seconds a sequence and pose, a second a pair of
+frames, on two cores. Copy conf/devices/basler.yaml for a laboratory's own devices.
+
+    sonotwin record part=board patterns=paper_calibration out=outputs/session
+    sonotwin record part=surface devices=basler calibration=optics.yaml out=outputs/session
+    sonotwin record part=sweep name=scan purpose=volume out=outputs/session
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+from rich.console import Console
+
+from recon.acquisition import preview_server
+from recon.acquisition.board_recording import BoardPlan, record_board
+from recon.acquisition.exposure_setting import Exposing
+from recon.acquisition.frame_checks import Limits
+from recon.acquisition.guidance import EvenGuide, Operator
+from recon.acquisition.lit_frames import Pattern, Stage, Triggering
+from recon.acquisition.pictures import Say, Show, hidden
+from recon.acquisition.recording import Recording, open_recording
+from recon.acquisition.still_session import as_set
+from recon.acquisition.surface_recording import SurfacePlan, record_surface
+from recon.acquisition.sweep_recording import SweepPlan, record_sweep
+from recon.acquisition.target_checks import target_judge
+from recon.artwork import projected_images
+from recon.capture.board_part import FRINGE_CAMERA
+from recon.capture.manifest import SCANNER, Device, Purpose, SweepNameOrNone, axes_not_encoded, sweep_part
+from recon.errors import validated
+from recon.model.boards import Board
+from recon.model.patterns import Patterns
+from recon.model.rig import Part, Positive, Rig
+from recon.tracking import networks
+from sonotwin.open_devices import AnyDevices, LiveDevices, Opened, open_still, open_sweep
+from sonotwin.terminal_operator import TerminalOperator
+from twin.shooting import FrameShooting
+from twin.ultrasound.timed_sweep import Clocks
+
+SWEEP_EXPOSURE_S = 0.01  # of frames of a sweep, where none is given: a tenth of a millimetre of blur at 10 mm/s
+
+SLOWER = 1000  # times as long as in life, that rendering may take
+
+
+class PreviewFields(Part):
+    """Where the page is served."""
+
+    serve: bool = True
+    host: str = preview_server.LOOPBACK
+    port: Annotated[int, Field(ge=0, le=65535)] = 0
+
+
+class Config(Part):
+    """Fields of `conf/record.yaml`."""
+
+    rig: Rig
+    devices: AnyDevices
+    patterns: Patterns
+    part: Literal["board", "surface", "sweep"]
+    out: Path
+    cameras: Annotated[list[Literal["cam1", "cam2"]], Field(min_length=1)]
+    calibration: Path | None
+    probe: Path | None
+    board: Board
+    count: Annotated[int, Field(ge=1, le=1000)]
+    name: SweepNameOrNone
+    purpose: Purpose | None
+    seconds: Positive | None
+    silent_s: Positive
+    exposing: Exposing
+    triggering: Triggering
+    limits: Limits
+    preview: PreviewFields
+    scene: dict
+    ultrasound: dict
+    path: dict | None
+    tracing: dict
+    clocks: Clocks
+    frames: FrameShooting
+    seed: Annotated[int, Field(ge=0, lt=2**32)]
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Config":
+        if self.part == "board" and (lacking := axes_not_encoded(self.patterns)):
+            found = f"none along {' and '.join(lacking)}"
+            raise ValueError(f"patterns: expected fringes or Gray code along both axes of a board, found {found}")
+        if self.part == "board" and FRINGE_CAMERA not in self.cameras:
+            raise ValueError(
+                f"cameras: expected {FRINGE_CAMERA}, which sees the fringes of a board, found {', '.join(self.cameras)}"
+            )
+        return self
+
+
+def run(config: Config) -> None:
+    """Record, and say what was kept."""
+    console = Console(soft_wrap=True, highlight=False)
+    with open_recording(config.out, config.out.resolve().name) as recording, shown(config, console) as (say, show):
+        if config.part == "sweep":
+            recording.check_new(sweep_part(config.name))
+            sweep(config, recording, console, say, show)
+        else:
+            still(config, recording, console, say, show)
+    if config.out.is_dir():  # nothing is left where nothing was kept
+        console.print(f"wrote       {config.out}", markup=False)
+
+
+@contextmanager
+def shown(config: Config, console: Console) -> Iterator[tuple[Say, Show]]:
+    """Where lines and pictures go: to the terminal, and to the page if it is served."""
+    if not config.preview.serve:
+        yield (lambda text: console.print(f"{config.part:11} {text}", markup=False)), hidden
+        return
+    preview = preview_server.Preview()
+
+    def say(text: str) -> None:
+        console.print(f"{config.part:11} {text}", markup=False)
+        preview.say(text)
+
+    with preview_server.served(preview, config.preview.host, config.preview.port) as address:
+        console.print(f"preview     {address}", markup=False)
+        yield say, preview.show
+
+
+def still(config: Config, recording: Recording, console: Console, say: Say, show: Show) -> None:
+    """Record a board or a surface."""
+    patterns = list(projected_images.images(config.patterns))
+    with still_devices(config, patterns, console) as (opened, operator):
+        assert opened.projector is not None
+        calibrations(
+            config,
+            recording,
+            {name: camera.size for name, camera in opened.cameras.items()} | {"projector": opened.projector.size},
+        )
+        stage = Stage(opened.projector, opened.cameras, config.triggering)
+        if config.part == "surface":
+            plan = SurfacePlan(config.patterns, patterns, config.exposing, config.limits)
+            kept = record_surface(recording, stage, operator, plan, say, show)
+            say(f"kept {config.patterns.count} images of {' and '.join(opened.cameras)}" if kept else "nothing kept")
+        else:
+            guide = EvenGuide(config.board, 2 ** opened.cameras[FRINGE_CAMERA].bits - 1)
+            plan = BoardPlan(config.board, config.patterns, patterns, config.count, config.exposing, config.limits)
+            names = record_board(recording, stage, operator, guide, plan, say, show)
+            say(f"kept {len(names)} poses")
+
+
+@contextmanager
+def still_devices(config: Config, patterns: list[Pattern], console: Console) -> Iterator[tuple[Opened, Operator]]:
+    """Cameras and projector, and who works before them."""
+    names = list(dict.fromkeys(config.cameras))
+    if isinstance(config.devices, LiveDevices):
+        with open_still(config.devices, names) as opened:
+            yield opened, TerminalOperator(console)
+        return
+    from twin.devices import virtual_session  # loads the ray tracer
+    from twin.optics.light_transport import Tracing
+
+    tracing = validated(Tracing, config.tracing, "record: tracing")
+    settings = virtual_session.StillSettings(config.rig, tracing, names, config.devices.bits, config.devices.paced, config.seed)
+    with console.status("setting up the scene"):
+        if config.part == "surface":
+            virtual = virtual_session.before_scene(settings, config.scene, patterns)
+        else:
+            virtual = virtual_session.before_board(settings, config.board, patterns, config.count)
+    yield Opened(virtual.cameras, virtual.projector), virtual.operator
+
+
+def sweep(config: Config, recording: Recording, console: Console, say: Say, show: Show) -> None:
+    """Record a sweep."""
+    exposure_s = config.exposing.exposure_s or SWEEP_EXPOSURE_S
+    silent_s = config.silent_s * (1 if isinstance(config.devices, LiveDevices) else SLOWER)
+    triggers = config.devices.sweep_triggers if isinstance(config.devices, LiveDevices) else ("hardware", "hardware")
+    plan = SweepPlan(config.name, config.purpose, triggers, config.seconds, silent_s, config.limits)
+    with sweep_devices(config, exposure_s, console) as (opened, operator, cameras):
+        devices = dict(cameras)
+        calibrations(config, recording, {name: device.size for name, device in devices.items()})
+        if opened.scanner is not None:
+            devices[SCANNER] = Device(size=opened.scanner.size)
+        judge = target_judge(networks.load(threads=1), config.rig.target)
+        record_sweep(recording, opened.pairs, opened.scanner, devices, operator, plan, dict.fromkeys(cameras, judge), say, show)
+
+
+Cameras = dict[str, Device]  # by name, as they are set
+
+
+@contextmanager
+def sweep_devices(config: Config, exposure_s: float, console: Console) -> Iterator[tuple[Opened, Operator, Cameras]]:
+    """Both cameras and the scanner, who leads the probe, and the cameras as they are set."""
+    if isinstance(config.devices, LiveDevices):
+        with open_sweep(config.devices, exposure_s, config.exposing.gain) as opened:
+            yield opened, TerminalOperator(console), as_set(opened.cameras, exposure_s, config.exposing.gain)
+        return
+    from sonotwin.verbs.film import ranges
+    from twin.devices import virtual_session
+    from twin.filmed_sweep import SweepSettings
+
+    brighter = exposure_s * config.exposing.gain / (config.frames.exposure_s * config.frames.gain)
+    frames = config.frames.model_copy(
+        update={"exposure_s": exposure_s, "gain": config.exposing.gain, "white_dn": config.frames.white_dn * brighter}
+    )
+    fields = {field: getattr(config, field) for field in ("rig", "scene", "ultrasound", "path", "clocks", "name", "seed")}
+    settings = validated(SweepSettings, fields | {"filmed": True, "frames": frames}, "record")
+    with console.status("setting up the scene"):
+        virtual = virtual_session.during_sweep(settings, ranges(), config.devices.paced)
+    yield Opened(scanner=virtual.scanner, pairs=virtual.pairs), virtual.operator, dict(virtual.pairs.devices())
+
+
+def calibrations(config: Config, recording: Recording, sizes: dict[str, tuple[int, int]]) -> None:
+    """Copy the calibrations that are given."""
+    if config.calibration is not None:
+        recording.add_calibration(config.calibration, sizes)
+    if config.probe is not None:
+        recording.add_probe(config.probe)

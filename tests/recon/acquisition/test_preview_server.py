@@ -1,0 +1,69 @@
+"""The page shows what is recorded, to this computer alone, and is not stopped by whoever asks it strange things."""
+
+import json
+import socket
+from http.client import HTTPConnection
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.acquisition import preview_server
+from recon.acquisition.pictures import Picture
+from recon.acquisition.preview_server import Preview, served
+from recon.errors import InputError
+
+
+def answer(address: str, path: str, **headers) -> tuple[int, bytes]:
+    connection = HTTPConnection(urlsplit(address).hostname, urlsplit(address).port, timeout=5)
+    connection.request("GET", path, headers=headers)
+    response = connection.getresponse()
+    return response.status, response.read()
+
+
+def test_the_page_shows_images_figures_and_faults():
+    preview = Preview()
+    image = np.full((1024, 1280), 400, np.uint16)
+    image[:, 640:] = 1023
+    preview.show(Picture("cam1", image, 10, "brightest 100 %", ("saturated: 50 %; halve the exposure",)))
+    preview.say("exposure cam1 10 ms")
+    with served(preview) as address:
+        assert b"/state" in answer(address, "/")[1]
+        state = json.loads(answer(address, "/state")[1])
+        shown = cv2.imdecode(np.frombuffer(answer(address, "/cam1.jpg?7")[1], np.uint8), cv2.IMREAD_COLOR)
+        assert answer(address, "/cam2.jpg")[0] == answer(address, "/../conf/record.yaml")[0] == 404
+    assert state["devices"] == [
+        {"name": "cam1", "number": 1, "text": "brightest 100 %", "faults": ["saturated: 50 %; halve the exposure"]}
+    ]
+    assert state["said"] == ["exposure cam1 10 ms"] and max(shown.shape) == 640
+    assert np.abs(shown[100, 100].astype(float) - 400 / 1023 * 255).max() < 4 and shown[100, 600, 2] > 200 > shown[100, 600, 0]
+
+
+def test_pages_of_others_see_nothing():
+    """A page in the same browser that calls this one by a name of its own."""
+    with served(Preview()) as address:
+        assert answer(address, "/state", Host="evil.example:80")[0] == 403
+        assert answer(address, "/state", Host="localhost:80")[0] == 200
+
+
+def test_strange_and_silent_visitors_dont_stop_it(monkeypatch):
+    monkeypatch.setattr(preview_server._Handler, "timeout", 0.2)
+    with served(Preview()) as address:
+        place = (urlsplit(address).hostname, urlsplit(address).port)
+        silent = [socket.create_connection(place) for _ in range(preview_server.MOST_VISITORS)]
+        for content in (b"\x00" * 100, b"GET " + b"/" * 100_000, b"POST / HTTP/1.1\r\n\r\n"):
+            with socket.create_connection(place) as visitor, pytest.MonkeyPatch.context():
+                visitor.sendall(content)
+        for visitor in silent:
+            visitor.settimeout(5)
+            assert visitor.recv(1) == b""  # sent away after a while
+            visitor.close()
+        assert answer(address, "/state")[0] == 200
+
+
+def test_a_taken_port_is_named():
+    with served(Preview()) as address:
+        port = urlsplit(address).port
+        with pytest.raises(InputError, match=f"expected 127.0.0.1:{port} to be free"), served(Preview(), port=port):
+            pass

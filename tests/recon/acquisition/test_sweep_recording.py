@@ -1,0 +1,149 @@
+"""Sweeps are recorded by threads, whatever their devices do."""
+
+import errno
+import time
+from itertools import count
+
+import numpy as np
+import pytest
+
+from recon.acquisition import frame_stream, sweep_recording
+from recon.acquisition.frame_checks import Limits
+from recon.acquisition.pictures import Picture, hidden
+from recon.acquisition.recording import open_recording
+from recon.acquisition.sweep_recording import SweepPlan, record_sweep
+from recon.capture import sweep_tables
+from recon.capture.images import read_image
+from recon.capture.manifest import Device
+from recon.devices.interfaces import DeviceError, Frame
+from tests.recon.acquisition.stand_ins import Scripted
+from twin.devices.virtual_operator import OneTake
+from twin.devices.virtual_sweep import FramePair
+
+SIZE = (32, 24)
+DEVICES = {name: Device(size=SIZE) for name in ("cam1", "cam2", "us")}
+NOW = 10**15
+
+
+def image(number: int) -> np.ndarray:
+    return np.full(SIZE[::-1], number % 256, np.uint8)
+
+
+class Source:
+    """Frames at 200 Hz, until `last`; some numbers are left out, some times are off by ns."""
+
+    name, size = "us", SIZE
+
+    def __init__(self, last=40, lost=(), off=None, then=None) -> None:
+        self.last, self.off, self.then, self.over = last, off or {}, then, False
+        self.numbers = iter([k for k in range(last) if k not in lost])
+
+    def frame(self, timeout_s):
+        number = next(self.numbers, None)
+        self.over = number is None
+        time.sleep(0.005)
+        if number is None:
+            if self.then is not None:
+                raise self.then
+            time.sleep(timeout_s)
+            return None
+        moment = NOW + number * 5_000_000
+        return Frame(image(number), number, moment + self.off.get(number, 0), moment + 1_000_000)
+
+    def pair(self, timeout_s):
+        frame = self.frame(timeout_s)
+        return None if frame is None else FramePair((frame, frame), 0, ("cam2: frame 7 never came",) if frame.number == 8 else ())
+
+    def start(self, trigger, second=None):
+        self.trigger = trigger, second
+
+    def stop(self):
+        self.trigger = None
+
+
+def record(tmp_path, pairs=None, scanner=None, silent_s=0.3, seconds=None, said=None, show=hidden):
+    plan = SweepPlan("scan", "volume", ("free", "hardware"), seconds, silent_s, Limits())
+    devices = {name: DEVICES[name] for name in (("cam1", "cam2") if pairs else ()) + (("us",) if scanner else ())}
+    operator = OneTake(lambda: all(source.over for source in (pairs, scanner) if source is not None) and silent_s > 1)
+    with open_recording(tmp_path / "out") as recording:
+        said = [] if said is None else said
+        return record_sweep(recording, pairs, scanner, devices, operator, plan, {}, said.append, show)
+
+
+def frames(tmp_path, device) -> np.ndarray:
+    return sweep_tables.read_stamps(tmp_path / "out/sweep/scan" / device / "timestamps.csv")[0]
+
+
+def test_all_frames_are_kept_with_their_numbers_and_times(tmp_path):
+    said: list[str] = []
+    counts = record(tmp_path, Source(), Source(60, lost=(5, 6)), silent_s=5, said=said)
+    assert counts == {"cam1": 40, "cam2": 40, "us": 58}
+    assert 5 not in frames(tmp_path, "us") and "lost cam2: frame 7 never came" in said
+    for device in DEVICES:
+        numbers, times = sweep_tables.read_stamps(tmp_path / "out/sweep/scan" / device / "timestamps.csv")
+        assert (times == NOW + numbers * 5_000_000).all()
+        for number in numbers.tolist():
+            assert (read_image(tmp_path / f"out/sweep/scan/{device}/{number:04d}.png", SIZE, 8) == image(number)).all()
+
+
+@pytest.mark.parametrize(
+    ("scanner", "reason"),
+    [
+        (Source(20, then=DeviceError("us: unplugged; check its cable")), "us: unplugged"),
+        (Source(20), "us: expected a frame within 0.3 s"),
+        (Source(20, off={19: 5 * 10**9}), r"us: expected a clock that goes on, found \+5.005 s after 0.005 s at frame 19"),
+        (Source(20, off={19: -(10**10)}), "us: expected a clock that goes on"),
+    ],
+    ids=["unplugged", "silent", "clock forward", "clock back"],
+)
+def test_a_device_that_fails_ends_the_recording_and_what_came_stays(tmp_path, scanner, reason):
+    with pytest.raises(DeviceError, match=reason):
+        record(tmp_path, Source(10_000), scanner)
+    assert len(frames(tmp_path, "us")) >= 19 and len(frames(tmp_path, "cam1")) > 0
+
+
+def test_a_full_disk_ends_the_recording_and_what_came_stays(tmp_path, monkeypatch):
+    written, real = count(), sweep_recording.GrowingSweep.add
+
+    def add(self, *frame):
+        if next(written) >= 10:
+            raise OSError(errno.ENOSPC, "No space left on device", "x.png")
+        real(self, *frame)
+
+    monkeypatch.setattr(sweep_recording.GrowingSweep, "add", add)
+    with pytest.raises(OSError, match="No space left"):
+        record(tmp_path, scanner=Source(400))
+    assert frames(tmp_path, "us").tolist() == list(range(10))
+
+
+def test_a_slow_disk_loses_frames_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(frame_stream, "WAITING", 2)
+    real = sweep_recording.GrowingSweep.add
+    monkeypatch.setattr(sweep_recording.GrowingSweep, "add", lambda self, *frame: (time.sleep(0.03), real(self, *frame))[1])
+    said: list[str] = []
+    counts = record(tmp_path, scanner=Source(60), silent_s=5, said=said)
+    assert counts["us"] < 60 and any("the disk was too slow" in line for line in said)
+    assert len(frames(tmp_path, "us")) == counts["us"]
+
+
+def test_a_recording_ends_after_its_time(tmp_path):
+    begun = time.monotonic()
+    counts = record(tmp_path, scanner=Source(10_000), seconds=0.2)
+    assert time.monotonic() - begun < 5 and 0 < counts["us"] < 1000
+
+
+def test_what_is_seen_before_the_start_is_shown_and_not_kept(tmp_path):
+    shown: list[Picture] = []
+    plan = SweepPlan("", None, ("free", "hardware"), None, 5.0, Limits())
+    source = Source(10_000)
+    with open_recording(tmp_path / "out") as recording:
+        operator = Scripted([*["wait"] * 5, "take", *["wait"] * 5])
+        counts = record_sweep(recording, None, source, {"us": DEVICES["us"]}, operator, plan, {}, print, shown.append)
+    numbers = sweep_tables.read_stamps(tmp_path / "out/sweep/us/timestamps.csv")[0]
+    assert numbers[0] == 5 and len(numbers) == counts["us"] > 0 and shown[0].image[0, 0] == 0
+
+
+def test_the_preview_gets_every_device(tmp_path):
+    shown: list[Picture] = []
+    record(tmp_path, Source(10_000), Source(10_000), silent_s=5, seconds=2.5, show=shown.append)
+    assert {picture.device for picture in shown} == set(DEVICES)

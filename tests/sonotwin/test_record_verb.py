@@ -1,0 +1,96 @@
+"""The verb `record`: what virtual devices record is read, and reconstructed as what is rendered into a folder."""
+
+import json
+import sys
+from io import StringIO
+
+import pytest
+from rich.console import Console
+
+from recon.acquisition.guidance import Step
+from recon.capture.board_part import read_board
+from recon.capture.manifest import read_manifest
+from sonotwin import cli, config
+from sonotwin.open_devices import LiveDevices
+from sonotwin.terminal_operator import TerminalOperator
+from sonotwin.verbs.record import Config
+
+QUIET = ("preview.serve=false", "tracing.samples=4")
+STROKE = ("path.start_mm=[-18,-2]", "path.end_mm=[-18,0]", "path.speed_mm_s=20", "frames.quality.rim=2")
+
+
+@pytest.mark.slow
+def test_a_recorded_surface_is_as_good_as_a_rendered_one(tmp_path):
+    """Of a sphere, under the same light and exposure: errors over a million points agree within a twentieth."""
+    scene = ("scene=sphere", "tracing.samples=4")
+    assert cli.main(["render", *scene, "cameras=[cam1]", f"out={tmp_path}/made"]) == 0
+    exposure = f"exposing.exposure_s={read_manifest(tmp_path / 'made/capture').devices['cam1'].exposure_s}"
+    optics = f"calibration={tmp_path}/made/capture/calibration/optics.yaml"
+    fields = ("scene=sphere", *QUIET, "cameras=[cam1]", exposure, optics)
+    assert cli.main(["record", "part=surface", *fields, f"out={tmp_path}/own"]) == 0
+    rms = {}
+    for name, capture in (("made", "made/capture"), ("own", "own")):
+        assert cli.main(["surface", f"capture={tmp_path}/{capture}", f"out={tmp_path}/{name}-surface"]) == 0
+        assert cli.main(["evaluate", f"surface={tmp_path}/{name}-surface", f"truth={tmp_path}/made/truth"]) == 0
+        rms[name] = json.loads((tmp_path / f"{name}-surface/evaluation/metrics.json").read_text())["surface_rms_mm"]
+    assert rms["own"] == pytest.approx(rms["made"], rel=0.05)
+
+
+@pytest.mark.slow
+def test_boards_and_sweeps_grow_in_one_capture(tmp_path, capsys):
+    out = f"out={tmp_path}/session"
+    board = ["record", "part=board", "patterns=paper_calibration", "cameras=[cam1,cam2]", "count=1", *QUIET, out]
+    assert cli.main(board) == 0 and cli.main([*board, "seed=1"]) == 0
+    assert cli.main(["record", "part=sweep", "name=scan", "purpose=volume", *STROKE, *QUIET, out]) == 0
+    captured = read_board(tmp_path / "session")
+    assert captured.poses == ("00", "01") and set(captured.pose(1).lit) == {"cam1", "cam2"}
+    read = read_manifest(tmp_path / "session")
+    assert set(read.contents["sweep/scan"]) == {"cam1", "cam2", "us"} and read.sweeps["scan"].purpose == "volume"
+    assert cli.main(["record", "part=sweep", "name=scan", *STROKE, *QUIET, out]) == 2
+    assert "give another name=NAME" in capsys.readouterr().err
+
+
+def composed(*overrides: str) -> Config:
+    return config.load("record", ["part=surface", "out=x", *overrides], Config)
+
+
+def test_the_laboratorys_choice_is_valid():
+    devices = composed("devices=basler").devices
+    assert isinstance(devices, LiveDevices) and set(devices.cameras) == {"cam1", "cam2"}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "reason"),
+    [
+        (["part=board"], "patterns: expected fringes or Gray code along both axes of a board, found none along rows"),
+        (["part=board", "patterns=paper_calibration", "cameras=[cam2]"], "cameras: expected cam1"),
+        (["part=film"], "part: expected"),
+        (["devices.kind=other"], "devices.kind: expected one of"),
+        (["exposing.level=2"], "exposing.level: expected less than 1"),
+        (["scene=board", "scene.kind=nothing"], "scene: kind: expected one of"),
+        (["calibration=missing.yaml", "scene=plane"], "missing.yaml"),
+        (["tracing.samples=3"], "record: tracing: samples: expected a power of two"),
+        (["part=sweep", "path=none"], "record: path: expected one that leads the probe"),
+    ],
+)
+def test_mistakes_are_named_in_one_line(tmp_path, capsys, overrides, reason):
+    assert cli.main(["record", "part=surface", f"out={tmp_path}/out", "preview.serve=false", *overrides]) == 2
+    said = capsys.readouterr().err
+    assert reason in said and said.count("\n") == 1 and list(tmp_path.iterdir()) == []
+
+
+def test_other_files_are_left_alone(tmp_path, capsys):
+    (tmp_path / "letter.txt").write_text("dear")
+    assert cli.main(["record", "part=surface", f"out={tmp_path}", "preview.serve=false"]) == 2
+    assert "found other files" in capsys.readouterr().err and [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_the_terminal_is_read_while_cameras_go_on(monkeypatch):
+    monkeypatch.setattr(sys, "stdin", StringIO("\n\ne\n\n"))
+    shown = StringIO()
+    operator = TerminalOperator(Console(file=shown, soft_wrap=True))
+    operator.ask(Step("hold the board in the middle"))
+    answers = []
+    while len(answers) < 4:
+        answers += [answer] if (answer := operator.answer()) != "wait" else []
+    assert answers == ["take", "take", "end", "end"] and "hold the board" in shown.getvalue()

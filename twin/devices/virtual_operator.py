@@ -1,0 +1,44 @@
+"""The hand before the virtual devices: it does at once what it is asked for."""
+
+from collections.abc import Callable, Sequence
+
+from recon.acquisition.guidance import Answer, Step
+from recon.geometry import rigid
+
+
+class BoardHand:
+    """Holds the board as it is asked to, or in the next of some poses where no place is given; ends after the last of these."""
+
+    def __init__(self, hold: Callable[[rigid.Array], None], poses: Sequence[rigid.Array]) -> None:
+        self._hold, self._left = hold, list(poses)
+        self._through = False
+
+    def ask(self, step: Step) -> None:
+        """Hold the board."""
+        if step.world_from_board is not None:
+            self._hold(step.world_from_board)
+        elif self._left:
+            self._hold(self._left.pop(0))
+        else:
+            self._through = True
+
+    def answer(self) -> Answer:
+        """`take`, or `end` after the last pose."""
+        return "end" if self._through else "take"
+
+
+class OneTake:
+    """Takes once, and keeps what came of it; of a sweep, ends when its path is over."""
+
+    def __init__(self, over: Callable[[], bool] = lambda: True) -> None:
+        self._over, self._asked = over, 0
+
+    def ask(self, step: Step) -> None:
+        """Count the requests: the first begins, a second one follows when it has been done."""
+        self._asked += 1
+
+    def answer(self) -> Answer:
+        """`take` at first, then `end` as soon as it is over."""
+        if self._asked < 2:
+            return "take"
+        return "end" if self._over() else "wait"

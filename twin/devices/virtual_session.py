@@ -1,0 +1,84 @@
+"""Virtual devices of a recording, with what stands before them and the hand that moves it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from recon.acquisition.guidance import Operator
+from recon.errors import InputError
+from recon.model.boards import AsymmetricCircles, Board
+from recon.model.rig import Rig
+from scenes import board_poses
+from scenes.catalogue import build_scene
+from scenes.kinds import board
+from twin.devices.shown_light import KnownLight, Pattern
+from twin.devices.still_scenes import HeldBoard, StillScene, known_to_board, white
+from twin.devices.virtual_clock import Turns, VirtualClock
+from twin.devices.virtual_operator import BoardHand, OneTake
+from twin.devices.virtual_rig import VirtualCamera, VirtualProjector, VirtualRig
+from twin.devices.virtual_sweep import VirtualPair, VirtualScanner
+from twin.filmed_sweep import SweepSettings, plan_sweep
+from twin.optics.light_transport import Tracing
+from twin.optics.surface_session import CameraName, calibration_of
+from twin.tracking.sampling_ranges import DataRanges
+
+SPARE = 2  # times as many poses of the board are at hand as are wanted: some may be refused
+
+
+@dataclass(frozen=True)
+class StillDevices:
+    """Cameras and projector before something at rest."""
+
+    cameras: Mapping[str, VirtualCamera]
+    projector: VirtualProjector
+    operator: Operator
+
+
+@dataclass(frozen=True)
+class SweepDevices:
+    """Both cameras and the scanner, before a hand that leads the probe."""
+
+    pairs: VirtualPair
+    scanner: VirtualScanner
+    operator: Operator
+
+
+@dataclass(frozen=True)
+class StillSettings:
+    """How things at rest are rendered."""
+
+    rig: Rig
+    tracing: Tracing
+    cameras: Sequence[CameraName]
+    bits: int = 8
+    paced: bool = False
+    seed: int = 0
+
+
+def before_scene(settings: StillSettings, scene: Mapping[str, object], patterns: Sequence[Pattern]) -> StillDevices:
+    """Devices before a scene, to which a sequence of patterns : (h, w) will be shown; InputError if there is no such scene."""
+    rig = settings.rig
+    known = KnownLight.of([*patterns, white(rig)], rig.projector)
+    return _devices(settings, StillScene(rig, build_scene(scene), known, settings.tracing, settings.seed), OneTake())
+
+
+def before_board(settings: StillSettings, design: Board, patterns: Sequence[Pattern], count: int) -> StillDevices:
+    """Devices before a hand that holds a board in random poses; InputError of a board other than of dark, asymmetric circles."""
+    if not isinstance(design, AsymmetricCircles) or design.white:
+        raise InputError("board.kind: expected asymmetric_circles, dark ones, as the twin prints no others, found another board")
+    printed = board.Config(**design.model_dump(exclude={"kind", "white"}))
+    held = HeldBoard(settings.rig, printed, known_to_board(patterns, settings.rig), settings.tracing, settings.seed)
+    wanted = board_poses.Config(count=SPARE * count)
+    poses = board_poses.random_poses(wanted, design, list(calibration_of(settings.rig).cameras.values()))
+    return _devices(settings, held, BoardHand(held.hold, list(poses)))
+
+
+def during_sweep(settings: SweepSettings, ranges: DataRanges, paced: bool = False) -> SweepDevices:
+    """Devices before a hand that leads the probe; InputError as of `plan_sweep`."""
+    planned, turns = plan_sweep(settings), Turns(VirtualClock(paced))
+    pairs, scanner = VirtualPair(planned, ranges, turns), VirtualScanner(planned, turns)
+    return SweepDevices(pairs, scanner, OneTake(lambda: pairs.over and scanner.over))
+
+
+def _devices(settings: StillSettings, still: StillScene | HeldBoard, operator: Operator) -> StillDevices:
+    rig = VirtualRig(settings.rig, still, VirtualClock(settings.paced), settings.bits, settings.seed)
+    return StillDevices({name: rig.camera(name) for name in settings.cameras}, rig.projector(), operator)
