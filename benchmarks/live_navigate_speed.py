@@ -11,7 +11,6 @@ from time import process_time, sleep
 
 import trimesh
 
-from recon.capture.manifest import CAMERAS, SCANNER
 from recon.devices import playback
 from recon.navigation import mass_distances, still_scene
 from recon.navigation.browser_view import BrowserView
@@ -58,17 +57,15 @@ def navigated() -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         capture = recorded(Path(folder))
         config = load("navigate", [f"capture={capture}", f"lag_s={LAG_S}"], navigate.Config)
-        devices = playback.read_recording(capture)
-        tracker = navigate.tracker_of(config, {name: devices[name].size for name in CAMERAS}, 8)
+        sources = navigate.sources_of(config)
+        tracker = navigate.tracker_of(config, sources.sizes, sources.bits)
         probe = navigate.probe_of(config)
-        scene = still_scene.read_scene(None, None, tracker.target, probe, devices[SCANNER].size[0])
+        scene = still_scene.read_scene(None, None, tracker.target, probe, sources.width)
         masses = {name: trimesh.creation.icosphere(4, 8.0).apply_translation(centre) for name, centre in MASSES.items()}
         view = BrowserView(scene, PORT)
-        cam1, cam2, scanner = navigate.played(devices, 1.0)
         warm_up(tracker)
-        navigator = Navigator(
-            (cam1, cam2), scanner, tracker, probe, LAG_S, mass_distances.bodies_of(masses), [SlicerPublisher(scene, Sink()), view]
-        )
+        publishers, bodies = [SlicerPublisher(scene, Sink()), view], mass_distances.bodies_of(masses)
+        navigator = Navigator((sources.cam1, sources.cam2), sources.scanner, tracker, probe, LAG_S, bodies, publishers)
         reader = subprocess.Popen([sys.executable, "-c", READER, view.address.replace("http", "ws")])
         navigator.start()
         try:

@@ -1,20 +1,22 @@
-"""Opens a laboratory's devices as `conf/devices` describes them; their libraries are loaded only then."""
+"""Opens a laboratory's devices as `conf/devices` describes them; a library is loaded when its device is opened."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
-from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from recon.acquisition.sweep_recording import PairSource
-from recon.capture.manifest import SCANNER, Name
+from recon.capture.manifest import CAMERAS, SCANNER, Name
+from recon.devices import basler
+from recon.devices.camera_pairs import CameraPair
+from recon.devices.igtl_scanner import IgtlScanner
 from recon.devices.interfaces import Camera, DeviceError, Projector, Scanner
+from recon.devices.projector_window import ProjectorWindow
+from recon.devices.scan_view import ScanView
+from recon.devices.video_grabber import VideoGrabber
 from recon.model.rig import NotNegative, Part, Positive
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 Side = Annotated[int, Field(ge=8, le=20000)]
 Port = Annotated[int, Field(ge=1, le=65535)]
@@ -65,6 +67,7 @@ class VideoDevice(Part):
 
     kind: Literal["video"]
     source: int | str  # number of the grabber, or a path or address
+    sent: tuple[Side, Side] | None = None  # width, height, px that it is to send; None: whatever it does by itself
     view: View = View()
 
 
@@ -106,45 +109,40 @@ def open_still(devices: LiveDevices, names: Sequence[str]) -> Iterator[Opened]:
     with ExitStack() as stack:
         if devices.projector is None:
             raise DeviceError("devices.projector: expected one, which lights what is recorded, found none; see conf/devices")
-        cameras = {name: stack.enter_context(closing(_camera(devices, name))) for name in names}
+        cameras = {name: stack.enter_context(closing(open_camera(devices, name))) for name in names}
         yield Opened(cameras, stack.enter_context(closing(_projector(devices.projector))))
 
 
 @contextmanager
 def open_sweep(devices: LiveDevices, exposure_s: float, gain: float) -> Iterator[Opened]:
     """Open both cameras as a pair, and the scanner if there is one; DeviceError if one isn't there."""
-    from recon.capture.manifest import CAMERAS
-
     with ExitStack() as stack:
-        cameras = {name: stack.enter_context(closing(_camera(devices, name))) for name in CAMERAS}
+        cameras = {name: stack.enter_context(closing(open_camera(devices, name))) for name in CAMERAS}
         for camera in cameras.values():
             camera.set_exposure(exposure_s, gain)
-        pair = _load("camera_pairs", "CameraPair")(tuple(cameras.values()), devices.pairs_within_s)
-        scanner = None if devices.scanner is None else stack.enter_context(closing(_scanner(devices.scanner)))
+        pair = CameraPair((cameras[CAMERAS[0]], cameras[CAMERAS[1]]), devices.pairs_within_s)
+        scanner = None if devices.scanner is None else stack.enter_context(closing(open_scanner(devices.scanner)))
         yield Opened(cameras, scanner=scanner, pairs=pair)
 
 
-def _camera(devices: LiveDevices, name: str) -> Camera:
+def open_camera(devices: LiveDevices, name: str) -> Camera:
+    """Open the camera of a name; DeviceError if it isn't there."""
     if name not in devices.cameras:
         found = ", ".join(devices.cameras) or "none"
         raise DeviceError(f"devices.cameras: expected {name}, found {found}; see conf/devices")
     chosen = devices.cameras[name]
-    settings = _load("basler", "BaslerSettings")(**chosen.model_dump(exclude={"kind", "serial"}))
-    return _load("basler", "open_camera")(name, chosen.serial, settings)
+    settings = basler.BaslerSettings(**chosen.model_dump(exclude={"kind", "serial"}))
+    return basler.open_camera(name, chosen.serial, settings)
 
 
 def _projector(chosen: WindowDevice) -> Projector:
     delay = {} if chosen.delay_s is None else {"delay_s": chosen.delay_s}
-    return _load("projector_window", "ProjectorWindow")(chosen.size, chosen.display, **delay)
+    return ProjectorWindow(chosen.size, chosen.display, **delay)
 
 
-def _scanner(chosen: IgtlDevice | VideoDevice) -> Scanner:
-    view = _load("scan_view", "ScanView")(**chosen.view.model_dump())
+def open_scanner(chosen: IgtlDevice | VideoDevice) -> Scanner:
+    """Open the scanner; DeviceError if it isn't there."""
+    view = ScanView(**chosen.view.model_dump())
     if isinstance(chosen, IgtlDevice):
-        return _load("igtl_scanner", "IgtlScanner")(SCANNER, chosen.host, chosen.port, chosen.device, view)
-    return _load("video_grabber", "VideoGrabber")(SCANNER, chosen.source, view)
-
-
-def _load(module: str, name: str) -> "Callable[..., Any]":
-    """A driver, by the name of its module: it needs a library that others do without."""
-    return getattr(import_module(f"recon.devices.{module}"), name)
+        return IgtlScanner(SCANNER, chosen.host, chosen.port, chosen.device, view)
+    return VideoGrabber(SCANNER, chosen.source, view, chosen.sent)

@@ -1,32 +1,22 @@
-"""Device clocks on this computer's monotonic clock, from nothing but the times at which frames arrive."""
+"""Exposures of frames by this computer's monotonic clock."""
 
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from recon.devices.device_clocks import ClockFollower
 from recon.devices.interfaces import Frame
 
 Exposed = Callable[[Frame], int]  # monotonic time : ns of a frame's exposure
 
-WINDOW = 200  # frames, among which the fastest delivery counts: clocks drift apart by less than 0.1 ms meanwhile
-JUMP_NS = 250_000_000  # by which no delivery varies: the device's clock was set anew
-
 
 @dataclass
-class ArrivalClock:
-    """Exposures by the fastest delivery of late; for devices whose clock nobody has mapped better.
+class FollowedClock:
+    """Exposures by a device's clock that is followed; by the arrival as long as too few frames have come."""
 
-    A frame is never delivered before its exposure, so the least difference of arrival and time stamp is the offset between the
-    clocks and the fastest delivery. The latter can't be seen in the differences; it has to be told.
-    """
-
-    least_delivery_ns: int = 0  # from the middle of an exposure to the image in memory
-    _offsets: deque[int] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    follower: ClockFollower
 
     def __call__(self, frame: Frame) -> int:
         """Monotonic time : ns of a frame's exposure."""
-        offset = frame.arrived_ns - frame.time_ns
-        if self._offsets and abs(offset - min(self._offsets)) > JUMP_NS:
-            self._offsets.clear()
-        self._offsets.append(offset)
-        return frame.time_ns + min(self._offsets) - self.least_delivery_ns
+        self.follower.add(frame.time_ns, frame.arrived_ns)
+        clock = self.follower.clock
+        return frame.arrived_ns if clock is None else clock.at(frame.time_ns)

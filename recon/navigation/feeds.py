@@ -8,7 +8,7 @@ from time import monotonic
 from typing import Protocol
 
 from recon.devices.interfaces import DeviceError, Frame
-from recon.navigation.exposure_clock import ArrivalClock, Exposed
+from recon.navigation.exposure_clock import Exposed
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ class Device:
 
     name: str
     open: Callable[[], Source]  # DeviceError if it isn't there
-    clock: Callable[[Source], Exposed] = lambda source: ArrivalClock()  # of the device, each time that it was opened
+    clock: Callable[[Source], Exposed]  # of the device, each time that it was opened
 
 
 @dataclass(frozen=True)

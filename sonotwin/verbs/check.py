@@ -16,7 +16,6 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 from rich.console import Console
-from rich.progress import Progress
 
 from recon.capture import calibration_files, lag_files, manifest, probe_files, stereo_frames, surface_part, sweep_part
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
@@ -36,6 +35,7 @@ from recon.target_calibration import target_poses
 from recon.tracking import networks
 from recon.tracking.pose_fit import Sighting
 from recon.tracking.tracker import Tracker
+from sonotwin.verbs.calibrate_target import collect
 
 CHECK, PAGE = "check.json", "check.html"  # the first is that by which the folder of a check is known
 SEARCH_PX = 5.0  # of the cameras' principal points: the tracker is to find the target by cameras that have moved, too
@@ -168,12 +168,8 @@ def filmed(
     film = stereo_frames.read_film(config.capture, config.calibration, name)
     wide = in_use(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale, SEARCH_PX)
     tracker = Tracker(film.cameras, target, networks.load(config.networks or networks.WEIGHTS, config.threads), film.bits, wide)
-    seen = []
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        pairs = progress.track(film.pairs(), total=len(film.times), description="tracking")
-        for time, pair in zip(film.times.tolist(), pairs, strict=True):
-            seen.append(target_poses.whole(tracker.step(*pair, time * 1e-9), film.cameras))
-    poses = target_poses.spread(target_poses.distinct([one for one in seen if one is not None]), config.most_poses)
+    seen, _ = collect(film, tracker, console)
+    poses = target_poses.spread(target_poses.distinct(seen), config.most_poses)
     if len(poses) < LEAST_POSES:
         found = f"{len(poses)} in {len(film.times)} pairs: move it about, uncovered and well lit"
         raise InputError(f"{film.name}: expected {LEAST_POSES} poses in which both cameras see all circles whole, found {found}")

@@ -1,38 +1,47 @@
-"""Follow the probe live: the B-scan in place, skin and masses around it, in the browser.
+"""Follow the probe live: the B-scan in place, skin and masses around it, in the browser and in 3D Slicer.
 
-Takes frames of both cameras and B-scans from a capture that is played back in real time, tracks the target, and shows where the
-probe and its image are, within the measured skin and the masses that were found before; and how far the image's plane is from
-each mass. A page in the browser shows it all. The latency from the exposure to the published pose is measured and shown. A device
-that is lost is opened again every second. Goes on until it is interrupted, or for some seconds. Writes nothing.
+Takes frames of both cameras and B-scans from the devices of conf/devices, or from a capture that is played back in real time;
+tracks the target, and shows where the probe and its image are, within the measured skin and the masses that were found before;
+and how far the image's plane is from each mass. A page in the browser shows it all, and an OpenIGTLink server sends it. The
+latency from the exposure to the published pose is measured and shown. A device that is lost is opened again every second. Goes on
+until it is interrupted, or for some seconds. Writes nothing.
 
     sonotwin navigate capture=session/capture skin=result/surface/surface.ply masses=result/masses/scan lag_s=0.05
+    sonotwin navigate devices=basler calibration=optics.yaml probe=probe.yaml skin=surface.ply masses=masses lag_s=0.05
 """
 
 from collections.abc import Mapping
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Annotated
+from typing import Annotated, Literal, NamedTuple, cast
 
-from pydantic import Field
+from pydantic import Field, model_validator
 from rich.console import Console
 
 from recon.capture import calibration_files, manifest, probe_files, target_files
 from recon.capture.manifest import CAMERAS, SCANNER
 from recon.devices import playback
-from recon.devices.interfaces import Size
-from recon.devices.playback import PlayedCamera, PlayedScanner, Recorded
+from recon.devices.device_clocks import ClockFollower, follow
+from recon.devices.interfaces import Camera, Size
+from recon.devices.openigtlink.igtl_server import PORT, Server
+from recon.devices.playback import PlayedCamera, PlayedScanner
 from recon.errors import InputError
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
 from recon.model.probe import ProbeCalibration, Speed
-from recon.model.rig import Part, Rig
+from recon.model.rig import Part, Positive, Rig
 from recon.model.tracks import LagSeconds
 from recon.navigation import mass_distances, still_scene
 from recon.navigation.browser_view import LOOPBACK, BrowserView
+from recon.navigation.exposure_clock import FollowedClock
 from recon.navigation.feeds import Device
+from recon.navigation.igtl_sender import IgtlSender
 from recon.navigation.navigator import Navigator, warm_up
+from recon.navigation.publishing import Publisher
+from recon.navigation.slicer_publisher import SlicerPublisher
 from recon.probe_calibration import sound_in_water
 from recon.tracking import networks
 from recon.tracking.tracker import Tracker
+from sonotwin.open_devices import LiveDevices, open_camera, open_scanner
 
 LOOK_S = 0.2  # between two looks whether all goes on
 
@@ -44,11 +53,23 @@ class View(Part):
     port: Annotated[int, Field(ge=1, le=65535)] = 8080
 
 
+class Igtl(Part):
+    """The OpenIGTLink server."""
+
+    serve: bool = True
+    host: str = LOOPBACK
+    port: Annotated[int, Field(ge=1, le=65535)] = PORT
+
+
 class Config(Part):
     """Fields of `conf/navigate.yaml`."""
 
     rig: Rig
-    capture: Path
+    devices: LiveDevices | None = None
+    exposure_s: Positive = 0.01
+    gain: Positive = 1.0
+    trigger: Literal["free", "hardware"] = "hardware"
+    capture: Path | None = None
     sweep: str = ""
     speed: Annotated[float, Field(gt=0, le=10)] = 1.0
     calibration: Path | None = None
@@ -64,7 +85,25 @@ class Config(Part):
     part_table: bool = True
     masses: Path | None = None
     view: View = View()
+    igtl: Igtl = Igtl()
     seconds: Annotated[float, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "Config":
+        if (self.capture is None) == (self.devices is None):
+            raise ValueError(f"capture: expected it or devices, found {'neither' if self.capture is None else 'both'}")
+        return self
+
+
+class Sources(NamedTuple):
+    """Devices, and what is known of them before they are opened."""
+
+    cam1: Device
+    cam2: Device
+    scanner: Device | None
+    sizes: dict[str, Size]  # of the cameras
+    bits: int  # of their digital numbers
+    width: int  # of the B-scans, px
 
 
 def run(config: Config) -> int:
@@ -76,18 +115,19 @@ def run(config: Config) -> int:
         If the capture is incomplete or damaged, a calibration or a network is missing, or a port is taken.
     """
     console = Console(soft_wrap=True, highlight=False)
-    recorded = playback.read_recording(config.capture, config.sweep)
+    sources = sources_of(config)
     probe = probe_of(config)
-    tracker = tracker_of(config, {name: recorded[name].size for name in CAMERAS}, max(recorded[name].bits for name in CAMERAS))
+    tracker = tracker_of(config, sources.sizes, sources.bits)
     with console.status("reading skin and masses"):
-        scene = still_scene.read_scene(
-            config.skin, config.masses, tracker.target, probe, recorded[SCANNER].size[0], config.part_table
-        )
+        scene = still_scene.read_scene(config.skin, config.masses, tracker.target, probe, sources.width, config.part_table)
     with console.status("getting ready to track"):
         warm_up(tracker)
     view = BrowserView(scene, config.view.port, config.view.host)
-    cam1, cam2, scanner = played(recorded, config.speed)
-    navigator = Navigator((cam1, cam2), scanner, tracker, probe, config.lag_s, mass_distances.bodies_of(scene.masses), [view])
+    publishers: list[Publisher] = [view]
+    if config.igtl.serve:
+        publishers.append(SlicerPublisher(scene, IgtlSender(Server(config.igtl.host, config.igtl.port))))
+    bodies = mass_distances.bodies_of(scene.masses)
+    navigator = Navigator((sources.cam1, sources.cam2), sources.scanner, tracker, probe, config.lag_s, bodies, publishers)
     console.print(f"view        {view.address}", markup=False)
     navigator.start()
     try:
@@ -108,20 +148,23 @@ def tell(navigator: Navigator, console: Console) -> None:
             console.print(f"{outlet.publisher.name:11} {late.rate_hz:.1f} poses a second, {figures}", markup=False)
 
 
+def sources_of(config: Config) -> Sources:
+    """The devices, or the capture that takes their place."""
+    if config.devices is not None:
+        return opened(config, config.devices)
+    assert config.capture is not None  # one of both is given
+    return played(config, config.capture)
+
+
 def probe_of(config: Config) -> ProbeCalibration:
     """The probe's calibration, for the tissue: from its file, else from the capture."""
-    held = manifest.read_manifest(config.capture)
-    if config.probe is None and held.probe is None:
-        raise InputError(f"{config.capture}: expected the probe's calibration, found none; give probe=...")
-    return sound_in_water.for_tissue(probe_files.read(config.probe or config.capture / str(held.probe)), config.tissue_m_s)
+    path = given_or_held(config, "probe", "the probe's calibration")
+    return sound_in_water.for_tissue(probe_files.read(path), config.tissue_m_s)
 
 
 def tracker_of(config: Config, sizes: Mapping[str, Size], bits: int) -> Tracker:
     """The tracker, by the calibration of cameras of some sizes: from its file, else from the capture."""
-    held = manifest.read_manifest(config.capture)
-    if config.calibration is None and held.calibration is None:
-        raise InputError(f"{config.capture}: expected the cameras' calibration, found none; give calibration=...")
-    known = calibration_files.read_for(config.calibration or config.capture / str(held.calibration), sizes)
+    known = calibration_files.read_for(given_or_held(config, "calibration", "the cameras' calibration"), sizes)
     cameras = {name: known.cameras[name] for name in CAMERAS}
     optics = in_use(known.uncertainty, cameras, config.board_scale, config.drift_px)
     design = config.rig.target
@@ -130,12 +173,51 @@ def tracker_of(config: Config, sizes: Mapping[str, Size], bits: int) -> Tracker:
     return Tracker((cameras[CAMERAS[0]], cameras[CAMERAS[1]]), target, loaded, bits if bits > 8 else None, optics)
 
 
-def played(recorded: Mapping[str, Recorded], speed: float) -> tuple[Device, Device, Device]:
-    """Both cameras and the scanner, played back by one timeline."""
-    line = playback.timeline_of(recorded, speed)
+def given_or_held(config: Config, field: Literal["calibration", "probe"], what: str) -> Path:
+    """The file that a field names, else the capture's own."""
+    given: Path | None = getattr(config, field)
+    if given is not None:
+        return given
+    held = None if config.capture is None else getattr(manifest.read_manifest(config.capture), field)
+    if config.capture is None or held is None:
+        raise InputError(f"{config.capture or 'navigate'}: expected {what}, found none; give {field}=...")
+    return config.capture / held
+
+
+def played(config: Config, capture: Path) -> Sources:
+    """Both cameras and the scanner of a capture, played back by one timeline."""
+    recorded = playback.read_recording(capture, config.sweep)
+    line = playback.timeline_of(recorded, config.speed)
 
     def device(name: str, kind: type[PlayedCamera] | type[PlayedScanner]) -> Device:
         return Device(name, lambda: kind(recorded[name], line), lambda source: lambda frame: line.clock_of(frame.time_ns))
 
     cam1, cam2 = (device(name, PlayedCamera) for name in CAMERAS)
-    return cam1, cam2, device(SCANNER, PlayedScanner)
+    sizes, bits = {name: recorded[name].size for name in CAMERAS}, max(recorded[name].bits for name in CAMERAS)
+    return Sources(cam1, cam2, device(SCANNER, PlayedScanner), sizes, bits, recorded[SCANNER].size[0])
+
+
+def opened(config: Config, devices: LiveDevices) -> Sources:
+    """A laboratory's devices, opened when they are used, and again after a loss."""
+
+    def camera(name: str) -> Device:
+        def begun() -> Camera:
+            found = open_camera(devices, name)
+            found.set_exposure(config.exposure_s, config.gain)
+            # camera 1's exposures trigger camera 2
+            found.start("hardware" if config.trigger == "hardware" and name != CAMERAS[0] else "free")
+            return found
+
+        return Device(name, begun, lambda source: FollowedClock(follow(cast(Camera, source))))
+
+    if lacking := [name for name in CAMERAS if name not in devices.cameras]:
+        raise InputError(f"devices.cameras: expected {' and '.join(CAMERAS)}, found no {lacking[0]}; see conf/devices")
+    chosen = devices.scanner
+    scanner = (
+        None
+        if chosen is None
+        else Device(SCANNER, lambda: open_scanner(chosen), lambda source: FollowedClock(ClockFollower(SCANNER)))
+    )
+    sizes, bits = {name: devices.cameras[name].size for name in CAMERAS}, max(devices.cameras[name].bits for name in CAMERAS)
+    cam1, cam2 = map(camera, CAMERAS)
+    return Sources(cam1, cam2, scanner, sizes, bits, config.rig.probe.image_size[0])

@@ -62,7 +62,15 @@ def test_a_recording_is_navigated(recorded, moments, tmp_path, capsys):
     meshes.write_ply(skin, trimesh.creation.icosphere(3, 60.0).apply_translation([0, 0, 700]))
     meshes.write_ply(masses / "mass0.ply", trimesh.creation.icosphere(2, 5.0).apply_translation([0, 0, 700]))
     port = free_port()
-    fields = [f"skin={skin}", f"masses={masses}", f"lag_s={LAG_S}", f"view.port={port}", "seconds=6", "speed=0.5"]
+    fields = [
+        f"skin={skin}",
+        f"masses={masses}",
+        f"lag_s={LAG_S}",
+        f"view.port={port}",
+        f"igtl.port={free_port()}",
+        "seconds=6",
+        "speed=0.5",
+    ]
     assert main(["navigate", f"capture={recorded}", *fields]) == 0
     told = capsys.readouterr().out.splitlines()
     assert told[0] == f"view        http://127.0.0.1:{port}"

@@ -20,7 +20,7 @@ def feed():
 
     def start(opener):
         came = []
-        made.append(Feed(Device("cam1", opener), came.append, AGAIN_S))
+        made.append(Feed(Device("cam1", opener, lambda source: lambda frame: frame.time_ns), came.append, AGAIN_S))
         made[-1].start()
         return made[-1], came
 
