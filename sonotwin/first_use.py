@@ -12,6 +12,7 @@ PARTS = {  # the modules' beginnings, what the console calls them, and the secon
     "recon.segmentation": ("search for masses", 5),
     "recon.geometry": ("cameras", 5),
     "recon.devices": ("checksums of messages", 1),
+    "recon.skin_projection": ("lines onto the skin", 5),
     "twin.ultrasound": ("the rendered scanner", 45),
     "twin.optics": ("light transport", 5),
     "twin": ("the rendered sensor", 3),

@@ -20,7 +20,7 @@ PLACED = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha")  # o
 FARTHEST_MM = 1e7
 DAMAGE = (  # what trimesh raises on files damaged at random
     *(ValueError, LookupError, TypeError, AttributeError, OverflowError, MemoryError, EOFError, RuntimeError),
-    *(NotImplementedError, AssertionError, ZeroDivisionError, struct.error),
+    *(NotImplementedError, AssertionError, ZeroDivisionError, NameError, struct.error),
 )
 GLTF_FROM_WORLD = np.diag([0.001, -0.001, -0.001, 1.0])
 

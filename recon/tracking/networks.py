@@ -79,10 +79,10 @@ def session(path: Path, interface: Interface, threads: int = 0) -> onnxruntime.I
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         opened = onnxruntime.InferenceSession(network, options, ["CPUExecutionProvider"], enable_fallback=0)
+        inputs, outputs = ({node.name: tuple(node.shape) for node in some} for some in (opened.get_inputs(), opened.get_outputs()))
     except (*FAULTS, ValueError) as error:  # the latter of texts in it
         raise InputError(f"{path}: expected an ONNX network, found {reason(error)}") from None
-    for what, expected, found in (("inputs", interface[0], opened.get_inputs()), ("outputs", interface[1], opened.get_outputs())):
-        shapes = {node.name: tuple(node.shape) for node in found}
+    for what, expected, shapes in (("inputs", interface[0], inputs), ("outputs", interface[1], outputs)):
         if not all(name in shapes and _fits(shapes[name], shape) for name, shape in expected.items()) or (
             what == "inputs" and len(shapes) != len(expected)
         ):

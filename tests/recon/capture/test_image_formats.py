@@ -174,7 +174,7 @@ def mended(data: bytes) -> bytes:
     return bytes(result)
 
 
-@settings(max_examples=400, deadline=2000)
+@settings(max_examples=400, deadline=20_000)
 @given(data=st.data(), name=st.sampled_from(list(FILES)))
 def test_a_damaged_image_is_an_image_or_one_line(data, name):
     spoilt = data.draw(damaged(FILES[name]))
