@@ -42,7 +42,7 @@ def test_rows_are_written_and_missed_bars_told(quick, value, status, tmp_path, c
         (
             "only=acoustics",
             "accuracy: only: expected 'optics', 'surface', 'reality', 'calibration', 'lifelike', 'ultrasound', 'tracking', "
-            "'session', 'studies', 'strangers' or 'trust', found 'acoustics'",
+            "'session', 'studies', 'strangers', 'trust' or 'live', found 'acoustics'",
         ),
     ],
 )
