@@ -40,7 +40,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "describe": {""},
     "reconstruct": {""},
 }
-WRITTEN = ("out", "document")  # fields that name what is written; other paths are read
+WRITTEN = ("out", "document", "log")  # fields that name what is written; other paths are read
 BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `make demo`
     "README.md": {"shots", "optics.yaml", "outputs/board/capture", "session/capture"},
     "captures.md": {
@@ -57,6 +57,10 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
     "freehand.md": {f"{folder}/capture" for folder in ("wires", "bottom", "sweep", "tank")}
     | {"scan.dcm", "poses.csv", "pairs.csv", "config.xml", "probe/probe.yaml", "surface/surface.ply"}
     | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires")},
+    "live.md": {"session", "morning"}
+    | {f"outputs/live/{name}" for name in ("result/surface/surface.ply", "result/masses/scan", "capture/calibration/optics.yaml")}
+    | {"result/surface/surface.ply", "result/masses/scan", "result/optics/optics.yaml", "result/probe/probe.yaml"},
+    "live-check.md": {"morning", "lag/lag.json"},
     "live-skin.md": {"result/surface/surface.ply", "result/masses/scan", "result/optics/optics.yaml"}
     | {"now.ply", "before.ply", "masses", "optics.yaml"},
     "recordings.md": {"photographs", "procam", "L", "relief.yaml", "caliInfo.yml", "spine.xml", "poses.csv"}
