@@ -13,7 +13,6 @@ from recon.devices import basler
 from recon.devices.camera_pairs import CameraPair
 from recon.devices.igtl_scanner import IgtlScanner
 from recon.devices.interfaces import Camera, DeviceError, Projector, Scanner
-from recon.devices.projector_window import ProjectorWindow
 from recon.devices.scan_view import ScanView
 from recon.devices.video_grabber import VideoGrabber
 from recon.model.rig import NotNegative, Part, Positive
@@ -136,6 +135,8 @@ def open_camera(devices: LiveDevices, name: str) -> Camera:
 
 
 def _projector(chosen: WindowDevice) -> Projector:
+    from recon.devices.projector_window import ProjectorWindow  # loads pyglet, of the extra `live`
+
     delay = {} if chosen.delay_s is None else {"delay_s": chosen.delay_s}
     return ProjectorWindow(chosen.size, chosen.display, **delay)
 

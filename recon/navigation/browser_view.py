@@ -1,5 +1,6 @@
 """A view in the browser: skin, masses, probe and B-scan in space, with distances, latency and what is wrong, as they come."""
 
+import re
 import socket
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -30,6 +31,7 @@ ASIDE = np.array([-0.5, -0.6, -0.7]) / np.sqrt(1.1)  # direction from the scene 
 FIELD_RAD, DISTANCE = 0.8, 3.0  # of the view, upright; and from where, as a multiple of the scene's half diagonal
 SPACE_MM = np.array([[-100.0, -100.0, 600.0], [100.0, 100.0, 760.0]])  # that is looked at where there is neither skin nor mass
 QUALITY = 85  # of JPEG
+MARKS = re.compile(r"[^\w\s.,;:+%-]")  # letters that may mean something in Markdown or HTML
 
 
 class BrowserView:
@@ -126,17 +128,24 @@ def turn_of(to_from: Array) -> Array:
 
 def words_of(moment: Moment) -> str:
     """The text of a moment, as Markdown."""
-    lines = [f"**{'Tracking' if moment.world_from_target is not None else 'Not tracking'}:** {moment.state}"]
-    lines += [f"**Device:** {trouble}" for trouble in moment.troubles]
+    lines = [f"**{'Tracking' if moment.world_from_target is not None else 'Not tracking'}:** {plain(moment.state)}"]
+    lines += [f"**Device:** {plain(trouble)}" for trouble in moment.troubles]
     if moment.latency is not None:
         late = moment.latency
         lines.append(f"**From exposure to published pose:** {late.median_ms:.0f} ms, 99 % below {late.high_ms:.0f} ms")
         lines.append(f"**Poses:** {late.rate_hz:.0f} a second")
     lines.append("**B-scan:** in place" if moment.scan is not None else "**B-scan:** none in place")
     if moment.distances:
-        rows = [f"| {each.name} | {each.distance_mm:.1f} | {_where(each.cut, each.in_image)} |" for each in moment.distances]
+        rows = [
+            f"| {plain(each.name)} | {each.distance_mm:.1f} | {_where(each.cut, each.in_image)} |" for each in moment.distances
+        ]
         lines.append("\n".join(["| mass | plane, mm | |", "|---|---:|---|", *rows]))
     return "\n\n".join(lines)
+
+
+def plain(text: str) -> str:
+    """A text as Markdown that shows it letter by letter: names may come from the network, and the page renders HTML."""
+    return MARKS.sub(lambda mark: f"&#{ord(mark[0])};", text)
 
 
 def _where(cut: bool, in_image: bool) -> str:

@@ -31,6 +31,7 @@ Group = Literal[
 MODULES = {
     "session": "sonotwin.session_accuracy",
     "studies": "sonotwin.study_accuracy",
+    "live": "sonotwin.live_accuracy",
 }  # of the others twin.accuracy.GROUP_accuracy
 
 

@@ -86,7 +86,8 @@ def run(config: Config) -> int:
         If the capture is incomplete or damaged or holds nothing that can be checked, or a place can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    inputs = [path for path in (config.capture, config.calibration, config.probe, config.lag, config.target) if path is not None]
+    given = (config.capture, config.calibration, config.probe, config.lag, config.target, config.log)
+    inputs = [path for path in given if path is not None]  # the log, too: a folder that is replaced would take it along
     atomic.check_folder(config.out, CHECK, inputs=inputs)
     if config.log is not None and config.log.exists():
         check_log.read(config.log)

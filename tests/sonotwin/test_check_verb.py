@@ -47,6 +47,12 @@ def test_a_damaged_log_is_refused_before_any_work(bottom, tmp_path, capsys):
     assert "rig.jsonl" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
+def test_a_log_within_the_folder_that_is_replaced_is_refused(bottom, tmp_path, capsys):
+    log = tmp_path / "out" / "rig.jsonl"
+    assert main(["check", f"capture={bottom / 'capture'}", f"out={tmp_path / 'out'}", f"log={log}"]) == 2
+    assert "expected a folder apart from what is read" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(("lag", "status"), [("lag", 0), ("early", 1)])
 def test_a_clock_that_is_off_is_told_and_logged(bottom, tmp_path, capsys, lag, status):
     """By 20 ms, known to 1 ms. Straight up and down, the bracket stays open; what wasn't recorded is not checked."""

@@ -17,7 +17,7 @@ from recon.rig_check.bottom_equations import Known
 from recon.rig_check.verdicts import Optics, Verdict
 from scenes.board_poses import Config as Poses
 from twin import conditions
-from twin.accuracy.table_rows import Row, Setup
+from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.conditions import IDEAL, Conditions
 from twin.studies import drawn_check, drawn_session
 from twin.studies.drawn_check import Clocks, Devices
@@ -43,6 +43,11 @@ class Rates(NamedTuple):
     alarms: int  # rigs of which nothing moved, and something is told to have
     found: Counter[str]  # by the move: what moved is among those that are told to have
     named: Counter[str]  # the same, and it alone
+
+
+def measurements(setup: Setup) -> list[Measurement]:
+    """The rows of the part."""
+    return [lambda: rows(setup)]
 
 
 def rows(setup: Setup, rigs: int = RIGS) -> list[Row]:

@@ -158,3 +158,8 @@ def seen(page):
     """A picture with the white corner in it, or None."""
     shot = page.picture()
     return shot if white_of_scene(shot).sum() > 200 else None
+
+
+def test_names_from_the_network_are_no_html():
+    words = browser_view.words_of(Moment(5, 0, None, "no frames", troubles=("us: found <img src=x onerror=alert(1)> | [a](b)",)))
+    assert not set("<>|[]()=") & set(words)

@@ -1,0 +1,25 @@
+"""The live rig's rows: devices, recordings, guided board poses, light on the skin, and the check of the rig."""
+
+from twin.accuracy import (
+    live_basler_accuracy,
+    live_poses_accuracy,
+    live_projector_accuracy,
+    live_record_accuracy,
+    live_skin_accuracy,
+)
+from twin.accuracy.table_rows import Measurement, Setup
+from twin.studies import check_rates
+
+PARTS = (
+    live_basler_accuracy,
+    live_projector_accuracy,
+    live_record_accuracy,
+    live_poses_accuracy,
+    live_skin_accuracy,
+    check_rates,
+)
+
+
+def measurements(setup: Setup) -> list[Measurement]:
+    """The rows of the group."""
+    return [measurement for part in PARTS for measurement in part.measurements(setup)]
