@@ -79,7 +79,9 @@ def session(path: Path, interface: Interface, threads: int = 0) -> onnxruntime.I
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         opened = onnxruntime.InferenceSession(network, options, ["CPUExecutionProvider"], enable_fallback=0)
-        inputs, outputs = ({node.name: tuple(node.shape) for node in some} for some in (opened.get_inputs(), opened.get_outputs()))
+        inputs, outputs = (
+            {node.name: tuple(node.shape) for node in some} for some in (opened.get_inputs(), opened.get_outputs())
+        )
     except (*FAULTS, ValueError) as error:  # the latter of texts in it
         raise InputError(f"{path}: expected an ONNX network, found {reason(error)}") from None
     for what, expected, shapes in (("inputs", interface[0], inputs), ("outputs", interface[1], outputs)):
