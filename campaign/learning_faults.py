@@ -74,4 +74,4 @@ def safetensors_faults(content: bytes) -> Iterator[tuple[str, bytes]]:
     yield from cut_faults(content)
     yield "a header of 2^62 bytes", struct.pack("<Q", 1 << 62) + content[8:]
     yield "a header that is no JSON", struct.pack("<Q", 4) + b"many" + content[8:]
-    yield "other names", content.replace(b"conv1", b"conv9")
+    yield "other names", content.replace(b".weight", b".height")

@@ -4,6 +4,7 @@ Images in memory cost no decoding during the training. What is larger than memor
 by its place: the same images either way, whatever the order.
 """
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -215,8 +216,6 @@ def _read(
         if expected is not None and expected != count - before:
             found = f"found {count - before} in shards; partial=true takes these"
             raise InputError(f"{folder}: expected {expected} samples as of dataset.json, {found}")
-        if count == before:
-            raise InputError(f"{folder}: expected samples in its shards, found none")
     _check_apart(shards, parts)
     columns = [np.concatenate(column) for column in zip(*(part.columns for part in parts), strict=True)]
     return _Index(tuple(shards), np.concatenate([part.places for part in parts]), columns)
@@ -244,7 +243,9 @@ def _scan(path: Path, number: int, ends: Sequence[str], model: type[SampleTruth]
         views.extend(truth.views)
         places.append([(number, members[end].offset, members[end].size) for end in ends])
         identities.append(identity(truth, content))
-    return _Shard(np.array(places, np.int64).reshape(-1, len(ends), 3), np.array(identities, np.uint64), convert(views))
+    if not places:
+        raise InputError(f"{path}: expected samples, found none in it; was it cut short? Remove it, and make its samples again")
+    return _Shard(np.array(places, np.int64), np.array(identities, np.uint64), convert(views))
 
 
 def _check_apart(shards: Sequence[Path], parts: Sequence[_Shard]) -> None:
@@ -268,7 +269,7 @@ class _Promise(Known):
 def _promised(folder: Path) -> int | None:
     """Number of samples by the data set's own count, or None."""
     path = folder / "dataset.json"
-    if not path.is_file():
+    if not os.path.lexists(path):
         return None
     try:
         return validated(_Promise, json_text.read(path), path).samples

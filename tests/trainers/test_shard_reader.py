@@ -166,6 +166,25 @@ def test_a_damaged_promise_is_said(data_set, tmp_path, content):
     assert str(caught.value).isprintable()
 
 
+@pytest.mark.parametrize("place", ["dataset.json", "nowhere"])
+def test_a_promise_behind_a_link_that_leads_nowhere_is_said(data_set, tmp_path, place):
+    """A data set without the file is read, as its shards are enough."""
+    folder = shutil.copytree(data_set, tmp_path / "set")
+    (folder / "dataset.json").unlink(missing_ok=True)
+    read_views([folder])
+    (folder / "dataset.json").symlink_to(folder / place)
+    with pytest.raises(InputError, match=rf"^{folder}/dataset\.json: expected a file"):
+        read_views([folder])
+
+
+def test_a_shard_of_zeros_is_refused(data_set, tmp_path):
+    folder = shutil.copytree(data_set, tmp_path / "set")
+    last = max(folder.glob("*.tar"))
+    last.write_bytes(bytes(last.stat().st_size))
+    with pytest.raises(InputError, match=rf"^{last}: expected samples, found none in it"):
+        read_views([folder])
+
+
 def test_ranges_of_a_set_are_the_set(write, data_set, tmp_path):
     """Two machines' folders, one after the other, are the folder of one."""
     parts = [write(tmp_path / "a", 16), write(tmp_path / "b", 8, first=16)]

@@ -55,6 +55,14 @@ def test_wrong_files_are_refused_in_one_line(folder):
         networks.load(folder)
 
 
+@pytest.mark.parametrize("name", [b"patch", b"mask"])
+def test_a_name_that_is_no_text_is_refused_in_one_line(folder, name):
+    path = folder / "segmenter.onnx"
+    path.write_bytes(path.read_bytes().replace(name, b"\xe6" + name[1:]))
+    with pytest.raises(InputError, match=r"segmenter\.onnx: expected an ONNX network, found "):
+        networks.load(folder)
+
+
 def test_candidates_are_where_the_logits_are(rng):
     places = np.array([[400.0, 300.0], [520.0, 700.0], [900.0, 310.0]])
     found = circle_detector.detect([np.zeros((1024, 1280), np.uint8)], Told([places]))[0]
