@@ -109,7 +109,7 @@ def open_still(devices: LiveDevices, names: Sequence[str]) -> Iterator[Opened]:
         if devices.projector is None:
             raise DeviceError("devices.projector: expected one, which lights what is recorded, found none; see conf/devices")
         cameras = {name: stack.enter_context(closing(open_camera(devices, name))) for name in names}
-        yield Opened(cameras, stack.enter_context(closing(_projector(devices.projector))))
+        yield Opened(cameras, stack.enter_context(closing(open_projector(devices.projector))))
 
 
 @contextmanager
@@ -134,7 +134,8 @@ def open_camera(devices: LiveDevices, name: str) -> Camera:
     return basler.open_camera(name, chosen.serial, settings)
 
 
-def _projector(chosen: WindowDevice) -> Projector:
+def open_projector(chosen: WindowDevice) -> Projector:
+    """Open the projector; DeviceError if its display isn't there."""
     from recon.devices.projector_window import ProjectorWindow  # loads pyglet, of the extra `live`
 
     delay = {} if chosen.delay_s is None else {"delay_s": chosen.delay_s}

@@ -29,6 +29,7 @@ from twin.optics.disturbed_light import emitted, with_stray
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Images, Tracing, meets_something, render_pixels
 from twin.optics.printed_edges import compute_edges
+from twin.optics.projected_image import ImageLight
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, is_convex, move_things
 from twin.optics.surface_session import CameraName, Shooting, calibration_of, camera_optics, describe_visible, device_of
@@ -199,7 +200,7 @@ class NearBoard:
         return len(self.near), *self.room.shape
 
 
-def trace_near(stage: Stage, optics: CameraOptics, light: Light, tracing: Tracing, seed: int) -> NearBoard:
+def trace_near(stage: Stage, optics: CameraOptics, light: Light | ImageLight, tracing: Tracing, seed: int) -> NearBoard:
     """As `light_transport.render`, but only the board and what is near are traced; the rest of an image shows the room."""
     box = stage.world.bbox()
     corners = np.array([box.corner(k) for k in range(8)]).reshape(8, 3)
@@ -208,7 +209,7 @@ def trace_near(stage: Stage, optics: CameraOptics, light: Light, tracing: Tracin
     window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     seen = cv2.dilate(np.uint8(meets_something(stage.world, optics)), window)
     pixels = np.flatnonzero(seen).astype(np.uint32)
-    near = np.empty((len(light.profiles), 0), np.float32)
+    near = np.empty((light.count, 0), np.float32)
     if len(pixels):
         near = render_pixels(stage.world, optics, stage.projector, light, tracing, seed, pixels, convex=stage.convex)
     return NearBoard(optics.transmission * np.float32(tracing.room_radiance), pixels, near)

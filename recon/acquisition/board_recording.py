@@ -10,12 +10,12 @@ from recon.acquisition import frame_checks
 from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
 from recon.acquisition.guidance import BoardGuide, Operator, sentence
-from recon.acquisition.lit_frames import Pattern, Stage
 from recon.acquisition.pictures import Say, Show
 from recon.acquisition.recording import Recording
 from recon.acquisition.still_session import StillSession
 from recon.board_detection.detect import BoardNotFound, detect
 from recon.capture.board_part import FRINGE_CAMERA, read_board
+from recon.devices.pattern_player import Pattern, Stage
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
 
@@ -49,24 +49,20 @@ def record_board(
         captured = read_board(recording.folder)
         for number in range(len(captured.poses)):
             guide.accept(captured.pose(number).lit)
-    stage.start()
-    try:
-        operator.ask(guide.suggest())
-        while len(names) < plan.poses:
-            lit = session.look()
-            answer = operator.answer()
-            if answer == "end":
-                break
-            if answer == "wait":
-                continue
-            if not names:
-                lit = session.expose()
-            reason = _recorded(recording, session, guide, plan, lit, names)
-            say(reason or f"pose {names[-1]}, {len(names)} of {plan.poses}")
-            if len(names) < plan.poses:
-                operator.ask(guide.suggest())
-    finally:
-        stage.stop()
+    operator.ask(guide.suggest())
+    while len(names) < plan.poses:
+        lit = session.look()
+        answer = operator.answer()
+        if answer == "end":
+            break
+        if answer == "wait":
+            continue
+        if not names:
+            lit = session.expose()
+        reason = _recorded(recording, session, guide, plan, lit, names)
+        say(reason or f"pose {names[-1]}, {len(names)} of {plan.poses}")
+        if len(names) < plan.poses:
+            operator.ask(guide.suggest())
     return names
 
 
@@ -79,10 +75,10 @@ def _recorded(
     verdict = guide.judge(lit)
     if not verdict.accepted:
         return f"not kept: {verdict.text}"
-    fringes = session.stage.sequence(plan.shown, [FRINGE_CAMERA], session.passing)
+    fringes, faults = session.sequence(plan.shown, [FRINGE_CAMERA])
     bits = session.stage.cameras[FRINGE_CAMERA].bits
     contrast = frame_checks.contrast(fringes[FRINGE_CAMERA], plan.patterns, bits, plan.limits)
-    if faults := frame_checks.fringe_faults(contrast, plan.limits):
+    if faults := [*faults, *frame_checks.fringe_faults(contrast, plan.limits)]:
         return f"not kept: {sentence(faults)}"
     after = session.look()
     moved = moved_px(lit[FRINGE_CAMERA], after[FRINGE_CAMERA], plan.board, 2**bits - 1)

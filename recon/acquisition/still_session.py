@@ -1,17 +1,19 @@
-"""What recordings of things at rest share: looks at what is lit, exposures, and the cameras as they are set."""
+"""What recordings of things at rest share: looks at what is lit, sequences, exposures, and the cameras as they are set."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 
+import numpy as np
 from numpy.typing import NDArray
 
 from recon.acquisition import frame_checks
 from recon.acquisition.exposure_setting import Exposing, set_exposure
 from recon.acquisition.frame_checks import Limits
-from recon.acquisition.lit_frames import Stage
 from recon.acquisition.pictures import Picture, Say, Show
 from recon.capture.manifest import Device
 from recon.devices.interfaces import Camera, Frame, Size
+from recon.devices.pattern_player import Pattern, Stage, play, take
 
 
 @dataclass
@@ -33,15 +35,16 @@ class StillSession:
 
     def expose(self) -> dict[str, NDArray]:
         """Set exposures for what is seen, and look."""
-        white = self.stage.white()
         for name, camera in self.stage.cameras.items():
-            self._exposures[name] = set_exposure(camera, lambda name=name: self.stage.take(white)[name].image, self.exposing)
+            alone = self.stage.of([name])
+            lit = lambda name=name, alone=alone: take(alone, alone.white)[name].image  # noqa: E731
+            self._exposures[name] = set_exposure(camera, lit, self.exposing)
         times = ", ".join(f"{name} {1e3 * seconds:.3g} ms" for name, seconds in self._exposures.items())
         self.say(f"exposure {times}")
         return self._lit()
 
     def _lit(self) -> dict[str, NDArray]:
-        frames = self.stage.take(self.stage.white())
+        frames = take(self.stage, self.stage.white)
         self.seen(frames)
         return {name: frame.image for name, frame in frames.items()}
 
@@ -61,10 +64,20 @@ class StillSession:
             faults = frame_checks.frame_faults(found, self.limits)
             self.show(Picture(name, frame.image, bits, found.text, tuple(faults)))
 
-    def passing(self, frames: Mapping[str, Frame]) -> None:
-        """Show frames of a sequence as they come, without a look at each: the sequence is judged as a whole."""
-        for name, frame in frames.items():
-            self.show(Picture(name, frame.image, self.stage.cameras[name].bits, "under a pattern"))
+    def sequence(self, patterns: Iterable[Pattern], names: Sequence[str]) -> tuple[dict[str, NDArray], list[str]]:
+        """Take a sequence with some of the cameras : camera -> (n, h, w), and name the faults of its light, a line each.
+
+        Frames are shown as they come, without a look at each: the sequence is judged as a whole.
+        """
+        taken: dict[str, list[NDArray]] = {name: [] for name in names}
+        faults: list[str] = []
+        with closing(play(self.stage.of(names), patterns)) as shots:  # so that an interrupt stops the cameras
+            for shot in shots:
+                faults += [fault for fault in shot.faults if fault not in faults]
+                for name, frame in shot.frames.items():
+                    taken[name].append(frame.image)
+                    self.show(Picture(name, frame.image, self.stage.cameras[name].bits, "under a pattern"))
+        return {name: np.stack(images) for name, images in taken.items()}, faults
 
     def devices(self, projector: Size) -> dict[str, Device]:
         """Cameras and projector as a capture describes them."""

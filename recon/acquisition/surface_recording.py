@@ -10,10 +10,10 @@ from recon.acquisition import frame_checks
 from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
 from recon.acquisition.guidance import Operator, Step, sentence
-from recon.acquisition.lit_frames import Pattern, Stage
 from recon.acquisition.pictures import Say, Show
 from recon.acquisition.recording import Recording
 from recon.acquisition.still_session import StillSession
+from recon.devices.pattern_player import Pattern, Stage
 from recon.model.patterns import Patterns
 
 STILL = 0.02  # relative RMS change of the lit image, beyond noise, between before the sequence and after it
@@ -36,27 +36,23 @@ def record_surface(recording: Recording, stage: Stage, operator: Operator, plan:
     A sequence with faults is kept only if the operator then ends rather than takes it again.
     """
     session = StillSession(stage, plan.exposing, plan.limits, say, show)
-    stage.start()
-    try:
-        operator.ask(Step("lay down what is to be measured, in the projector's light, and let nothing move"))
-        taken: dict[str, NDArray] = {}
-        while True:
-            lit = session.look()
-            answer = operator.answer()
-            if answer == "wait":
-                continue
-            if answer == "end":
-                break
-            lit = session.expose()
-            taken = stage.sequence(plan.shown, list(stage.cameras), session.passing)
-            faults = [*session.faults(lit), *_faults(session, plan, taken), *_moved(lit, session.look())]
-            if not faults:
-                break
-            operator.ask(Step(f"{sentence(faults)}; take it again, or end to keep it as it is"))
-        if taken:
-            recording.add_surface(taken, plan.patterns, session.devices(plan.patterns.projector_size))
-    finally:
-        stage.stop()
+    operator.ask(Step("lay down what is to be measured, in the projector's light, and let nothing move"))
+    taken: dict[str, NDArray] = {}
+    while True:
+        lit = session.look()
+        answer = operator.answer()
+        if answer == "wait":
+            continue
+        if answer == "end":
+            break
+        lit = session.expose()
+        taken, unlit = session.sequence(plan.shown, list(stage.cameras))
+        faults = [*session.faults(lit), *unlit, *_faults(session, plan, taken), *_moved(lit, session.look())]
+        if not faults:
+            break
+        operator.ask(Step(f"{sentence(faults)}; take it again, or end to keep it as it is"))
+    if taken:
+        recording.add_surface(taken, plan.patterns, session.devices(plan.patterns.projector_size))
     return bool(taken)
 
 

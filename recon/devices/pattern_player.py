@@ -3,15 +3,16 @@
     show -> light (delay measured) -> trigger -> exposure -> image          cameras that are triggered
     show -> light (delay measured) -> images to wait (measured) -> image    cameras that run freely or by the projector's wire
 
-Images that don't arrive, and those that don't change although the pattern does, are taken again.
+A pattern whose image doesn't arrive, or doesn't change although the pattern does, is shown and taken again. Times are those of
+projector and frames alone, so that devices with a time of their own are played, too.
 """
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +24,11 @@ from recon.devices.pattern_changes import Light
 log = logging.getLogger(__name__)
 
 Pattern = NDArray[np.uint8]
-Frames = tuple[Frame, ...]  # one of each camera
 
 TRIES = 3  # of a pattern
 DOUBLED = 0.1  # share of the expected change below which an image shows the pattern before; gamma and a part in view leave 0.2
 LEAST_LIGHT_DN = 2.0  # root mean square of white less black
+MOST_WAITING = 1000  # images of earlier light that are left out at most
 
 
 class Taking(Protocol):
@@ -38,7 +39,7 @@ class Taking(Protocol):
         """Mode that the cameras are started in."""
 
     def take(self, cameras: Sequence[Camera], lit_ns: int) -> list[Frame | None]:
-        """One image of each camera, begun after a time of this computer's monotonic clock; None where none came."""
+        """One image of each camera, begun after a time of the projector's clock; None where none came."""
 
 
 @dataclass(frozen=True)
@@ -69,117 +70,148 @@ class Streamed:
 
 
 @dataclass(frozen=True)
+class Stage:
+    """A projector, cameras that see its light, and the way to take their images."""
+
+    projector: Projector
+    cameras: Mapping[str, Camera]  # by their names, with exposure and gain set
+    taking: Taking
+
+    @property
+    def black(self) -> Pattern:
+        """The pattern with all pixels off : (h, w)."""
+        return np.zeros(self.projector.size[::-1], np.uint8)
+
+    @property
+    def white(self) -> Pattern:
+        """The pattern with all pixels on : (h, w)."""
+        return np.full(self.projector.size[::-1], 255, np.uint8)
+
+    def of(self, names: Iterable[str]) -> "Stage":
+        """The same with some of the cameras."""
+        return replace(self, cameras={name: self.cameras[name] for name in names})
+
+
+@dataclass(frozen=True)
 class Shot:
     """All cameras' images of a pattern."""
 
     number: int  # of the pattern in its sequence
-    lit_ns: int  # from which on it was lit, of this computer's monotonic clock
-    frames: Frames
-    changes: tuple[float, ...]  # a camera, as `pattern_changes.change`
-
-    @property
-    def doubled(self) -> bool:
-        """Whether a camera still shows the pattern before, after all tries."""
-        return any(change < DOUBLED for change in self.changes)
+    lit_ns: int  # from which on it was lit, of the projector's clock
+    frames: dict[str, Frame]  # by camera
+    changes: dict[str, float]  # by camera, as `pattern_changes.change`
+    faults: tuple[str, ...]  # a line each: a camera that doesn't see the projector, or shows the pattern before after all tries
 
 
-def play(projector: Projector, patterns: Iterable[Pattern], cameras: Sequence[Camera], taking: Taking) -> Iterator[Shot]:
+def take(stage: Stage, pattern: Pattern) -> dict[str, Frame]:
+    """Show one pattern : (height, width), and take an image of each camera; DeviceError if one gives none in three tries."""
+    with _started(stage):
+        return _take(stage, pattern, "what is lit").frames
+
+
+def play(stage: Stage, patterns: Iterable[Pattern]) -> Generator[Shot, None, None]:
     """Show black, white and then a sequence, and yield all cameras' images of each of its patterns as soon as they are there.
+
+    Cameras are started here, and stopped at the end. A sequence is yielded whatever its images show; its faults are said.
 
     Parameters
     ----------
     patterns : of (height, width), 0 to 255
-    cameras : with exposure and gain set; they are started here, and stopped at the end
 
     Raises
     ------
     DeviceError
-        If a camera doesn't see the projector's light, or gives no image in three tries. A sequence whose images don't change is
-        yielded all the same, see `Shot.doubled`.
+        If a camera gives no image in three tries.
     """
-    with _started(cameras, taking.trigger):
-        lights, shown, frames = _measure_light(projector, cameras, taking)
+    with _started(stage):
+        dark, lit = _take(stage, stage.black, "black"), _take(stage, stage.white, "white")
+        before = _take(stage, stage.white, "white")
+        images = {name: tuple(taken.frames[name].image for taken in (dark, lit, before)) for name in stage.cameras}
+        lights = {name: pattern_changes.measure_light(*three) for name, three in images.items()}
+        unlit = [fault for name, light in lights.items() if (fault := _light_fault(name, light))]
         for number, pattern in enumerate(patterns):
-            shot = _shoot(projector, (shown, pattern), cameras, taking, lights, frames, number)
-            yield shot
-            shown, frames = pattern, shot.frames
+            before, changes = _take_changed(stage, lights, before, pattern, number)
+            frozen = [_frozen_fault(name, number) for name, change in changes.items() if change < DOUBLED]
+            yield Shot(number, before.lit_ns, before.frames, changes, (*unlit, *frozen))
 
 
-def refuse_doubled(shot: Shot, cameras: Sequence[Camera]) -> None:
-    """Refuse a shot of which an image didn't change with its pattern.
+def refuse_faults(shot: Shot) -> None:
+    """Refuse a shot of a camera without light, or with the image of the pattern before.
 
     Raises
     ------
     DeviceError
-        With the camera and the pattern.
+        With the camera, and with the pattern.
     """
-    for camera, change in zip(cameras, shot.changes, strict=True):
-        if change < DOUBLED:
-            raise DeviceError(
-                f"{camera.name}: expected another image of pattern {shot.number} than of the one before, found the same in "
-                f"{TRIES} tries: is the projector's image frozen, its delay longer than was measured, or this "
-                "part of it out of view?"
-            )
+    if shot.faults:
+        raise DeviceError(shot.faults[0])
 
 
-def _shoot(
-    projector: Projector,
-    patterns: tuple[Pattern, Pattern],
-    cameras: Sequence[Camera],
-    taking: Taking,
-    lights: Sequence[Light],
-    before: Frames,
-    number: int,
-) -> Shot:
-    """Show the second of two patterns until all images differ from those before as the patterns do."""
-    for attempt in range(TRIES):
-        lit_ns = projector.show(patterns[1])
-        frames = _all_frames(cameras, taking, lit_ns, f"pattern {number}")
-        changes = tuple(
-            pattern_changes.change(light, (old.image, new.image), patterns)
-            for light, old, new in zip(lights, before, frames, strict=True)
-        )
-        shot = Shot(number, lit_ns, frames, changes)
-        if not shot.doubled:
-            return shot
-        log.warning("projector: pattern %d does not show in the images, try %d of %d", number, attempt + 1, TRIES)
-    return shot
+class _Taken(NamedTuple):
+    """A pattern and its images."""
+
+    pattern: Pattern
+    lit_ns: int
+    frames: dict[str, Frame]
 
 
-def _measure_light(projector: Projector, cameras: Sequence[Camera], taking: Taking) -> tuple[list[Light], Pattern, Frames]:
-    """The projector's light in each camera, and the pattern and images that it ended with."""
-    width, height = projector.size
-    black, white = np.zeros((height, width), np.uint8), np.full((height, width), 255, np.uint8)
-    dark = _all_frames(cameras, taking, projector.show(black), "black")
-    lit = _all_frames(cameras, taking, projector.show(white), "white")
-    again = _all_frames(cameras, taking, time.monotonic_ns(), "white")
-    lights = [pattern_changes.measure_light(*(frame.image for frame in frames)) for frames in zip(dark, lit, again, strict=True)]
-    for camera, light in zip(cameras, lights, strict=True):
-        if light.power < max(LEAST_LIGHT_DN**2, light.noise):
-            raise DeviceError(
-                f"{camera.name}: expected the projector's light, found white {np.sqrt(light.power):.1f} DN brighter than black: "
-                "is the lens covered, the exposure too short, the projector off, or its delay longer than was measured?"
-            )
-    return lights, white, again
+def _take_changed(
+    stage: Stage, lights: Mapping[str, Light], before: _Taken, pattern: Pattern, number: int
+) -> tuple[_Taken, dict[str, float]]:
+    """Show a pattern until all images differ from those before as the patterns do.
+
+    Two patterns may be alike in the part that a camera sees. So white, then black is shown between tries: in any part, one of
+    them differs from the pattern.
+    """
+    for number_of_try, between in enumerate(("", "white", "black"), 1):
+        if between:
+            before = _take(stage, stage.white if between == "white" else stage.black, between)
+        taken = _take(stage, pattern, f"pattern {number}")
+        changes = {
+            name: pattern_changes.change(light, (before.frames[name].image, taken.frames[name].image), (before.pattern, pattern))
+            for name, light in lights.items()
+        }
+        if not any(change < DOUBLED for change in changes.values()):
+            break
+        log.info("projector: pattern %d does not show in the images, try %d of %d", number, number_of_try, TRIES)
+    return taken, changes
 
 
-def _all_frames(cameras: Sequence[Camera], taking: Taking, lit_ns: int, what: str) -> Frames:
-    """An image of each camera, taken again if one is lost.
+def _light_fault(name: str, light: Light) -> str:
+    """What is wrong with a camera's view of the projector's light; nothing if it is seen."""
+    if light.power >= max(LEAST_LIGHT_DN**2, light.noise):
+        return ""
+    return (
+        f"{name}: expected the projector's light, found white {np.sqrt(light.power):.1f} DN brighter than black: "
+        "is the lens covered, the exposure too short, the projector off, or its delay longer than was measured?"
+    )
+
+
+def _frozen_fault(name: str, number: int) -> str:
+    return (
+        f"{name}: expected another image of pattern {number} than of the one before, found the same in {TRIES} tries: is the "
+        "projector's image frozen, or its delay longer than was measured?"
+    )
+
+
+def _take(stage: Stage, pattern: Pattern, what: str) -> _Taken:
+    """Show a pattern and take an image of each camera, again if one is lost.
 
     A camera that gave none is started anew, so that an image which comes late isn't taken for that of the next pattern.
     """
-    lost: list[Camera] = []
+    lost: list[str] = []
     for _ in range(TRIES):
-        frames = taking.take(cameras, lit_ns)
-        lost = [camera for camera, frame in zip(cameras, frames, strict=True) if frame is None]
+        lit_ns = stage.projector.show(pattern)
+        frames = dict(zip(stage.cameras, stage.taking.take(list(stage.cameras.values()), lit_ns), strict=True))
+        lost = [name for name, frame in frames.items() if frame is None]
         if not lost:
-            return tuple(frame for frame in frames if frame is not None)
-        for camera in lost:
-            log.warning("%s: no image of %s, taken again", camera.name, what)
-            camera.stop()
-            camera.start(taking.trigger)
+            return _Taken(pattern, lit_ns, {name: frame for name, frame in frames.items() if frame is not None})
+        for name in lost:
+            log.warning("%s: no image of %s, taken again", name, what)
+            stage.cameras[name].stop()
+            stage.cameras[name].start(stage.taking.trigger)
     raise DeviceError(
-        f"{lost[0].name}: expected an image of {what}, found none in {TRIES} tries: is its cable or trigger loose, another "
+        f"{lost[0]}: expected an image of {what}, found none in {TRIES} tries: is its cable or trigger loose, another "
         "program using it, or the exposure longer than the time to wait?"
     )
 
@@ -187,7 +219,10 @@ def _all_frames(cameras: Sequence[Camera], taking: Taking, lit_ns: int, what: st
 def _frame_after(camera: Camera, lit_ns: int, wait_frames: int, timeout_s: float) -> Frame | None:
     """The image that comes a number of images after the first one that arrived later than a time; None if it doesn't come."""
     first, end = None, time.monotonic() + timeout_s
-    while (frame := camera.frame(max(end - time.monotonic(), 0))) is not None:
+    for _ in range(MOST_WAITING):  # by number, not by time: of virtual cameras an image may take longer than life
+        frame = camera.frame(max(end - time.monotonic(), 0))
+        if frame is None:
+            return None
         if frame.arrived_ns < lit_ns:
             continue
         first = frame.number if first is None else first
@@ -197,12 +232,12 @@ def _frame_after(camera: Camera, lit_ns: int, wait_frames: int, timeout_s: float
 
 
 @contextmanager
-def _started(cameras: Sequence[Camera], trigger: Trigger) -> Iterator[None]:
+def _started(stage: Stage) -> Iterator[None]:
     """Cameras that take images, until the end."""
     try:
-        for camera in cameras:
-            camera.start(trigger)
+        for camera in stage.cameras.values():
+            camera.start(stage.taking.trigger)
         yield
     finally:
-        for camera in cameras:
+        for camera in stage.cameras.values():
             camera.stop()

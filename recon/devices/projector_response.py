@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from recon.devices.interfaces import Camera, DeviceError, Image, Projector
-from recon.devices.pattern_player import Taking, play
+from recon.devices.pattern_player import Stage, Taking, play, refuse_faults
 from recon.model.patterns import Fringes, Patterns
 
 Array = NDArray[np.float64]
@@ -52,13 +52,16 @@ def measure(projector: Projector, camera: Camera, taking: Taking, steps: int = S
     Raises
     ------
     DeviceError
-        If the camera doesn't see the projector, or white is saturated.
+        If the camera doesn't see the projector or its steps, or white is saturated.
     """
     width, height = projector.size
     order = _far_apart(steps)
     levels = np.uint8(np.rint(np.linspace(0, 255, steps)))
-    shots = play(projector, (np.full((height, width), levels[k], np.uint8) for k in order), [camera], taking)
-    images = {k: shot.frames[0].image for k, shot in zip(order, shots, strict=True)}
+    shown = (np.full((height, width), levels[k], np.uint8) for k in order)
+    images = {}
+    for k, shot in zip(order, play(Stage(projector, {camera.name: camera}, taking), shown), strict=True):
+        refuse_faults(shot)
+        images[k] = shot.frames[camera.name].image
     return response(levels / 255, [images[k] for k in range(steps)], 2**camera.bits - 1, camera.name)
 
 

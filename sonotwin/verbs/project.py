@@ -7,22 +7,28 @@ skin of that time as `earlier_skin`, and masses and cut move along. Writes into 
 curves.json (mm) and curves.ply, the curves on the skin; scene.glb with skin, masses and curves; expected_cam1.png, what camera 1
 should see of it; and metrics.json. Takes some seconds, less than one of them to draw.
 
+With `show=true` and a laboratory's `devices` the projector, a second display, then shows the picture until Ctrl-C.
+
     sonotwin project skin=result/surface/surface.ply masses=result/masses/scan calibration=result/optics/optics.yaml out=light
     sonotwin project skin=now.ply earlier_skin=before.ply masses=masses calibration=optics.yaml eye_mm=[0,300,100] out=light
+    sonotwin project skin=now.ply masses=masses calibration=optics.yaml out=light show=true devices=basler
 """
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, NoReturn
 
 import cv2
 import numpy as np
 import trimesh
-from pydantic import Field
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
 from rich.console import Console
 
 from recon.capture import calibration_files, sweep_part
+from recon.devices.interfaces import Projector
 from recon.errors import InputError
 from recon.files import atomic, layers, metrics
 from recon.files.metrics import Metrics
@@ -47,11 +53,13 @@ from recon.skin_projection import (
 from recon.skin_projection.projector_image import Drawing, Lines
 from recon.skin_projection.skin_curve import SkinCurve
 from recon.skin_projection.skin_registration import SkinShift
+from sonotwin.open_devices import LiveDevices, open_projector
 
 PICTURE, CURVES, STRIPS, SCENE, EXPECTED = "projector.png", "curves.json", "curves.ply", "scene.glb", "expected_cam1.png"
 LIGHT = (60, 220, 120, 255)  # colour of curves in scene.glb
 UNSURE_MM = 0.5  # of a moved mass, beyond which a warning is due
 RESHAPED_MM = 0.5  # of a moved skin's distances that are left, the same
+LOOK_S = 1.0  # between looks at whether the picture is still on its display
 
 
 class Config(Part):
@@ -73,6 +81,15 @@ class Config(Part):
     lag_s: LagSeconds = 0.0
     margin_mm: NotNegative = probe_shadow.MARGIN_MM
     lines: Lines = Lines()
+    show: bool = False
+    devices: LiveDevices | None = None
+
+    @model_validator(mode="after")
+    def _shown_by_a_projector(self) -> "Config":
+        if self.show and (self.devices is None or self.devices.projector is None):
+            found = "no devices" if self.devices is None else "none among the devices"
+            raise ValueError(f"show: expected a projector, found {found}; give devices=basler, or a copy of it: see conf/devices")
+        return self
 
 
 class Held(NamedTuple):
@@ -83,14 +100,25 @@ class Held(NamedTuple):
 
 
 def run(config: Config) -> None:
-    """Read what is given, draw, and write.
+    """Read what is given, draw, and write; show the picture if it is to be.
 
     Raises
     ------
     InputError
         If nothing is given to draw, a file is missing or damaged, or nothing of it can be lit; or `out` can't be written to.
+    DeviceError
+        If the picture is to be shown and the projector's display isn't there, or goes.
     """
     console = Console(soft_wrap=True, highlight=False)
+    with opened(config) as projector:
+        image = draw(config, console)
+        if projector is not None:
+            console.print("shown       projector.png, until Ctrl-C")
+            keep_shown(projector, image)
+
+
+def draw(config: Config, console: Console) -> NDArray[np.uint8]:
+    """Read what is given, draw, and write; returns the picture : (h, w)."""
     given = (config.skin, config.calibration, config.masses, config.cut, config.earlier_skin, config.capture, config.probe)
     atomic.check_folder(config.out, PICTURE, inputs=[path for path in given if path is not None])
     if config.masses is None and config.cut is None and config.capture is None:
@@ -128,6 +156,27 @@ def run(config: Config) -> None:
     for line in described(curves, drawing, masses, shift):
         console.print(line, markup=False)
     console.print(f"wrote       {config.out}/{{{','.join([*written, metrics.FILE])}}}", markup=False)
+    return drawing.image
+
+
+@contextmanager
+def opened(config: Config) -> Iterator[Projector | None]:
+    """The projector, dark, if the picture is to be shown."""
+    if not config.show:
+        yield None
+        return
+    assert config.devices is not None and config.devices.projector is not None  # as checked by the fields
+    chosen = config.devices.projector
+    calibration_files.read_for(config.calibration, {"projector": chosen.size})
+    with closing(open_projector(chosen)) as projector:
+        yield projector
+
+
+def keep_shown(projector: Projector, image: NDArray[np.uint8]) -> NoReturn:
+    """Show the picture until interrupted; DeviceError once the display is gone or changed."""
+    while True:
+        projector.show(image)
+        time.sleep(LOOK_S)
 
 
 def read_skin(path: Path, part_table: bool) -> trimesh.Trimesh:

@@ -28,7 +28,6 @@ from recon.acquisition.board_recording import BoardPlan, record_board
 from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
 from recon.acquisition.guidance import EvenGuide, Operator
-from recon.acquisition.lit_frames import Pattern, Stage, Triggering
 from recon.acquisition.pictures import Say, Show, hidden
 from recon.acquisition.recording import Recording, open_recording
 from recon.acquisition.still_session import as_set
@@ -38,6 +37,8 @@ from recon.acquisition.target_checks import target_judge
 from recon.artwork import projected_images
 from recon.capture.board_part import FRINGE_CAMERA
 from recon.capture.manifest import SCANNER, Device, Purpose, SweepNameOrNone, axes_not_encoded, sweep_part
+from recon.devices.interfaces import Trigger
+from recon.devices.pattern_player import Pattern, Stage, Streamed, Taking, Triggered
 from recon.errors import validated
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
@@ -59,6 +60,21 @@ class PreviewFields(Part):
     serve: bool = True
     host: str = preview_server.LOOPBACK
     port: Annotated[int, Field(ge=0, le=65535)] = 0
+
+
+class Triggering(Part):
+    """How pattern and exposure come together."""
+
+    by: Trigger = "software"  # hardware: a wire from the projector, with each image of its display
+    wait_frames: Annotated[int, Field(ge=0, le=100)] = 1  # of cameras that aren't triggered by software, after a new pattern
+    timeout_s: Positive = 2.0  # after which a frame counts as lost
+
+    @property
+    def taking(self) -> Taking:
+        """The player's way to take images."""
+        if self.by == "software":
+            return Triggered(self.timeout_s)
+        return Streamed(self.wait_frames, self.by, self.timeout_s)
 
 
 class Config(Part):
@@ -142,7 +158,7 @@ def still(config: Config, recording: Recording, console: Console, say: Say, show
             recording,
             {name: camera.size for name, camera in opened.cameras.items()} | {"projector": opened.projector.size},
         )
-        stage = Stage(opened.projector, opened.cameras, config.triggering)
+        stage = Stage(opened.projector, opened.cameras, config.triggering.taking)
         if config.part == "surface":
             plan = SurfacePlan(config.patterns, patterns, config.exposing, config.limits)
             kept = record_surface(recording, stage, operator, plan, say, show)

@@ -1,6 +1,8 @@
 """`sonotwin project`: the picture, the curves and the scene of what is given, and one line for what isn't there."""
 
 import json
+import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,7 +14,10 @@ from recon.files import meshes
 from recon.geometry import rigid
 from scenes.solid_meshes import grid
 from sonotwin.cli import main
+from sonotwin.verbs import project
 from tests.recon import sweep_sets
+from tests.recon.devices.x_server import x_server
+from twin.accuracy.virtual_screen import screenshot
 from twin.optics.surface_session import calibration_of
 
 BALL = np.array([2.0, -3.0, 680.0])
@@ -93,6 +98,41 @@ def test_the_probe_gets_a_line_and_no_light(given, rig, tmp_path):
         lit[margin] = np.count_nonzero(cv2.imread(str(tmp_path / "out" / "projector.png"), cv2.IMREAD_UNCHANGED))
     assert 0 < lit[2] < lit[0]
     assert "scan0020" in curves(tmp_path / "out")
+
+
+def test_the_projector_shows_the_picture_until_interrupted(given, tmp_path, monkeypatch, capsys):
+    """Pixel by pixel, on its own display alone; dark afterwards."""
+    seen = []
+
+    def look(_):
+        seen.append([screenshot(f"{desktop}.{index}") for index in range(2)])
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    with x_server("640x480x24", "1280x800x24") as desktop:
+        monkeypatch.setenv("DISPLAY", desktop)
+        monkeypatch.setattr(project, "time", SimpleNamespace(perf_counter=time.perf_counter, sleep=look))
+        shown = ["show=true", "devices=basler", "devices.projector.delay_s=0"]
+        assert main(["project", *given, f"masses={tmp_path}/masses", *shown]) == 130
+        assert not screenshot(f"{desktop}.1").any()
+    picture = cv2.imread(str(tmp_path / "out" / "projector.png"), cv2.IMREAD_UNCHANGED)
+    for beside, projector in seen:
+        assert not beside.any() and (projector == picture[..., None]).all()
+    assert "until Ctrl-C" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("fields", "complaint"), [
+    ("devices=basler", "DISPLAY: log in at the computer that the projector is connected to"),
+    ("", "show: expected a projector, found no devices; give devices=basler"),
+    ("devices=basler devices.projector=null", "show: expected a projector, found none among the devices"),
+    ("devices=basler devices.projector.size=[1024,768]", "optics.yaml: expected projector of 1024x768 px, found 1280x800"),
+])  # fmt: skip
+def test_a_picture_without_a_display_is_one_line(given, tmp_path, monkeypatch, capsys, fields, complaint):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert main(["project", *given, f"masses={tmp_path}/masses", "show=true", *fields.split()]) == 2
+    said = capsys.readouterr().err
+    assert complaint in said and said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("fields", "complaint"), [

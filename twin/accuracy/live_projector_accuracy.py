@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.artwork import projected_images
 from recon.devices import pattern_changes, projector_delay
 from recon.devices.interfaces import Frame, Size, Trigger
-from recon.devices.pattern_player import DOUBLED, Triggered, play
+from recon.devices.pattern_player import DOUBLED, Stage, Triggered, play
 from recon.devices.projector_window import ProjectorWindow
 from recon.model.patterns import Patterns, Uniform
 from scenes.catalogue import build_scene
@@ -43,8 +43,10 @@ def display(sequences: Mapping[str, Patterns]) -> list[Row]:
                     projector.show(image)
                     exact.append(bool((virtual_screen.screenshot(camera.display) == image[..., None]).all()))
                 delays.append(projector_delay.seconds_to_wait(projector, camera, flashes=4))
-                shots = play(projector, images, [camera], Triggered())
-                taken += [np.array_equal(shot.frames[0].image, image) for shot, image in zip(shots, images, strict=True)]
+                shots = play(Stage(projector, {camera.name: camera}, Triggered()), images)
+                taken += [
+                    np.array_equal(shot.frames[camera.name].image, image) for shot, image in zip(shots, images, strict=True)
+                ]
             finally:
                 projector.close()
     text = f"{len(sequences)} sequences of conf/patterns on a display, {len(exact)} patterns"

@@ -12,7 +12,6 @@ import numpy as np
 
 from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
-from recon.acquisition.lit_frames import Stage, Triggering
 from recon.acquisition.pictures import hidden
 from recon.acquisition.recording import open_recording
 from recon.acquisition.surface_recording import SurfacePlan, record_surface
@@ -20,6 +19,7 @@ from recon.artwork.projected_images import images
 from recon.capture import sweep_tables
 from recon.capture.images import read_image, read_images
 from recon.capture.manifest import STAMPS, image_name, read_manifest
+from recon.devices.pattern_player import Stage, Triggered
 from recon.structured_light.decode import decode
 from recon.structured_light.surface_mesh import clean
 from recon.structured_light.triangulate import triangulate
@@ -60,7 +60,7 @@ def surface_rows(setup: Setup) -> Sequence[Row]:
     plan = SurfacePlan(patterns, shown, Exposing(exposure_s=made.view.exposure.time_s), Limits())
     with TemporaryDirectory() as folder:
         with open_recording(Path(folder) / "capture") as recording:
-            stage = Stage(devices.projector, devices.cameras, Triggering())
+            stage = Stage(devices.projector, devices.cameras, Triggered())
             record_surface(recording, stage, devices.operator, plan, lambda text: None, hidden)
         surface = read_manifest(Path(folder) / "capture").surface
         assert surface is not None

@@ -18,6 +18,7 @@ from twin.board_session import CAMERAS, EVEN_SAMPLES, FRINGE_CAMERA, NearBoard, 
 from twin.devices.shown_light import KnownLight, Pattern
 from twin.optics.instruments import ProjectorOptics
 from twin.optics.light_transport import Images, Tracing, render
+from twin.optics.projected_image import ImageLight
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, is_convex, move_things, translucent
 from twin.optics.surface_session import CameraName, camera_optics
@@ -47,9 +48,9 @@ class StillScene:
             self._images[camera] = self._rendered(camera, light)
         return self._images[camera][place]
 
-    def _rendered(self, camera: CameraName, light: Light) -> Images:
+    def _rendered(self, camera: CameraName, light: Light | ImageLight) -> Images:
         seed = int(np.random.SeedSequence([self.seed, CAMERAS.index(camera)]).generate_state(2)[0])
-        soft = translucent(self.scene, self._world)
+        soft = translucent(self.scene, self._world) if isinstance(light, Light) else ()  # images don't spread beneath skin
         return render(self._world, self._optics[camera], self._projector, light, self.tracing, seed, soft)
 
 
@@ -96,8 +97,8 @@ class HeldBoard:
             self._images[camera] = images
         return self._images[camera][place]
 
-    def _traced(self, camera: CameraName, light: Light) -> NearBoard:
-        even = all(np.ptp(profile) == 0 for profile in light.profiles)
+    def _traced(self, camera: CameraName, light: Light | ImageLight) -> NearBoard:
+        even = isinstance(light, Light) and all(np.ptp(profile) == 0 for profile in light.profiles)
         tracing = self.tracing.model_copy(update={"samples": EVEN_SAMPLES}) if even else self.tracing
         return trace_near(self._stage, self._stage.cameras[camera], light, tracing, self._seeds(camera)[0])
 
@@ -111,7 +112,13 @@ def white(rig: Rig) -> Pattern:
     return np.full(rig.projector.optics.size[::-1], 255, np.uint8)
 
 
-def known_to_board(patterns: Sequence[Pattern], rig: Rig) -> dict[str, KnownLight]:
-    """What each camera will see of a board: camera 1 a sequence and even light, camera 2 even light alone."""
+def known_to_scene(patterns: Sequence[Pattern], rig: Rig) -> KnownLight:
+    """What cameras will see of a scene: black, a sequence, and white, as the player shows them."""
     even = white(rig)
-    return {camera: KnownLight.of([*patterns, even] if camera == FRINGE_CAMERA else [even], rig.projector) for camera in CAMERAS}
+    return KnownLight.of([np.zeros_like(even), *patterns, even], rig.projector)
+
+
+def known_to_board(patterns: Sequence[Pattern], rig: Rig) -> dict[str, KnownLight]:
+    """What each camera will see of a board: camera 1 the same as of a scene, camera 2 even light alone."""
+    even = KnownLight.of([white(rig)], rig.projector)
+    return {camera: known_to_scene(patterns, rig) if camera == FRINGE_CAMERA else even for camera in CAMERAS}

@@ -44,7 +44,7 @@ class VirtualRig:
     bits: int = 8
     seed: int = 0
     shown: Pattern = field(init=False)
-    _wired: list["VirtualCamera"] = field(default_factory=list, init=False)  # cameras that the projector triggers
+    _wired: list["VirtualCamera"] = field(default_factory=list, init=False)  # cameras that the projector's display triggers
     _rendering: threading.Lock = field(default_factory=threading.Lock, init=False)
 
     def __post_init__(self) -> None:
@@ -57,6 +57,12 @@ class VirtualRig:
     def projector(self) -> "VirtualProjector":
         """The rig's projector."""
         return VirtualProjector(self)
+
+    def refresh(self) -> None:
+        """Go on to the next image of the projector's display, with which all cameras expose that are wired to it."""
+        self.clock.advance_to((self.clock.now_ns // REFRESH_NS + 1) * REFRESH_NS)
+        for camera in self._wired:
+            camera.expose_now()
 
     def image(self, camera: CameraName, shown: Pattern, exposure: Exposure, number: int) -> NDArray:
         """Take an image : (h, w), by a number on which its noise depends."""
@@ -103,7 +109,7 @@ class VirtualCamera:
         self.expose_now()
 
     def expose_now(self) -> None:
-        """Expose one frame, as by wire."""
+        """Expose one frame."""
         middle = self._rig.clock.now_ns + round(0.5e9 * self._exposure.time_s)
         self._exposed.append((middle, self._rig.shown, self._exposure))
 
@@ -114,6 +120,8 @@ class VirtualCamera:
         if self._trigger == "free" and not self._exposed:
             self._rig.clock.advance_to(self._rig.clock.now_ns + FREE_NS)
             self.expose_now()
+        if self._trigger == "hardware" and not self._exposed:
+            self._rig.refresh()
         if not self._exposed:
             return None
         middle, shown, exposure = self._exposed.popleft()
@@ -149,10 +157,8 @@ class VirtualProjector:
         if pattern.shape != self.size[::-1] or pattern.dtype != np.uint8:
             expected = f"a pattern of {self.size[0]}x{self.size[1]} uint8"
             raise DeviceError(f"projector: expected {expected}, found {pattern.shape[::-1]} {pattern.dtype}")
-        self._rig.clock.advance_to(self._rig.clock.now_ns + REFRESH_NS)
         self._rig.shown = pattern
-        for camera in self._rig._wired:
-            camera.expose_now()
+        self._rig.clock.advance_to(self._rig.clock.now_ns + REFRESH_NS)
         return self._rig.clock.now_ns
 
     def close(self) -> None:

@@ -10,8 +10,8 @@ from recon.model.rig import Rig
 from scenes import board_poses
 from scenes.catalogue import build_scene
 from scenes.kinds import board
-from twin.devices.shown_light import KnownLight, Pattern
-from twin.devices.still_scenes import HeldBoard, StillScene, known_to_board, white
+from twin.devices.shown_light import Pattern
+from twin.devices.still_scenes import HeldBoard, StillScene, known_to_board, known_to_scene
 from twin.devices.virtual_clock import Turns, VirtualClock
 from twin.devices.virtual_operator import BoardHand, OneTake
 from twin.devices.virtual_rig import VirtualCamera, VirtualProjector, VirtualRig
@@ -57,8 +57,8 @@ class StillSettings:
 def before_scene(settings: StillSettings, scene: Mapping[str, object], patterns: Sequence[Pattern]) -> StillDevices:
     """Devices before a scene, to which a sequence of patterns : (h, w) will be shown; InputError if there is no such scene."""
     rig = settings.rig
-    known = KnownLight.of([*patterns, white(rig)], rig.projector)
-    return _devices(settings, StillScene(rig, build_scene(scene), known, settings.tracing, settings.seed), OneTake())
+    still = StillScene(rig, build_scene(scene), known_to_scene(patterns, rig), settings.tracing, settings.seed)
+    return _devices(settings, still, OneTake())
 
 
 def before_board(settings: StillSettings, design: Board, patterns: Sequence[Pattern], count: int) -> StillDevices:

@@ -32,6 +32,11 @@ class ImageLight:
         black = 1 / device.contrast
         return cls(np.float32(black + (1 - black) * (image / 255) ** device.gamma), device.lens.blur_px)
 
+    @property
+    def count(self) -> int:
+        """Images: one."""
+        return 1
+
     @cached_property
     def table(self) -> "ImageTable":
         """The image's light at any projector coordinates."""

@@ -51,6 +51,11 @@ class Light:
         return cls(size, tuple(axis for axis, _, _ in profiles), tuple(emitted), device.lens.blur_px)
 
     @property
+    def count(self) -> int:
+        """Patterns."""
+        return len(self.axes)
+
+    @property
     def order(self) -> tuple[int, ...]:
         """Place of each pattern : (n,) when those along columns come first, then those along rows."""
         places = sorted(range(len(self.axes)), key=lambda k: AXES.index(self.axes[k]))  # stable

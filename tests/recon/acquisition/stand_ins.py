@@ -20,15 +20,10 @@ class Bench:
         self.reflectance = np.broadcast_to(reflectance, SIZE[::-1]).astype(float)
         self.pattern = np.zeros(RASTER[::-1], np.uint8)
         self.now, self.shows = 0, 0
-        self.wired: list[BenchCamera] = []
-        self.lost: set[int] = set()  # of the shows, those whose wire trigger is lost
 
     def show(self, pattern: np.ndarray) -> int:
         self.pattern, self.shows = pattern, self.shows + 1
         self.now += 10_000_000
-        if self.shows not in self.lost:
-            for camera in self.wired:
-                camera.expose()
         return self.now
 
     def close(self) -> None:
@@ -46,7 +41,6 @@ class BenchCamera:
     def __init__(self, name: str, bench: Bench, bits: int = 8) -> None:
         self.name, self.size, self.bits = name, SIZE, bits
         self.exposure_s, self.gain = 0.01, 1.0
-        self.mode: Trigger | None = None
         self.number, self.unplugged = 0, False
         self._bench, self._waiting = bench, deque[Frame]()
 
@@ -54,9 +48,7 @@ class BenchCamera:
         self.exposure_s, self.gain = exposure_s, gain
 
     def start(self, trigger: Trigger) -> None:
-        self.mode, self.number = trigger, 0
-        if trigger == "hardware":
-            self._bench.wired.append(self)
+        self.number = 0
 
     def trigger(self) -> None:
         self.expose()
@@ -71,15 +63,10 @@ class BenchCamera:
     def frame(self, timeout_s: float) -> Frame | None:
         if self.unplugged:
             raise DeviceError(f"{self.name}: unplugged; check cable and power")
-        if self.mode == "free":
-            self._bench.now += 10_000_000
-            self.expose()
         return self._waiting.popleft() if self._waiting else None
 
     def stop(self) -> None:
-        self.mode = None
         self._waiting.clear()
-        self._bench.wired.clear()
 
     def close(self) -> None:
         self.stop()

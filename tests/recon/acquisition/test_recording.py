@@ -146,4 +146,4 @@ def test_kill_9_loses_nothing(tmp_path, rng):
             assert frames.tolist() == list(range(len(frames))) and len(frames) > said[-1]
             for frame in frames.tolist():
                 read_image(out / place / f"{frame:04d}.png", (32, 24), 8)
-    assert min(said) >= 0 and max(said) > 5
+    assert max(said) > 0, "some were killed amid their frames"

@@ -8,7 +8,6 @@ from recon.acquisition.board_recording import BoardPlan, record_board
 from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
 from recon.acquisition.guidance import EvenGuide
-from recon.acquisition.lit_frames import Stage, Triggering
 from recon.acquisition.pictures import Picture, hidden
 from recon.acquisition.recording import open_recording
 from recon.acquisition.surface_recording import SurfacePlan, record_surface
@@ -16,6 +15,7 @@ from recon.artwork.projected_images import images
 from recon.capture.board_part import read_board
 from recon.capture.manifest import read_manifest
 from recon.devices.interfaces import DeviceError
+from recon.devices.pattern_player import Stage, Triggered
 from recon.model.boards import AsymmetricCircles
 from recon.model.patterns import Fringes, GrayCode, Patterns
 from tests.recon.acquisition import stand_ins
@@ -52,7 +52,7 @@ def printed(shift: tuple[float, float]) -> np.ndarray:
 
 def bench() -> tuple[Bench, Stage]:
     made = Bench(0.5)
-    return made, Stage(made, {"cam1": BenchCamera("cam1", made)}, Triggering(timeout_s=0.01))
+    return made, Stage(made, {"cam1": BenchCamera("cam1", made)}, Triggered(timeout_s=0.01))
 
 
 def record(tmp_path, stage, operator, count=3, say=print, show=hidden):

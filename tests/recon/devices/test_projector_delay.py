@@ -6,7 +6,7 @@ from recon.devices import projector_delay
 from recon.devices.interfaces import DeviceError
 from recon.devices.pattern_player import Streamed, Triggered, play
 from tests.recon.devices.lit_scene import Wall, WallCamera
-from tests.recon.devices.test_pattern_player import IMAGES, shown_by
+from tests.recon.devices.test_pattern_player import IMAGES, on, shown
 
 
 @pytest.fixture(autouse=True)
@@ -30,8 +30,8 @@ def test_images_after_the_measured_number_show_each_pattern(clock, rng, delay_s)
     camera = WallCamera(wall, rng)
     found = projector_delay.frames_to_wait(wall, camera, flashes=8)
     assert delay_s / 0.004 - 1 <= found <= delay_s / 0.004 + 3
-    shots = list(play(wall, IMAGES, [camera], Streamed(wait_frames=found)))
-    assert [shown_by(shot.frames[0]) for shot in shots] == list(range(len(IMAGES)))
+    shots = list(play(on(wall, Streamed(wait_frames=found), camera), IMAGES))
+    assert shown(shots) == list(range(len(IMAGES)))
 
 
 def test_the_largest_of_several_flashes_counts(clock, rng, monkeypatch):
@@ -79,5 +79,5 @@ def test_a_sequence_by_the_measured_delay_is_whole(clock, rng):
             clock.sleep(delay_s)
             return clock.monotonic_ns()
 
-    shots = list(play(Waiting(), IMAGES, [camera], Triggered()))
-    assert [shown_by(shot.frames[0]) for shot in shots] == list(range(len(IMAGES)))
+    shots = list(play(on(Waiting(), Triggered(), camera), IMAGES))
+    assert shown(shots) == list(range(len(IMAGES)))

@@ -22,7 +22,7 @@ def test_gamma_is_measured(clock, rng, gamma):
     assert found.gamma == pytest.approx(gamma, abs=0.005 * gamma)
     assert found.light == pytest.approx(found.levels**gamma, abs=0.003)
     assert (found.bend > 0.05) == (gamma > 1)
-    assert wall.calls == 17 + 2  # no step was taken for one that isn't shown
+    assert wall.calls == 17 + 3  # no step was taken for one that isn't shown
 
 
 def test_saturated_white_is_refused(clock, rng):

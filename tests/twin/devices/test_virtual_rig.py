@@ -3,21 +3,10 @@
 import numpy as np
 import pytest
 
-from recon.acquisition.lit_frames import Stage, Triggering
-from recon.artwork.projected_images import images
 from recon.devices.interfaces import DeviceError
-from recon.model.patterns import CentreLine, Fringes, Patterns
-from twin.devices import shown_light
-from twin.devices.shown_light import KnownLight
+from recon.devices.pattern_player import Stage, Streamed, Triggered, play
 from twin.devices.virtual_clock import Turns, VirtualClock
 from twin.devices.virtual_rig import VirtualRig
-from twin.optics.raster import Light
-
-PATTERNS = Patterns(
-    projector_size=(1280, 800),
-    unwrap="centre_line",
-    parts=(CentreLine(), Fringes(pitch=12, steps=4), CentreLine(axis="rows"), Fringes(axis="rows", pitch=16, steps=3)),
-)
 
 
 class Wall:
@@ -32,24 +21,26 @@ def virtual(rig) -> VirtualRig:
     return VirtualRig(rig, Wall(), VirtualClock())
 
 
-@pytest.mark.parametrize("by", ["software", "hardware", "free"])
-def test_frames_show_what_the_projector_shows_and_time_goes_on(virtual, by):
+WAYS = [Triggered(), Streamed(wait_frames=0, trigger="hardware"), Streamed(wait_frames=1)]
+
+
+@pytest.mark.parametrize("taking", WAYS, ids=["software", "hardware", "free"])
+def test_frames_show_what_the_projector_shows_and_time_goes_on(virtual, taking):
     cameras = {name: virtual.camera(name) for name in ("cam1", "cam2")}
-    projector = virtual.projector()
-    stage = Stage(projector, cameras, Triggering(by=by, settle_frames=0))
+    stage = Stage(virtual.projector(), cameras, taking)
     for camera in cameras.values():
         camera.set_exposure(0.01, 1.0)
-    stage.start()
     levels, times = [], []
-    for level in (0, 255, 128):
-        frames = stage.take(np.full((800, 1280), level, np.uint8))
+    for shot in play(stage, [np.full((800, 1280), level, np.uint8) for level in (0, 255, 128)]):
+        frames = shot.frames
+        assert shot.faults == () and shot.lit_ns <= min(frame.arrived_ns for frame in frames.values())
         levels.append([frame.image.mean() for frame in frames.values()])
         times.append([(frame.time_ns, frame.arrived_ns) for frame in frames.values()])
     assert (np.diff(np.array(levels)[[0, 2, 1]], axis=0) > 5).all()
     assert (np.diff([time for time, _ in np.array(times)[:, 0]]) > 0).all() and (
         np.diff(np.array(times), axis=2) > 5_000_000
     ).all()
-    if by != "free":
+    if taking.trigger != "free":
         assert (np.ptp(np.array(times)[:, :, 0], axis=1) == 0).all()  # both cameras at once
 
 
@@ -62,25 +53,10 @@ def test_settings_and_patterns_out_of_range_are_named(virtual):
     camera.start("hardware")
     with pytest.raises(DeviceError, match="software trigger, found hardware"):
         camera.trigger()
+    camera.start("software")
     assert camera.frame(0.0) is None
     with pytest.raises(DeviceError, match="expected a pattern of 1280x800"):
         projector.show(np.zeros((10, 10), np.uint8))
-    with pytest.raises(DeviceError, match="varies along one axis"):
-        shown_light.profile_of(np.eye(8, dtype=np.uint8))
-
-
-def test_light_of_images_is_that_of_their_patterns(rig):
-    """Rounded to 8 bits, as the twin projects them; each is found by its image."""
-    shown = images(PATTERNS)
-    known = KnownLight.of(shown, rig.projector)
-    expected = Light.of(PATTERNS, rig.projector)
-    assert known.light.axes == expected.axes
-    for one, other in zip(known.light.profiles, expected.profiles, strict=True):
-        assert np.abs(one - other).max() < 2e-3
-    for k, pattern in enumerate(shown):
-        light, place = known.find(pattern)
-        assert light is known.light and place == k
-    assert known.find(np.full((800, 1280), 7, np.uint8))[0] is not known.light
 
 
 def test_noise_differs_from_frame_to_frame(virtual):
