@@ -8,7 +8,7 @@ from rich.console import Console
 
 from recon.acquisition.guidance import Answer, Step
 
-ENDS = ("e", "end", "q", "quit")
+ENDS, KEEPS = ("e", "end", "q", "quit"), ("k", "keep")
 
 
 class TerminalOperator:
@@ -25,15 +25,16 @@ class TerminalOperator:
         self._console.print(f"next        {step.text} (Enter; e ends)", markup=False)
 
     def answer(self) -> Answer:
-        """`take` for each line, `end` for e or the end of the input, `wait` meanwhile."""
+        """`take` for each line, `keep` for k, `end` for e or the end of the input, `wait` meanwhile."""
         if self._over:
             return "end"
         try:
             line = self._lines.get_nowait()
         except queue.Empty:
             return "wait"
-        self._over = line is None or line.strip().lower() in ENDS
-        return "end" if self._over else "take"
+        word = ENDS[0] if line is None else line.strip().lower()
+        self._over = word in ENDS
+        return "end" if self._over else "keep" if word in KEEPS else "take"
 
     def _read(self) -> None:
         for line in sys.stdin:

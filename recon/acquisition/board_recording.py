@@ -2,25 +2,28 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.acquisition import frame_checks
+from recon.acquisition.board_guide import BoardGuide, new_guide
 from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
-from recon.acquisition.guidance import BoardGuide, Operator, sentence
+from recon.acquisition.guidance import Operator, sentence
 from recon.acquisition.pictures import Say, Show
 from recon.acquisition.recording import Recording
 from recon.acquisition.still_session import StillSession
-from recon.board_detection.detect import BoardNotFound, detect
+from recon.board_guidance.board_room import PoseLimits
+from recon.board_guidance.pose_progress import held
 from recon.capture.board_part import FRINGE_CAMERA, read_board
 from recon.devices.pattern_player import Pattern, Stage
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
+from recon.model.rig import Rig
 
 HEADROOM = 0.75  # of the level, at the first pose: others come nearer, and turn to the projector
-HELD_PX = 0.3  # by which the board's points may move, in the mean, while the fringes are taken
 
 
 @dataclass(frozen=True)
@@ -33,22 +36,31 @@ class BoardPlan:
     poses: int  # that are wanted
     exposing: Exposing
     limits: Limits
+    rig: Rig  # as it is described: poses are asked for by it, until those so far determine the devices
+    reach: PoseLimits
+    seed: int = 0  # of the poses from which one is chosen
 
 
-def record_board(
-    recording: Recording, stage: Stage, operator: Operator, guide: BoardGuide, plan: BoardPlan, say: Say, show: Show
-) -> list[str]:
+class Outcome(NamedTuple):
+    """What came of a pose that was held."""
+
+    kept: bool
+    text: str
+
+
+def record_board(recording: Recording, stage: Stage, operator: Operator, plan: BoardPlan, say: Say, show: Show) -> list[str]:
     """Record poses until there are enough, or the operator ends; returns their names. Each is kept as soon as it is whole.
 
-    Poses that the capture has already are shown to the guide first.
+    Poses that the capture has already count for those that are asked for.
     """
-    names: list[str] = []
-    darker = plan.exposing.model_copy(update={"level": HEADROOM * plan.exposing.level})
-    session = StillSession(stage, darker, plan.limits, say, show)
+    recording.check_board(plan.board, plan.patterns)
+    rng = np.random.default_rng(plan.seed)
+    guide = new_guide(plan.rig, stage.cameras, stage.projector.size, plan.board, plan.patterns, plan.reach, rng)
     if recording.contents.board is not None:
-        captured = read_board(recording.folder)
-        for number in range(len(captured.poses)):
-            guide.accept(captured.pose(number).lit)
+        guide.read(read_board(recording.folder), say)
+    darker = plan.exposing.model_copy(update={"level": HEADROOM * plan.exposing.level})
+    session = StillSession(stage, darker, plan.limits, say, show, frame_checks.light_faults, guide.over)
+    names: list[str] = []
     operator.ask(guide.suggest())
     while len(names) < plan.poses:
         lit = session.look()
@@ -59,40 +71,41 @@ def record_board(
             continue
         if not names:
             lit = session.expose()
-        reason = _recorded(recording, session, guide, plan, lit, names)
-        say(reason or f"pose {names[-1]}, {len(names)} of {plan.poses}")
+        name = recording.next_pose
+        outcome = _held(recording, session, guide, plan, lit, answer == "keep")
+        names += [name] if outcome.kept else []
+        say(f"pose {name}, {len(names)} of {plan.poses}, {outcome.text}" if outcome.kept else outcome.text)
         if len(names) < plan.poses:
-            operator.ask(guide.suggest())
+            operator.ask(guide.suggest() if outcome.kept else guide.insist())
     return names
 
 
-def _recorded(
-    recording: Recording, session: StillSession, guide: BoardGuide, plan: BoardPlan, lit: Mapping[str, NDArray], names: list[str]
-) -> str:
-    """Take one pose; returns why it isn't kept, or nothing."""
-    if faults := session.faults(lit):
-        return f"not kept: {sentence(faults)}"
-    verdict = guide.judge(lit)
-    if not verdict.accepted:
-        return f"not kept: {verdict.text}"
-    fringes, faults = session.sequence(plan.shown, [FRINGE_CAMERA])
+def _held(
+    recording: Recording, session: StillSession, guide: BoardGuide, plan: BoardPlan, lit: Mapping[str, NDArray], whatever: bool
+) -> Outcome:
+    """Take a pose that is held, and keep it if nothing is wrong with it, or whatever is wrong if camera 1 can place it."""
+    name = recording.next_pose
+    sighting, faults = guide.sight(name, lit), session.faults(lit)
+    verdict = guide.judge_lit(sighting, lit)
+    reason = sentence(faults) or ("" if verdict.accepted else verdict.reason)
+    if held(sighting, guide.so_far) is None:
+        return Outcome(False, f"not kept: {reason}")
+    if reason and not whatever:
+        return _refused(reason)
+    fringes, unlit = session.sequence(plan.shown, [FRINGE_CAMERA])
     bits = session.stage.cameras[FRINGE_CAMERA].bits
     contrast = frame_checks.contrast(fringes[FRINGE_CAMERA], plan.patterns, bits, plan.limits)
-    if faults := [*faults, *frame_checks.fringe_faults(contrast, plan.limits)]:
-        return f"not kept: {sentence(faults)}"
-    after = session.look()
-    moved = moved_px(lit[FRINGE_CAMERA], after[FRINGE_CAMERA], plan.board, 2**bits - 1)
-    if not moved <= HELD_PX:
-        return f"not kept: the board moved by {moved:.1f} px under the fringes; put it down, or lean it against something"
-    names.append(recording.add_pose(lit, fringes, plan.board, plan.patterns, session.devices(plan.patterns.projector_size)))
-    guide.accept(lit)
-    return ""
+    again = guide.sight(name, session.look())
+    sighting = guide.decode(sighting, lit, fringes[FRINGE_CAMERA])
+    verdict = guide.judge(sighting, lit, again)
+    faults = [*unlit, *frame_checks.fringe_faults(contrast, plan.limits)]
+    reason = reason or sentence(faults) or ("" if verdict.accepted else verdict.reason)
+    if reason and not whatever:
+        return _refused(reason)
+    recording.add_pose(lit, fringes, plan.board, plan.patterns, session.devices(plan.patterns.projector_size))
+    guide.accept(sighting, verdict)
+    return Outcome(True, f"kept though {reason}" if reason else verdict.reason)
 
 
-def moved_px(before: NDArray, after: NDArray, board: Board, full: float) -> float:
-    """Mean displacement of the board's points between two images : (h, w); infinite if the board is gone."""
-    try:
-        first, second = (detect(image, board, full=full).pixels for image in (before, after))
-    except BoardNotFound:
-        return np.inf
-    return float(np.linalg.norm(np.nanmean(second - first, axis=0)))
+def _refused(reason: str) -> Outcome:
+    return Outcome(False, f"not kept: {reason} (k takes the board as it is held, and keeps the pose)")

@@ -119,6 +119,20 @@ def _contrast(modulation: NDArray[np.float32], saturated: NDArray[np.bool_], bit
 
 def frame_faults(found: Look, limits: Limits) -> list[str]:
     """Faults of a frame, each with the way to mend it; none of a good one."""
+    faults = light_faults(found, limits)
+    if found.level < limits.least_level:
+        return faults
+    if found.focus_px > limits.most_blur_px:
+        faults.append(f"blurred: edges {found.focus_px:.1f} px wide in all directions; focus the lens, or come into its range")
+    elif found.motion_px > limits.most_blur_px:
+        faults.append(
+            f"blurred: smeared by {found.motion_px:.1f} px in one direction; hold still, or expose shorter under more light"
+        )
+    return faults
+
+
+def light_faults(found: Look, limits: Limits) -> list[str]:
+    """Faults of a frame's brightness, each with the way to mend it."""
     faults = []
     if found.saturated > limits.saturated:
         faults.append(f"saturated: {100 * found.saturated:.1f} % of the pixels; halve the exposure, or turn glossy things aside")
@@ -126,12 +140,6 @@ def frame_faults(found: Look, limits: Limits) -> list[str]:
         times = 0.8 / max(found.level, 0.01)
         faults.append(
             f"dark: brightest {100 * found.level:.0f} % of full scale; expose {times:.1f} times as long, or open the lens"
-        )
-    elif found.focus_px > limits.most_blur_px:
-        faults.append(f"blurred: edges {found.focus_px:.1f} px wide in all directions; focus the lens, or come into its range")
-    elif found.motion_px > limits.most_blur_px:
-        faults.append(
-            f"blurred: smeared by {found.motion_px:.1f} px in one direction; hold still, or expose shorter under more light"
         )
     return faults
 

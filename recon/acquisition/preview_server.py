@@ -14,8 +14,9 @@ from importlib.resources import files
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from recon.acquisition.pictures import Picture
+from recon.acquisition.pictures import Over, Picture
 from recon.errors import InputError
 
 LOOPBACK = "127.0.0.1"
@@ -23,6 +24,7 @@ MOST_SIDE_PX = 640  # of an image on the page
 MOST_VISITORS = 8  # at once
 PATIENCE_S = 5.0  # with a visitor who says nothing
 SAID = 20  # last lines that are shown
+ASKED, THERE = (0, 220, 255), (110, 220, 90)  # BGR, of the outline of a place, and of one that is reached
 
 
 class Preview:
@@ -49,12 +51,13 @@ class Preview:
         with self._lock:
             pictures, said = list(self._pictures.values()), list(self._said)
         devices = [
-            {"name": one.device, "number": number, "text": one.text, "faults": list(one.faults)} for number, one in pictures
+            {"name": one.device, "number": number, "text": one.text, "faults": list(one.faults), "way": _way(one)}
+            for number, one in pictures
         ]
         return {"devices": devices, "said": said}
 
     def jpeg(self, device: str) -> bytes | None:
-        """A device's latest image, smaller; pixels at full scale are red. None if there is none."""
+        """A device's latest image, smaller; pixels at full scale are red, and the outline is drawn. None without one."""
         with self._lock:
             _, picture = self._pictures.get(device, (0, None))
         if picture is None:
@@ -64,7 +67,21 @@ class Preview:
         grey = picture.image[::step, ::step]
         shown = cv2.cvtColor(np.uint8(grey.astype(np.float32) * (255 / full)), cv2.COLOR_GRAY2BGR)
         shown[grey >= full] = (0, 0, 255)
+        if picture.over is not None:
+            _draw(shown, picture.over, step)
         return cv2.imencode(".jpg", shown)[1].tobytes()
+
+
+def _way(picture: Picture) -> str:
+    return "" if picture.over is None else picture.over.words
+
+
+def _draw(shown: NDArray[np.uint8], over: Over, step: int) -> None:
+    """Draw what lies over an image : (h, w, 3), of which each `step`th pixel is shown."""
+    line, first = (np.rint(at / step).astype(np.int32) for at in (over.outline, over.first))
+    colour = THERE if over.there else ASKED
+    cv2.polylines(shown, [line], isClosed=True, color=colour, thickness=2, lineType=cv2.LINE_AA)
+    cv2.circle(shown, (int(first[0]), int(first[1])), 5, colour, -1, cv2.LINE_AA)
 
 
 class _Handler(BaseHTTPRequestHandler):

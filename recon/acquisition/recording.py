@@ -111,6 +111,23 @@ class Recording:
         InputError
             If the poses before it show another board or other patterns.
         """
+        self.check_board(board, patterns)
+        before = self._manifest.board
+        poses = before.poses if before else ()
+        name = self.next_pose
+        shutil.rmtree(self.folder / BOARD / name, ignore_errors=True)  # of a pose that was never entered
+        pose = writer.write_pose(self.folder, name, lit, fringes)
+        self._enter(BOARD, BoardPart(board=board, patterns=patterns, poses=(*poses, pose)), devices)
+        return name
+
+    @property
+    def next_pose(self) -> str:
+        """Name of the next pose of a board."""
+        poses = self._manifest.board.poses if self._manifest.board else ()
+        return f"{max((int(pose.name) for pose in poses if pose.name.isdecimal()), default=-1) + 1:02d}"
+
+    def check_board(self, board: Board, patterns: Patterns | None) -> None:
+        """Check that the poses so far show this board under these patterns; InputError else."""
         before = self._manifest.board
         for field, there, given in (
             ("board", before and before.board, board),
@@ -119,12 +136,6 @@ class Recording:
             if before is not None and there != given:
                 path = self.folder / manifest.MANIFEST
                 raise InputError(f"{path}: board.{field}: expected the same as given, found another; give another out=FOLDER")
-        poses = before.poses if before else ()
-        name = f"{max((int(pose.name) for pose in poses if pose.name.isdecimal()), default=-1) + 1:02d}"
-        shutil.rmtree(self.folder / BOARD / name, ignore_errors=True)  # of a pose that was never entered
-        pose = writer.write_pose(self.folder, name, lit, fringes)
-        self._enter(BOARD, BoardPart(board=board, patterns=patterns, poses=(*poses, pose)), devices)
-        return name
 
     @contextmanager
     def sweep(self, name: str, purpose: Purpose | None, devices: Mapping[str, Device]) -> Iterator["GrowingSweep"]:

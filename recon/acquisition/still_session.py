@@ -1,6 +1,6 @@
 """What recordings of things at rest share: looks at what is lit, sequences, exposures, and the cameras as they are set."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from recon.acquisition import frame_checks
 from recon.acquisition.exposure_setting import Exposing, set_exposure
-from recon.acquisition.frame_checks import Limits
-from recon.acquisition.pictures import Picture, Say, Show
+from recon.acquisition.frame_checks import Limits, Look
+from recon.acquisition.pictures import Over, Picture, Say, Show, bare
 from recon.capture.manifest import Device
 from recon.devices.interfaces import Camera, Frame, Size
 from recon.devices.pattern_player import Pattern, Stage, play, take
@@ -25,6 +25,8 @@ class StillSession:
     limits: Limits
     say: Say
     show: Show
+    judged: Callable[[Look, Limits], list[str]] = frame_checks.frame_faults  # faults of a frame
+    over: Callable[[str, NDArray], Over | None] = bare  # of a camera's image under even light
     _exposures: dict[str, float] = field(default_factory=dict)  # s, by camera
 
     def look(self) -> dict[str, NDArray]:
@@ -53,7 +55,7 @@ class StillSession:
         return [
             f"{name} {fault}"
             for name, image in images.items()
-            for fault in frame_checks.frame_faults(frame_checks.look(image, self.stage.cameras[name].bits), self.limits)
+            for fault in self.judged(frame_checks.look(image, self.stage.cameras[name].bits), self.limits)
         ]
 
     def seen(self, frames: Mapping[str, Frame]) -> None:
@@ -61,8 +63,8 @@ class StillSession:
         for name, frame in frames.items():
             bits = self.stage.cameras[name].bits
             found = frame_checks.look(frame.image, bits)
-            faults = frame_checks.frame_faults(found, self.limits)
-            self.show(Picture(name, frame.image, bits, found.text, tuple(faults)))
+            faults = self.judged(found, self.limits)
+            self.show(Picture(name, frame.image, bits, found.text, tuple(faults), self.over(name, frame.image)))
 
     def sequence(self, patterns: Iterable[Pattern], names: Sequence[str]) -> tuple[dict[str, NDArray], list[str]]:
         """Take a sequence with some of the cameras : camera -> (n, h, w), and name the faults of its light, a line each.

@@ -33,7 +33,7 @@ class SurfacePlan:
 def record_surface(recording: Recording, stage: Stage, operator: Operator, plan: SurfacePlan, say: Say, show: Show) -> bool:
     """Record the sequence when the operator is ready; returns whether it was kept.
 
-    A sequence with faults is kept only if the operator then ends rather than takes it again.
+    A sequence with faults is kept only if the operator then keeps it, or ends, rather than takes it again.
     """
     session = StillSession(stage, plan.exposing, plan.limits, say, show)
     operator.ask(Step("lay down what is to be measured, in the projector's light, and let nothing move"))
@@ -43,7 +43,7 @@ def record_surface(recording: Recording, stage: Stage, operator: Operator, plan:
         answer = operator.answer()
         if answer == "wait":
             continue
-        if answer == "end":
+        if answer in ("end", "keep"):
             break
         lit = session.expose()
         taken, unlit = session.sequence(plan.shown, list(stage.cameras))

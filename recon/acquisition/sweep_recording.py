@@ -162,7 +162,7 @@ def _rehearsed(pairs: PairSource | None, scanner: Scanner | None, operator: Oper
     """Show what the devices see until the operator is ready; whether it is to be recorded then."""
     answer = operator.answer()
     if answer != "wait":
-        return answer == "take"
+        return answer != "end"
     if pairs is not None:
         pairs.start(*plan.triggers)
     while answer == "wait":
@@ -175,7 +175,7 @@ def _rehearsed(pairs: PairSource | None, scanner: Scanner | None, operator: Oper
         answer = operator.answer()
     if pairs is not None:
         pairs.stop()
-    return answer == "take"
+    return answer != "end"
 
 
 def _follow(streams: Sequence[FrameStream], operator: Operator, plan: SweepPlan, shown: _Shown) -> None:

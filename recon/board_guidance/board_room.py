@@ -3,15 +3,17 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
 from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry.camera import Camera
 from recon.model.boards import AsymmetricCircles, Board, Charuco, Chessboard, SymmetricCircles
-from recon.model.rig import Lens, Optics, Rig
+from recon.model.rig import Lens, NotNegative, Optics, Part, Positive, Rig
 
 Array = NDArray[np.float64]
 
@@ -26,23 +28,52 @@ BATCH, BATCHES = 1000, 20  # places drawn at once, and times at most
 STEPS = 8  # points a side of an outline: lenses bend it
 
 
+def _near_to_far(depths: tuple[float, float]) -> tuple[float, float]:
+    if depths[0] >= depths[1]:
+        raise ValueError(f"expected the nearest depth, then a farther one, found {depths[0]:g} and {depths[1]:g}")
+    return depths
+
+
+Depths = Annotated[tuple[Positive, Positive], AfterValidator(_near_to_far)]  # nearest and farthest, mm
+Angle = Annotated[float, Field(ge=0, lt=90)]
+
+
+class PoseLimits(Part):
+    """Limits of poses, as a person gives them."""
+
+    depth_mm: Depths | None = None  # z of the board's middle; those at which all lenses are sharp enough if not given
+    volume_mm: Depths | None = None  # z of the volume that is measured later, where points count; in focus if not given
+    tilt_deg: Angle = 40.0  # largest angle between the board's normal and camera 1's axis
+    oblique_deg: Angle = 60.0  # largest angle between the board's normal and the view of any device
+    margin_px: NotNegative = 10.0  # that the board keeps from every image's border
+
+
 @dataclass(frozen=True)
 class Reach:
-    """Limits of poses that a person may be asked for."""
+    """Limits of poses that a person may be asked for; see `PoseLimits`."""
 
-    depth_mm: tuple[float, float]  # nearest and farthest z of the board's middle
-    volume_mm: tuple[float, float]  # nearest and farthest z of the volume that is measured later, where points count
-    tilt_deg: float = 40.0  # largest angle between the board's normal and camera 1's axis
-    oblique_deg: float = 60.0  # largest angle between the board's normal and the view of any device
-    margin_px: float = 10.0  # that the board keeps from every image's border
-
-
-def reach_of(rig: Rig) -> Reach:
-    """The limits that a rig's lenses set: depths at which all of them are sharp enough."""
-    return Reach(depth_mm=_sharp_depths(rig, BLUR_PX), volume_mm=_sharp_depths(rig, SHARP_PX))
+    depth_mm: tuple[float, float]
+    volume_mm: tuple[float, float]
+    tilt_deg: float
+    oblique_deg: float
+    margin_px: float
 
 
-def _sharp_depths(rig: Rig, blur_px: Mapping[str, float]) -> tuple[float, float]:
+def reach_of(rig: Rig, limits: PoseLimits | None = None) -> Reach:
+    """The limits that are given, and where none are those that a rig's lenses set: depths at which all of them are sharp enough.
+
+    Raises
+    ------
+    InputError
+        If a depth isn't given, and there is none at which all lenses are sharp.
+    """
+    limits = limits or PoseLimits()
+    depth = limits.depth_mm or _sharp_depths(rig, BLUR_PX, "depth_mm")
+    volume = limits.volume_mm or _sharp_depths(rig, SHARP_PX, "volume_mm")
+    return Reach(depth, volume, limits.tilt_deg, limits.oblique_deg, limits.margin_px)
+
+
+def _sharp_depths(rig: Rig, blur_px: Mapping[str, float], field: str) -> tuple[float, float]:
     """Nearest and farthest distance, mm, at which no device's discs of confusion are larger than those given.
 
     A thin lens of aperture A and focal length f px makes discs of `A f |1/z - 1/focus|` px.
@@ -60,7 +91,7 @@ def _sharp_depths(rig: Rig, blur_px: Mapping[str, float]) -> tuple[float, float]
     if nearest >= farthest:
         raise InputError(
             f"rig: expected a depth at which all lenses are sharp, found none (focus_mm {rig.cam1.lens.focus_mm:g}, "
-            f"{rig.cam2.lens.focus_mm:g}, projector {rig.projector.lens.focus_mm:g}); correct these, or give depth_mm"
+            f"{rig.cam2.lens.focus_mm:g}, projector {rig.projector.lens.focus_mm:g}); correct these, or give reach.{field}"
         )
     return float(nearest), float(farthest)
 
@@ -137,7 +168,7 @@ def candidates(board: Board, cameras: Mapping[str, Camera], reach: Reach, count:
         near, far = reach.depth_mm
         raise InputError(
             f"board: expected room for it in the views of {', '.join(cameras)} between {near:.0f} and {far:.0f} mm, found none: "
-            "a smaller board, other depths (depth_mm), or devices that are turned to each other"
+            "a smaller board, other depths (reach.depth_mm), or devices that are turned to each other"
         )
     return np.concatenate(found)[:count]
 

@@ -1,6 +1,6 @@
 """Where to hold the calibration board next: the pose, of many that are possible, that lowers the errors of points most."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +53,7 @@ def suggest(
     reach : Reach, optional
         Limits of the pose; those of the rig's lenses if not given.
     noise : device -> px
-        Of a sighting of a point in u and v.
+        Of a sighting of a point in u and v, of each device that is to be calibrated.
 
     Raises
     ------
@@ -76,16 +76,17 @@ def knowledge(
 ) -> Knowledge:
     """Knowledge of the devices' parameters so far; see `suggest`."""
     points = board.points()
-    cameras = described(rig) if calibration is None else calibration.cameras
+    cameras = described(rig, noise) if calibration is None else calibration.cameras
     each = {device: noise[device] * np.sqrt(len(few(points)) / len(points)) for device in cameras}
     if calibration is None:
         return pose_information.of_rig(cameras, each, np.reshape(poses, (-1, 4, 4)), few(points), reach.volume_mm)
     return pose_information.of_calibration(calibration, each, reach.volume_mm)
 
 
-def described(rig: Rig) -> dict[str, Camera]:
-    """The devices as the rig's description has them."""
-    return {"cam1": rig.cam1.optics.camera(), "cam2": rig.cam2.optics.camera(), "projector": rig.projector.optics.camera()}
+def described(rig: Rig, names: Collection[str]) -> dict[str, Camera]:
+    """The devices of these names as the rig's description has them, camera 1 first."""
+    optics = {"cam1": rig.cam1.optics, "cam2": rig.cam2.optics, "projector": rig.projector.optics}
+    return {name: one.camera() for name, one in optics.items() if name in names}
 
 
 def _unlike(choice: Array, poses: Array, board: Board) -> Array:

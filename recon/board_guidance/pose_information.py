@@ -95,7 +95,7 @@ def _forms(cameras: Mapping[str, Camera], free: Free, depths: tuple[float, float
         near, far = depths
         raise InputError(
             f"rig: expected views of {', '.join(cameras)} that overlap between {near:.0f} and {far:.0f} mm, found hardly any "
-            "point that all see: is the rig described as it stands (rig=NAME), or volume_mm another one?"
+            "point that all see: is the rig described as it stands (rig=NAME), or reach.volume_mm another one?"
         ) from None
     first, *others = cameras
     return np.concatenate([uncertainty.mean_squares(known, first, second, volume) for second in others])

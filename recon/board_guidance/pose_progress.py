@@ -35,18 +35,18 @@ class SoFar:
     sightings: tuple[Sighting, ...] = ()
     calibration: Calibration | None = None  # with its covariance; None until the poses determine all devices
     poses: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (p, 4, 4) world_from_board, by it or by the description
-    noise: Mapping[str, float] = field(default_factory=lambda: dict(NOISE_PX))  # px, of a sighting in u and v, by device
+    noise: Mapping[str, float] = field(default_factory=lambda: dict(NOISE_PX))  # px, of a sighting in u and v, of each device
     misfit: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (p, d) median residual of each pose over the noise
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
         """The devices as far as they are known."""
-        return described(self.rig) if self.calibration is None else self.calibration.cameras
+        return described(self.rig, self.noise) if self.calibration is None else self.calibration.cameras
 
     @property
     def sizes(self) -> dict[str, Size]:
         """Image sizes of the devices."""
-        return {name: camera.size for name, camera in described(self.rig).items()}
+        return {name: camera.size for name, camera in self.cameras.items()}
 
 
 def with_sighting(so_far: SoFar, sighting: Sighting) -> SoFar:

@@ -1,7 +1,11 @@
-"""Whether a pose of the board is worth keeping, and if not, the reason and the way on."""
+"""Whether a pose of the board is worth keeping, and if not, the reason and the way on.
+
+`judge_lit` says what can be said by the cameras' images alone, before a projector's sequence is taken; `judge` says all.
+"""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +15,7 @@ from recon.board_guidance.board_room import ALIKE_DEG, ALIKE_MM, Reach, apart, c
 from recon.board_guidance.next_pose import CANDIDATES, few, knowledge
 from recon.board_guidance.pose_progress import BAD_POSE, SoFar, held, with_sighting
 from recon.geometry.camera import Array
+from recon.optical_calibration.observations import PROJECTOR
 from recon.optical_calibration.sightings import Sighting
 
 LEAST_SHARE = 0.7  # of what the asked pose would add; an earlier pose once more adds half of it, by averaging noise
@@ -25,7 +30,7 @@ class Observation:
 
     sighting: Sighting
     lit: Mapping[str, NDArray] = field(default_factory=dict)  # camera: (h, w), the images that it was found in
-    again: Mapping[str, Array] = field(default_factory=dict)  # camera: (n, 2) px, found once more after the last frame
+    again: Mapping[str, Array] = field(default_factory=dict)  # camera: (n, 2) px, once more after the last frame; NaN: not found
     asked_gain: float | None = None  # of the pose that was asked for; that of the best of many if none was
 
 
@@ -46,45 +51,67 @@ def judge(observation: Observation, so_far: SoFar, reach: Reach | None = None) -
 
     reach : the limits, of which the volume counts here; those of the rig's lenses if not given.
     """
-    fault = next(_faults(observation, so_far), None)
-    pose = held(observation.sighting, so_far)
+    faults = chain(_camera_faults(observation, so_far), _later_faults(observation, so_far))
+    verdict = _by_faults_and_gain(observation, so_far, reach, faults)
+    if not verdict.accepted:
+        return verdict
+    extended = with_sighting(so_far, observation.sighting)
+    if disagreeing := _disagreement(so_far, extended):
+        return Verdict(False, disagreeing, verdict.gain, so_far)
+    return replace(verdict, so_far=extended)
+
+
+def judge_lit(observation: Observation, so_far: SoFar, reach: Reach | None = None) -> Verdict:
+    """Judge a pose by the cameras' images alone: all cameras must see the board, sharp, and it must add to the poses so far.
+
+    The projector counts as one that will see what lies in its light. A pose that is accepted isn't part of `so_far` yet.
+    """
+    return _by_faults_and_gain(observation, so_far, reach, _camera_faults(observation, so_far))
+
+
+def _by_faults_and_gain(observation: Observation, so_far: SoFar, reach: Reach | None, faults: Iterator[str]) -> Verdict:
+    """Refuse a pose by the gravest fault, or if it adds little; one that is accepted isn't part of `so_far` yet."""
+    pose, fault = held(observation.sighting, so_far), next(faults, None)
     if pose is None:
         return Verdict(False, fault or "cam1: the board has no place; show all of it to camera 1", 0.0, so_far)
     reach = reach or reach_of(so_far.rig)
     gain = _gains(pose[None], so_far, reach)[0]
-    if fault:
-        return Verdict(False, fault, gain, so_far)
-    if alike := _too_alike(pose, so_far, gain, observation.asked_gain, reach):
-        return Verdict(False, alike, gain, so_far)
-    extended = with_sighting(so_far, observation.sighting)
-    if disagreeing := _disagreement(so_far, extended):
-        return Verdict(False, disagreeing, gain, so_far)
-    return Verdict(True, f"adds {100 * gain:.1f} %", gain, extended)
+    if refusal := fault or _too_alike(pose, so_far, gain, observation.asked_gain, reach):
+        return Verdict(False, refusal, gain, so_far)
+    return Verdict(True, f"adds {100 * gain:.1f} %", gain, so_far)
 
 
-def _faults(observation: Observation, so_far: SoFar) -> Iterator[str]:
-    """What is wrong with the images, the gravest first."""
+def _camera_faults(observation: Observation, so_far: SoFar) -> Iterator[str]:
+    """What is wrong with the cameras' images, the gravest first."""
     sighting = observation.sighting
-    for device in so_far.sizes:
-        if device not in sighting.pixels:
-            reason = sighting.failures.get(device)
-            yield f"{device}: board not found{f': {reason}' if reason else ''}; {_way_in(device)}"
+    yield from (_not_found(device, sighting) for device in so_far.sizes if device != PROJECTOR and device not in sighting.pixels)
     for device, image in observation.lit.items():
         found = blur(image, sighting.pixels[device])
         if found.most > SMEARED[0] * found.least + SMEARED[1]:
             yield f"{device}: smeared by {found.most:.1f} px: the board moved during the exposure; rest it, or expose shorter"
         elif found.most > BLURRED_PX:
             yield f"{device}: blurred by {found.most:.1f} px: out of focus; hold it nearer to the middle distance, or focus"
+
+
+def _later_faults(observation: Observation, so_far: SoFar) -> Iterator[str]:
+    """What went wrong from the first frame to the last, the gravest first."""
+    sighting = observation.sighting
+    if PROJECTOR in so_far.sizes and PROJECTOR not in sighting.pixels:
+        yield _not_found(PROJECTOR, sighting)
     for device, pixels in observation.again.items():
-        moved = float(np.nanmedian(np.linalg.norm(pixels - sighting.pixels[device], axis=1)))
-        if moved > MOVED_PX:
+        away = np.linalg.norm(pixels - sighting.pixels[device], axis=1)
+        if np.isnan(away).all():
+            yield f"{device}: the board was out of sight after the last frame; rest it on something, until all is taken"
+        elif (moved := float(np.nanmedian(away))) > MOVED_PX:
             yield f"{device}: the board moved by {moved:.2f} px between the first frame and the last; rest it on something"
 
 
-def _way_in(device: str) -> str:
-    if device == "projector":
-        return "hold it so that all of it lies in the projector's light, and nothing shades it"
-    return f"hold it so that {device} sees all of it, evenly lit"
+def _not_found(device: str, sighting: Sighting) -> str:
+    reason = sighting.failures.get(device)
+    way = f"hold it so that {device} sees all of it, evenly lit"
+    if device == PROJECTOR:
+        way = "hold it so that all of it lies in the projector's light, and nothing shades it"
+    return f"{device}: board not found{f': {reason}' if reason else ''}; {way}"
 
 
 def _gains(poses: Array, so_far: SoFar, reach: Reach) -> list[float]:

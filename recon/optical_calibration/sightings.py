@@ -89,19 +89,32 @@ def sight(
     pixels = {camera: detection.pixels for camera, detection in found.items()}
     covariance = {camera: detection.covariance for camera, detection in found.items()}
     radii = {camera: detection.radii for camera, detection in found.items() if detection.radii is not None}
-    gradient = np.zeros((len(board.points()), 2, 2))
-    if fringes is not None and patterns is not None and FIRST in found:
-        try:
-            centres, reach = found[FIRST].pixels, _reach(found[FIRST], board)
-            rows, columns = _around(centres, reach, patterns, lit[FIRST].shape)
-            projector_map = decode(fringes[:, rows, columns], patterns, bits=bits[FIRST], name=f"{name}: fringes")
-            corner = np.array([columns.start, rows.start])
-            seen = correspondences(projector_map, lit[FIRST][rows, columns], centres - corner, reach)
-            pixels[PROJECTOR], covariance[PROJECTOR], gradient = seen.pixels, seen.covariance, seen.gradient
-        except InputError as reason:
-            cause = Cause.CODE_OUTSIDE if isinstance(reason, CodeOutside) else Cause.UNDECODED
-            failures[PROJECTOR] = Failure(cause, str(reason))
-    return without_scraps(Sighting(name, pixels, covariance, gradient, radii, failures))
+    sighting = Sighting(name, pixels, covariance, np.zeros((len(board.points()), 2, 2)), radii, failures)
+    if fringes is None or patterns is None or FIRST not in lit:
+        return without_scraps(sighting)
+    return with_projector(sighting, board, lit[FIRST], fringes, patterns, bits[FIRST])
+
+
+def with_projector(sighting: Sighting, board: Board, lit: Image, fringes: Image, patterns: Patterns, bits: int) -> Sighting:
+    """The sighting with the projector's of the points that camera 1 sees, or the reason why its fringes can't be decoded.
+
+    lit, fringes : (h, w) and (n, h, w) of camera 1; see `sight`
+    """
+    if FIRST not in sighting.pixels:
+        return without_scraps(sighting)
+    try:
+        centres, reach = sighting.pixels[FIRST], _reach(sighting, board)
+        rows, columns = _around(centres, reach, patterns, lit.shape)
+        projector_map = decode(fringes[:, rows, columns], patterns, bits=bits, name=f"{sighting.name}: fringes")
+        corner = np.array([columns.start, rows.start])
+        seen = correspondences(projector_map, lit[rows, columns], centres - corner, reach)
+    except InputError as reason:
+        cause = Cause.CODE_OUTSIDE if isinstance(reason, CodeOutside) else Cause.UNDECODED
+        return without_scraps(replace(sighting, failures={**sighting.failures, PROJECTOR: Failure(cause, str(reason))}))
+    pixels, covariance = (
+        {**own, PROJECTOR: its} for own, its in ((sighting.pixels, seen.pixels), (sighting.covariance, seen.covariance))
+    )
+    return without_scraps(replace(sighting, pixels=pixels, covariance=covariance, gradient=seen.gradient))
 
 
 def without_scraps(sighting: Sighting) -> Sighting:
@@ -158,11 +171,11 @@ def _around(centres: Array, reach: Array, patterns: Patterns, shape: tuple[int, 
     return slice(top, bottom), slice(left, right)
 
 
-def _reach(detection: Detection, board: Board) -> Array:
-    """Radius of the window : (n,) px, in which the fringes around each point are looked at."""
-    if detection.radii is not None:
-        return np.nan_to_num(DISC_REACH * detection.radii.max(axis=1), nan=1.0)
-    points, pixels = board.points()[:, :2], detection.pixels
+def _reach(sighting: Sighting, board: Board) -> Array:
+    """Radius of the window : (n,) px of camera 1, in which the fringes around each point are looked at."""
+    if FIRST in sighting.radii:
+        return np.nan_to_num(DISC_REACH * sighting.radii[FIRST].max(axis=1), nan=1.0)
+    points, pixels = board.points()[:, :2], sighting.pixels[FIRST]
     known = np.isfinite(pixels[:, 0])
     magnified = np.sqrt(np.linalg.det(np.cov(pixels[known].T)) / np.linalg.det(np.cov(points[known].T)))  # (px / mm)^2
     step = np.linalg.norm(points[1] - points[0])

@@ -1,10 +1,10 @@
 """Record a part of a capture from devices: the calibration board pose by pose, a surface under fringes, a freehand sweep.
 
 Guides at the terminal, and shows in a browser, at the address that it prints, what each device sees: exposure, saturation,
-focus, fringes, whether the target is found, what is wrong and how to mend it. OUT is a capture folder, a new one or one that
-grows: poses are added to those that are there, sweeps have names, a new surface takes the place of the old one. All that was
-recorded is on the disk at once and whole, whether the command is ended by Ctrl-C, by the system or by a lost cable; give it again
-to go on.
+focus, fringes, whether the target is found, what is wrong and how to mend it. Each next pose of the board is asked for where it
+adds most to those so far, and its outline is shown over camera 1's image. OUT is a capture folder, a new one or one that grows:
+poses are added to those that are there, sweeps have names, a new surface takes the place of the old one. All that was recorded is
+on the disk at once and whole, whether the command is ended by Ctrl-C, by the system or by a lost cable; give it again to go on.
 
 `devices=virtual` has the twin stand in for every device, and for the person: `scene`, `path` and the other fields at the end of
 conf/record.yaml say what is before them. It takes as long as rendering takes: ten seconds a sequence and pose, a second a pair of
@@ -27,7 +27,7 @@ from recon.acquisition import preview_server
 from recon.acquisition.board_recording import BoardPlan, record_board
 from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
-from recon.acquisition.guidance import EvenGuide, Operator
+from recon.acquisition.guidance import Operator
 from recon.acquisition.pictures import Say, Show, hidden
 from recon.acquisition.recording import Recording, open_recording
 from recon.acquisition.still_session import as_set
@@ -35,6 +35,7 @@ from recon.acquisition.surface_recording import SurfacePlan, record_surface
 from recon.acquisition.sweep_recording import SweepPlan, record_sweep
 from recon.acquisition.target_checks import target_judge
 from recon.artwork import projected_images
+from recon.board_guidance.board_room import PoseLimits
 from recon.capture.board_part import FRINGE_CAMERA
 from recon.capture.manifest import SCANNER, Device, Purpose, SweepNameOrNone, axes_not_encoded, sweep_part
 from recon.devices.interfaces import Trigger
@@ -90,6 +91,7 @@ class Config(Part):
     probe: Path | None
     board: Board
     count: Annotated[int, Field(ge=1, le=1000)]
+    reach: PoseLimits
     name: SweepNameOrNone
     purpose: Purpose | None
     seconds: Positive | None
@@ -164,9 +166,8 @@ def still(config: Config, recording: Recording, console: Console, say: Say, show
             kept = record_surface(recording, stage, operator, plan, say, show)
             say(f"kept {config.patterns.count} images of {' and '.join(opened.cameras)}" if kept else "nothing kept")
         else:
-            guide = EvenGuide(config.board, 2 ** opened.cameras[FRINGE_CAMERA].bits - 1)
-            plan = BoardPlan(config.board, config.patterns, patterns, config.count, config.exposing, config.limits)
-            names = record_board(recording, stage, operator, guide, plan, say, show)
+            fields = {name: getattr(config, name) for name in ("board", "patterns", "exposing", "limits", "rig", "reach", "seed")}
+            names = record_board(recording, stage, operator, BoardPlan(shown=patterns, poses=config.count, **fields), say, show)
             say(f"kept {len(names)} poses")
 
 

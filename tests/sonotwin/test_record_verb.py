@@ -66,6 +66,7 @@ def test_the_laboratorys_choice_is_valid():
         (["part=board", "patterns=paper_calibration", "cameras=[cam2]"], "cameras: expected cam1"),
         (["part=film"], "part: expected"),
         (["devices.kind=other"], "devices.kind: expected one of"),
+        (["reach.depth_mm=[700,600]"], "reach.depth_mm: expected the nearest depth, then a farther one, found 700 and 600"),
         (["exposing.level=2"], "exposing.level: expected less than 1"),
         (["scene=board", "scene.kind=nothing"], "scene: kind: expected one of"),
         (["calibration=missing.yaml", "scene=plane"], "missing.yaml"),
@@ -86,11 +87,11 @@ def test_other_files_are_left_alone(tmp_path, capsys):
 
 
 def test_the_terminal_is_read_while_cameras_go_on(monkeypatch):
-    monkeypatch.setattr(sys, "stdin", StringIO("\n\ne\n\n"))
+    monkeypatch.setattr(sys, "stdin", StringIO("\n\nk\ne\n\n"))
     shown = StringIO()
     operator = TerminalOperator(Console(file=shown, soft_wrap=True))
     operator.ask(Step("hold the board in the middle"))
     answers = []
-    while len(answers) < 4:
+    while len(answers) < 5:
         answers += [answer] if (answer := operator.answer()) != "wait" else []
-    assert answers == ["take", "take", "end", "end"] and "hold the board" in shown.getvalue()
+    assert answers == ["take", "take", "keep", "end", "end"] and "hold the board" in shown.getvalue()

@@ -1,30 +1,26 @@
 """The hand before the virtual devices: it does at once what it is asked for."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from recon.acquisition.guidance import Answer, Step
 from recon.geometry import rigid
 
 
 class BoardHand:
-    """Holds the board as it is asked to, or in the next of some poses where no place is given; ends after the last of these."""
+    """Holds the board where it is asked to, some times at most, and then ends."""
 
-    def __init__(self, hold: Callable[[rigid.Array], None], poses: Sequence[rigid.Array]) -> None:
-        self._hold, self._left = hold, list(poses)
-        self._through = False
+    def __init__(self, hold: Callable[[rigid.Array], None], most: int) -> None:
+        self._hold, self._left = hold, most
 
     def ask(self, step: Step) -> None:
         """Hold the board."""
+        self._left -= 1
         if step.world_from_board is not None:
             self._hold(step.world_from_board)
-        elif self._left:
-            self._hold(self._left.pop(0))
-        else:
-            self._through = True
 
     def answer(self) -> Answer:
-        """`take`, or `end` after the last pose."""
-        return "end" if self._through else "take"
+        """`take`, or `end` after too many requests."""
+        return "end" if self._left < 0 else "take"
 
 
 class OneTake:

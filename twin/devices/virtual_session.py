@@ -7,7 +7,6 @@ from recon.acquisition.guidance import Operator
 from recon.errors import InputError
 from recon.model.boards import AsymmetricCircles, Board
 from recon.model.rig import Rig
-from scenes import board_poses
 from scenes.catalogue import build_scene
 from scenes.kinds import board
 from twin.devices.shown_light import Pattern
@@ -18,10 +17,10 @@ from twin.devices.virtual_rig import VirtualCamera, VirtualProjector, VirtualRig
 from twin.devices.virtual_sweep import VirtualPair, VirtualScanner
 from twin.filmed_sweep import SweepSettings, plan_sweep
 from twin.optics.light_transport import Tracing
-from twin.optics.surface_session import CameraName, calibration_of
+from twin.optics.surface_session import CameraName
 from twin.tracking.sampling_ranges import DataRanges
 
-SPARE = 2  # times as many poses of the board are at hand as are wanted: some may be refused
+PATIENCE = 3  # times as often as poses are wanted, the hand holds the board: some may be refused
 
 
 @dataclass(frozen=True)
@@ -62,14 +61,12 @@ def before_scene(settings: StillSettings, scene: Mapping[str, object], patterns:
 
 
 def before_board(settings: StillSettings, design: Board, patterns: Sequence[Pattern], count: int) -> StillDevices:
-    """Devices before a hand that holds a board in random poses; InputError of a board other than of dark, asymmetric circles."""
+    """Devices before a hand that holds a board where it is asked to; InputError of one other than of dark, asymmetric circles."""
     if not isinstance(design, AsymmetricCircles) or design.white:
         raise InputError("board.kind: expected asymmetric_circles, dark ones, as the twin prints no others, found another board")
     printed = board.Config(**design.model_dump(exclude={"kind", "white"}))
     held = HeldBoard(settings.rig, printed, known_to_board(patterns, settings.rig), settings.tracing, settings.seed)
-    wanted = board_poses.Config(count=SPARE * count)
-    poses = board_poses.random_poses(wanted, design, list(calibration_of(settings.rig).cameras.values()))
-    return _devices(settings, held, BoardHand(held.hold, list(poses)))
+    return _devices(settings, held, BoardHand(held.hold, PATIENCE * count))
 
 
 def during_sweep(settings: SweepSettings, ranges: DataRanges, paced: bool = False) -> SweepDevices:

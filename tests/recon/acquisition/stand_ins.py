@@ -34,6 +34,10 @@ class Bench:
         v, u = (np.arange(side) for side in SIZE[::-1])
         return self.pattern[v[:, None] + 2, u[None] + 16] / 255
 
+    def seen(self, camera: str) -> np.ndarray:
+        """What arrives at a camera's pixels : (h, w), white on white is 1."""
+        return self.reflectance * (0.02 + self.light())
+
 
 class BenchCamera:
     """Sees the bench; 10 ms of white on white are 0.8 of full scale."""
@@ -55,7 +59,7 @@ class BenchCamera:
 
     def expose(self) -> None:
         full = 2**self.bits - 1
-        light = self._bench.reflectance * (0.02 + self._bench.light()) * self.exposure_s * self.gain / 0.01 * 0.8
+        light = self._bench.seen(self.name) * self.exposure_s * self.gain / 0.01 * 0.8
         image = np.minimum(np.rint(light * full), full).astype(np.uint8 if self.bits == 8 else np.uint16)
         self._waiting.append(Frame(image, self.number, self._bench.now, self._bench.now + 1))
         self.number += 1

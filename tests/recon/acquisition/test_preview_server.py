@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.acquisition import preview_server
-from recon.acquisition.pictures import Picture
+from recon.acquisition.pictures import Over, Picture
 from recon.acquisition.preview_server import Preview, served
 from recon.errors import InputError
 
@@ -34,10 +34,24 @@ def test_the_page_shows_images_figures_and_faults():
         shown = cv2.imdecode(np.frombuffer(answer(address, "/cam1.jpg?7")[1], np.uint8), cv2.IMREAD_COLOR)
         assert answer(address, "/cam2.jpg")[0] == answer(address, "/../conf/record.yaml")[0] == 404
     assert state["devices"] == [
-        {"name": "cam1", "number": 1, "text": "brightest 100 %", "faults": ["saturated: 50 %; halve the exposure"]}
+        {"name": "cam1", "number": 1, "text": "brightest 100 %", "faults": ["saturated: 50 %; halve the exposure"], "way": ""}
     ]
     assert state["said"] == ["exposure cam1 10 ms"] and max(shown.shape) == 640
     assert np.abs(shown[100, 100].astype(float) - 400 / 1023 * 255).max() < 4 and shown[100, 600, 2] > 200 > shown[100, 600, 0]
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_place_is_drawn_where_it_is_asked_for(there):
+    """In yellow, in green when it is reached, on the smaller image; its mark is filled, and the way is said."""
+    preview, corners = Preview(), np.array([[200.0, 200.0], [1000.0, 200.0], [1000.0, 800.0], [200.0, 800.0]])
+    over = Over("60 mm nearer", corners, np.array([300.0, 300.0]), there)
+    preview.show(Picture("cam1", np.full((1024, 1280), 100, np.uint8), 8, "", (), over))
+    shown = cv2.imdecode(np.frombuffer(preview.jpeg("cam1"), np.uint8), cv2.IMREAD_COLOR).astype(int)
+    for u, v in ((300, 100), (500, 250), (150, 150)):
+        blue, green, red = shown[v, u]
+        assert green > 170 and (red < 130 if there else red > 220), (u, v, blue, green, red)
+    assert np.abs(shown[250, 300] - 100).max() < 8
+    assert preview.state()["devices"][0]["way"] == "60 mm nearer"
 
 
 def test_pages_of_others_see_nothing():

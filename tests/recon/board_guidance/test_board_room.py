@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.board_guidance import board_room
-from recon.board_guidance.board_room import candidates, fits, half_turn_is_alike, middles, outline, reach_of
+from recon.board_guidance.board_room import PoseLimits, candidates, fits, half_turn_is_alike, middles, outline, reach_of
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.boards import AsymmetricCircles, Charuco, Chessboard, SymmetricCircles
@@ -63,6 +63,15 @@ def test_lenses_focused_apart_are_refused(rig):
     apart = rig.model_copy(update={"projector": rig.projector.model_copy(update={"lens": lens})})
     with pytest.raises(InputError, match="focus_mm"):
         reach_of(apart)
+
+
+def test_depths_that_are_given_stand_for_those_of_the_lenses(rig):
+    """Lenses that are described as focused apart don't matter then."""
+    lens = rig.projector.lens.model_copy(update={"focus_mm": 2000.0})
+    apart = rig.model_copy(update={"projector": rig.projector.model_copy(update={"lens": lens})})
+    given = reach_of(apart, PoseLimits(depth_mm=(500, 800), volume_mm=(600, 700), tilt_deg=20))
+    assert (given.depth_mm, given.volume_mm, given.tilt_deg) == ((500, 800), (600, 700), 20)
+    assert reach_of(rig, PoseLimits(depth_mm=(500, 800))).volume_mm == reach_of(rig).volume_mm
 
 
 @pytest.mark.parametrize("board", [BOARD, Chessboard(columns=7, rows=5, square_mm=20)])

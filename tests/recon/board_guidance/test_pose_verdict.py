@@ -8,7 +8,7 @@ import pytest
 
 from recon.board_guidance.next_pose import suggest
 from recon.board_guidance.pose_progress import SoFar, with_sighting
-from recon.board_guidance.pose_verdict import Observation, judge
+from recon.board_guidance.pose_verdict import Observation, judge, judge_lit
 from recon.optical_calibration.sightings import Cause, Failure
 from tests.recon.board_guidance.held_boards import kept, photograph, posed, seen, spread
 from tests.recon.board_sets import BOARD, devices
@@ -68,6 +68,31 @@ def test_a_device_that_does_not_find_the_board_is_named_with_its_reason(rig, rng
     blind = replace(sighting, pixels={k: v for k, v in sighting.pixels.items() if k != "cam2"}, failures=failures)
     verdict = judge(Observation(blind), so_far)
     assert not verdict.accepted and verdict.reason.startswith("cam2: board not found: 30 of 44 discs usable; ")
+
+
+def test_the_projector_is_judged_last(rig, rng, so_far):
+    """Before its fringes are taken, a pose is as good as the cameras see it."""
+    sighting = seen(rig, [posed((0, 20, 680), (20, 20))], rng)[0]
+    unlit = replace(sighting, pixels={k: v for k, v in sighting.pixels.items() if k != "projector"})
+    lit = Observation(unlit, asked_gain=0.05)
+    early = judge_lit(lit, so_far)
+    assert early.accepted and early.so_far is so_far
+    assert judge(lit, so_far).reason.startswith("projector: board not found; ")
+
+
+def test_a_board_that_is_gone_afterwards_is_told(rig, rng, so_far):
+    seen_once = observed(rig, posed((0, 20, 680), (20, 20)), rng)
+    gone = {"cam1": np.full_like(seen_once.sighting.pixels["cam1"], np.nan)}
+    assert "out of sight after the last frame" in judge(replace(seen_once, again=gone), so_far).reason
+
+
+def test_one_camera_and_the_projector_are_guided_alone(rig, rng):
+    so_far = SoFar(rig, BOARD, noise={"cam1": 0.01, "projector": 0.01})
+    for one in seen(rig, POSES, rng):
+        pixels = {name: at for name, at in one.pixels.items() if name != "cam2"}
+        so_far = with_sighting(so_far, replace(one, pixels=pixels))
+    assert so_far.calibration is not None and list(so_far.calibration.cameras) == ["cam1", "projector"]
+    assert suggest(so_far.calibration, so_far.poses, rig, BOARD, rng, noise=so_far.noise).gain > 0
 
 
 def test_a_board_that_moved_is_told(rig, rng, so_far):
