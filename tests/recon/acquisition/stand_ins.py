@@ -79,14 +79,12 @@ class BenchCamera:
 class Scripted:
     """An operator that answers from a list, and then ends."""
 
-    def __init__(self, answers: Sequence[Answer], moves: Sequence = ()) -> None:
+    def __init__(self, answers: Sequence[Answer]) -> None:
         self.asked: list[Step] = []
-        self._answers, self._moves = deque(answers), deque(moves)
+        self._answers = deque(answers)
 
     def ask(self, step: Step) -> None:
         self.asked.append(step)
-        if self._moves:
-            self._moves.popleft()()
 
     def answer(self) -> Answer:
         return self._answers.popleft() if self._answers else "end"

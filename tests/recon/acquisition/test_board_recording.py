@@ -47,9 +47,8 @@ def record(tmp_path, rig, devices, operator, count=3, said=None, show=hidden):
 
 def test_poses_are_asked_for_held_and_kept(tmp_path, own):
     made, devices = stage(own)
-    said, shown = [], []
     hand = Hand(made, own, ["wait", *["take"] * 4])
-    assert record(tmp_path, own, devices, hand, said=said, show=shown.append) == ["00", "01", "02"]
+    assert record(tmp_path, own, devices, hand) == ["00", "01", "02"]
     captured = read_board(tmp_path / "out")
     assert captured.poses == ("00", "01", "02") and captured.pose(1).fringes.shape[0] == patterns(own).count
     device = read_manifest(tmp_path / "out").devices["cam1"]
