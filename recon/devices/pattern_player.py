@@ -161,20 +161,20 @@ def _take_changed(
     """Show a pattern until all images differ from those before as the patterns do.
 
     Two patterns may be alike in the part that a camera sees. So white, then black is shown between tries: in any part, one of
-    them differs from the pattern.
+    them differs from the pattern. Each camera's image is that of its own first try without fault.
     """
+    frames, changes = dict[str, Frame](), dict[str, float]()
     for number_of_try, between in enumerate(("", "white", "black"), 1):
         if between:
             before = _take(stage, stage.white if between == "white" else stage.black, between)
         taken = _take(stage, pattern, f"pattern {number}")
-        changes = {
-            name: pattern_changes.change(light, (before.frames[name].image, taken.frames[name].image), (before.pattern, pattern))
-            for name, light in lights.items()
-        }
+        for name in [name for name in lights if changes.get(name, 0.0) < DOUBLED]:
+            frames[name], images = taken.frames[name], (before.frames[name].image, taken.frames[name].image)
+            changes[name] = pattern_changes.change(lights[name], images, (before.pattern, pattern))
         if not any(change < DOUBLED for change in changes.values()):
             break
         log.info("projector: pattern %d does not show in the images, try %d of %d", number, number_of_try, TRIES)
-    return taken, changes
+    return _Taken(pattern, taken.lit_ns, frames), changes
 
 
 def _light_fault(name: str, light: Light) -> str:
