@@ -36,7 +36,18 @@ def overrides(verb: str, fields: Sequence[str], inputs: Sequence[str]) -> Iterat
     for way, value in _leaves(config.compose(verb, fields)):
         if way not in {"out", *inputs, *FREE}:
             yield from (f"{way}={nonsense}" for nonsense in NONSENSE.get(type(value), ()))
-    yield from ("unknown=1", "rig.unknown=1", "=1", "out", "--out=x", "~unknown", "+unknown=1", "out=[a", "out={a: b}")
+    yield from (
+        "unknown=1",
+        "rig.unknown=1",
+        "rig=null",
+        "=1",
+        "out",
+        "--out=x",
+        "~unknown",
+        "+unknown=1",
+        "out=[a",
+        "out={a: b}",
+    )
     yield from (f"out={place}" for place in (*OUT, *(() if verb in BESIDE else TAKEN)))
     for name in inputs:
         yield from (f"{name}={place}" for place in IN)

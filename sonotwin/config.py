@@ -75,6 +75,9 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
     name = verb if (folder() / f"{verb}.yaml").is_file() else None
     plain = [override for override in overrides if override.partition("=")[0] in _fields_named_like_groups(verb)]
     quoted = [_literal_if_not_grammar(verb, override) for override in overrides if override not in plain]
+    for group, names in groups(verb).items():
+        if f"{group}=null" in quoted:  # which Hydra can't take
+            raise InputError(f"{verb}: {group}: expected one of {', '.join(names)}, found null; leave it out for the usual one")
     with initialize_config_dir(str(folder()), version_base=None):
         try:
             composed = hydra_compose(name, quoted)
