@@ -76,8 +76,12 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
     plain = [override for override in overrides if override.partition("=")[0] in _fields_named_like_groups(verb)]
     quoted = [_literal_if_not_grammar(verb, override) for override in overrides if override not in plain]
     for group, names in groups(verb).items():
-        if f"{group}=null" in quoted:  # which Hydra can't take
-            raise InputError(f"{verb}: {group}: expected one of {', '.join(names)}, found null; leave it out for the usual one")
+        chosen = [value for key, _, value in (override.partition("=") for override in quoted) if key == group]
+        if nonsense := next(
+            (value for value in chosen if value == "null" or value[:1] in ("[", "{")), None
+        ):  # Hydra fails at these
+            expected = f"one of {', '.join(names)}"
+            raise InputError(f"{verb}: {group}: expected {expected}, found {short(nonsense)}; leave it out for the usual one")
     with initialize_config_dir(str(folder()), version_base=None):
         try:
             composed = hydra_compose(name, quoted)
