@@ -75,13 +75,8 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
     name = verb if (folder() / f"{verb}.yaml").is_file() else None
     plain = [override for override in overrides if override.partition("=")[0] in _fields_named_like_groups(verb)]
     quoted = [_literal_if_not_grammar(verb, override) for override in overrides if override not in plain]
-    for group, names in groups(verb).items():
-        chosen = [value for key, _, value in (override.partition("=") for override in quoted) if key == group]
-        if nonsense := next(
-            (value for value in chosen if value == "null" or value[:1] in ("[", "{")), None
-        ):  # Hydra fails at these
-            expected = f"one of {', '.join(names)}"
-            raise InputError(f"{verb}: {group}: expected {expected}, found {short(nonsense)}; leave it out for the usual one")
+    for override in quoted:
+        _check_choice(verb, override)
     with initialize_config_dir(str(folder()), version_base=None):
         try:
             composed = hydra_compose(name, quoted)
@@ -106,6 +101,14 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
             raise InputError(f"{verb}: {error.full_key}: {_first_line(error)}") from error
     assert isinstance(result, dict)
     return {str(key): value for key, value in result.items()}
+
+
+def _check_choice(verb: str, override: str) -> None:
+    """Refuse null, a list or a map in place of a group's choice, at which Hydra fails."""
+    group, _, value = override.partition("=")
+    if (value == "null" or value[:1] in ("[", "{")) and (names := groups(verb).get(group)) is not None:
+        expected = f"one of {', '.join(names)}"
+        raise InputError(f"{verb}: {group}: expected {expected}, found {short(value)}; leave it out for the usual one")
 
 
 def _fields_named_like_groups(verb: str) -> set[str]:
