@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 
 MOST_MB, LONGEST_S = 2000, 10
 MOST_FAULTS = 5  # of one reader, after which it isn't fuzzed on
+SPELL_S = 150  # of a process, after which another goes on with its inputs: libFuzzer itself grows by some hundred bytes an input
 NAMES = (
     "manifest", "calibration", "calibration_xml", "calibration_npz", "probe", "target", "lag", "stamps", "track", "pairs",
     "pose_table", "image", "mesh", "volume_nrrd", "volume_mha", "sequence", "plus_config", "messages", "dicom", "video",
@@ -66,17 +67,18 @@ def fuzz(place: Path, name: str, seconds: float) -> Fuzzed:
     found, kept = Fuzzed(name), place.parent / "fuzzing" / name
     kept.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    while (left := seconds - (time.perf_counter() - start)) > 1 and len(found.faults) < MOST_FAULTS:
-        with TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
-            limits = [f"-max_total_time={int(left)}", f"-rss_limit_mb={MOST_MB}", f"-timeout={LONGEST_S}"]
+    with TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
+        while (left := seconds - (time.perf_counter() - start)) > 1 and len(found.faults) < MOST_FAULTS:
+            spell = min(int(left), SPELL_S)
+            limits = [f"-max_total_time={spell}", f"-rss_limit_mb={MOST_MB}", f"-timeout={LONGEST_S}"]
             settings = [*limits, f"-artifact_prefix={kept}/", "-print_final_stats=1"]
             line = [sys.executable, "-m", "campaign.fuzzing", name, str(place), folder, *settings]
             done = subprocess.run(line, capture_output=True, check=False, cwd=Path(__file__).resolve().parents[1])
-        said = done.stderr.decode(errors="replace") + done.stdout.decode(errors="replace")
-        found.inputs += sum(int(number) for number in re.findall(r"stat::number_of_executed_units:\s*(\d+)", said))
-        found.edges = max([found.edges, *(int(number) for number in re.findall(r"cov: (\d+)", said))])
-        if done.returncode:
-            found.faults.append(_cause(said) or f"status {done.returncode}")
+            said = done.stderr.decode(errors="replace") + done.stdout.decode(errors="replace")
+            found.inputs += sum(int(number) for number in re.findall(r"stat::number_of_executed_units:\s*(\d+)", said))
+            found.edges = max([found.edges, *(int(number) for number in re.findall(r"cov: (\d+)", said))])
+            if done.returncode:
+                found.faults.append(_cause(said) or f"status {done.returncode}")
     found.seconds = time.perf_counter() - start
     return found
 
@@ -109,12 +111,12 @@ def main(name: str, place: Path, folder: Path, settings: Sequence[str]) -> None:
     from recon.errors import InputError
 
     reader = READERS[name]
-    corpus = folder / "corpus"
-    corpus.mkdir()
+    corpus = folder / "corpus"  # of the process before, too, whose finds libFuzzer adds
+    corpus.mkdir(exist_ok=True)
     for number, seed in enumerate(seed for seed in reader.seeds if (place / seed).exists()):
         (corpus / str(number)).write_bytes((place / seed).read_bytes())
     path = folder / "read" / reader.name
-    path.parent.mkdir()
+    path.parent.mkdir(exist_ok=True)
 
     def read(content: bytes) -> None:
         path.write_bytes(content)

@@ -32,7 +32,7 @@ def one_line(error: ValidationError) -> str:
     if kind.startswith("union_tag"):  # at fault is the field that tells which of several models is meant
         place += (first["ctx"]["discriminator"].strip("'"),)
     field = ".".join(
-        str(piece) for piece in place if not re.match(r"\w+\[", str(piece))
+        short(str(piece)) for piece in place if not re.match(r"\w+\[", str(piece))
     )  # `literal[...]`: a choice of several types
     if kind in ("missing", "union_tag_not_found"):
         text = "expected a value, found none"

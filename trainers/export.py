@@ -3,6 +3,7 @@
 import io
 import struct
 import warnings
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from pickle import UnpicklingError
@@ -23,8 +24,9 @@ from trainers.shard_reader import PATCH, VIEW
 OPSET = 17
 DAMAGE = (  # what reading damaged files of weights ends in
     *(RuntimeError, EOFError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ArithmeticError),
-    *(OSError, MemoryError, NameError, struct.error),
+    *(OSError, MemoryError, NameError, struct.error, zipfile.BadZipFile),
 )
+MOST_BYTES = 1 << 29  # of a checkpoint's parts, once they are unpacked
 AGREEMENT = 1e-4  # of the largest logit, most between torch and ONNX Runtime
 
 
@@ -93,6 +95,7 @@ def read_state(path: Path) -> dict:
         If the file is damaged or something else.
     """
     try:
+        _check_parts(path)
         with warnings.catch_warnings(action="ignore"):  # torch's on how such files were written: what counts is checked
             state = torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError:
@@ -102,6 +105,17 @@ def read_state(path: Path) -> dict:
     if not isinstance(state, dict):
         raise InputError(f"{path}: expected a state dictionary of torch, found something else")
     return state
+
+
+def _check_parts(path: Path) -> None:
+    """Refuse an archive with a damaged or a bloated table of its parts, for which torch would take as much memory as it says."""
+    with path.open("rb") as stream:
+        if stream.read(2) != b"PK":  # written by torch before 1.6
+            return
+        with zipfile.ZipFile(stream) as archive:
+            size = sum(part.file_size for part in archive.infolist())
+    if size > MOST_BYTES:
+        raise ValueError(f"its parts would take {size >> 20} MiB, more than {MOST_BYTES >> 20}")
 
 
 def _read(path: Path) -> dict[Any, Any]:

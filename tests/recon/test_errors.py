@@ -20,6 +20,7 @@ FRINGES = {"kind": "fringes", "pitch": 12, "steps": 4}
         ({"parts": [FRINGES | {"pitch": "wide"}]},
          "parts.0.fringes.pitch: expected number, unable to parse string as a number, found 'wide'"),
         ({"parts": [FRINGES | {"phase": 1}]}, "parts.0.fringes.phase: expected no such field, found 1"),
+        ({"parts": [FRINGES | {"pha\rse": 1}]}, "parts.0.fringes.pha se: expected no such field, found 1"),
         ({"parts": [{"kind": "centre_line"}]}, "parts: expected at least one set of fringes, found none"),
         ({"unwrap": "guess"}, "unwrap: expected 'centre_line', 'gray' or 'heterodyne', found 'guess'"),
     ],

@@ -6,7 +6,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from recon.errors import InputError
-from trainers import checkpoints
+from trainers import checkpoints, export
 from trainers.architectures import Segmenter
 from trainers.export import read_state
 
@@ -99,3 +99,15 @@ def test_rates_are_those_that_were_asked_for(written):
     networks, optimizer = training(1, 0)
     checkpoints.resume(written, networks, optimizer, SAMPLES)
     assert all((group["lr"], group["betas"]) == (0.01, (0.9, 0.999)) for group in optimizer.param_groups)
+
+
+def test_an_archive_with_a_damaged_or_bloated_table_of_parts_is_refused_unread(written, monkeypatch):
+    """Torch takes as much memory for a part as the archive says: of 1.7 kB, 6.6 GB were seen."""
+    intact = written.read_bytes()
+    written.write_bytes(intact[:-22] + bytes(22))  # all but the end of the table
+    with pytest.raises(InputError, match=f"^{written}: expected a file that torch saved, found a damaged one"):
+        read_state(written)
+    written.write_bytes(intact)
+    monkeypatch.setattr(export, "MOST_BYTES", 100)
+    with pytest.raises(InputError, match="its parts would take"):
+        read_state(written)
