@@ -14,6 +14,7 @@ from recon.devices.camera_pairs import CameraPair
 from recon.devices.igtl_scanner import IgtlScanner
 from recon.devices.interfaces import Camera, DeviceError, Projector, Scanner
 from recon.devices.scan_view import ScanView
+from recon.devices.timed_frames import TimedScanner
 from recon.devices.video_grabber import VideoGrabber
 from recon.model.rig import NotNegative, Part, Positive
 
@@ -114,13 +115,13 @@ def open_still(devices: LiveDevices, names: Sequence[str]) -> Iterator[Opened]:
 
 @contextmanager
 def open_sweep(devices: LiveDevices, exposure_s: float, gain: float) -> Iterator[Opened]:
-    """Open both cameras as a pair, and the scanner if there is one; DeviceError if one isn't there."""
+    """Open both cameras as a pair, and the scanner if there is one, all timed by one clock; DeviceError if one isn't there."""
     with ExitStack() as stack:
         cameras = {name: stack.enter_context(closing(open_camera(devices, name))) for name in CAMERAS}
         for camera in cameras.values():
             camera.set_exposure(exposure_s, gain)
         pair = CameraPair((cameras[CAMERAS[0]], cameras[CAMERAS[1]]), devices.pairs_within_s)
-        scanner = None if devices.scanner is None else stack.enter_context(closing(open_scanner(devices.scanner)))
+        scanner = None if devices.scanner is None else stack.enter_context(closing(TimedScanner(open_scanner(devices.scanner))))
         yield Opened(cameras, scanner=scanner, pairs=pair)
 
 

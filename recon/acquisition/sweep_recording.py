@@ -199,7 +199,7 @@ def _readers(pairs: PairSource | None, scanner: Scanner | None, say: Say) -> lis
         for lost in pair.lost:
             say(f"lost {lost}")
         first = pair.frames[0]
-        times = first.time_ns, first.time_ns + pair.apart_ns  # both by camera 1's clock
+        times = first.time_ns, first.time_ns + pair.apart_ns
         return [Taken(name, frame, time) for name, frame, time in zip(CAMERAS, pair.frames, times, strict=True)]
 
     def scan(timeout_s: float) -> list[Taken] | None:

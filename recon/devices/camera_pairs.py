@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Literal
 
-from recon.devices.device_clocks import follow
 from recon.devices.interfaces import Camera, Frame, Trigger
+from recon.devices.timed_frames import FrameTimes
 
 LOG = logging.getLogger(__name__)
 SLICE_S = 0.05  # of waiting for one camera, after which the other's frames are fetched
@@ -37,7 +37,7 @@ class Lost:
 class Pair:
     """Frames of both cameras of one moment."""
 
-    frames: tuple[Frame, Frame]
+    frames: tuple[Frame, Frame]  # timed by this computer's clock, unless each waited for a call
     number: int  # of pairs, from 0
     apart_ns: int  # second frame after the first, by this computer's clock; 0 where pairs are made by number
     lost: tuple[Lost, ...]  # since the pair before
@@ -122,6 +122,7 @@ class CameraPair:
         self._within_s = within_s
         self._held = held
         self._called: list[Camera] = []  # cameras that wait for a call
+        self.times = tuple(FrameTimes(camera) for camera in cameras)
         self._begin()
 
     def start(self, trigger: Trigger, second: Trigger | None = None) -> None:
@@ -171,19 +172,13 @@ class CameraPair:
         first, second = self.cameras
         within_ns = 0 if self._within_s is None else round(1e9 * self._within_s)
         self._queue = PairQueue((first.name, second.name), within_ns, self._held)
-        self._untimed: tuple[list[Frame], list[Frame]] = ([], [])  # from before a clock is known, some at the beginning
-        self.clocks = tuple(follow(camera) for camera in self.cameras)
+        for times in self.times:
+            times.clear()
 
     def _fetch(self, which: Literal[0, 1], timeout_s: float) -> None:
         frame = self.cameras[which].frame(timeout_s)
         if frame is None:
             return
-        self.clocks[which].add(frame.time_ns, frame.arrived_ns)
-        if self._within_s is None:
-            return self._queue.add(which, frame.number, frame)
-        self._untimed[which].append(frame)
-        clock = self.clocks[which].clock
-        if clock:
-            for each in self._untimed[which]:
-                self._queue.add(which, clock.at(each.time_ns), each)
-            self._untimed[which].clear()
+        untimed = self._within_s is None and self._called  # a call, and perhaps no other for long
+        for one in [frame] if untimed else self.times[which].add(frame):
+            self._queue.add(which, one.number if self._within_s is None else one.time_ns, one)

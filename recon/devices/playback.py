@@ -88,7 +88,17 @@ def read_recording(folder: Path, sweep: str = "", names: tuple[str, ...] = (*CAM
 
 
 def timeline_of(recorded: Mapping[str, Recorded], speed: float = 1.0) -> Timeline:
-    """The timeline that devices share: a round ends one period after the last frame of the one that goes on longest."""
+    """The timeline that devices share: a round ends one period after the last frame of the one that goes on longest.
+
+    Raises
+    ------
+    InputError
+        If there is no time at which all of them were recorded, as of clocks of their own.
+    """
+    begun, ended = max(int(each.times[0]) for each in recorded.values()), min(int(each.times[-1]) for each in recorded.values())
+    if begun > ended:
+        expected = f"expected one clock of {', '.join(recorded)}, found times {(begun - ended) / 1e9:.6g} s apart"
+        raise InputError(f"{STAMPS}: {expected}; clocks of their own? record them by one, as sonotwin record does")
     first = min(int(each.times[0]) for each in recorded.values())
     ends = [int(each.times[-1] + _period(each.times)) for each in recorded.values()]
     return Timeline(first, max(ends) - first, speed)

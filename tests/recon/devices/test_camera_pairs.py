@@ -59,7 +59,7 @@ def all_pairs(pair):
 
 
 def numbered(numbers):
-    return [frame(number) for number in numbers]
+    return [frame(number, number * PERIOD_NS, (number + 1) * PERIOD_NS) for number in numbers]
 
 
 def test_partners_have_the_same_number():
@@ -182,9 +182,9 @@ def test_both_cameras_are_driven_together():
 def test_a_new_start_counts_anew():
     cameras = tuple(Recorded(name, numbered(range(3))) for name in NAMES)
     pair = CameraPair(cameras)
-    pair.start("free")
+    pair.start("software")
     assert len(all_pairs(pair)) == 3
     for camera in cameras:
         camera.frames.extend(numbered(range(3)))
-    pair.start("free")
+    pair.start("software")
     assert [(one.number, one.lost) for one in all_pairs(pair)] == [(k, ()) for k in range(3)]

@@ -1,5 +1,6 @@
 """A recording that is played back comes as it was recorded, in real time, and loses what nobody fetches."""
 
+from dataclasses import replace
 from time import monotonic_ns, sleep
 
 import numpy as np
@@ -90,3 +91,10 @@ def test_a_device_that_was_not_recorded_is_named(rig, tmp_path):
     folder = sweep_sets.ball(tmp_path / "ball", rig, count=3)
     with pytest.raises(InputError, match=r"sweep\.images\.cam1: expected a path, found none"):
         playback.read_recording(folder)
+
+
+def test_devices_of_clocks_of_their_own_have_no_timeline(recorded):
+    """A camera's clock began when it got power, a scanner's in 1970: no round would hold both."""
+    other = replace(recorded, times=recorded.times + 1_795_000_000 * 10**9)
+    with pytest.raises(InputError, match=r"expected one clock of us, cam1, found times 1.795e\+09 s apart"):
+        playback.timeline_of({SCANNER: recorded, "cam1": other})

@@ -1,0 +1,80 @@
+"""Frames of devices with clocks of their own, on this computer's clock."""
+
+import numpy as np
+import pytest
+
+from recon.devices.camera_pairs import CameraPair
+from recon.devices.interfaces import Frame
+from recon.devices.timed_frames import MOST_WAITING, FrameTimes, TimedScanner
+
+IMAGE = np.zeros((2, 2), np.uint8)
+START_NS = 5 * 10**12
+UPTIME_NS, UNIX_NS = 3 * 10**9, 1_795_000_000 * 10**9  # what a camera's and a scanner's clock show at the start
+TRANSFER_NS = 5_000_000
+
+
+class Sent:
+    """A device that gives frames in turn."""
+
+    size, bits = (2, 2), 8
+
+    def __init__(self, name, frames):
+        self.name, self.frames = name, list(frames)
+
+    def frame(self, timeout_s):
+        return self.frames.pop(0) if self.frames else None
+
+    def start(self, trigger):
+        pass
+
+
+def taken(rng, shown_ns, rate=1.0, n=400, period_ns=20_000_000):
+    """Frames by a clock of the device's own, which arrive late by a transfer and, at random, more."""
+    true = START_NS + period_ns * np.arange(n)
+    late = TRANSFER_NS + rng.exponential(300e3, n).astype(int)
+    own = [shown_ns + round(rate * int(moment - START_NS)) for moment in true]
+    return [Frame(IMAGE, k, own[k], int(true[k] + late[k])) for k in range(n)], true
+
+
+def test_a_camera_that_counts_from_power_on_and_a_scanner_that_counts_from_1970_lie_on_one_line(rng):
+    """Fifty-six years apart, 50 ppm fast and slow: to 1 ms the same moments, later by the transfer that no clock shows."""
+    films = [taken(rng, UPTIME_NS + k, 1 + 5e-5)[0] for k in range(2)]
+    scans, true = taken(rng, UNIX_NS, 1 - 5e-5)
+    pair = CameraPair((Sent("cam1", films[0]), Sent("cam2", films[1])))
+    pair.start("hardware")
+    pairs = [pair.pair(0.01) for _ in range(len(true) + 20)]
+    filmed = np.array([one.frames[0].time_ns for one in pairs if one])
+    scanner = TimedScanner(Sent("us", scans))
+    scanned = np.array([one.time_ns for one in (scanner.frame(0.0) for _ in range(len(true) + 20)) if one])
+    assert len(filmed) == len(scanned) == len(true)
+    assert np.allclose(filmed, scanned, atol=1e6, rtol=0)
+    assert np.allclose(filmed, true + TRANSFER_NS, atol=1e6, rtol=0)
+    assert np.all(np.diff(filmed) > 0) and np.all(np.diff(scanned) > 0)
+
+
+def test_frames_wait_for_a_clock_in_order_and_none_is_lost(rng):
+    times = FrameTimes(Sent("us", []))
+    frames, _ = taken(rng, UNIX_NS, n=30)
+    given = [times.add(one) for one in frames]
+    assert not given[0] and [one.number for some in given for one in some] == list(range(30))
+
+
+def test_a_device_without_a_clock_is_timed_by_arrivals(rng):
+    """Its stamps stand still: each frame begins a new clock."""
+    frames, _ = taken(rng, 0, 0.0, n=200)
+    times = FrameTimes(Sent("us", []))
+    given = [times.add(one) for one in frames]
+    assert max(map(len, given)) == MOST_WAITING
+    found = [one for some in given for one in some]
+    assert [one.time_ns for one in found] == [one.arrived_ns for one in frames[: len(found)]]
+
+
+@pytest.mark.parametrize("calls", [1, 3])
+def test_frames_taken_at_a_call_wait_for_no_clock(rng, calls):
+    film = taken(rng, UPTIME_NS, n=calls)[0]
+    cameras = Sent("cam1", film), Sent("cam2", film)
+    for camera in cameras:
+        camera.trigger = lambda: None
+    pair = CameraPair(cameras)
+    pair.start("software")
+    assert [pair.pair(0.01) is not None for _ in range(calls)] == [True] * calls
