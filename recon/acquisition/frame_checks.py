@@ -125,9 +125,8 @@ def frame_faults(found: Look, limits: Limits) -> list[str]:
     if found.focus_px > limits.most_blur_px:
         faults.append(f"blurred: edges {found.focus_px:.1f} px wide in all directions; focus the lens, or come into its range")
     elif found.motion_px > limits.most_blur_px:
-        faults.append(
-            f"blurred: smeared by {found.motion_px:.1f} px in one direction; hold still, or expose shorter under more light"
-        )
+        way = "hold still, or expose shorter under more light; round or slanted rims at rest look so, too"
+        faults.append(f"blurred: smeared by {found.motion_px:.1f} px in one direction; {way}")
     return faults
 
 
