@@ -1,10 +1,11 @@
-"""Two Basler cameras of pylon's emulator: pairs of frames from images on disk to arrays with number and time, none lost."""
+"""Two Basler cameras of pylon's emulator: pairs of frames from images on disk to arrays, and to a recording, none lost."""
 
 import hashlib
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Literal
@@ -12,15 +13,24 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from recon.acquisition.frame_checks import Limits
+from recon.acquisition.pictures import hidden
+from recon.acquisition.recording import open_recording
+from recon.acquisition.sweep_recording import SweepPlan, record_sweep
+from recon.capture import sweep_tables
+from recon.capture.images import read_image
+from recon.capture.manifest import CAMERAS, STAMPS, Device, image_name
 from recon.devices.basler import BaslerSettings, open_camera
-from recon.devices.camera_pairs import CameraPair
+from recon.devices.camera_pairs import CameraPair, Pair
 from recon.devices.interfaces import Image
 from twin.accuracy.table_rows import Measurement, Row
+from twin.devices.virtual_operator import OneTake
 
 PAIRS = 1000
 SIZE = (1280, 1024)
 SERIALS = ("0815-0000", "0815-0001")  # of the emulator's first cameras
 HELD = 256  # frames; where the cores limit the rate, one emulated camera runs ahead of the other by some
+RECORDED_HZ = 25.0  # as fast as the tracker follows on two cores
 SERVED = (7, 11)  # images that each camera serves in turn: frames of different pairs differ in their hashes
 WHAT = f"{PAIRS} pairs 1280x1024 of two emulated Basler cameras"
 
@@ -28,7 +38,7 @@ WHAT = f"{PAIRS} pairs 1280x1024 of two emulated Basler cameras"
 def measurements() -> list[Measurement]:
     """The rows of the group."""
     os.environ["PYLON_CAMEMU"] = "2"  # before pylon is loaded
-    return [free_running, software_trigger]
+    return [free_running, software_trigger, recorded]
 
 
 def free_running() -> list[Row]:
@@ -50,6 +60,50 @@ def software_trigger() -> list[Row]:
     return [
         Row("a", f"{WHAT}, software trigger: frames lost, or with another hash", lost + wrong, 0, None, ""),
         Row("a", f"{WHAT}, software trigger, 10 ms exposure", rate, None, None, "pairs/s"),
+    ]
+
+
+class CountedPairs(CameraPair):
+    """Pairs until there were enough of them."""
+
+    given = 0
+
+    def pair(self, timeout_s: float) -> Pair | None:
+        """Next pair, counted."""
+        one = super().pair(timeout_s)
+        self.given += one is not None
+        return one
+
+    @property
+    def over(self) -> bool:
+        """Whether there were enough."""
+        return self.given >= PAIRS
+
+
+def recorded() -> list[Row]:
+    """Row a: both cameras at a rate of their own into a capture, whose images are read again."""
+    said, plan = list[str](), SweepPlan("scan", None, ("free", "free"), None, 10.0, Limits())
+    with served() as (settings, hashes), tempfile.TemporaryDirectory() as folder:
+        cameras = [open_camera(name, SERIALS[k], replace(settings[k], rate_hz=RECORDED_HZ)) for k, name in enumerate(CAMERAS)]
+        pairs = CountedPairs((cameras[0], cameras[1]))
+        devices = {name: Device(size=SIZE) for name in CAMERAS}
+        start = perf_counter()
+        with open_recording(Path(folder) / "capture") as recording:
+            counts = record_sweep(recording, pairs, None, devices, OneTake(lambda: pairs.over), plan, {}, said.append, hidden)
+        rate = counts[CAMERAS[0]] / (perf_counter() - start)
+        pairs.close()
+        lost, wrong = 0, 0
+        for name, own in zip(CAMERAS, hashes, strict=True):
+            place = Path(folder) / "capture/sweep/scan" / name
+            numbers = sweep_tables.read_stamps(place / STAMPS)[0].tolist()
+            lost += numbers[-1] + 1 - len(numbers)
+            for k in numbers:
+                wrong += digest(read_image(place / image_name(k), SIZE, 8)) != own[k % len(own)]
+    what = f"{counts[CAMERAS[0]]} pairs 1280x1024 at {RECORDED_HZ:g} a second into a capture"
+    return [
+        Row("a", f"{what}: frames lost", lost + sum(line.startswith("lost") for line in said), 0, None, ""),
+        Row("a", f"{what}: images on the disk with another hash than that served", wrong, 0, None, ""),
+        Row("a", f"{what}: rate", rate, None, RECORDED_HZ, "pairs/s"),
     ]
 
 

@@ -18,7 +18,7 @@ from campaign.sources import COMMANDS, Command
 
 LONGEST_S = 300.0
 SHARES = (0.02, 0.5, 0.9)  # of the result's size that is free beside the old one
-GROWING = ("dataset", "train", "study", "reconstruct", "record")  # verbs that go on with what is there, file by file or step by step
+GROWING = ("dataset", "train", "study", "reconstruct", "record")  # verbs that go on with what is there, file by file or by step
 BLOCK = 4096  # bytes
 WITHOUT = ("accuracy", "demo")  # which write by the other verbs
 
