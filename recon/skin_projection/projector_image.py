@@ -53,12 +53,15 @@ class Lines:
 USUAL = Lines()
 
 
+Lit = Mapping[str, NDArray[np.bool_]]  # whether light reaches a curve's points : (n,), by its name
+
+
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """An image for a projector, and the share of each curve that it shows, dashes and gaps alike."""
+    """An image for a projector, and what of each curve it lights, dashes and gaps alike."""
 
     image: Image  # (h, w)
-    shown: Mapping[str, float]  # of the curve's points on the skin, by its name
+    lit: Lit
 
 
 def draw(
@@ -78,24 +81,42 @@ def draw(
     dark : (h, w)
         Pixels that are to stay dark, as of `probe_shadow.shadow`.
     """
-    light, shown = np.zeros(projector.size[::-1], np.float32), {}
-    together = np.concatenate([np.zeros((0, 3)), *(curve.points for curve in curves)])  # so that the skin is looked at once
-    lit = visible(together, skin, projector)
-    if dark is not None:
-        u, v = np.rint(projector.project(together[lit])).astype(int).T
-        lit[lit] = ~dark[v, u]
-    parts = np.split(lit, np.cumsum([len(curve.points) for curve in curves]))
-    for curve, reached in zip(curves, parts, strict=False):  # an empty part is left
-        on_skin = np.isfinite(curve.points).all(axis=1)
-        shown[curve.name] = float(reached.sum() / max(on_skin.sum(), 1))
-        line = lines.of(curve)
-        pieces = skin_curve.dashed(curve, line.dash_mm) & reached[:-1] & reached[1:]
-        corners = quadrilaterals(curve, line.width_mm, projector)
-        whole = pieces & np.isfinite(corners).all(axis=(1, 2))
-        np.maximum(light, line.light * coverage(corners[whole], projector.size), out=light)
+    lit = reached(curves, skin, projector, dark)
+    light = strips_of_light(curves, lit, projector, lines)
     if dark is not None:
         light[dark] = 0
-    return Drawing(np.uint8(np.rint(255 * light ** (1 / gamma))), shown)
+    return Drawing(np.uint8(np.rint(255 * light ** (1 / gamma))), lit)
+
+
+def reached(
+    curves: Sequence[SkinCurve], skin: trimesh.Trimesh, device: Camera, dark: NDArray[np.bool_] | None = None
+) -> dict[str, NDArray[np.bool_]]:
+    """Whether a device's lines of sight reach a curve's points, but for pixels that are dark."""
+    together = np.concatenate([np.zeros((0, 3)), *(curve.points for curve in curves)])  # so that the skin is looked at once
+    lit = visible(together, skin, device)
+    if dark is not None:
+        u, v = np.rint(device.project(together[lit])).astype(int).T
+        lit[lit] = ~dark[v, u]
+    parts = np.split(lit, np.cumsum([len(curve.points) for curve in curves]))  # an empty one is left
+    return {curve.name: part for curve, part in zip(curves, parts, strict=False)}
+
+
+def strips_of_light(curves: Sequence[SkinCurve], lit: Lit, device: Camera, lines: Lines) -> NDArray[np.float32]:
+    """Light of a device's pixels : (h, w) by what is lit of curves, of the projector's full light."""
+    light = np.zeros(device.size[::-1], np.float32)
+    for curve in curves:
+        line, points = lines.of(curve), lit[curve.name]
+        pieces = skin_curve.dashed(curve, line.dash_mm) & points[:-1] & points[1:]
+        corners = quadrilaterals(curve, line.width_mm, device)
+        whole = pieces & np.isfinite(corners).all(axis=(1, 2))
+        np.maximum(light, line.light * coverage(corners[whole], device.size), out=light)
+    return light
+
+
+def lit_share(curve: SkinCurve, lit: Lit) -> float:
+    """Share of a curve's points on the skin that are lit."""
+    on_skin = np.isfinite(curve.points).all(axis=1)
+    return float(lit[curve.name].sum() / max(on_skin.sum(), 1))
 
 
 def visible(points: Array, skin: trimesh.Trimesh, device: Camera) -> NDArray[np.bool_]:

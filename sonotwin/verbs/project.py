@@ -50,7 +50,7 @@ from recon.skin_projection import (
     scan_line,
     skin_registration,
 )
-from recon.skin_projection.projector_image import Drawing, Lines
+from recon.skin_projection.projector_image import Drawing, Lines, lit_share
 from recon.skin_projection.skin_curve import SkinCurve
 from recon.skin_projection.skin_registration import SkinShift
 from sonotwin.open_devices import LiveDevices, open_projector
@@ -222,7 +222,7 @@ def measure(
         found |= {
             f"{curve.name}_length_mm": curve.length_mm,
             f"{curve.name}_on_skin": curve.on_skin,
-            f"{curve.name}_lit": drawing.shown[curve.name],
+            f"{curve.name}_lit": lit_share(curve, drawing.lit),
         }
     if shift is not None:
         turn = rigid.difference(np.eye(4), shift.new_from_old)[:3]
@@ -251,8 +251,8 @@ def described(
             if way["moved_sigma_mm"] > UNSURE_MM:
                 yield f"warning     the skin may slide in itself: {name} is uncertain by it; measure more of the skin"
     for curve in curves:
-        lit = drawing.shown[curve.name]
-        yield f"{curve.name:12}{curve.length_mm:.1f} mm on the skin, {lit:.0%} of it in the projector's reach"
+        lit = lit_share(curve, drawing.lit)
+        yield f"{curve.name:12}{curve.length_mm:.1f} mm on the skin, {lit:.0%} of it lit"
         if curve.on_skin < 1:
             yield f"warning     {1 - curve.on_skin:.0%} of {curve.name} is left out: there is no skin measured"
 
@@ -269,7 +269,7 @@ def write(
     """Write all files but the figures; returns their names."""
     pictures = {PICTURE: drawing.image}
     if "cam1" in cameras:
-        pictures[EXPECTED] = expected_view.expected(curves, skin, cameras["cam1"], lines)
+        pictures[EXPECTED] = expected_view.expected(curves, drawing.lit, skin, cameras["cam1"], lines)
     for name, image in pictures.items():
         (folder / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
     curve_files.write_json(folder / CURVES, curves)

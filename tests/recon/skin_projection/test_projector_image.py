@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from recon.geometry.camera import Camera
-from recon.skin_projection import skin_curve
+from recon.skin_projection import expected_view, skin_curve
 from recon.skin_projection.lines_of_sight import Sight, first_hits
 from recon.skin_projection.projector_image import Line, Lines, coverage, draw, visible
 from recon.skin_projection.skin_curve import laid
@@ -36,7 +36,7 @@ def test_light_lies_on_the_curve_and_is_as_wide():
     assert abs(weight @ across) < 0.02
     pixel = 0.37
     assert abs(weight @ across**2 - (width**2 + pixel**2) / 12) < 0.02
-    assert drawing.shown == {"line": 1.0}
+    assert drawing.lit["line"].all()
 
 
 def test_without_the_lens_the_line_would_be_elsewhere():
@@ -68,7 +68,7 @@ def test_no_light_reaches_the_far_side_of_a_ridge():
 def test_what_lies_outside_the_image_is_not_drawn():
     skin, device = plane(size=(600.0, 100.0), step=4.0), projector()
     drawing = draw([straight([-280.0, 0.0], [280.0, 0.0], skin)], skin, device)
-    assert 0.5 < drawing.shown["line"] < 0.95
+    assert 0.5 < drawing.lit["line"].mean() < 0.95
     assert drawing.image[:, 0].any() and drawing.image[:, -1].any(), "up to the border on both sides"
 
 
@@ -96,3 +96,16 @@ def test_coverage_is_the_area(rng):
         (a, b), (c, d) = corners[0, 2] - corners[0, 0], corners[0, 3] - corners[0, 1]
         area = abs(a * d - b * c) / 2
         assert abs(coverage(corners, (64, 48)).sum() / area - 1) < 0.1
+
+
+def test_a_camera_is_expected_to_see_what_is_lit_alone():
+    """Of a line that a shadow covers by half, from where the shadow ends on."""
+    skin, device = plane(), projector()
+    line = straight([-20.0, 0.0], [20.0, 0.0], skin)
+    dark = np.zeros(device.size[::-1], bool)
+    dark[:, : round(device.project(np.array([[0.0, 0.0, PLANE_MM]]))[0, 0])] = True
+    drawing = draw([line], skin, device, dark=dark)
+    camera = Camera(device.size, device.matrix, np.zeros(5), np.eye(4))
+    seen = expected_view.expected([line], drawing.lit, skin, camera, Lines()) > 200
+    ends = camera.project(np.array([[x, 0.0, PLANE_MM] for x in (0.0, 20.0)]))[:, 0]
+    assert abs(np.flatnonzero(seen.any(axis=0))[0] - ends[0]) < 3 and abs(np.flatnonzero(seen.any(axis=0))[-1] - ends[1]) < 3
