@@ -96,9 +96,12 @@ def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None) -> 
     read = manifest.read_manifest(folder)
     place, part = read.sweep_of(folder / MANIFEST, "B-scans and the poses of the probe", name, purpose)
     root, entry = folder / read.root, manifest.field_of(place)
-    for field, found in ((f"images.{SCANNER}", part.images.get(SCANNER)), ("track", part.track)):
+    for field, found, way in (
+        (f"images.{SCANNER}", part.images.get(SCANNER), ""),
+        ("track", part.track, "; find the poses by `sonotwin track` first, and give its folder"),
+    ):
         if found is None:
-            raise InputError(f"{folder / MANIFEST}: {entry}.{field}: expected a path, found none")
+            raise InputError(f"{folder / MANIFEST}: {entry}.{field}: expected a path, found none{way}")
     device = read.devices_of(place)[SCANNER]
     if device.bits != 8:
         raise InputError(f"{folder / MANIFEST}: devices.{SCANNER}.bits: expected 8, found {device.bits}")
