@@ -3,7 +3,7 @@
 import re
 import socket
 from collections.abc import Sequence
-from contextlib import redirect_stdout
+from contextlib import ExitStack, redirect_stdout
 from io import StringIO
 from time import monotonic
 
@@ -46,13 +46,16 @@ class BrowserView:
         _check_free(host, port)
         with redirect_stdout(StringIO()):  # it prints, even so
             self._server = viser.ViserServer(host=host, port=port, label="sonotwin", verbose=False)
-        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self._bodies = _add_scene(self._server, scene)
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
         self._beside: viser.GuiImageHandle | None = None  # and beside it
         self._shown: PlacedScan | None = None
         self._picture: Picture | None = None  # of that
-        self._words, self._written = self._server.gui.add_markdown("waiting for the first frames"), 0.0
+        with ExitStack() as stack:
+            stack.callback(self.close)
+            self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+            self._bodies = _add_scene(self._server, scene)
+            self._words, self._written = self._server.gui.add_markdown("waiting for the first frames"), 0.0
+            stack.pop_all()  # it is open
 
     @property
     def address(self) -> str:
