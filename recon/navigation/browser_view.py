@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.navigation.mass_distances import MassDistance
+from recon.navigation.own_pages import own_pages_alone
 from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import Moment, StillScene
 
@@ -44,7 +45,7 @@ class BrowserView:
         import viser  # of the extra `live`
 
         _check_free(host, port)
-        with redirect_stdout(StringIO()):  # it prints, even so
+        with own_pages_alone(host), redirect_stdout(StringIO()):  # it prints, even so
             self._server = viser.ViserServer(host=host, port=port, label="sonotwin", verbose=False)
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
         self._beside: viser.GuiImageHandle | None = None  # and beside it
