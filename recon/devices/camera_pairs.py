@@ -16,7 +16,12 @@ LOG = logging.getLogger(__name__)
 SLICE_S = 0.05  # of waiting for one camera, after which the other's frames are fetched
 HELD = 64  # frames of a camera that wait for the other's
 
-Cause = Literal["lost", "alone"]
+Cause = Literal["lost", "alone", "untimed"]
+WORDS: dict[Cause, str] = {
+    "lost": "never came",
+    "alone": "without a partner",
+    "untimed": "without a time: the camera's clock isn't known",
+}
 
 
 @dataclass(frozen=True)
@@ -26,11 +31,11 @@ class Lost:
     camera: str
     first: int
     last: int
-    cause: Cause  # never came, or came without its partner
+    cause: Cause
 
     def __str__(self) -> str:
         frames = f"frame {self.first}" if self.first == self.last else f"frames {self.first} to {self.last}"
-        return f"{self.camera}: {frames} {'never came' if self.cause == 'lost' else 'without a partner'}"
+        return f"{self.camera}: {frames} {WORDS[self.cause]}"
 
 
 @dataclass(frozen=True)
@@ -61,13 +66,16 @@ class PairQueue:
 
     def add(self, which: Literal[0, 1], key: int, frame: Frame) -> None:
         """Take a camera's next frame; one too many waits no longer for its partner."""
-        if frame.number > self._next[which]:
-            self._lose(which, self._next[which], frame.number - 1, "lost")
-        self._next[which] = frame.number + 1
+        self._count(which, frame)
         waiting = self._waiting[which]
         waiting.append((key, frame))
         if len(waiting) > self._held:
             self._leave_alone(which)
+
+    def leave_out(self, which: Literal[0, 1], frame: Frame) -> None:
+        """Take a camera's next frame, but not for a pair: its time isn't known."""
+        self._count(which, frame)
+        self._lose(which, frame.number, frame.number, "untimed")
 
     def pair(self) -> Pair | None:
         """Next pair, if both its frames are there."""
@@ -89,6 +97,11 @@ class PairQueue:
     def behind(self) -> Literal[0, 1]:
         """The camera of which fewer frames wait."""
         return 0 if len(self._waiting[0]) <= len(self._waiting[1]) else 1
+
+    def _count(self, which: int, frame: Frame) -> None:
+        if frame.number > self._next[which]:
+            self._lose(which, self._next[which], frame.number - 1, "lost")
+        self._next[which] = frame.number + 1
 
     def _leave_alone(self, which: Literal[0, 1]) -> None:
         number = self._waiting[which].popleft()[1].number
@@ -116,7 +129,7 @@ class CameraPair:
             Pairs are frames taken within that time, at most half the time between two frames; without, frames of the same
             number, for cameras that are triggered together.
         held : int
-            Frames that wait for a partner.
+            Frames of a camera that wait for a partner, or for its clock to be known.
         """
         self.cameras = cameras
         self._within_s = within_s
@@ -171,7 +184,7 @@ class CameraPair:
         first, second = self.cameras
         within_ns = 0 if self._within_s is None else round(1e9 * self._within_s)
         self._queue = PairQueue((first.name, second.name), within_ns, self._held)
-        self._untimed: tuple[list[Frame], list[Frame]] = ([], [])  # from before a clock is known, some at the beginning
+        self._untimed = (deque[Frame](), deque[Frame]())  # from before a clock is known, some at the beginning
         self.clocks = tuple(follow(camera) for camera in self.cameras)
 
     def _fetch(self, which: Literal[0, 1], timeout_s: float) -> None:
@@ -181,9 +194,11 @@ class CameraPair:
         self.clocks[which].add(frame.time_ns, frame.arrived_ns)
         if self._within_s is None:
             return self._queue.add(which, frame.number, frame)
-        self._untimed[which].append(frame)
-        clock = self.clocks[which].clock
+        untimed, clock = self._untimed[which], self.clocks[which].clock
+        untimed.append(frame)
         if clock:
-            for each in self._untimed[which]:
+            for each in untimed:
                 self._queue.add(which, clock.at(each.time_ns), each)
-            self._untimed[which].clear()
+            untimed.clear()
+        elif len(untimed) > self._held:
+            self._queue.leave_out(which, untimed.popleft())

@@ -83,6 +83,7 @@ def test_partners_have_the_same_number():
 def test_lost_frames_in_words():
     assert str(Lost("cam1", 4, 4, "lost")) == "cam1: frame 4 never came"
     assert str(Lost("cam2", 4, 6, "alone")) == "cam2: frames 4 to 6 without a partner"
+    assert str(Lost("cam2", 4, 6, "untimed")) == "cam2: frames 4 to 6 without a time: the camera's clock isn't known"
 
 
 def free_running(rng, n, phase_ns, missing=(), offset_ns=0, start_ns=5 * 10**12, rate=1.0):
@@ -134,6 +135,17 @@ def test_a_silent_camera_costs_no_memory():
         "cam2: frames 0 to 9994 never came",
         "cam1: frames 9992 to 9994 without a partner",
     ]
+
+
+def test_a_camera_without_a_clock_costs_no_memory():
+    """Its stamps stand still, so that its clock is never known: the newest frames wait for it, the others are named."""
+    first = [frame(k, 0, k * PERIOD_NS) for k in range(1000)]
+    pair = CameraPair((Recorded("cam1", first), Recorded("cam2", [])), within_s=0.005, held=16)
+    pair.start("free")
+    while pair.cameras[0].frames:
+        assert pair.pair(0.01) is None
+    (lost,) = pair.stop()
+    assert (lost.camera, lost.first, lost.cause) == ("cam1", 0, "untimed") and 980 <= lost.last <= 983
 
 
 def test_frames_of_both_are_fetched_while_one_is_silent():

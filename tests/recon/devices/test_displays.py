@@ -6,7 +6,8 @@ import pytest
 from recon.devices import displays
 from recon.devices.displays import Display
 from recon.devices.interfaces import DeviceError
-from tests.recon.devices.x_server import set_output, set_ramp, sockets, x_server
+from tests.recon.devices.open_sockets import sockets
+from tests.recon.devices.x_server import set_output, set_ramp, x_server
 
 LAPTOP = Display(0, "eDP-1", (1920, 1080), (1920, 1080), (0, 0), 60.0)
 PROJECTOR = Display(1, "HDMI-1", (1280, 800), (1280, 800), (1920, 0), 60.0)

@@ -13,7 +13,8 @@ from recon.capture.surface_part import read_patterns
 from recon.devices.displays import displays
 from recon.devices.interfaces import DeviceError
 from recon.devices.projector_window import ProjectorWindow
-from tests.recon.devices.x_server import covered, move_windows, set_output, set_ramp, sockets, x_server
+from tests.recon.devices.open_sockets import sockets
+from tests.recon.devices.x_server import covered, move_windows, set_output, set_ramp, x_server
 from twin.accuracy.virtual_screen import screenshot
 
 SEQUENCES = sorted((Path(__file__).resolve().parents[3] / "conf/patterns").glob("*.yaml"))

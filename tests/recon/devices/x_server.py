@@ -1,9 +1,8 @@
 """What may happen to a desktop, on a screen without a monitor."""
 
 import ctypes
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -87,15 +86,6 @@ def set_output(display: str, size: tuple[int, int], position: tuple[int, int]) -
         done = xrandr.XRRSetCrtcConfig(connection, resources, crtc, xlib.CurrentTime, *position, made, 1, outputs, 1)
         assert done == 0
         xlib.XSync(connection, 0)
-
-
-def sockets() -> int:
-    """Number of sockets that this process has open, those of connections to displays among them."""
-    count = 0
-    for number in os.listdir("/proc/self/fd"):
-        with suppress(FileNotFoundError):  # of the listing itself
-            count += os.readlink(f"/proc/self/fd/{number}").startswith("socket:")
-    return count
 
 
 class Ramp(ctypes.Structure):
