@@ -30,7 +30,7 @@ MODULES = {  # where a package isn't imported by the name that it is installed b
     "pyyaml": "yaml",
     "scikit-image": "skimage",
 }
-BROUGHT_BY = {"drjit": "mitsuba", "omegaconf": "hydra"}  # imported by us, required by what we require
+BROUGHT_BY = {"drjit": "mitsuba", "omegaconf": "hydra", "websockets": "viser"}  # imported by us, required by what we require
 
 
 @dataclass(frozen=True)

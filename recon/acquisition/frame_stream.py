@@ -1,17 +1,18 @@
 """Frames of one source on their way to the disk: one thread reads, one writes, and a bounded queue lies between them."""
 
-import queue
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
 from typing import NamedTuple
 
 from recon.acquisition.pictures import Say
 from recon.devices.interfaces import DeviceError, Frame
-from recon.errors import InputError
 
 WAITING = 128  # sets of frames that wait for the disk: 340 MB of pairs of 1280 x 1024
 SLICE_S = 0.2  # of waiting for a frame
-MOST_JUMP_NS = 1_000_000_000  # by which a device's clock may go on otherwise than this computer's between two frames
+MOST_OFF_NS = 1_000_000_000  # a frame that comes later than that is named; one that is stamped as much ahead shows a jump
+SURE = 8  # frames of a device, of which one at least came without delay
 
 
 class Taken(NamedTuple):
@@ -39,75 +40,112 @@ class FrameStream:
         """
         self.latest: dict[str, Frame] = {}  # by device
         self._read, self._write, self._silent_s, self._say = read, write, silent_s, say
-        self._waiting: queue.Queue[list[Taken] | None] = queue.Queue(WAITING)
+        self._waiting: SimpleQueue[list[Taken] | None] = SimpleQueue()  # None: no more will come
         self._ending = threading.Event()
-        self._failure: InputError | OSError | None = None
+        self._stamps: dict[str, _Stamps] = {}  # by device
         self._left_out = 0
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._fetch, self._store)]
-        for thread in self._threads:
-            thread.start()
+        self._threads = ThreadPoolExecutor(2, "recording")
+        self._work = [self._threads.submit(work) for work in (self._store, self._fetch)]
 
     @property
     def alive(self) -> bool:
         """Whether frames are still read and written."""
-        return all(thread.is_alive() for thread in self._threads)
+        return not any(work.done() for work in self._work)
 
     def end(self) -> None:
         """Read no more, and write what has come."""
         self._ending.set()
-        for thread in self._threads:
-            thread.join()
+        self._threads.shutdown()
         if self._left_out:
             self._say(f"lost {self._left_out} sets of frames, for which the disk was too slow; free it, or lower the rate")
+        for device, stamps in self._stamps.items():
+            if stamps.late:
+                most = f"by up to {1e-9 * stamps.latest_ns:.1f} s"
+                self._say(f"frames of {device} that came late: {stamps.late}, {most}; they are recorded by their own time stamps")
 
     def check(self) -> None:
-        """Raise what ended the stream, if anything did."""
-        if self._failure is not None:
-            raise self._failure
+        """Raise what ended the stream, if anything did, whatever it is."""
+        for work in self._work:
+            work.result()
 
     def _fetch(self) -> None:
-        silent, before = 0.0, dict[str, Taken]()
+        silent = 0.0
         try:
-            while not self._ending.is_set() and self._failure is None:
+            while not self._ending.is_set():
                 taken = self._read(SLICE_S)
                 if taken is None:
                     silent += SLICE_S
                     if silent >= self._silent_s:
                         expected = f"expected a frame within {self._silent_s:g} s, found none"
-                        raise DeviceError(f"{' and '.join(before) or 'devices'}: {expected}; see cable and power")
+                        raise DeviceError(f"{' and '.join(self._stamps) or 'devices'}: {expected}; see cable and power")
                     continue
                 silent = 0.0
                 for one in taken:
-                    _check_clock(before.get(one.device), one)
-                    before[one.device], self.latest[one.device] = one, one.frame
-                try:
-                    self._waiting.put_nowait(taken)
-                except queue.Full:
+                    self._look(one)
+                if self._waiting.qsize() < WAITING:
+                    self._waiting.put(taken)
+                else:
                     self._left_out += 1
-        except DeviceError as error:
-            self._failure = self._failure or error
         finally:
             self._waiting.put(None)
+
+    def _look(self, one: Taken) -> None:
+        """Check a frame's number and stamp, and say if it came late."""
+        stamps = self._stamps.setdefault(one.device, _Stamps())
+        if late_ns := stamps.add(one):
+            self._say(f"{one.device}: frame {one.frame.number} came {1e-9 * late_ns:.1f} s late: is the computer busy?")
+        self.latest[one.device] = one.frame
 
     def _store(self) -> None:
         try:
             while (taken := self._waiting.get()) is not None:
                 for one in taken:
                     self._write(one)
-        except (InputError, OSError) as error:
-            self._failure = error
-            while self._waiting.get() is not None:  # so that the reader can end
-                pass
+        finally:
+            self._ending.set()  # without a writer, the reader ends
 
 
-def _check_clock(before: Taken | None, now: Taken) -> None:
-    """Check that a device counts and times on; DeviceError if its clock jumped, or it began anew."""
-    if before is None:
-        return
-    step, passed = now.time_ns - before.time_ns, now.frame.arrived_ns - before.frame.arrived_ns
-    if step <= 0 or abs(step - passed) > MOST_JUMP_NS:
-        found = f"{1e-9 * step:+.3f} s after {1e-9 * passed:.3f} s"
-        raise DeviceError(f"{now.device}: expected a clock that goes on, found {found} at frame {now.frame.number}; record anew")
-    if now.frame.number <= before.frame.number:
-        expected = f"a frame after {before.frame.number}"
-        raise DeviceError(f"{now.device}: expected {expected}, found {now.frame.number}: it began anew; record anew")
+class _Stamps:
+    """A device's time stamps, beside the moments at which its frames arrive.
+
+    A frame may arrive any time after it was taken, so one that comes late leaves the clock beyond doubt. But stamps rise, and
+    no frame arrives before it was taken: a stamp that is ahead of the fastest frame so far shows a clock that was set forward.
+    The first frames may all be the late ones of a slow start, so that those after them only seem to be ahead.
+    """
+
+    def __init__(self) -> None:
+        self.late, self.latest_ns = 0, 0  # frames that came late, and by how long the latest one
+        self._before: Taken | None = None
+        self._seen = 0
+        self._least_ns = 0  # from a stamp to its arrival, of the fastest frame; both clocks drift apart by some 0.1 s an hour
+        self._behind = False  # whether the frame before came late
+
+    def add(self, now: Taken) -> int:
+        """Take the next frame; returns its delay in ns if it is the first late one of a row, else 0.
+
+        Raises
+        ------
+        DeviceError
+            If the clock jumped, or the device began to count anew.
+        """
+        delay_ns = now.frame.arrived_ns - now.time_ns
+        if self._before is not None:
+            self._check(self._before, now, self._least_ns - delay_ns)
+        self._least_ns = delay_ns if self._before is None else min(self._least_ns, delay_ns)
+        self._before, self._seen = now, self._seen + 1
+        late_ns, followed = delay_ns - self._least_ns, self._behind
+        self._behind = late_ns > MOST_OFF_NS
+        if not self._behind:
+            return 0
+        self.late, self.latest_ns = self.late + 1, max(self.latest_ns, late_ns)
+        return 0 if followed else late_ns
+
+    def _check(self, before: Taken, now: Taken, ahead_ns: int) -> None:
+        back_ns = before.time_ns - now.time_ns
+        if back_ns >= 0 or (ahead_ns > MOST_OFF_NS and self._seen >= SURE):
+            found = f"it {1e-9 * back_ns:.3f} s back" if back_ns >= 0 else f"it {1e-9 * ahead_ns:.3f} s ahead of arrival"
+            expected = "a clock that goes on"
+            raise DeviceError(f"{now.device}: expected {expected}, found {found} at frame {now.frame.number}; record anew")
+        if now.frame.number <= before.frame.number:
+            expected = f"a frame after {before.frame.number}"
+            raise DeviceError(f"{now.device}: expected {expected}, found {now.frame.number}: it began anew; record anew")

@@ -10,8 +10,9 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pyglet
@@ -22,6 +23,7 @@ from recon.errors import reason
 
 if TYPE_CHECKING:
     from pyglet.display.base import Screen
+    from pyglet.display.xlib import XlibDisplay
 
 pyglet.options.shadow_window = False  # else importing its windows opens one
 pyglet.options.dpi_scaling = "real"  # a pixel of a window is one of the display
@@ -56,19 +58,28 @@ def displays() -> list[Display]:
     DeviceError
         If this session has no desktop.
     """
-    return [described(index, screen) for index, screen in enumerate(screens())]
+    with screens() as found:
+        return [described(index, screen) for index, screen in enumerate(found)]
 
 
-def screens() -> "list[Screen]":
-    """What pyglet calls a display, in the order of `displays`; of connections of their own. DeviceError without a desktop."""
-    found = list(itertools.chain.from_iterable(_screens_of_desktops()))
-    if not found:
-        place = os.environ.get("DISPLAY")
-        raise DeviceError(
-            f"projector: expected a desktop with displays, found {f'none at DISPLAY={place}' if place else 'no DISPLAY'}: "
-            "log in at the computer that the projector is connected to, or set DISPLAY, mostly to :0"
-        )
-    return found
+@contextmanager
+def screens() -> "Iterator[list[Screen]]":
+    """What pyglet calls a display, in the order of `displays`, by connections that are closed afterwards.
+
+    Raises
+    ------
+    DeviceError
+        If this session has no desktop.
+    """
+    with ExitStack() as stack:
+        found = list(itertools.chain.from_iterable(_screens_of_desktops(stack)))
+        if not found:
+            place = os.environ.get("DISPLAY")
+            raise DeviceError(
+                f"projector: expected a desktop with displays, found {f'none at DISPLAY={place}' if place else 'no DISPLAY'}: "
+                "log in at the computer that the projector is connected to, or set DISPLAY, mostly to :0"
+            )
+        yield found
 
 
 def chosen(found: Sequence[Display], index: int, size: Size) -> Display:
@@ -158,8 +169,8 @@ class _Ramp(ctypes.Structure):
     )
 
 
-def _screens_of_desktops() -> "Iterator[Sequence[Screen]]":
-    """Screens of pyglet, those of each screen of X11 by a connection of its own."""
+def _screens_of_desktops(stack: ExitStack) -> "Iterator[Sequence[Screen]]":
+    """Screens of pyglet, those of each screen of X11 by a connection of its own, which the stack closes."""
     if not sys.platform.startswith("linux"):
         yield pyglet.display.Display().get_screens()
         return
@@ -172,6 +183,17 @@ def _screens_of_desktops() -> "Iterator[Sequence[Screen]]":
         return
     for number in itertools.count():
         try:
-            yield XlibDisplay(f"{desktop}.{number}", number).get_screens()
+            connection = XlibDisplay(f"{desktop}.{number}", number)
         except NoSuchDisplayException:
             return
+        stack.callback(_disconnect, connection)
+        yield connection.get_screens()
+
+
+def _disconnect(connection: "XlibDisplay") -> None:
+    """Close a connection to X11 with what is left of its windows; pyglet keeps it for ever, and a server has room for 256."""
+    from pyglet.app.xlib import XlibEventLoop
+    from pyglet.libs.x11 import xlib
+
+    cast(XlibEventLoop, pyglet.app.platform_event_loop).select_devices.discard(connection)
+    xlib.XCloseDisplay(connection._display)

@@ -9,7 +9,8 @@ import logging
 import os
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import cv2
@@ -58,13 +59,14 @@ class ProjectorWindow:
         self.delay_s = delay_s
         self._closing = threading.Event()
         self._thread = ThreadPoolExecutor(1, "projector")  # the one thread that OpenGL and the window belong to
-        try:
-            self._canvas = self._thread.submit(_Canvas, size, display).result()
-        except BaseException:
-            self._thread.shutdown()
-            raise
-        self._pump = threading.Thread(target=self._keep_alive, name="projector messages", daemon=True)
-        self._pump.start()
+        opening = self._thread.submit(_Canvas, size, display)
+        with ExitStack() as stack:
+            stack.callback(self._thread.shutdown)
+            stack.callback(self._give_back, opening)
+            self._canvas = opening.result()
+            self._pump = threading.Thread(target=self._keep_alive, name="projector messages", daemon=True)
+            self._pump.start()
+            self._open = stack.pop_all()
 
     @property
     def display(self) -> Display:
@@ -97,8 +99,12 @@ class ProjectorWindow:
             return
         self._closing.set()
         self._pump.join()
-        self._thread.submit(self._canvas.close).result()
-        self._thread.shutdown()
+        self._open.close()
+
+    def _give_back(self, opening: "Future[_Canvas]") -> None:
+        """Close the window, if it was opened, also where nobody waited for it to the end."""
+        if opening.exception() is None:
+            self._thread.submit(opening.result().close).result()
 
     def _keep_alive(self) -> None:
         while not self._closing.wait(PUMP_S):
@@ -110,22 +116,21 @@ class _Canvas:
     """The window and what is drawn in it; all in one thread."""
 
     def __init__(self, size: Size, index: int) -> None:
-        screens = displays.screens()
-        found = [displays.described(each, screen) for each, screen in enumerate(screens)]
-        self.display = displays.chosen(found, index, size)
-        _warn_of_bending(screens[index], self.display)
-        self._window = _opened(screens[index], self.display)
-        self._window.push_handlers(on_key_press=_ignored, on_close=_ignored, on_expose=self._redraw)
-        self._window.set_mouse_visible(False)
-        self._texture = pyglet.image.Texture.create(
-            *size, min_filter=pyglet.gl.GL_NEAREST, mag_filter=pyglet.gl.GL_NEAREST, blank_data=True
-        )
-        try:
+        with ExitStack() as stack:
+            screens = stack.enter_context(displays.screens())
+            found = [displays.described(each, screen) for each, screen in enumerate(screens)]
+            self.display = displays.chosen(found, index, size)
+            _warn_of_bending(screens[index], self.display)
+            self._window = _opened(screens[index], self.display)
+            stack.callback(self._window.close)
+            self._window.push_handlers(on_key_press=_ignored, on_close=_ignored, on_expose=self._redraw)
+            self._window.set_mouse_visible(False)
+            self._texture = pyglet.image.Texture.create(
+                *size, min_filter=pyglet.gl.GL_NEAREST, mag_filter=pyglet.gl.GL_NEAREST, blank_data=True
+            )
             self._wait_for_place()
             self.draw(np.zeros(size[::-1], np.uint8))
-        except DeviceError:
-            self._window.close()
-            raise
+            self._open = stack.pop_all()
 
     def draw(self, pattern: Pattern) -> int:
         """Draw a pattern, check it and show it; the time in ns after the exchange of images."""
@@ -148,11 +153,11 @@ class _Canvas:
         self._window.dispatch_events()
 
     def close(self) -> None:
-        """Darken the screen and close the window."""
-        self._window.switch_to()
-        self._window.clear()
-        self._window.flip()
-        self._window.close()
+        """Darken the screen, and close window and connection in any case."""
+        with self._open:
+            self._window.switch_to()
+            self._window.clear()
+            self._window.flip()
 
     def _paint(self) -> None:
         self._window.clear()

@@ -3,7 +3,7 @@
 import re
 import socket
 from collections.abc import Sequence
-from contextlib import redirect_stdout
+from contextlib import ExitStack, redirect_stdout
 from io import StringIO
 from time import monotonic
 
@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.navigation.mass_distances import MassDistance
+from recon.navigation.own_pages import own_pages_alone
 from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import Moment, StillScene
 
@@ -44,15 +45,18 @@ class BrowserView:
         import viser  # of the extra `live`
 
         _check_free(host, port)
-        with redirect_stdout(StringIO()):  # it prints, even so
+        with own_pages_alone(host), redirect_stdout(StringIO()):  # it prints, even so
             self._server = viser.ViserServer(host=host, port=port, label="sonotwin", verbose=False)
-        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self._bodies = _add_scene(self._server, scene)
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
         self._beside: viser.GuiImageHandle | None = None  # and beside it
         self._shown: PlacedScan | None = None
         self._picture: Picture | None = None  # of that
-        self._words, self._written = self._server.gui.add_markdown("waiting for the first frames"), 0.0
+        with ExitStack() as stack:
+            stack.callback(self.close)
+            self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+            self._bodies = _add_scene(self._server, scene)
+            self._words, self._written = self._server.gui.add_markdown("waiting for the first frames"), 0.0
+            stack.pop_all()  # it is open
 
     @property
     def address(self) -> str:

@@ -5,6 +5,7 @@ where something is slow, what is shown is less often new, but never older.
 """
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from threading import Event, Thread
 from time import monotonic_ns
@@ -73,13 +74,14 @@ class Navigator:
         self._thread.start()
 
     def stop(self) -> None:
-        """End all threads, and give devices and publishers back."""
+        """End all threads, and give devices and publishers back, each whatever befalls the others."""
         self._stopped.set()
         self.pairs.close()
-        if self._thread is not None:
-            self._thread.join()
-        for each in (*self.feeds, *self.outlets):
-            each.stop()
+        with ExitStack() as stack:
+            for each in (*self.outlets, *self.feeds):
+                stack.callback(each.stop)
+            if self._thread is not None:
+                self._thread.join()
 
     @property
     def running(self) -> bool:

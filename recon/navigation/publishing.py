@@ -1,5 +1,6 @@
 """What is published: a scene that stands still, and moments; and a thread a publisher, so that none waits for another."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from threading import Thread
@@ -10,10 +11,13 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from recon.errors import InputError
 from recon.navigation.latencies import Latencies, Latency
 from recon.navigation.mass_distances import MassDistance
 from recon.navigation.newest import Newest
 from recon.navigation.placed_scans import PlacedScan
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -96,6 +100,12 @@ class Outlet:
         return self._thread is not None and self._thread.is_alive()
 
     def _run(self) -> None:
+        try:
+            self._publish_all()
+        except InputError as error:  # such as a B-scan larger than a message may be
+            log.error("%s: %s; nothing more is published by it", self.publisher.name, error)
+
+    def _publish_all(self) -> None:
         shown = None
         while not self._ended:
             moment = self.newest.take(WAIT_S)

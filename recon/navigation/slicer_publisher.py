@@ -5,6 +5,8 @@ Slicer puts whatever comes into its own frame RAS, from which the world is half 
 and masses as models, and a line of text.
 """
 
+import logging
+from collections.abc import Iterable
 from time import monotonic_ns, time_ns
 from typing import Protocol
 
@@ -12,16 +14,21 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from recon.devices.openigtlink.igtl_header import MOST_NAME_BYTES
+from recon.errors import short
 from recon.freehand.sequences import RAS_FROM_LPS
 from recon.geometry import rigid
 from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import Moment, StillScene
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
 TARGET, PROBE = "TargetToRAS", "ProbeToRAS"
 SCAN, STATUS, SKIN, DISTANCES = "BScan", "Status", "Skin", "Distances"
 PROBE_BODY = "Probe"  # a model in the target's frame, to be put under its transform
+OWN = (TARGET, PROBE, SCAN, STATUS, SKIN, DISTANCES, PROBE_BODY)
 
 
 class Sender(Protocol):
@@ -53,9 +60,10 @@ class SlicerPublisher:
         self._since_1970 = time_ns() - monotonic_ns()
         self._sent: PlacedScan | None = None
         self._status = ""
-        for name, mesh in ((SKIN, scene.skin), *((name.capitalize(), mesh) for name, mesh in scene.masses.items())):
-            if mesh is not None:
-                self._send_model(name, mesh, RAS_FROM_LPS)
+        if scene.skin is not None:
+            self._send_model(SKIN, scene.skin, RAS_FROM_LPS)
+        for name, mesh in zip(model_names(scene.masses), scene.masses.values(), strict=True):
+            self._send_model(name, mesh, RAS_FROM_LPS)
         if scene.probe is not None:
             self._send_model(PROBE_BODY, scene.probe, np.eye(4))
 
@@ -81,6 +89,30 @@ class SlicerPublisher:
 
     def _send_model(self, name: str, mesh: trimesh.Trimesh, ras_from_mesh: Array) -> None:
         self._sender.model(name, rigid.apply(ras_from_mesh, np.asarray(mesh.vertices)), np.asarray(mesh.faces, np.int64))
+
+
+def model_names(masses: Iterable[str]) -> list[str]:
+    """Names of masses as Slicer gets them: short enough for a message, and distinct from each other and from what else is sent.
+
+    A name that had to be changed beyond its capital is logged.
+    """
+    names: list[str] = []
+    for mass in masses:
+        whole = mass.capitalize().encode(errors="replace").decode()  # a file's name may hold what is no text
+        name, number = _shortened(whole), 1
+        while name in OWN or name in names:
+            number += 1
+            name = _shortened(whole, f"~{number}")
+        if name != whole:
+            why = f"its name is taken, or longer than {MOST_NAME_BYTES} bytes"
+            log.warning("OpenIGTLink: mass %s is sent as %s: %s", short(mass), name, why)
+        names.append(name)
+    return names
+
+
+def _shortened(name: str, end: str = "") -> str:
+    """A name with an end, of at most as many bytes as a message has room for."""
+    return name.encode()[: MOST_NAME_BYTES - len(end)].decode(errors="ignore") + end
 
 
 def distances_line(moment: Moment) -> str:

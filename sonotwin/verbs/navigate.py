@@ -11,6 +11,7 @@ until it is interrupted, or for some seconds. Writes nothing.
 """
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Annotated, Literal, NamedTuple, cast
@@ -36,7 +37,7 @@ from recon.navigation.exposure_clock import FollowedClock
 from recon.navigation.feeds import Device
 from recon.navigation.igtl_sender import IgtlSender
 from recon.navigation.navigator import Navigator, warm_up
-from recon.navigation.publishing import Publisher
+from recon.navigation.publishing import Publisher, StillScene
 from recon.navigation.slicer_publisher import SlicerPublisher
 from recon.probe_calibration import sound_in_water
 from recon.tracking import networks
@@ -122,15 +123,11 @@ def run(config: Config) -> int:
         scene = still_scene.read_scene(config.skin, config.masses, tracker.target, probe, sources.width, config.part_table)
     with console.status("getting ready to track"):
         warm_up(tracker)
-    view = BrowserView(scene, config.view.port, config.view.host)
-    publishers: list[Publisher] = [view]
-    if config.igtl.serve:
-        publishers.append(SlicerPublisher(scene, IgtlSender(Server(config.igtl.host, config.igtl.port))))
     bodies = mass_distances.bodies_of(scene.masses)
+    publishers = publishers_of(config, scene, console)
     navigator = Navigator((sources.cam1, sources.cam2), sources.scanner, tracker, probe, config.lag_s, bodies, publishers)
-    console.print(f"view        {view.address}", markup=False)
-    navigator.start()
     try:
+        navigator.start()
         until = monotonic() + (config.seconds or float("inf"))
         while navigator.running and monotonic() < until:
             sleep(LOOK_S)
@@ -138,6 +135,21 @@ def run(config: Config) -> int:
     finally:
         navigator.stop()
         tell(navigator, console)
+
+
+def publishers_of(config: Config, scene: StillScene, console: Console) -> list[Publisher]:
+    """Open the page and the OpenIGTLink server; if a port is taken, none of them stays open."""
+    with ExitStack() as stack:
+        view = BrowserView(scene, config.view.port, config.view.host)
+        stack.callback(view.close)
+        publishers: list[Publisher] = [view]
+        if config.igtl.serve:
+            server = Server(config.igtl.host, config.igtl.port)
+            stack.callback(server.close)
+            publishers.append(SlicerPublisher(scene, IgtlSender(server)))
+        console.print(f"view        {view.address}", markup=False)
+        stack.pop_all()  # they are the navigator's now
+        return publishers
 
 
 def tell(navigator: Navigator, console: Console) -> None:
@@ -202,11 +214,14 @@ def opened(config: Config, devices: LiveDevices) -> Sources:
 
     def camera(name: str) -> Device:
         def begun() -> Camera:
-            found = open_camera(devices, name)
-            found.set_exposure(config.exposure_s, config.gain)
-            # camera 1's exposures trigger camera 2
-            found.start("hardware" if config.trigger == "hardware" and name != CAMERAS[0] else "free")
-            return found
+            with ExitStack() as stack:
+                found = open_camera(devices, name)
+                stack.callback(found.close)
+                found.set_exposure(config.exposure_s, config.gain)
+                # camera 1's exposures trigger camera 2
+                found.start("hardware" if config.trigger == "hardware" and name != CAMERAS[0] else "free")
+                stack.pop_all()  # it is open, and its feed's to close
+                return found
 
         return Device(name, begun, lambda source: FollowedClock(follow(cast(Camera, source))))
 

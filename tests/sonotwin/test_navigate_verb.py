@@ -6,14 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from rich.console import Console
 
 from recon.capture.manifest import CAMERAS, SCANNER, Device
 from recon.capture.writer import new_capture
+from recon.devices.interfaces import DeviceError
 from recon.files import meshes
 from recon.navigation.browser_view import LOOPBACK, BrowserView
+from recon.navigation.publishing import StillScene
 from recon.tracking import networks
+from sonotwin import config
 from sonotwin.cli import main
+from sonotwin.verbs import navigate
 from tests.recon import probe_motions
+from tests.recon.acquisition.stand_ins import Bench, BenchCamera
 from tests.recon.tracking import films
 from tests.recon.tracking.stand_ins import Told
 
@@ -53,6 +59,39 @@ def free_port():
     with socket.socket() as any_port:
         any_port.bind((LOOPBACK, 0))
         return any_port.getsockname()[1]
+
+
+def composed(*fields: str) -> navigate.Config:
+    return config.load("navigate", list(fields), navigate.Config)
+
+
+def test_a_taken_port_of_openigtlink_leaves_no_page_open():
+    port = free_port()
+    with socket.create_server((LOOPBACK, 0)) as other:
+        taken = other.getsockname()[1]
+        fields = composed("capture=x", f"view.port={port}", f"igtl.port={taken}")
+        with pytest.raises(DeviceError, match=f"OpenIGTLink server 127.0.0.1:{taken}: expected a free port"):
+            navigate.publishers_of(fields, StillScene(np.eye(4)), Console())
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection((LOOPBACK, port), 1).close()
+
+
+@pytest.mark.parametrize("refuses", ["set_exposure", "start"])
+def test_a_camera_that_refuses_a_setting_is_closed(monkeypatch, refuses):
+    """It is opened again every second, which a camera that is still open would refuse for ever."""
+    camera = BenchCamera("cam1", Bench())
+    closed = []
+
+    def refuse(*_):
+        raise DeviceError(f"cam1: {refuses} is refused")
+
+    monkeypatch.setattr(camera, refuses, refuse)
+    monkeypatch.setattr(camera, "close", lambda: closed.append(True))
+    monkeypatch.setattr(navigate, "open_camera", lambda devices, name: camera)
+    sources = navigate.sources_of(composed("devices=basler"))
+    with pytest.raises(DeviceError, match=refuses):
+        sources.cam1.open()
+    assert closed == [True]
 
 
 @pytest.mark.slow

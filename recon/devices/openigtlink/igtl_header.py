@@ -22,6 +22,7 @@ ENCODINGS = {3: "ascii", 4: "latin-1", 106: "utf-8"}  # numbers of the IANA char
 ASCII, UTF8 = 3, 106
 SECOND = 10**9  # ns
 LAST_SECOND = 2**32  # since 1970; the field ends in 2106
+MOST_NAME_BYTES = 20  # of a device
 MOST_BODY_BYTES = 64 << 20  # a volume of 64 MB; a live image has less than 10
 MOST_ENTRIES = 1000  # of the metadata
 FARTHEST_MM = 1e9
@@ -111,8 +112,9 @@ def join(version: int, kind: str, device: str, time_ns: int | None, body: Body) 
     name = device.encode()
     if not KIND.fullmatch(kind.encode()):
         raise InputError(f"OpenIGTLink: expected a kind of 1 to 12 letters, found {short(kind)!r}")
-    if len(name) > 20:
-        raise InputError(f"OpenIGTLink: expected a device's name of at most 20 bytes, found {short(device)!r} of {len(name)}")
+    if len(name) > MOST_NAME_BYTES:
+        expected = f"a device's name of at most {MOST_NAME_BYTES} bytes"
+        raise InputError(f"OpenIGTLink: expected {expected}, found {short(device)!r} of {len(name)}")
     whole = bytes(body.content) if version == 1 else _extended(body)
     return HEADER.pack(version, kind.encode(), name, fixed_point(time_ns), len(whole), crc64(whole)) + whole
 

@@ -13,7 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 from recon.devices.interfaces import DeviceError
 from recon.devices.openigtlink import igtl_header, igtl_messages
@@ -58,12 +58,14 @@ class Server:
         self._clients: list[_Client] = []
         self._lock = threading.Lock()  # over the two above
         self._ends = threading.Event()
-        self._listener = _listener(host, port)
-        self.port: int = self._listener.getsockname()[1]
-        self._complaints = Complaints(log, f"OpenIGTLink server {host}:{self.port}")
         igtl_header.crc64(b"")  # is compiled now, not within the first message
-        self._thread = threading.Thread(target=self._accept_all, name="OpenIGTLink server", daemon=True)
-        self._thread.start()
+        with ExitStack() as stack:
+            self._listener = stack.enter_context(_listener(host, port))
+            self.port: int = self._listener.getsockname()[1]
+            self._complaints = Complaints(log, f"OpenIGTLink server {host}:{self.port}")
+            self._thread = threading.Thread(target=self._accept_all, name="OpenIGTLink server", daemon=True)
+            self._thread.start()
+            stack.pop_all()  # the thread closes it
 
     @property
     def clients(self) -> int:
@@ -229,6 +231,7 @@ def _is_query(header: Header) -> bool:
 def _listener(host: str, port: int) -> socket.socket:
     """A socket that listens."""
     try:
+        host.encode("idna")  # of a name that is none, `create_server` would leave its socket open
         listener = socket.create_server((host, checked_port(port, least=0)))
     except (OSError, UnicodeError) as error:  # the second of a host's name that is none
         used = isinstance(error, OSError) and error.errno == errno.EADDRINUSE

@@ -30,12 +30,12 @@ def image(number: int) -> np.ndarray:
 
 
 class Source:
-    """Frames at 200 Hz, until `last`; some numbers are left out, some times are off by ns."""
+    """Frames at 200 Hz, until `last`; some numbers are left out, some times are off by ns, some frames late by ns."""
 
     name, size = "us", SIZE
 
-    def __init__(self, last=40, lost=(), off=None, then=None) -> None:
-        self.last, self.off, self.then, self.over = last, off or {}, then, False
+    def __init__(self, last=40, lost=(), off=None, then=None, late=None) -> None:
+        self.last, self.off, self.then, self.late, self.over = last, off or {}, then, late or {}, False
         self.numbers = iter([k for k in range(last) if k not in lost])
 
     def frame(self, timeout_s):
@@ -48,7 +48,7 @@ class Source:
             time.sleep(timeout_s)
             return None
         moment = NOW + number * 5_000_000
-        return Frame(image(number), number, moment + self.off.get(number, 0), moment + 1_000_000)
+        return Frame(image(number), number, moment + self.off.get(number, 0), moment + self.late.get(number, 1_000_000))
 
     def pair(self, timeout_s):
         frame = self.frame(timeout_s)
@@ -91,8 +91,8 @@ def test_all_frames_are_kept_with_their_numbers_and_times(tmp_path):
     [
         (Source(20, then=DeviceError("us: unplugged; check its cable")), 20, "us: unplugged"),
         (Source(20), 1, "us: expected a frame within 1 s"),
-        (Source(20, off={19: 5 * 10**9}), 20, r"us: expected a clock that goes on, found \+5.005 s after 0.005 s at frame 19"),
-        (Source(20, off={19: -(10**10)}), 20, "us: expected a clock that goes on"),
+        (Source(20, off={19: 5 * 10**9}), 20, "us: expected a clock that goes on, found it 5.000 s ahead of arrival at frame 19"),
+        (Source(20, off={19: -(10**10)}), 20, "us: expected a clock that goes on, found it 9.995 s back"),
     ],
     ids=["unplugged", "silent", "clock forward", "clock back"],
 )
@@ -100,6 +100,28 @@ def test_a_device_that_fails_ends_the_recording_and_what_came_stays(tmp_path, sc
     with pytest.raises(DeviceError, match=reason):
         record(tmp_path, Source(10_000), scanner, silent_s)
     assert len(frames(tmp_path, "us")) >= 19 and len(frames(tmp_path, "cam1")) > 0
+
+
+@pytest.mark.parametrize(
+    ("late", "named"),
+    [
+        ({19: 2 * 10**9}, ["us: frame 19 came 2.0 s late", "frames of us that came late: 1, by up to 2.0 s"]),
+        (
+            {k: 3 * 10**9 - k * 5_000_000 for k in range(10, 30)},
+            ["us: frame 10 came 2.9 s late", "frames of us that came late: 20, by up to 2.9 s"],
+        ),
+        ({0: 2 * 10**9}, []),
+    ],
+    ids=["one", "a row that comes at once", "the first"],
+)
+def test_a_late_frame_is_recorded_and_named(tmp_path, late, named):
+    """The computer was busy: the device's clock has gone on all the same."""
+    said: list[str] = []
+    assert record(tmp_path, scanner=Source(40, late=late), said=said)["us"] == 40
+    numbers, times = sweep_tables.read_stamps(tmp_path / "out/sweep/scan/us/timestamps.csv")
+    assert (times == NOW + numbers * 5_000_000).all()
+    found = [line for line in said if "late" in line]
+    assert len(found) == len(named) and all(line.startswith(start) for line, start in zip(found, named, strict=True))
 
 
 def test_a_full_disk_ends_the_recording_and_what_came_stays(tmp_path, monkeypatch):

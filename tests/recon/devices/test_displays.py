@@ -6,6 +6,7 @@ import pytest
 from recon.devices import displays
 from recon.devices.displays import Display
 from recon.devices.interfaces import DeviceError
+from tests.recon.devices.open_sockets import sockets
 from tests.recon.devices.x_server import set_output, set_ramp, x_server
 
 LAPTOP = Display(0, "eDP-1", (1920, 1080), (1920, 1080), (0, 0), 60.0)
@@ -21,6 +22,17 @@ def test_displays_are_listed_with_size_place_and_rate(monkeypatch):
     assert (projector.index, projector.size, projector.position) == (0, (320, 240), (640, 480))
     assert projector.rate_hz == pytest.approx(60, abs=0.1)
     assert (other.index, other.size, other.position) == (1, (640, 480), (0, 0))
+
+
+def test_a_list_of_displays_leaves_no_connection_open(monkeypatch):
+    """A server has room for 256 clients: whoever asks for the displays again and again would fill it."""
+    with x_server("320x240x24", "320x240x24") as desktop:
+        monkeypatch.setenv("DISPLAY", desktop)
+        displays.displays()  # what is loaded once
+        before = sockets()
+        for _ in range(5):
+            assert len(displays.displays()) == 2
+        assert sockets() == before
 
 
 @pytest.mark.parametrize("named", ["", ":12345"])
@@ -55,7 +67,8 @@ def test_a_ramp_is_read_as_it_was_set(monkeypatch):
     with x_server("640x480x24") as desktop:
         monkeypatch.setenv("DISPLAY", desktop)
         set_ramp(desktop, levels)
-        ramp = displays.gamma_ramp(displays.screens()[0])
+        with displays.screens() as screens:
+            ramp = displays.gamma_ramp(screens[0])
     assert ramp == pytest.approx(np.tile(levels, (3, 1)), abs=1 / 65535)
 
 

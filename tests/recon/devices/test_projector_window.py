@@ -1,5 +1,6 @@
 """Whether a display shows what a sequence asks for, on a screen without a monitor."""
 
+import threading
 import time
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from recon.capture.surface_part import read_patterns
 from recon.devices.displays import displays
 from recon.devices.interfaces import DeviceError
 from recon.devices.projector_window import ProjectorWindow
+from tests.recon.devices.open_sockets import sockets
 from tests.recon.devices.x_server import covered, move_windows, set_output, set_ramp, x_server
 from twin.accuracy.virtual_screen import screenshot
 
@@ -89,6 +91,45 @@ def test_a_closed_projector_is_dark_and_refuses(desktop, noise):
     assert not screenshot(f"{desktop}.1").any()
     with pytest.raises(DeviceError, match="expected an open window"):
         window.show(noise)
+
+
+def left_behind() -> tuple[int, int, int]:
+    """Sockets, windows and threads of this process."""
+    return sockets(), len(pyglet.app.windows), sum(one.name.startswith("projector") for one in threading.enumerate())
+
+
+@pytest.mark.parametrize("fails", ["pyglet.image.Texture.create", "pyglet.window.Window.flip", "threading.Thread.start"])
+def test_what_fails_while_it_opens_leaves_nothing_behind(desktop, monkeypatch, fails):
+    """A fault of OpenGL's or of the system's, once the window is there."""
+    ProjectorWindow((1280, 800), 1, delay_s=0).close()
+    before, start = left_behind(), threading.Thread.start
+
+    def fail(*given, **_):
+        if fails.startswith("threading") and given[0].name != "projector messages":
+            return start(given[0])
+        raise RuntimeError("out of memory")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fails, fail)
+        with pytest.raises(RuntimeError, match="out of memory"):
+            ProjectorWindow((1280, 800), 1, delay_s=0)
+    assert left_behind() == before and not screenshot(f"{desktop}.1").any()
+
+
+def test_a_window_that_cannot_be_darkened_is_closed_all_the_same(desktop, monkeypatch, noise):
+    ProjectorWindow((1280, 800), 1, delay_s=0).close()
+    before = left_behind()
+    window = ProjectorWindow((1280, 800), 1, delay_s=0)
+    window.show(noise)
+
+    def fail(_):
+        raise RuntimeError("the graphics card is gone")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(window._canvas._window), "flip", fail)
+        with pytest.raises(RuntimeError, match="graphics card"):
+            window.close()
+    assert left_behind() == before and not screenshot(f"{desktop}.1").any()
 
 
 def test_what_was_covered_comes_back(desktop, projector, noise):

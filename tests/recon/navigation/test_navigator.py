@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from recon.devices.interfaces import DeviceError
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.navigation.feeds import Device
 from recon.navigation.mass_distances import bodies_of
@@ -167,6 +168,32 @@ def test_an_end_closes_devices_and_publishers(navigate):
     until(lambda: len(devices) == 3)
     navigator.stop()
     assert kept.closed and all(device.closed for device in devices) and not navigator.running
+
+
+def test_an_end_closes_the_others_though_one_fails(navigate):
+    class Stuck(Kept):
+        def close(self):
+            if not self.closed:
+                super().close()
+                raise RuntimeError("a fault in the program")
+
+    publishers = [Kept(), Stuck(), Kept()]
+    navigator = navigate(publishers)
+    with pytest.raises(RuntimeError):
+        navigator.stop()
+    assert all(each.closed for each in publishers) and not navigator.running
+
+
+def test_what_cannot_be_published_is_told_in_one_line(navigate, caplog, monkeypatch):
+    class Refusing(Kept):
+        def publish(self, moment):
+            raise InputError("IMAGE of 'BScan': expected at most 67108864 bytes, found 99999999")
+
+    unhandled = []
+    monkeypatch.setattr("threading.excepthook", unhandled.append)
+    navigator = navigate([Refusing()])
+    until(lambda: not navigator.running)
+    assert not unhandled and "kept: IMAGE of 'BScan': expected at most 67108864 bytes" in caplog.text
 
 
 def test_a_publisher_that_fails_ends_it_all(navigate, monkeypatch):

@@ -78,6 +78,19 @@ def test_models_lie_in_the_same_frame_and_the_probe_in_the_targets(scene):
         assert triangles.max() == len(points) - 1
 
 
+def test_names_of_masses_stay_distinct_and_fit_in_a_message(scene, caplog):
+    """Bodies of the same names beside them are kept, and so is each mass."""
+    long = ["mass_of_the_left_upper_1", "mass_of_the_left_upper_2", "Knötchen_im_Gewebe_1"]
+    names = [*long, "mASS", "MASS", "skin", "probe", "\udcff"]
+    ball = scene.skin
+    sent, masses = Sent(), dict.fromkeys(names, ball)
+    SlicerPublisher(StillScene(scene.target_from_image, ball, masses, ball), sent)
+    found = [name for kind, name, *_ in sent.messages if kind == "model"]
+    assert len(set(found)) == len(names) + 2 and {"Skin", "Probe", "Mass", "Mass~2", "Skin~2", "Probe~2"} <= set(found)
+    assert max(len(name.encode()) for name in found) <= 20
+    assert "mass_of_the_left_upper_2 is sent as Mass_of_the_left_u~2" in caplog.text and "MASS is sent as Mass~2" in caplog.text
+
+
 def test_what_has_not_changed_is_not_sent_again(rig, scene):
     sent = Sent()
     publisher, moment = SlicerPublisher(scene, sent), moment_of(probe_motions.true_probe(rig))

@@ -17,6 +17,7 @@ from recon.devices.openigtlink.igtl_model import Model
 from recon.devices.openigtlink.igtl_server import Server
 from recon.devices.openigtlink.igtl_stream import Splitter
 from recon.errors import InputError
+from tests.recon.devices.open_sockets import sockets
 from tests.recon.devices.openigtlink.igtl_peers import TIME_NS, pose
 
 WAIT_S = 10.0
@@ -208,9 +209,21 @@ def test_a_used_port_is_named(server):
 
 @pytest.mark.parametrize("host", ["203.0.113.7", "a" * 70])  # an address for documentation, which is nobody's
 def test_addresses_of_others_are_named(host):
+    before = sockets()
     with pytest.raises(DeviceError, match="expected a free port of this computer, found") as caught:
         Server(host, port=0)
-    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(caught.value).splitlines()) == 1 and sockets() == before
+
+
+def test_a_server_that_cannot_begin_leaves_its_port_free(monkeypatch):
+    def fail(_):
+        raise RuntimeError("can't start new thread")
+
+    before = sockets()
+    monkeypatch.setattr(threading.Thread, "start", fail)
+    with pytest.raises(RuntimeError) as caught:
+        Server(port=0)
+    assert sockets() == before and caught.tb  # which would keep a socket that nobody has closed
 
 
 def test_an_open_address_is_told(caplog):

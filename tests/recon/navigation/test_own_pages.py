@@ -1,0 +1,66 @@
+"""A stranger's page in the surgeon's browser gets nothing of the view."""
+
+import socket
+import urllib.request
+
+import numpy as np
+import pytest
+
+from recon.navigation import own_pages
+from recon.navigation.browser_view import LOOPBACK, BrowserView
+from recon.navigation.publishing import StillScene
+from tests.recon.navigation.test_browser_view import free_port
+
+pytest.importorskip("viser")
+
+
+@pytest.fixture(scope="module")
+def port():
+    view = BrowserView(StillScene(np.eye(4)), free_port())
+    yield view._server.get_port()
+    view.close()
+
+
+def answer(port: int, origin: str | None, host: str | None = None) -> int:
+    """Status of a handshake; 101 begins a connection."""
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    try:
+        reached = socket.create_connection((LOOPBACK, port), 5)
+        with connect(f"ws://{host or LOOPBACK}:{port}", sock=reached, origin=origin, subprotocols=["viser-v0"]) as opened:
+            return opened.response.status_code
+    except InvalidStatus as refused:
+        return refused.response.status_code
+
+
+def test_its_own_page_and_other_programs_are_let_in(port):
+    assert answer(port, f"http://{LOOPBACK}:{port}") == 101
+    assert answer(port, f"http://localhost:{port}", "localhost") == 101
+    assert answer(port, None) == 101
+    with urllib.request.urlopen(f"http://{LOOPBACK}:{port}/") as page:
+        assert page.status == 200
+
+
+def test_a_strangers_page_is_refused(port):
+    assert answer(port, "https://example.org") == 403
+    assert answer(port, f"http://{LOOPBACK}:{port + 1}") == 403, "a page of another program on this computer"
+    assert answer(port, "null") == 403, "a page in a frame without an origin"
+    assert answer(port, f"http://rebound.example:{port}", "rebound.example") == 403, "a stranger's name that leads here"
+
+
+@pytest.mark.parametrize(
+    ("origins", "asked", "host", "own"),
+    [
+        (["http://rig.clinic:8080"], ["rig.clinic:8080"], "0.0.0.0", True),
+        (["https://rig.clinic"], ["rig.clinic"], "0.0.0.0", True),
+        (["http://localhost:9000"], ["localhost:9000"], LOOPBACK, True),
+        (["http://rig.clinic:8080"], ["192.168.0.4:8080"], "0.0.0.0", False),
+        (["http://[", "http://["], ["["], LOOPBACK, False),
+        (["http://["], ["["], LOOPBACK, False),
+        (["http://localhost:8080"], [], LOOPBACK, False),
+    ],
+)
+def test_a_page_is_own_where_it_came_from_the_place_that_is_asked(origins, asked, host, own):
+    """Also by a name in the network, behind a proxy, or through a tunnel to another port."""
+    assert own_pages.is_own(origins, asked, host) is own
