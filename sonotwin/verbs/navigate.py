@@ -44,19 +44,21 @@ from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_o
 
 LOOK_S = 0.2  # between two looks whether all goes on
 
+Host = Annotated[str, Field(min_length=1)]  # an empty one would stand for all of the network
+
 
 class View(Part):
     """The page in the browser."""
 
-    host: str = LOOPBACK
-    port: Annotated[int, Field(ge=1, le=65535)] = 8080
+    host: Host = LOOPBACK
+    port: Annotated[int, Field(ge=0, le=65535)] = 8080
 
 
 class Igtl(Part):
     """The OpenIGTLink server."""
 
     serve: bool = True
-    host: str = LOOPBACK
+    host: Host = LOOPBACK
     port: Annotated[int, Field(ge=1, le=65535)] = PORT
 
 
@@ -114,10 +116,9 @@ def run(config: Config) -> int:
         scene = still_scene.read_scene(config.skin, config.masses, tracker.target, probe, sources.width, config.part_table)
     with console.status("getting ready to track"):
         warm_up(tracker)
-    view = BrowserView(scene, config.view.port, config.view.host)
-    publishers: list[Publisher] = [view]
-    if config.igtl.serve:
-        publishers.append(SlicerPublisher(scene, IgtlSender(Server(config.igtl.host, config.igtl.port))))
+    slicer = [SlicerPublisher(scene, IgtlSender(Server(config.igtl.host, config.igtl.port)))] if config.igtl.serve else []
+    view = BrowserView(scene, config.view.port, config.view.host)  # last, as it would print at the end of a run that is refused
+    publishers: list[Publisher] = [view, *slicer]
     bodies = mass_distances.bodies_of(scene.masses)
     navigator = Navigator((sources.cam1, sources.cam2), sources.scanner, tracker, probe, config.lag_s, bodies, publishers)
     console.print(f"view        {view.address}", markup=False)
