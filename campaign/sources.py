@@ -107,14 +107,14 @@ COMMANDS = (
             ("both/capture/manifest.json", "both/capture/surface/cam2/0003.png", "both/capture/calibration/optics.yaml")),
     Command("check", ("capture=bottom/capture", "probe=probe/probe.yaml", "lag=lag/lag.json", "log=rig.jsonl"),
             ("bottom", "probe", "lag", "rig.jsonl"), (*_sweep("bottom"), "probe/probe.yaml", "lag/lag.json", "rig.jsonl")),
-    Command("navigate", ("capture=filmed/capture", "skin=skin/surface.ply", "masses=lump", "seconds=1", "view.port=0",
+    Command("navigate", ("capture=filmed/capture", "skin=bent.ply", "masses=lump", "seconds=1", "view.port=0",
                          "igtl.serve=false"),
-            ("filmed", "skin", "lump"), (*PLAYED, "skin/surface.ply", "lump/mass0.ply"), out=""),
-    Command("project", ("skin=skin/surface.ply", "calibration=optics/optics.yaml", "masses=lump", "cut=cut.mrk.json"),
-            ("skin", "optics", "lump", "cut.mrk.json"),
-            ("skin/surface.ply", "optics/optics.yaml", "lump/mass0.ply", "cut.mrk.json")),
-    Command("project", ("skin=skin/surface.ply", "calibration=optics/optics.yaml", "cut=cut.mrk.json", "capture=scan/capture"),
-            ("skin", "optics", "scan", "cut.mrk.json"), SCAN),
+            ("filmed", "bent.ply", "lump"), (*PLAYED, "bent.ply", "lump/mass0.ply"), out=""),
+    Command("project", ("skin=bent.ply", "calibration=optics/optics.yaml", "masses=lump", "cut=cut.mrk.json"),
+            ("bent.ply", "optics", "lump", "cut.mrk.json"),
+            ("bent.ply", "optics/optics.yaml", "lump/mass0.ply", "cut.mrk.json")),
+    Command("project", ("skin=bent.ply", "calibration=optics/optics.yaml", "cut=cut.mrk.json", "capture=scan/capture"),
+            ("bent.ply", "optics", "scan", "cut.mrk.json"), SCAN),
     Command("freehand", ("capture=scan/capture",), ("scan",), SCAN),
     Command("freehand", ("sequence=volume/sequence.igs.mha", "config=plus.xml"), ("volume", "plus.xml"),
             ("volume/sequence.igs.mha", "plus.xml")),
@@ -191,18 +191,22 @@ def _write_others(folder: Path) -> None:
 
 
 def _write_what_is_projected(folder: Path) -> None:
-    """A mass under the plane beside the ball, where no probe takes the light, and a cut over it."""
+    """A skin that is read at once, a mass below it where no probe takes the light, and a cut over that."""
     import json
 
     import trimesh
 
     from recon.files import meshes
+    from scenes.solid_meshes import grid
 
-    points = meshes.read_ply(folder / "skin/surface.ply", "a skin").vertices
-    place = points[np.linalg.norm(points[:, :2] - [0, 50], axis=1).argmin()]
+    points, triangles = grid((240.0, 200.0), (60, 50))
+    height = 660 + ((points / [12.0, 11.0]) ** 2).sum(axis=1)
+    skin = trimesh.Trimesh(np.column_stack([points, height]), triangles[:, ::-1], process=False)
+    place = np.array([0.0, 50.0, 680.0])
     mass = trimesh.creation.icosphere(2, 4.0).apply_translation(place + np.array([0, 0, 10]))
     (folder / "lump").mkdir(exist_ok=True)
     meshes.write_ply(folder / "lump/mass0.ply", mass)
+    meshes.write_ply(folder / "bent.ply", skin)
     cut = [{"position": (place + np.array([aside, 4, 0])).tolist()} for aside in (-6, -2, 2, 6)]
     (folder / "cut.mrk.json").write_text(json.dumps({"markups": [{"type": "Curve", "controlPoints": cut}]}), encoding="utf-8")
 
