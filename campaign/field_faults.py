@@ -48,10 +48,13 @@ def overrides(verb: str, fields: Sequence[str], inputs: Sequence[str]) -> Iterat
         "out=[a",
         "out={a: b}",
     )
-    yield from (f"out={place}" for place in (*OUT, *(() if verb in BESIDE else TAKEN)))
+    writes = any(field.startswith("out=") for field in fields)
+    if writes:
+        yield from (f"out={place}" for place in (*OUT, *(() if verb in BESIDE else TAKEN)))
     for name in inputs:
         yield from (f"{name}={place}" for place in IN)
-        yield f"out={next(field.partition('=')[2] for field in fields if field.startswith(f'{name}='))}"  # what is read
+        if writes:
+            yield f"out={next(field.partition('=')[2] for field in fields if field.startswith(f'{name}='))}"  # what is read
 
 
 def lay_out(folder: Path) -> None:

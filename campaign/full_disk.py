@@ -64,7 +64,7 @@ def small_disk(folder: Path, size: int) -> Iterator[None]:
 
 def writers() -> list[Command]:
     """A command of each verb that writes."""
-    firsts = {command.verb: command for command in reversed(COMMANDS) if command.verb not in WITHOUT}
+    firsts = {command.verb: command for command in reversed(COMMANDS) if command.out and command.verb not in WITHOUT}
     return list(reversed(firsts.values()))
 
 

@@ -21,9 +21,11 @@ MADE = (  # command lines in the order in which they are run
     ("render", "scene=sphere", "cameras=[cam1]", "tracing.samples=4", "out=ball"),
     ("render", "scene=board", "poses=demo", "poses.count=5", "patterns=paper_calibration", "cameras=[cam1,cam2]",
      "tracing.samples=4", "out=board"),
+    ("render", "scene=sphere", "cameras=[cam1,cam2]", "tracing.samples=4", "out=both"),
     ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "path.count=12", "out=wires"),
     ("sweep", "scene=tank", "ultrasound=water", "path=bob", "path.seconds=2", "out=bottom"),
     ("sweep", *STROKE, "out=scan"),
+    ("sweep", *STROKE, "filmed=true", "clocks.camera_hz=20", "out=filmed"),
     ("film", "frames=24", "path.turn_deg=20", "white_dn=120", "seed=1", "out=film"),
     ("dataset", "samples=4", "shard=2", "out=data"),
     ("train", "network=detector", "data=data", "steps=2", "batch=2", "crop_px=64", "out=net"),
@@ -35,6 +37,7 @@ MADE = (  # command lines in the order in which they are run
     ("segment", "capture=scan/capture", "out=masses"),
     ("calibrate-target", "capture=film/capture", "least_tilt_deg=0", "least_range_mm=0", "out=target"),
     ("export", "capture=ball/capture", "out=published"),
+    ("check", "capture=bottom/capture", "lag=lag/lag.json", "log=rig.jsonl", "out=checked"),
     ("study", "name=sweep", "of=tracking", "film.frames=2", "over={film.rays: [16]}", "seeds=1", "out=study"),
 )  # fmt: skip
 
@@ -49,12 +52,12 @@ class Command:
     reads: tuple[str, ...] = ()  # files of those that it must refuse if they are damaged
     reads_in_part: tuple[str, ...] = ()  # files of which some fields or pixels don't matter to it: it must refuse other files
     minutes: bool = False  # that it takes without a fault: it isn't tried without one
-    out: str = "new"
+    out: str = "new"  # nothing for a verb that writes none
 
     @property
     def line(self) -> tuple[str, ...]:
         """The whole command line."""
-        return (self.verb, *self.fields, f"out={self.out}")
+        return (self.verb, *self.fields, *([f"out={self.out}"] if self.out else []))
 
 
 def _sweep(name: str, number: int = 3) -> tuple[str, ...]:
@@ -70,6 +73,12 @@ def _film(name: str) -> tuple[str, ...]:
 
 BALL = ("ball/capture/manifest.json", "ball/capture/surface/cam1/0003.png", "ball/capture/calibration/optics.yaml")
 SCAN = (*_sweep("scan"), "scan/capture/calibration/probe.yaml")
+PLAYED = (
+    "filmed/capture/manifest.json",
+    "filmed/capture/calibration/optics.yaml",
+    "filmed/capture/calibration/probe.yaml",
+    *(f"filmed/capture/sweep/{device}/timestamps.csv" for device in ("cam1", "cam2", "us")),
+)  # images: while it goes on
 POSES = ("columns.time=t", "columns.translation=[x,y,z]", "columns.quaternion=[qx,qy,qz,qw]")
 
 COMMANDS = (
@@ -92,6 +101,20 @@ COMMANDS = (
     Command("track", ("capture=film/capture", "target=target/target.yaml", "networks=networks"),
             ("film", "target", "networks"),
             (*_film("film"), "target/target.yaml", "networks/detector.onnx", "networks/segmenter.onnx")),
+    Command("check", ("capture=film/capture", "target=target/target.yaml", "alarm_sigma=20"), ("film", "target"),
+            (*_film("film"), "target/target.yaml")),
+    Command("check", ("capture=both/capture", "alarm_sigma=20"), ("both",),
+            ("both/capture/manifest.json", "both/capture/surface/cam2/0003.png", "both/capture/calibration/optics.yaml")),
+    Command("check", ("capture=bottom/capture", "probe=probe/probe.yaml", "lag=lag/lag.json", "log=rig.jsonl"),
+            ("bottom", "probe", "lag", "rig.jsonl"), (*_sweep("bottom"), "probe/probe.yaml", "lag/lag.json", "rig.jsonl")),
+    Command("navigate", ("capture=filmed/capture", "skin=bent.ply", "masses=lump", "seconds=1", "view.port=0",
+                         "igtl.serve=false"),
+            ("filmed", "bent.ply", "lump"), (*PLAYED, "bent.ply", "lump/mass0.ply"), out=""),
+    Command("project", ("skin=bent.ply", "calibration=optics/optics.yaml", "masses=lump", "cut=cut.mrk.json"),
+            ("bent.ply", "optics", "lump", "cut.mrk.json"),
+            ("bent.ply", "optics/optics.yaml", "lump/mass0.ply", "cut.mrk.json")),
+    Command("project", ("skin=bent.ply", "calibration=optics/optics.yaml", "cut=cut.mrk.json", "capture=scan/capture"),
+            ("bent.ply", "optics", "scan", "cut.mrk.json"), SCAN),
     Command("freehand", ("capture=scan/capture",), ("scan",), SCAN),
     Command("freehand", ("sequence=volume/sequence.igs.mha", "config=plus.xml"), ("volume", "plus.xml"),
             ("volume/sequence.igs.mha", "plus.xml")),
@@ -162,8 +185,30 @@ def _write_others(folder: Path) -> None:
     (folder / "poses.csv").write_text("\n".join(["t,x,y,z,qx,qy,qz,qw", *rows]) + "\n", encoding="utf-8")
     (folder / "pairs.csv").write_text(_pairs(folder), encoding="utf-8")
     (folder / "plus.xml").write_text(PLUS, encoding="utf-8")
+    _write_what_is_projected(folder)
     _write_small_ones(folder)
     (folder / "study.yaml").write_text("title: Rays\nof: tracking\nover:\n  film.rays: [16]\nseeds: 1\n", encoding="utf-8")
+
+
+def _write_what_is_projected(folder: Path) -> None:
+    """A skin that is read at once, a mass below it where no probe takes the light, and a cut over that."""
+    import json
+
+    import trimesh
+
+    from recon.files import meshes
+    from scenes.solid_meshes import grid
+
+    points, triangles = grid((240.0, 200.0), (60, 50))
+    height = 660 + ((points / [12.0, 11.0]) ** 2).sum(axis=1)
+    skin = trimesh.Trimesh(np.column_stack([points, height]), triangles[:, ::-1], process=False)
+    place = np.array([0.0, 50.0, 680.0])
+    mass = trimesh.creation.icosphere(2, 4.0).apply_translation(place + np.array([0, 0, 10]))
+    (folder / "lump").mkdir(exist_ok=True)
+    meshes.write_ply(folder / "lump/mass0.ply", mass)
+    meshes.write_ply(folder / "bent.ply", skin)
+    cut = [{"position": (place + np.array([aside, 4, 0])).tolist()} for aside in (-6, -2, 2, 6)]
+    (folder / "cut.mrk.json").write_text(json.dumps({"markups": [{"type": "Curve", "controlPoints": cut}]}), encoding="utf-8")
 
 
 def _write_small_ones(folder: Path) -> None:

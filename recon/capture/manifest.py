@@ -6,10 +6,10 @@ Everything is checked on load; a fault is an `InputError` of one line that names
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -158,6 +158,13 @@ class SweepPart(Part):
             yield self.track
 
 
+class SweepImages(NamedTuple):
+    """A device's images of a sweep."""
+
+    folder: Path  # of the images and timestamps.csv
+    device: Device
+
+
 class Manifest(rig.Part):
     """`manifest.json`. Parts are optional: a capture need not hold all of them."""
 
@@ -256,6 +263,27 @@ class Manifest(rig.Part):
         names = ", ".join(self.sweeps)
         found = f"{name}, which isn't among them" if name else f"{len(fitting) or 'none'} for this"
         raise InputError(f"{path}: sweeps: expected the name of one of {names}, found {found}; give sweep=NAME")
+
+    def images_of(
+        self, folder: Path, names: Sequence[str], sweep: str = "", purpose: Purpose | None = None
+    ) -> dict[str, SweepImages]:
+        """Images of devices, each of which a sweep must have; the sweep as of `sweep_of`.
+
+        Parameters
+        ----------
+        folder : of the manifest.
+
+        Raises
+        ------
+        InputError
+            If there is no such sweep, or it lacks images of a device.
+        """
+        place, part = self.sweep_of(folder / MANIFEST, f"with images of {', '.join(names)}", sweep, purpose)
+        for name in names:
+            if name not in part.images:
+                raise InputError(f"{folder / MANIFEST}: {field_of(place)}.images.{name}: expected a path, found none")
+        devices = self.devices_of(place)
+        return {name: SweepImages(folder / self.root / part.images[name], devices[name]) for name in names}
 
     def _places(self) -> Iterator[tuple[PartName, str, Iterable[str]]]:
         """Parts and their fields in which devices are named, and these names."""

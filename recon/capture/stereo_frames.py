@@ -77,21 +77,16 @@ def read_film(folder: Path, calibration_file: Path | None = None, sweep: str = "
     """
     folder = Path(folder)
     read = manifest.read_manifest(folder)
-    listed, root = folder / MANIFEST, folder / read.root
-    place, part = read.sweep_of(listed, f"with frames of {' and '.join(CAMERAS)}", sweep)
-    for name in CAMERAS:
-        if name not in part.images:
-            raise InputError(f"{listed}: {manifest.field_of(place)}.images.{name}: expected a path, found none")
+    listed, images = folder / MANIFEST, read.images_of(folder, CAMERAS, sweep)
     if calibration_file is None and read.calibration is None:
         raise InputError(f"{listed}: expected calibration, the path of a calibration file, found none")
-    devices = [read.devices_of(place)[name] for name in CAMERAS]
-    depths = devices[0].bits, devices[1].bits
+    depths = images[CAMERAS[0]].device.bits, images[CAMERAS[1]].device.bits
     if min(depths) > 8 and depths[0] != depths[1]:
         raise InputError(f"{listed}: devices.cam2.bits: expected {depths[0]}, as of cam1, found {depths[1]}")
-    sizes = {name: device.size for name, device in zip(CAMERAS, devices, strict=True)}
+    sizes = {name: each.device.size for name, each in images.items()}
     known = calibration_files.read_for(Path(calibration_file or folder / str(read.calibration)), sizes)
     cameras = known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]
-    places = [root / part.images[name] for name in CAMERAS]
+    places = [each.folder for each in images.values()]
     tables = [sweep_tables.read_stamps(place / STAMPS) for place in places]
     first, second = _partners(places, tables)
     frames = np.column_stack([tables[0][0][first], tables[1][0][second]])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from recon.capture import manifest, sweep_tables
 from recon.capture.images import frame_file, read_image
-from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, STAMPS, image_name
+from recon.capture.manifest import CAMERAS, SCANNER, STAMPS, image_name
 from recon.devices.interfaces import DeviceError, Frame, Image, Size, Trigger
 from recon.errors import InputError
 from recon.files.regular import check_there
@@ -75,14 +75,8 @@ def read_recording(folder: Path, sweep: str = "", names: tuple[str, ...] = (*CAM
         If the manifest or a table is wrong, or frames of a device are missing.
     """
     folder = Path(folder)
-    read = manifest.read_manifest(folder)
-    listed, root = folder / MANIFEST, folder / read.root
-    place, part = read.sweep_of(listed, f"with images of {', '.join(names)}", sweep, "volume")
-    for name in names:
-        if name not in part.images:
-            raise InputError(f"{listed}: {manifest.field_of(place)}.images.{name}: expected a path, found none")
-    devices = read.devices_of(place)
-    found = {name: _read(root / part.images[name], name, devices[name]) for name in names}
+    images = manifest.read_manifest(folder).images_of(folder, names, sweep, "volume")
+    found = {name: _read(each.folder, name, each.device) for name, each in images.items()}
     check_there(path for each in found.values() for path in each.paths)
     return found
 

@@ -41,12 +41,20 @@ class BrowserView:
     name = "browser"
 
     def __init__(self, scene: StillScene, port: int = 8080, host: str = LOOPBACK) -> None:
-        """Serve the page of a scene. InputError if the port can't be had; ModuleNotFoundError without viser."""
+        """Serve the page of a scene; a port of 0 takes any that is free.
+
+        Raises
+        ------
+        InputError
+            If the port can't be had.
+        ModuleNotFoundError
+            Without viser.
+        """
         import viser  # of the extra `live`
 
-        _check_free(host, port)
+        free = _free_port(host, port)
         with own_pages_alone(host), redirect_stdout(StringIO()):  # it prints, even so
-            self._server = viser.ViserServer(host=host, port=port, label="sonotwin", verbose=False)
+            self._server = viser.ViserServer(host=host, port=free, label="sonotwin", verbose=False)
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
         self._beside: viser.GuiImageHandle | None = None  # and beside it
         self._shown: PlacedScan | None = None
@@ -194,12 +202,13 @@ def _looked_at(scene: StillScene) -> tuple[Array, float]:
     return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
 
-def _check_free(host: str, port: int) -> None:
-    """Refuse a port that another program has: the server would silently take the next."""
+def _free_port(host: str, port: int) -> int:
+    """The port, or any for 0. Refuses one that another program has: the server would silently take the next."""
     with socket.socket() as trial:
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             trial.bind((host, port))
+            return trial.getsockname()[1]
         except OSError as error:
             found = f"found it refused: {error.strerror}; give another view.port, or close the other program"
             raise InputError(f"view: expected to listen on {host}:{port}, {found}") from None

@@ -19,32 +19,23 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon.capture import stereo_frames, target_files
-from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
-from recon.model.rig import Part, Rig
 from recon.target_calibration import target_bundle, target_figures, target_poses
 from recon.target_calibration.target_poses import Fault, Seen
-from recon.tracking import networks
 from recon.tracking.tracker import Tracker
+from sonotwin.tracker_fields import TrackerFields, make_tracker
 
 TARGET = "target.yaml"  # by which the folder of a target is known
 NO_COVARIANCE = "the cameras' calibration has no covariance: its errors are not in these uncertainties"
 
 
-class Config(Part):
+class Config(TrackerFields):
     """Fields of `conf/calibrate-target.yaml`."""
 
-    rig: Rig
     capture: Path
     sweep: str = ""
     out: Path
-    calibration: Path | None = None
-    drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
-    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
-    networks: Path | None = None
-    threads: Annotated[int, Field(ge=0, le=1024)] = 0
     most_poses: Annotated[int, Field(ge=target_poses.LEAST, le=10_000)] = 100
     least_tilt_deg: Annotated[float, Field(ge=0, le=45)] = 5.0
     least_range_mm: Annotated[float, Field(ge=0, le=1000)] = 20.0
@@ -63,15 +54,13 @@ def run(config: Config) -> None:
     atomic.check_folder(config.out, TARGET, inputs=inputs)
     film = stereo_frames.read_film(config.capture, config.calibration, config.sweep)
     design = config.rig.target
-    optics = in_use(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale, config.drift_px)
-    loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
-    tracker = Tracker(film.cameras, design, loaded, film.bits, optics)
+    tracker = make_tracker(config, design, film.cameras, film.optics, film.bits)
     seen, faults = collect(film, tracker, console)
     pairs = target_poses.spread(target_poses.distinct(seen), config.most_poses)
     console.print(f"found       {len(seen)} of {len(film.times)} pairs whole, {len(pairs)} poses that differ", markup=False)
     target_poses.check(pairs, film.name, faults, config.least_tilt_deg, config.least_range_mm)
     with console.status("adjusting"):
-        adjusted = target_bundle.adjust(pairs, design, optics)
+        adjusted = target_bundle.adjust(pairs, design, tracker.optics)
     figures = target_figures.measure(adjusted, pairs, design)
     for line in target_figures.describe(figures):
         console.print(line, markup=False)

@@ -19,12 +19,11 @@ from rich.console import Console
 
 from recon.capture import calibration_files, lag_files, manifest, probe_files, stereo_frames, surface_part, sweep_part
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
-from recon.capture.target_files import read as read_target
 from recon.errors import InputError
 from recon.files import atomic
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Calibration, in_use
+from recon.model.calibration import Calibration, in_use
 from recon.model.probe import ProbeCalibration
-from recon.model.rig import NotNegative, Part, Positive, Rig, Target
+from recon.model.rig import NotNegative, Positive, Target
 from recon.probe_calibration import sound_in_water
 from recon.rig_check import bottom_equations, check_log, check_page, fringe_matches, verdicts
 from recon.rig_check.bottom_equations import Known
@@ -32,9 +31,8 @@ from recon.rig_check.optics_equations import PROJECTOR, Matches
 from recon.rig_check.verdicts import TITLES, Optics, Verdict
 from recon.structured_light import decode
 from recon.target_calibration import target_poses
-from recon.tracking import networks
 from recon.tracking.pose_fit import Sighting
-from recon.tracking.tracker import Tracker
+from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
 from sonotwin.verbs.calibrate_target import collect
 
 CHECK, PAGE = "check.json", "check.html"  # the first is that by which the folder of a check is known
@@ -44,29 +42,22 @@ LEAST_POSES = 3
 SEED = 0  # of the points under the fringes
 
 
-class Config(Part):
+class Config(MeasuredTargetFields):
     """Fields of `conf/check.yaml`."""
 
-    rig: Rig
     capture: Path
     out: Path
     log: Path | None = None
     film: manifest.SweepNameOrNone = ""
     bottom: manifest.SweepNameOrNone = ""
-    calibration: Path | None = None
     probe: Path | None = None
     lag: Path | None = None
-    target: Path | None = None
     alarm_sigma: Annotated[float, Field(ge=1, le=20)] = 3.5
-    drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
-    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
     water_c: Annotated[float, Field(ge=0, le=95)] = 22.0
     water_sigma_c: NotNegative = 1.0
     top_px: Annotated[int, Field(ge=0)] = 40
     speed_mm_s: Positive = 10.0
     most_poses: Annotated[int, Field(ge=LEAST_POSES, le=10_000)] = 40
-    networks: Path | None = None
-    threads: Annotated[int, Field(ge=0, le=1024)] = 0
 
 
 class Held(NamedTuple):
@@ -153,7 +144,7 @@ def optics(config: Config, listed: Manifest, held: Held, console: Console) -> li
     calibration = calibration_files.read_for(file, sizes)
     if calibration.uncertainty is None:
         console.print(f"warning     {file}: no covariance: an error of the calibration is taken for a motion", markup=False)
-    target = config.rig.target if config.target is None else read_target(config.target, config.rig.target)
+    target = target_of(config)
     film = None if held.film is None else filmed(config, held.film, target, calibration, console)
     matches = matched(config, calibration, console) if held.fringes else None
     known = in_use(calibration.uncertainty, calibration.cameras, config.board_scale, config.drift_px)
@@ -167,8 +158,8 @@ def filmed(
 ) -> list[tuple[Sighting, Sighting]]:
     """Pairs of frames in which both cameras see the target whole, in poses that differ."""
     film = stereo_frames.read_film(config.capture, config.calibration, name)
-    wide = in_use(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale, SEARCH_PX)
-    tracker = Tracker(film.cameras, target, networks.load(config.networks or networks.WEIGHTS, config.threads), film.bits, wide)
+    wide = config.model_copy(update={"drift_px": SEARCH_PX})
+    tracker = make_tracker(wide, target, film.cameras, film.optics, film.bits)
     seen, _ = collect(film, tracker, console)
     poses = target_poses.spread(target_poses.distinct(seen), config.most_poses)
     if len(poses) < LEAST_POSES:

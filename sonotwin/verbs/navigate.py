@@ -19,7 +19,7 @@ from typing import Annotated, Literal, NamedTuple, cast
 from pydantic import Field, model_validator
 from rich.console import Console
 
-from recon.capture import calibration_files, manifest, probe_files, target_files
+from recon.capture import calibration_files, manifest, probe_files
 from recon.capture.manifest import CAMERAS, SCANNER
 from recon.devices import playback
 from recon.devices.device_clocks import ClockFollower, follow
@@ -27,9 +27,8 @@ from recon.devices.interfaces import Camera, Size
 from recon.devices.openigtlink.igtl_server import PORT, Server
 from recon.devices.playback import PlayedCamera, PlayedScanner
 from recon.errors import InputError
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
 from recon.model.probe import ProbeCalibration, Speed
-from recon.model.rig import Part, Positive, Rig
+from recon.model.rig import Part, Positive
 from recon.model.tracks import LagSeconds
 from recon.navigation import mass_distances, still_scene
 from recon.navigation.browser_view import LOOPBACK, BrowserView
@@ -40,32 +39,33 @@ from recon.navigation.navigator import Navigator, warm_up
 from recon.navigation.publishing import Publisher, StillScene
 from recon.navigation.slicer_publisher import SlicerPublisher
 from recon.probe_calibration import sound_in_water
-from recon.tracking import networks
 from recon.tracking.tracker import Tracker
 from sonotwin.open_devices import LiveDevices, open_camera, open_scanner
+from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
 
 LOOK_S = 0.2  # between two looks whether all goes on
+
+Host = Annotated[str, Field(min_length=1)]  # an empty one would stand for all of the network
 
 
 class View(Part):
     """The page in the browser."""
 
-    host: str = LOOPBACK
-    port: Annotated[int, Field(ge=1, le=65535)] = 8080
+    host: Host = LOOPBACK
+    port: Annotated[int, Field(ge=0, le=65535)] = 8080
 
 
 class Igtl(Part):
     """The OpenIGTLink server."""
 
     serve: bool = True
-    host: str = LOOPBACK
+    host: Host = LOOPBACK
     port: Annotated[int, Field(ge=1, le=65535)] = PORT
 
 
-class Config(Part):
+class Config(MeasuredTargetFields):
     """Fields of `conf/navigate.yaml`."""
 
-    rig: Rig
     devices: LiveDevices | None = None
     exposure_s: Positive = 0.01
     gain: Positive = 1.0
@@ -73,12 +73,6 @@ class Config(Part):
     capture: Path | None = None
     sweep: str = ""
     speed: Annotated[float, Field(gt=0, le=10)] = 1.0
-    calibration: Path | None = None
-    drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
-    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
-    target: Path | None = None
-    networks: Path | None = None
-    threads: Annotated[int, Field(ge=0, le=1024)] = 0
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
     tissue_m_s: Speed | None = None
@@ -140,16 +134,15 @@ def run(config: Config) -> int:
 def publishers_of(config: Config, scene: StillScene, console: Console) -> list[Publisher]:
     """Open the page and the OpenIGTLink server; if a port is taken, none of them stays open."""
     with ExitStack() as stack:
-        view = BrowserView(scene, config.view.port, config.view.host)
-        stack.callback(view.close)
-        publishers: list[Publisher] = [view]
+        slicer: list[Publisher] = []
         if config.igtl.serve:
             server = Server(config.igtl.host, config.igtl.port)
             stack.callback(server.close)
-            publishers.append(SlicerPublisher(scene, IgtlSender(server)))
+            slicer = [SlicerPublisher(scene, IgtlSender(server))]
+        view = BrowserView(scene, config.view.port, config.view.host)  # last, as it would print at the end of a refused run
         console.print(f"view        {view.address}", markup=False)
         stack.pop_all()  # they are the navigator's now
-        return publishers
+        return [view, *slicer]
 
 
 def tell(navigator: Navigator, console: Console) -> None:
@@ -177,12 +170,8 @@ def probe_of(config: Config) -> ProbeCalibration:
 def tracker_of(config: Config, sizes: Mapping[str, Size], bits: int) -> Tracker:
     """The tracker, by the calibration of cameras of some sizes: from its file, else from the capture."""
     known = calibration_files.read_for(given_or_held(config, "calibration", "the cameras' calibration"), sizes)
-    cameras = {name: known.cameras[name] for name in CAMERAS}
-    optics = in_use(known.uncertainty, cameras, config.board_scale, config.drift_px)
-    design = config.rig.target
-    target = design if config.target is None else target_files.read(config.target, design)
-    loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
-    return Tracker((cameras[CAMERAS[0]], cameras[CAMERAS[1]]), target, loaded, bits if bits > 8 else None, optics)
+    cameras = known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]
+    return make_tracker(config, target_of(config), cameras, known.uncertainty, bits if bits > 8 else None)
 
 
 def given_or_held(config: Config, field: Literal["calibration", "probe"], what: str) -> Path:

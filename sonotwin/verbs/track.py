@@ -18,37 +18,26 @@ poses are given it instead:
 
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 from rich.console import Console
 from rich.progress import Progress
 
-from recon.capture import stereo_frames, target_files
-from recon.capture.manifest import CAMERAS
+from recon.capture import stereo_frames
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
-from recon.model.rig import Part, Rig
-from recon.tracking import networks, results, track_figures
+from recon.tracking import results, track_figures
 from recon.tracking.results import Step
 from recon.tracking.tracker import Tracker
+from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
 
 
-class Config(Part):
+class Config(MeasuredTargetFields):
     """Fields of `conf/track.yaml`."""
 
-    rig: Rig
     capture: Path
     sweep: str = ""
     out: Path
-    calibration: Path | None = None
-    drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
-    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
-    target: Path | None = None
-    networks: Path | None = None
-    threads: Annotated[int, Field(ge=0, le=1024)] = 0
     overlays: bool = True
 
 
@@ -64,11 +53,8 @@ def run(config: Config) -> None:
     inputs = [path for path in (config.capture, config.calibration, config.target, config.networks) if path is not None]
     atomic.check_folder(config.out, results.POSES, inputs=inputs)
     film = stereo_frames.read_film(config.capture, config.calibration, config.sweep)
-    optics = in_use(film.optics, dict(zip(CAMERAS, film.cameras, strict=True)), config.board_scale, config.drift_px)
-    loaded = networks.load(config.networks or networks.WEIGHTS, config.threads)
-    design = config.rig.target
-    target = design if config.target is None else target_files.read(config.target, design)
-    tracker = Tracker(film.cameras, target, loaded, film.bits, optics)
+    target = target_of(config)
+    tracker = make_tracker(config, target, film.cameras, film.optics, film.bits)
     rate = f", {film.rate_hz:.4g} a second" if np.isfinite(film.rate_hz) else ""
     sizes = " and ".join(dict.fromkeys("x".join(map(str, camera.size)) for camera in film.cameras))
     console.print(f"read        {len(film.times)} pairs of frames, {sizes}{rate}", markup=False)

@@ -79,6 +79,12 @@ def test_each_command_has_bad_fields(command):
     assert len(found) > 20 and not set(found) & set(command.line)
 
 
+def test_a_verb_without_a_result_is_given_no_place_for_it():
+    command = next(command for command in COMMANDS if command.verb == "navigate")
+    found = list(field_faults.overrides(command.verb, command.line[1:], ["capture"]))
+    assert not any(field.startswith("out=/") for field in (*command.line, *found)) and "capture=/dev/zero" in found
+
+
 def test_cases_are_drawn_evenly_over_the_verbs(tmp_path):
     """As many of each, the same for the same seed."""
     few = [command for command in COMMANDS if not command.reads]

@@ -133,8 +133,12 @@ def test_what_is_wrong_is_said_in_one_line(recorded, moments, tmp_path, capsys):
     assert complaint(f"skin={tmp_path / 'skin.ply'}") == f"{tmp_path}/skin.ply: expected a surface as PLY, found none"
     assert "expected a folder of `sonotwin segment`" in complaint(f"masses={tmp_path}")
     assert complaint("speed=0").startswith("navigate: speed: expected")
+    assert complaint("view.host=''").startswith("navigate: view.host: expected")
     with socket.socket() as other:
         other.bind((LOOPBACK, 0))
         other.listen()
         port = other.getsockname()[1]
-        assert complaint(f"view.port={port}").startswith(f"view: expected to listen on 127.0.0.1:{port}, found it refused")
+        refused = f"view: expected to listen on 127.0.0.1:{port}, found it refused"
+        assert complaint(f"view.port={port}", "igtl.serve=false").startswith(refused)
+        refused = f"OpenIGTLink server 127.0.0.1:{port}: expected a free port"
+        assert complaint("view.port=0", f"igtl.port={port}").startswith(refused)

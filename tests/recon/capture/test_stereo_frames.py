@@ -129,7 +129,7 @@ def test_what_the_manifest_lacks_is_named(copy):
     edited(copy, lambda content: content["sweep"]["images"].pop("cam2"))
     assert complaint(copy) == "manifest.json: sweep.images.cam2: expected a path, found none"
     edited(copy, lambda content: content.pop("sweep"))
-    assert complaint(copy) == "manifest.json: expected sweep, with frames of cam1 and cam2, found none"
+    assert complaint(copy) == "manifest.json: expected sweep, with images of cam1, cam2, found none"
 
 
 def test_cameras_that_dont_fit_are_named(copy, rig):

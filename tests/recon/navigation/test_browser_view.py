@@ -86,6 +86,17 @@ def test_a_taken_port_is_refused_in_one_line():
             BrowserView(StillScene(np.eye(4)), port)
 
 
+def test_of_port_0_it_takes_a_free_one():
+    """Two of them don't meet, and each gives the address at which it is reached."""
+    views = [BrowserView(StillScene(np.eye(4)), 0) for _ in range(2)]
+    try:
+        addresses = [view.address.removeprefix("http://").split(":") for view in views]
+        assert all(reached(host, int(port)) for host, port in addresses) and addresses[0] != addresses[1]
+    finally:
+        for view in views:
+            view.close()
+
+
 def test_it_listens_on_this_computer_alone():
     view = BrowserView(StillScene(np.eye(4)), free_port())
     try:

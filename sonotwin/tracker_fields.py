@@ -1,0 +1,57 @@
+"""The tracker as the fields of verbs."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from recon.capture import target_files
+from recon.capture.manifest import CAMERAS
+from recon.geometry.camera import Camera
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty, in_use
+from recon.model.rig import Part, Rig, Target
+from recon.tracking import networks
+from recon.tracking.tracker import Tracker
+
+
+class TrackerFields(Part):
+    """Fields of a verb that tracks the target."""
+
+    rig: Rig
+    calibration: Path | None = None
+    drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
+    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
+    networks: Path | None = None
+    threads: Annotated[int, Field(ge=0, le=1024)] = 0
+
+
+class MeasuredTargetFields(TrackerFields):
+    """Those of a verb that takes the target as it was measured, where it was."""
+
+    target: Path | None = None
+
+
+def target_of(fields: MeasuredTargetFields) -> Target:
+    """The target as it was measured, else its design; InputError as of `recon.capture.target_files.read`."""
+    design = fields.rig.target
+    return design if fields.target is None else target_files.read(fields.target, design)
+
+
+def make_tracker(
+    fields: TrackerFields, target: Target, cameras: tuple[Camera, Camera], known: Uncertainty | None, bits: int | None
+) -> Tracker:
+    """The tracker of a target, by cameras some time after their calibration.
+
+    Parameters
+    ----------
+    known : of the cameras' calibration; None where it has none
+    bits : of frames deeper than 8 bits; None of others
+
+    Raises
+    ------
+    InputError
+        If a network is missing, or isn't one.
+    """
+    optics = in_use(known, dict(zip(CAMERAS, cameras, strict=True)), fields.board_scale, fields.drift_px)
+    loaded = networks.load(fields.networks or networks.WEIGHTS, fields.threads)
+    return Tracker(cameras, target, loaded, bits, optics)

@@ -1,0 +1,39 @@
+"""The tracker as the fields of verbs."""
+
+import numpy as np
+import pytest
+
+from recon.capture import target_files
+from recon.capture.manifest import CAMERAS
+from recon.errors import InputError
+from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
+
+
+@pytest.fixture(scope="module")
+def cameras(rig):
+    return rig.cam1.optics.camera(), rig.cam2.optics.camera()
+
+
+def test_cameras_may_have_drifted_and_their_board_may_have_stretched(rig, cameras):
+    """Without a covariance of the calibration the optics are as uncertain as the fields say, and exact where these are 0."""
+    fields = MeasuredTargetFields(rig=rig, drift_px=0.2, board_scale=1e-3, threads=1)
+    optics = make_tracker(fields, rig.target, cameras, None, None).optics
+    sigma = dict(zip(optics.names, np.sqrt(np.diag(optics.covariance)), strict=True))
+    baseline = np.sqrt(sum(sigma[f"cam2.{axis}"] ** 2 for axis in ("tx", "ty", "tz")))
+    assert [sigma[f"{name}.{axis}"] for name in CAMERAS for axis in ("cx", "cy")] == pytest.approx([0.2] * 4)
+    assert baseline == pytest.approx(1e-3 * np.linalg.norm(cameras[1].camera_from_world[:3, 3]))
+    exact = fields.model_copy(update={"drift_px": 0.0, "board_scale": 0.0})
+    assert make_tracker(exact, rig.target, cameras, None, None).optics is None
+
+
+def test_the_target_is_the_measured_one_where_there_is_one(rig, tmp_path):
+    measured = rig.target.model_copy(update={"c1_mm": 25.1})
+    target_files.write(tmp_path / "target.yaml", measured, 1e-4 * np.eye(7))
+    fields = MeasuredTargetFields(rig=rig)
+    assert target_of(fields) == rig.target
+    assert target_of(fields.model_copy(update={"target": tmp_path / "target.yaml"})).c1_mm == pytest.approx(25.1)
+
+
+def test_a_missing_network_is_named(rig, cameras, tmp_path):
+    with pytest.raises(InputError, match=str(tmp_path / "detector.onnx")):
+        make_tracker(MeasuredTargetFields(rig=rig, networks=tmp_path), rig.target, cameras, None, None)
