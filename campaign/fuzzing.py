@@ -21,7 +21,7 @@ SPELL_S = 150  # of a process, after which another goes on with its inputs: libF
 NAMES = (
     "manifest", "calibration", "calibration_xml", "calibration_npz", "probe", "target", "lag", "stamps", "track", "pairs",
     "pose_table", "image", "mesh", "volume_nrrd", "volume_mha", "sequence", "plus_config", "messages", "dicom", "video",
-    "patterns", "metrics", "truth", "points", "shard", "checkpoint", "network",
+    "patterns", "metrics", "truth", "check_log", "cut", "points", "shard", "checkpoint", "network",
 )  # fmt: skip
 
 

@@ -13,6 +13,8 @@ from recon.errors import InputError
 from recon.files import meshes, metrics, npz, volumes
 from recon.freehand import plus_config, sequences
 from recon.model.rig import Target
+from recon.rig_check import check_log
+from recon.skin_projection import planned_cut
 from recon.tracking import networks
 from sonotwin import config
 from trainers import export, shard_reader
@@ -82,6 +84,8 @@ READERS = {
     "patterns": Reader(read_patterns, ("patterns.yaml",), "file.yaml"),
     "metrics": Reader(metrics.read, ("skin/metrics.json",)),
     "truth": Reader(session.read_json, ("ball/truth/scene.json",)),
+    "check_log": Reader(check_log.read, ("rig.jsonl",)),
+    "cut": Reader(planned_cut.read, ("cut.mrk.json",)),
     "points": Reader(lambda path: npz.read(path, POINTS), ("small.npz",)),
     "shard": Reader(_shard, ("data/shard-00000.tar",), "shard-00000.tar"),
     "checkpoint": Reader(export.read_state, ("small.pt",)),
