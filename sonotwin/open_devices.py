@@ -20,6 +20,7 @@ from recon.model.rig import NotNegative, Part, Positive
 
 Side = Annotated[int, Field(ge=8, le=20000)]
 Port = Annotated[int, Field(ge=1, le=65535)]
+Host = Annotated[str, Field(min_length=1)]  # an empty one would stand for all of the network
 
 
 class BaslerDevice(Part):
@@ -56,7 +57,7 @@ class IgtlDevice(Part):
     """A scanner that sends by OpenIGTLink."""
 
     kind: Literal["igtl"]
-    host: str
+    host: Host
     port: Port
     device: str | None = None  # name of the images
     view: View = View()

@@ -58,8 +58,9 @@ class PairSource(Protocol):
     def pair(self, timeout_s: float) -> PairOfFrames | None:
         """Wait for the next pair; None if none came in time. DeviceError if a camera is gone."""
 
-    def stop(self) -> object:
-        """Take no more frames."""
+    def stop(self) -> Sequence[object]:
+        """Take no more frames; those without a partner since the pair before, each in words by `str`."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,8 @@ def record_sweep(
         finally:
             for stream in streams:
                 stream.end()
-            if pairs is not None:
-                pairs.stop()
+            for lost in () if pairs is None else pairs.stop():
+                say(f"lost {lost}")
             say("recorded " + ", ".join(f"{count} frames of {device}" for device, count in counts.items()))
         for stream in streams:
             stream.check()

@@ -10,7 +10,7 @@ from recon.devices.openigtlink.igtl_header import Header
 from recon.devices.openigtlink.igtl_image import Image
 from recon.devices.openigtlink.igtl_server import LOOPBACK, PORT
 from recon.devices.scan_view import ScanView
-from recon.errors import short
+from recon.errors import InputError, short
 
 FIRST_S = 5.0  # in which an image must come after the scanner was opened
 DEPTHS = (8, 16)  # bits of grey levels
@@ -58,7 +58,7 @@ class IgtlScanner:
             grey = self._grey(first)
             self._sent = grey.shape
             self.size = self._view.size((grey.shape[1], grey.shape[0]))
-        except DeviceError:
+        except InputError:  # of the view, too
             self._client.close()
             raise
 

@@ -80,8 +80,7 @@ def run(config: Config) -> int:
     given = (config.capture, config.calibration, config.probe, config.lag, config.target, config.log)
     inputs = [path for path in given if path is not None]  # the log, too: a folder that is replaced would take it along
     atomic.check_folder(config.out, CHECK, inputs=inputs)
-    if config.log is not None and config.log.exists():
-        check_log.read(config.log)
+    earlier = check_log.read(config.log) if config.log is not None and config.log.exists() else []
     listed = manifest.read_manifest(config.capture)
     held = parts_of(config, listed)
     found = [*optics(config, listed, held, console)]
@@ -94,9 +93,10 @@ def run(config: Config) -> int:
         console.print(f"{TITLES[one.part]:22}{check_page.WORDS[one.state]:15}{shown}{or_else}", markup=False)
     console.print(f"verdict     {check_page.summary(made.parts)}", markup=False)
     with atomic.new_folder(config.out, CHECK) as folder:
-        log = [made] if config.log is None else check_log.add(config.log, made)
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
-        (folder / PAGE).write_text(check_page.write_text(made, log, config.alarm_sigma), encoding="utf-8")
+        (folder / PAGE).write_text(check_page.write_text(made, [*earlier, made], config.alarm_sigma), encoding="utf-8")
+    if config.log is not None:
+        check_log.add(config.log, made)
     console.print(f"wrote       {config.out}/{{{CHECK},{PAGE}}}", markup=False)
     return int(any(one.state == "moved" for one in found))
 

@@ -40,12 +40,10 @@ from recon.navigation.publishing import Publisher, StillScene
 from recon.navigation.slicer_publisher import SlicerPublisher
 from recon.probe_calibration import sound_in_water
 from recon.tracking.tracker import Tracker
-from sonotwin.open_devices import LiveDevices, open_camera, open_scanner
+from sonotwin.open_devices import Host, LiveDevices, open_camera, open_scanner
 from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
 
 LOOK_S = 0.2  # between two looks whether all goes on
-
-Host = Annotated[str, Field(min_length=1)]  # an empty one would stand for all of the network
 
 
 class View(Part):

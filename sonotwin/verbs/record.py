@@ -45,7 +45,7 @@ from recon.model.boards import Board
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
 from recon.tracking import networks
-from sonotwin.open_devices import AnyDevices, LiveDevices, Opened, open_still, open_sweep
+from sonotwin.open_devices import AnyDevices, Host, LiveDevices, Opened, open_still, open_sweep
 from sonotwin.terminal_operator import TerminalOperator
 from twin.shooting import FrameShooting
 from twin.ultrasound.timed_sweep import Clocks
@@ -59,7 +59,7 @@ class PreviewFields(Part):
     """Where the page is served."""
 
     serve: bool = True
-    host: str = preview_server.LOOPBACK
+    host: Host = preview_server.LOOPBACK
     port: Annotated[int, Field(ge=0, le=65535)] = 0
 
 

@@ -71,10 +71,11 @@ class VirtualPair:
         self._turns.advance(PAIR, arrived, None if self.over else self._moments[self._taken])
         return FramePair((first, second))
 
-    def stop(self) -> None:
-        """Take no more frames."""
+    def stop(self) -> tuple[str, ...]:
+        """Take no more frames; names those lost, which are none."""
         self._frames = None
         self._turns.set_next(PAIR, None)
+        return ()
 
     def close(self) -> None:
         """Give the cameras back."""

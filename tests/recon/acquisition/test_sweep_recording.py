@@ -59,6 +59,7 @@ class Source:
 
     def stop(self):
         self.trigger = None
+        return ("cam1: frame 41 without a partner",)
 
 
 def record(tmp_path, pairs=None, scanner=None, silent_s=20, seconds=None, said=None, show=hidden):
@@ -79,6 +80,7 @@ def test_all_frames_are_kept_with_their_numbers_and_times(tmp_path):
     counts = record(tmp_path, Source(), Source(60, lost=(5, 6)), said=said)
     assert counts == {"cam1": 40, "cam2": 40, "us": 58}
     assert 5 not in frames(tmp_path, "us") and "lost cam2: frame 7 never came" in said
+    assert "lost cam1: frame 41 without a partner" in said  # after the last pair
     for device in DEVICES:
         numbers, times = sweep_tables.read_stamps(tmp_path / "out/sweep/scan" / device / "timestamps.csv")
         assert (times == NOW + numbers * 5_000_000).all()
