@@ -4,7 +4,7 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -88,10 +88,9 @@ def recorded() -> list[Row]:
         pairs = CountedPairs((cameras[0], cameras[1]))
         devices = {name: Device(size=SIZE) for name in CAMERAS}
         start = perf_counter()
-        with open_recording(Path(folder) / "capture") as recording:
+        with closing(pairs), open_recording(Path(folder) / "capture") as recording:
             counts = record_sweep(recording, pairs, None, devices, OneTake(lambda: pairs.over), plan, {}, said.append, hidden)
         rate = counts[CAMERAS[0]] / (perf_counter() - start)
-        pairs.close()
         lost, wrong = 0, 0
         for name, own in zip(CAMERAS, hashes, strict=True):
             place = Path(folder) / "capture/sweep/scan" / name

@@ -26,7 +26,7 @@ class TrackerFields(Part):
 
 
 class MeasuredTargetFields(TrackerFields):
-    """Those of a verb that takes the target as it was measured, where it was."""
+    """Fields of a verb that tracks the target as it was measured, if it was."""
 
     target: Path | None = None
 

@@ -94,8 +94,8 @@ def read_state(path: Path) -> dict:
     InputError
         If the file is damaged or something else.
     """
+    _check_parts(path)
     try:
-        _check_parts(path)
         with warnings.catch_warnings(action="ignore"):  # torch's on how such files were written: what counts is checked
             state = torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError:
@@ -109,13 +109,16 @@ def read_state(path: Path) -> dict:
 
 def _check_parts(path: Path) -> None:
     """Refuse an archive with a damaged or a bloated table of its parts, for which torch would take as much memory as it says."""
-    with path.open("rb") as stream:
-        if stream.read(2) != b"PK":  # written by torch before 1.6
-            return
-        with zipfile.ZipFile(stream) as archive:
-            size = sum(part.file_size for part in archive.infolist())
+    try:
+        with path.open("rb") as stream:
+            if stream.read(2) != b"PK":  # written by torch before 1.6
+                return
+            with zipfile.ZipFile(stream) as archive:
+                size = sum(part.file_size for part in archive.infolist())
+    except DAMAGE as error:
+        raise InputError(f"{path}: expected a file that torch saved, found a damaged one: {reason(error)}") from None
     if size > MOST_BYTES:
-        raise ValueError(f"its parts would take {size >> 20} MiB, more than {MOST_BYTES >> 20}")
+        raise InputError(f"{path}: expected at most {MOST_BYTES >> 20} MiB of weights, found {size >> 20} MiB")
 
 
 def _read(path: Path) -> dict[Any, Any]:

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
+from time import monotonic
 from typing import NamedTuple
 
 from recon.acquisition.pictures import Say
@@ -12,7 +13,7 @@ from recon.devices.interfaces import DeviceError, Frame
 WAITING = 128  # sets of frames that wait for the disk: 340 MB of pairs of 1280 x 1024
 SLICE_S = 0.2  # of waiting for a frame
 MOST_OFF_NS = 1_000_000_000  # a frame that comes later than that is named; one that is stamped as much ahead shows a jump
-SURE = 8  # frames of a device, of which one at least came without delay
+FIRST = 8  # frames of a device, of which one at least came without delay
 
 
 class Taken(NamedTuple):
@@ -45,7 +46,11 @@ class FrameStream:
         self._stamps: dict[str, _Stamps] = {}  # by device
         self._left_out = 0
         self._threads = ThreadPoolExecutor(2, "recording")
-        self._work = [self._threads.submit(work) for work in (self._store, self._fetch)]
+        try:
+            self._work = [self._threads.submit(work) for work in (self._store, self._fetch)]
+        except RuntimeError:  # no further thread: the first one must not wait for ever
+            self._waiting.put(None)
+            raise
 
     @property
     def alive(self) -> bool:
@@ -69,17 +74,16 @@ class FrameStream:
             work.result()
 
     def _fetch(self) -> None:
-        silent = 0.0
+        came = monotonic()
         try:
             while not self._ending.is_set():
                 taken = self._read(SLICE_S)
                 if taken is None:
-                    silent += SLICE_S
-                    if silent >= self._silent_s:
+                    if monotonic() - came >= self._silent_s:
                         expected = f"expected a frame within {self._silent_s:g} s, found none"
                         raise DeviceError(f"{' and '.join(self._stamps) or 'devices'}: {expected}; see cable and power")
                     continue
-                silent = 0.0
+                came = monotonic()
                 for one in taken:
                     self._look(one)
                 if self._waiting.qsize() < WAITING:
@@ -142,7 +146,7 @@ class _Stamps:
 
     def _check(self, before: Taken, now: Taken, ahead_ns: int) -> None:
         back_ns = before.time_ns - now.time_ns
-        if back_ns >= 0 or (ahead_ns > MOST_OFF_NS and self._seen >= SURE):
+        if back_ns >= 0 or (ahead_ns > MOST_OFF_NS and self._seen >= FIRST):
             found = f"it {1e-9 * back_ns:.3f} s back" if back_ns >= 0 else f"it {1e-9 * ahead_ns:.3f} s ahead of arrival"
             expected = "a clock that goes on"
             raise DeviceError(f"{now.device}: expected {expected}, found {found} at frame {now.frame.number}; record anew")

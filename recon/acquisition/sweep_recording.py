@@ -5,6 +5,7 @@ that jumps, ends the recording, and what came before it is kept.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from time import monotonic, sleep
 from typing import Protocol
@@ -145,18 +146,22 @@ def record_sweep(
         operator.ask(Step("recording; end it when you are through"))
         if pairs is not None:
             pairs.start(*plan.triggers)
-        streams = [FrameStream(read, _writer(sweep, counts), plan.silent_s, say) for read in _readers(pairs, scanner, say)]
-        try:
-            _follow(streams, operator, plan, shown)
-        finally:
+        with ExitStack() as stack:
+            stack.callback(_stop, pairs, counts, say)
+            streams = [FrameStream(read, _writer(sweep, counts), plan.silent_s, say) for read in _readers(pairs, scanner, say)]
             for stream in streams:
-                stream.end()
-            for lost in () if pairs is None else pairs.stop():
-                say(f"lost {lost}")
-            say("recorded " + ", ".join(f"{count} frames of {device}" for device, count in counts.items()))
+                stack.callback(stream.end)
+            _follow(streams, operator, plan, shown)
         for stream in streams:
             stream.check()
     return counts
+
+
+def _stop(pairs: PairSource | None, counts: Mapping[str, int], say: Say) -> None:
+    """Stop the cameras, and say how many frames came and which are lost."""
+    for lost in () if pairs is None else pairs.stop():
+        say(f"lost {lost}")
+    say("recorded " + ", ".join(f"{count} frames of {device}" for device, count in counts.items()))
 
 
 def _rehearsed(pairs: PairSource | None, scanner: Scanner | None, operator: Operator, plan: SweepPlan, shown: _Shown) -> bool:

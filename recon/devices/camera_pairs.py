@@ -147,7 +147,7 @@ class CameraPair:
             camera.trigger()
 
     def pair(self, timeout_s: float) -> Pair | None:
-        """Wait for the next pair, in order; None if none came in time. DeviceError if a camera is gone."""
+        """Wait for the next pair, in order; None if none came in time. DeviceError if a camera is gone or its clock jumped."""
         until = monotonic() + timeout_s
         while True:
             pair = self._queue.pair()
@@ -173,7 +173,7 @@ class CameraPair:
         within_ns = 0 if self._within_s is None else round(1e9 * self._within_s)
         self._queue = PairQueue((first.name, second.name), within_ns, self._held)
         for times in self.times:
-            times.clear()
+            times.begin_anew()
 
     def _fetch(self, which: Literal[0, 1], timeout_s: float) -> None:
         frame = self.cameras[which].frame(timeout_s)

@@ -27,7 +27,7 @@ class Frame:
 
     image: Image  # (h, w), read-only
     number: int  # counted by the device from its start; a gap is a frame that was lost
-    time_ns: int  # middle of the exposure, of the device's clock
+    time_ns: int  # middle of the exposure, of the device's clock; of this computer's, once `timed_frames` has mapped it
     arrived_ns: int  # of this computer's monotonic clock, as soon as the image was whole in memory
 
 

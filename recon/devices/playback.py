@@ -92,7 +92,8 @@ def timeline_of(recorded: Mapping[str, Recorded], speed: float = 1.0) -> Timelin
     begun, ended = max(int(each.times[0]) for each in recorded.values()), min(int(each.times[-1]) for each in recorded.values())
     if begun > ended:
         expected = f"expected one clock of {', '.join(recorded)}, found times {(begun - ended) / 1e9:.6g} s apart"
-        raise InputError(f"{STAMPS}: {expected}; clocks of their own? record them by one, as sonotwin record does")
+        file = next(iter(recorded.values())).paths[0].with_name(STAMPS)
+        raise InputError(f"{file}: {expected}; clocks of their own? record them by one, as sonotwin record does")
     first = min(int(each.times[0]) for each in recorded.values())
     ends = [int(each.times[-1] + _period(each.times)) for each in recorded.values()]
     return Timeline(first, max(ends) - first, speed)

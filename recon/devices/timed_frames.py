@@ -3,13 +3,14 @@
 A camera counts from when it got power, a scanner's computer from 1970: the lag between both would be another each day.
 """
 
+import logging
 from collections import deque
 from dataclasses import replace
 
 from recon.devices.device_clocks import follow
-from recon.devices.interfaces import Camera, Frame, Scanner
+from recon.devices.interfaces import Camera, DeviceError, Frame, Scanner
 
-MOST_WAITING = 64  # frames that wait for a clock; a device of which none is found by then is timed by arrivals
+LOG = logging.getLogger(__name__)
 
 
 class FrameTimes:
@@ -17,21 +18,43 @@ class FrameTimes:
 
     def __init__(self, device: Camera | Scanner) -> None:
         """Begin without a clock, which takes some frames."""
-        self.follower = follow(device)
+        self._follower = follow(device)
+        self._known = False  # whether the device's clock has been
+        self._stuck = False  # whether its stamps don't rise
         self._waiting = deque[Frame]()
+        self._last_ns = 0
 
     def add(self, frame: Frame) -> list[Frame]:
-        """Take the next frame; those, in order, whose `time_ns` is now of this computer's monotonic clock."""
-        self.follower.add(frame.time_ns, frame.arrived_ns)
-        self._waiting.append(frame)
-        clock = self.follower.clock
-        if clock is None:
-            return [] if len(self._waiting) < MOST_WAITING else [replace(one, time_ns=one.arrived_ns) for one in self._leave()]
-        return [replace(one, time_ns=clock.at(one.time_ns)) for one in self._leave()]
+        """Take the next frame; those, in order, whose `time_ns` is now of this computer's monotonic clock, and rises.
 
-    def clear(self) -> None:
-        """Forget frames that wait; the clock goes on."""
+        Where stamps don't rise, there is no clock to follow: such frames are timed by their arrival.
+
+        Raises
+        ------
+        DeviceError
+            If the device's clock has jumped.
+        """
+        jump, timed = self._follower.add(frame.time_ns, frame.arrived_ns), list[Frame]()
+        if jump is not None:
+            if self._known:
+                raise DeviceError(f"{jump}; record anew")
+            timed = [self._at(one, one.arrived_ns) for one in self._leave()]
+            if not self._stuck:
+                LOG.warning("%s: its time stamps don't rise; frames are timed by their arrival", self._follower.device)
+            self._stuck = True
+        self._waiting.append(frame)
+        if (clock := self._follower.clock) is not None:
+            self._known = True
+            timed += [self._at(one, clock.at(one.time_ns)) for one in self._leave()]
+        return timed
+
+    def begin_anew(self) -> None:
+        """Forget frames that wait, as of a device that is started again; its clock goes on."""
         self._waiting.clear()
+
+    def _at(self, frame: Frame, time_ns: int) -> Frame:
+        self._last_ns = max(time_ns, self._last_ns + 1)  # each fit moves the clock a little
+        return replace(frame, time_ns=self._last_ns)
 
     def _leave(self) -> list[Frame]:
         gone = list(self._waiting)
@@ -48,7 +71,10 @@ class TimedScanner:
         self._timed = deque[Frame]()
 
     def frame(self, timeout_s: float) -> Frame | None:
-        """Wait for the next B-scan : (h, w) uint8; None if none came in time, or its time isn't known yet."""
+        """Wait for the next B-scan : (h, w) uint8; None if none came in time, or its time isn't known yet.
+
+        DeviceError if the scanner is gone, or its clock has jumped.
+        """
         if not self._timed and (frame := self._scanner.frame(timeout_s)) is not None:
             self._timed.extend(self._times.add(frame))
         return self._timed.popleft() if self._timed else None

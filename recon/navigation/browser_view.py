@@ -53,8 +53,12 @@ class BrowserView:
         import viser  # of the extra `live`
 
         free = _free_port(host, port)
-        with own_pages_alone(host), redirect_stdout(StringIO()):  # it prints, even so
-            self._server = viser.ViserServer(host=host, port=free, label="sonotwin", verbose=False)
+        try:
+            with own_pages_alone(host), redirect_stdout(StringIO()):  # it prints, even so
+                self._server = viser.ViserServer(host=host, port=free, label="sonotwin", verbose=False)
+        except InputError:
+            self.close()
+            raise
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
         self._beside: viser.GuiImageHandle | None = None  # and beside it
         self._shown: PlacedScan | None = None

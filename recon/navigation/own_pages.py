@@ -6,30 +6,40 @@ replaced while it does so, by one that looks at each request first.
 """
 
 import logging
+import re
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from http import HTTPStatus
+from importlib.metadata import version
 from typing import Any
 from urllib.parse import urlsplit
 
-from recon.errors import short
+from recon.errors import InputError, short
 
 log = logging.getLogger(__name__)
 
+MOST_NAMED = 20  # origins that are refused, each once
 HERE = ("127.0.0.1", "localhost")  # names of this computer, for itself
 
 
 @contextmanager
 def own_pages_alone(host: str) -> Iterator[None]:
-    """Let a server of websockets that begins meanwhile refuse what pages of other origins ask for; `host` is where it listens."""
+    """Have the websocket server that begins within refuse pages of other origins; `host` is where it listens.
+
+    Raises
+    ------
+    InputError
+        If none has begun by the function that is replaced, as of another version of viser: it is unguarded.
+    """
     from websockets.asyncio import server  # comes with viser
 
-    serve, guarded = server.serve, []
+    serve, guarded, refused = server.serve, [], set[str]()
 
     def serve_own(*given: Any, process_request: Callable | None = None, **others: Any) -> Any:
         guarded.append(True)
-        return serve(*given, process_request=partial(_looked_at, host, process_request), **others)
+        return serve(*given, process_request=partial(_answer, host, refused, process_request), **others)
 
     server.serve = serve_own  # type: ignore[assignment]
     try:
@@ -37,7 +47,8 @@ def own_pages_alone(host: str) -> Iterator[None]:
     finally:
         server.serve = serve
     if not guarded:
-        log.warning("view: this version of viser can't be guarded: pages that other browser windows show can read it, too")
+        expected = "a version of viser that can be guarded against pages of other origins"
+        raise InputError(f"view: expected {expected}, found {version('viser')}; install that of constraints.txt")
 
 
 def is_own(origins: list[str], asked: list[str], host: str) -> bool:
@@ -48,7 +59,7 @@ def is_own(origins: list[str], asked: list[str], host: str) -> bool:
     origins, asked : headers Origin, scheme and place of the page; and Host, the place that was asked
     host : where the server listens
 
-    Where it listens to this computer alone, the place must have a name of this computer: names of others may be led here, too.
+    The place must be this computer's by name or number: whoever owns another name can lead it here.
     """
     if not origins:  # other programs than browsers
         return True
@@ -59,13 +70,24 @@ def is_own(origins: list[str], asked: list[str], host: str) -> bool:
         named = page.hostname
     except ValueError:  # no address at all
         return False
-    return page.netloc.lower() == asked[0].lower() and (host not in HERE or named in HERE)
+    return page.netloc.lower() == asked[0].lower() and named is not None and _is_here(named, host)
 
 
-def _looked_at(host: str, process: Callable | None, connection: Any, request: Any) -> Any:
+def _is_here(name: str, host: str) -> bool:
+    """Whether a name or an address may stand for this computer, where it listens to itself alone or to a network."""
+    if name in HERE or host in HERE:
+        return name in HERE
+    own = {host.lower(), socket.gethostname().lower(), socket.getfqdn().lower()}
+    return name in own or bool(re.fullmatch(r"[\d.]+|[\da-f:]+", name))  # a page led here by name never has an address
+
+
+def _answer(host: str, refused: set[str], process: Callable | None, connection: Any, request: Any) -> Any:
     """The answer of a server to a request, by `process` if it is from a page of its own."""
     origins = request.headers.get_all("Origin")
     if not is_own(origins, request.headers.get_all("Host"), host):
-        log.info("view: a page of %s is refused", short(", ".join(origins)))
+        origin = short(", ".join(origins))
+        if origin not in refused and len(refused) < MOST_NAMED:
+            refused.add(origin)
+            log.warning("view: a page of %s is refused; open the address that was printed", origin)
         return connection.respond(HTTPStatus.FORBIDDEN, "expected a page of this server's own\n")
     return None if process is None else process(connection, request)

@@ -103,7 +103,7 @@ class Outlet:
         try:
             self._publish_all()
         except InputError as error:  # such as a B-scan larger than a message may be
-            log.error("%s: %s; nothing more is published by it", self.publisher.name, error)
+            log.error("%s: %s; navigation ends", self.publisher.name, error)
 
     def _publish_all(self) -> None:
         shown = None

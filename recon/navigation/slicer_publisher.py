@@ -94,11 +94,11 @@ class SlicerPublisher:
 def model_names(masses: Iterable[str]) -> list[str]:
     """Names of masses as Slicer gets them: short enough for a message, and distinct from each other and from what else is sent.
 
-    A name that had to be changed beyond its capital is logged.
+    A name that isn't sent as it is but for a capital is logged.
     """
     names: list[str] = []
     for mass in masses:
-        whole = mass.capitalize().encode(errors="replace").decode()  # a file's name may hold what is no text
+        whole = (mass[:1].upper() + mass[1:]).encode(errors="replace").decode()  # a file's name may hold what is no text
         name, number = _shortened(whole), 1
         while name in OWN or name in names:
             number += 1

@@ -59,8 +59,8 @@ def read(path: Path) -> list[Check]:
     return [validated(Check, json_text.parsed(path, line), f"{path}: line {k}") for k, line in lines if line.strip()]
 
 
-def add(path: Path, made: Check) -> list[Check]:
-    """Add a check, and give all; one process at a time does, and whatever stops it, the log stays whole.
+def add(path: Path, made: Check) -> None:
+    """Add a check; one process at a time does, and whatever stops it, the log stays whole.
 
     Raises
     ------
@@ -71,4 +71,3 @@ def add(path: Path, made: Check) -> list[Check]:
     with atomic.new_file(path) as temporary:
         checks = [*(read(path) if path.exists() else []), made]
         temporary.write_text("".join(json.dumps(one.model_dump(mode="json")) + "\n" for one in checks), encoding="utf-8")
-    return checks

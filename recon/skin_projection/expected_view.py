@@ -29,7 +29,7 @@ def expected(curves: Sequence[SkinCurve], lit: Lit, skin: trimesh.Trimesh, camer
     greys = meshes.greys_of(skin)
     view[v, u] = DIMMED * (PLAIN if greys is None else greys[within])
     filled = np.where(view == 0, cv2.dilate(view, np.ones((3, 3), np.uint8)), view)  # between vertices that are farther apart
-    seen = projector_image.reached(curves, skin, camera)
+    seen = projector_image.in_sight(curves, skin, camera)
     both = {name: points & seen[name] for name, points in lit.items()}
     drawn = projector_image.strips_of_light(curves, both, camera, lines)
     return np.maximum(filled, np.uint8(np.rint(255 * drawn)))

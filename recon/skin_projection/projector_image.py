@@ -81,17 +81,17 @@ def draw(
     dark : (h, w)
         Pixels that are to stay dark, as of `probe_shadow.shadow`.
     """
-    lit = reached(curves, skin, projector, dark)
+    lit = in_sight(curves, skin, projector, dark)
     light = strips_of_light(curves, lit, projector, lines)
     if dark is not None:
         light[dark] = 0
     return Drawing(np.uint8(np.rint(255 * light ** (1 / gamma))), lit)
 
 
-def reached(
+def in_sight(
     curves: Sequence[SkinCurve], skin: trimesh.Trimesh, device: Camera, dark: NDArray[np.bool_] | None = None
 ) -> dict[str, NDArray[np.bool_]]:
-    """Whether a device's lines of sight reach a curve's points, but for pixels that are dark."""
+    """Whether a device sees each point of a curve, by the curve's name; points at dark pixels count as unseen."""
     together = np.concatenate([np.zeros((0, 3)), *(curve.points for curve in curves)])  # so that the skin is looked at once
     lit = visible(together, skin, device)
     if dark is not None:

@@ -95,8 +95,8 @@ def run(config: Config) -> int:
     with atomic.new_folder(config.out, CHECK) as folder:
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
         (folder / PAGE).write_text(check_page.write_text(made, [*earlier, made], config.alarm_sigma), encoding="utf-8")
-    if config.log is not None:
-        check_log.add(config.log, made)
+        if config.log is not None:  # last, so that whatever fails leaves both as they were
+            check_log.add(config.log, made)
     console.print(f"wrote       {config.out}/{{{CHECK},{PAGE}}}", markup=False)
     return int(any(one.state == "moved" for one in found))
 

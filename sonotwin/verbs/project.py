@@ -128,13 +128,13 @@ def draw(config: Config, console: Console) -> NDArray[np.uint8]:
         raise InputError(f"{config.calibration}: expected the projector, found {', '.join(cameras)}")
 
     with console.status("reading"):
-        earlier = read_masses(config)  # before the skin, which takes seconds
+        masses_before = read_masses(config)  # before the skin, which takes seconds
         chains = [] if config.cut is None else planned_cut.read(config.cut)
         skin, shift = read_skin(config.skin, config.part_table), None
         if config.earlier_skin is not None:
             shift = skin_registration.register(read_skin(config.earlier_skin, config.part_table), skin)
         new_from_old = np.eye(4) if shift is None else shift.new_from_old
-        masses = {name: mass.copy().apply_transform(new_from_old) for name, mass in earlier.items()}
+        masses = {name: mass.copy().apply_transform(new_from_old) for name, mass in masses_before.items()}
         cuts = [rigid.apply(new_from_old, chain) for chain in chains]
         held = None if config.capture is None else read_probe(config, skin)
 

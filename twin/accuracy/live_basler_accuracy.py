@@ -92,11 +92,13 @@ def drawn(rng: np.random.Generator, n: int, rate: float, delays: Delays) -> tupl
 
 
 def followed(device_ns: Times, arrived_ns: Times) -> list[Jump]:
-    """Jumps that are named while a clock is followed, but to nobody: there are hundreds."""
+    """Jumps found while a clock is followed; their warnings, hundreds, are left out."""
     follower = ClockFollower("cam1")
     LOG.addFilter(_unheard)
-    found = [follower.add(int(device), int(arrived)) for device, arrived in zip(device_ns, arrived_ns, strict=True)]
-    LOG.removeFilter(_unheard)
+    try:
+        found = [follower.add(int(device), int(arrived)) for device, arrived in zip(device_ns, arrived_ns, strict=True)]
+    finally:
+        LOG.removeFilter(_unheard)
     return [jump for jump in found if jump]
 
 

@@ -15,7 +15,9 @@ from recon.acquisition.sweep_recording import SweepPlan, record_sweep
 from recon.capture import sweep_tables
 from recon.capture.images import read_image
 from recon.capture.manifest import Device
+from recon.devices.camera_pairs import CameraPair
 from recon.devices.interfaces import DeviceError, Frame
+from recon.devices.timed_frames import TimedScanner
 from tests.recon.acquisition.stand_ins import Scripted
 from twin.devices.virtual_operator import OneTake
 from twin.devices.virtual_sweep import FramePair
@@ -170,3 +172,56 @@ def test_the_preview_gets_every_device(tmp_path):
     shown: list[Picture] = []
     record(tmp_path, Source(10_000), Source(10_000), seconds=2.5, show=shown.append)
     assert {picture.device for picture in shown} == set(DEVICES)
+
+
+class Film:
+    """A camera of its own clock at 100 Hz, which shows a time after power-on, until `last`."""
+
+    size, bits, over = SIZE, 8, False
+
+    def __init__(self, name, shown_ns, last=40, jump_ns=0) -> None:
+        self.name, self.shown_ns, self.last, self.jump_ns, self.numbers = name, shown_ns, last, jump_ns, count()
+        self.begun = time.monotonic_ns()
+
+    def start(self, trigger):
+        pass
+
+    def stop(self):
+        pass
+
+    def close(self):
+        pass
+
+    def frame(self, timeout_s):
+        time.sleep(0.01)
+        if self.over:
+            return None
+        number, now = next(self.numbers), time.monotonic_ns()
+        self.over = number == self.last - 1
+        shown = now - self.begun + self.shown_ns + (self.jump_ns if number >= 30 else 0)
+        return Frame(image(number), number, shown, now)
+
+
+def test_devices_of_a_laboratory_lie_on_one_clock(tmp_path):
+    """Cameras that count from power-on and a scanner that counts from 1970."""
+    films = Film("cam1", 10**9), Film("cam2", 7 * 10**9)
+    pairs, scanner = CameraPair(films), Film("us", 1_795_000_000 * 10**9)
+    pairs.over = False
+    devices = {name: DEVICES[name] for name in ("cam1", "cam2", "us")}
+    operator = OneTake(lambda: all(one.over for one in (*films, scanner)))
+    plan = SweepPlan("scan", "volume", ("free", "hardware"), None, 20, Limits())
+    with open_recording(tmp_path / "out") as recording:
+        counts = record_sweep(recording, pairs, TimedScanner(scanner), devices, operator, plan, {}, print, hidden)
+    assert min(counts.values()) >= 38
+    times = {name: sweep_tables.read_stamps(tmp_path / "out/sweep/scan" / name / "timestamps.csv")[1] for name in devices}
+    now = time.monotonic_ns()
+    assert all(films[0].begun - 0.1e9 < at[0] < at[-1] < now + 0.1e9 for at in times.values())
+    assert (times["cam1"] == times["cam2"]).all()
+
+
+def test_a_scanners_clock_that_jumps_ends_the_recording(tmp_path):
+    scanner = TimedScanner(Film("us", 0, jump_ns=5 * 10**9))
+    scanner.over = False
+    with pytest.raises(DeviceError, match=r"us: its clock jumped by \+5\.0\d+ s"):
+        record(tmp_path, scanner=scanner)
+    assert len(frames(tmp_path, "us")) == 30

@@ -1,11 +1,13 @@
 """Frames of devices with clocks of their own, on this computer's clock."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from recon.devices.camera_pairs import CameraPair
-from recon.devices.interfaces import Frame
-from recon.devices.timed_frames import MOST_WAITING, FrameTimes, TimedScanner
+from recon.devices.interfaces import DeviceError, Frame
+from recon.devices.timed_frames import FrameTimes, TimedScanner
 
 IMAGE = np.zeros((2, 2), np.uint8)
 START_NS = 5 * 10**12
@@ -59,14 +61,35 @@ def test_frames_wait_for_a_clock_in_order_and_none_is_lost(rng):
     assert not given[0] and [one.number for some in given for one in some] == list(range(30))
 
 
-def test_a_device_without_a_clock_is_timed_by_arrivals(rng):
-    """Its stamps stand still: each frame begins a new clock."""
+def test_a_device_without_a_clock_is_timed_by_arrivals(rng, caplog):
+    """Its stamps stand still: each frame begins a new clock, and comes when the next one shows that."""
     frames, _ = taken(rng, 0, 0.0, n=200)
     times = FrameTimes(Sent("us", []))
-    given = [times.add(one) for one in frames]
-    assert max(map(len, given)) == MOST_WAITING
-    found = [one for some in given for one in some]
-    assert [one.time_ns for one in found] == [one.arrived_ns for one in frames[: len(found)]]
+    found = [one for frame in frames for one in times.add(frame)]
+    assert [one.time_ns for one in found] == [one.arrived_ns for one in frames[:-1]]
+    assert [record.message for record in caplog.records] == ["us: its time stamps don't rise; frames are timed by their arrival"]
+
+
+@pytest.mark.parametrize("step_s", [37.0, -37.0])
+def test_a_clock_that_jumps_ends_it(rng, step_s):
+    """What came before keeps its time; times after it don't belong to those."""
+    frames, true = taken(rng, UNIX_NS, n=100)
+    frames[60:] = [replace(one, time_ns=one.time_ns + round(1e9 * step_s)) for one in frames[60:]]
+    times = FrameTimes(Sent("us", []))
+    found = [one for frame in frames[:60] for one in times.add(frame)]
+    assert np.allclose([one.time_ns for one in found], true[:60] + TRANSFER_NS, atol=1e6, rtol=0)
+    with pytest.raises(DeviceError, match=r"us: its clock jumped by [+-]3[67]\.\d+ s.*record anew"):
+        times.add(frames[60])
+
+
+def test_times_rise_though_the_first_frames_come_at_once(rng):
+    """Fifteen frames that waited in a buffer arrive together: each fit finds an earlier clock."""
+    frames, true = taken(rng, UNIX_NS, n=200)
+    frames[:15] = [replace(one, arrived_ns=int(true[15]) + k) for k, one in enumerate(frames[:15])]
+    times = FrameTimes(Sent("us", []))
+    found = np.array([one.time_ns for frame in frames for one in times.add(frame)])
+    assert np.all(np.diff(found) > 0) and len(found) == 200
+    assert np.allclose(found[100:], true[100:] + TRANSFER_NS, atol=2e7, rtol=0)  # the early ones count for long
 
 
 @pytest.mark.parametrize("calls", [1, 3])

@@ -6,6 +6,7 @@ import urllib.request
 import numpy as np
 import pytest
 
+from recon.errors import InputError
 from recon.navigation import own_pages
 from recon.navigation.browser_view import LOOPBACK, BrowserView
 from recon.navigation.publishing import StillScene
@@ -55,12 +56,22 @@ def test_a_strangers_page_is_refused(port):
         (["http://rig.clinic:8080"], ["rig.clinic:8080"], "0.0.0.0", True),
         (["https://rig.clinic"], ["rig.clinic"], "0.0.0.0", True),
         (["http://localhost:9000"], ["localhost:9000"], LOOPBACK, True),
+        (["http://192.168.0.4:8080"], ["192.168.0.4:8080"], "0.0.0.0", True),
         (["http://rig.clinic:8080"], ["192.168.0.4:8080"], "0.0.0.0", False),
+        (["http://rebound.example:8080"], ["rebound.example:8080"], "0.0.0.0", False),
+        (["http://rebound.example:8080"], ["rebound.example:8080"], "127.0.1.1", False),
         (["http://[", "http://["], ["["], LOOPBACK, False),
         (["http://["], ["["], LOOPBACK, False),
         (["http://localhost:8080"], [], LOOPBACK, False),
     ],
 )
-def test_a_page_is_own_where_it_came_from_the_place_that_is_asked(origins, asked, host, own):
-    """Also by a name in the network, behind a proxy, or through a tunnel to another port."""
+def test_a_page_is_own_where_it_came_from_the_place_that_is_asked(monkeypatch, origins, asked, host, own):
+    """Also by this computer's name or number in the network, or through a tunnel to another port."""
+    monkeypatch.setattr(socket, "getfqdn", lambda: "rig.clinic")
     assert own_pages.is_own(origins, asked, host) is own
+
+
+def test_a_server_that_cant_be_guarded_is_refused():
+    """As a version of viser that begins to serve by another function."""
+    with pytest.raises(InputError, match="expected a version of viser that can be guarded"), own_pages.own_pages_alone(LOOPBACK):
+        pass

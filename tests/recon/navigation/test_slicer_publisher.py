@@ -86,9 +86,9 @@ def test_names_of_masses_stay_distinct_and_fit_in_a_message(scene, caplog):
     sent, masses = Sent(), dict.fromkeys(names, ball)
     SlicerPublisher(StillScene(scene.target_from_image, ball, masses, ball), sent)
     found = [name for kind, name, *_ in sent.messages if kind == "model"]
-    assert len(set(found)) == len(names) + 2 and {"Skin", "Probe", "Mass", "Mass~2", "Skin~2", "Probe~2"} <= set(found)
+    assert len(set(found)) == len(names) + 2 and {"Skin", "Probe", "MASS", "MASS~2", "Skin~2", "Probe~2"} <= set(found)
     assert max(len(name.encode()) for name in found) <= 20
-    assert "mass_of_the_left_upper_2 is sent as Mass_of_the_left_u~2" in caplog.text and "MASS is sent as Mass~2" in caplog.text
+    assert "mass_of_the_left_upper_2 is sent as Mass_of_the_left_u~2" in caplog.text and "MASS is sent as MASS~2" in caplog.text
 
 
 def test_what_has_not_changed_is_not_sent_again(rig, scene):

@@ -12,9 +12,11 @@ SEEN = (Verdict("cam1", "maybe", 3.0, 0.1, 0.05), MOVED, Verdict("probe", "unsee
 
 def test_checks_are_read_as_they_were_added(tmp_path):
     log = tmp_path / "days" / "rig.jsonl"
-    first = check_log.add(log, check_log.check("monday", SEEN[:1]))
-    both = check_log.add(log, check_log.check("tuesday", SEEN))
-    assert len(first) == 1 and check_log.read(log) == both and [one.name for one in both] == ["monday", "tuesday"]
+    made = [check_log.check("monday", SEEN[:1]), check_log.check("tuesday", SEEN)]
+    for one in made:
+        check_log.add(log, one)
+    both = check_log.read(log)
+    assert both == made and [one.name for one in both] == ["monday", "tuesday"]
     assert both[1].parts[1].rivals == ("cam1",) and both[1].parts[2].sigma is None
     assert len(log.read_text().splitlines()) == 2 and [path.name for path in log.parent.iterdir()] == ["rig.jsonl"]
 
