@@ -4,7 +4,7 @@ The curve is laid on the skin as masses are: along the skin's normal over it, or
 """
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import trimesh
@@ -14,7 +14,6 @@ from scipy.interpolate import CubicSpline
 
 from recon.errors import InputError, validated
 from recon.files import json_text
-from recon.model.rig import Vector
 from recon.skin_projection import skin_curve
 from recon.skin_projection.mass_outline import sight_of
 from recon.skin_projection.skin_curve import SkinCurve
@@ -22,13 +21,15 @@ from recon.skin_projection.skin_curve import SkinCurve
 Array = NDArray[np.float64]
 
 LPS_FROM = {"LPS": np.ones(3), "RAS": np.array([-1.0, -1.0, 1.0])}
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # mm: nothing of the rig is farther away than ten metres
+LEAST_MM = 1e-3  # between two control points; nearer ones are one
 FINE = 20  # points of a spline from one control point to the next
 
 
 class ControlPoint(BaseModel):
     """A control point of 3D Slicer's markups; other keys don't matter here."""
 
-    position: Vector  # mm
+    position: tuple[Coordinate, Coordinate, Coordinate]
     positionStatus: str = "defined"
 
 
@@ -65,7 +66,7 @@ def read(path: Path) -> list[Array]:
         points = LPS_FROM[markup.coordinateSystem] * np.reshape(defined, (-1, 3))
         if markup.type == "ClosedCurve":
             points = np.concatenate([points, points[:1]])
-        if len(points) < 2 or not np.linalg.norm(np.diff(points, axis=0), axis=1).min() > 0:
+        if len(points) < 2 or not np.linalg.norm(np.diff(points, axis=0), axis=1).min() > LEAST_MM:
             raise InputError(f"{path}: markups.{number}: expected control points in two places or more, found some in one place")
         chains.append(points if markup.type == "Line" else _spline(points, markup.type == "ClosedCurve"))
     return chains

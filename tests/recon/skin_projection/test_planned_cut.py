@@ -74,6 +74,7 @@ def test_a_cut_that_nothing_lies_under_is_refused():
 
 @pytest.mark.parametrize(("change", "complaint"), [
     ({"points": ARC[:1]}, "markups.0.controlPoints: expected"),
+    ({"points": [ARC[0], [-6e60, 0.0, 0.0]]}, r"markups.0.controlPoints.1.position.0: expected greater than or equal to -10000"),
     ({"points": [ARC[0], ARC[0]]}, "markups.0: expected control points in two places or more"),
     ({"kind": "ROI"}, "markups.0.type: expected"),
     ({"system": "XYZ"}, "markups.0.coordinateSystem: expected"),
