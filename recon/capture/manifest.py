@@ -323,6 +323,9 @@ def read_manifest(folder: Path) -> Manifest:
         If it is missing, not JSON, of another version, or a field is wrong.
     """
     path = Path(folder) / MANIFEST
+    within = Path(folder) / "capture"
+    if not path.exists() and (within / MANIFEST).exists():
+        raise InputError(f"{path}: expected a file, found none; is {within} meant?")
     return validated(Manifest, json_text.read(path), path)
 
 

@@ -79,7 +79,7 @@ def read_film(folder: Path, calibration_file: Path | None = None, sweep: str = "
     read = manifest.read_manifest(folder)
     listed, images = folder / MANIFEST, read.images_of(folder, CAMERAS, sweep)
     if calibration_file is None and read.calibration is None:
-        raise InputError(f"{listed}: expected calibration, the path of a calibration file, found none")
+        raise InputError(f"{listed}: expected calibration, the path of a calibration file, found none; give calibration=FILE")
     depths = images[CAMERAS[0]].device.bits, images[CAMERAS[1]].device.bits
     if min(depths) > 8 and depths[0] != depths[1]:
         raise InputError(f"{listed}: devices.cam2.bits: expected {depths[0]}, as of cam1, found {depths[1]}")

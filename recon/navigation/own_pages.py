@@ -20,6 +20,9 @@ from recon.errors import InputError, short
 
 log = logging.getLogger(__name__)
 
+QUIET = logging.getLogger(f"{__name__}.handshakes")  # of peers that are no browsers or go away, by tracebacks
+QUIET.setLevel(logging.CRITICAL)
+
 MOST_NAMED = 20  # origins that are refused, each once
 HERE = ("127.0.0.1", "localhost")  # names of this computer, for itself
 
@@ -39,6 +42,7 @@ def own_pages_alone(host: str) -> Iterator[None]:
 
     def serve_own(*given: Any, process_request: Callable | None = None, **others: Any) -> Any:
         guarded.append(True)
+        others.setdefault("logger", QUIET)
         return serve(*given, process_request=partial(_answer, host, refused, process_request), **others)
 
     server.serve = serve_own  # type: ignore[assignment]

@@ -138,7 +138,9 @@ def optics(config: Config, listed: Manifest, held: Held, console: Console) -> li
         return [Verdict(part, "unseen") for part in (*CAMERAS, PROJECTOR, "target")]
     file = config.calibration or (None if listed.calibration is None else config.capture / listed.calibration)
     if file is None:
-        raise InputError(f"{config.capture / MANIFEST}: expected calibration, the path of a calibration file, found none")
+        raise InputError(
+            f"{config.capture / MANIFEST}: expected calibration, the path of a file, found none; give calibration=FILE"
+        )
     wanted = [*CAMERAS, *([PROJECTOR] if held.fringes else [])]
     sizes = {name: device.size for name, device in listed.devices.items() if name in wanted}
     calibration = calibration_files.read_for(file, sizes)

@@ -142,7 +142,10 @@ def test_cameras_that_dont_fit_are_named(copy, rig):
     calibration_files.write(copy / "calibration/optics.yaml", alone)
     assert complaint(copy) == "calibration/optics.yaml: expected cam2, found cam1, projector"
     edited(copy, lambda content: content.pop("calibration"))
-    assert complaint(copy) == "manifest.json: expected calibration, the path of a calibration file, found none"
+    assert (
+        complaint(copy)
+        == "manifest.json: expected calibration, the path of a calibration file, found none; give calibration=FILE"
+    )
 
 
 def test_nothing_is_left_of_a_film_that_failed(rig, tmp_path):

@@ -1,6 +1,8 @@
 """A stranger's page in the surgeon's browser gets nothing of the view."""
 
 import socket
+import subprocess
+import sys
 import urllib.request
 
 import numpy as np
@@ -75,3 +77,23 @@ def test_a_server_that_cant_be_guarded_is_refused():
     """As a version of viser that begins to serve by another function."""
     with pytest.raises(InputError, match="expected a version of viser that can be guarded"), own_pages.own_pages_alone(LOOPBACK):
         pass
+
+
+STRANGE_PEERS = """
+import socket, time
+import numpy as np
+from recon.navigation.browser_view import LOOPBACK, BrowserView
+from recon.navigation.publishing import StillScene
+view = BrowserView(StillScene(np.eye(4)), 0)
+for sent in (b"", b"garbage\\r\\n\\r\\n"):
+    with socket.create_connection((LOOPBACK, view._server.get_port()), 5) as peer:
+        peer.sendall(sent)
+        time.sleep(0.3)
+view.close()
+"""
+
+
+def test_a_peer_that_is_no_browser_leaves_no_traceback():
+    """It goes away in the middle, or sends garbage. In a process of its own, whose log is a user's."""
+    done = subprocess.run([sys.executable, "-c", STRANGE_PEERS], capture_output=True, text=True, check=True)
+    assert "Traceback" not in done.stderr
