@@ -53,18 +53,14 @@ class BrowserView:
         import viser  # of the extra `live`
 
         free = _free_port(host, port)
-        try:
-            with own_pages_alone(host), redirect_stdout(StringIO()):  # it prints, even so
-                self._server = viser.ViserServer(host=host, port=free, label="sonotwin", verbose=False)
-        except InputError:
-            self.close()
-            raise
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
         self._beside: viser.GuiImageHandle | None = None  # and beside it
         self._shown: PlacedScan | None = None
         self._picture: Picture | None = None  # of that
         with ExitStack() as stack:
-            stack.callback(self.close)
+            with own_pages_alone(host), redirect_stdout(StringIO()):  # it prints, even so
+                self._server = viser.ViserServer(host=host, port=free, label="sonotwin", verbose=False)
+                stack.callback(self.close)
             self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
             self._bodies = _add_scene(self._server, scene)
             self._words, self._written = self._server.gui.add_markdown("waiting for the first frames"), 0.0
