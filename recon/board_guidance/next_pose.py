@@ -15,7 +15,7 @@ from recon.model.boards import Board
 from recon.model.calibration import Calibration
 from recon.model.rig import Rig
 
-CANDIDATES = 300  # from which the best one is chosen
+CANDIDATES = 600  # from which the best one is chosen
 OFF = 2.5  # times the distance of poses that are alike: that of asked poses from earlier ones
 FEW_POINTS = 24  # of a board: so many stand for all of a larger one
 NOISE_PX = {"cam1": 0.01, "cam2": 0.01, "projector": 0.01}  # of a sighting before any was measured; rendered boards have half

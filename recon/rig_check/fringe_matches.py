@@ -17,7 +17,7 @@ from recon.structured_light.decode import ProjectorMap
 
 Array = NDArray[np.float64]
 
-MOST = 200  # points
+MOST = 1000  # points: fewer hardly show a shift of the projector, whose parallax lies below a point's noise
 LEAST = 30
 HALF = 3  # px of a window, to each side of its middle
 CANDIDATES = 20  # pixels tried, for one that is used

@@ -22,6 +22,7 @@ from recon.model.tracks import Track
 from recon.rig_check import bottom_equations
 from recon.rig_check.bottom_equations import Lines
 from recon.rig_check.fault_tests import root
+from recon.rig_check.fringe_matches import MOST
 from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, Matches, points_by_light
 from recon.tracking.pose import aligned
 from recon.tracking.pose_fit import Sighting, meet
@@ -29,9 +30,8 @@ from recon.tracking.pose_fit import Sighting, meet
 Array = NDArray[np.float64]
 Devices = Mapping[str, Camera]
 
-PAIRS = 24  # of the film
+PAIRS = 40  # of the film: as many as conf/check.yaml takes
 REACH_MM, DEPTHS_MM, TILT_DEG = (50.0, 40.0), (606.0, 713.0), 20.0  # of the target in it
-MATCHES = 200  # points of the surface
 GROUND_MM, HEIGHT_MM, WIDTH_MM = 700.0, 45.0, 45.0  # of a mound under the fringes
 VIEW_PX = 60  # that the points keep from camera 1's border
 WINDOW_PX = 2.0  # to both sides, over which a map's gradient is taken
@@ -98,14 +98,14 @@ def drawn_film(
 def drawn_matches(true: Devices, known: Devices, axes: tuple[int, ...], sigma_px: float, rng: np.random.Generator) -> Matches:
     """Points of a mound under fringes along some axes, as both cameras' maps show them."""
     width, height = known["cam1"].size
-    pixels = rng.uniform([VIEW_PX, VIEW_PX], [width - VIEW_PX, height - VIEW_PX], (4 * MATCHES, 2))
+    pixels = rng.uniform([VIEW_PX, VIEW_PX], [width - VIEW_PX, height - VIEW_PX], (4 * MOST, 2))
     first = _shown(true, "cam1", pixels)[:, list(axes)]
     first = first + sigma_px * rng.standard_normal(first.shape)
     seen_at = known["cam2"].project(points_by_light(pixels, first, axes, known))
     exact = _shown(true, "cam2", seen_at)
     inside = ((seen_at > VIEW_PX) & (seen_at < np.array(known["cam2"].size) - VIEW_PX)).all(axis=1)
     inside &= ((exact > 0) & (exact < np.array(known[PROJECTOR].size) - 1)).all(axis=1)
-    chosen = np.flatnonzero(inside)[:MATCHES]
+    chosen = np.flatnonzero(inside)[:MOST]
     steps = WINDOW_PX * np.eye(2)
     gradient = np.stack([_shown(true, "cam2", seen_at + step) - _shown(true, "cam2", seen_at - step) for step in steps], axis=2)
     second = exact[:, list(axes)] + sigma_px * rng.standard_normal(first.shape)
