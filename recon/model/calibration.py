@@ -9,6 +9,7 @@ from recon.geometry import camera_jacobian
 from recon.geometry.camera import Array, Camera
 
 DRIFT_PX = 0.05  # usual standard deviation of cameras' principal points since their calibration
+FOCAL_DRIFT = 4.0e-4  # relative change of a focal length for each px of such a drift: 2e-5 with 0.05 px, of the same warmth
 PRINT_SCALE = 3.0e-4  # usual relative standard deviation of the scale of a board printed on paper, which takes up moisture
 WORLD = "cam1"  # the device whose frame the world is: it has no pose
 
@@ -50,20 +51,24 @@ class Calibration:
 
 def in_use(known: Uncertainty | None, cameras: Mapping[str, Camera], scale: float, drift_px: float) -> Uncertainty | None:
     """Uncertainty of cameras that are used some time after they were calibrated: `with_scale` and `with_drift`."""
-    return with_drift(with_scale(known, cameras, scale), list(cameras), drift_px)
+    return with_drift(with_scale(known, cameras, scale), cameras, drift_px)
 
 
-def with_drift(known: Uncertainty | None, devices: Sequence[str], drift_px: float) -> Uncertainty | None:
+def with_drift(known: Uncertainty | None, cameras: Mapping[str, Camera], drift_px: float) -> Uncertainty | None:
     """Add that devices have warmed, or turned on their mounts, since they were calibrated.
 
-    drift_px : standard deviation of each device's principal point along each axis; a turn by as much is all but the same.
+    drift_px : standard deviation of each device's principal point along each axis; a turn by as much is all but the same. Its
+        focal lengths change together, by FOCAL_DRIFT times as much.
     """
     if drift_px == 0:
         return known
-    moved = [f"{device}.{name}" for device in devices for name in ("cx", "cy")]
+    moved = [f"{device}.{name}" for device in cameras for name in ("cx", "cy", "fx", "fy")]
     wider = _extended(known, moved)
-    drifts = np.isin(wider.names, moved)
-    wider.covariance[drifts, drifts] += drift_px**2
+    for device, camera in cameras.items():
+        centre, focal = ([wider.names.index(f"{device}.{name}") for name in pair] for pair in (("cx", "cy"), ("fx", "fy")))
+        wider.covariance[centre, centre] += drift_px**2
+        longer = drift_px * FOCAL_DRIFT * camera.matrix[[0, 1], [0, 1]]
+        wider.covariance[np.ix_(focal, focal)] += np.outer(longer, longer)
     return wider
 
 

@@ -1,18 +1,22 @@
 """`sonotwin check`: a capture's parts, verdicts and exit status; the whole way over rendered images is a slow test of its own."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
-from recon.capture import lag_files, probe_files
+from recon.capture import calibration_files, lag_files, probe_files
 from recon.capture.lag_files import LagFile
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
 from recon.probe_calibration.sound_in_water import speed_of_sound
+from scenes.board_poses import Config as Poses
 from sonotwin.cli import main
 from tests.recon import bscans, sweep_sets
+from twin.conditions import IDEAL
+from twin.studies.drawn_session import Noise, calibrated_optics
 
 LAG_S = 0.0473
 
@@ -70,3 +74,38 @@ def test_a_clock_that_is_off_is_told_and_logged(bottom, tmp_path, capsys, lag, s
     assert len((tmp_path / "rig.jsonl").read_text().splitlines()) == 1
     page, said = (tmp_path / "out/check.html").read_text(encoding="utf-8"), capsys.readouterr().out
     assert ("Run measure-lag." in page) == bool(status) == ("Moved: scanner's clock. Run measure-lag." in said)
+
+
+SEED = 21  # of calibration, drift, prints, hand and light: nothing was tried on it
+RENDERED = [
+    "cameras=[cam1,cam2]",
+    "scene=breast",
+    "patterns=paper_calibration",
+    "conditions=lifelike",
+    "tracing.samples=8",
+    f"seed={SEED}",
+]
+
+
+@pytest.fixture(scope="module")
+def drifted(rig, tmp_path_factory):
+    """A folder with a calibration that errs as it says, and a film of the target by cameras that have drifted since."""
+    folder = tmp_path_factory.mktemp("drifted")
+    calibration_files.write(folder / "optics.yaml", calibrated_optics(rig, IDEAL, Noise(), Poses(), SEED))
+    led = ["frames=30", "path.turn_deg=20", "white_dn=120", "conditions=lifelike", f"seed={SEED}"]
+    assert main(["film", f"out={folder}", *led]) == 0
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shift_mm", [0.0, 0.3])
+def test_a_rendered_rig_is_as_calibrated_but_for_a_projector_that_was_shifted(rig, drifted, tmp_path, shift_mm):
+    """Skin that light spreads in, a lamp that flickers, drift of a warm day: no alarm. A shift by 0.3 mm is 0.8 px."""
+    x, y, z = rig.projector.optics.device_from_world.translation_mm
+    moved = f"rig.projector.optics.device_from_world.translation_mm=[{x + shift_mm},{y + shift_mm},{z}]"
+    shutil.copytree(drifted / "capture", tmp_path / "capture")
+    assert main(["render", f"out={tmp_path}", "add=true", moved, *RENDERED]) == 0
+    line = ["check", f"capture={tmp_path / 'capture'}", f"calibration={drifted / 'optics.yaml'}", f"out={tmp_path / 'check'}"]
+    assert main(line) == (1 if shift_mm else 0)
+    states = {one["part"]: one["state"] for one in json.loads((tmp_path / "check/check.json").read_text())["parts"]}
+    assert [part for part in ("cam1", "cam2", "projector", "target") if states[part] == "moved"] == ["projector"] * bool(shift_mm)

@@ -74,9 +74,9 @@ def sharp_and_lit(view: Seen) -> bool:
 
 def scored(samples: Iterable[tuple[Take, Frames]], target: Target, networks: Networks) -> Iterable[Seen]:
     """Track each sample as if nothing were known before, with the usual allowance for drift, and score both views."""
-    drift = with_drift(None, CAMERAS, DRIFT_PX)
     for take, given in samples:
         first, second = (device.optics.camera() for device in take.cameras)
+        drift = with_drift(None, dict(zip(CAMERAS, (first, second), strict=True)), DRIFT_PX)
         result = Tracker((first, second), target, networks, optics=drift).step(*given.views)
         for view, truth in zip(result.views, given.truth, strict=True):
             yield score(view, truth, take.present)
