@@ -95,7 +95,7 @@ class SweepPlan:
     name: str
     purpose: Purpose | None
     triggers: tuple[Trigger, Trigger]  # of camera 1 and camera 2; free or hardware
-    seconds: float | None  # after which it ends by itself
+    seconds: float | None  # after which it ends by itself, by the time stamps of the frames
     silent_s: float  # without a frame of a device, after which it counts as gone
     limits: Limits
 
@@ -223,9 +223,8 @@ def _rehearsed(pairs: PairSource | None, scanner: ScanSource | None, operator: O
 
 def _follow(streams: Sequence[FrameStream], operator: Operator, plan: SweepPlan, shown: _Shown) -> None:
     """Wait for the end of a recording, and show how it goes."""
-    begun = monotonic()
     while all(stream.alive for stream in streams) and operator.answer() == "wait":
-        if plan.seconds is not None and monotonic() - begun >= plan.seconds:
+        if plan.seconds is not None and any(stream.span_s >= plan.seconds for stream in streams):
             break
         shown.look({device: frame for stream in streams for device, frame in stream.latest.items()})
         sleep(POLL_S)

@@ -155,9 +155,18 @@ def test_a_slow_disk_loses_frames_and_says_so(tmp_path, monkeypatch):
     assert len(frames(tmp_path, "us")) == counts["us"]
 
 
-def test_a_recording_ends_after_its_time(tmp_path):
-    counts = record(tmp_path, scanner=Source(10_000), seconds=0.2)
-    assert 0 < counts["us"] < 10_000
+class Slow(Source):
+    """A virtual device: each frame takes a twentieth of a second, between frames lie 5 ms of its time."""
+
+    def frame(self, timeout_s):
+        time.sleep(0.05)
+        return super().frame(timeout_s)
+
+
+def test_a_recording_ends_after_its_time_of_the_devices_own(tmp_path):
+    """Forty milliseconds are eight periods of five, and at most a look later; the clock on the wall shows half a second."""
+    counts = record(tmp_path, scanner=Slow(10_000), seconds=0.04)
+    assert 9 <= counts["us"] <= 11
 
 
 def test_what_is_seen_before_the_start_is_shown_and_not_kept(tmp_path):
