@@ -65,12 +65,19 @@ def test_the_laboratorys_choice_is_valid():
     assert isinstance(devices, LiveDevices) and set(devices.cameras) == {"cam1", "cam2"}
 
 
+def test_images_have_up_to_as_many_bits_as_the_virtual_sensor():
+    assert composed("devices.bits=10").devices.bits == 10
+    finer = ("rig.cam1.sensor.adc_bits=12", "rig.cam2.sensor.adc_bits=12")
+    assert composed("devices.bits=12", *finer).devices.bits == 12
+
+
 @pytest.mark.parametrize(
     ("overrides", "reason"),
     [
         (["part=board"], "patterns: expected fringes or Gray code along both axes of a board, found none along rows"),
         (["part=board", "patterns=paper_calibration", "cameras=[cam2]"], "cameras: expected cam1"),
         (["part=film"], "part: expected"),
+        (["devices.bits=12"], "devices.bits: expected at most the 10 of rig.cam1.sensor.adc_bits, found 12"),
         (["devices.kind=other"], "devices.kind: expected one of"),
         (["reach.depth_mm=[700,600]"], "reach.depth_mm: expected the nearest depth, then a farther one, found 700 and 600"),
         (["exposing.level=2"], "exposing.level: expected less than 1"),
