@@ -15,6 +15,7 @@ from recon.acquisition.recording import open_recording
 from recon.capture.board_part import read_board
 from recon.capture.manifest import Device, read_manifest
 from recon.devices.interfaces import DeviceError
+from recon.errors import InputError
 from sonotwin import cli, config
 from sonotwin.open_devices import LiveDevices
 from sonotwin.terminal_operator import TerminalOperator
@@ -130,6 +131,14 @@ def test_a_folder_around_a_capture_is_named(tmp_path, capsys):
     with_surface(tmp_path / "demo/capture")
     found = refused(capsys, "part=surface", f"out={tmp_path}/demo")
     assert f"which has manifest.json, found other files; is {tmp_path}/demo/capture meant?" in found
+
+
+@pytest.mark.parametrize(("made", "given"), [("session", "session/capture"), ("made/capture", "made")])
+def test_a_folder_too_deep_or_not_deep_enough_is_named(tmp_path, made, given):
+    """What is recorded into OUT is OUT, what is rendered into OUT is OUT/capture."""
+    with_surface(tmp_path / made)
+    with pytest.raises(InputError, match=rf"expected a file, found none; is {tmp_path}/{made} meant\?"):
+        read_manifest(tmp_path / given)
 
 
 def test_a_rendered_surface_is_replaced_only_if_told(tmp_path, capsys, monkeypatch):
