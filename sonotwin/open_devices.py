@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from recon.acquisition.sweep_recording import PairSource
+from recon.acquisition.sweep_recording import PairSource, ScanSource
 from recon.capture.manifest import CAMERAS, SCANNER, Name
 from recon.devices import basler
 from recon.devices.camera_pairs import CameraPair
@@ -100,7 +100,7 @@ class Opened:
 
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     projector: Projector | None = None
-    scanner: Scanner | None = None
+    scanner: ScanSource | None = None
     pairs: PairSource | None = None
 
 

@@ -45,12 +45,18 @@ class FrameStream:
         self._ending = threading.Event()
         self._stamps: dict[str, _Stamps] = {}  # by device
         self._left_out = 0
+        self._span_ns = 0
         self._threads = ThreadPoolExecutor(2, "recording")
         try:
             self._work = [self._threads.submit(work) for work in (self._store, self._fetch)]
         except RuntimeError:  # no further thread: the first one must not wait for ever
             self._waiting.put(None)
             raise
+
+    @property
+    def span_s(self) -> float:
+        """Time from a device's first frame to its newest one, by their time stamps; of several devices, the longest."""
+        return 1e-9 * self._span_ns
 
     @property
     def alive(self) -> bool:
@@ -98,6 +104,7 @@ class FrameStream:
         stamps = self._stamps.setdefault(one.device, _Stamps())
         if late_ns := stamps.add(one):
             self._say(f"{one.device}: frame {one.frame.number} came {1e-9 * late_ns:.1f} s late: is the computer busy?")
+        self._span_ns = max(self._span_ns, stamps.span_ns)
         self.latest[one.device] = one.frame
 
     def _store(self) -> None:
@@ -119,6 +126,7 @@ class _Stamps:
 
     def __init__(self) -> None:
         self.late, self.latest_ns = 0, 0  # frames that came late, and by how long the latest one
+        self.span_ns = 0  # from the first frame to the newest
         self._before: Taken | None = None
         self._seen = 0
         self._least_ns = 0  # from a stamp to its arrival, of the fastest frame; both clocks drift apart by some 0.1 s an hour
@@ -135,6 +143,7 @@ class _Stamps:
         delay_ns = now.frame.arrived_ns - now.time_ns
         if self._before is not None:
             self._check(self._before, now, self._least_ns - delay_ns)
+            self.span_ns += now.time_ns - self._before.time_ns
         self._least_ns = delay_ns if self._before is None else min(self._least_ns, delay_ns)
         self._before, self._seen = now, self._seen + 1
         late_ns, followed = delay_ns - self._least_ns, self._behind

@@ -13,6 +13,7 @@ import shutil
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
 
 import cv2
@@ -56,6 +57,13 @@ class Recording:
         if there and manifest.SWEEP in (part, *there):
             found = ", ".join(there)
             raise InputError(f"{path}: expected sweeps that all have names, found {found}; give name=NAME, or another out=FOLDER")
+
+    @property
+    def surface_day(self) -> str:
+        """Day and time of the surface that is there, by its first image."""
+        paths = self._manifest.surface.paths() if self._manifest.surface else ()
+        first = next((path for path in map(self.folder.joinpath, paths) if path.is_file()), None)
+        return "unknown day" if first is None else f"{datetime.fromtimestamp(first.stat().st_mtime):%Y-%m-%d %H:%M}"
 
     def add_calibration(self, file: Path, sizes: Mapping[str, Size]) -> None:
         """Copy the calibration of cameras and projector, of any dialect; InputError if it isn't one of devices of these sizes."""
@@ -246,6 +254,7 @@ def open_recording(folder: Path, name: str = "") -> Iterator[Recording]:
         If the place is taken by something that is not a capture, can't be written to, or its capture's files lie elsewhere.
     """
     folder = Path(os.path.realpath(folder))
+    _check_capture(folder)
     atomic.check_folder(folder, manifest.MANIFEST)
     folder.mkdir(parents=True, exist_ok=True)
     with atomic.alone(folder):
@@ -262,6 +271,15 @@ def open_recording(folder: Path, name: str = "") -> Iterator[Recording]:
         finally:
             if new and not recording.contents.contents:
                 recording._remove()
+
+
+def _check_capture(folder: Path) -> None:
+    """Check that a folder with files is a capture; InputError else."""
+    within = folder / "capture"
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / manifest.MANIFEST).is_file():
+        expected = f"expected a new folder or a capture folder, which has {manifest.MANIFEST}"
+        way = f"is {within} meant?" if (within / manifest.MANIFEST).is_file() else "give another out=FOLDER"
+        raise InputError(f"{folder}: {expected}, found other files; {way}")
 
 
 def _write_whole(path: Path, data: bytes | np.ndarray) -> None:

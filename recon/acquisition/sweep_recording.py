@@ -12,7 +12,7 @@ from typing import Protocol
 
 from recon.acquisition import frame_checks
 from recon.acquisition.frame_checks import Limits
-from recon.acquisition.frame_stream import FrameStream, Read, Taken
+from recon.acquisition.frame_stream import FrameStream, Taken
 from recon.acquisition.guidance import Operator, Step
 from recon.acquisition.pictures import Picture, Say, Show
 from recon.acquisition.recording import GrowingSweep, Recording
@@ -59,8 +59,32 @@ class PairSource(Protocol):
     def pair(self, timeout_s: float) -> PairOfFrames | None:
         """Wait for the next pair; None if none came in time. DeviceError if a camera is gone."""
 
+    def rest(self) -> Sequence[PairOfFrames]:
+        """Pairs that still wait, as for their times, where no more will be asked for."""
+        ...
+
     def stop(self) -> Sequence[object]:
         """Take no more frames; those without a partner since the pair before, each in words by `str`."""
+        ...
+
+
+class ScanSource(Scanner, Protocol):
+    """A scanner whose B-scans may wait for their times."""
+
+    def rest(self) -> Sequence[Frame]:
+        """B-scans that still wait where no more will be asked for."""
+        ...
+
+
+class Reader(Protocol):
+    """What reads the frames of one source."""
+
+    def read(self, timeout_s: float) -> list[Taken] | None:
+        """Wait for the next ones; None if none came in time."""
+        ...
+
+    def rest(self) -> list[Taken]:
+        """Those that still wait at the end."""
         ...
 
 
@@ -71,7 +95,7 @@ class SweepPlan:
     name: str
     purpose: Purpose | None
     triggers: tuple[Trigger, Trigger]  # of camera 1 and camera 2; free or hardware
-    seconds: float | None  # after which it ends by itself
+    seconds: float | None  # after which it ends by itself, by the time stamps of the frames
     silent_s: float  # without a frame of a device, after which it counts as gone
     limits: Limits
 
@@ -115,7 +139,7 @@ class _Shown:
 def record_sweep(
     recording: Recording,
     pairs: PairSource | None,
-    scanner: Scanner | None,
+    scanner: ScanSource | None,
     devices: Mapping[str, Device],
     operator: Operator,
     plan: SweepPlan,
@@ -146,9 +170,12 @@ def record_sweep(
         operator.ask(Step("recording; end it when you are through"))
         if pairs is not None:
             pairs.start(*plan.triggers)
+        readers, write = _readers(pairs, scanner, say), _writer(sweep, counts)
         with ExitStack() as stack:
-            stack.callback(_stop, pairs, counts, say)
-            streams = [FrameStream(read, _writer(sweep, counts), plan.silent_s, say) for read in _readers(pairs, scanner, say)]
+            stack.callback(_say_counts, counts, say)
+            stack.callback(_stop, pairs, say)
+            stack.callback(_write_rest, readers, write)
+            streams = [FrameStream(reader.read, write, plan.silent_s, say) for reader in readers]
             for stream in streams:
                 stack.callback(stream.end)
             _follow(streams, operator, plan, shown)
@@ -157,14 +184,24 @@ def record_sweep(
     return counts
 
 
-def _stop(pairs: PairSource | None, counts: Mapping[str, int], say: Say) -> None:
-    """Stop the cameras, and say how many frames came and which are lost."""
+def _write_rest(readers: Sequence[Reader], write: Callable[[Taken], None]) -> None:
+    """Write the frames that waited for their times until the end."""
+    for reader in readers:
+        for taken in reader.rest():
+            write(taken)
+
+
+def _stop(pairs: PairSource | None, say: Say) -> None:
+    """Stop the cameras, and say which frames are lost."""
     for lost in () if pairs is None else pairs.stop():
         say(f"lost {lost}")
+
+
+def _say_counts(counts: Mapping[str, int], say: Say) -> None:
     say("recorded " + ", ".join(f"{count} frames of {device}" for device, count in counts.items()))
 
 
-def _rehearsed(pairs: PairSource | None, scanner: Scanner | None, operator: Operator, plan: SweepPlan, shown: _Shown) -> bool:
+def _rehearsed(pairs: PairSource | None, scanner: ScanSource | None, operator: Operator, plan: SweepPlan, shown: _Shown) -> bool:
     """Show what the devices see until the operator is ready; whether it is to be recorded then."""
     answer = operator.answer()
     if answer != "wait":
@@ -186,35 +223,54 @@ def _rehearsed(pairs: PairSource | None, scanner: Scanner | None, operator: Oper
 
 def _follow(streams: Sequence[FrameStream], operator: Operator, plan: SweepPlan, shown: _Shown) -> None:
     """Wait for the end of a recording, and show how it goes."""
-    begun = monotonic()
     while all(stream.alive for stream in streams) and operator.answer() == "wait":
-        if plan.seconds is not None and monotonic() - begun >= plan.seconds:
+        if plan.seconds is not None and any(stream.span_s >= plan.seconds for stream in streams):
             break
         shown.look({device: frame for stream in streams for device, frame in stream.latest.items()})
         sleep(POLL_S)
 
 
-def _readers(pairs: PairSource | None, scanner: Scanner | None, say: Say) -> list[Read]:
-    """What reads each stream's next frames."""
+def _readers(pairs: PairSource | None, scanner: ScanSource | None, say: Say) -> list[Reader]:
+    return [*([] if pairs is None else [_PairReader(pairs, say)]), *([] if scanner is None else [_ScanReader(scanner)])]
 
-    def both(timeout_s: float) -> list[Taken] | None:
-        assert pairs is not None
-        pair = pairs.pair(timeout_s)
-        if pair is None:
-            return None
+
+@dataclass(frozen=True)
+class _PairReader:
+    """Reads pairs of frames, and says which are lost."""
+
+    pairs: PairSource
+    say: Say
+
+    def read(self, timeout_s: float) -> list[Taken] | None:
+        pair = self.pairs.pair(timeout_s)
+        return None if pair is None else self._taken(pair)
+
+    def rest(self) -> list[Taken]:
+        return [taken for pair in self.pairs.rest() for taken in self._taken(pair)]
+
+    def _taken(self, pair: PairOfFrames) -> list[Taken]:
         for lost in pair.lost:
-            say(f"lost {lost}")
+            self.say(f"lost {lost}")
         first = pair.frames[0]
         times = first.time_ns, first.time_ns + pair.apart_ns
         return [Taken(name, frame, time) for name, frame, time in zip(CAMERAS, pair.frames, times, strict=True)]
 
-    def scan(timeout_s: float) -> list[Taken] | None:
-        assert scanner is not None
-        frame = scanner.frame(timeout_s)
-        return None if frame is None else [Taken(scanner.name, frame, frame.time_ns)]
 
-    reads: list[tuple[object, Read]] = [(pairs, both), (scanner, scan)]
-    return [read for source, read in reads if source is not None]
+@dataclass(frozen=True)
+class _ScanReader:
+    """Reads B-scans."""
+
+    scanner: ScanSource
+
+    def read(self, timeout_s: float) -> list[Taken] | None:
+        frame = self.scanner.frame(timeout_s)
+        return None if frame is None else [self._taken(frame)]
+
+    def rest(self) -> list[Taken]:
+        return [self._taken(frame) for frame in self.scanner.rest()]
+
+    def _taken(self, frame: Frame) -> Taken:
+        return Taken(self.scanner.name, frame, frame.time_ns)
 
 
 def _writer(sweep: GrowingSweep, counts: dict[str, int]) -> Callable[[Taken], None]:

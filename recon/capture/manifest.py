@@ -323,9 +323,9 @@ def read_manifest(folder: Path) -> Manifest:
         If it is missing, not JSON, of another version, or a field is wrong.
     """
     path = Path(folder) / MANIFEST
-    within = Path(folder) / "capture"
-    if not path.exists() and (within / MANIFEST).exists():
-        raise InputError(f"{path}: expected a file, found none; is {within} meant?")
+    for other in (Path(folder) / "capture", Path(folder).parent):  # of what was rendered, given as if recorded; and the reverse
+        if not path.exists() and (other / MANIFEST).exists():
+            raise InputError(f"{path}: expected a file, found none; is {other} meant?")
     return validated(Manifest, json_text.read(path), path)
 
 

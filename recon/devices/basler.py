@@ -9,6 +9,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from math import log10
@@ -187,14 +188,13 @@ class BaslerCamera:
     def _open(self) -> None:
         self._device = self._connect()
         self._features = Features(self.name, self._device)
-        try:
+        with ExitStack() as stack:
+            stack.callback(self._quietly, self._device.Close)
             with said_by(self.name):
                 self._device.Open()
                 self._device.MaxNumBuffer.SetValue(BUFFERS)
             self._set_up()
-        except DeviceError:
-            self._quietly(self._device.Close)
-            raise
+            stack.pop_all()  # it is open, and `close` gives it back
 
     def _set_up(self) -> None:
         settings, features = self._settings, self._features

@@ -5,6 +5,7 @@ A frame that was lost, or that has no partner, is named with the next pair.
 
 import logging
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Literal
@@ -81,6 +82,13 @@ class PairQueue:
                 return Pair((first.popleft()[1], second.popleft()[1]), self._pairs - 1, apart, self.lost())
         return None
 
+    def end(self) -> tuple[Lost, ...]:
+        """Let those that wait go, as no partner will come; names all lost since the last pair."""
+        for which, waiting in ((0, self._waiting[0]), (1, self._waiting[1])):
+            while waiting:
+                self._leave_alone(which)
+        return self.lost()
+
     def lost(self) -> tuple[Lost, ...]:
         """Frames lost since the last pair; they are named once."""
         lost, self._lost = tuple(self._lost), []
@@ -149,19 +157,25 @@ class CameraPair:
     def pair(self, timeout_s: float) -> Pair | None:
         """Wait for the next pair, in order; None if none came in time. DeviceError if a camera is gone or its clock jumped."""
         until = monotonic() + timeout_s
-        while True:
-            pair = self._queue.pair()
-            if pair or monotonic() > until:
-                return pair
+        while (pair := self._queue.pair()) is None:
             behind = self._queue.behind()
             self._fetch(behind, min(SLICE_S, max(0.0, until - monotonic())))
             self._fetch(1 if behind == 0 else 0, 0.0)
+            if monotonic() >= until:
+                return self._queue.pair()
+        return pair
+
+    def rest(self) -> list[Pair]:
+        """Pairs that still wait where no more will be asked for, in order; their times are as certain as few frames allow."""
+        self._add(0, self.times[0].rest())
+        self._add(1, self.times[1].rest())
+        return list(iter(self._queue.pair, None))
 
     def stop(self) -> tuple[Lost, ...]:
-        """Take no more frames; names those lost since the last pair."""
+        """Take no more frames; names those in no pair since the last one."""
         for camera in self.cameras:
             camera.stop()
-        return self._queue.lost()
+        return self._queue.end()
 
     def close(self) -> None:
         """Give both cameras back."""
@@ -180,5 +194,8 @@ class CameraPair:
         if frame is None:
             return
         untimed = self._within_s is None and self._called  # a call, and perhaps no other for long
-        for one in [frame] if untimed else self.times[which].add(frame):
+        self._add(which, [frame] if untimed else self.times[which].add(frame))
+
+    def _add(self, which: Literal[0, 1], frames: Iterable[Frame]) -> None:
+        for one in frames:
             self._queue.add(which, one.number if self._within_s is None else one.time_ns, one)

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.devices.interfaces import Camera, Scanner
+from recon.devices.interfaces import Camera, DeviceError, Scanner
 
 LOG = logging.getLogger(__name__)
 CRYSTAL = 1e-4  # standard deviation of a rate about 1; quartz oscillators are within some tens of parts in a million
-FEWEST = 8  # frames for a first map
+FEWEST = 8  # frames for a first map while more come, and of a block
 BLOCKS = 12  # in each the fastest frame counts
 FEWEST_BLOCKS = 4  # for a rate
 WINDOW = 512  # frames that are looked back on: some seconds, in which a crystal's rate stays as it is
@@ -82,29 +82,30 @@ def fit_clock(device_ns: NDArray[np.int64], arrived_ns: NDArray[np.int64]) -> Cl
     The frames are cut into blocks; the one that comes first for its time speaks for its block. A straight line goes through
     those, its rate held near 1 as far as a short time leaves it open. That they, too, are late is corrected as if delays fell
     off exponentially, by their mean over a block's size. Since the law of the delays isn't known, the standard deviation of the
-    offset is that correction and the scatter of the blocks together; with fewer than four blocks, a whole delay.
+    offset is that correction and the scatter of the blocks together; with fewer than four blocks, a whole delay; of a single
+    frame, whose delay nothing shows, infinite.
 
     Parameters
     ----------
     device_ns, arrived_ns : (n,) int64, ns
-        Times of frames by the device's clock, rising, and arrivals by this computer's; n >= 8.
+        Times of frames by the device's clock, rising, and arrivals by this computer's; n >= 1.
 
     Raises
     ------
     ValueError
-        If there are fewer than eight, or the device's clock stands still.
+        If there are none, or the device's clock stands still.
 
     Source: lower envelopes for clocks over networks: Paxson 1998 (fastest packets of segments); the mean smallest of n
     exponential delays is their mean over n.
     """
-    if len(device_ns) < FEWEST:
-        raise ValueError(f"device_ns: expected {FEWEST} times or more, found {len(device_ns)}")
+    if len(device_ns) == 0:
+        raise ValueError("device_ns: expected a time or more, found none")
     reference, arrival = int(device_ns[len(device_ns) // 2]), int(arrived_ns[len(device_ns) // 2])
     times = np.float64(device_ns - reference)
-    if times[-1] <= times[0]:
+    if len(times) > 1 and times[-1] <= times[0]:
         raise ValueError("device_ns: expected rising times, found a clock that stands still")
     delays = np.float64(arrived_ns - arrival) - times
-    blocks = np.array_split(np.arange(len(times)), min(BLOCKS, len(times) // FEWEST))
+    blocks = np.array_split(np.arange(len(times)), min(BLOCKS, max(len(times) // FEWEST, 1)))
     fastest = np.array([block[np.argmin(delays[block])] for block in blocks])
     at, least = times[fastest], delays[fastest]
     middle = at.mean()
@@ -122,7 +123,7 @@ def fit_clock(device_ns: NDArray[np.int64], arrived_ns: NDArray[np.int64]) -> Cl
         reference + round(middle),
         arrival + round(middle + lowest),
         1 + held * slope,
-        late + scatter if enough else typical,
+        late + scatter if enough else typical if len(times) > 1 else np.inf,
         CRYSTAL * float(np.sqrt(1 - held)),
     )
 
@@ -189,14 +190,31 @@ class ClockFollower:
         self._take(device_ns, arrived_ns)
         return None
 
+    def clock_of_few(self) -> ClockMap | None:
+        """The clock by the frames so far, however few, where no more will come; None if there are none.
+
+        Of a device that is gone and whose clock wasn't read before, the least transfer stays in it.
+        """
+        if self.clock is not None or not self._frames:
+            return self.clock
+        edge = self._fit()
+        try:
+            return self._without_transfer(edge)
+        except DeviceError as gone:
+            LOG.debug("%s: its clock can't be read: %s", self.device, gone)
+            return edge
+
     def _take(self, device_ns: int, arrived_ns: int) -> None:
         self._frames.append((device_ns, arrived_ns))
         self._until_fit -= 1
         if self._until_fit <= 0:
-            device, arrived = np.array(self._frames, np.int64).T
-            self._edge = fit_clock(device, arrived)
+            self._edge = self._fit()
             self.clock = self._without_transfer(self._edge)
             self._until_fit = REFIT if len(self._frames) > 2 * REFIT else FEWEST // 2
+
+    def _fit(self) -> ClockMap:
+        device, arrived = np.array(self._frames, np.int64).T
+        return fit_clock(device, arrived)
 
     def _without_transfer(self, edge: ClockMap) -> ClockMap:
         """Take the least transfer out, by readings of the first moments; it is held when the window is full, or after a jump."""

@@ -7,6 +7,7 @@ the beginning, with time stamps that go on.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import ceil
 from pathlib import Path
 from threading import Event, Lock
 from time import monotonic_ns
@@ -22,6 +23,8 @@ from recon.errors import InputError
 from recon.files.regular import check_there
 
 DELIVERY_NS = 10_000_000  # from the middle of an exposure to the image in memory: half of 10 ms, and 1.3 MB over USB 3
+MOST_APART, MOST_APART_S = 0.1, 1.0  # of the longest recording, and s beside it, that a device may begin or end after another
+CLOCKS = "clocks of their own? record them by one, as sonotwin record does"
 BUFFERED = 4  # frames that wait to be fetched
 MOST_KEPT = 1 << 28  # bytes of a device's images that are kept in memory, so that later rounds read none
 
@@ -81,19 +84,23 @@ def read_recording(folder: Path, sweep: str = "", names: tuple[str, ...] = (*CAM
     return found
 
 
-def timeline_of(recorded: Mapping[str, Recorded], speed: float = 1.0) -> Timeline:
+def timeline_of(recorded: Mapping[str, Recorded], speed: float = 1.0, apart_s: float | None = None) -> Timeline:
     """The timeline that devices share: a round ends one period after the last frame of the one that goes on longest.
+
+    Parameters
+    ----------
+    apart_s : by which devices may begin or end after others; None for a tenth of the longest recording, and 1 s
 
     Raises
     ------
     InputError
-        If there is no time at which all of them were recorded, as of clocks of their own.
+        If there is no time at which all of them were recorded, or one began or ended long after another: clocks of their own.
     """
     begun, ended = max(int(each.times[0]) for each in recorded.values()), min(int(each.times[-1]) for each in recorded.values())
     if begun > ended:
-        expected = f"expected one clock of {', '.join(recorded)}, found times {(begun - ended) / 1e9:.6g} s apart"
-        file = next(iter(recorded.values())).paths[0].with_name(STAMPS)
-        raise InputError(f"{file}: {expected}; clocks of their own? record them by one, as sonotwin record does")
+        found = f"found times {(begun - ended) / 1e9:.6g} s apart"
+        raise InputError(f"{_table(recorded)}: expected one clock of {', '.join(recorded)}, {found}; {CLOCKS}")
+    _check_ends(recorded, apart_s)
     first = min(int(each.times[0]) for each in recorded.values())
     ends = [int(each.times[-1] + _period(each.times)) for each in recorded.values()]
     return Timeline(first, max(ends) - first, speed)
@@ -188,6 +195,24 @@ class PlayedCamera(_Played):
 
 class PlayedScanner(_Played):
     """A `Scanner` that plays a recording."""
+
+
+def _check_ends(recorded: Mapping[str, Recorded], apart_s: float | None) -> None:
+    """Check that devices begin and end together; InputError as of `timeline_of`."""
+    spans = {name: (int(each.times[0]), int(each.times[-1])) for name, each in recorded.items()}
+    longest_s = max(last - first for first, last in spans.values()) / 1e9
+    most_s = MOST_APART * longest_s + MOST_APART_S if apart_s is None else apart_s
+    for end, word in enumerate(("begin", "end")):
+        early, late = min(spans, key=lambda name: spans[name][end]), max(spans, key=lambda name: spans[name][end])
+        found_s = (spans[late][end] - spans[early][end]) / 1e9
+        if found_s > most_s:
+            found = f"found {late} to {word} {found_s:.3g} s after {early}"
+            way = f"was one recorded longer? give apart_s={ceil(found_s)}"
+            raise InputError(f"{_table(recorded)}: expected devices that {word} within {most_s:.3g} s, {found}; {CLOCKS}; {way}")
+
+
+def _table(recorded: Mapping[str, Recorded]) -> Path:
+    return next(iter(recorded.values())).paths[0].with_name(STAMPS)
 
 
 def _read(folder: Path, name: str, device: manifest.Device) -> Recorded:

@@ -7,7 +7,7 @@ import logging
 from collections import deque
 from dataclasses import replace
 
-from recon.devices.device_clocks import follow
+from recon.devices.device_clocks import ClockMap, follow
 from recon.devices.interfaces import Camera, DeviceError, Frame, Scanner
 
 LOG = logging.getLogger(__name__)
@@ -38,19 +38,30 @@ class FrameTimes:
         if jump is not None:
             if self._known:
                 raise DeviceError(f"{jump}; record anew")
-            timed = [self._at(one, one.arrived_ns) for one in self._leave()]
+            timed = self._by_arrival()
             if not self._stuck:
                 LOG.warning("%s: its time stamps don't rise; frames are timed by their arrival", self._follower.device)
             self._stuck = True
         self._waiting.append(frame)
         if (clock := self._follower.clock) is not None:
             self._known = True
-            timed += [self._at(one, clock.at(one.time_ns)) for one in self._leave()]
+            timed += self._by(clock)
         return timed
+
+    def rest(self) -> list[Frame]:
+        """Frames that still wait where no more will come: timed as `add` does, as well as so few allow."""
+        clock = None if self._stuck else self._follower.clock_of_few()
+        return self._by_arrival() if clock is None else self._by(clock)
 
     def begin_anew(self) -> None:
         """Forget frames that wait, as of a device that is started again; its clock goes on."""
         self._waiting.clear()
+
+    def _by(self, clock: ClockMap) -> list[Frame]:
+        return [self._at(one, clock.at(one.time_ns)) for one in self._leave()]
+
+    def _by_arrival(self) -> list[Frame]:
+        return [self._at(one, one.arrived_ns) for one in self._leave()]
 
     def _at(self, frame: Frame, time_ns: int) -> Frame:
         self._last_ns = max(time_ns, self._last_ns + 1)  # each fit moves the clock a little
@@ -78,6 +89,12 @@ class TimedScanner:
         if not self._timed and (frame := self._scanner.frame(timeout_s)) is not None:
             self._timed.extend(self._times.add(frame))
         return self._timed.popleft() if self._timed else None
+
+    def rest(self) -> list[Frame]:
+        """B-scans that still wait for their time where no more will be asked for, in order."""
+        rest = [*self._timed, *self._times.rest()]
+        self._timed.clear()
+        return rest
 
     def close(self) -> None:
         """Give the scanner back."""

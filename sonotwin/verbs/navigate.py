@@ -71,6 +71,7 @@ class Config(MeasuredTargetFields):
     capture: Path | None = None
     sweep: str = ""
     speed: Annotated[float, Field(gt=0, le=10)] = 1.0
+    apart_s: Positive | None = None
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
     tissue_m_s: Speed | None = None
@@ -186,7 +187,7 @@ def given_or_held(config: Config, field: Literal["calibration", "probe"], what: 
 def played(config: Config, capture: Path) -> Sources:
     """Both cameras and the scanner of a capture, played back by one timeline."""
     recorded = playback.read_recording(capture, config.sweep)
-    line = playback.timeline_of(recorded, config.speed)
+    line = playback.timeline_of(recorded, config.speed, config.apart_s)
 
     def device(name: str, kind: type[PlayedCamera] | type[PlayedScanner]) -> Device:
         return Device(name, lambda: kind(recorded[name], line), lambda source: lambda frame: line.clock_of(frame.time_ns))

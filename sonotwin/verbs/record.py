@@ -3,7 +3,8 @@
 Guides at the terminal, and shows in a browser, at the address that it prints, what each device sees: exposure, saturation,
 focus, fringes, whether the target is found, what is wrong and how to mend it. Each next pose of the board is asked for where it
 adds most to those so far, and its outline is shown over camera 1's image. OUT is a capture folder, a new one or one that grows:
-poses are added to those that are there, sweeps have names, a new surface takes the place of the old one. All that was recorded is
+poses are added to those that are there, sweeps have names, a new surface takes the place of the old one; of a rendered one, whose
+truth stands beside the capture, only with replace=true. Later verbs take OUT itself: capture=OUT. All that was recorded is
 on the disk at once and whole, whether the command is ended by Ctrl-C, by the system or by a lost cable; give it again to go on.
 
 `devices=virtual` has the twin stand in for every device, and for the person: `scene`, `path` and the other fields at the end of
@@ -29,7 +30,7 @@ from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
 from recon.acquisition.guidance import Operator
 from recon.acquisition.pictures import Say, Show, hidden
-from recon.acquisition.recording import Recording, open_recording
+from recon.acquisition.recording import SURFACE, Recording, open_recording
 from recon.acquisition.still_session import as_set
 from recon.acquisition.surface_recording import SurfacePlan, record_surface
 from recon.acquisition.sweep_recording import SweepPlan, record_sweep
@@ -40,13 +41,14 @@ from recon.capture.board_part import FRINGE_CAMERA
 from recon.capture.manifest import SCANNER, Device, Purpose, SweepNameOrNone, axes_not_encoded, sweep_part
 from recon.devices.interfaces import Trigger
 from recon.devices.pattern_player import Pattern, Stage, Streamed, Taking, Triggered
-from recon.errors import validated
+from recon.errors import InputError, validated
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
 from recon.tracking import networks
 from sonotwin.open_devices import AnyDevices, Host, LiveDevices, Opened, open_still, open_sweep
 from sonotwin.terminal_operator import TerminalOperator
+from twin.session import CAPTURE, TRUTH
 from twin.shooting import FrameShooting
 from twin.ultrasound.timed_sweep import Clocks
 
@@ -89,6 +91,7 @@ class Config(Part):
     cameras: Annotated[list[Literal["cam1", "cam2"]], Field(min_length=1)]
     calibration: Path | None
     probe: Path | None
+    replace: bool
     board: Board
     count: Annotated[int, Field(ge=1, le=1000)]
     reach: PoseLimits
@@ -119,18 +122,39 @@ class Config(Part):
             )
         return self
 
+    @model_validator(mode="after")
+    def _bits_of_the_sensor(self) -> "Config":
+        bits = 8 if isinstance(self.devices, LiveDevices) or self.part == "sweep" else self.devices.bits
+        for camera in self.cameras:
+            if bits > (adc := getattr(self.rig, camera).sensor.adc_bits):
+                raise ValueError(f"devices.bits: expected at most the {adc} of rig.{camera}.sensor.adc_bits, found {bits}")
+        return self
+
 
 def run(config: Config) -> None:
     """Record, and say what was kept."""
     console = Console(soft_wrap=True, highlight=False)
-    with open_recording(config.out, config.out.resolve().name) as recording, shown(config, console) as (say, show):
-        if config.part == "sweep":
-            recording.check_new(sweep_part(config.name))
-            sweep(config, recording, console, say, show)
-        else:
-            still(config, recording, console, say, show)
+    with open_recording(config.out, config.out.resolve().name) as recording:
+        check_place(config, recording)
+        with shown(config, console) as (say, show):
+            record = sweep if config.part == "sweep" else still
+            record(config, recording, console, say, show)
     if config.out.is_dir():  # nothing is left where nothing was kept
         console.print(f"wrote       {config.out}", markup=False)
+
+
+def check_place(config: Config, recording: Recording) -> None:
+    """Check, before anything is opened, that the part has a place in the capture; InputError else."""
+    if config.part == "sweep":
+        recording.check_new(sweep_part(config.name))
+    if config.part == "board":
+        recording.check_board(config.board, config.patterns)
+    truth = recording.folder.parent / TRUTH / SURFACE
+    rendered = recording.folder.name == CAPTURE and truth.is_dir()
+    if config.part == "surface" and recording.contents.surface and rendered and not config.replace:
+        found = f"found one, and {truth}, which a recorded one wouldn't fit"
+        way = "give another out=FOLDER, or replace=true"
+        raise InputError(f"{recording.folder}: surface: expected none whose truth stands beside the capture, {found}; {way}")
 
 
 @contextmanager
@@ -153,6 +177,8 @@ def shown(config: Config, console: Console) -> Iterator[tuple[Say, Show]]:
 def still(config: Config, recording: Recording, console: Console, say: Say, show: Show) -> None:
     """Record a board or a surface."""
     patterns = list(projected_images.images(config.patterns))
+    if config.part == "surface" and recording.contents.surface:
+        say(f"replaces the surface of {recording.surface_day}, which stays until the new one is whole")
     with still_devices(config, patterns, console) as (opened, operator):
         assert opened.projector is not None
         calibrations(

@@ -2,17 +2,24 @@
 
 import json
 import sys
+from datetime import date
 from io import StringIO
+from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from recon.acquisition.guidance import Step
+from recon.acquisition.recording import open_recording
 from recon.capture.board_part import read_board
-from recon.capture.manifest import read_manifest
+from recon.capture.manifest import Device, read_manifest
+from recon.devices.interfaces import DeviceError
+from recon.errors import InputError
 from sonotwin import cli, config
 from sonotwin.open_devices import LiveDevices
 from sonotwin.terminal_operator import TerminalOperator
+from sonotwin.verbs import record
 from sonotwin.verbs.record import Config
 
 QUIET = ("preview.serve=false", "tracing.samples=4")
@@ -59,12 +66,19 @@ def test_the_laboratorys_choice_is_valid():
     assert isinstance(devices, LiveDevices) and set(devices.cameras) == {"cam1", "cam2"}
 
 
+def test_images_have_up_to_as_many_bits_as_the_virtual_sensor():
+    assert composed("devices.bits=10").devices.bits == 10
+    finer = ("rig.cam1.sensor.adc_bits=12", "rig.cam2.sensor.adc_bits=12")
+    assert composed("devices.bits=12", *finer).devices.bits == 12
+
+
 @pytest.mark.parametrize(
     ("overrides", "reason"),
     [
         (["part=board"], "patterns: expected fringes or Gray code along both axes of a board, found none along rows"),
         (["part=board", "patterns=paper_calibration", "cameras=[cam2]"], "cameras: expected cam1"),
         (["part=film"], "part: expected"),
+        (["devices.bits=12"], "devices.bits: expected at most the 10 of rig.cam1.sensor.adc_bits, found 12"),
         (["devices.kind=other"], "devices.kind: expected one of"),
         (["reach.depth_mm=[700,600]"], "reach.depth_mm: expected the nearest depth, then a farther one, found 700 and 600"),
         (["exposing.level=2"], "exposing.level: expected less than 1"),
@@ -84,6 +98,63 @@ def test_other_files_are_left_alone(tmp_path, capsys):
     (tmp_path / "letter.txt").write_text("dear")
     assert cli.main(["record", "part=surface", f"out={tmp_path}", "preview.serve=false"]) == 2
     assert "found other files" in capsys.readouterr().err and [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+CAMERA, PROJECTOR = Device(size=(32, 24), exposure_s=0.01, gain=1.0), Device(size=(1280, 800))
+
+
+def with_surface(folder: Path) -> Path:
+    """A capture with a surface of black images."""
+    patterns = composed().patterns
+    with open_recording(folder) as capture:
+        images = np.zeros((patterns.count, 24, 32), np.uint8)
+        capture.add_surface({"cam1": images}, patterns, {"cam1": CAMERA, "projector": PROJECTOR})
+    return folder
+
+
+def refused(capsys, *fields: str) -> str:
+    """Why a recording is refused, before its preview is served."""
+    assert cli.main(["record", *fields]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1
+    return said.err
+
+
+def test_a_taken_name_is_refused_before_anything_is_opened(tmp_path, capsys):
+    out = tmp_path / "session"
+    with open_recording(out) as capture, capture.sweep("scan", None, {"us": CAMERA}) as growing:
+        growing.add("us", 0, 5, np.zeros((24, 32), np.uint8))
+    assert "give another name=NAME" in refused(capsys, "part=sweep", "name=scan", f"out={out}")
+
+
+def test_a_folder_around_a_capture_is_named(tmp_path, capsys):
+    with_surface(tmp_path / "demo/capture")
+    found = refused(capsys, "part=surface", f"out={tmp_path}/demo")
+    assert f"which has manifest.json, found other files; is {tmp_path}/demo/capture meant?" in found
+
+
+@pytest.mark.parametrize(("made", "given"), [("session", "session/capture"), ("made/capture", "made")])
+def test_a_folder_too_deep_or_not_deep_enough_is_named(tmp_path, made, given):
+    """What is recorded into OUT is OUT, what is rendered into OUT is OUT/capture."""
+    with_surface(tmp_path / made)
+    with pytest.raises(InputError, match=rf"expected a file, found none; is {tmp_path}/{made} meant\?"):
+        read_manifest(tmp_path / given)
+
+
+def test_a_rendered_surface_is_replaced_only_if_told(tmp_path, capsys, monkeypatch):
+    """Its truth wouldn't fit the recorded one. A surface without truth is replaced, and said by its day."""
+    rendered, recorded = with_surface(tmp_path / "demo/capture"), with_surface(tmp_path / "demo/own")
+    (tmp_path / "demo/truth/surface").mkdir(parents=True)
+    assert "replace=true" in refused(capsys, "part=surface", f"out={rendered}")
+
+    def none(*_):
+        raise DeviceError("cam1: not there")
+
+    monkeypatch.setattr(record, "still_devices", none)
+    for fields in ([f"out={rendered}", "replace=true"], [f"out={recorded}"]):
+        assert cli.main(["record", "part=surface", "preview.serve=false", *fields]) == 2
+        assert f"replaces the surface of {date.today()}" in capsys.readouterr().out
+    assert read_manifest(rendered).surface == read_manifest(recorded).surface
 
 
 def test_the_terminal_is_read_while_cameras_go_on(monkeypatch):

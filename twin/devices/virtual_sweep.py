@@ -71,6 +71,10 @@ class VirtualPair:
         self._turns.advance(PAIR, arrived, None if self.over else self._moments[self._taken])
         return FramePair((first, second))
 
+    def rest(self) -> tuple[FramePair, ...]:
+        """Pairs that still wait, which are none."""
+        return ()
+
     def stop(self) -> tuple[str, ...]:
         """Take no more frames; names those lost, which are none."""
         self._frames = None
@@ -87,7 +91,7 @@ class VirtualPair:
 
 
 class VirtualScanner:
-    """The scanner, as `recon.devices.interfaces.Scanner`: its stamps are late, and jitter, as the plan has them."""
+    """The scanner, as `recon.acquisition.sweep_recording.ScanSource`: its stamps are late, and jitter, as the plan has them."""
 
     def __init__(self, planned: PlannedSweep, turns: Turns) -> None:
         self.name = SCANNER
@@ -115,6 +119,10 @@ class VirtualScanner:
         self._taken += 1
         self._turns.advance(SCANNER, arrived, None if self.over else self._moments[self._taken])
         return frame
+
+    def rest(self) -> tuple[Frame, ...]:
+        """B-scans that still wait, which are none."""
+        return ()
 
     def close(self) -> None:
         """Give the scanner back."""

@@ -13,6 +13,7 @@ from recon.acquisition import preview_server
 from recon.acquisition.pictures import Over, Picture
 from recon.acquisition.preview_server import Preview, served
 from recon.errors import InputError
+from tests.recon.navigation import headless_browser
 
 
 def answer(address: str, path: str, **headers) -> tuple[int, bytes]:
@@ -52,6 +53,22 @@ def test_a_place_is_drawn_where_it_is_asked_for(there):
         assert green > 170 and (red < 130 if there else red > 220), (u, v, blue, green, red)
     assert np.abs(shown[250, 300] - 100).max() < 8
     assert preview.state()["devices"][0]["way"] == "60 mm nearer"
+
+
+PLACES = "JSON.stringify([...document.images].map(image => [image.alt, image.x, image.y]))"
+
+
+def test_cameras_stand_side_by_side(tmp_path):
+    """Camera 1, then 2, on a page of 1000 px, whichever frame came first; the B-scan below them."""
+    preview = Preview()
+    for device in ("us", "cam2", "cam1"):
+        preview.show(Picture(device, np.full((1024, 1280), 90, np.uint8), 8, "frame 12, no target"))
+    with served(preview) as address, headless_browser.opened(address, tmp_path / "profile") as page:
+        placed = page.until(lambda page: len(found := json.loads(page.run(PLACES))) == 3 and found)
+        assert page.complaints == []
+    (first, *left), (second, *right), (third, *below) = placed
+    assert (first, second, third) == ("cam1", "cam2", "us")
+    assert left[1] == right[1] < below[1] and left[0] == below[0] < right[0]
 
 
 def test_pages_of_others_see_nothing():

@@ -80,7 +80,10 @@ def test_what_would_be_lost_or_mixed_is_refused(tmp_path, rng):
     assert list(read_manifest(out).contents) == ["board", "sweep/scan"]
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "a.txt").write_text("kept")
-    with pytest.raises(InputError, match="other files"), recording.open_recording(tmp_path / "letters"):
+    with (
+        pytest.raises(InputError, match="a new folder or a capture folder"),
+        recording.open_recording(tmp_path / "letters"),
+    ):
         pass
 
 

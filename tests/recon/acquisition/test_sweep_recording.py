@@ -59,6 +59,9 @@ class Source:
     def start(self, trigger, second=None):
         self.trigger = trigger, second
 
+    def rest(self):
+        return ()
+
     def stop(self):
         self.trigger = None
         return ("cam1: frame 41 without a partner",)
@@ -152,9 +155,18 @@ def test_a_slow_disk_loses_frames_and_says_so(tmp_path, monkeypatch):
     assert len(frames(tmp_path, "us")) == counts["us"]
 
 
-def test_a_recording_ends_after_its_time(tmp_path):
-    counts = record(tmp_path, scanner=Source(10_000), seconds=0.2)
-    assert 0 < counts["us"] < 10_000
+class Slow(Source):
+    """A virtual device: each frame takes a twentieth of a second, between frames lie 5 ms of its time."""
+
+    def frame(self, timeout_s):
+        time.sleep(0.05)
+        return super().frame(timeout_s)
+
+
+def test_a_recording_ends_after_its_time_of_the_devices_own(tmp_path):
+    """Forty milliseconds are eight periods of five, and at most a look later; the clock on the wall shows half a second."""
+    counts = record(tmp_path, scanner=Slow(10_000), seconds=0.04)
+    assert 9 <= counts["us"] <= 11
 
 
 def test_what_is_seen_before_the_start_is_shown_and_not_kept(tmp_path):
@@ -181,7 +193,7 @@ class Film:
 
     def __init__(self, name, shown_ns, last=40, jump_ns=0) -> None:
         self.name, self.shown_ns, self.last, self.jump_ns, self.numbers = name, shown_ns, last, jump_ns, count()
-        self.begun = time.monotonic_ns()
+        self.begun, self.taken = time.monotonic_ns(), []
 
     def start(self, trigger):
         pass
@@ -198,6 +210,7 @@ class Film:
             return None
         number, now = next(self.numbers), time.monotonic_ns()
         self.over = number == self.last - 1
+        self.taken.append(now)
         shown = now - self.begun + self.shown_ns + (self.jump_ns if number >= 30 else 0)
         return Frame(image(number), number, shown, now)
 
@@ -212,11 +225,40 @@ def test_devices_of_a_laboratory_lie_on_one_clock(tmp_path):
     plan = SweepPlan("scan", "volume", ("free", "hardware"), None, 20, Limits())
     with open_recording(tmp_path / "out") as recording:
         counts = record_sweep(recording, pairs, TimedScanner(scanner), devices, operator, plan, {}, print, hidden)
-    assert min(counts.values()) >= 38
+    assert set(counts.values()) == {40}
     times = {name: sweep_tables.read_stamps(tmp_path / "out/sweep/scan" / name / "timestamps.csv")[1] for name in devices}
     now = time.monotonic_ns()
     assert all(films[0].begun - 0.1e9 < at[0] < at[-1] < now + 0.1e9 for at in times.values())
     assert (times["cam1"] == times["cam2"]).all()
+
+
+@pytest.mark.parametrize("count", [1, 3, 7, 20])
+def test_short_recordings_keep_all_frames(tmp_path, count):
+    """Of seven frames no clock is known yet when it ends: they are timed by the fastest of them, here to some milliseconds."""
+    films = Film("cam1", 10**9, count), Film("cam2", 7 * 10**9, count)
+    scanner = Film("us", 1_795_000_000 * 10**9, count)
+    devices = {name: DEVICES[name] for name in ("cam1", "cam2", "us")}
+    operator = OneTake(lambda: all(one.over for one in (*films, scanner)))
+    plan = SweepPlan("scan", "volume", ("free", "hardware"), None, 20, Limits())
+    said: list[str] = []
+    with open_recording(tmp_path / "out") as recording:
+        record_sweep(recording, CameraPair(films), TimedScanner(scanner), devices, operator, plan, {}, said.append, hidden)
+    assert said == [f"recorded {count} frames of cam1, {count} frames of cam2, {count} frames of us"]
+    for name, film in (("cam1", films[0]), ("us", scanner)):
+        numbers, times = sweep_tables.read_stamps(tmp_path / "out/sweep/scan" / name / "timestamps.csv")
+        assert numbers.tolist() == list(range(count))
+        assert np.abs(times - film.taken).max() < 20e6
+
+
+def test_frames_without_a_partner_at_the_end_are_named(tmp_path):
+    films = Film("cam1", 10**9, 5), Film("cam2", 7 * 10**9, 3)
+    operator = OneTake(lambda: all(one.over for one in films))
+    plan = SweepPlan("scan", "volume", ("free", "hardware"), None, 20, Limits())
+    said: list[str] = []
+    with open_recording(tmp_path / "out") as recording:
+        devices = {name: DEVICES[name] for name in ("cam1", "cam2")}
+        counts = record_sweep(recording, CameraPair(films), None, devices, operator, plan, {}, said.append, hidden)
+    assert counts == {"cam1": 3, "cam2": 3} and "lost cam1: frames 3 to 4 without a partner" in said
 
 
 def test_a_scanners_clock_that_jumps_ends_the_recording(tmp_path):

@@ -208,6 +208,18 @@ def test_an_exposure_beyond_the_range_is_refused(opened, exposure_s, gain, messa
         opened().set_exposure(exposure_s, gain)
 
 
+@pytest.mark.parametrize("failure", [KeyboardInterrupt(), DeviceError("cam1: refused"), ZeroDivisionError("in a driver")])
+def test_a_camera_is_given_back_whatever_ends_its_set_up(monkeypatch, failure):
+    def fails(*_):
+        raise failure
+
+    device = PylonStandIn()
+    monkeypatch.setattr(BaslerCamera, "_set_up", fails)
+    with pytest.raises(type(failure)):
+        BaslerCamera("cam1", lambda: device, BaslerSettings(device.size))
+    assert device.closed == 1
+
+
 def test_a_camera_that_isnt_there_is_named_with_those_that_are():
     with pytest.raises(DeviceError, match=r"serial number 123, found 0815-0000, 0815-0001; cable, power\?"):
         open_camera("cam1", "123")

@@ -75,9 +75,9 @@ def test_partners_have_the_same_number():
     named = [lost for one in found for lost in one.lost] + list(pair.stop())
     for name, one, other in zip(NAMES, kept, kept[::-1], strict=True):
         gone = [k for lost in named if lost.camera == name for k in range(lost.first, lost.last + 1)]
-        assert sorted(gone) == sorted(set(range(both[-1] + 1)) - set(both))
+        assert sorted(gone) == sorted(set(range(one[-1] + 1)) - set(both))
         alone = [k for lost in named if (lost.camera, lost.cause) == (name, "alone") for k in range(lost.first, lost.last + 1)]
-        assert set(alone) == {k for k in one if k not in other and k <= both[-1]}
+        assert set(alone) == {k for k in one if k not in other}
 
 
 def test_lost_frames_in_words():
@@ -147,6 +147,12 @@ def test_frames_of_both_are_fetched_while_one_is_silent():
     cameras[1].frames.extend(numbered(range(40)))
     assert len(all_pairs(pair)) == 40
     assert not pair.stop()
+
+
+def test_a_look_without_waiting_fetches_what_is_there():
+    pair = CameraPair(tuple(Recorded(name, numbered(range(2))) for name in NAMES))
+    pair.start("software")
+    assert [pair.pair(0.0).number for _ in range(2)] == [0, 1] and pair.pair(0.0) is None
 
 
 def test_no_pair_comes_in_time():

@@ -93,6 +93,20 @@ def test_a_device_that_was_not_recorded_is_named(rig, tmp_path):
         playback.read_recording(folder)
 
 
+@pytest.mark.parametrize("step_s", [-1.5, 1.5])
+def test_devices_that_begin_long_after_others_are_refused_unless_told(recorded, step_s):
+    """Of two seconds: clocks of their own that overlap by chance, or a scanner that was switched on later."""
+    times = recorded.times[0] + np.arange(9) * 250_000_000
+    first, later = replace(recorded, times=times), replace(recorded, times=times + round(1e9 * step_s))
+    late = "us" if step_s < 0 else "cam1"
+    with pytest.raises(InputError, match=rf"that begin within 1\.2 s, found {late} to begin 1\.5 s after .* give apart_s=2"):
+        playback.timeline_of({SCANNER: first, "cam1": later})
+    assert playback.timeline_of({SCANNER: first, "cam1": later}, apart_s=2).length == 2_250_000_000 + 1_500_000_000
+    cut = replace(recorded, times=times[:3])
+    with pytest.raises(InputError, match=r"found us to end 1\.5 s after cam1"):
+        playback.timeline_of({SCANNER: first, "cam1": cut})
+
+
 def test_devices_of_clocks_of_their_own_have_no_timeline(recorded):
     """A camera's clock began when it got power, a scanner's in 1970: no round would hold both."""
     other = replace(recorded, times=recorded.times + 1_795_000_000 * 10**9)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from recon.devices.camera_pairs import CameraPair
+from recon.devices.device_clocks import ClockReading
 from recon.devices.interfaces import DeviceError, Frame
 from recon.devices.timed_frames import FrameTimes, TimedScanner
 
@@ -66,7 +67,8 @@ def test_a_device_without_a_clock_is_timed_by_arrivals(rng, caplog):
     frames, _ = taken(rng, 0, 0.0, n=200)
     times = FrameTimes(Sent("us", []))
     found = [one for frame in frames for one in times.add(frame)]
-    assert [one.time_ns for one in found] == [one.arrived_ns for one in frames[:-1]]
+    found += times.rest()  # the last one
+    assert [one.time_ns for one in found] == [one.arrived_ns for one in frames]
     assert [record.message for record in caplog.records] == ["us: its time stamps don't rise; frames are timed by their arrival"]
 
 
@@ -80,6 +82,37 @@ def test_a_clock_that_jumps_ends_it(rng, step_s):
     assert np.allclose([one.time_ns for one in found], true[:60] + TRANSFER_NS, atol=1e6, rtol=0)
     with pytest.raises(DeviceError, match=r"us: its clock jumped by [+-]3[67]\.\d+ s.*record anew"):
         times.add(frames[60])
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_few_frames_are_timed_by_the_fastest_of_them(rng, n):
+    """Late by 0.3 ms in the mean: the fastest of a few, and its correction, to a millisecond."""
+    frames, true = taken(rng, UNIX_NS, n=n)
+    times = FrameTimes(Sent("us", []))
+    assert not [one for frame in frames for one in times.add(frame)]
+    rest = times.rest()
+    assert [one.number for one in rest] == list(range(n)) and not times.rest()
+    assert np.allclose([one.time_ns for one in rest], true + TRANSFER_NS, atol=1.5e6, rtol=0)
+    assert np.all(np.diff([one.time_ns for one in rest]) == 20_000_000)
+
+
+@pytest.mark.parametrize("gone", [False, True])
+def test_a_clock_that_can_be_read_takes_the_transfer_out_of_few_frames(rng, gone):
+    """Of a camera that was unplugged before it could be read, the transfer stays in."""
+    frames, true = taken(rng, UPTIME_NS, n=5)
+
+    def read_clock():
+        if gone:
+            raise DeviceError("cam1: unplugged")
+        return ClockReading(frames[4].time_ns, int(true[4]) - 10_000, int(true[4]) + 10_000)
+
+    camera = Sent("cam1", [])
+    camera.read_clock = read_clock
+    times = FrameTimes(camera)
+    for frame in frames:
+        times.add(frame)
+    found = np.array([one.time_ns for one in times.rest()])
+    assert np.allclose(found, true + (TRANSFER_NS if gone else 0), atol=1.5e6, rtol=0)
 
 
 def test_times_rise_though_the_first_frames_come_at_once(rng):
