@@ -133,11 +133,7 @@ def optics(config: Config, listed: Manifest, held: Held, console: Console) -> li
     """Verdicts on cameras, projector and target."""
     if held.film is None and not held.fringes:
         return [Verdict(part, "unseen") for part in (*CAMERAS, PROJECTOR, "target")]
-    file = config.calibration or (None if listed.calibration is None else config.capture / listed.calibration)
-    if file is None:
-        raise InputError(
-            f"{config.capture / MANIFEST}: expected calibration, the path of a file, found none; give calibration=FILE"
-        )
+    file = listed.calibration_file(config.capture, config.calibration)
     wanted = [*CAMERAS, *([PROJECTOR] if held.fringes else [])]
     sizes = {name: device.size for name, device in listed.devices.items() if name in wanted}
     calibration = calibration_files.read_for(file, sizes)
