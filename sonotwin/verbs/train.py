@@ -125,7 +125,7 @@ def run(config: Config) -> None:
         If it was stopped; a checkpoint is there then.
     """
     inputs = [*config.data, *(config.validation_data or ()), *([config.init] if config.init else ())]
-    atomic.check_folder(config.out, MARKER, inputs=inputs)
+    atomic.check_filled_folder(config.out, MARKER, inputs=inputs)
     with occupied(config.out):
         _train(config, Console(soft_wrap=True, highlight=False))
 
