@@ -93,6 +93,7 @@ def _system_name() -> str:
 def _own_packages() -> Iterator[Finding]:
     """Check that `recon`, `twin` ... are ours: found beside `sonotwin`, without another distribution's files among them."""
     brought = importlib.metadata.packages_distributions()
+    sound: dict[Path, list[str]] = {}
     for place in namesakes.places():
         strangers = sorted(set(brought.get(place.name, ())) - {"sonotwin"})
         if place.found is None:
@@ -104,28 +105,45 @@ def _own_packages() -> Iterator[Finding]:
             found = f"{place.found} has files of {', '.join(strangers)}, too"
             yield Finding("core", place.name, "problem", found, remedy)
         else:
-            yield Finding("core", place.name, "ok", str(place.found))
+            sound.setdefault(place.found.parent, []).append(place.name)
+    for folder, names in sound.items():
+        yield Finding("core", "sonotwin", "ok", f"{', '.join(names)} in {folder}")
 
 
 def _packages() -> Iterator[Finding]:
+    """One finding for what is sound of a part's packages, one for what is absent of an extra, and one for each fault."""
     from packaging.specifiers import SpecifierSet
 
     wanted = list(requirements())
     installed = {name: _version(name) for _, name, _ in wanted}
     broken = _failing_imports([MODULES.get(name, name) for _, name, _ in wanted if installed[name] is not None])
+    sound: dict[str, list[str]] = {}
+    absent: dict[str, list[str]] = {}
+    faults = []
     for part, name, accepted in wanted:
-        remedy = f"pip install '.{'' if part == 'core' else f'[{part}]'}' in sonotwin's folder"
+        remedy = f"pip install '{_distribution(part)}' in sonotwin's folder"
         found = installed[name]
         failure = broken.get(MODULES.get(name, name))
-        if found is None:
-            yield Finding(part, name, "problem" if part == "core" else "absent", "not installed", remedy)
+        if found is None and part != "core":
+            absent.setdefault(part, []).append(name)
+        elif found is None:
+            faults.append(Finding(part, name, "problem", "not installed", remedy))
         elif not SpecifierSet(accepted).contains(found, prereleases=True):
-            yield Finding(part, name, "problem", f"{found}, expected {accepted}", remedy)
+            faults.append(Finding(part, name, "problem", f"{found}, expected {accepted}", remedy))
         elif failure is not None:
             again = f"pip install --force-reinstall {name}"
-            yield Finding(part, name, "problem", f"{found}, can't be imported: {failure}", again)
+            faults.append(Finding(part, name, "problem", f"{found}, can't be imported: {failure}", again))
         else:
-            yield Finding(part, name, "ok", found)
+            sound.setdefault(part, []).append(f"{name} {found}")
+    yield from (Finding(part, "packages", "ok", ", ".join(names)) for part, names in sound.items())
+    for part, names in absent.items():
+        yield Finding(part, "packages", "absent", f"{', '.join(names)}; pip install '{_distribution(part)}' in sonotwin's folder")
+    yield from faults
+
+
+def _distribution(part: str) -> str:
+    """The argument of pip for a part."""
+    return "." if part == "core" else f".[{part}]"
 
 
 def _version(name: str) -> str | None:

@@ -43,7 +43,7 @@ def play(steps: Sequence[Step], folder: Path, settings: Mapping[str, object], an
     ValueError
         If a step contradicts a figure of an earlier one that it doesn't refine.
     """
-    atomic.check_folder(folder, MARKER)
+    atomic.check_filled_folder(folder, MARKER)
     folder.mkdir(parents=True, exist_ok=True)
     with atomic.new_file(folder / MARKER) as temporary:
         temporary.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")

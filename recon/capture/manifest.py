@@ -285,6 +285,26 @@ class Manifest(rig.Part):
         devices = self.devices_of(place)
         return {name: SweepImages(folder / self.root / part.images[name], devices[name]) for name in names}
 
+    def calibration_file(self, folder: Path, given: Path | None = None) -> Path:
+        """The file of cameras and projector: the one given, or else the capture's own.
+
+        Parameters
+        ----------
+        folder : of the manifest.
+
+        Raises
+        ------
+        InputError
+            If there is neither.
+        """
+        if given is not None:
+            return given
+        if self.calibration is None:
+            raise InputError(
+                f"{folder / MANIFEST}: expected calibration, the path of a calibration file, found none; give calibration=FILE"
+            )
+        return folder / self.calibration
+
     def _places(self) -> Iterator[tuple[PartName, str, Iterable[str]]]:
         """Parts and their fields in which devices are named, and these names."""
         if self.surface is not None:

@@ -78,13 +78,12 @@ def read_film(folder: Path, calibration_file: Path | None = None, sweep: str = "
     folder = Path(folder)
     read = manifest.read_manifest(folder)
     listed, images = folder / MANIFEST, read.images_of(folder, CAMERAS, sweep)
-    if calibration_file is None and read.calibration is None:
-        raise InputError(f"{listed}: expected calibration, the path of a calibration file, found none; give calibration=FILE")
+    file = read.calibration_file(folder, calibration_file)
     depths = images[CAMERAS[0]].device.bits, images[CAMERAS[1]].device.bits
     if min(depths) > 8 and depths[0] != depths[1]:
         raise InputError(f"{listed}: devices.cam2.bits: expected {depths[0]}, as of cam1, found {depths[1]}")
     sizes = {name: each.device.size for name, each in images.items()}
-    known = calibration_files.read_for(Path(calibration_file or folder / str(read.calibration)), sizes)
+    known = calibration_files.read_for(file, sizes)
     cameras = known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]
     places = [each.folder for each in images.values()]
     tables = [sweep_tables.read_stamps(place / STAMPS) for place in places]

@@ -41,13 +41,9 @@ def read_surface(folder: Path, camera: str = "cam1", calibration_file: Path | No
     if manifest.surface is None or camera not in manifest.surface.images:
         found = ", ".join(manifest.surface.images) if manifest.surface else "no surface part"
         raise InputError(f"{folder / MANIFEST}: expected surface images of {camera}, found {found or 'none'}")
-    if calibration_file is None and manifest.calibration is None:
-        raise InputError(
-            f"{folder / MANIFEST}: expected calibration, the path of a calibration file, found none; give calibration=FILE"
-        )
     device = manifest.devices_of("surface")[camera]
     sizes = {camera: device.size, "projector": manifest.surface.patterns.projector_size}
-    optics = calibration_files.read_for(Path(calibration_file or folder / str(manifest.calibration)), sizes)
+    optics = calibration_files.read_for(manifest.calibration_file(folder, calibration_file), sizes)
     root = folder / manifest.root
     images = read_images([root / path for path in manifest.surface.images[camera]], device.size, device.bits)
     return SurfaceCapture(images, manifest.surface.patterns, device.bits, optics, manifest.name or folder.resolve().name)

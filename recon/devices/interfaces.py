@@ -1,7 +1,7 @@
 """A camera, a projector and a scanner, as the rig's software uses them, whoever makes them.
 
-Drivers, captures that are played back and the twin's stand-ins offer the same, so that no line above them can know which one it
-has. Two clocks stand in each frame: the device's own, and this computer's monotonic one, `time.monotonic_ns()`.
+Drivers, captures that are played back and the twin's stand-ins offer the same, so that the code above them is one for all. Two
+clocks stand in each frame: the device's own, and this computer's monotonic one, `time.monotonic_ns()`.
 """
 
 from dataclasses import dataclass

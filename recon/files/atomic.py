@@ -70,7 +70,7 @@ def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
     paths = [Path(os.path.realpath(path)) for path in places]
     with ExitStack() as locks:
         for path in sorted(paths):
-            _check_writable(path)
+            _check_writable(path, path.parent)
             path.parent.mkdir(parents=True, exist_ok=True)
             locks.enter_context(alone(path))
         _put_back(paths)
@@ -205,6 +205,18 @@ def check_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
         If something else is there: a file, or a folder that holds files but not `marker`; if `path` is one of the inputs or has
         one in it; or if the place can't be written to.
     """
+    path = _checked(path, marker, inputs)
+    _check_writable(path, path.parent)
+
+
+def check_filled_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
+    """The same of a folder that is filled where it stands, not replaced: of one that is there the parent needn't be writable."""
+    path = _checked(path, marker, inputs)
+    _check_writable(path, path)
+
+
+def _checked(path: Path, marker: str, inputs: Iterable[Path]) -> Path:
+    """The place itself behind links, where nothing is lost by writing there; InputError otherwise, as of `check_folder`."""
     named, path = path, Path(os.path.realpath(path))
     if path.is_symlink():
         raise InputError(f"{named}: expected a folder or nothing, found a loop of links")
@@ -215,16 +227,17 @@ def check_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
         raise InputError(f"{path}: expected a folder or nothing, found a file")
     if path.is_dir() and any(path.iterdir()) and not (path / marker).is_file():
         raise InputError(f"{path}: expected a new or empty folder or one with {marker} to replace, found other files")
-    _check_writable(path)
+    return path
 
 
-def _check_writable(path: Path) -> None:
-    parent = next(parent for parent in path.parents if parent.exists())
+def _check_writable(path: Path, folder: Path) -> None:
+    """Check, for what is written at `path`, that entries can be made in a folder, or in the nearest one above that is there."""
+    there = next(place for place in (folder, *folder.parents) if place.exists())
     try:
-        with TemporaryDirectory(prefix=".", dir=parent):
+        with TemporaryDirectory(prefix=".", dir=there):
             pass
     except OSError as error:
-        raise InputError(f"{path}: expected a place to write to, found {parent} not writable: {error.strerror}") from None
+        raise InputError(f"{path}: expected a place to write to, found {there} not writable: {error.strerror}") from None
 
 
 @contextmanager

@@ -116,8 +116,8 @@ def residuals(result: Result, metrics: Metrics) -> Section:
     blocks = [
         page.paragraph(
             "An arrow is where a point was seen less where the calibration predicts it, magnified, from all poses together. "
-            "Arrows that point anywhere are noise; neighbours that agree are something that the model doesn’t know. Noise "
-            "cancels in the means of the image’s cells, so what stands out there is a pattern."
+            "Arrows in random directions are noise; neighbouring arrows in one direction are an error of the model. Noise "
+            "cancels in the means of the image’s cells, so that a pattern stands out there."
         )
     ]
     histograms, published = [], figures_of_merit.published_rms(result.adjustment.calibration)
@@ -301,7 +301,7 @@ def consistency(result: Result) -> Section:
     text = (
         "Calibrated twice, from one half of the poses and from the other: the difference in units of its predicted standard "
         f"deviation. RMS {rms:.2f}, largest {worst:.1f}. They should scatter about zero by 1, and exceed {SUSPICIOUS:g} next to "
-        "never; where they do, something that the prediction doesn’t know moves the result: a board that bends, a lens that the "
+        "never; where they do, something that the prediction leaves out moves the result: a board that bends, a lens that the "
         "model doesn’t describe. What both halves share, such as an error of the board’s scale, doesn’t show."
     )
     return Section("Two halves", [page.paragraph(text), page.table(("", *(NAMES[device] for device in devices)), rows)])

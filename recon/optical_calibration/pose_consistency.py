@@ -14,8 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from recon.geometry import rigid
 from recon.geometry.board_shape import Tolerances, bends
 from recon.model.calibration import Calibration
+from recon.optical_calibration import uncertainty
 from recon.optical_calibration.adjustment import Adjustment, inverse, prior_information, without_poses
 from recon.optical_calibration.bundle import Array, Estimate, Problem, linearised
 from recon.optical_calibration.observations import Observations
@@ -26,6 +28,9 @@ STEP_MM = 1e-3  # of a bend, for its slope
 DETERMINED = 1e-2  # of the largest eigenvalue: directions of less are held by what is known without sightings, not shown by poses
 SURE = 1e-4  # of the largest eigenvalue: no pull is surer in one direction
 CONTRADICTING = 1.5  # scatter from which on it is worth a warning; noise leaves 1.0 +- 0.1
+MATTERING = 1.1  # rise of the uncertainty from which on it is worth one
+SHOWN = 2.0  # standard deviations from which on a bend is named
+SOME_POINTS = 50  # of a board: enough to see the uncertainty rise
 
 
 @dataclass(frozen=True)
@@ -34,18 +39,22 @@ class Consistency:
 
     scatter: float  # variance of their pulls over that by the sightings' noise; about 1 if they agree
     bend_mm: float  # standard deviation of each bend of the board, RMS over its points
+    bend_sigma: float  # standard deviations by which the poses show a bend, by the ratio of likelihoods
     factor: float  # by which sightings count as less exact than their residuals besides
+    rise: float  # standard deviation of projections with both causes over that without, in the device in which it rises most
     covariance: Array  # (g, g) of the devices' parameters, with both causes in it
 
     @property
     def warning(self) -> str | None:
-        """What is wrong, if anything is."""
-        if self.scatter < CONTRADICTING:
+        """The causes and their effect, if they have one that matters."""
+        if self.scatter < CONTRADICTING or self.rise < MATTERING:
             return None
-        bend = f"the board seems to bend by {self.bend_mm:.2g} mm (RMS) from pose to pose" if self.bend_mm else ""
+        named = self.bend_sigma > SHOWN
+        bend = f"the board seems to bend by {self.bend_mm:.2g} mm (RMS) from pose to pose" if named else ""
         rest = f"poses contradict each other by {self.factor:.1f} times the residuals" if self.factor > 1 else ""
         causes = " and ".join(filter(None, (bend, rest))) or "poses contradict each other"
-        return f"{causes}, which the uncertainty includes: is the board stiff, did a device move or warm up?"
+        effect = f"the uncertainty includes it, and is {self.rise:.1f} times as large"
+        return f"{causes}: {effect}; is the board stiff, did a device move or warm up?"
 
 
 class Pulls(NamedTuple):
@@ -86,14 +95,16 @@ def consistency(
     scatter = float((pulls.found**2).sum() / max(np.count_nonzero(shown), 1))
     covariance = adjusted.calibration.uncertainty.covariance
     if scatter <= 1:
-        return Consistency(scatter, 0.0, 1.0, covariance)
-    causes = [(bend, factor) for bend in BENDS_MM for factor in FACTORS]
+        return Consistency(scatter, 0.0, 0.0, 1.0, 1.0, covariance)
     by_bends = pulls.bends @ pulls.bends.swapaxes(1, 2)
-    likely = [_likelihood(pulls, factor * pulls.noise + bend**2 * by_bends) for bend, factor in causes]
-    bend, factor = (float(value) for value in causes[int(np.argmax(likely))])
+    likely = np.array([[_likelihood(pulls, b * pulls.noise + a**2 * by_bends) for b in FACTORS] for a in BENDS_MM])
+    place = np.unravel_index(np.argmax(likely), likely.shape)
+    bend, factor = float(BENDS_MM[place[0]]), float(FACTORS[place[1]])
+    evidence = float(np.sqrt(2 * (likely.max() - likely[0].max())))  # BENDS_MM begins with none
     moved = np.hstack([carry @ slopes for _, _, slopes in parts])
     added = (factor - 1) * carry @ total @ carry.T + bend**2 * moved @ moved.T
-    return Consistency(scatter, bend, float(np.sqrt(factor)), covariance + (added + added.T) / 2)
+    wider = covariance + (added + added.T) / 2
+    return Consistency(scatter, bend, evidence, float(np.sqrt(factor)), _rise(observations, adjusted, wider), wider)
 
 
 def widened(adjusted: Adjustment, covariance: Array) -> Adjustment:
@@ -101,6 +112,27 @@ def widened(adjusted: Adjustment, covariance: Array) -> Adjustment:
     found = adjusted.calibration
     assert found.uncertainty is not None
     return replace(adjusted, calibration=Calibration(found.cameras, replace(found.uncertainty, covariance=covariance)))
+
+
+def _rise(observations: Observations, adjusted: Adjustment, covariance: Array) -> float:
+    """Standard deviation of projections by a covariance over that by the adjustment's own, of the device in which it rises most.
+
+    Of the board's points where they were seen; of a board with many some are enough.
+    """
+    some = slice(None, None, max(len(adjusted.points) // SOME_POINTS, 1))
+    places = np.array([rigid.apply(pose, adjusted.points[some]) for pose in adjusted.poses])
+    seen = observations.seen[:, some]
+    volume = places[seen.any(axis=-1)]
+    wider = widened(adjusted, covariance).calibration
+    rises = [1.0]
+    for d, device in enumerate(observations.devices):
+        points = places[seen[..., d]]
+        before, after = (
+            np.trace(uncertainty.projection(known, device, points, volume), axis1=1, axis2=2).mean()
+            for known in (adjusted.calibration, wider)
+        )
+        rises.append(float(np.sqrt(after / before)))
+    return max(rises)
 
 
 def _of_pose(problem: Problem, adjusted: Adjustment, p: int, ways: Array) -> tuple[Array, Array, Array]:

@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import AwareDatetime, Field
 
@@ -13,6 +14,8 @@ from recon.files import atomic, json_text
 from recon.files.regular import MOST_TEXT, read_text
 from recon.model.rig import NotNegative, Part
 from recon.rig_check.verdicts import State, Verdict
+
+EPOCH, END = datetime(1970, 1, 1, tzinfo=UTC), datetime(2200, 1, 1, tzinfo=UTC)  # of times that a computer's clock shows
 
 
 class Entry(Part):
@@ -30,7 +33,7 @@ class Entry(Part):
 class Check(Part):
     """One check."""
 
-    time: AwareDatetime
+    time: Annotated[AwareDatetime, Field(ge=EPOCH, lt=END)]
     name: str  # of the capture
     parts: tuple[Entry, ...] = Field(min_length=1)
 

@@ -1,8 +1,10 @@
 """`check.html`: verdicts on all parts of the rig, and their course over the days of the log."""
 
 from collections.abc import Sequence
+from datetime import datetime, timedelta
+from typing import NamedTuple
 
-from matplotlib import dates
+from matplotlib import dates, ticker
 
 from recon.reports import figures, page
 from recon.reports.page import Opening, Section
@@ -17,7 +19,26 @@ WORDS = {
     "open": "open",
     "unseen": "not checked",
 }
-LEAST_SIGMA = 0.01  # of a logarithmic axis
+
+
+class Axis(NamedTuple):
+    """A logarithmic axis of deviations; those below its floor are drawn there."""
+
+    field: str  # of `Entry`
+    unit: str
+    floor: float
+    top: float  # at least
+
+    def caption(self, log: Sequence[Check]) -> str:
+        """The number of checks, and the reading of the lowest points."""
+        checks = f"{len(log)} check{'s' * (len(log) != 1)}"
+        return f"{checks}, times in UTC. Points at {self.floor:g} {self.unit} are at or below it."
+
+
+SIGMA, LENGTH = Axis("sigma", "σ", 0.1, 10.0), Axis("mm", "mm", 0.01, 1.0)
+ASIDE = timedelta(hours=6)  # of time left free beside the first and the last check
+MARGIN = 0.03  # of the time between them, if that is more
+BESIDE = 0.01  # of the axis of time between the marks of two parts in one check, or less where checks are close
 FOOTER = (
     "Deviations are in standard deviations of calibration, usual drift and this check's noise together, as of a normal number. "
     "mm: root mean square over the working volume. This file is complete: it fetches nothing."
@@ -27,7 +48,7 @@ FOOTER = (
 def write_text(made: Check, log: Sequence[Check], alarm_sigma: float) -> str:
     """The page as HTML."""
     sections = [
-        Section("Parts", [page.table(("part", "verdict", "motion", "deviation", "in mm"), map(_row, made.parts))]),
+        Section("Parts", [page.table(("part", "verdict", "motion", "limit, 1 σ", "deviation", "in mm"), map(_row, made.parts))]),
         Section("Over the days", _course(log, alarm_sigma)),
         Section("How to read this", [page.paragraph(text) for text in READING]),
     ]
@@ -37,8 +58,9 @@ def write_text(made: Check, log: Sequence[Check], alarm_sigma: float) -> str:
 READING = (
     "A part has moved where its deviation, had nothing moved, would come by chance in one check of two thousand. Where another "
     "part explains the measurements as well, both are named.",
-    "In mm stands the deviation found, and its standard deviation: what is smaller than some of these is not found by this "
-    "check. A part is open where the check shows hardly any motion of it, or where cameras that moved have tracked it.",
+    "The limit is that of this check, not an error of the deviation beside it: one standard deviation of the motions that the "
+    "recording leaves possible, whatever was found. Motions below some of these pass unseen. A part is open where the limit is "
+    "nearly a usual motion, or where cameras that moved have tracked it.",
     "Motions of all devices together, a projector's along its fringes, and a probe's along its own depth do not show. The first "
     "two do no harm; the third the crossed wires show.",
 )
@@ -61,15 +83,41 @@ def anew(parts: Sequence[Entry]) -> list[str]:
     return [verb for verb in dict.fromkeys(ANEW.values()) if verb in needed]
 
 
-def deviation(one: Entry) -> tuple[str, str]:
-    """A part's deviation in standard deviations and in mm, with that of the latter."""
+class Shown(NamedTuple):
+    """A part's numbers in words, empty where nothing showed it."""
+
+    deviation: str  # in standard deviations
+    mm: str
+    limit: str  # of this check, one standard deviation: smaller motions aren't found
+
+
+def shown(one: Entry) -> Shown:
+    """A part's numbers in words."""
     if one.sigma is None or one.mm is None or one.mm_sigma is None:
-        return "", ""
-    return f"{one.sigma:.1f} σ", f"{one.mm:.3f} ± {one.mm_sigma:.3f} mm"
+        return Shown("", "", "")
+    return Shown(f"{one.sigma:.1f} σ", f"{one.mm:.3f} mm", f"{one.mm_sigma:.3f} mm")
+
+
+def lines(made: Check) -> list[str]:
+    """A head and a line a part, for the terminal."""
+    return [_line(("part", "verdict", "deviation", "in mm", "limit, 1 σ", "motion")), *map(_line_of, made.parts)]
+
+
+def _line_of(one: Entry) -> str:
+    deviation, mm, limit = shown(one)
+    rivals = f" (or {', '.join(TITLES[name] for name in one.rivals)})" if one.rivals else ""
+    return _line((TITLES[one.part], WORDS[one.state], deviation, mm, limit, one.motion + rivals))
+
+
+def _line(cells: Sequence[str]) -> str:
+    """Cells in columns, the numbers to the right."""
+    part, verdict, *numbers, motion = cells
+    return f"{part:22}{verdict:19}{''.join(f'{number:>12}' for number in numbers)}  {motion}".rstrip()
 
 
 def _row(one: Entry) -> tuple[str, ...]:
-    return (TITLES[one.part], WORDS[one.state], one.motion, *deviation(one))
+    deviation, mm, limit = shown(one)
+    return (TITLES[one.part], WORDS[one.state], one.motion, limit, deviation, mm)
 
 
 def _figures(made: Check) -> list[tuple[str, str, str]]:
@@ -81,25 +129,41 @@ def _figures(made: Check) -> list[tuple[str, str, str]]:
 
 def _course(log: Sequence[Check], alarm_sigma: float) -> list[str]:
     """Deviations of all checks in the log, in standard deviations and in mm."""
-    lines = {"sigma": (f"alarm at {alarm_sigma:g}", "deviation, σ"), "mm": ("", "deviation, mm")}
-    return [_plot(log, field, label, alarm_sigma if bound else None) for field, (bound, label) in lines.items()]
+    seen = {one.part for made in log for one in made.parts if one.sigma is not None}
+    key = page.key({TITLES[part]: COLOURS[part] for part in PARTS if part in seen})
+    alarm = f"Dashed: alarm at {alarm_sigma:g} σ. {SIGMA.caption(log)}"
+    return [
+        key,
+        page.drawing(_plot(log, SIGMA, alarm_sigma), "Deviation in standard deviations", alarm),
+        page.drawing(_plot(log, LENGTH), "Deviation over the working volume", LENGTH.caption(log)),
+    ]
 
 
-def _plot(log: Sequence[Check], field: str, label: str, bound: float | None) -> str:
+def span(log: Sequence[Check]) -> tuple[datetime, datetime]:
+    """Ends of the axis of time."""
+    first, last = min(made.time for made in log), max(made.time for made in log)
+    margin = max(ASIDE, MARGIN * (last - first))
+    return first - margin, last + margin
+
+
+def _plot(log: Sequence[Check], axis: Axis, alarm: float | None = None) -> str:
+    """Deviations over time, a line a part; marks of one check stand beside each other, so that none hides another."""
     figure, axes = figures.blank(7.0, 2.8)
-    for part in PARTS:
-        points = [(made.time, getattr(one, field)) for made in log for one in made.parts if one.part == part]
-        points = [(time, max(value, LEAST_SIGMA / 10)) for time, value in points if value is not None]
+    start, end = span(log)
+    step = min(BESIDE, 0.5 / (len(PARTS) * len(log))) * (end - start)
+    top = axis.top
+    for k, part in enumerate(PARTS):
+        points = [(made.time, getattr(one, axis.field)) for made in log for one in made.parts if one.part == part]
+        points = [(time + (k - 2.5) * step, max(value, axis.floor)) for time, value in points if value is not None]
         if points:
-            axes.plot(*zip(*points, strict=True), "o-", color=COLOURS[part], markersize=3.6, linewidth=1.1, label=TITLES[part])
-    if bound is not None:
-        axes.axhline(bound, color=figures.LINE, linewidth=1.3, linestyle="--")
-    axes.set(ylabel=label, yscale="log")
-    locator = dates.AutoDateLocator()
+            axes.plot(*zip(*points, strict=True), "o-", color=COLOURS[part], markersize=3.6, linewidth=1.0)
+            top = max(top, *(2 * value for _, value in points))
+    if alarm is not None:
+        axes.axhline(alarm, color=figures.TEXT, linewidth=1.0, linestyle="--")
+    axes.set(ylabel=f"deviation, {axis.unit}", yscale="log", xlim=(start, end), ylim=(0.8 * axis.floor, top))
+    axes.yaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
+    locator = dates.AutoDateLocator(maxticks=8)
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
-    if axes.lines:
-        axes.legend(frameon=False, labelcolor=figures.TEXT, fontsize=8, ncols=3)
     axes.spines[["top", "right"]].set_visible(False)
-    caption = "Deviation in standard deviations" if bound is not None else "Deviation over the working volume"
-    return page.drawing(figures.inline_svg(figure), caption, f"{len(log)} checks.")
+    return figures.inline_svg(figure)

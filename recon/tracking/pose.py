@@ -118,7 +118,7 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
     best = int(np.argmin(total))
     off, sigma = shapes[best]
     if not _like(off, sigma, SIZES):
-        return lost(f"circles whose sizes are {100 * np.abs(off).max():.0f} % from what their distance asks for")
+        return lost(f"circles whose sizes are {100 * np.abs(off).max():.0f} % off those at their distance")
     rivals = [fit for k, fit in enumerate(good) if k != best and total[k] < total[best] + DISTINCT]
     if any(fit.merging for fit in (good[best], *rivals)):
         turn = np.degrees(np.sqrt(np.trace(good[best].total[:3, :3])))

@@ -35,7 +35,7 @@ SHRUNK = 0.3  # of the path, standard deviation of a semi-axis by clipped white;
 UNEVEN = 0.05  # of the contrast: white of a larger spread over the sectors isn't even within one
 BENT_PX = 0.1  # times that share: standard deviation of a centre by uneven white
 LARGEST_BLUR = 0.35  # of the ring's width; beyond that its dark ring is gone
-ELSEWHERE = "not where the others ask for it"
+ELSEWHERE = "not at the place that the others predict"
 
 
 class Known(NamedTuple):

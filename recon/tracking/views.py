@@ -66,7 +66,7 @@ def judged(outlines: Outlines, target: Target) -> View:
     if not np.isfinite(off):
         return View(outlines, "circles of which the names are mirrored")
     if off > identity.ALIKE:
-        return View(outlines, f"circles whose sizes are {100 * off:.0f} % from what their distances ask for")
+        return View(outlines, f"circles whose sizes are {100 * off:.0f} % off those at their distances")
     return View(outlines)
 
 

@@ -1,4 +1,4 @@
-"""Measure the errors of the twin and of the pipeline, beside what is asked, what physics allows and what the paper reports.
+"""Measure the errors of the twin and of the pipeline, beside their bars, the limits of physics and the paper's figures.
 
 Reads the rig and the pattern sequences from conf/, and real recordings where `real` names their folder. Writes GROUP.json into
 the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}, and figures; and the tables of the Markdown page

@@ -28,7 +28,7 @@ from recon.probe_calibration import sound_in_water
 from recon.rig_check import bottom_equations, check_log, check_page, fringe_matches, verdicts
 from recon.rig_check.bottom_equations import Known
 from recon.rig_check.optics_equations import PROJECTOR, Matches
-from recon.rig_check.verdicts import TITLES, Optics, Verdict
+from recon.rig_check.verdicts import Optics, Verdict
 from recon.structured_light import decode
 from recon.target_calibration import target_poses
 from recon.tracking.pose_fit import Sighting
@@ -86,11 +86,8 @@ def run(config: Config) -> int:
     found = [*optics(config, listed, held, console)]
     found += verdicts.doubted(tank(config, held, console), found)
     made = check_log.check(listed.name or config.capture.resolve().name, found)
-    for one, entry in zip(found, made.parts, strict=True):
-        sigma, mm = check_page.deviation(entry)
-        shown = "" if one.state == "unseen" else f"{sigma}, {mm}; {one.motion}"
-        or_else = f" (or {', '.join(map(TITLES.__getitem__, one.rivals))})" if one.rivals else ""
-        console.print(f"{TITLES[one.part]:22}{check_page.WORDS[one.state]:15}{shown}{or_else}", markup=False)
+    for line in check_page.lines(made):
+        console.print(line, markup=False)
     console.print(f"verdict     {check_page.summary(made.parts)}", markup=False)
     with atomic.new_folder(config.out, CHECK) as folder:
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -136,11 +133,7 @@ def optics(config: Config, listed: Manifest, held: Held, console: Console) -> li
     """Verdicts on cameras, projector and target."""
     if held.film is None and not held.fringes:
         return [Verdict(part, "unseen") for part in (*CAMERAS, PROJECTOR, "target")]
-    file = config.calibration or (None if listed.calibration is None else config.capture / listed.calibration)
-    if file is None:
-        raise InputError(
-            f"{config.capture / MANIFEST}: expected calibration, the path of a file, found none; give calibration=FILE"
-        )
+    file = listed.calibration_file(config.capture, config.calibration)
     wanted = [*CAMERAS, *([PROJECTOR] if held.fringes else [])]
     sizes = {name: device.size for name, device in listed.devices.items() if name in wanted}
     calibration = calibration_files.read_for(file, sizes)

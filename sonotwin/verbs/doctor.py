@@ -6,6 +6,8 @@ to be tried. Takes some seconds. Exit status 0 if the core can be used, else 2; 
     sonotwin doctor
 """
 
+import textwrap
+
 from rich.console import Console
 
 from recon.errors import InputError
@@ -13,6 +15,9 @@ from recon.model.rig import Part
 from sonotwin import installation
 
 STYLES = {"ok": "green", "absent": "yellow", "unused": "dim", "problem": "bold red"}
+WHAT = 18  # characters of the second column
+INDENT = 8 + WHAT + 9  # of the findings
+NARROWEST = 100  # characters a line, also where no terminal says
 
 
 class Config(Part):
@@ -30,9 +35,11 @@ def run(config: Config) -> None:
     findings = installation.examine()
     console = Console(soft_wrap=True, highlight=False)
     for finding in findings:
-        console.print(f"{finding.part:8}{finding.what:32}", end="")
+        console.print(f"{finding.part:8}{finding.what:{WHAT - 1}} ", end="")
         console.print(f"{finding.state:9}", style=STYLES[finding.state], end="")
-        console.print(finding.found, markup=False)
+        room = max(console.width, NARROWEST) - INDENT
+        lines = textwrap.wrap(finding.found, room, break_long_words=False, break_on_hyphens=False)
+        console.print(f"\n{' ' * INDENT}".join(lines), markup=False)
     for finding in findings:
         if finding.remedy:
             console.print(f"{finding.part} {finding.what}: {finding.remedy}", markup=False)

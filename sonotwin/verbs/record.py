@@ -1,7 +1,7 @@
 """Record a part of a capture from devices: the calibration board pose by pose, a surface under fringes, a freehand sweep.
 
 Guides at the terminal, and shows in a browser, at the address that it prints, what each device sees: exposure, saturation,
-focus, fringes, whether the target is found, what is wrong and how to mend it. Each next pose of the board is asked for where it
+focus, fringes, whether the target is found, each fault and its remedy. Each next pose of the board is chosen as the one that
 adds most to those so far, and its outline is shown over camera 1's image. OUT is a capture folder, a new one or one that grows:
 poses are added to those that are there, sweeps have names, a new surface takes the place of the old one; of a rendered one, whose
 truth stands beside the capture, only with replace=true. Later verbs take OUT itself: capture=OUT. All that was recorded is

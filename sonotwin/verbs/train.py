@@ -5,8 +5,8 @@ Reads data sets as of `sonotwin dataset`, one or several: ranges of one, or of o
 `memory_gb`; the training is the same either way. Writes into the folder `out`: the network as ONNX for the tracker, its weights
 as .safetensors and .pt with the published names, metrics.json of the validation samples, the curves as log.jsonl and curves.png,
 and checkpoint.pt, from which the same command goes on if it was interrupted. A second run into one folder is refused while the
-first is at work. Needs the extra `train`. On one core the networks of ours see some 40 crops or 100 patches a second, and half an
-hour to some hours are asked for; the published ones take 6 to 20 times as long.
+first is at work. Needs the extra `train`. On one core the networks of ours take some 40 crops or 100 patches a second, and need
+half an hour to some hours; the published ones take 6 to 20 times as long.
 
     sonotwin train network=detector data=outputs/dataset out=outputs/detector max_minutes=60
     sonotwin train network=published_segmenter data=outputs/dataset out=outputs/segmenter steps=20000 threads=1
@@ -125,7 +125,7 @@ def run(config: Config) -> None:
         If it was stopped; a checkpoint is there then.
     """
     inputs = [*config.data, *(config.validation_data or ()), *([config.init] if config.init else ())]
-    atomic.check_folder(config.out, MARKER, inputs=inputs)
+    atomic.check_filled_folder(config.out, MARKER, inputs=inputs)
     with occupied(config.out):
         _train(config, Console(soft_wrap=True, highlight=False))
 

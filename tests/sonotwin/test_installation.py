@@ -72,7 +72,19 @@ def test_a_missing_twin_is_status_0(others_work, monkeypatch, capsys):
     real = installation._version
     monkeypatch.setattr(installation, "_version", lambda name: None if name in ("mitsuba", "drjit") else real(name))
     assert cli.main(["doctor"]) == 0
-    assert "twin mitsuba: pip install '.[twin]' in sonotwin's folder" in capsys.readouterr().out
+    assert "mitsuba; pip install '.[twin]' in sonotwin's folder" in capsys.readouterr().out
+
+
+def test_a_core_alone_fits_a_screen(others_work, monkeypatch, capsys):
+    """Of all that is absent there is a line an extra, which names each package."""
+    real, wanted = installation._version, list(installation.requirements())
+    extras = {name for part, name, _ in wanted if part != "core"}
+    monkeypatch.setattr(installation, "_version", lambda name: None if name in extras else real(name))
+    assert cli.main(["doctor"]) == 0
+    said = capsys.readouterr().out
+    assert all(name in said for name in extras) and "pip install '.[live]'" in said
+    assert len(said.splitlines()) <= 40 and max(map(len, said.splitlines())) <= 130
+    assert [line.split()[:3] for line in said.splitlines()].count(["live", "packages", "absent"]) == 1
 
 
 def test_a_package_that_crashes_does_not_take_the_doctor_along(tmp_path, monkeypatch):
@@ -132,7 +144,7 @@ def test_the_doctor_lists_namesakes(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "trainers", raising=False)  # an imported one would be found first
     found = {finding.what: finding for finding in installation._own_packages()}
-    assert found["recon"].state == found["twin"].state == found["scenes"].state == "ok"
+    assert found["sonotwin"].state == "ok" and found["sonotwin"].found == f"recon, scenes, twin in {ROOT}"
     assert found["trainers"].state == "problem" and str(tmp_path / "trainers") in found["trainers"].found
 
 
@@ -144,5 +156,5 @@ def test_two_distributions_in_one_folder_are_named(tmp_path, monkeypatch):
     both = {"recon": ["sonotwin", "other-recon"], "twin": ["sonotwin"]}
     monkeypatch.setattr(installation.importlib.metadata, "packages_distributions", lambda: both)
     found = {finding.what: finding for finding in installation._own_packages()}
-    assert found["twin"].state == "ok" and found["recon"].state == "problem"
+    assert "twin" in found["sonotwin"].found and "recon" not in found["sonotwin"].found and found["recon"].state == "problem"
     assert "pip uninstall other-recon" in found["recon"].remedy

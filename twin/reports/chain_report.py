@@ -38,7 +38,7 @@ def lines(metrics: Metrics) -> Iterator[Line]:
     used = f"from {metrics['probe_frames_used']} B-scans of wires"
     yield "Probe’s calibration, worst of five pixels", used, _mm(metrics, "probe_worst_sigma_mm"), _mm(metrics, "probe_worst_mm")
     predicted, off = (_mm(metrics, f"sweep_placement_{name}_mm", ".2f") for name in ("sigma", "rms"))
-    yield "Pixels of the sweep, but for sound", "B-scans in space", predicted, off
+    yield "Places of the sweep’s pixels, without the speed of sound’s error", "B-scans in space", predicted, off
     yield from of_tumours(metrics)
 
 

@@ -13,7 +13,7 @@ from twin.evaluation.surface_errors import GROSS_MM, Comparison
 
 ERROR_MM = 0.1  # colours of errors span plus and minus this, or twice their RMS if that is more
 SYSTEMATIC_MM = 0.02  # colours of averaged errors span plus and minus this
-PARTS = {"calibration": "calibration of cameras and projector", "rest": "the rest that neighbours share", "noise": "noise"}
+PARTS = {"calibration": "calibration of cameras and projector", "rest": "rest, the same in neighbouring points", "noise": "noise"}
 
 
 def errors(comparison: Comparison, parts: ErrorParts) -> Section:
@@ -23,9 +23,9 @@ def errors(comparison: Comparison, parts: ErrorParts) -> Section:
         compared = page.grid(histograms(comparison, parts), "two")
     text = (
         "The error of a point is its distance from the plane that touches the true surface where the pixel’s ray meets it. "
-        f"{by_calibration(parts)}Noise is what neighbours don’t share, and is predicted for each point; the rest is what they "
-        "share beside the calibration’s part: light from one surface to another, blur at edges, lenses that the model doesn’t "
-        "describe."
+        f"{by_calibration(parts)}Noise differs from point to point, and is predicted for each; the rest is alike in neighbouring "
+        "points and no part of the calibration’s: light from one surface to another, blur at edges, lenses that the model "
+        "doesn’t describe."
     )
     return Section(
         "Errors", [page.paragraph(text), parts_table(parts), page.grid(error_maps(comparison, parts), "two"), compared]
@@ -74,11 +74,11 @@ def error_maps(comparison: Comparison, parts: ErrorParts) -> list[str]:
             error,
             "mm",
         ),
-        page.picture(error(mean), "What neighbours share", f"{over}: calibration and rest, on the same scale.", error, "mm"),
+        page.picture(error(mean), "Calibration and rest", f"{over}. On the same scale.", error, "mm"),
     ]
     if "calibration" in parts.parts:
         pictures.append(page.picture(rest(left), "The rest", f"The same less the calibration’s part. {band}.", rest, "mm"))
-    predicted = "Standard deviation that the images’ own noise lets expect."
+    predicted = "Standard deviation expected from the images’ own noise."
     return [*pictures, page.picture(noise(comparison.predicted), "Predicted noise", predicted, noise, "mm")]
 
 

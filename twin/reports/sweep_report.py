@@ -37,8 +37,8 @@ Array = NDArray[np.float64]
 SKIN = "#d9b8a4"
 FRAMES = "#8f969c"
 PATH = "#7d8b6a"
-DEEP_MM = 20.0  # at which a speed of sound other than assumed is told
-MASS_MM = 10.0  # of a tumour, of which it is told too
+DEEP_MM = 20.0  # at which a speed of sound other than assumed is stated
+MASS_MM = 10.0  # of a tumour, of which it is stated too
 CELLS = (17, 21)  # of the maps over a B-scan, across and down
 PLANES_SHOWN = 12  # B-scans whose outlines are drawn in space
 PAPER = {  # Meza et al. 2021, Optical Engineering 60(5) 054106: CR2, and the RMS of the equations
@@ -62,7 +62,7 @@ class Inside:
     bob: SweepCapture  # over a flat bottom
     depth_residuals: Array  # (k, 2) for each of its B-scans: depth in px and residual in px; NaN where none
     lag_s: float
-    speed_m_s: float  # of sound in the tissue, as was told
+    speed_m_s: float  # of sound in the tissue, as given to the reconstruction
 
 
 def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: SweepTruth) -> Inside:
@@ -81,10 +81,10 @@ def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: Swe
     probe = probe_files.read(folders["probe"] / "probe.yaml")
     lag_s = lag_files.read(folders["lag"] / lag_files.FILE).lag_s
     rows = _rows(folders["lag"] / "depths.csv")
-    told = float(read_figures(folders["volume"] / FILE)["speed_m_per_s"])
+    given = float(read_figures(folders["volume"] / FILE)["speed_m_per_s"])
     return Inside(
         sweep,
-        sweep.poses(lag_s) @ sequences.target_from_pixel(sound_in_water.for_tissue(probe, told)),
+        sweep.poses(lag_s) @ sequences.target_from_pixel(sound_in_water.for_tissue(probe, given)),
         volumes.read_volume(folders["volume"] / "volume.nrrd"),
         findings,
         expected,
@@ -92,7 +92,7 @@ def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: Swe
         sweep_part.read_sweep(folders["bottom"]),
         np.array([[float(row[name] or "nan") for name in ("depth_px", "residual_px")] for row in rows]),
         lag_s,
-        told,
+        given,
     )
 
 
@@ -148,7 +148,7 @@ def inside(story: Inside, points: NDArray[np.float32], skin: NDArray[np.bool_], 
     )
 
 
-def too_deep(expected: SweepTruth, told: float) -> str:
+def too_deep(expected: SweepTruth, given: float) -> str:
     """Effect of the tissue's speed of sound on depths, and its correction."""
     speed, assumed = sweep_pictures.tissue_speed(expected), expected.transducer.assumed_speed
     off = float(sound_in_water.shown_too_deep(DEEP_MM, speed, assumed))
@@ -157,12 +157,13 @@ def too_deep(expected: SweepTruth, told: float) -> str:
     of_mass = float(np.mean([solid.tissue.speed for solid in expected.body.solids if solid.name in names]))
     shorter = MASS_MM * (1 - speed / of_mass)
     far = (
-        f" Of sound in a tumour ({of_mass:.0f} m/s) nothing is told: {MASS_MM:.0f} mm of it look {abs(shorter):.1f} mm "
+        f" The speed in a tumour ({of_mass:.0f} m/s) isn’t given: {MASS_MM:.0f} mm of it look {abs(shorter):.1f} mm "
         f"{'shorter' if shorter > 0 else 'longer'}, so its far side is shown {'above' if shorter > 0 else 'below'} its outline."
     )
     return (
-        f"Sound makes {speed:.0f} m/s in this tissue, and the scanner assumes {assumed:.0f}: an echo shown {DEEP_MM:.0f} mm "
-        f"deep {lies}. Found outlines, ticks and volume are for {told:.0f} m/s, as was told, true outlines for {speed:.0f}."
+        f"The speed of sound is {speed:.0f} m/s in this tissue, and the scanner assumes {assumed:.0f}: an echo shown "
+        f"{DEEP_MM:.0f} mm deep {lies}. Found outlines, ticks and volume are for {given:.0f} m/s, as given to the "
+        f"reconstruction, true outlines for {speed:.0f}."
         f"{far if round(abs(shorter), 1) else ''}"
     )
 

@@ -16,8 +16,8 @@ from twin.studies.error_budget import Budget, Sum
 from twin.studies.study_page import kept_drawing, title
 
 PREDICTED = (
-    "Errors as the software propagates them. Of the latency and the speed of sound it is told the size that is drawn: their "
-    "ratios test slopes alone. Tolerances that act on wires and scan alike cancel in part, which neither's covariance knows."
+    "Errors as the software propagates them. Of the latency and the speed of sound it gets the size that is drawn: their "
+    "ratios test slopes alone. Tolerances that act on wires and scan alike cancel in part, which neither's covariance includes."
 )
 TICKS, GAP = 8, 0.07  # lengths on the axis at most, and the least distance between them, of all
 LEAST = 0.002  # share of the sum's square that gets a bar of its own

@@ -72,7 +72,7 @@ class StudyFolder:
 
     def open(self, description: Mapping[str, Any]) -> None:
         """Begin or go on with a study; raises InputError if the folder holds something else."""
-        atomic.check_folder(self.folder, STUDY)
+        atomic.check_filled_folder(self.folder, STUDY)
         _check_mark(self.folder / STUDY)
         for place in (self.folder, self.trials):
             place.mkdir(parents=True, exist_ok=True)

@@ -233,3 +233,15 @@ def test_corners_and_places_of_a_mesh_are_checked_as_it_is_read(tmp_path, at, va
     with pytest.raises(InputError) as refusal:
         meshes.read_ply(path, "a mesh")
     assert str(refusal.value).startswith(f"{path}: {complaint}")
+
+
+def test_a_mesh_whose_header_lost_a_space_is_refused_in_one_line(tmp_path):
+    """Faces before vertices, `propertyfloat x`: trimesh stumbles over a name of its own that was never bound."""
+    lines = ["ply", "format binary_little_endian 1.0", "element face 20", "element vertex 12", "propertyfloat x"]
+    lines += ["property float y", "property float z", "property list uchar int vertex_indices", "end_header\n"]
+    path = tmp_path / "mesh.ply"
+    path.write_bytes("\n".join(lines).encode() + ply().partition(b"end_header\n")[2])
+    with pytest.raises(InputError) as refusal:
+        meshes.read_ply(path, "a mesh")
+    assert str(refusal.value).startswith(f"{path}: expected a mesh as PLY, found a damaged one: ")
+    assert "\n" not in str(refusal.value)

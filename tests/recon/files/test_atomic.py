@@ -303,6 +303,27 @@ def test_a_loop_of_links_is_refused(tmp_path):
         atomic.check_folder(tmp_path / "a", "mark", inputs=[tmp_path / "b"])
 
 
+def test_a_folder_that_is_filled_needs_no_writable_parent(tmp_path, monkeypatch):
+    """As a disk that is mounted in the root's folder: it can be filled, but not replaced, nor can one be made beside it."""
+    made = atomic.TemporaryDirectory
+    (disk := tmp_path / "disk").mkdir()
+
+    def refusing(prefix, dir):
+        if Path(dir) == tmp_path:
+            raise PermissionError(13, "Permission denied")
+        return made(prefix=prefix, dir=dir)
+
+    monkeypatch.setattr(atomic, "TemporaryDirectory", refusing)
+    atomic.check_filled_folder(disk, "mark")
+    for check, path in ((atomic.check_folder, disk), (atomic.check_filled_folder, tmp_path / "other")):
+        with pytest.raises(InputError, match=rf"{path.name}: expected a place to write to, found {tmp_path} not writable"):
+            check(path, "mark")
+    (disk / "thesis.tex").touch()
+    with pytest.raises(InputError, match="found other files"):
+        atomic.check_filled_folder(disk, "mark")
+    assert names(disk) == ["thesis.tex"]
+
+
 @pytest.mark.parametrize("place", [lambda path: atomic.new_file(path), lambda path: atomic.new_folder(path, "mark")])
 def test_a_full_disk_is_named(tmp_path, place):
     with pytest.raises(OSError, match=r"No space left.*out"), place(tmp_path / "out"):

@@ -87,6 +87,26 @@ def test_the_page_says_what_came_out(story, written):
     assert len(re.findall(r"\d\d\s+44\u202f/\u202f44\u202f/\u202f44", shown)) == 12, "a row a pose"
 
 
+def test_numbers_stand_in_their_columns(story, written):
+    """A pose's residuals by device, and a device's scores by model, with the one taken."""
+    shown, (result, _) = text_of(written), story
+    remaining = figures_of_merit.pose_rms(result)[3]
+    assert len({f"{value:.4f}" for value in remaining}) == 3, "else an exchange would pass"
+    assert re.search(r"\b03 .*?" + r"\s+".join(f"{value:.4f}" for value in remaining), shown)
+    models = shown[shown.index("Distortion models") :]
+    assert re.search(r"device\s+none\s+decentred\s+brown\s+taken", models)
+    assert re.search(r"camera 2\s+0\.2000 px\s+0\.0151 px\s+0\.0152 px\s+decentred", models)
+
+
+def test_the_opening_says_how_good_it_is(story, written):
+    """In its sentence and in large figures."""
+    result, truth = story
+    measured = figures_of_merit.measure(result, truth)
+    top = text_of(written)[: text_of(written).index("Residuals, camera 1")]
+    assert top.count(f"{measured['point_sigma_mm']:.3f}") >= 2 and top.count(f"{measured['shape_sigma_mm']:.4f}") >= 2
+    assert f"off by {measured['point_error_rms_mm']:.3f} mm and {measured['shape_error_rms_mm']:.4f} mm" in top
+
+
 def test_parameters_stand_beside_the_true_ones(story, written):
     """As many decimals as the standard deviation has a use for."""
     result, _ = story

@@ -9,6 +9,7 @@ from recon.geometry.board_shape import departures
 from recon.model.calibration import Calibration
 from recon.optical_calibration import joint_calibration
 from recon.optical_calibration.joint_calibration import Settings, calibrate, deviation
+from recon.optical_calibration.pose_consistency import Consistency
 from tests.recon.board_sets import BOARD, devices, random_poses, sightings
 
 QUICK = Settings(distortion="decentred")
@@ -45,6 +46,7 @@ def test_steady_poses_scatter_as_their_noise(cameras, monkeypatch):
     found, squared = results(cameras, range(6), monkeypatch, lambda k, rng: (cameras, BOARD.points()))
     assert np.mean([one.scatter for one in found]) == pytest.approx(1, abs=0.15)
     assert not any(one.warning for one in found) and 0.7 < squared < 1.4
+    assert all(1 <= one.rise < 1.05 for one in found)
 
 
 def test_a_board_that_bends_is_told_and_counts(cameras, monkeypatch):
@@ -55,7 +57,7 @@ def test_a_board_that_bends_is_told_and_counts(cameras, monkeypatch):
         return cameras, BOARD.points() + (ways @ (0.02 * rng.standard_normal(3))).reshape(-1, 3)
 
     found, squared = results(cameras, range(6), monkeypatch, bent)
-    assert all(one.scatter > 2 and "bend" in one.warning for one in found)
+    assert all(one.scatter > 2 and "bend" in one.warning and one.rise > 1.5 for one in found)
     assert all((one.covariance == one.covariance.T).all() for one in found), "as readers demand it"
     assert 0.01 < np.median([one.bend_mm for one in found]) < 0.04
     assert 0.4 < squared < 2  # 84 random bends in 6 sets, in directions that are far from alike
@@ -68,4 +70,13 @@ def test_a_device_that_is_touched_is_told(cameras, monkeypatch, moved):
     matrix[0, 2] += 0.1
     touched = {**cameras, "cam2": replace(cameras["cam2"], matrix=matrix)}
     found, _ = results(cameras, range(3), monkeypatch, lambda k, rng: (touched if moved(k) else cameras, BOARD.points()))
-    assert all(one.warning for one in found)
+    assert all(one.warning and one.rise > 1.3 for one in found)
+
+
+def test_what_hardly_raises_the_uncertainty_is_not_warned_of():
+    """Residuals of 0.006 px that contradict each other twofold, and a bend of 0.3 um, beside a lens known far less."""
+    slight = Consistency(5.06, 0.00032, 2.5, 2.15, 1.001, np.eye(1))
+    assert slight.warning is None
+    large = replace(slight, rise=1.7).warning
+    assert "bend by 0.00032 mm" in large and "2.1 times the residuals" in large and "1.7 times as large" in large
+    assert "bend" not in replace(slight, rise=1.7, bend_sigma=1.0).warning, "as likely without one"

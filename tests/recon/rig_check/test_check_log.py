@@ -3,10 +3,11 @@
 import pytest
 
 from recon.errors import InputError
-from recon.rig_check import check_log, check_page
+from recon.rig_check import check_log
 from recon.rig_check.verdicts import Verdict
 
 MOVED = Verdict("cam2", "moved", 19.3, 0.98, 0.11, "turned by 0.020 deg, shifted by 0.06 mm", ("cam1",))
+LONG_AGO = '{"time": "0001-01-01T00:00:00Z", "name": "x", "parts": [{"part": "cam1", "state": "good"}]}'
 SEEN = (Verdict("cam1", "maybe", 3.0, 0.1, 0.05), MOVED, Verdict("probe", "unseen"))
 
 
@@ -21,7 +22,7 @@ def test_checks_are_read_as_they_were_added(tmp_path):
     assert len(log.read_text().splitlines()) == 2 and [path.name for path in log.parent.iterdir()] == ["rig.jsonl"]
 
 
-@pytest.mark.parametrize("line", ['{"time": "2026-01-01T00:00:00Z", "name": "x"', '{"name": "x"}', "[1, 2]"])
+@pytest.mark.parametrize("line", ['{"time": "2026-01-01T00:00:00Z", "name": "x"', '{"name": "x"}', "[1, 2]", LONG_AGO])
 def test_a_damaged_log_is_refused_and_stays(tmp_path, line):
     log = tmp_path / "rig.jsonl"
     check_log.add(log, check_log.check("monday", SEEN))
@@ -30,15 +31,3 @@ def test_a_damaged_log_is_refused_and_stays(tmp_path, line):
     with pytest.raises(InputError, match=r"rig\.jsonl"):
         check_log.add(log, check_log.check("tuesday", SEEN))
     assert log.read_text() == damaged
-
-
-def test_the_page_says_what_moved_and_what_to_do(tmp_path):
-    checks = [check_log.check("monday", SEEN), check_log.check("<tuesday>", SEEN)]
-    text = check_page.write_text(checks[1], checks, 3.5)
-    assert "Moved: camera 2 or camera 1. Run calibrate-optics." in text and "&lt;tuesday&gt;" in text
-    assert text.count("<svg") == 2 and "turned by 0.020\u00a0deg" in text
-
-
-def test_a_page_of_parts_that_nothing_showed(tmp_path):
-    made = check_log.check("x", [Verdict("probe", "unseen")])
-    assert "Nothing could be checked." in check_page.write_text(made, [made], 3.5)

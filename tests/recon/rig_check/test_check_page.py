@@ -1,0 +1,66 @@
+"""The page and the lines of a check: verdicts, limits, and a course that one check and many are read from."""
+
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from recon.rig_check import check_log, check_page
+from recon.rig_check.verdicts import Verdict
+
+FIRST = datetime(2026, 5, 4, 8, 12, tzinfo=UTC)
+MOVED = Verdict("cam2", "moved", 19.3, 0.982, 0.112, "turned by 0.020 deg, shifted by 0.06 mm", ("cam1",))
+SEEN = (Verdict("cam1", "maybe", 3.0, 0.1, 0.05), MOVED, Verdict("probe", "unseen"))
+STILL = (Verdict("cam1", "good", 0.0, 0.0004, 0.371), Verdict("cam2", "good", 0.02, 0.001, 0.112))
+
+
+def checks(days, seen) -> list[check_log.Check]:
+    """Checks of the same outcome, on days after the first."""
+    made = check_log.check("<morning>", seen)
+    return [made.model_copy(update={"time": FIRST + timedelta(days=day)}) for day in days]
+
+
+def test_the_page_says_what_moved_and_what_to_do():
+    log = checks((0, 1), SEEN)
+    text = check_page.write_text(log[1], log, 3.5)
+    assert "Moved: camera 2 or camera 1. Run calibrate-optics." in text and "&lt;morning&gt;" in text
+    assert text.count("<svg") == 2 and "turned by 0.020\u00a0deg" in text
+    assert "0.982\u00a0mm" in text and "0.112\u00a0mm" in text and "±" not in text
+
+
+def test_a_page_of_parts_that_nothing_showed():
+    made = check_log.check("x", [Verdict("probe", "unseen")])
+    assert "Nothing could be checked." in check_page.write_text(made, [made], 3.5)
+
+
+@pytest.mark.parametrize("days", [(0,), (0, 0.02), range(30), (0, 700)])
+def test_the_axis_of_time_holds_all_checks_and_little_else(days):
+    """Hours beside a lone check, some days beside those of a month, weeks beside those of two years."""
+    log = checks(days, STILL)
+    start, end = check_page.span(log)
+    length = log[-1].time - log[0].time
+    assert start < log[0].time <= log[-1].time < end
+    assert end - start <= max(length + timedelta(hours=12), 1.07 * length)
+
+
+def test_a_lone_check_is_drawn_on_its_day():
+    log = checks((0,), STILL)
+    text = check_page.write_text(log[0], log, 3.5)
+    assert "2026-May-04" in text and "2025" not in text and "2028" not in text
+    assert "1 check, " in text and "1 checks" not in text
+
+
+def test_small_deviations_are_drawn_at_the_floor():
+    """0 and 0.02 sigma would lie decades below the alarm, and take most of the drawing; two checks join by a level line."""
+    log = checks((0, 1), STILL)
+    text = check_page.write_text(log[0], log, 3.5)
+    labels = [label for label in ("0.001", "0.01", "0.1", "1", "10") if f">{label}</text>" in text]
+    assert labels == ["0.01", "0.1", "1", "10"]  # the first of mm, the last of standard deviations
+    assert "2 checks, " in text and "at or below" in text
+
+
+def test_the_limit_stands_apart_from_the_deviation():
+    head, first, second, third = check_page.lines(checks((0,), SEEN)[0])
+    place = head.index("limit") + len("limit, 1 σ")
+    assert second[:place].endswith("0.112 mm") and "19.3 σ    0.982 mm    0.112 mm" in second
+    assert second.endswith("shifted by 0.06 mm (or camera 1)") and "±" not in head + first + second
+    assert third.split() == ["probe", "on", "its", "bracket", "not", "checked"]
