@@ -19,11 +19,11 @@ from recon.navigation.mass_distances import MassDistance
 from recon.navigation.own_pages import own_pages_alone
 from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import Moment, StillScene
+from recon.own_requests import LOOPBACK
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-LOOPBACK = "127.0.0.1"
 M = 0.001  # the view is in metres: its nearest and farthest depth suit them
 SKIN, MASS, BODY, INK = (224, 187, 165), (200, 60, 60), (235, 235, 235), (20, 20, 20)
 OUTSIDE, INSIDE = 0.5, 0.1  # opacity of the skin's two sides: where both were alike, a dome would look like a bowl

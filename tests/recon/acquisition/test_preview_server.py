@@ -55,9 +55,10 @@ def test_a_place_is_drawn_where_it_is_asked_for(there):
 
 
 def test_pages_of_others_see_nothing():
-    """A page in the same browser that calls this one by a name of its own."""
+    """A page in the same browser that calls this one by a name of its own, or by this one's name from elsewhere."""
     with served(Preview()) as address:
         assert answer(address, "/state", Host="evil.example:80")[0] == 403
+        assert answer(address, "/state", Origin="https://evil.example")[0] == 403
         assert answer(address, "/state", Host="localhost:80")[0] == 200
 
 
