@@ -18,13 +18,13 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated, NamedTuple, NoReturn
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from recon.capture import calibration_files, sweep_part
@@ -53,7 +53,7 @@ from recon.skin_projection import (
 from recon.skin_projection.projector_image import Drawing, Lines, lit_share
 from recon.skin_projection.skin_curve import SkinCurve
 from recon.skin_projection.skin_registration import SkinShift
-from sonotwin.open_devices import LiveDevices, open_projector
+from sonotwin.open_devices import LiveDevices, of_a_laboratory, open_projector
 
 PICTURE, CURVES, STRIPS, SCENE, EXPECTED = "projector.png", "curves.json", "curves.ply", "scene.glb", "expected_cam1.png"
 LIGHT = (60, 220, 120, 255)  # colour of curves in scene.glb
@@ -83,6 +83,11 @@ class Config(Part):
     lines: Lines = Lines()
     show: bool = False
     devices: LiveDevices | None = None
+
+    @field_validator("devices", mode="before")
+    @classmethod
+    def _no_stand_ins(cls, given: Any) -> Any:
+        return of_a_laboratory(given, "without a projector leave devices and show out, and look at expected_cam1.png")
 
     @model_validator(mode="after")
     def _shown_by_a_projector(self) -> "Config":
