@@ -57,7 +57,6 @@ class BrowserView:
 
         free = _free_port(host, port)
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
-        self._beside: viser.GuiImageHandle | None = None  # and beside it
         self._shown: PlacedScan | None = None
         self._picture: Picture | None = None  # of that
         self._masses = tuple(scene.masses)
@@ -85,8 +84,7 @@ class BrowserView:
             self._show_scan(moment.scan, moment.distances)
             if monotonic() - self._written > FIGURES_S:  # figures and picture of one moment
                 self._written = monotonic()
-                self._figures.content = moment_figures.html_of(moment, self._masses)
-                self._show_beside()
+                self._figures.content = moment_figures.html_of(moment, self._masses, self._picture)
         self._server.flush()
 
     def close(self) -> None:
@@ -117,15 +115,6 @@ class BrowserView:
         else:
             self._scan.image = picture
         self._scan.wxyz, self._scan.position = turn_of(scan.world_from_pixel), scan.corners.mean(axis=0) * M
-
-    def _show_beside(self) -> None:
-        """Show the B-scan flat, under the figures."""
-        if self._beside is None:
-            self._beside = None if self._picture is None else self._server.gui.add_image(self._picture, jpeg_quality=QUALITY)
-            return
-        self._beside.visible = self._picture is not None
-        if self._picture is not None:
-            self._beside.image = self._picture
 
 
 def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:

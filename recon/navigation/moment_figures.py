@@ -1,15 +1,22 @@
 """The figures of a moment as HTML for the page: whether the target is tracked, the plane's distance from each mass, what is late.
 
-Each figure has a place of its own, with digits of one width, so that nothing on the page moves while they change.
+Each figure has a place of its own, with digits of one width, so that nothing on the page moves while they change. The B-scan is
+part of the same text: a picture of its own would be loaded later, and stand beside the figures of another moment.
 """
 
+from base64 import b64encode
 from collections.abc import Iterable
 from html import escape
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from recon.navigation.mass_distances import MassDistance
 from recon.navigation.publishing import Moment
 
 NONE = "–"  # in the place of a figure that there is none of
+QUALITY = 85  # of JPEG
 NARROW = "36em"  # of the window, where viser has a sheet below in place of the panel beside
 
 # The last rules are for a small window, of which the sheet would cover half.
@@ -20,6 +27,7 @@ STYLE = f"""<style>
 .figures th {{ text-align: left; font-weight: 600; }}
 .figures td {{ vertical-align: top; overflow-wrap: anywhere; }}
 .figures .number {{ width: 40%; text-align: right; padding-right: 1.2em; white-space: nowrap; overflow-wrap: normal; }}
+.figures img {{ display: block; width: 100%; }}
 .figures .cut td {{ color: rgb(255, 210, 60); }}
 @media (max-width: {NARROW}) {{
   .mantine-Paper-root:has(.figures) {{ max-height: 40% !important; width: 17em !important; }}
@@ -28,8 +36,8 @@ STYLE = f"""<style>
 </style>"""
 
 
-def html_of(moment: Moment, masses: Iterable[str]) -> str:
-    """The figures of a moment; each mass has its row, whether there is a distance or none."""
+def html_of(moment: Moment, masses: Iterable[str], picture: NDArray[np.uint8] | None = None) -> str:
+    """The figures of a moment; each mass has its row, whether there is a distance or none. Under them its B-scan : (h, w, 3)."""
     tracked = "Tracking" if moment.world_from_target is not None else "Not tracking"
     parts = [f"<p><b>{tracked}:</b> {escape(moment.state)}</p>"]
     near = {each.name: each for each in moment.distances}
@@ -38,7 +46,17 @@ def html_of(moment: Moment, masses: Iterable[str]) -> str:
         parts.append(f"<table><tr>{heads}</tr>{''.join(rows)}</table>")
     parts.append(f"<table>{''.join(_row(*row) for row in _states(moment))}</table>")
     parts += [f"<p><b>Device:</b> {escape(trouble)}</p>" for trouble in moment.troubles]
+    if picture is not None:
+        parts.append(_image(picture))
     return f'<div class="figures">{"".join(parts)}</div>'
+
+
+def _image(picture: NDArray[np.uint8]) -> str:
+    """A picture : (h, w, 3) RGB within the text, which is painted with it."""
+    jpeg = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    height, width = picture.shape[:2]
+    source = f"data:image/jpeg;base64,{b64encode(jpeg).decode()}"
+    return f'<img decoding="sync" width="{width}" height="{height}" style="height: auto" src="{source}">'
 
 
 def _states(moment: Moment) -> Iterable[tuple[str, str]]:
