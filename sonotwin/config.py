@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from recon.errors import InputError, one_line, short
 
+OF_ONE_VERB = {"devices/virtual": "record"}  # choices of a group that only this verb takes
 MOST_NAMES = 12  # of keys in a message
 MOST_DIGITS = 1000  # of a number; Hydra's parser can't take more than Python's own limit of some thousands
 Model = TypeVar("Model", bound=BaseModel)
@@ -27,7 +28,7 @@ def folder() -> Path:
 
 
 def groups(verb: str) -> dict[str, list[str]]:
-    """Name the choices of each group that the verb's defaults list uses, such as `{"rig": ["meza2021"]}`."""
+    """Name the choices of each group that the verb's defaults list uses and that it takes, such as `{"rig": ["meza2021"]}`."""
     import yaml
 
     path = folder() / f"{verb}.yaml"
@@ -36,7 +37,8 @@ def groups(verb: str) -> dict[str, list[str]]:
     defaults = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("defaults", [])
     entries = [key for entry in defaults if isinstance(entry, dict) for key in entry]
     names = [re.sub(r"^(override |optional )*/?|@.*$", "", entry) for entry in entries]
-    return {name: sorted(choice.stem for choice in (folder() / name).glob("*.yaml")) for name in names}
+    found = {name: sorted(choice.stem for choice in (folder() / name).glob("*.yaml")) for name in names}
+    return {name: [one for one in given if OF_ONE_VERB.get(f"{name}/{one}", verb) == verb] for name, given in found.items()}
 
 
 def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -89,6 +89,14 @@ class VirtualDevices(Part):
     kind: Literal["virtual"]
     paced: bool = False  # wait where rendering is faster than life
     bits: Literal[8, 10, 12] = 8  # of images of things at rest
+
+
+def of_a_laboratory(given: Any, otherwise: str) -> Any:
+    """Devices as they are given, unless the twin is to stand in for them: then a ValueError says what to do `otherwise`."""
+    if isinstance(given, Mapping) and given.get("kind") == "virtual":
+        expected = "those of a laboratory, as conf/devices/basler.yaml has them"
+        raise ValueError(f"expected {expected}, found virtual, which stands in for them in `record` alone; {otherwise}")
+    return given
 
 
 AnyDevices = Annotated[VirtualDevices | LiveDevices, Field(discriminator="kind")]

@@ -12,11 +12,16 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+import trimesh
 
+from recon.capture import calibration_files
 from recon.capture.manifest import Manifest
+from recon.files import meshes
 from recon.model.boards import Board
+from recon.segmentation import containment
 from sonotwin.cli import VERBS, main
 from sonotwin.config import load
+from twin.optics.surface_session import calibration_of
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
@@ -136,6 +141,26 @@ def test_the_readme_runs(tmp_path, monkeypatch):
     for recipe in recipes:
         assert main([*recipe, *few.get(recipe[0], [])]) == 0, recipe
     assert Path("outputs/sphere/surface/evaluation/metrics.json").is_file()
+
+
+@pytest.mark.slow
+def test_the_tour_of_the_live_rig_runs(tmp_path, monkeypatch, rig):
+    """What the page has a reader run beside `make live`: the twin is recorded, its skin measured, and masses are drawn on it."""
+    monkeypatch.chdir(tmp_path)
+    live = Path("outputs/live")
+    (live / "capture" / "calibration").mkdir(parents=True)
+    calibration_files.write(live / "capture" / "calibration" / "optics.yaml", calibration_of(rig))
+    page = (ROOT / "docs" / "live.md").read_text(encoding="utf-8")
+    recipes = commands(page, fence="```")
+    record, surface, project = [recipe for recipe in recipes if any("outputs/tour" in field for field in recipe)]
+    assert main([*record, "tracing.samples=2"]) == main(surface) == 0
+    (live / "result" / "masses" / "scan").mkdir(parents=True)
+    shutil.copytree("outputs/tour_surface", live / "result" / "surface")
+    skin = containment.read_skin(live / "result" / "surface" / "surface.ply")
+    lump = trimesh.creation.icosphere(3, 6.0).apply_translation(skin.vertices.mean(axis=0)).apply_translation([0, 0, 15.0])
+    meshes.write_ply(live / "result" / "masses" / "scan" / "mass0.ply", lump)
+    assert main(project) == 0
+    assert Path("outputs/tour_light/expected_cam1.png").is_file()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

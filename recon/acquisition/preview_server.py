@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from recon.acquisition.pictures import Over, Picture
 from recon.errors import InputError
+from recon.own_requests import LOOPBACK, is_own
 
-LOOPBACK = "127.0.0.1"
 MOST_SIDE_PX = 640  # of an image on the page
 MOST_VISITORS = 8  # at once
 PATIENCE_S = 5.0  # with a visitor who says nothing
@@ -88,13 +88,13 @@ class _Handler(BaseHTTPRequestHandler):
     """Answers `/`, `/state` and `/DEVICE.jpg`, and nothing else."""
 
     preview: Preview
-    hosts: tuple[str, ...]  # by which the page may be called; another one is a page of somebody else's that looks in here
+    listens: str  # host where the server does
     timeout = PATIENCE_S
 
     def do_GET(self) -> None:
         """Answer a request."""
         path = self.path.partition("?")[0]
-        if self.headers.get("Host", "").rpartition(":")[0] not in self.hosts:
+        if not is_own(self.headers.get_all("Host", []), self.headers.get_all("Origin", []), self.listens):
             self.send_error(HTTPStatus.FORBIDDEN)
         elif path == "/":
             self._send("text/html; charset=utf-8", files("recon.acquisition").joinpath("preview.html").read_bytes())
@@ -152,8 +152,7 @@ def served(preview: Preview, host: str = LOOPBACK, port: int = 0) -> Iterator[st
     InputError
         If the port is taken, or the host isn't this computer's.
     """
-    hosts = ("localhost", LOOPBACK, "[::1]", host)
-    handler = type("Handler", (_Handler,), {"preview": preview, "hosts": hosts})
+    handler = type("Handler", (_Handler,), {"preview": preview, "listens": host})
     try:
         server = _Server((host, port), handler)
     except (OSError, OverflowError) as error:

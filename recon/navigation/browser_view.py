@@ -1,6 +1,5 @@
 """A view in the browser: skin, masses, probe and B-scan in space, with distances, latency and what is wrong, as they come."""
 
-import re
 import socket
 from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
@@ -15,24 +14,28 @@ from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.navigation import moment_figures
 from recon.navigation.mass_distances import MassDistance
 from recon.navigation.own_pages import own_pages_alone
 from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import Moment, StillScene
+from recon.own_requests import LOOPBACK
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-LOOPBACK = "127.0.0.1"
 M = 0.001  # the view is in metres: its nearest and farthest depth suit them
 SKIN, MASS, BODY, INK = (224, 187, 165), (200, 60, 60), (235, 235, 235), (20, 20, 20)
+OUTSIDE, INSIDE = 0.5, 0.1  # opacity of the skin's two sides: where both were alike, a dome would look like a bowl
+AMBIENT, SUN, SUN_STANDS = 0.5, 4.0, (-1.0, -1.2, -0.5)  # light from the viewer's side, low, so that what is bent shows as bent
 OUTLINE = (255, 210, 60)  # of masses that a B-scan cuts, drawn into it
-WORDS_S = 0.1  # between two texts, and pictures beside them: faster ones can't be read
+FONT, NAME_GAP_PX = (cv2.FONT_HERSHEY_SIMPLEX, 0.5), 4  # of the names, and between them and the outlines
+FIGURES_S = 0.1  # between two sets of figures, and pictures under them: faster ones can't be read
+PANEL_PX = 290  # width of the figures, beside the view
 ASIDE = np.array([-0.5, -0.6, -0.7]) / np.sqrt(1.1)  # direction from the scene to the viewer: camera 1's side, from above
 FIELD_RAD, DISTANCE = 0.8, 3.0  # of the view, upright; and from where, as a multiple of the scene's half diagonal
 SPACE_MM = np.array([[-100.0, -100.0, 600.0], [100.0, 100.0, 760.0]])  # that is looked at where there is neither skin nor mass
 QUALITY = 85  # of JPEG
-MARKS = re.compile(r"[^\w\s.,;:+%-]")  # letters that may mean something in Markdown or HTML
 
 
 class BrowserView:
@@ -54,16 +57,19 @@ class BrowserView:
 
         free = _free_port(host, port)
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
-        self._beside: viser.GuiImageHandle | None = None  # and beside it
         self._shown: PlacedScan | None = None
         self._picture: Picture | None = None  # of that
+        self._masses = tuple(scene.masses)
         with ExitStack() as stack:
             with own_pages_alone(host), redirect_stdout(StringIO()):  # it prints, even so
                 self._server = viser.ViserServer(host=host, port=free, label="sonotwin", verbose=False)
                 stack.callback(self.close)
             self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+            self._server.gui.main_panel.dock_right()  # beside the view, where it covers nothing
+            self._server.gui.main_panel.set_width(PANEL_PX)
             self._bodies = _add_scene(self._server, scene)
-            self._words, self._written = self._server.gui.add_markdown("waiting for the first frames"), 0.0
+            self._server.gui.add_html(moment_figures.STYLE)
+            self._figures, self._written = self._server.gui.add_html("waiting for the first frames"), 0.0
             stack.pop_all()  # it is open
 
     @property
@@ -76,10 +82,9 @@ class BrowserView:
         with self._server.atomic():
             self._show_probe(moment.world_from_target)
             self._show_scan(moment.scan, moment.distances)
-        if monotonic() - self._written > WORDS_S:
-            self._written = monotonic()
-            self._words.content = words_of(moment)
-            self._show_beside()
+            if monotonic() - self._written > FIGURES_S:  # figures and picture of one moment
+                self._written = monotonic()
+                self._figures.content = moment_figures.html_of(moment, self._masses, self._picture)
         self._server.flush()
 
     def close(self) -> None:
@@ -111,25 +116,28 @@ class BrowserView:
             self._scan.image = picture
         self._scan.wxyz, self._scan.position = turn_of(scan.world_from_pixel), scan.corners.mean(axis=0) * M
 
-    def _show_beside(self) -> None:
-        """Show the B-scan flat, under the text."""
-        if self._beside is None:
-            self._beside = None if self._picture is None else self._server.gui.add_image(self._picture, jpeg_quality=QUALITY)
-            return
-        self._beside.visible = self._picture is not None
-        if self._picture is not None:
-            self._beside.image = self._picture
-
 
 def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:
-    """A B-scan : (h, w, 3) with the outlines of masses that it cuts."""
+    """A B-scan : (h, w, 3) with the outlines of masses that it cuts, and their names."""
     picture = cv2.cvtColor(scan.image, cv2.COLOR_GRAY2RGB)
     pixel_from_world = np.linalg.inv(scan.world_from_pixel)
     for each in distances:
         if each.in_image:
             pieces = np.rint(rigid.apply(pixel_from_world, each.outline)[..., :2]).astype(np.int32)
             cv2.polylines(picture, list(pieces), False, OUTLINE, 1, cv2.LINE_AA)
+            at = name_place(each.name, pieces.reshape(-1, 2), scan.image.shape)
+            for colour, thickness in ((INK, 3), (OUTLINE, 1)):
+                cv2.putText(picture, each.name, at, *FONT, colour, thickness, cv2.LINE_AA)
     return picture
+
+
+def name_place(name: str, outline: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[int, int]:
+    """Lower left corner of a name in a picture of a shape (h, w): over the outline : (n, 2) px, else under it, else within."""
+    (width, height), below = cv2.getTextSize(name, *FONT, 1)
+    (left, top), (right, bottom) = outline.min(axis=0), outline.max(axis=0)
+    over, under = int(top) - NAME_GAP_PX - below, int(bottom) + NAME_GAP_PX + height
+    row = over if over >= height else under if under + below <= shape[0] else int(top + bottom + height) // 2
+    return max(0, min(int(left + right - width) // 2, shape[1] - width)), row
 
 
 def turn_of(to_from: Array) -> Array:
@@ -138,48 +146,24 @@ def turn_of(to_from: Array) -> Array:
     return np.roll(Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)])).as_quat(), 1)
 
 
-def words_of(moment: Moment) -> str:
-    """The text of a moment, as Markdown."""
-    lines = [f"**{'Tracking' if moment.world_from_target is not None else 'Not tracking'}:** {plain(moment.state)}"]
-    lines += [f"**Device:** {plain(trouble)}" for trouble in moment.troubles]
-    if moment.latency is not None:
-        late = moment.latency
-        lines.append(f"**From exposure to published pose:** {late.median_ms:.0f} ms, 99 % below {late.high_ms:.0f} ms")
-        lines.append(f"**Poses:** {late.rate_hz:.0f} a second")
-    lines.append("**B-scan:** in place" if moment.scan is not None else "**B-scan:** none in place")
-    if moment.distances:
-        rows = [
-            f"| {plain(each.name)} | {each.distance_mm:.1f} | {_where(each.cut, each.in_image)} |" for each in moment.distances
-        ]
-        lines.append("\n".join(["| mass | plane, mm | |", "|---|---:|---|", *rows]))
-    return "\n\n".join(lines)
-
-
-def plain(text: str) -> str:
-    """A text as Markdown that shows it letter by letter: names may come from the network, and the page renders HTML."""
-    return MARKS.sub(lambda mark: f"&#{ord(mark[0])};", text)
-
-
-def _where(cut: bool, in_image: bool) -> str:
-    if not cut:
-        return ""
-    return "cut, in the image" if in_image else "cut beside the image"
-
-
 def _add_scene(server, scene: StillScene):
     """Add what stands still; returns the handle of the probe, which moves."""
-    for name, mesh, colour, opacity in (
-        ("skin", scene.skin, SKIN, 0.35),
-        *((f"masses/{name}", mesh, MASS, None) for name, mesh in scene.masses.items()),
-    ):
-        if mesh is not None:
-            _add_mesh(server, f"/{name}", mesh, colour, opacity)
+    if scene.skin is not None:
+        _add_mesh(server, "/skin", scene.skin, SKIN, "front", OUTSIDE)
+        _add_mesh(server, "/skin/inside", scene.skin, SKIN, "back", INSIDE)
+    for name, mesh in scene.masses.items():
+        _add_mesh(server, f"/masses/{name}", mesh, MASS)
+        top = np.array([mesh.bounds[:, 0].mean(), mesh.bounds[0, 1], mesh.bounds[:, 2].mean()])  # y of the world is down
+        server.scene.add_label(f"/names/{name}", name, position=top * M, anchor="bottom-center", font_screen_scale=0.8)
     handle = server.scene.add_frame("/probe", show_axes=False, visible=False)
     for name, mesh, colour in (("body", scene.probe, BODY), ("circles", scene.circles, INK)):
         if mesh is not None:
-            _add_mesh(server, f"/probe/{name}", mesh, colour, None)
+            _add_mesh(server, f"/probe/{name}", mesh, colour)
     server.scene.set_up_direction((0.0, -1.0, 0.0))
-    server.scene.add_light_ambient("/light", intensity=0.8)
+    server.scene.configure_default_lights(False)
+    server.scene.configure_environment_map(None)
+    server.scene.add_light_ambient("/light", intensity=AMBIENT)
+    server.scene.add_light_directional("/sun", intensity=SUN, position=SUN_STANDS)
     middle, radius = _looked_at(scene)
     server.initial_camera.position = (middle + DISTANCE * radius * ASIDE) * M
     server.initial_camera.look_at = middle * M
@@ -188,10 +172,12 @@ def _add_scene(server, scene: StillScene):
     return handle
 
 
-def _add_mesh(server, name: str, mesh: trimesh.Trimesh, colour: tuple[int, int, int], opacity: float | None) -> None:
+def _add_mesh(
+    server, name: str, mesh: trimesh.Trimesh, colour: tuple[int, int, int], side: str = "double", opacity: float | None = None
+) -> None:
     vertices = np.asarray(mesh.vertices) * M
     server.scene.add_mesh_simple(
-        name, vertices, np.asarray(mesh.faces), color=colour, opacity=opacity, side="double", cast_shadow=False
+        name, vertices, np.asarray(mesh.faces), color=colour, opacity=opacity, side=side, cast_shadow=False
     )
 
 

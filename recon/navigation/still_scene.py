@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import trimesh
 
 from recon.fusion import fused_scene, probe_shape, skin
@@ -11,6 +12,7 @@ from recon.navigation.publishing import StillScene
 from recon.segmentation import containment, mass_files
 
 STEP_MM = 2.0  # of the skin's vertices, which are merged to that: 20 000 triangles of a breast
+LEAST_SIDED = 0.01  # of a skin's area, by which more of it looks away than towards camera 1, to be turned
 
 
 def read_scene(
@@ -43,4 +45,18 @@ def read_scene(
 def _coarse(path: Path, part_table: bool) -> trimesh.Trimesh:
     whole = containment.read_skin(path)
     parted = skin.by_plane(whole).skin if part_table else whole
-    return fused_scene.merged(whole if parted is None else parted, STEP_MM)
+    return outside_out(fused_scene.merged(whole if parted is None else parted, STEP_MM))
+
+
+def outside_out(skin: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A skin whose triangles have their front outside, towards camera 1; other programs may wind them otherwise.
+
+    A closed skin, whose sides look everywhere alike, is left as it is.
+    """
+    areas = np.asarray(skin.area_faces)
+    away = areas @ np.asarray(skin.face_normals) @ (skin.centroid / np.linalg.norm(skin.centroid))
+    if away <= LEAST_SIDED * areas.sum():
+        return skin
+    turned = skin.copy()
+    turned.invert()
+    return turned

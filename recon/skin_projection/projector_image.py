@@ -44,10 +44,11 @@ class Lines:
     mass: Line = Line(1.0)
     cut: Line = Line(1.0, 1.0, (4.0, 2.0))
     scan: Line = Line(0.7, 0.7)
+    name: Line = Line(0.5)
 
     def of(self, curve: SkinCurve) -> Line:
         """That of a curve."""
-        return {"mass": self.mass, "cut": self.cut, "scan": self.scan}[curve.kind]
+        return {"mass": self.mass, "cut": self.cut, "scan": self.scan, "name": self.name}[curve.kind]
 
 
 USUAL = Lines()

@@ -11,7 +11,7 @@ from recon.skin_projection import skin_gaps
 from recon.skin_projection.lines_of_sight import NOWHERE, Sight, first_hits
 
 Array = NDArray[np.float64]
-Kind = Literal["mass", "cut", "scan"]
+Kind = Literal["mass", "cut", "scan", "name"]
 
 STEP_MM = 0.3  # between points of a curve: a chord leaves a circle of 5 mm by 0.002 mm
 

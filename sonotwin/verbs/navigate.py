@@ -14,16 +14,16 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Annotated, Literal, NamedTuple, cast
+from typing import Annotated, Any, Literal, NamedTuple, cast
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from recon.capture import calibration_files, manifest, probe_files
 from recon.capture.manifest import CAMERAS, SCANNER
 from recon.devices import playback
 from recon.devices.device_clocks import ClockFollower, follow
-from recon.devices.interfaces import Camera, Size
+from recon.devices.interfaces import Camera, DeviceError, Size
 from recon.devices.openigtlink.igtl_server import PORT, Server
 from recon.devices.playback import PlayedCamera, PlayedScanner
 from recon.errors import InputError
@@ -40,7 +40,7 @@ from recon.navigation.publishing import Publisher, StillScene
 from recon.navigation.slicer_publisher import SlicerPublisher
 from recon.probe_calibration import sound_in_water
 from recon.tracking.tracker import Tracker
-from sonotwin.open_devices import Host, LiveDevices, open_camera, open_scanner
+from sonotwin.open_devices import Host, LiveDevices, of_a_laboratory, open_camera, open_scanner
 from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
 
 LOOK_S = 0.2  # between two looks whether all goes on
@@ -58,7 +58,7 @@ class Igtl(Part):
 
     serve: bool = True
     host: Host = LOOPBACK
-    port: Annotated[int, Field(ge=1, le=65535)] = PORT
+    port: Annotated[int, Field(ge=0, le=65535)] = PORT
 
 
 class Config(MeasuredTargetFields):
@@ -81,6 +81,11 @@ class Config(MeasuredTargetFields):
     view: View = View()
     igtl: Igtl = Igtl()
     seconds: Annotated[float, Field(gt=0)] | None = None
+
+    @field_validator("devices", mode="before")
+    @classmethod
+    def _no_stand_ins(cls, given: Any) -> Any:
+        return of_a_laboratory(given, "a recorded or rendered sweep is played back by capture=FOLDER")
 
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
@@ -134,14 +139,25 @@ def publishers_of(config: Config, scene: StillScene, console: Console) -> list[P
     """Open the page and the OpenIGTLink server; if a port is taken, none of them stays open."""
     with ExitStack() as stack:
         slicer: list[Publisher] = []
+        told: list[str] = []
         if config.igtl.serve:
-            server = Server(config.igtl.host, config.igtl.port)
+            server = opened_server(config.igtl)
             stack.callback(server.close)
+            told.append(f"OpenIGTLink {config.igtl.host}:{server.port}")
             slicer = [SlicerPublisher(scene, IgtlSender(server))]
         view = BrowserView(scene, config.view.port, config.view.host)  # last, as it would print at the end of a refused run
-        console.print(f"view        {view.address}", markup=False)
+        for line in (f"view        {view.address}", *told):
+            console.print(line, markup=False)
         stack.pop_all()  # they are the navigator's now
         return [view, *slicer]
+
+
+def opened_server(chosen: Igtl) -> Server:
+    """Open the OpenIGTLink server; DeviceError if it can't listen there."""
+    try:
+        return Server(chosen.host, chosen.port)
+    except DeviceError as error:
+        raise DeviceError(f"{error}; give another igtl.port, of which 0 is any that is free, or another igtl.host") from None
 
 
 def tell(navigator: Navigator, console: Console) -> None:

@@ -2,10 +2,10 @@
 
 Reads the skin as it lies now (`sonotwin surface`), masses of `sonotwin segment`, a cut drawn in 3D Slicer (.mrk.json), and a
 capture's sweep with poses, as far as each is given. The outline of a mass is where the lines that touch it come through the skin:
-parallel lines along the skin's normal over it, or those of the surgeon's eye (`eye_mm`). Where the body has moved since, give the
-skin of that time as `earlier_skin`, and masses and cut move along. Writes into `out`: projector.png, to be shown pixel by pixel;
-curves.json (mm) and curves.ply, the curves on the skin; scene.glb with skin, masses and curves; expected_cam1.png, what camera 1
-should see of it; and metrics.json. Takes some seconds, less than one of them to draw.
+parallel lines along the skin's normal over it, or those of the surgeon's eye (`eye_mm`); its name stands beside it. Where the
+body has moved since, give the skin of that time as `earlier_skin`, and masses and cut move along. Writes into `out`:
+projector.png, to be shown pixel by pixel; curves.json (mm) and curves.ply, the curves on the skin; scene.glb with skin, masses
+and curves; expected_cam1.png, what camera 1 should see of it; and metrics.json. Takes some seconds, about one of them to draw.
 
 With `show=true` and a laboratory's `devices` the projector, a second display, then shows the picture until Ctrl-C.
 
@@ -18,13 +18,13 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated, NamedTuple, NoReturn
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from recon.capture import calibration_files, sweep_part
@@ -44,6 +44,7 @@ from recon.skin_projection import (
     curve_files,
     expected_view,
     mass_outline,
+    outline_names,
     planned_cut,
     probe_shadow,
     projector_image,
@@ -53,7 +54,7 @@ from recon.skin_projection import (
 from recon.skin_projection.projector_image import Drawing, Lines, lit_share
 from recon.skin_projection.skin_curve import SkinCurve
 from recon.skin_projection.skin_registration import SkinShift
-from sonotwin.open_devices import LiveDevices, open_projector
+from sonotwin.open_devices import LiveDevices, of_a_laboratory, open_projector
 
 PICTURE, CURVES, STRIPS, SCENE, EXPECTED = "projector.png", "curves.json", "curves.ply", "scene.glb", "expected_cam1.png"
 LIGHT = (60, 220, 120, 255)  # colour of curves in scene.glb
@@ -80,9 +81,15 @@ class Config(Part):
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
     margin_mm: NotNegative = probe_shadow.MARGIN_MM
+    names_mm: Annotated[float, Field(ge=0, le=50)] = 5.0
     lines: Lines = Lines()
     show: bool = False
     devices: LiveDevices | None = None
+
+    @field_validator("devices", mode="before")
+    @classmethod
+    def _no_stand_ins(cls, given: Any) -> Any:
+        return of_a_laboratory(given, "without a projector leave devices and show out, and look at expected_cam1.png")
 
     @model_validator(mode="after")
     def _shown_by_a_projector(self) -> "Config":
@@ -145,7 +152,8 @@ def draw(config: Config, console: Console) -> NDArray[np.uint8]:
     if not curves:
         raise InputError(f"{config.masses}: expected masses to draw, found none in it; give a cut or a capture, too")
     dark = None if held is None else probe_shadow.shadow(held.body, cameras["projector"], config.margin_mm)
-    drawing = projector_image.draw(curves, skin, cameras["projector"], config.rig.projector.gamma, config.lines, dark)
+    names = named(config, curves, masses, skin, cameras["projector"], dark)
+    drawing = projector_image.draw([*curves, *names], skin, cameras["projector"], config.rig.projector.gamma, config.lines, dark)
     seconds = round(time.perf_counter() - start, 3)
     if not drawing.image.any():
         found = "none: is the calibration that of this rig, and the probe not before all of it?"
@@ -153,7 +161,7 @@ def draw(config: Config, console: Console) -> NDArray[np.uint8]:
 
     figures = measure(curves, drawing, masses, shift) | {"seconds_drawing": seconds}
     with console.status("writing"), atomic.new_folder(config.out, PICTURE) as folder:
-        written = write(folder, curves, drawing, skin, masses, cameras, config.lines)
+        written = write(folder, curves, names, drawing, skin, masses, cameras, config.lines)
         metrics.write(folder / metrics.FILE, figures)
     for line in described(curves, drawing, masses, shift):
         console.print(line, markup=False)
@@ -215,6 +223,22 @@ def read_probe(config: Config, skin: trimesh.Trimesh) -> Held:
     return Held(line, body.apply_transform(sweep.poses(config.lag_s)[config.scan]))
 
 
+def named(
+    config: Config,
+    curves: Sequence[SkinCurve],
+    masses: Mapping[str, trimesh.Trimesh],
+    skin: trimesh.Trimesh,
+    projector: Camera,
+    dark: NDArray[np.bool_] | None,
+) -> list[SkinCurve]:
+    """The masses' names beside their outlines, where there is room for them."""
+
+    def reached(name: SkinCurve) -> bool:
+        return lit_share(name, projector_image.in_sight([name], skin, projector, dark)) == 1
+
+    return outline_names.beside(curves, masses, skin, config.eye_mm, config.names_mm, reached) if config.names_mm else []
+
+
 def measure(
     curves: Sequence[SkinCurve], drawing: Drawing, masses: Mapping[str, trimesh.Trimesh], shift: SkinShift | None
 ) -> Metrics:
@@ -262,6 +286,7 @@ def described(
 def write(
     folder: Path,
     curves: Sequence[SkinCurve],
+    names: Sequence[SkinCurve],
     drawing: Drawing,
     skin: trimesh.Trimesh,
     masses: Mapping[str, trimesh.Trimesh],
@@ -271,13 +296,14 @@ def write(
     """Write all files but the figures; returns their names."""
     pictures = {PICTURE: drawing.image}
     if "cam1" in cameras:
-        pictures[EXPECTED] = expected_view.expected(curves, drawing.lit, skin, cameras["cam1"], lines)
+        pictures[EXPECTED] = expected_view.expected([*curves, *names], drawing.lit, skin, cameras["cam1"], lines)
     for name, image in pictures.items():
         (folder / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
     curve_files.write_json(folder / CURVES, curves)
     curve_files.write_ply(folder / STRIPS, curves, lines)
     shown = {"skin": fused_scene.surface_layer(skin, fused_scene.SKIN, fused_scene.GREY_SKIN)}
     shown |= {name: layers.painted(mass, fused_scene.MASS) for name, mass in masses.items()}
-    shown |= {f"{name}_light": layers.painted(strip, LIGHT) for name, strip in curve_files.strips(curves, lines).items()}
+    strips = curve_files.strips([*curves, *names], lines)
+    shown |= {f"{name}_light": layers.painted(strip, LIGHT) for name, strip in strips.items()}
     layers.write_layers(folder / SCENE, shown)
     return [*pictures, CURVES, STRIPS, SCENE]

@@ -30,7 +30,7 @@ from twin.filmed_sweep import PlannedSweep, SweepSettings, plan_sweep
 from twin.session import Session
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import Scan
-from twin.ultrasound.probe_path import WirePath
+from twin.ultrasound.probe_path import Bob, SurfacePath, WirePath
 
 if TYPE_CHECKING:
     from twin.tracking.rendered_views import Frames
@@ -62,7 +62,7 @@ def run(config: Config) -> None:
         planned = plan_sweep(config)
         film = filming(planned, console) if config.filmed else None
     count, moments = len(planned.plan.times), len(planned.plan.track.times)
-    console.print(f"path        {config.path.kind}, {count} B-scans, {moments} {'pairs of frames' if film else 'poses'}")
+    console.print(f"path        {led_along(config.path)}, {count} B-scans, {moments} {'pairs of frames' if film else 'poses'}")
     probe = None if isinstance(config.path, WirePath) else sweep_session.calibration_of(config.rig, config.ultrasound)
     start = perf_counter()
     sweep_session.write_session(
@@ -90,3 +90,10 @@ def shown(planned: PlannedSweep, console: Console) -> Iterator[Scan]:
     """Take the images, in order, and show how far it is."""
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         yield from progress.track(planned.scans(), total=len(planned.plan.times), description="rendering B-scans")
+
+
+def led_along(path: SurfacePath | Bob | WirePath) -> str:
+    """How the probe is led, for the console; a raster is several strokes."""
+    if isinstance(path, SurfacePath):
+        return f"{path.strokes} strokes side by side" if path.strokes > 1 else "1 stroke"
+    return path.kind

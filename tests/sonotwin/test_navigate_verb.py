@@ -1,6 +1,8 @@
 """`sonotwin navigate`, from a drawn recording to a view, with stand-ins for the networks."""
 
+import re
 import socket
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ from rich.console import Console
 from recon.capture.manifest import CAMERAS, SCANNER, Device
 from recon.capture.writer import new_capture
 from recon.devices.interfaces import DeviceError
+from recon.errors import InputError
 from recon.files import meshes
 from recon.navigation.browser_view import LOOPBACK, BrowserView
 from recon.navigation.publishing import StillScene
@@ -65,6 +68,16 @@ def composed(*fields: str) -> navigate.Config:
     return config.load("navigate", list(fields), navigate.Config)
 
 
+@pytest.mark.parametrize(("verb", "given"), [("navigate", []), ("project", ["skin=a.ply", "calibration=b.yaml", "out=c"])])
+def test_the_devices_that_are_offered_are_taken(verb, given):
+    """And the twin's, which aren't, are refused by a line that says what to do without any."""
+    model = import_module(f"sonotwin.verbs.{verb}").Config
+    offered = config.groups(verb)["devices"]
+    assert "basler" in offered and all(config.load(verb, [*given, f"devices={name}"], model).devices for name in offered)
+    with pytest.raises(InputError, match=f"{verb}: devices: expected those of a laboratory, .* found virtual, .*; "):
+        config.load(verb, [*given, "devices=virtual"], model)
+
+
 def test_a_taken_port_of_openigtlink_leaves_no_page_open():
     port = free_port()
     with socket.create_server((LOOPBACK, 0)) as other:
@@ -106,14 +119,15 @@ def test_a_recording_is_navigated(recorded, moments, tmp_path, capsys):
         f"masses={masses}",
         f"lag_s={LAG_S}",
         f"view.port={port}",
-        f"igtl.port={free_port()}",
+        "igtl.port=0",
         "seconds=6",
         "speed=0.5",
     ]
     assert main(["navigate", f"capture={recorded}", *fields]) == 0
     told = capsys.readouterr().out.splitlines()
     assert told[0] == f"view        http://127.0.0.1:{port}"
-    assert told[1].startswith("browser     ") and "poses a second" in told[1]
+    assert re.fullmatch(r"OpenIGTLink 127\.0\.0\.1:\d+", told[1]) and int(told[1].rpartition(":")[2]) > 0
+    assert told[2].startswith("browser     ") and "poses a second" in told[2]
     found = [moment.world_from_target for moment in moments if moment.world_from_target is not None]
     known = films.places(COUNT)[:, :3, 3]
     assert len(found) > 5
@@ -141,4 +155,5 @@ def test_what_is_wrong_is_said_in_one_line(recorded, moments, tmp_path, capsys):
         refused = f"view: expected to listen on 127.0.0.1:{port}, found it refused"
         assert complaint(f"view.port={port}", "igtl.serve=false").startswith(refused)
         refused = f"OpenIGTLink server 127.0.0.1:{port}: expected a free port"
-        assert complaint("view.port=0", f"igtl.port={port}").startswith(refused)
+        said = complaint("view.port=0", f"igtl.port={port}")
+        assert said.startswith(refused) and "give another igtl.port" in said

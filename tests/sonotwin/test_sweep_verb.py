@@ -13,7 +13,9 @@ from recon.files import volumes
 from recon.geometry import rigid
 from recon.model.patterns import CentreLine, Fringes, Patterns
 from scenes.scene_types import Scene
+from sonotwin import config
 from sonotwin.cli import main
+from sonotwin.verbs.sweep import Config, led_along
 from twin.evaluation import track_errors
 from twin.session import Session, describe
 
@@ -48,6 +50,13 @@ def test_the_capture_is_one_of_a_calibrated_rig(stroke, rig):
     found = sweep.poses(lag_s=0.05) @ sweep.probe.target_from_image
     apart = np.linalg.norm(found[:, :3, 3] - truth["world_from_image"][:, :3, 3], axis=1)
     assert 0.005 < np.nanmax(apart) < 1.0, "0.05 deg over 91 mm are 0.08 mm an axis; five times that, and the shift"
+
+
+@pytest.mark.parametrize(
+    ("choice", "said"), [("stroke", "1 stroke"), ("raster", "2 strokes side by side"), ("bob", "bob"), ("wire", "wire")]
+)
+def test_the_path_that_was_chosen_is_said(choice, said):
+    assert led_along(config.load("sweep", [f"path={choice}", "out=x"], Config).path) == said
 
 
 def test_labels_say_what_the_pixels_show(stroke):

@@ -235,11 +235,7 @@ def _listener(host: str, port: int) -> socket.socket:
         listener = socket.create_server((host, checked_port(port, least=0)))
     except (OSError, UnicodeError) as error:  # the second of a host's name that is none
         used = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
-        found = (
-            "one that another server uses, such as PlusServer; give another port, as igtl.port of navigate"
-            if used
-            else reason(error)
-        )
+        found = "one that another server uses, such as PlusServer" if used else reason(error)
         raise DeviceError(f"OpenIGTLink server {host}:{port}: expected a free port of this computer, found {found}") from None
     listener.settimeout(LOOK_S)
     if not listener.getsockname()[0].startswith("127."):

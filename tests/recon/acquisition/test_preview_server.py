@@ -72,9 +72,10 @@ def test_cameras_stand_side_by_side(tmp_path):
 
 
 def test_pages_of_others_see_nothing():
-    """A page in the same browser that calls this one by a name of its own."""
+    """A page in the same browser that calls this one by a name of its own, or by this one's name from elsewhere."""
     with served(Preview()) as address:
         assert answer(address, "/state", Host="evil.example:80")[0] == 403
+        assert answer(address, "/state", Origin="https://evil.example")[0] == 403
         assert answer(address, "/state", Host="localhost:80")[0] == 200
 
 

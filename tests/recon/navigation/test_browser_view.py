@@ -1,6 +1,7 @@
 """The view: what it says of a moment, and a page that opens and shows the B-scan where it is."""
 
 import socket
+from time import sleep
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ pytest.importorskip("viser")
 BALL = trimesh.creation.icosphere(3, 60.0).apply_translation([0, 0, 700])
 POSE = rigid.transform(np.eye(3), [0, 0, 640])
 SHAPE, MM_PER_PX = (120, 80), 0.5
+CANVAS = "[...document.querySelectorAll('canvas')].map(each => each.getBoundingClientRect()).sort((a, b) => b.width - a.width)[0]"
 
 
 def free_port():
@@ -34,28 +36,6 @@ def free_port():
 def scan_of(image, world_from_pixel=None):
     placed = np.diag([MM_PER_PX, MM_PER_PX, MM_PER_PX, 1]) if world_from_pixel is None else world_from_pixel
     return PlacedScan(image, 1, 10**9, placed)
-
-
-def test_a_moment_in_words():
-    near = (
-        MassDistance("mass0", -1.26, 0.5, np.zeros((1, 2, 3)), True),
-        MassDistance("mass1", -3.0, 0.5, np.zeros((1, 2, 3)), False),
-        MassDistance("mass2", 12.34, -20, np.empty((0, 2, 3)), False),
-    )
-    scan = scan_of(np.zeros(SHAPE, np.uint8))
-    words = browser_view.words_of(Moment(4, 0, POSE, "target predicted", scan, near, ("us: silent",), Latency(31.4, 58.0, 24.9)))
-    for line in (
-        "**Tracking:** target predicted",
-        "**Device:** us: silent",
-        "**From exposure to published pose:** 31 ms, 99 % below 58 ms",
-        "| mass0 | -1.3 | cut, in the image |",
-        "| mass1 | -3.0 | cut beside the image |",
-        "| mass2 | 12.3 |  |",
-    ):
-        assert line in words.splitlines()
-    lost = browser_view.words_of(Moment(5, 0, None, "target not found: camera 1: 2 of 3 circles"))
-    assert lost.splitlines()[0] == "**Not tracking:** target not found: camera 1: 2 of 3 circles"
-    assert "**B-scan:** none in place" in lost
 
 
 def test_directions_become_a_quaternion(rng):
@@ -70,11 +50,27 @@ def test_a_mass_is_outlined_where_the_plane_cuts_it():
     """A ball about the image's pixel (30, 70), of 20 px."""
     ball = trimesh.creation.icosphere(4, 20 * MM_PER_PX).apply_translation([30 * MM_PER_PX, 70 * MM_PER_PX, 0.1])
     scan = scan_of(np.full(SHAPE, 90, np.uint8))
-    picture = browser_view.outlined(scan, distances(bodies_of({"ball": ball}), scan))
+    picture = browser_view.outlined(scan, distances(bodies_of({"": ball}), scan))  # no name, as that is drawn, too
     v, u = np.nonzero((picture != 90).any(axis=-1))
     away = np.hypot(u - 30, v - 70)
     assert len(u) > 100 and (np.abs(away - 20) < 2.5).all()
     assert (scan.image == 90).all(), "drawn into a copy"
+
+
+@pytest.mark.parametrize("middle", [(40, 60), (2, 60), (40, 8), (40, 112), (78, 118)])
+@pytest.mark.parametrize("half", [6, 12])
+def test_a_masss_name_stands_beside_its_outline(middle, half):
+    """Whole within the picture, and not over the outline, wherever that is."""
+    outline = np.array(middle) + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    left, row = browser_view.name_place("mass0", outline.astype(np.int32), SHAPE)
+    (width, height), below = cv2.getTextSize("mass0", *browser_view.FONT, 1)
+    assert 0 <= left <= SHAPE[1] - width and height <= row <= SHAPE[0] - below
+    assert row + below < outline[:, 1].min() or row - height > outline[:, 1].max()
+
+
+def test_of_a_mass_as_tall_as_the_picture_the_name_stands_within():
+    outline = np.array([[5, 1], [75, 1], [75, 118], [5, 118]], np.int32)
+    assert browser_view.name_place("m", outline, SHAPE)[1] == pytest.approx(SHAPE[0] / 2, abs=8)
 
 
 def test_a_taken_port_is_refused_in_one_line():
@@ -111,6 +107,39 @@ def reached(address, port):
         return client.connect_ex((address, port)) == 0
 
 
+SHOWN = """(async () => {
+  const image = document.querySelector('.figures img'), figure = document.querySelector('.figures .cut .number');
+  if (!image || !figure) return null;
+  const canvas = Object.assign(document.createElement('canvas'), {width: 1, height: 1});
+  const drawn = canvas.getContext('2d');
+  if (image.complete) drawn.drawImage(image, 0, 0, 1, 1);
+  const [grey, , , alpha] = drawn.getImageData(0, 0, 1, 1).data;
+  return figure.innerText + ' ' + grey + ' ' + alpha;
+})()"""
+
+
+@pytest.mark.slow
+def test_figures_and_picture_are_of_one_moment(tmp_path):
+    """Whenever one looks: each moment has its own grey, and the same distance; and there is always a picture."""
+    view, seen = BrowserView(StillScene(np.eye(4), masses={"ball": BALL}), 0), []
+
+    def publish(k):
+        near = MassDistance("ball", -float(1 + k % 20), 0.0, np.empty((0, 2, 3)), False)
+        view.publish(Moment(k, 0, POSE, "target predicted", scan_of(np.full(SHAPE, 10 * (1 + k % 20), np.uint8)), (near,)))
+
+    try:
+        with headless_browser.opened(view.address, tmp_path / "profile") as page:
+            for k in range(80):
+                publish(k)
+                sleep(0.05)
+                if (shown := page.run(SHOWN)) is not None:
+                    seen.append(shown.replace("\u2212", "").split())
+    finally:
+        view.close()
+    assert len({figure for figure, _, _ in seen}) > 5, "it goes on"
+    assert all(alpha == "255" and abs(float(figure) - int(grey) / 10) < 0.4 for figure, grey, alpha in seen)
+
+
 @pytest.mark.slow
 def test_the_page_shows_the_b_scan_in_place(tmp_path):
     """One corner of the image is white: on the page it is where a camera of the view's own place and field sees that corner."""
@@ -121,7 +150,8 @@ def test_the_page_shows_the_b_scan_in_place(tmp_path):
     half = MM_PER_PX * (np.array(SHAPE[::-1]) - 1) / 2
     placed = rigid.transform(turn, middle - turn[:, :2] @ half) @ np.diag([MM_PER_PX, MM_PER_PX, MM_PER_PX, 1])
     view = BrowserView(StillScene(np.eye(4), masses={"mass0": BALL}), free_port())
-    view._server.scene.remove_by_name("/masses/mass0")  # it only sets where one looks from
+    for name in ("/masses/mass0", "/names/mass0"):  # it only sets where one looks from
+        view._server.scene.remove_by_name(name)
     try:
         with headless_browser.opened(view.address, tmp_path / "profile") as page:
             page.until(lambda page: "waiting for the first frames" in (page.run("document.body.innerText") or ""))
@@ -130,14 +160,15 @@ def test_the_page_shows_the_b_scan_in_place(tmp_path):
             shot = page.until(seen)
             cv2.imwrite(str(tmp_path / "page.png"), shot)
             height, width = shot.shape[:2]
-            drawn = page.run("[...document.querySelectorAll('canvas')].map(each => each.width + ' ' + each.height).join()")
+            free = page.run(f"{CANVAS}.width + ' ' + {CANVAS}.height")
             assert page.complaints == []
             assert all(address.startswith(view.address) for address in page.fetched), "a hospital's PC may have no network"
     finally:
         view.close()
-    assert f"{width} {height}" in drawn.split(",")
+    free_width, free_height = (float(number) for number in free.split())
+    assert free_height == height and width / 2 < free_width < width - browser_view.PANEL_PX / 2, "it ends at the figures"
     corner = placed[:3, :3] @ [12, 12, 0] + placed[:3, 3]
-    expected = on_screen(corner, middle, np.linalg.norm(np.ptp(BALL.bounds, axis=0)) / 2, (width, height))
+    expected = on_screen(corner, middle, np.linalg.norm(np.ptp(BALL.bounds, axis=0)) / 2, (free_width, height))
     v, u = np.nonzero(white_of_scene(shot))
     assert np.hypot(u.mean() - expected[0], v.mean() - expected[1]) < 6
 
@@ -169,8 +200,3 @@ def seen(page):
     """A picture with the white corner in it, or None."""
     shot = page.picture()
     return shot if white_of_scene(shot).sum() > 200 else None
-
-
-def test_names_from_the_network_are_no_html():
-    words = browser_view.words_of(Moment(5, 0, None, "no frames", troubles=("us: found <img src=x onerror=alert(1)> | [a](b)",)))
-    assert not set("<>|[]()=") & set(words)

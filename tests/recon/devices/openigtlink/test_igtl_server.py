@@ -203,7 +203,7 @@ def test_clients_beyond_the_bound_are_refused(server, monkeypatch):
 
 
 def test_a_used_port_is_named(server):
-    with pytest.raises(DeviceError, match=f"127.0.0.1:{server.port}: expected a free port .* give another port"):
+    with pytest.raises(DeviceError, match=f"127.0.0.1:{server.port}: expected a free port .* such as PlusServer"):
         Server(port=server.port)
 
 
