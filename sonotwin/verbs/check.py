@@ -155,10 +155,11 @@ def filmed(
     film = stereo_frames.read_film(config.capture, config.calibration, name)
     wide = config.model_copy(update={"drift_px": SEARCH_PX})
     tracker = make_tracker(wide, target, film.cameras, film.optics, film.bits)
-    seen, _ = collect(film, tracker, console)
+    seen, faults = collect(film, tracker, console)
     poses = target_poses.spread(target_poses.distinct(seen), config.most_poses)
     if len(poses) < LEAST_POSES:
-        found = f"{len(poses)} in {len(film.times)} pairs: move it about, uncovered and well lit"
+        others = "".join(f", {count} {fault}" for fault, count in faults.most_common())
+        found = f"{len(poses)} in {len(film.times)} pairs{others}: move it about, clean, uncovered and well lit"
         raise InputError(f"{film.name}: expected {LEAST_POSES} poses in which both cameras see all circles whole, found {found}")
     tilt, reach = target_poses.tilt_deg(poses), target_poses.range_mm(poses)
     console.print(

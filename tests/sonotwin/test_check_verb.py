@@ -77,14 +77,8 @@ def test_a_clock_that_is_off_is_told_and_logged(bottom, tmp_path, capsys, lag, s
 
 
 SEED = 21  # of calibration, drift, prints, hand and light: nothing was tried on it
-RENDERED = [
-    "cameras=[cam1,cam2]",
-    "scene=breast",
-    "patterns=paper_calibration",
-    "conditions=lifelike",
-    "tracing.samples=8",
-    f"seed={SEED}",
-]
+LIFE = ["conditions=lifelike", f"seed={SEED}"]
+RENDERED = ["cameras=[cam1,cam2]", "scene=breast", "patterns=paper_calibration", "tracing.samples=8", *LIFE]
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +86,7 @@ def drifted(rig, tmp_path_factory):
     """A folder with a calibration that errs as it says, and a film of the target by cameras that have drifted since."""
     folder = tmp_path_factory.mktemp("drifted")
     calibration_files.write(folder / "optics.yaml", calibrated_optics(rig, IDEAL, Noise(), Poses(), SEED))
-    led = ["frames=30", "path.turn_deg=20", "white_dn=120", "conditions=lifelike", f"seed={SEED}"]
-    assert main(["film", f"out={folder}", *led]) == 0
+    assert main(["film", f"out={folder}", "frames=30", "path.turn_deg=20", "white_dn=120", *LIFE]) == 0
     return folder
 
 

@@ -104,11 +104,9 @@ def _rows(counted: Rates, words: str) -> Iterator[Row]:
 
 
 def _warm_rows(counted: Rates) -> Iterator[Row]:
-    text = (
-        f"projector shifted by {SHIFT_MM} mm any way, devices warm, drift of {WARM_PX} px, {counted.rigs} rigs: found and named"
-    )
+    text = f"projector shifted by {SHIFT_MM} mm any way, drift of {WARM_PX} px, {counted.rigs} rigs: found and named"
     yield Row("h", text, counted.named["projector"] / counted.rigs, 0.95, None, "", at_least=True)
-    yield Row("h", "nothing moved, devices warm: false alarms", counted.alarms / counted.rigs, 0.02, None, "")
+    yield Row("h", f"nothing moved, drift of {WARM_PX} px: false alarms", counted.alarms / counted.rigs, 0.02, None, "")
 
 
 def rates(rig: Rig, life: Conditions, transducer: Transducer, rigs: int) -> Rates:

@@ -174,9 +174,8 @@ def test_a_rendered_film_is_tracked(tmp_path, config):
     truth = track_errors.read_truth(tmp_path / "film" / "truth")
     assert track_errors.visible_whole(truth).all()
     drift_px = load("track", ["capture=unused", "out=unused"], track.Config).drift_px
-    tracker = Tracker(
-        read.cameras, config.rig.target, optics=with_drift(read.optics, dict(zip(CAMERAS, read.cameras, strict=True)), drift_px)
-    )
+    optics = with_drift(read.optics, dict(zip(CAMERAS, read.cameras, strict=True)), drift_px)
+    tracker = Tracker(read.cameras, config.rig.target, optics=optics)
     tracker.remember(rigid.transform(truth.poses[0][:3, :3], truth.poses[0][:3, 3] + [0.3, 0, 0]), -0.03)
     for (left, right), time, true in itertools.islice(zip(read.pairs(), read.times, truth.poses, strict=True), 3):
         found = tracker.step(left, right, time * 1e-9)
