@@ -2,6 +2,7 @@
 
 from twin.accuracy import (
     live_basler_accuracy,
+    live_board_accuracy,
     live_poses_accuracy,
     live_projector_accuracy,
     live_record_accuracy,
@@ -14,6 +15,7 @@ PARTS = (
     live_basler_accuracy,
     live_projector_accuracy,
     live_record_accuracy,
+    live_board_accuracy,
     live_poses_accuracy,
     live_skin_accuracy,
     check_rates,
