@@ -10,6 +10,7 @@ more freedom explains more, and has to (MacKay 1992, Bayesian interpolation).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,12 @@ class Finding:
     usual: Array  # (k,) as of the fault
     named: bool  # whether it is told to have moved
     rivals: tuple[str, ...] = ()  # that explain all as well
+
+
+class _Test(NamedTuple):
+    finding: Finding
+    evidence: float  # logarithm, over that of nothing having moved
+    statistic: float  # squared length of the motion in standard deviations: twice the logarithm of the largest likelihood ratio
 
 
 def eliminated(own: Array, rest: Array) -> Array:
@@ -95,7 +102,10 @@ def _scaled(equations: Equations) -> Array:
 
 
 def find(equations: Equations, alarm_sigma: float) -> dict[str, Finding]:
-    """Test all parts. While some part is beyond `alarm_sigma` the likeliest is named, and the others are tested beside it.
+    """Test all parts. While some are beyond `alarm_sigma` the likeliest of these is named, and the others are tested beside it.
+
+    Its rivals are as likely, within RIVAL, by their evidence and by their best fit: a part that explains nothing has lost little
+    evidence either, if its freedom is small.
 
     Returns
     -------
@@ -106,12 +116,17 @@ def find(equations: Equations, alarm_sigma: float) -> dict[str, Finding]:
     equations = replace(equations, faults=seen)
     while True:
         tests = {name: _tested(equations, fault) for name, fault in equations.faults.items()}
-        if len(found) == MOST_NAMED or not any(finding.sigma > alarm_sigma for finding, _ in tests.values()):
-            return found | {name: finding for name, (finding, _) in tests.items()}
-        best = max(tests, key=lambda name: tests[name][1])
-        rivals = tuple(name for name in tests if name != best and tests[name][1] > tests[best][1] - RIVAL)
-        found[best] = replace(tests[best][0], named=True, rivals=rivals)
+        beyond = [name for name, test in tests.items() if test.finding.sigma > alarm_sigma]
+        if len(found) == MOST_NAMED or not beyond:
+            return found | {name: test.finding for name, test in tests.items()}
+        best = max(beyond, key=lambda name: tests[name].evidence)
+        rivals = tuple(name for name in tests if name != best and _as_likely(tests[name], tests[best]))
+        found[best] = replace(tests[best].finding, named=True, rivals=rivals)
         equations = _beside(equations, best)
+
+
+def _as_likely(test: _Test, best: _Test) -> bool:
+    return test.evidence > best.evidence - RIVAL and test.statistic > best.statistic - 2 * RIVAL
 
 
 def _beside(equations: Equations, name: str) -> Equations:
@@ -121,8 +136,8 @@ def _beside(equations: Equations, name: str) -> Equations:
     return Equations(equations.residuals, np.column_stack([equations.spread, fault.slopes * (10 * fault.usual)]), others)
 
 
-def _tested(equations: Equations, fault: Fault) -> tuple[Finding, float]:
-    """A part by itself, and the logarithm of its evidence over that of nothing having moved."""
+def _tested(equations: Equations, fault: Fault) -> _Test:
+    """Test a part by itself."""
     slopes, y, spread = fault.slopes * fault.usual, equations.residuals, equations.spread
     weighed = slopes - spread @ np.linalg.solve(np.eye(spread.shape[1]) + spread.T @ spread, spread.T @ slopes)  # Woodbury
     information, right = weighed.T @ slopes, weighed.T @ y
@@ -135,7 +150,8 @@ def _tested(equations: Equations, fault: Fault) -> tuple[Finding, float]:
     evidence = 0.5 * float(right @ motion - np.sum(np.log1p(np.maximum(values, 0))))
     freedom, sizes = int(shown.sum()), fault.usual
     covariance = posterior * np.outer(sizes, sizes)
-    return Finding(as_sigma(statistic, freedom), freedom, sizes * motion, covariance, sizes, named=False), evidence
+    finding = Finding(as_sigma(statistic, freedom), freedom, sizes * motion, covariance, sizes, named=False)
+    return _Test(finding, evidence, statistic)
 
 
 def as_sigma(statistic: float, freedom: int) -> float:

@@ -52,6 +52,16 @@ def test_parts_that_explain_the_same_are_rivals(equations, rng):
     assert set(fault_tests.named(fault_tests.find(twins, 3.5))) == {"first", "twin"}
 
 
+def test_a_part_that_explains_nothing_is_neither_named_nor_a_rival(equations, rng):
+    """The first moves far less than is usual for it, so that its evidence is below that of a second that hardly can move."""
+    faults = {
+        "first": Fault(equations.faults["first"].slopes, np.full(6, 1e5)),
+        "second": Fault(equations.faults["second"].slopes, np.full(2, 0.01)),
+    }
+    found = fault_tests.find(measured(Equations(equations.residuals, equations.spread, faults), rng, (1.5,)), 3.5)
+    assert fault_tests.named(found) == ["first"] and found["second"].sigma < 3
+
+
 def test_a_part_that_nothing_shows_is_left_out(equations, rng):
     unseen = {**equations.faults, "unseen": Fault(np.zeros((40, 6)), np.ones(6))}
     assert "unseen" not in fault_tests.find(Equations(rng.standard_normal(40), equations.spread, unseen), 3.5)
