@@ -6,12 +6,13 @@ the answers as its own, so it must be a name or a number of this computer. Origi
 browser sends it: it must be the place that was asked.
 """
 
-import re
 import socket
 from collections.abc import Sequence
+from ipaddress import ip_address
 from urllib.parse import urlsplit
 
 LOOPBACK = "127.0.0.1"
+FOREIGN = "expected a page of this server's own: open it by this computer's number, or let it listen at the name (host)"
 HERE = (LOOPBACK, "localhost", "::1")  # names of this computer, for itself
 
 
@@ -38,4 +39,12 @@ def _is_here(name: str, listens: str) -> bool:
     if name in HERE or listens in HERE:
         return name in HERE
     own = {listens.lower(), socket.gethostname().lower(), socket.getfqdn().lower()}
-    return name in own or bool(re.fullmatch(r"[\d.]+|[\da-f:]+", name))  # a page led here by name never has a number
+    return name in own or _is_number(name)  # a page led here by name never has a number
+
+
+def _is_number(name: str) -> bool:
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon.acquisition.pictures import Over, Picture
 from recon.errors import InputError
-from recon.own_requests import LOOPBACK, is_own
+from recon.own_requests import FOREIGN, LOOPBACK, is_own
 
 MOST_SIDE_PX = 640  # of an image on the page
 MOST_VISITORS = 8  # at once
@@ -95,7 +95,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer a request."""
         path = self.path.partition("?")[0]
         if not is_own(self.headers.get_all("Host", []), self.headers.get_all("Origin", []), self.listens):
-            self.send_error(HTTPStatus.FORBIDDEN)
+            self.send_error(HTTPStatus.FORBIDDEN, explain=FOREIGN)
         elif path == "/":
             self._send("text/html; charset=utf-8", files("recon.acquisition").joinpath("preview.html").read_bytes())
         elif path == "/state":

@@ -174,7 +174,8 @@ def record_sweep(
         with ExitStack() as stack:
             stack.callback(_say_counts, counts, say)
             stack.callback(_stop, pairs, say)
-            stack.callback(_write_rest, readers, write)
+            for reader in readers:
+                stack.callback(_write_rest, reader, write)
             streams = [FrameStream(reader.read, write, plan.silent_s, say) for reader in readers]
             for stream in streams:
                 stack.callback(stream.end)
@@ -184,11 +185,10 @@ def record_sweep(
     return counts
 
 
-def _write_rest(readers: Sequence[Reader], write: Callable[[Taken], None]) -> None:
-    """Write the frames that waited for their times until the end."""
-    for reader in readers:
-        for taken in reader.rest():
-            write(taken)
+def _write_rest(reader: Reader, write: Callable[[Taken], None]) -> None:
+    """Write a reader's frames that waited for their times until the end."""
+    for taken in reader.rest():
+        write(taken)
 
 
 def _stop(pairs: PairSource | None, say: Say) -> None:

@@ -8,6 +8,7 @@ the beginning, with time stamps that go on.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import ceil
+from operator import itemgetter
 from pathlib import Path
 from threading import Event, Lock
 from time import monotonic_ns
@@ -202,13 +203,17 @@ def _check_ends(recorded: Mapping[str, Recorded], apart_s: float | None) -> None
     spans = {name: (int(each.times[0]), int(each.times[-1])) for name, each in recorded.items()}
     longest_s = max(last - first for first, last in spans.values()) / 1e9
     most_s = MOST_APART * longest_s + MOST_APART_S if apart_s is None else apart_s
-    for end, word in enumerate(("begin", "end")):
-        early, late = min(spans, key=lambda name: spans[name][end]), max(spans, key=lambda name: spans[name][end])
-        found_s = (spans[late][end] - spans[early][end]) / 1e9
-        if found_s > most_s:
-            found = f"found {late} to {word} {found_s:.3g} s after {early}"
-            way = f"was one recorded longer? give apart_s={ceil(found_s)}"
-            raise InputError(f"{_table(recorded)}: expected devices that {word} within {most_s:.3g} s, {found}; {CLOCKS}; {way}")
+    found_s, word, late, early = max((_furthest(spans, end) for end in (0, 1)), key=itemgetter(0))
+    if found_s > most_s:
+        found = f"found {late} to {word} {found_s:.3g} s after {early}"
+        way = f"if one was recorded longer, allow apart_s={ceil(found_s)}"
+        raise InputError(f"{_table(recorded)}: expected devices that {word} within {most_s:.3g} s, {found}; {CLOCKS}; {way}")
+
+
+def _furthest(spans: Mapping[str, tuple[int, int]], end: int) -> tuple[float, str, str, str]:
+    """The largest time, s, between beginnings (0) or ends (1) of devices, which it is, and the later and the earlier device."""
+    early, late = min(spans, key=lambda name: spans[name][end]), max(spans, key=lambda name: spans[name][end])
+    return (spans[late][end] - spans[early][end]) / 1e9, ("begin", "end")[end], late, early
 
 
 def _table(recorded: Mapping[str, Recorded]) -> Path:

@@ -9,7 +9,8 @@ from recon.geometry import camera_jacobian
 from recon.geometry.camera import Array, Camera
 
 DRIFT_PX = 0.05  # usual standard deviation of cameras' principal points since their calibration
-FOCAL_DRIFT = 4.0e-4  # relative change of a focal length for each px of such a drift: 2e-5 with 0.05 px, of the same warmth
+FOCAL_DRIFT = 4.0e-4  # relative change of a focal length for each px of such a drift; assumed: 0.05 px go with a kelvin, by which
+# aluminium, which lens barrels are of, expands by 2.3e-5
 PRINT_SCALE = 3.0e-4  # usual relative standard deviation of the scale of a board printed on paper, which takes up moisture
 WORLD = "cam1"  # the device whose frame the world is: it has no pose
 

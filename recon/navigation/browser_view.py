@@ -134,7 +134,8 @@ def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:
 def name_place(name: str, outline: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[int, int]:
     """Lower left corner of a name in a picture of a shape (h, w): over the outline : (n, 2) px, else under it, else within."""
     (width, height), below = cv2.getTextSize(name, *FONT, 1)
-    (left, top), (right, bottom) = outline.min(axis=0), outline.max(axis=0)
+    corner = np.array(shape[1::-1]) - 1
+    (left, top), (right, bottom) = (np.clip(each, 0, corner) for each in (outline.min(axis=0), outline.max(axis=0)))
     over, under = int(top) - NAME_GAP_PX - below, int(bottom) + NAME_GAP_PX + height
     row = over if over >= height else under if under + below <= shape[0] else int(top + bottom + height) // 2
     return max(0, min(int(left + right - width) // 2, shape[1] - width)), row

@@ -13,7 +13,7 @@ from importlib.metadata import version
 from typing import Any
 
 from recon.errors import InputError, short
-from recon.own_requests import is_own
+from recon.own_requests import FOREIGN, is_own
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +58,6 @@ def _answer(host: str, refused: set[str], process: Callable | None, connection: 
         page = short(", ".join(origins or hosts))
         if page not in refused and len(refused) < MOST_NAMED:
             refused.add(page)
-            log.warning("view: a page of %s is refused; open the address that was printed", page)
-        return connection.respond(HTTPStatus.FORBIDDEN, "expected a page of this server's own\n")
+            log.warning("view: %s is refused: %s", page, FOREIGN)
+        return connection.respond(HTTPStatus.FORBIDDEN, f"{FOREIGN}\n")
     return None if process is None else process(connection, request)

@@ -151,7 +151,7 @@ def _plot(log: Sequence[Check], axis: Axis, alarm: float | None = None) -> str:
     figure, axes = figures.blank(7.0, 2.8)
     start, end = span(log)
     step = min(BESIDE, 0.5 / (len(PARTS) * len(log))) * (end - start)
-    top = axis.top
+    top = max(axis.top, 1.5 * (alarm or 0.0))
     for k, part in enumerate(PARTS):
         points = [(made.time, getattr(one, axis.field)) for made in log for one in made.parts if one.part == part]
         points = [(time + (k - 2.5) * step, max(value, axis.floor)) for time, value in points if value is not None]

@@ -165,6 +165,8 @@ def draw(config: Config, console: Console) -> NDArray[np.uint8]:
         metrics.write(folder / metrics.FILE, figures)
     for line in described(curves, drawing, masses, shift):
         console.print(line, markup=False)
+    for name in unnamed(config, curves, names):
+        console.print(f"warning     no room for the name of {name} on the skin: give a smaller names_mm", markup=False)
     console.print(f"wrote       {config.out}/{{{','.join([*written, metrics.FILE])}}}", markup=False)
     return drawing.image
 
@@ -237,6 +239,14 @@ def named(
         return lit_share(name, projector_image.in_sight([name], skin, projector, dark)) == 1
 
     return outline_names.beside(curves, masses, skin, config.eye_mm, config.names_mm, reached) if config.names_mm else []
+
+
+def unnamed(config: Config, curves: Sequence[SkinCurve], names: Sequence[SkinCurve]) -> list[str]:
+    """Masses whose outlines are drawn without their names, though names are wanted."""
+    if config.names_mm == 0:
+        return []
+    shown = {name.name for name in names}
+    return [curve.name for curve in curves if curve.kind == "mass" and curve.name not in shown]
 
 
 def measure(

@@ -124,7 +124,9 @@ class Config(Part):
 
     @model_validator(mode="after")
     def _bits_of_the_sensor(self) -> "Config":
-        bits = 8 if isinstance(self.devices, LiveDevices) or self.part == "sweep" else self.devices.bits
+        if isinstance(self.devices, LiveDevices) or self.part == "sweep":
+            return self
+        bits = self.devices.bits
         for camera in self.cameras:
             if bits > (adc := getattr(self.rig, camera).sensor.adc_bits):
                 raise ValueError(f"devices.bits: expected at most the {adc} of rig.{camera}.sensor.adc_bits, found {bits}")

@@ -43,6 +43,7 @@ def test_own_pages_and_other_programs_are_answered(host, origin, listens):
         (["rebound.example:8080"], ["http://rebound.example:8080"], ALL),
         (["rebound.example:8080"], ["http://rebound.example:8080"], "127.0.1.1"),
         (["127.0.0.1.rebound.example"], [], ALL),
+        (["cafe:8080"], ["http://cafe:8080"], ALL),  # a word of hexadecimal digits
         (["192.168.0.4:8080"], [], LOOPBACK),
         (["localhost:8080"], ["https://example.org"], LOOPBACK),  # a stranger's page that asks here
         (["localhost:8080"], ["http://localhost:9000"], LOOPBACK),  # that of another program on this computer

@@ -66,15 +66,21 @@ def test_few_frames_leave_the_rate_to_the_crystal(rng):
     assert (clock.rate, clock.rate_sigma) == (1, pytest.approx(1e-4))
 
 
-@pytest.mark.parametrize("n", [1, 7])
-def test_fewer_frames_show_a_clock_to_their_delays(rng, n):
-    """A single one leaves its delay open; of seven, nine of ten errors are within three standard deviations."""
+def test_fewer_frames_show_a_clock_to_their_delays(rng):
+    """Of seven, nine of ten errors are within three standard deviations."""
     errors = []
     for _ in range(200):
-        device, true, arrived = frames(rng, n, 1.0, exponential)
+        device, true, arrived = frames(rng, 7, 1.0, exponential)
         clock = fit_clock(device, arrived)
         errors.append((clock.at(int(device[0])) - true[0] - TRANSFER_NS) / clock.sigma_at(int(device[0])))
     assert np.mean(np.abs(errors) < 3) > 0.9
+
+
+def test_a_single_frame_leaves_its_delay_open(rng):
+    """It is taken to have come at once, late by 0.3 ms in the mean: 5 ms are e^-16 of them."""
+    device, true, arrived = frames(rng, 1, 1.0, exponential)
+    clock = fit_clock(device, arrived)
+    assert 0 <= clock.at(int(device[0])) - true[0] - TRANSFER_NS < 5e6 and np.isinf(clock.sigma_at(int(device[0])))
 
 
 def test_a_clock_that_stands_still_is_refused():

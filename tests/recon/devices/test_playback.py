@@ -99,7 +99,7 @@ def test_devices_that_begin_long_after_others_are_refused_unless_told(recorded, 
     times = recorded.times[0] + np.arange(9) * 250_000_000
     first, later = replace(recorded, times=times), replace(recorded, times=times + round(1e9 * step_s))
     late = "us" if step_s < 0 else "cam1"
-    with pytest.raises(InputError, match=rf"that begin within 1\.2 s, found {late} to begin 1\.5 s after .* give apart_s=2"):
+    with pytest.raises(InputError, match=rf"that begin within 1\.2 s, found {late} to begin 1\.5 s after .* allow apart_s=2"):
         playback.timeline_of({SCANNER: first, "cam1": later})
     assert playback.timeline_of({SCANNER: first, "cam1": later}, apart_s=2).length == 2_250_000_000 + 1_500_000_000
     cut = replace(recorded, times=times[:3])

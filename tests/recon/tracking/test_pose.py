@@ -128,6 +128,15 @@ def drift(camera, rng, px=0.3):
     return np.append(px * rng.standard_normal(2), px * FOCAL_DRIFT * rng.standard_normal() * np.diag(camera.matrix)[:2])
 
 
+def test_focal_lengths_drift_together(cameras):
+    """fx and fy by the same share, 4e-4 for each px of the principal point, apart from that."""
+    known = with_drift(None, {"cam1": cameras[0]}, 0.05)
+    fx, fy = np.diag(cameras[0].matrix)[:2]
+    assert known.sigma("cam1.fx") == pytest.approx(2e-5 * fx) and known.sigma("cam1.cx") == pytest.approx(0.05)
+    covariance = known.ordered(["cam1.fx", "cam1.fy", "cam1.cx", "cam1.cy"])
+    assert covariance[0, 1] == pytest.approx(4e-10 * fx * fy) and not covariance[:2, 2:].any() and covariance[2, 3] == 0
+
+
 def test_cameras_that_drifted_since_their_calibration_are_in_the_shared_covariance(cameras, target, rng):
     """By 0.3 px, ten times the noise: without a tolerance nearly all are refused; with it errors and misfits are chi-square."""
     squared, misfits, refused, names = [], [], 0, ["cx", "cy", "fx", "fy"]

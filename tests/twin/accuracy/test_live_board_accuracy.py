@@ -11,7 +11,7 @@ from twin.optics.surface_session import calibration_of
 
 
 def test_calibrations_are_apart_by_their_standard_deviations(rig, rng):
-    """Two draws of one covariance, forty times: squares of mean 1, each of some ten degrees of freedom."""
+    """Two draws of one covariance, forty times: squares of mean 1, each of five degrees of freedom or more."""
     cameras = calibration_of(rig).cameras
     true = Calibration(cameras, with_drift(None, cameras, 0.1))
     assert true.uncertainty is not None
