@@ -52,7 +52,7 @@ class Config(MeasuredTargetFields):
     bottom: manifest.SweepNameOrNone = ""
     probe: Path | None = None
     lag: Path | None = None
-    alarm_sigma: Annotated[float, Field(ge=1, le=20)] = 3.5
+    alarm_sigma: Annotated[float, Field(ge=1, le=20)] = 3.2
     water_c: Annotated[float, Field(ge=0, le=95)] = 22.0
     water_sigma_c: NotNegative = 1.0
     top_px: Annotated[int, Field(ge=0)] = 40

@@ -95,6 +95,15 @@ def drawn_film(
     return pairs
 
 
+def measured(printed: Target, sigma_mm: float, rng: np.random.Generator) -> Target:
+    """A target as it was measured, each of its lengths to a standard deviation."""
+    lengths = {
+        name: getattr(printed, name) + sigma_mm * float(rng.standard_normal()) for name in ("c1_mm", "c2_aside_mm", "c2_mm")
+    }
+    variances = tuple(tuple(row) for row in (sigma_mm**2 * np.eye(3)).tolist())
+    return printed.model_copy(update={**lengths, "covariance_mm2": variances})
+
+
 def drawn_matches(true: Devices, known: Devices, axes: tuple[int, ...], sigma_px: float, rng: np.random.Generator) -> Matches:
     """Points of a mound under fringes along some axes, as both cameras' maps show them."""
     width, height = known["cam1"].size
