@@ -34,14 +34,14 @@ demo: $(TWIN)  ## render a phantom, reconstruct its surface, compare with the tr
 	@$(BIN)/sonotwin demo
 
 live: $(LIVE)/result/metrics.json  ## play a rendered scene as the rig would, live in the browser; needs no hardware
-	@$(BIN)/sonotwin navigate capture=$(LIVE)/capture lag_s=0.05 skin=$(LIVE)/result/surface/surface.ply \
+	@$(BIN)/sonotwin navigate capture=$(LIVE)/capture lag_s=0.05 tissue_m_s=1450 skin=$(LIVE)/result/surface/surface.ply \
 		masses=$(LIVE)/result/masses/scan $(ARGS)
 
 # Skin, a filmed sweep, and what is found in them: minutes, once.
 $(LIVE)/result/metrics.json: | setup
 	@$(BIN)/sonotwin render scene=breast add=true out=$(LIVE)
 	@$(BIN)/sonotwin sweep scene=breast path=raster filmed=true clocks.camera_hz=25 name=scan add=true out=$(LIVE)
-	@$(BIN)/sonotwin reconstruct capture=$(LIVE)/capture lag_s=0.05 out=$(LIVE)/result
+	@$(BIN)/sonotwin reconstruct capture=$(LIVE)/capture lag_s=0.05 tissue_m_s=1450 out=$(LIVE)/result
 
 test: setup  ## check style, types and arrows, then run the fast tests
 	@bash .ci/browser & browser=$$!; $(MAKE) --no-print-directory lint && wait $$browser

@@ -64,7 +64,13 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
     | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires")},
     "live.md": {"session", "morning"}
     | {f"outputs/live/{name}" for name in ("result/surface/surface.ply", "result/masses/scan", "capture/calibration/optics.yaml")}
-    | {"result/surface/surface.ply", "result/masses/scan", "result/optics/optics.yaml", "result/probe/probe.yaml"},
+    | {
+        "result/surface/surface.ply",
+        "result/masses/scan",
+        "result/optics/optics.yaml",
+        "result/probe/probe.yaml",
+        "result/latency/lag.json",
+    },
     "live-check.md": {"morning", "lag/lag.json"},
     "live-skin.md": {"result/surface/surface.ply", "result/masses/scan", "result/optics/optics.yaml"}
     | {"now.ply", "before.ply", "masses", "optics.yaml"},

@@ -7,7 +7,8 @@ moved up and down. Writes into the folder `out` check.html, the verdicts with th
 An error that the calibrations admit by their covariance, and usual drift, are no alarm. Exit status 1 if something has moved.
 Takes some seconds.
 
-    sonotwin check capture=outputs/morning/capture out=outputs/check log=outputs/rig.jsonl lag=outputs/lag/lag.json
+    sonotwin check capture=outputs/morning out=outputs/check log=outputs/rig.jsonl lag=outputs/lag/lag.json
+    sonotwin check capture=outputs/morning film=target tracked=outputs/tracked lag=outputs/lag/lag.json out=outputs/check
 """
 
 from pathlib import Path
@@ -50,6 +51,7 @@ class Config(MeasuredTargetFields):
     log: Path | None = None
     film: manifest.SweepNameOrNone = ""
     bottom: manifest.SweepNameOrNone = ""
+    tracked: Path | None = None
     probe: Path | None = None
     lag: Path | None = None
     alarm_sigma: Annotated[float, Field(ge=1, le=20)] = 3.2
@@ -77,12 +79,14 @@ def run(config: Config) -> int:
         If the capture is incomplete or damaged or holds nothing that can be checked, or a place can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    given = (config.capture, config.calibration, config.probe, config.lag, config.target, config.log)
+    given = (config.capture, config.tracked, config.calibration, config.probe, config.lag, config.target, config.log)
     inputs = [path for path in given if path is not None]  # the log, too: a folder that is replaced would take it along
     atomic.check_folder(config.out, CHECK, inputs=inputs)
     earlier = check_log.read(config.log) if config.log is not None and config.log.exists() else []
     listed = manifest.read_manifest(config.capture)
-    held = parts_of(config, listed)
+    held = parts_of(config, listed, listed if config.tracked is None else manifest.read_manifest(config.tracked))
+    for line in left_out(held):
+        console.print(line, markup=False)
     found = [*optics(config, listed, held, console)]
     found += verdicts.doubted(tank(config, held, console), found)
     made = check_log.check(listed.name or config.capture.resolve().name, found)
@@ -98,22 +102,27 @@ def run(config: Config) -> int:
     return int(any(one.state == "moved" for one in found))
 
 
-def parts_of(config: Config, listed: Manifest) -> Held:
+def parts_of(config: Config, listed: Manifest, tracked: Manifest) -> Held:
     """Parts that can be checked.
+
+    tracked : of the folder that has the bottom's poses.
 
     Raises
     ------
     InputError
         If there is none, or a sweep that is named.
     """
-    sweeps = dict(listed.sweeps) if listed.sweep is None else {"": listed.sweep}
-    for field, name in (("film", config.film), ("bottom", config.bottom)):
-        if name and name not in sweeps:
-            found = ", ".join(sweeps) or "no sweep"
-            raise InputError(f"{config.capture / MANIFEST}: {field}: expected one of its sweeps, found {name} beside {found}")
+    sweeps, followed = (dict(one.sweeps) if one.sweep is None else {"": one.sweep} for one in (listed, tracked))
+    for field, name, there, folder in (
+        ("film", config.film, sweeps, config.capture),
+        ("bottom", config.bottom, followed, config.tracked or config.capture),
+    ):
+        if name and name not in there:
+            found = ", ".join(there) or "no sweep"
+            raise InputError(f"{folder / MANIFEST}: {field}: expected one of its sweeps, found {name} beside {found}")
     films = [name for name, part in sweeps.items() if set(CAMERAS) <= part.images.keys() and SCANNER not in part.images]
-    bottoms = [name for name, part in sweeps.items() if SCANNER in part.images and part.track is not None]
-    wanted = [name for name in bottoms if sweeps[name].purpose == "latency"] or bottoms
+    bottoms = [name for name, part in followed.items() if SCANNER in part.images and part.track is not None]
+    wanted = [name for name in bottoms if followed[name].purpose == "latency"] or bottoms
     film, bottom = ([name] if name else found for name, found in ((config.film, films), (config.bottom, wanted)))
     for field, found in (("film", film), ("bottom", bottom)):
         if len(found) > 1:
@@ -123,10 +132,19 @@ def parts_of(config: Config, listed: Manifest) -> Held:
     fringes = listed.surface is not None and set(CAMERAS) <= listed.surface.images.keys()
     if not (film or bottom or fringes):
         expected = "frames of the target, fringes before both cameras, or tracked B-scans of a bottom"
-        raise InputError(
-            f"{config.capture / MANIFEST}: expected {expected}, found none of them; sweeps are tracked by sonotwin track"
-        )
+        way = "name a film that has B-scans, too, by film; sweeps are tracked by sonotwin track, whose folder is tracked"
+        raise InputError(f"{config.capture / MANIFEST}: expected {expected}, found none of them; {way}")
     return Held(film[0] if film else None, fringes, bottom[0] if bottom else None)
+
+
+def left_out(held: Held) -> list[str]:
+    """Lines on parts that can't be checked, with the way on."""
+    ways = {
+        "film": (held.film is None, "no frames of the target alone; film=NAME takes those of a sweep with B-scans"),
+        "fringes": (not held.fringes, "no fringes before both cameras"),
+        "bottom": (held.bottom is None, "no B-scans with poses; tracked=FOLDER takes those of sonotwin track"),
+    }
+    return [f"{name:12}{way}" for name, (lacking, way) in ways.items() if lacking]
 
 
 def optics(config: Config, listed: Manifest, held: Held, console: Console) -> list[Verdict]:
@@ -185,7 +203,7 @@ def tank(config: Config, held: Held, console: Console) -> list[Verdict]:
     parts = (bottom_equations.PROBE, bottom_equations.CLOCK)
     if held.bottom is None:
         return [Verdict(part, "unseen") for part in parts]
-    sweep = sweep_part.read_sweep(config.capture, held.bottom)
+    sweep = sweep_part.read_sweep(config.tracked or config.capture, held.bottom)
     probe = sweep.probe if config.probe is None else probe_files.read(config.probe)
     if probe is None:
         raise InputError(

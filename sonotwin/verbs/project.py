@@ -288,7 +288,7 @@ def described(
                 yield f"warning     the skin may slide in itself: {name} is uncertain by it; measure more of the skin"
     for curve in curves:
         lit = lit_share(curve, drawing.lit)
-        yield f"{curve.name:12}{curve.length_mm:.1f} mm on the skin, {lit:.0%} of it lit"
+        yield f"{curve.name:12}{curve.length_mm:.1f} mm long on the skin, {lit:.0%} of it lit"
         if curve.on_skin < 1:
             yield f"warning     {1 - curve.on_skin:.0%} of {curve.name} is left out: there is no skin measured"
 

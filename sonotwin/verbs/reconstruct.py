@@ -7,7 +7,8 @@ for volumes and masses. What is missing is taken from the calibrations given her
 Writes into the folder `out`, each step in a folder of its own as its verb would: optics/, surface/, poses/NAME/, latency/,
 probe/, volume/NAME/, masses/NAME/ or tube/NAME/, and scene/NAME/ (of a sweep without a name poses/, volume/ ...); and
 metrics.json, the figures of all steps. A step whose result is there, made of the same, isn't done again, so a run that was killed
-is simply started again. Takes minutes. Exit status 1 if a step failed; those that build on it are left out.
+is simply started again. Takes minutes. Exit status 1 if a step failed, those that build on it are
+left out, or if none could be done.
 
     sonotwin reconstruct capture=session/capture out=result
     sonotwin reconstruct capture=session/capture tissue_m_s=1450 temperature_c=22 out=result
@@ -111,7 +112,7 @@ class Sources:
 
 
 def run(config: Config) -> int:
-    """Do all steps that the capture allows; returns 1 if a part could not be used.
+    """Do all steps that the capture allows; returns 1 if a part could not be used, or none.
 
     Raises
     ------
@@ -133,8 +134,10 @@ def run(config: Config) -> int:
             if part.purpose in (None, "volume") and SCANNER in part.images:
                 look_inside(steps, sources, name, tracked[name], probe, lag, skin, optics)
         metrics.write(config.out / metrics.FILE, figures(config.out, steps))
+    if not steps.done:
+        console.print("nothing     could be done: give what was left out, such as calibration=FILE, probe=FILE", markup=False)
     console.print(f"wrote       {config.out}/{{{','.join([*steps.done, metrics.FILE])}}}", markup=False)
-    return 1 if steps.failed else 0
+    return 1 if steps.failed or not steps.done else 0
 
 
 def check(sources: Sources) -> None:

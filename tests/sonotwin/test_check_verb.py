@@ -76,6 +76,21 @@ def test_a_clock_that_is_off_is_told_and_logged(bottom, tmp_path, capsys, lag, s
     assert ("Run measure-lag." in page) == bool(status) == ("Moved: scanner's clock. Run measure-lag." in said)
 
 
+def test_poses_of_the_bottom_may_be_in_track_s_folder(bottom, tmp_path, capsys):
+    """The capture has its B-scans without poses; what it lacks is said with the way on."""
+    shutil.copytree(bottom / "capture", tmp_path / "capture")
+    listed = json.loads((tmp_path / "capture/manifest.json").read_text())
+    del listed["sweep"]["track"]
+    (tmp_path / "capture/manifest.json").write_text(json.dumps(listed))
+    line = ["check", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}"]
+    assert main(line) == 2 and "whose folder is tracked" in capsys.readouterr().err
+    probe = ProbeCalibration(rigid.transform([[1, 0, 0], [0, 0, -1], [0, 1, 0]], [0, 0, 0]), np.full(2, bscans.MM_PER_PX))
+    probe_files.write(tmp_path / "probe.yaml", probe)
+    files = [f"tracked={bottom / 'capture'}", f"probe={tmp_path / 'probe.yaml'}", f"lag={bottom / 'lag.json'}"]
+    main([*line, *files])
+    assert "film=NAME" in (said := capsys.readouterr().out) and "bottom      in" in said
+
+
 SEED = 21  # of calibration, drift, prints, hand and light: nothing was tried on it
 LIFE = ["conditions=lifelike", f"seed={SEED}"]
 RENDERED = ["cameras=[cam1,cam2]", "scene=breast", "patterns=paper_calibration", "tracing.samples=8", *LIFE]

@@ -92,7 +92,7 @@ def test_a_sweep_alone_becomes_a_volume(rig, tmp_path, capsys):
 def test_what_is_missing_is_named(rig, tmp_path, capsys):
     """Without a probe's calibration B-scans have no place; without a flat bottom their time stamps count as they are."""
     capture = sweep_sets.ball(tmp_path / "ball", rig, with_probe=False)
-    assert main(["reconstruct", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 0
+    assert main(["reconstruct", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 1
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("left out")]
     assert lines[0].startswith("left out    latency: no sweep over a flat bottom and no lag_s")
     for line, name in zip(lines[1:], ("volume", "masses", "scene"), strict=True):
