@@ -8,6 +8,7 @@ browser sends it: it must be the place that was asked.
 
 import socket
 from collections.abc import Sequence
+from functools import cache
 from ipaddress import ip_address
 from urllib.parse import urlsplit
 
@@ -38,8 +39,13 @@ def _is_here(name: str, listens: str) -> bool:
     """Whether a name or number may stand for this computer, which listens to itself alone or to a network."""
     if name in HERE or listens in HERE:
         return name in HERE
-    own = {listens.lower(), socket.gethostname().lower(), socket.getfqdn().lower()}
-    return name in own or _is_number(name)  # a page led here by name never has a number
+    return name in {listens.lower(), *own_names()} or _is_number(name)  # a page led here by name never has a number
+
+
+@cache
+def own_names() -> tuple[str, str]:
+    """Names of this computer, found once: the longer one may take a question to a name server."""
+    return socket.gethostname().lower(), socket.getfqdn().lower()
 
 
 def _is_number(name: str) -> bool:

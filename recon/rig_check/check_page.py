@@ -32,7 +32,8 @@ class Axis(NamedTuple):
     def caption(self, log: Sequence[Check]) -> str:
         """The number of checks, and the reading of the lowest points."""
         checks = f"{len(log)} check{'s' * (len(log) != 1)}"
-        return f"{checks}, times in UTC. Points at {self.floor:g} {self.unit} are at or below it."
+        low = f"Points at {self.floor:g} {self.unit} are at or below it."
+        return f"{checks}, times in UTC; marks of one check stand side by side. {low}"
 
 
 SIGMA, LENGTH = Axis("sigma", "σ", 0.1, 10.0), Axis("mm", "mm", 0.01, 1.0)
@@ -153,8 +154,9 @@ def _plot(log: Sequence[Check], axis: Axis, alarm: float | None = None) -> str:
     step = min(BESIDE, 0.5 / (len(PARTS) * len(log))) * (end - start)
     top = max(axis.top, 1.5 * (alarm or 0.0))
     for k, part in enumerate(PARTS):
+        aside = (k - (len(PARTS) - 1) / 2) * step
         points = [(made.time, getattr(one, axis.field)) for made in log for one in made.parts if one.part == part]
-        points = [(time + (k - 2.5) * step, max(value, axis.floor)) for time, value in points if value is not None]
+        points = [(time + aside, max(value, axis.floor)) for time, value in points if value is not None]
         if points:
             axes.plot(*zip(*points, strict=True), "o-", color=COLOURS[part], markersize=3.6, linewidth=1.0)
             top = max(top, *(2 * value for _, value in points))

@@ -4,6 +4,7 @@ import socket
 
 import pytest
 
+from recon import own_requests
 from recon.own_requests import LOOPBACK, is_own
 
 ALL, NAME = "0.0.0.0", "rig.clinic"
@@ -12,6 +13,9 @@ ALL, NAME = "0.0.0.0", "rig.clinic"
 @pytest.fixture(autouse=True)
 def named(monkeypatch):
     monkeypatch.setattr(socket, "getfqdn", lambda: NAME)
+    own_requests.own_names.cache_clear()
+    yield
+    own_requests.own_names.cache_clear()
 
 
 @pytest.mark.parametrize(
