@@ -50,7 +50,9 @@ from sonotwin.open_devices import AnyDevices, Host, LiveDevices, Opened, open_st
 from sonotwin.terminal_operator import TerminalOperator
 from twin.session import CAPTURE, TRUTH
 from twin.shooting import FrameShooting
+from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.timed_sweep import Clocks
+from twin.ultrasound.transducer import Transducer
 
 SWEEP_EXPOSURE_S = 0.01  # of frames of a sweep, where none is given: a tenth of a millimetre of blur at 10 mm/s
 
@@ -104,8 +106,8 @@ class Config(Part):
     limits: Limits
     preview: PreviewFields
     scene: dict
-    ultrasound: dict
-    path: dict | None
+    ultrasound: Transducer
+    path: AnyPath | None
     tracing: dict
     clocks: Clocks
     frames: FrameShooting

@@ -78,6 +78,8 @@ def test_images_have_up_to_as_many_bits_as_the_virtual_sensor():
         (["part=board"], "patterns: expected fringes or Gray code along both axes of a board, found none along rows"),
         (["part=board", "patterns=paper_calibration", "cameras=[cam2]"], "cameras: expected cam1"),
         (["part=film"], "part: expected"),
+        (["ultrasound.receive_f_number=many"], "ultrasound.receive_f_number: expected"),
+        (["path=stroke", "path.speed_mm_s=fast"], "path"),
         (["devices.bits=12"], "devices.bits: expected at most the 10 of rig.cam1.sensor.adc_bits, found 12"),
         (["devices.kind=other"], "devices.kind: expected one of"),
         (["reach.depth_mm=[700,600]"], "reach.depth_mm: expected the nearest depth, then a farther one, found 700 and 600"),
