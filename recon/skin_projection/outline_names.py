@@ -66,6 +66,11 @@ def beside(
     return names
 
 
+def title(mass: str) -> str:
+    """What the curve of a mass's name is called."""
+    return f"name of {mass}"
+
+
 def letters(name: str, height_mm: float) -> list[Array]:
     """Closed contours : (n, 2) mm, to the right and down, of a name about its middle, with capitals of a height."""
     scale = height_mm / CAPITAL / text_to_path.FONT_SCALE
@@ -94,7 +99,7 @@ def _tried(
             place = (low + high) / 2 + side * ((high - low) / 2 + half + farther * gap)
             if (np.abs(drawn - place) > half + 0.9 * gap).any(axis=1).all():
                 chain = np.concatenate([part for contour in contours for part in (contour + place, [[np.nan, np.nan]])])
-                laid = skin_curve.laid(f"name of {curve.name}", "name", table.chart(chain), sight, skin)
+                laid = skin_curve.laid(title(curve.name), "name", table.chart(chain), sight, skin)
                 if np.array_equal(np.isfinite(laid.points[:, 0]), np.isfinite(chain[:, 0])):
                     yield laid
 

@@ -246,7 +246,7 @@ def unnamed(config: Config, curves: Sequence[SkinCurve], names: Sequence[SkinCur
     if config.names_mm == 0:
         return []
     shown = {name.name for name in names}
-    return [curve.name for curve in curves if curve.kind == "mass" and curve.name not in shown]
+    return [curve.name for curve in curves if curve.kind == "mass" and outline_names.title(curve.name) not in shown]
 
 
 def measure(

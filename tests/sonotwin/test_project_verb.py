@@ -63,6 +63,12 @@ def test_masses_and_a_cut_are_drawn_where_they_are(given, rig, tmp_path, capsys)
         assert (tmp_path / "out" / name).is_file()
 
 
+@pytest.mark.parametrize(("names_mm", "warned"), [(5, False), (40, True), (0, False)])
+def test_a_mass_without_room_for_its_name_is_said(given, tmp_path, capsys, names_mm, warned):
+    assert main(["project", *given, f"masses={tmp_path}/masses", f"names_mm={names_mm}"]) == 0
+    assert ("no room for the name of" in capsys.readouterr().out) == warned
+
+
 def test_the_eye_sees_it_elsewhere_than_the_normal(given, tmp_path):
     masses = f"masses={tmp_path}/masses"
     assert main(["project", *given, masses]) == 0
