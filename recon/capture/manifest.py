@@ -285,6 +285,11 @@ class Manifest(rig.Part):
         devices = self.devices_of(place)
         return {name: SweepImages(folder / self.root / part.images[name], devices[name]) for name in names}
 
+    @property
+    def named_sweeps(self) -> dict[str, SweepPart]:
+        """Sweeps by name; the only one, which has none, under an empty one."""
+        return dict(self.sweeps) if self.sweep is None else {"": self.sweep}
+
     def calibration_file(self, folder: Path, given: Path | None = None) -> Path:
         """The file of cameras and projector: the one given, or else the capture's own.
 

@@ -77,6 +77,11 @@ def range_mm(pairs: Sequence[Seen]) -> float:
     return float(np.ptp(depths))
 
 
+def counted(faults: Mapping[Fault, int]) -> str:
+    """Numbers of pairs by their fault, to be added to a message."""
+    return "".join(f", {count} pairs {fault}" for fault, count in faults.items())
+
+
 def check(pairs: Sequence[Seen], name: str, faults: Mapping[Fault, int], least_tilt_deg: float, least_range_mm: float) -> None:
     """Refuse pairs that don't show the target from enough sides.
 
@@ -90,9 +95,8 @@ def check(pairs: Sequence[Seen], name: str, faults: Mapping[Fault, int], least_t
         If pairs, tilts or distances are missing, with what to do.
     """
     if len(pairs) < LEAST:
-        others = "".join(f", {count} pairs {fault}" for fault, count in faults.items())
         expected = f"{LEAST} poses in which both cameras see all three circles whole and evenly lit"
-        raise InputError(f"{name}: expected {expected}, found {len(pairs)}{others}")
+        raise InputError(f"{name}: expected {expected}, found {len(pairs)}{counted(faults)}")
     missing = []
     if (tilt := tilt_deg(pairs)) < least_tilt_deg:
         missing.append(f"tilts that differ by {least_tilt_deg:g} deg (standard deviation; to all sides), found {tilt:.1f}")

@@ -11,6 +11,7 @@ Takes some seconds.
     sonotwin check capture=outputs/morning film=target tracked=outputs/tracked lag=outputs/lag/lag.json out=outputs/check
 """
 
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -112,29 +113,28 @@ def parts_of(config: Config, listed: Manifest, tracked: Manifest) -> Held:
     InputError
         If there is none, or a sweep that is named.
     """
-    sweeps, followed = (dict(one.sweeps) if one.sweep is None else {"": one.sweep} for one in (listed, tracked))
-    for field, name, there, folder in (
-        ("film", config.film, sweeps, config.capture),
-        ("bottom", config.bottom, followed, config.tracked or config.capture),
-    ):
-        if name and name not in there:
-            found = ", ".join(there) or "no sweep"
-            raise InputError(f"{folder / MANIFEST}: {field}: expected one of its sweeps, found {name} beside {found}")
+    sweeps, followed = listed.named_sweeps, tracked.named_sweeps
     films = [name for name, part in sweeps.items() if set(CAMERAS) <= part.images.keys() and SCANNER not in part.images]
     bottoms = [name for name, part in followed.items() if SCANNER in part.images and part.track is not None]
     wanted = [name for name in bottoms if followed[name].purpose == "latency"] or bottoms
-    film, bottom = ([name] if name else found for name, found in ((config.film, films), (config.bottom, wanted)))
-    for field, found in (("film", film), ("bottom", bottom)):
-        if len(found) > 1:
-            raise InputError(
-                f"{config.capture / MANIFEST}: expected one sweep for this, found {', '.join(found)}; give {field}=NAME"
-            )
+    film = _the_one("film", config.film, sweeps, films, config.capture)
+    bottom = _the_one("bottom", config.bottom, followed, wanted, config.tracked or config.capture)
     fringes = listed.surface is not None and set(CAMERAS) <= listed.surface.images.keys()
-    if not (film or bottom or fringes):
+    if film is None and bottom is None and not fringes:
         expected = "frames of the target, fringes before both cameras, or tracked B-scans of a bottom"
         way = "name a film that has B-scans, too, by film; sweeps are tracked by sonotwin track, whose folder is tracked"
         raise InputError(f"{config.capture / MANIFEST}: expected {expected}, found none of them; {way}")
-    return Held(film[0] if film else None, fringes, bottom[0] if bottom else None)
+    return Held(film, fringes, bottom)
+
+
+def _the_one(field: str, given: str, there: Collection[str], fitting: Sequence[str], folder: Path) -> str | None:
+    """The sweep that is given, else the only fitting one, if any; InputError if it isn't there, or several fit."""
+    if given and given not in there:
+        found = ", ".join(there) or "no sweep"
+        raise InputError(f"{folder / MANIFEST}: {field}: expected one of its sweeps, found {given} beside {found}")
+    if not given and len(fitting) > 1:
+        raise InputError(f"{folder / MANIFEST}: expected one sweep for this, found {', '.join(fitting)}; give {field}=NAME")
+    return given or next(iter(fitting), None)
 
 
 def left_out(held: Held) -> list[str]:
@@ -176,8 +176,9 @@ def filmed(
     seen, faults = collect(film, tracker, console)
     poses = target_poses.spread(target_poses.distinct(seen), config.most_poses)
     if len(poses) < LEAST_POSES:
-        others = "".join(f", {count} {fault}" for fault, count in faults.most_common())
-        found = f"{len(poses)} in {len(film.times)} pairs{others}: move it about, clean, uncovered and well lit"
+        found = (
+            f"{len(poses)} in {len(film.times)} pairs{target_poses.counted(faults)}: move it about, clean, uncovered and well lit"
+        )
         raise InputError(f"{film.name}: expected {LEAST_POSES} poses in which both cameras see all circles whole, found {found}")
     tilt, reach = target_poses.tilt_deg(poses), target_poses.range_mm(poses)
     console.print(

@@ -99,8 +99,8 @@ class Sources:
 
     @property
     def sweeps(self) -> dict[str, SweepPart]:
-        """Sweeps by name; one without a name under none."""
-        return {"": self.held.sweep} if self.held.sweep else dict(self.held.sweeps)
+        """Sweeps by name."""
+        return self.held.named_sweeps
 
     def files(self, *parts: str) -> dict[str, object]:
         """Files of some parts, by which a step's inputs are known."""
