@@ -23,7 +23,7 @@ from sonotwin import latency_fields
 from sonotwin.config import load
 from sonotwin.demo_config import BOARD_PATTERNS, CALIBRATION, WATER_C, Config
 from sonotwin.latency_fields import Latency
-from sonotwin.pipeline import Step
+from sonotwin.pipeline import DEMO, Step
 from sonotwin.verbs import calibrate_optics, calibrate_probe, film, render, sweep, track
 from twin.evaluation import session_errors, sweep_errors, track_errors
 from twin.reports import track_report
@@ -246,7 +246,7 @@ def _named(part: str) -> Callable[[Path], Metrics]:
 
 def _with_meshes(folder: Path) -> Metrics:
     for name in MESHES:
-        _offer(folder / "surface" / name, folder / name)
+        _offer(folder / "surface" / name, folder, name)
     return _figures("surface")(folder)
 
 
@@ -264,9 +264,9 @@ def tracked_film(folder: Path, swept: bool) -> track_report.Tracked:
     return track_report.read(folder / "film", folder / "track")
 
 
-def _offer(source: Path, path: Path) -> None:
+def _offer(source: Path, folder: Path, name: str) -> None:
     """Give a file a second place, without a second copy where the file system can do that."""
-    with atomic.new_file(path) as temporary:
+    with atomic.listed_file(folder, name, DEMO) as temporary:
         try:
             os.link(source, temporary)
         except OSError:

@@ -7,7 +7,6 @@ anywhere goes on where it was.
 
 import hashlib
 import json
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,7 +18,8 @@ from recon.errors import InputError
 from recon.files import atomic, json_text, metrics
 from sonotwin.config import load
 
-RECORD = "reconstruct.json"  # by which the folder of all steps is known
+RECORD = "reconstruct.json"
+BY = "reconstruct"  # who writes
 RESULTS = 2  # number of what verbs leave in their folders; another one does all steps anew
 
 
@@ -44,12 +44,14 @@ class KeptSteps:
         InputError
             If something else is there, or the folder can't be written to.
         """
-        path = self.folder / RECORD
-        self._forget_stopped_beginning(path)
-        atomic.check_folder(self.folder, RECORD, inputs)
+        atomic.check_folder(self.folder, BY, inputs)
         self.folder.mkdir(parents=True, exist_ok=True)
         with atomic.alone(self.folder):
-            self.record = _read(path)
+            for name in (RECORD, metrics.FILE):
+                atomic.check_listed(self.folder, name, BY)
+                atomic.remove_leftovers(self.folder / name)
+            atomic.begin_filled(self.folder, BY)
+            self.record = _read(self.folder / RECORD)
             self._write()
             yield
             for name in [name for name in self.record if name not in self.done]:
@@ -79,8 +81,6 @@ class KeptSteps:
                 self.done.append(name)
                 return place
             self.say(f"{name}: {does}")
-            if name in self.record and not all((place / file).is_file() for file in files):
-                shutil.rmtree(place, ignore_errors=True)  # ours, and damaged
             self._change(name, None)
             module.run(config)
         except InputError as error:
@@ -119,15 +119,8 @@ class KeptSteps:
         self._write()
 
     def _write(self) -> None:
-        with atomic.new_file(self.folder / RECORD) as temporary:
+        with atomic.listed_file(self.folder, RECORD, BY) as temporary:
             temporary.write_text(json.dumps(self.record, indent=2, sort_keys=True) + "\n", encoding="utf-8")
-
-    def _forget_stopped_beginning(self, path: Path) -> None:
-        """Remove what a run that was killed while it wrote its first record has left: hidden files of the record's name."""
-        entries = list(self.folder.iterdir()) if self.folder.is_dir() else []
-        if entries and all(entry.is_file() and entry.name.startswith(f".{path.stem}") for entry in entries):
-            for entry in entries:
-                entry.unlink()
 
 
 def _read(path: Path) -> dict[str, str]:

@@ -9,7 +9,8 @@ from pathlib import Path
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 
-MARKER = "demo.json"  # by which the folder of a demonstration is known
+MARKER = "demo.json"
+DEMO = "demo"  # who writes
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,8 @@ class Step:
 def play(steps: Sequence[Step], folder: Path, settings: Mapping[str, object], announce: Callable[[str], None]) -> Metrics:
     """Run the steps and write `metrics.json`: all their figures, and the seconds that each took.
 
-    The folder is marked before the first step, and what an earlier demonstration left there is taken away as far as it would
-    mix with the new: after a run that was killed, the next one starts clean.
+    The folder is marked before the first step, and what an earlier demonstration wrote there is taken away as far as it would
+    mix with the new: after a run that was killed, the next one starts clean. Files of others stay.
 
     Parameters
     ----------
@@ -43,11 +44,16 @@ def play(steps: Sequence[Step], folder: Path, settings: Mapping[str, object], an
     ValueError
         If a step contradicts a figure of an earlier one that it doesn't refine.
     """
-    atomic.check_filled_folder(folder, MARKER)
-    folder.mkdir(parents=True, exist_ok=True)
-    with atomic.new_file(folder / MARKER) as temporary:
+    atomic.check_filled_folder(folder, DEMO)
+    files = [metrics.FILE, *(name for step in steps for name in step.makes if not (folder / name).is_dir())]
+    for name in files:
+        atomic.check_listed(folder, name, DEMO)
+    atomic.begin_filled(folder, DEMO)
+    with atomic.listed_file(folder, MARKER, DEMO) as temporary:
         temporary.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
-    _clear(folder, [metrics.FILE, *(name for step in steps for name in step.makes)])
+    for name in (MARKER, *files):
+        atomic.remove_leftovers(folder / name)
+    atomic.remove_listed(folder, files, DEMO)
     found: Metrics = {}
     beginning = time.perf_counter()
     for number, step in enumerate(steps, 1):
@@ -60,17 +66,6 @@ def play(steps: Sequence[Step], folder: Path, settings: Mapping[str, object], an
                 raise ValueError(f"{step.name}: {name}: expected {found[name]} as before, found {new[name]}")
         found |= new
     found["seconds_demo"] = round(time.perf_counter() - beginning, 2)
-    metrics.write(folder / metrics.FILE, found)
+    with atomic.listed_file(folder, metrics.FILE, DEMO) as temporary:
+        metrics.write(temporary, found)
     return found
-
-
-def _clear(folder: Path, names: Sequence[str]) -> None:
-    """Remove the files that an earlier run made, and what one that was killed left while it made them.
-
-    Folders stay: the step that makes one replaces it.
-    """
-    atomic.remove_leftovers(folder / MARKER)
-    for path in (folder / name for name in names):
-        atomic.remove_leftovers(path)
-        if not path.is_dir():
-            path.unlink(missing_ok=True)

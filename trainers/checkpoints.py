@@ -8,8 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from recon.errors import InputError
+from recon.files import atomic
 from trainers.export import check_tensors, read_state, write_state
 
+TRAIN = "train"  # who writes
 COUNTER = "step"  # of AdamW, one for each parameter
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -24,7 +26,9 @@ def write(
 ) -> None:
     """Write networks by their names, the optimizer's moments, the numbers of samples, the step and the time that it took."""
     states = {name: network.state_dict() for name, network in networks.items()}
-    write_state(path, {**states, "optimizer": optimizer.state_dict(), "samples": samples, "step": step, "seconds": seconds})
+    with atomic.listed_file(path.parent, path.name, TRAIN) as temporary:
+        state = {"optimizer": optimizer.state_dict(), "samples": samples, "step": step, "seconds": seconds}
+        write_state(temporary, {**states, **state})
 
 
 def resume(

@@ -23,6 +23,7 @@ from recon.files.regular import read_bytes
 from trainers import checkpoints
 from trainers.architectures import Name, is_detector
 from trainers.batches import Batches
+from trainers.checkpoints import TRAIN
 from trainers.labels import Labels, detector_loss, segmenter_loss
 from trainers.network_metrics import measure_detector, measure_segmenter
 from trainers.shard_reader import Data, Views, chosen
@@ -99,6 +100,8 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
 
     def save() -> None:
         checkpoints.write(folder / CHECKPOINT, networks, optimizer, samples, step, seconds)
+        if (folder / LOG).is_file():
+            atomic.list_again(folder, LOG, TRAIN)
 
     batches = Batches(train, plan.batch, plan.crop_px, plan.seed).since(step, plan.loaders)
     with interrupts.held_back() as came:
@@ -216,6 +219,9 @@ def _blend(average: nn.Module, module: nn.Module, stays: float) -> None:
 
 def _append(path: Path, row: Mapping[str, float | int]) -> None:
     finite = {name: value if math.isfinite(value) else None for name, value in row.items()}
+    if not path.exists():
+        with atomic.listed_file(path.parent, path.name, TRAIN, grows=True) as temporary:
+            temporary.touch()
     with atomic.named_in_errors(path), path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(finite) + "\n")
 
@@ -224,5 +230,5 @@ def _forget_later(folder: Path, step: int) -> None:
     """Drop rows of steps after the checkpoint: they come again."""
     if (folder / LOG).is_file():
         kept = [row for row in read_log(folder) if (row["step"] or 0) <= step]
-        with atomic.new_file(folder / LOG) as temporary:
+        with atomic.listed_file(folder, LOG, TRAIN, grows=True) as temporary:
             temporary.write_text("".join(f"{json.dumps(row)}\n" for row in kept), encoding="utf-8")

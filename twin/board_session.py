@@ -5,7 +5,6 @@ finished set then takes its place as `OUT/capture/` and `OUT/truth/`.
 """
 
 import math
-import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from recon.capture import writer
 from recon.capture.manifest import MANIFEST, BoardPart, Device
-from recon.files import atomic
+from recon.files import atomic, written_files
 from recon.geometry import rigid
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
@@ -34,7 +33,7 @@ from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, is_convex, move_things
 from twin.optics.surface_session import CameraName, Shooting, calibration_of, camera_optics, describe_visible, device_of
 from twin.sensor import Exposure, Numbers, auto_exposure, expose
-from twin.session import CAPTURE, SETTINGS, Session, read_json, write_json
+from twin.session import CAPTURE, SETTINGS, TWIN, Session, read_json, write_json
 
 FRINGE_CAMERA: CameraName = "cam1"  # sees the fringes; others see the board lit only
 CAMERAS: tuple[CameraName, CameraName] = ("cam1", "cam2")
@@ -252,8 +251,8 @@ def is_finished(session: Session) -> bool:
 
 def check_place(folder: Path) -> None:
     """Check, before any work, that a folder is new or one in which a board's images are kept; else raises InputError."""
-    if not (folder / UNFINISHED / SETTINGS).is_file():
-        atomic.check_folder(folder, f"{CAPTURE}/{MANIFEST}")
+    if not any((folder / file).is_file() for file in (f"{UNFINISHED}/{SETTINGS}", f"{CAPTURE}/{MANIFEST}")):
+        atomic.check_folder(folder, TWIN)
 
 
 def missing_poses(session: Session, settings: Settings) -> list[int]:
@@ -266,12 +265,14 @@ def missing_poses(session: Session, settings: Settings) -> list[int]:
     """
     session.check()
     unfinished = session.out / UNFINISHED
-    atomic.check_folder(unfinished, SETTINGS)
+    atomic.check_folder(unfinished, TWIN)
     kept = unfinished / SETTINGS
     if not kept.is_file() or read_json(kept) != session.settings:
-        with atomic.new_folder(unfinished, SETTINGS) as folder:
+        written_files.discard(unfinished)
+        with atomic.new_folder(unfinished, TWIN) as folder:
             write_json(folder / SETTINGS, session.settings)
-    return [k for k in range(settings.poses.count) if not (unfinished / "capture" / "board" / pose_name(k)).is_dir()]
+    places = [unfinished / "capture" / "board" / pose_name(k) for k in range(settings.poses.count)]
+    return [k for k, place in enumerate(places) if not written_files.is_whole(place)]
 
 
 def write_pose(session: Session, number: int, lit: Mapping[str, Numbers], fringes: Mapping[str, Numbers]) -> None:
@@ -293,7 +294,7 @@ def finish(session: Session, settings: Settings, exposures: Mapping[CameraName, 
         truth.write_arrays("board.npz", board_truth(settings, placed))
         atomic.link_tree(session.out / UNFINISHED / "capture", capture.folder, leave_out={MANIFEST})
         capture.add_board(part, devices)
-    shutil.rmtree(session.out / UNFINISHED)
+    written_files.discard(session.out / UNFINISHED)
 
 
 def board_truth(settings: Settings, placed: rigid.Array) -> dict[str, np.ndarray]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from recon.capture import calibration_files
 from recon.capture.manifest import MANIFEST, OPTICS, SWEEP, PartName, Purpose, is_sweep, read_manifest
-from recon.capture.writer import CaptureWriter, check_kept
+from recon.capture.writer import AMENDED, CaptureWriter, check_kept
 from recon.errors import InputError
 from recon.files import atomic, json_text, npz
 from recon.geometry.camera import Camera
@@ -28,8 +28,9 @@ from recon.model.calibration import Calibration
 from scenes.scene_types import Scene
 
 CAPTURE, TRUTH = "capture", "truth"
-SCENE = "scene.json"  # by which a folder of truth is known
+SCENE = "scene.json"
 SETTINGS = "settings.json"
+TWIN = "the twin"  # who writes captures and truths
 
 
 @dataclass(frozen=True)
@@ -110,8 +111,8 @@ class Session:
             If something else is there: other files, other parts that would be lost, a sweep of other devices in the place of this
             one, parts that can't stay where they are, or parts rendered with another rig.
         """
-        atomic.check_folder(self.truth.folder, SCENE)
-        atomic.check_folder(self.capture, MANIFEST)
+        atomic.check_folder(self.truth.folder, TWIN)
+        atomic.check_folder(self.capture, TWIN, amends=AMENDED if self.add else ())
         atomic.restore((self.truth.folder, self.capture))
         self._check_parts()
 
@@ -154,7 +155,8 @@ class Session:
         ----------
         scene : as of `describe`
         """
-        with atomic.new_folders({self.truth.folder: SCENE, self.capture: MANIFEST}) as (folder, capture):
+        places = {self.truth.folder: TWIN, self.capture: TWIN}
+        with atomic.new_folders(places, {self.capture: AMENDED} if self.add else {}) as (folder, capture):
             self._check_parts()
             writer, truth = CaptureWriter(capture, str(scene["name"])), TruthFolder(folder, self.part)
             kept = writer.keep(self.capture, self.part) if self.add and (self.capture / MANIFEST).is_file() else ()

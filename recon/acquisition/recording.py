@@ -9,12 +9,12 @@ folder is opened for the next recording.
 import logging
 import os
 import re
-import shutil
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -25,13 +25,15 @@ from recon.capture import calibration_files, manifest, probe_files, writer
 from recon.capture.images import PNG_ENCODER, Images, Size, write_images
 from recon.capture.manifest import BoardPart, Device, Manifest, PartName, Purpose, SurfacePart, SweepPart, image_name
 from recon.errors import InputError, one_line
-from recon.files import atomic
+from recon.files import atomic, written_files
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
 
 log = logging.getLogger(__name__)
 
 SURFACE, BOARD = "surface", "board"
+RECORD = "record"  # who writes
+FRAME_FILE = re.compile(rf"\.?(\d+\.png|{re.escape(manifest.STAMPS)})(\.part)?")  # of a sweep's device
 
 
 class Recording:
@@ -68,19 +70,13 @@ class Recording:
     def add_calibration(self, file: Path, sizes: Mapping[str, Size]) -> None:
         """Copy the calibration of cameras and projector, of any dialect; InputError if it isn't one of devices of these sizes."""
         optics = calibration_files.read_for(file, sizes)
-        place = self.folder / manifest.OPTICS
-        place.parent.mkdir(exist_ok=True)
-        with atomic.new_file(place) as temporary:
-            calibration_files.write(temporary, optics)
+        self._copy(manifest.OPTICS, lambda path: calibration_files.write(path, optics))
         self._exchange(writer.changed(self._manifest, calibration=manifest.OPTICS))
 
     def add_probe(self, file: Path) -> None:
         """Copy the calibration of the ultrasound probe, of any dialect; InputError if it can't be read."""
         probe = probe_files.read(file)
-        place = self.folder / manifest.PROBE
-        place.parent.mkdir(exist_ok=True)
-        with atomic.new_file(place) as temporary:
-            probe_files.write(temporary, probe)
+        self._copy(manifest.PROBE, lambda path: probe_files.write(path, probe))
         self._exchange(writer.changed(self._manifest, probe=manifest.PROBE))
 
     def add_surface(self, images: Mapping[str, Images], patterns: Patterns, devices: Mapping[str, Device]) -> None:
@@ -92,9 +88,9 @@ class Recording:
         place = f"{SURFACE}/take{max(takes, default=0) + 1:02d}"
         paths = {camera: tuple(f"{place}/{camera}/{image_name(k)}" for k in range(patterns.count)) for camera in images}
         try:
-            with atomic.named_in_errors(self.folder / place):
+            with atomic.new_folder(self.folder / place, RECORD) as temporary:
                 for camera, stack in images.items():
-                    write_images([self.folder / path for path in paths[camera]], stack)
+                    write_images([temporary / Path(path).relative_to(place) for path in paths[camera]], stack)
             self._enter(SURFACE, SurfacePart(patterns=patterns, images=paths), devices)
         finally:
             self._tidy_surface()
@@ -123,7 +119,7 @@ class Recording:
         before = self._manifest.board
         poses = before.poses if before else ()
         name = self.next_pose
-        shutil.rmtree(self.folder / BOARD / name, ignore_errors=True)  # of a pose that was never entered
+        written_files.discard(self.folder / BOARD / name)  # of a pose that was never entered
         pose = writer.write_pose(self.folder, name, lit, fringes)
         self._enter(BOARD, BoardPart(board=board, patterns=patterns, poses=(*poses, pose)), devices)
         return name
@@ -132,7 +128,10 @@ class Recording:
     def next_pose(self) -> str:
         """Name of the next pose of a board."""
         poses = self._manifest.board.poses if self._manifest.board else ()
-        return f"{max((int(pose.name) for pose in poses if pose.name.isdecimal()), default=-1) + 1:02d}"
+        number = max((int(pose.name) for pose in poses if pose.name.isdecimal()), default=-1) + 1
+        while written_files.foreign(self.folder / BOARD / f"{number:02d}"):
+            number += 1
+        return f"{number:02d}"
 
     def check_board(self, board: Board, patterns: Patterns | None) -> None:
         """Check that the poses so far show this board under these patterns; InputError else."""
@@ -150,13 +149,34 @@ class Recording:
         """Give a sweep to add frames to, from any thread; InputError as of `check_new`."""
         place = manifest.sweep_part(name)
         self.check_new(place)
-        for device in devices:  # of a sweep that was never entered
-            shutil.rmtree(self.folder / place / device, ignore_errors=True)
+        for device in devices:
+            self._clear_unentered(self.folder / place / device)
         growing = GrowingSweep(self, place, purpose, devices)
         try:
             yield growing
         finally:
             growing.close()
+
+    def _copy(self, file: str, write: Callable[[Path], None]) -> None:
+        """Write a calibration, unless the same is there; InputError if another one is that this command didn't write."""
+        place = self.folder / file
+        place.parent.mkdir(exist_ok=True)
+        with TemporaryDirectory() as name:
+            write(made := Path(name) / place.name)
+            content = made.read_bytes()
+        if not (place.is_file() and place.read_bytes() == content):
+            with atomic.listed_file(self.folder, file, RECORD) as temporary:
+                temporary.write_bytes(content)
+
+    def _clear_unentered(self, folder: Path) -> None:
+        """Make room for a sweep's device: remove what a killed process recorded and didn't enter; InputError if there is more."""
+        if written_files.LIST in (written_files.read_list(folder) or {}):
+            for name in written_files.entries(folder):
+                if FRAME_FILE.fullmatch(name):
+                    (folder / name).unlink()
+        if there := written_files.entries(folder):
+            found = f"found {min(there)}, which sonotwin didn't record; move it away, or give another name=NAME"
+            raise InputError(f"{folder}: expected nothing where a sweep is recorded, {found}")
 
     def _enter(self, name: PartName, part: manifest.Part, devices: Mapping[str, Device]) -> None:
         """Enter a part into the manifest; InputError if its devices are others than those of the capture's other parts."""
@@ -174,17 +194,21 @@ class Recording:
 
     def _remove(self) -> None:
         """Remove a new capture into which nothing was recorded."""
-        shutil.rmtree(self.folder / Path(manifest.OPTICS).parent, ignore_errors=True)
+        with suppress(InputError):  # of one that was changed since
+            atomic.remove_listed(self.folder, (manifest.OPTICS, manifest.PROBE), RECORD)
         (self.folder / manifest.MANIFEST).unlink()
-        with suppress(OSError):  # of a sweep of which a frame was written, but not entered
-            self.folder.rmdir()
+        if not written_files.entries(self.folder) - {str(Path(manifest.OPTICS).parent)}:
+            written_files.discard(self.folder)
+        for empty in (self.folder / Path(manifest.OPTICS).parent, self.folder):
+            with suppress(OSError):  # of a sweep of which a frame was written, but not entered
+                empty.rmdir()
 
     def _tidy_surface(self) -> None:
         """Remove takes of the surface that the manifest doesn't name."""
         named = {path for paths in (self._manifest.surface.images.values() if self._manifest.surface else ()) for path in paths}
         for entry in _entries(self.folder / SURFACE):
             if re.fullmatch(r"take\d+", entry.name) and not any(path.startswith(f"{SURFACE}/{entry.name}/") for path in named):
-                shutil.rmtree(entry)
+                written_files.discard(entry)
 
     def _tidy(self) -> None:
         """Mend what a process that was killed has left."""
@@ -219,7 +243,8 @@ class GrowingSweep:
             If it can't be written, as on a full disk; all frames before it stay as they are.
         """
         folder = self._recording.folder / self.place / device
-        folder.mkdir(parents=True, exist_ok=True)
+        if device not in self._tables:
+            atomic.begin_filled(folder, RECORD)
         encoded, data = cv2.imencode(".png", image, PNG_ENCODER)
         if not encoded:
             raise OSError(f"{folder}: the PNG encoder failed")
@@ -230,6 +255,7 @@ class GrowingSweep:
         self._tables[device] = GrowingTable(folder / manifest.STAMPS)
         self._tables[device].append(number, time_ns)
         self._enter()
+        (folder / written_files.LIST).unlink(missing_ok=True)  # from now on the manifest names what is here
 
     def close(self) -> None:
         """End the tables."""
@@ -255,7 +281,7 @@ def open_recording(folder: Path, name: str = "") -> Iterator[Recording]:
     """
     folder = Path(os.path.realpath(folder))
     _check_capture(folder)
-    atomic.check_folder(folder, manifest.MANIFEST)
+    atomic.check_folder(folder, RECORD, amends=(manifest.MANIFEST,))
     folder.mkdir(parents=True, exist_ok=True)
     with atomic.alone(folder):
         path = folder / manifest.MANIFEST

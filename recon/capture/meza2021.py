@@ -32,7 +32,7 @@ PROJECTOR_SIZE = (1280, 800)  # px; their files don't store it
 PARAMETERS = "cam1_proj_params.npz"
 STEREO_PARAMETERS = "cam1_cam2_params.npz"
 STEREO_XML = "StereoParams.xml"  # the same, as OpenCV FileStorage
-MARKER = "sonotwin-export.json"  # by which a folder of ours is known; theirs is never replaced
+MARKER = "sonotwin-export.json"  # by which a folder of ours is known
 
 
 def patterns(projector_size: Size = PROJECTOR_SIZE, lit: bool = True) -> Patterns:
@@ -101,7 +101,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
     InputError
         If the place is taken by something else, a folder of theirs included, or can't be written to.
     """
-    with atomic.new_folder(folder, MARKER) as temporary:
+    with atomic.new_folder(folder, "export") as temporary:
         mark(temporary)
         yield temporary
 

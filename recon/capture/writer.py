@@ -6,7 +6,6 @@ The same input gives the same bytes.
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +31,8 @@ from recon.model.calibration import Calibration
 from recon.model.patterns import Patterns
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
+
+AMENDED = (manifest.MANIFEST, manifest.OPTICS)  # where a part is added: what they hold stays in them
 
 
 class CaptureWriter:
@@ -195,7 +196,7 @@ def changed(before: Manifest, **fields: object) -> Manifest:
 
 
 @contextmanager
-def new_capture(folder: Path, name: str = "", add: PartName | None = None) -> Iterator[CaptureWriter]:
+def new_capture(folder: Path, name: str = "", add: PartName | None = None, by: str = "new_capture") -> Iterator[CaptureWriter]:
     """Give the writer of a capture folder, which appears whole or not at all.
 
     Waits, before anything is written, for another process that writes the same folder, so that no part of either is lost.
@@ -203,13 +204,14 @@ def new_capture(folder: Path, name: str = "", add: PartName | None = None) -> It
     Parameters
     ----------
     add : the one part that is written; all others of a capture that is there stay. None replaces the whole capture.
+    by : verb or function that writes; only files that it wrote itself are replaced
 
     Raises
     ------
     InputError
-        If the place is taken by something that is not a capture, or can't be written to.
+        If the place is taken by something that `by` didn't write, or that isn't as it was written; or can't be written to.
     """
-    with atomic.new_folder(folder, manifest.MANIFEST) as temporary:
+    with atomic.new_folder(folder, by, () if add is None else AMENDED) as temporary:
         capture = CaptureWriter(temporary, name)
         if add is not None and Path(folder, manifest.MANIFEST).is_file():
             capture.keep(Path(folder), add)
@@ -235,11 +237,11 @@ def write_surface(
     Raises
     ------
     InputError
-        If the place is taken by something that is not a capture, or can't be written to.
+        If the place is taken by something else than an earlier such capture, as it was written, or can't be written to.
     ValueError
         If images, patterns and devices don't fit together.
     """
-    with new_capture(folder, name) as capture:
+    with new_capture(folder, name, by="write_surface") as capture:
         capture.add_calibration(optics)
         capture.add_surface(images, patterns, devices)
 
@@ -263,8 +265,7 @@ def write_pose(folder: Path, name: str, lit: Mapping[str, Images], fringes: Mapp
     """
     record = describe_pose(name, list(lit), {camera: len(stack) for camera, stack in fringes.items()})
     place = Path("board", name)
-    marker = Path(next(chain(record.lit.values(), *record.fringes.values()))).relative_to(place)
-    with atomic.new_folder(folder / place, str(marker)) as temporary:
+    with atomic.new_folder(folder / place, "write_pose") as temporary:
         for camera, stack in fringes.items():
             write_images([temporary / Path(path).relative_to(place) for path in record.fringes[camera]], stack)
         for camera, image in lit.items():

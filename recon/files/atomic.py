@@ -14,70 +14,153 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 
 from filelock import Timeout
 
 from recon import file_locks, interrupts
 from recon.errors import InputError
-from recon.files import renaming
+from recon.files import renaming, written_files
+from recon.files.written_files import LIST, UNPLACED
 
 log = logging.getLogger(__name__)
 
-UNPLACED = ".unplaced"  # in the last of several new folders, until all are in place
+_being_written = set[Path]()  # temporary files of this process
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """Give a temporary path with the same suffix to write to; on success it becomes `path`, on failure it goes away.
 
-    Where `path` is a link, the file that it leads to is written.
+    Where `path` is a link, the file that it leads to is written; where it is such a temporary path, that itself.
     """
     path = Path(os.path.realpath(path))
+    if path in _being_written:
+        yield path
+        return
     if not path.parent.is_dir():  # the lock's file would make it
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
     temporary = _beside(path, "new")
     with named_in_errors(path), alone(path):
+        _being_written.add(temporary)
         try:
             yield temporary
             os.replace(temporary, path)
         finally:
+            _being_written.discard(temporary)
             temporary.unlink(missing_ok=True)
 
 
 @contextmanager
-def new_folder(path: Path, marker: str) -> Iterator[Path]:
+def new_folder(path: Path, by: str, amends: Collection[str] = ()) -> Iterator[Path]:
     """Give a temporary folder to fill; on success it takes the place of `path`, on failure it goes away.
 
-    A folder that is already there is replaced if `check_folder` allows it, and deleted once the new one is in its place.
+    Of a folder that is already there, the files that `by` wrote are replaced if `check_folder` allows it; all else stays in it.
     """
-    with new_folders({path: marker}) as (folder,):
+    with new_folders({path: by}, {path: amends} if amends else {}) as (folder,):
         yield folder
 
 
 @contextmanager
-def new_folders(places: Mapping[Path, str]) -> Iterator[tuple[Path, ...]]:
+def new_folders(
+    places: Mapping[Path, str], amends: Mapping[Path, Collection[str]] = MappingProxyType({})
+) -> Iterator[tuple[Path, ...]]:
     """Give temporary folders to fill, one a place; on success all take their places, on failure all old folders stay.
 
     The last folder is exchanged with the old one at once, so that at every moment an old or a new one can be read. The others are
     set aside before and put in place after it, so that none stands beside another age of the last. Where a path is a link, the
     folder that it leads to is replaced. Waits until no other process writes one of them; what stands there then doesn't change
-    before the end.
+    before the end. What is there and isn't replaced, by `written_files`, is in the new folder, too.
 
     Parameters
     ----------
-    places : path -> marker, as of `check_folder`
+    places : path -> who writes it, as of `check_folder`
+    amends : path -> files there that are replaced whoever wrote them, as of `check_folder`
     """
-    paths = [Path(os.path.realpath(path)) for path in places]
+    by = {Path(os.path.realpath(path)): name for path, name in places.items()}
+    amended = {Path(os.path.realpath(path)): names for path, names in amends.items()}
+    paths = list(by)
     with ExitStack() as locks:
         for path in sorted(paths):
             _check_writable(path, path.parent)
             path.parent.mkdir(parents=True, exist_ok=True)
             locks.enter_context(alone(path))
         _put_back(paths)
-        for path, marker in zip(paths, places.values(), strict=True):
-            check_folder(path, marker)
+        for path in paths:
+            check_folder(path, by[path], amends=amended.get(path, ()))
         with named_in_errors(paths[-1]), _exchanged(paths) as temporaries:
             yield temporaries
+            for folder, path in zip(temporaries, paths, strict=True):
+                written_files.complete(folder, path, by[path], amended.get(path, ()))
+    for path in paths:
+        if path not in amended and (others := written_files.foreign(path)):
+            log.warning("%s: kept %s, which this run didn't write", path, ", ".join(others[:3]) + " ..." * (len(others) > 3))
+
+
+def begin_filled(folder: Path, by: str) -> None:
+    """Make a folder that is filled where it stands, and list its writer, so that a run that is killed can go on."""
+    folder.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(folder / LIST)
+    if LIST not in (written_files.read_list(folder) or {}):
+        _enter(folder, LIST, (written_files.Written(by, 0, ""),))
+
+
+@contextmanager
+def listed_file(folder: Path, name: str, by: str, grows: bool = False) -> Iterator[Path]:
+    """As `new_file`, in a folder that is filled where it stands: only a file that `by` wrote is replaced, as it was written.
+
+    Parameters
+    ----------
+    grows : whether more is appended to the file later
+
+    Raises
+    ------
+    InputError
+        As of `check_listed`.
+    """
+    path = folder / name
+    with new_file(path) as temporary:
+        check_listed(folder, name, by)
+        yield temporary
+        new = written_files.written(temporary, by, grows)
+        before = _enter(folder, name, (new,), kept=True)  # either is right until one stands there
+        if before == (new,) and path.is_file():
+            return
+    _enter(folder, name, (new,))
+
+
+def list_again(folder: Path, name: str, by: str) -> None:
+    """List a file that has grown, in a folder that is filled where it stands, as it is now."""
+    _enter(folder, name, (written_files.written(folder / name, by, grows=True),))
+
+
+def check_listed(folder: Path, name: str, by: str) -> None:
+    """Check that a file in a folder that is filled where it stands can be written; InputError if another's is there."""
+    path, files = folder / name, written_files.read_list(folder) or {}
+    if os.path.lexists(path) and not (name in files and written_files.is_unchanged(path, files[name])):
+        found = "found it changed since" if name in files else "found another file"
+        raise InputError(f"{path}: expected nothing or a file as {by} wrote it, {found}; {written_files.ELSEWHERE}")
+
+
+def remove_listed(folder: Path, names: Iterable[str], by: str) -> None:
+    """Remove some files from a folder that is filled where it stands; InputError, and nothing removed, if another's is there."""
+    there = [name for name in names if os.path.lexists(folder / name)]
+    for name in there:
+        check_listed(folder, name, by)
+    for name in there:
+        (folder / name).unlink()
+
+
+def _enter(
+    folder: Path, name: str, written: tuple[written_files.Written, ...], kept: bool = False
+) -> tuple[written_files.Written, ...]:
+    """Enter a file into a folder's list, in place of what it says of it or beside that; returns what it said."""
+    with new_file(folder / LIST) as temporary:
+        files = written_files.read_list(folder) or {}
+        before = files.get(name, ())
+        files[name] = tuple(dict.fromkeys((*written, *(before if kept else ()))))
+        written_files.write_list(temporary, files)
+    return before
 
 
 @contextmanager
@@ -106,7 +189,9 @@ def _exchanged(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
             for path in others:
                 if path.exists():
                     path.rename(_beside(path, "old"))
-            _exchange(made[-1], last)
+            whole = _beside(last, "whole")
+            os.rename(made[-1], whole)
+            _exchange(whole, last)
             for folder, path in zip(made, others, strict=False):
                 folder.rename(path)
     finally:
@@ -145,14 +230,20 @@ def _put_back(paths: Sequence[Path]) -> None:
     """
     *others, last = paths
     for aside in [] if last.exists() else _leftovers(last, "old"):
-        aside.rename(last)
+        _return(aside, last)
     state = "new" if (last / UNPLACED).exists() else "old"
     for path in others:
         for folder in [] if path.exists() else _leftovers(path, state):
-            folder.rename(path)
+            _return(folder, path)
     (last / UNPLACED).unlink(missing_ok=True)
     for path in paths:
-        _remove(_leftovers(path))
+        _remove(path)
+
+
+def _return(aside: Path, path: Path) -> None:
+    """Put a whole folder of ours back in its place."""
+    if (aside / LIST).is_file():
+        aside.rename(path)
 
 
 def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> None:
@@ -160,7 +251,7 @@ def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> No
 
     Parameters
     ----------
-    leave_out : files and folders in `source`, as paths relative to it
+    leave_out : files and folders in `source`, as paths relative to it; lists of what sonotwin wrote are always left out
     """
 
     def link(file: str, name: str) -> None:
@@ -171,7 +262,7 @@ def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> No
 
     def left_out(folder: str, names: list[str]) -> list[str]:
         here = Path(folder).relative_to(source)
-        return [name for name in names if (here / name).as_posix() in leave_out]
+        return [name for name in names if name == LIST or (here / name).as_posix() in leave_out]
 
     shutil.copytree(source, target, copy_function=link, ignore=left_out, dirs_exist_ok=True)
 
@@ -179,43 +270,49 @@ def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> No
 def remove_leftovers(path: Path) -> None:
     """Remove the temporary files and folders that a process which was killed while it wrote `path` has left beside it."""
     path = Path(os.path.realpath(path))
-    if _leftovers(path):
+    if _leftovers(path) or _lock_of(path).exists():
         with suppress(Timeout), alone(path, wait=False):  # what another process is writing is no leftover
-            _remove(_leftovers(path))
+            _remove(path)
 
 
-def _remove(entries: Iterable[Path]) -> None:
-    for entry in entries:
+def _remove(path: Path) -> None:
+    """Remove leftovers beside a place, whose lock is held; what others have put into a folder that stood there goes back."""
+    for entry in _leftovers(path, "new"):  # wholly ours, perhaps half
         shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    for entry in _leftovers(path, "whole|old"):
+        if entry.is_dir():
+            written_files.take_away(entry, path)
 
 
-def check_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
+def check_folder(path: Path, by: str, inputs: Iterable[Path] = (), amends: Collection[str] = ()) -> None:
     """Check, before any long work, that a folder can be written at `path`, and that nothing is lost by it.
 
     Parameters
     ----------
-    marker : str
-        A file that folders of this kind have and no others, by which one that may be replaced is known.
+    by : str
+        Who writes it: a verb, or a function. Only files that it wrote itself may be replaced.
     inputs : iterable of paths
         Sources of the folder's content.
+    amends : collection of str
+        Files that are replaced whoever wrote them, as the new ones take over what they hold.
 
     Raises
     ------
     InputError
-        If something else is there: a file, or a folder that holds files but not `marker`; if `path` is one of the inputs or has
-        one in it; or if the place can't be written to.
+        If something else is there: a file, a folder of another's, or one with a file that was changed since; if `path` is one of
+        the inputs or has one in it; or if the place can't be written to.
     """
-    path = _checked(path, marker, inputs)
+    path = _checked(path, by, inputs, amends)
     _check_writable(path, path.parent)
 
 
-def check_filled_folder(path: Path, marker: str, inputs: Iterable[Path] = ()) -> None:
+def check_filled_folder(path: Path, by: str, inputs: Iterable[Path] = ()) -> None:
     """The same of a folder that is filled where it stands, not replaced: of one that is there the parent needn't be writable."""
-    path = _checked(path, marker, inputs)
+    path = _checked(path, by, inputs)
     _check_writable(path, path)
 
 
-def _checked(path: Path, marker: str, inputs: Iterable[Path]) -> Path:
+def _checked(path: Path, by: str, inputs: Iterable[Path], amends: Collection[str] = ()) -> Path:
     """The place itself behind links, where nothing is lost by writing there; InputError otherwise, as of `check_folder`."""
     named, path = path, Path(os.path.realpath(path))
     if path.is_symlink():
@@ -225,8 +322,8 @@ def _checked(path: Path, marker: str, inputs: Iterable[Path]) -> Path:
             raise InputError(f"{path}: expected a folder apart from what is read, found it to hold {source}")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: expected a folder or nothing, found a file")
-    if path.is_dir() and any(path.iterdir()) and not (path / marker).is_file():
-        raise InputError(f"{path}: expected a new or empty folder or one with {marker} to replace, found other files")
+    if path.is_dir():
+        written_files.replaceable(path, by, amends)
     return path
 
 
@@ -244,7 +341,7 @@ def _check_writable(path: Path, folder: Path) -> None:
 def alone(path: Path, wait: bool = True) -> Iterator[None]:
     """Hold the lock of a place. Where another process, or another thread, holds it: wait, or raise Timeout."""
     path = Path(os.path.realpath(path))
-    place = path.with_name(f".{path.name}.lock")
+    place = _lock_of(path)
 
     def announce(holder: str) -> None:
         log.warning("%s: waiting for %s, which is writing it", path, holder)
@@ -253,7 +350,11 @@ def alone(path: Path, wait: bool = True) -> Iterator[None]:
         yield
 
 
-def _leftovers(path: Path, states: str = "new|old") -> list[Path]:
+def _lock_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}.lock")
+
+
+def _leftovers(path: Path, states: str = "new|whole|old") -> list[Path]:
     """Hidden names beside `path` in one of the states, of any process."""
     name = re.compile(rf"\.{re.escape(path.stem)}\.\d+\.({states}){re.escape(path.suffix)}")
     entries = list(path.parent.iterdir()) if path.parent.is_dir() else []

@@ -75,7 +75,7 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     inputs = [path for path in (config.capture, config.truth) if path is not None]
-    atomic.check_folder(config.out, PAGE, inputs=inputs)
+    atomic.check_folder(config.out, "calibrate-optics", inputs=inputs)
     captured = board_part.read_board(config.capture)
     sizes = board_frames.sizes_of(captured, config.devices)
     truth = None if config.truth is None else calibration_files.read_for(config.truth / manifest.OPTICS, sizes)
@@ -157,7 +157,7 @@ def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
 def write(config: Config, result: Result, figures: Metrics, truth: Calibration | None) -> list[str]:
     """Write all files, whole or not at all; returns their names."""
     found = result.adjustment.calibration
-    with atomic.new_folder(config.out, PAGE) as folder:
+    with atomic.new_folder(config.out, "calibrate-optics") as folder:
         calibration_files.write(folder / OPTICS, found)
         names = [OPTICS, *meza2021.write_parameters(folder, found), metrics.FILE, PAGE]
         metrics.write(folder / metrics.FILE, figures)

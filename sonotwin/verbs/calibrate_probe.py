@@ -93,7 +93,7 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     source = config.capture or config.sequence or config.pairs
     assert source is not None
-    atomic.check_folder(config.out, FRAMES, inputs=[source, *([] if config.earlier is None else [config.earlier])])
+    atomic.check_folder(config.out, "calibrate-probe", inputs=[source, *([] if config.earlier is None else [config.earlier])])
     earlier = None if config.earlier is None else probe_files.read(config.earlier)
     if config.temperature_c is not None:
         sound_in_water.speed_of_sound(config.temperature_c)  # a mistake shows before the work
@@ -146,7 +146,7 @@ def read(config: Config) -> SweepCapture | SequenceSweep:
 
 def write(out: Path, frames: CrossingFrames, result: Result, figures: Metrics) -> list[str]:
     """Write all files, whole or not at all; returns their names."""
-    with atomic.new_folder(out, FRAMES) as folder:
+    with atomic.new_folder(out, "calibrate-probe") as folder:
         probe_files.write(folder / PROBE, result.calibration)
         probe_files.write_authors(folder / probe_files.AUTHORS, result.calibration)
         sweep_tables.write_rows(folder / FRAMES, probe_figures.COLUMNS, probe_figures.rows(frames, result.adjustment))

@@ -51,7 +51,7 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     inputs = [path for path in (config.capture, config.calibration, config.networks) if path is not None]
-    atomic.check_folder(config.out, TARGET, inputs=inputs)
+    atomic.check_folder(config.out, "calibrate-target", inputs=inputs)
     film = stereo_frames.read_film(config.capture, config.calibration, config.sweep)
     design = config.rig.target
     tracker = make_tracker(config, design, film.cameras, film.optics, film.bits)
@@ -66,7 +66,7 @@ def run(config: Config) -> None:
         console.print(line, markup=False)
     if film.optics is None:
         console.print(f"warning     {NO_COVARIANCE}", markup=False)
-    with atomic.new_folder(config.out, TARGET) as folder:
+    with atomic.new_folder(config.out, "calibrate-target") as folder:
         target_files.write(folder / TARGET, adjusted.target, adjusted.covariance)
         metrics.write(folder / metrics.FILE, figures)
     console.print(f"wrote       {config.out}/{{{TARGET},{metrics.FILE}}}", markup=False)

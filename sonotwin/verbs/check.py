@@ -82,7 +82,7 @@ def run(config: Config) -> int:
     console = Console(soft_wrap=True, highlight=False)
     given = (config.capture, config.tracked, config.calibration, config.probe, config.lag, config.target, config.log)
     inputs = [path for path in given if path is not None]  # the log, too: a folder that is replaced would take it along
-    atomic.check_folder(config.out, CHECK, inputs=inputs)
+    atomic.check_folder(config.out, "check", inputs=inputs)
     earlier = check_log.read(config.log) if config.log is not None and config.log.exists() else []
     listed = manifest.read_manifest(config.capture)
     held = parts_of(config, listed, listed if config.tracked is None else manifest.read_manifest(config.tracked))
@@ -94,7 +94,7 @@ def run(config: Config) -> int:
     for line in check_page.lines(made):
         console.print(line, markup=False)
     console.print(f"verdict     {check_page.summary(made.parts)}", markup=False)
-    with atomic.new_folder(config.out, CHECK) as folder:
+    with atomic.new_folder(config.out, "check") as folder:
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
         (folder / PAGE).write_text(check_page.write_text(made, [*earlier, made], config.alarm_sigma), encoding="utf-8")
         if config.log is not None:  # last, so that whatever fails leaves both as they were

@@ -12,6 +12,7 @@ takes them together. A second run into one folder is refused while the first is 
     sonotwin dataset out=outputs/full samples=20 frames=full
 """
 
+from contextlib import closing
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Literal
@@ -68,9 +69,12 @@ def _make(config: Config, console: Console) -> None:
     if total < config.samples:
         console.print(f"found       {config.samples - total} samples")
     start = perf_counter()
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+    with (
+        Progress(console=console, transient=True, disable=not console.is_terminal) as progress,
+        closing(generate(place, settings, missing, config.engine)) as counts,
+    ):
         task = progress.add_task("rendering samples", total=total)
-        for count in generate(place, settings, missing, config.engine):
+        for count in counts:
             progress.advance(task, count)
     if total:
         seconds = perf_counter() - start

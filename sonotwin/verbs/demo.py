@@ -18,6 +18,7 @@ from pathlib import Path
 from rich.console import Console
 
 from recon.capture import calibration_files
+from recon.files import atomic
 from recon.files.metrics import Metrics, shown
 from recon.tracking import networks
 from scenes.catalogue import parse_scene
@@ -110,7 +111,8 @@ def telling_step(config: Config) -> Step:
         listed = [(name, text) for name, text in OUTPUTS if name.partition("/")[0] not in unmade]
         outputs = [(name, text) for name, text in listed if (folder / name.partition(",")[0]).exists() or name == "report.html"]
         lines = commands(folder, config, config._overrides, latency_fields.measured(folder / "lag") if inside else None)
-        demo_report.write(folder / "report.html", story, dict(figures), outputs, lines, inside, tracked, fused)
+        with atomic.listed_file(folder, "report.html", pipeline.DEMO) as page:
+            demo_report.write(page, story, dict(figures), outputs, lines, inside, tracked, fused)
         return {}
 
     return Step("report", "write the report", telling, ("report.html",))

@@ -70,7 +70,7 @@ def run(config: Config) -> None:
     """
     sources = [config.folder, config.calibration, config.patterns]
     inputs = [Path(source) for source in sources if source is not None and Path(source).exists()]
-    atomic.check_folder(config.out, manifest.MANIFEST, inputs=inputs)
+    atomic.check_folder(config.out, "describe", inputs=inputs)
     if config.board is None and config.patterns is None:
         raise InputError("describe: expected board, patterns or both, found none; give board={kind: ...} or patterns=NAME")
     board = None if config.board is None else design(config.board)
@@ -145,7 +145,7 @@ def write(config: Config, part: Mapping[str, SurfacePart | BoardPart], devices: 
     place = Path(os.path.abspath(config.out))
     root = Path(os.path.relpath(config.folder.resolve(), place.parent.resolve() / place.name)).as_posix()
     described = {"schema": manifest.SCHEMA, "name": config.folder.resolve().name, "root": root, "devices": devices, **part}
-    with atomic.new_folder(config.out, manifest.MANIFEST) as folder:
+    with atomic.new_folder(config.out, "describe") as folder:
         if optics is not None:
             (folder / OPTICS).parent.mkdir()
             calibration_files.write(folder / OPTICS, optics)

@@ -36,12 +36,12 @@ def run(config: Config) -> None:
         If surface or truth are missing, damaged, or don't fit together; or `out` can't be written to.
     """
     out = config.out or config.surface / "evaluation"
-    atomic.check_folder(out, ERROR_MAP, inputs=(config.surface, config.truth))
+    atomic.check_folder(out, "evaluate", inputs=(config.surface, config.truth))
     truth = surface_errors.read_truth(config.truth, config.camera)
     points, sigma = surface_errors.read_points(config.surface / POINTS)
     comparison = surface_errors.compare(points, sigma, truth)
     found = surface_errors.measure(points, comparison, truth)
-    with atomic.new_folder(out, ERROR_MAP) as folder:
+    with atomic.new_folder(out, "evaluate") as folder:
         (folder / ERROR_MAP).write_bytes(figures.error_map_png(comparison.error, comparison.interior))
         metrics.write(folder / metrics.FILE, found)
     print(f"evaluate    {describe(found)}")

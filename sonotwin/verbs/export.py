@@ -71,7 +71,7 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     given = (config.calibration, config.surface, config.probe, config.masses)
-    atomic.check_folder(config.out, meza2021.MARKER, inputs=[config.capture, *(path for path in given if path is not None)])
+    atomic.check_folder(config.out, "export", inputs=[config.capture, *(path for path in given if path is not None)])
     held = manifest.read_manifest(config.capture)
     written = []
     with console.status("writing"), meza2021.new_folder(config.out) as folder:

@@ -82,7 +82,7 @@ def run(config: Config) -> None:
     plus = None if config.config is None else plus_config.read_config(config.config)
     settings = settings_of(config, plus)
     inputs = [path for path in (config.capture, config.probe, config.sequence, config.config) if path is not None]
-    atomic.check_folder(config.out, VOLUME, inputs=inputs)
+    atomic.check_folder(config.out, "freehand", inputs=inputs)
     sweep, scans = read(config, plus)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
@@ -107,7 +107,7 @@ def run(config: Config) -> None:
     for line in describe(filled, figures, settings, config):
         console.print(line, markup=False)
 
-    with console.status("writing"), atomic.new_folder(config.out, VOLUME) as folder:
+    with console.status("writing"), atomic.new_folder(config.out, "freehand") as folder:
         volumes.write_volume(folder / VOLUME, filled.volume)
         if sigma is not None:
             volumes.write_volume(folder / SIGMA, sigma)

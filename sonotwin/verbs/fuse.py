@@ -73,12 +73,12 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     given = (config.probe, config.surface, config.masses, config.calibration, config.volume, config.mask)
-    atomic.check_folder(config.out, SCENE, inputs=[config.capture, *(path for path in given if path is not None)])
+    atomic.check_folder(config.out, "fuse", inputs=[config.capture, *(path for path in given if path is not None)])
     voxels = volumes(config)
     with console.status("putting it together"):
         scene = read(config)
         made = fused_scene.layers(scene, config.scans)
-    with console.status("writing"), atomic.new_folder(config.out, SCENE) as folder:
+    with console.status("writing"), atomic.new_folder(config.out, "fuse") as folder:
         layers.write_layers(folder / SCENE, made)
         scene_page.write(folder / PAGE, scene, config.capture.resolve().name)
         slicer_folder.write(folder / SLICER, scene, voxels, config.scans)

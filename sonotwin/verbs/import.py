@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from rich.console import Console
 
-from recon.capture import calibration_files, manifest, meza2021, meza2021_sweep, probe_files, sweep_tables
+from recon.capture import calibration_files, meza2021, meza2021_sweep, probe_files, sweep_tables
 from recon.capture.images import read_grey
 from recon.capture.manifest import SCANNER, Device, Purpose
 from recon.capture.meza2021_sweep import AuthorsSweep
@@ -58,7 +58,7 @@ def run(config: Config) -> None:
         If nothing of the layout is there, a file is damaged, parts don't fit together, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    atomic.check_folder(config.out, manifest.MANIFEST, inputs=[config.folder])
+    atomic.check_folder(config.out, "import", inputs=[config.folder])
     fringes = meza2021.read_images(config.folder, config.projector_size) if (config.folder / "SLdata").is_dir() else None
     sweep = meza2021_sweep.read_sweep(config.folder)
     if fringes is None and sweep is None:
@@ -66,7 +66,7 @@ def run(config: Config) -> None:
     images = None if fringes is None else fringes[0]
     optics, lines = cameras(config, images, sweep)
     probe = read_probe(config)
-    with console.status("writing"), new_capture(config.out, config.folder.resolve().name) as capture:
+    with console.status("writing"), new_capture(config.out, config.folder.resolve().name, by="import") as capture:
         if optics.cameras:
             capture.add_calibration(optics)
         if fringes is not None:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 from rich.console import Console
 
-from recon.capture import manifest
 from recon.capture.manifest import SCANNER, Device, Purpose
 from recon.capture.writer import new_capture
 from recon.clips import clip_reader, image_region, pose_tables
@@ -57,14 +56,14 @@ def run(config: Config) -> None:
         If one is missing or damaged, they have no time in common, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    atomic.check_folder(config.out, manifest.MANIFEST, inputs=[config.clip, config.poses])
+    atomic.check_folder(config.out, "import-sweep", inputs=[config.clip, config.poses])
     track = pose_tables.read(config.poses, config.columns)
     with console.status("reading the clip"):
         clip = clip_reader.read(config.clip)
         times = stamps(config, clip, track)
         box = b_scan(config, clip)
     width, height = box[2:]
-    with console.status("writing"), new_capture(config.out, config.clip.stem) as capture:
+    with console.status("writing"), new_capture(config.out, config.clip.stem, by="import-sweep") as capture:
         devices = {SCANNER: Device(size=(width, height))}
         capture.add_sweep({SCANNER: times}, _cut(clip, box), devices, track, purpose=config.purpose)
     for line in describe(config, clip, times, box, track):

@@ -80,7 +80,9 @@ def run(config: Config) -> None:
         If the input is incomplete or damaged, the motion doesn't determine the lag, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    atomic.check_folder(config.out, LAG, inputs=[path for path in (config.capture, config.sequence) if path is not None])
+    atomic.check_folder(
+        config.out, "measure-lag", inputs=[path for path in (config.capture, config.sequence) if path is not None]
+    )
     sweep = read(config)
     start = perf_counter()
     with console.status("looking for the bottom"):
@@ -146,7 +148,7 @@ def describe(figures: Metrics) -> Iterator[str]:
 def write(out: Path, sweep: SweepCapture | SequenceSweep, depths: Array, found: Lag, figures: Metrics) -> list[str]:
     """Write all files, whole or not at all; returns their names."""
     lag = LagFile(lag_s=found.seconds, sigma_s=found.sigma_s, interval_s=found.interval_s, coverage=latency.COVERAGE)
-    with atomic.new_folder(out, LAG) as folder:
+    with atomic.new_folder(out, "measure-lag") as folder:
         lag_files.write(folder / LAG, lag)
         sweep_tables.write_rows(folder / DEPTHS, HEADER, rows(sweep, depths, found))
         metrics.write(folder / metrics.FILE, figures)

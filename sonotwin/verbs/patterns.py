@@ -81,10 +81,10 @@ class Config(BaseModel):
 
 def run(config: Config) -> None:
     """Write images, sheet, sequence and commands."""
-    atomic.check_folder(config.out, SHEET)
+    atomic.check_folder(config.out, "patterns")
     images = projected_images.images(config.patterns, config.linearise_gamma or 1.0)
     names = [f"{k:04}.png" for k in range(len(images))]
-    with atomic.new_folder(config.out, SHEET) as folder:
+    with atomic.new_folder(config.out, "patterns") as folder:
         write_images([folder / name for name in names], images)
         if config.for_boards:
             write_images([folder / LIT], np.full_like(images[:1], projected_images.FULL))

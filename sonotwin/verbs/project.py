@@ -127,7 +127,7 @@ def run(config: Config) -> None:
 def draw(config: Config, console: Console) -> NDArray[np.uint8]:
     """Read what is given, draw, and write; returns the picture : (h, w)."""
     given = (config.skin, config.calibration, config.masses, config.cut, config.earlier_skin, config.capture, config.probe)
-    atomic.check_folder(config.out, PICTURE, inputs=[path for path in given if path is not None])
+    atomic.check_folder(config.out, "project", inputs=[path for path in given if path is not None])
     if config.masses is None and config.cut is None and config.capture is None:
         raise InputError("project: expected masses, a cut or a capture to draw, found none of them")
     cameras = calibration_files.read(config.calibration).cameras
@@ -160,7 +160,7 @@ def draw(config: Config, console: Console) -> NDArray[np.uint8]:
         raise InputError(f"{config.skin}: expected some of the curves in the projector's reach, found {found}")
 
     figures = measure(curves, drawing, masses, shift) | {"seconds_drawing": seconds}
-    with console.status("writing"), atomic.new_folder(config.out, PICTURE) as folder:
+    with console.status("writing"), atomic.new_folder(config.out, "project") as folder:
         written = write(folder, curves, names, drawing, skin, masses, cameras, config.lines)
         metrics.write(folder / metrics.FILE, figures)
     for line in described(curves, drawing, masses, shift):

@@ -27,7 +27,7 @@ from rich.console import Console
 from recon.capture import calibration_files, manifest, probe_files, target_files
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPart, is_sweep, sweep_part
 from recon.errors import InputError
-from recon.files import metrics
+from recon.files import atomic, metrics
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE
 from recon.model.probe import Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig
@@ -36,7 +36,7 @@ from recon.probe_calibration import sound_in_water
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
 from recon.tracking import networks
 from recon.tracking.results import POSES
-from sonotwin import latency_fields
+from sonotwin import kept_steps, latency_fields
 from sonotwin.kept_steps import KeptSteps, files_of
 from sonotwin.latency_fields import Latency
 from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, fuse, measure_lag, segment, surface
@@ -133,7 +133,8 @@ def run(config: Config) -> int:
         for name, part in sources.sweeps.items():
             if part.purpose in (None, "volume") and SCANNER in part.images:
                 look_inside(steps, sources, name, tracked[name], probe, lag, skin, optics)
-        metrics.write(config.out / metrics.FILE, figures(config.out, steps))
+        with atomic.listed_file(config.out, metrics.FILE, kept_steps.BY) as temporary:
+            metrics.write(temporary, figures(config.out, steps))
     if not steps.done:
         console.print("nothing     could be done: give what was left out, such as calibration=FILE, probe=FILE", markup=False)
     console.print(f"wrote       {config.out}/{{{','.join([*steps.done, metrics.FILE])}}}", markup=False)

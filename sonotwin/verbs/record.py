@@ -3,9 +3,9 @@
 Guides at the terminal, and shows in a browser, at the address that it prints, what each device sees: exposure, saturation,
 focus, fringes, whether the target is found, each fault and its remedy. Each next pose of the board is chosen as the one that
 adds most to those so far, and its outline is shown over camera 1's image. OUT is a capture folder, a new one or one that grows:
-poses are added to those that are there, sweeps have names, a new surface takes the place of the old one; of a rendered one, whose
-truth stands beside the capture, only with replace=true. Later verbs take OUT itself: capture=OUT. All that was recorded is
-on the disk at once and whole, whether the command is ended by Ctrl-C, by the system or by a lost cable; give it again to go on.
+poses are added to those that are there, sweeps have names, a new surface takes the place of the old one only with
+replace=true. Later verbs take OUT itself: capture=OUT. All that was recorded is on the disk at once and whole, whether the
+command is ended by Ctrl-C, by the system or by a lost cable; give it again to go on.
 
 `devices=virtual` has the twin stand in for every device, and for the person: `scene`, `path` and the other fields at the end of
 conf/record.yaml say what is before them. It takes as long as rendering takes: ten seconds a sequence and pose, a second a pair of
@@ -154,11 +154,11 @@ def check_place(config: Config, recording: Recording) -> None:
     if config.part == "board":
         recording.check_board(config.board, config.patterns)
     truth = recording.folder.parent / TRUTH / SURFACE
-    rendered = recording.folder.name == CAPTURE and truth.is_dir()
-    if config.part == "surface" and recording.contents.surface and rendered and not config.replace:
-        found = f"found one, and {truth}, which a recorded one wouldn't fit"
-        way = "give another out=FOLDER, or replace=true"
-        raise InputError(f"{recording.folder}: surface: expected none whose truth stands beside the capture, {found}; {way}")
+    if config.part == "surface" and recording.contents.surface and not config.replace:
+        rendered = recording.folder.name == CAPTURE and truth.is_dir()
+        found = f"found that of {recording.surface_day}"
+        found += f", and {truth}, which a recorded one wouldn't fit" if rendered else ""
+        raise InputError(f"{recording.folder}: surface: expected none yet, {found}; give another out=FOLDER, or replace=true")
 
 
 @contextmanager

@@ -97,7 +97,7 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     sources = (config.capture, config.probe, config.sequence, config.config, config.surface)
     inputs = [path for path in sources if path is not None]
-    atomic.check_folder(config.out, metrics.FILE, inputs=inputs)
+    atomic.check_folder(config.out, "segment", inputs=inputs)
     skin = None if config.surface is None else containment.read_skin(config.surface)
     scans = read(config)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
@@ -110,7 +110,7 @@ def run(config: Config) -> None:
     for line in found.lines:
         console.print(line, markup=False)
     figures = {"frames": len(scans.world_from_pixel), "frames_placed": scans.placed, "speed_m_per_s": scans.speed_m_s}
-    with console.status("writing"), atomic.new_folder(config.out, metrics.FILE) as folder:
+    with console.status("writing"), atomic.new_folder(config.out, "segment") as folder:
         for name, mesh in found.meshes.items():
             meshes.write_ply(folder / f"{name}.ply", mesh)
             meshes.write_glb(folder / f"{name}.glb", mesh)

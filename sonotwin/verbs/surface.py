@@ -65,7 +65,7 @@ def run(config: Config) -> None:
     InputError
         If the input is incomplete or damaged, `out` can't be written to, or the devices have no view in common.
     """
-    atomic.check_folder(config.out, POINTS, inputs=sources(config))
+    atomic.check_folder(config.out, "surface", inputs=sources(config))
     watch = Stopwatch()
     with watch.stage("read"):
         shots = read(config)
@@ -92,7 +92,7 @@ def run(config: Config) -> None:
     points, sigma = f"{figures['points']:,}".replace(",", " "), shown(figures["predicted_rms_mm"], ".3f", " mm")
     print(f"triangulate {points} points, predicted sigma {sigma}, {figures['removed_px']} px removed as unsure")
 
-    with atomic.new_folder(config.out, POINTS) as folder:
+    with atomic.new_folder(config.out, "surface") as folder:
         with watch.stage("write"):
             meshes.write_ply(folder / "surface.ply", mesh)
             meshes.write_glb(folder / "surface.glb", mesh)

@@ -51,7 +51,7 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     inputs = [path for path in (config.capture, config.calibration, config.target, config.networks) if path is not None]
-    atomic.check_folder(config.out, results.POSES, inputs=inputs)
+    atomic.check_folder(config.out, "track", inputs=inputs)
     film = stereo_frames.read_film(config.capture, config.calibration, config.sweep)
     target = target_of(config)
     tracker = make_tracker(config, target, film.cameras, film.optics, film.bits)
@@ -59,7 +59,7 @@ def run(config: Config) -> None:
     sizes = " and ".join(dict.fromkeys("x".join(map(str, camera.size)) for camera in film.cameras))
     console.print(f"read        {len(film.times)} pairs of frames, {sizes}{rate}", markup=False)
 
-    with atomic.new_folder(config.out, results.POSES) as folder:
+    with atomic.new_folder(config.out, "track") as folder:
         start = perf_counter()
         steps = follow(film, tracker, folder if config.overlays else None, console)
         figures = track_figures.measure(steps)

@@ -31,6 +31,7 @@ from recon.files.metrics import Metrics, shown
 from recon.files.occupied import occupied
 from trainers import export, fit, free_memory, shard_reader
 from trainers.architectures import Name, is_detector, network
+from trainers.checkpoints import TRAIN
 from trainers.fit import Fitted, Plan, Precision
 from trainers.shard_reader import Data
 from trainers.stored_images import StoredImages
@@ -125,7 +126,9 @@ def run(config: Config) -> None:
         If it was stopped; a checkpoint is there then.
     """
     inputs = [*config.data, *(config.validation_data or ()), *([config.init] if config.init else ())]
-    atomic.check_filled_folder(config.out, MARKER, inputs=inputs)
+    atomic.check_filled_folder(config.out, TRAIN, inputs=inputs)
+    for name in [MARKER, *names_of(config)]:
+        atomic.check_listed(config.out, name, TRAIN)
     with occupied(config.out):
         _train(config, Console(soft_wrap=True, highlight=False))
 
@@ -188,13 +191,12 @@ def settings(config: Config) -> dict:
 
 def prepare(config: Config, goes_on: bool) -> None:
     """Make the folder, without what an earlier run left if this one starts anew."""
-    config.out.mkdir(parents=True, exist_ok=True)
+    atomic.begin_filled(config.out, TRAIN)
     for name in [MARKER, *names_of(config)]:
         atomic.remove_leftovers(config.out / name)
     if not goes_on:
-        for name in (fit.CHECKPOINT, fit.LOG, metrics.FILE, CURVES):
-            (config.out / name).unlink(missing_ok=True)
-    with atomic.new_file(config.out / MARKER) as temporary:
+        atomic.remove_listed(config.out, (fit.CHECKPOINT, fit.LOG, metrics.FILE, CURVES), TRAIN)
+    with atomic.listed_file(config.out, MARKER, TRAIN) as temporary:
         temporary.write_text(json.dumps(settings(config), indent=2) + "\n", encoding="utf-8")
 
 
@@ -257,11 +259,14 @@ def weights_file(config: Config, suffix: str) -> Path:
 
 def write(config: Config, fitted: Fitted, figures: Metrics) -> None:
     """Write the network, its figures and curves."""
-    export.save_onnx(weights_file(config, ".onnx"), fitted.network, config.network)
+    with atomic.listed_file(config.out, weights_file(config, ".onnx").name, TRAIN) as temporary:
+        export.save_onnx(temporary, fitted.network, config.network)
     for suffix in (".safetensors", ".pt"):
-        export.save(weights_file(config, suffix), fitted.network)
-    metrics.write(config.out / metrics.FILE, figures | {"steps": fitted.steps, "seconds_train": round(fitted.seconds, 1)})
-    with atomic.new_file(config.out / CURVES) as temporary:
+        with atomic.listed_file(config.out, weights_file(config, suffix).name, TRAIN) as temporary:
+            export.save(temporary, fitted.network)
+    with atomic.listed_file(config.out, metrics.FILE, TRAIN) as temporary:
+        metrics.write(temporary, figures | {"steps": fitted.steps, "seconds_train": round(fitted.seconds, 1)})
+    with atomic.listed_file(config.out, CURVES, TRAIN) as temporary:
         curves(fit.read_log(config.out)).savefig(temporary, dpi=120)
 
 

@@ -48,7 +48,7 @@ def write(
     parts.append(Section("Again, and the table in pandas", [page.commands([*commands, pandas])]))
     counted = [("trials", page.count(len(table)), ""), ("points", page.count(len(_distinct_points(table, fields))), "")]
     result = f"{len(table) - len(failed)} of {len(table)} trials gave figures."
-    with atomic.new_file(folder / PAGE) as path:
+    with atomic.listed_file(folder, PAGE, study_runs.BY) as path:
         path.write_text(page.render(Opening("study", title, result, counted), parts, FOOTER), encoding="utf-8")
 
 
@@ -102,7 +102,7 @@ def _drawn(folder: Path, table: study_plots.Table, of: Experiment, figure: str, 
 def kept_drawing(folder: Path, name: str, drawn: Figure, caption: str, detail: str) -> str:
     """A drawing for the page, kept as a PNG file too."""
     (folder / PICTURES).mkdir(exist_ok=True)
-    with atomic.new_file(folder / PICTURES / name) as path:
+    with atomic.listed_file(folder, f"{PICTURES}/{name}", study_runs.BY) as path:
         drawn.savefig(path, dpi=160, metadata={"Software": None})
     return page.drawing(figures.inline_svg(drawn), caption, detail)
 

@@ -6,8 +6,10 @@ that they depend on, and `OUT/table.parquet` has a row a trial.
 
 import json
 import math
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from twin.studies.experiments import Settings
 from twin.studies.factors import Point
 
 STUDY, TABLE, TRIALS = "study.json", "table.parquet", "trials"
+BY = "study"  # who writes
 MARKS = ("of", "settings")  # fields of a study's description, by which it is known
 ERROR = "error"  # of a trial: in one line why it has no figures
 SEED = "seed"
@@ -72,13 +75,13 @@ class StudyFolder:
 
     def open(self, description: Mapping[str, Any]) -> None:
         """Begin or go on with a study; raises InputError if the folder holds something else."""
-        atomic.check_filled_folder(self.folder, STUDY)
+        atomic.check_filled_folder(self.folder, BY)
         _check_mark(self.folder / STUDY)
-        for place in (self.folder, self.trials):
-            place.mkdir(parents=True, exist_ok=True)
+        atomic.begin_filled(self.folder, BY)
+        self.trials.mkdir(parents=True, exist_ok=True)
         for leftover in self.trials.glob(".*.new.json"):  # of a run that was killed while it wrote a trial
             atomic.remove_leftovers(self._path(leftover.name.split(".")[1]))
-        with atomic.new_file(self.folder / STUDY) as path:
+        with atomic.listed_file(self.folder, STUDY, BY) as path:
             path.write_text(json.dumps(description, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
     def kept(self, trial: Trial) -> Done | None:
@@ -92,16 +95,20 @@ class StudyFolder:
             return None
 
     def keep(self, done: Done) -> None:
-        """Keep a trial's figures; one that gave none is tried again by a later run."""
+        """Keep a trial's figures; one that gave none is tried again by a later run. A damaged one is set aside."""
         if isinstance(done.found, str):
             return
+        path = self._path(done.trial.key)
+        if os.path.lexists(path):  # it wasn't kept, and so was changed by somebody
+            aside = next(each for k in count(1) if not os.path.lexists(each := path.with_name(f"{path.name}.damaged{k}")))
+            path.rename(aside)
         figures = {name: value if math.isfinite(value) else None for name, value in done.found.items()}
         with atomic.new_file(self._path(done.trial.key)) as path:
             path.write_text(json.dumps({"figures": figures}) + "\n", encoding="utf-8")
 
     def write_table(self, done: Sequence[Done]) -> None:
         """Write a row a trial: its factors, its seed, its figures, and the error of one that has none."""
-        with atomic.new_file(self.folder / TABLE) as path:
+        with atomic.listed_file(self.folder, TABLE, BY) as path:
             pq.write_table(pa.Table.from_pylist(rows(done)), path)
 
     def _path(self, key: str) -> Path:

@@ -9,7 +9,7 @@ shards of different names, but for one that a range ends in, and no key twice.
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -35,6 +35,7 @@ from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import ViewTruth, disc_masks
 
 INDEX, SETTINGS = "index.parquet", "dataset.json"
+BY = "dataset"  # who writes
 VERSION = 2  # 1 had keys without the seed, and began with sample 0
 BATCH = 5  # samples traced in one launch; doesn't change them
 ROWS = 10_000  # of the index that are written at once
@@ -44,7 +45,7 @@ COLUMNS = pa.schema(
     + [(f"{name}_{i}", pa.float64()) for name in ("white_dn", "blur_px", "visible") for i in (1, 2)]
     + [(f"inside_{i}", pa.bool_()) for i in (1, 2)]
 )
-LEFTOVER = re.compile(r"\.shard-(\d+)\..+\.tar")  # perhaps, as of recon.files.atomic
+LEFTOVER = re.compile(r"\.shard-(\d+)\..*\.(tar|lock)")  # perhaps, as of recon.files.atomic
 MADE_ANEW = "delete the file, and the same command makes it anew"
 PNG = [cv2.IMWRITE_PNG_COMPRESSION, 4]
 RENDER = {"views": render_views, "sketches": render_sketches, "full": render_full}
@@ -111,12 +112,14 @@ def prepare(place: Place, settings: Settings) -> list[int]:
     written = {"version": VERSION, **settings.model_dump(mode="json")}
     if told.exists():
         _check_same(told, written)
-    elif place.folder.exists() and any(not path.name.startswith(".") for path in _entries(place.folder)):
-        raise InputError(f"{place.folder}: expected an empty folder or a data set, found other files")
-    place.folder.mkdir(parents=True, exist_ok=True)
-    _remove_leftovers(place)
+    atomic.check_filled_folder(place.folder, BY)
+    if place.folder.is_dir():
+        _remove_leftovers(place)
     missing = [number for number in settings.shards() if not _complete(place, settings, number)]
-    with atomic.new_file(told) as path:
+    for name in (SETTINGS, INDEX, *(place.shard(number).name for number in missing)):
+        atomic.check_listed(place.folder, name, BY)
+    atomic.begin_filled(place.folder, BY)
+    with atomic.listed_file(place.folder, SETTINGS, BY) as path:
         path.write_text(json.dumps(written, indent=1), encoding="utf-8")
     return missing
 
@@ -143,12 +146,6 @@ def _check_same(told: Path, written: Mapping[str, Any]) -> None:
         raise InputError(f"{told}: {name}: {expected}; choose another out")
 
 
-def _entries(folder: Path) -> Iterable[Path]:
-    if not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder or nothing, found a file")
-    return folder.iterdir()
-
-
 def _remove_leftovers(place: Place) -> None:
     """Remove what a killed run has left of shards; the folder, which may have many thousands, is looked through once."""
     leftovers = [LEFTOVER.fullmatch(path.name) for path in place.folder.iterdir()]
@@ -167,16 +164,20 @@ def _complete(place: Place, settings: Settings, number: int) -> bool:
         raise InputError(f"{error}; {MADE_ANEW}") from None
 
 
-def generate(place: Place, settings: Settings, missing: Sequence[int], engine: Engine) -> Iterator[int]:
-    """Make the missing shards; gives the number of samples as each shard is done."""
-    return results(engine, write_shard, ((place, settings, number) for number in missing))
+def generate(place: Place, settings: Settings, missing: Sequence[int], engine: Engine) -> Generator[int, None, None]:
+    """Make the missing shards; gives the number of samples as each shard is done. However it ends, nothing temporary is left."""
+    try:
+        yield from results(engine, write_shard, ((place, settings, number) for number in missing))
+    finally:
+        _remove_leftovers(place)  # of workers that were ended with this process
 
 
 def write_shard(place: Place, settings: Settings, number: int) -> int:
     """Render a shard's samples and write them; gives their number."""
     bank = build_bank(settings.rig.target, settings.ranges.variants, settings.seed)
     samples = settings.samples_of(number)
-    with atomic.new_file(place.shard(number)) as path, wds.TarWriter(str(path), encoder=False, mtime=0, mode=0o644) as tar:
+    shard = atomic.listed_file(place.folder, place.shard(number).name, BY)
+    with shard as path, wds.TarWriter(str(path), encoder=False, mtime=0, mode=0o644) as tar:
         for first in range(samples.start, samples.stop, BATCH):
             takes = [draw(settings.ranges, settings.rig, settings.seed, k) for k in samples if first <= k < first + BATCH]
             rendered = RENDER[settings.frames](bank, settings.rig, takes, settings.quality, settings.seed)
@@ -265,7 +266,7 @@ def truths(path: Path) -> Iterator[dict]:
 def write_index(place: Place, settings: Settings) -> None:
     """Index table, a row a sample: its place, and the quantities by which samples are chosen."""
     rows = (_index_row(place.shard(number), record) for number in settings.shards() for record in truths(place.shard(number)))
-    with atomic.new_file(place.folder / INDEX) as path, pq.ParquetWriter(path, COLUMNS) as table:
+    with atomic.listed_file(place.folder, INDEX, BY) as path, pq.ParquetWriter(path, COLUMNS) as table:
         while some := list(islice(rows, ROWS)):  # not all at once: there may be millions
             table.write_table(pa.Table.from_pylist(some, COLUMNS))
 

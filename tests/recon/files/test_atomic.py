@@ -12,6 +12,7 @@ import pytest
 
 from recon.errors import InputError
 from recon.files import atomic, renaming
+from recon.files.written_files import LIST
 
 
 def names(folder):
@@ -50,8 +51,9 @@ def test_a_folder_of_another_kind_is_left_alone(tmp_path):
 @pytest.mark.parametrize("source", ["out", "out/inner/file", "link"])
 def test_what_is_read_is_never_replaced(tmp_path, source):
     """Not if it is the folder itself, lies in it, or is the same folder by another name."""
-    (tmp_path / "out" / "inner").mkdir(parents=True)
-    (tmp_path / "out" / "mark").write_text("")
+    with atomic.new_folder(tmp_path / "out", "mark") as folder:
+        (folder / "inner").mkdir()
+        (folder / "inner" / "file").write_text("")
     (tmp_path / "link").symlink_to("out")
     atomic.check_folder(tmp_path / "out", "mark", inputs=[tmp_path, tmp_path / "outer"])
     with pytest.raises(InputError, match="expected a folder apart from what is read"):
@@ -112,7 +114,7 @@ def test_a_killed_process_may_have_had_the_number_of_a_living_one(tmp_path, proc
     (tmp_path / f".capture.{number}.new").mkdir()
     (tmp_path / f".capture.{number}.new" / "half").write_text("")
     write_both(tmp_path, "second")
-    assert [sorted(path.name for path in (tmp_path / name).iterdir()) for name in names(tmp_path)] == [["mark"], ["mark"]]
+    assert [sorted(path.name for path in (tmp_path / name).iterdir()) for name in names(tmp_path)] == [[LIST, "mark"]] * 2
 
 
 @pytest.mark.parametrize("place", ["file", "folder"])
@@ -188,7 +190,7 @@ def test_an_error_while_folders_change_places_leaves_both_of_one_age(tmp_path, m
         write_both(tmp_path, "second")
     assert names(tmp_path) == ["capture", "truth"]
     age = "first" if calls + done < 2 else "second"
-    assert [sorted(path.name for path in (tmp_path / name).iterdir()) for name in names(tmp_path)] == [["mark"], ["mark"]]
+    assert [sorted(path.name for path in (tmp_path / name).iterdir()) for name in names(tmp_path)] == [[LIST, "mark"]] * 2
     assert [(tmp_path / name / "mark").read_text() for name in names(tmp_path)] == [age, age]
 
 
@@ -237,6 +239,7 @@ def test_a_killed_process_leaves_old_folders_or_new_ones(tmp_path, calls, atomic
 import itertools, os
 from pathlib import Path
 from recon.files import atomic, renaming
+from recon.files.written_files import LIST
 count, rename, exchange = itertools.count(), Path.rename, renaming.exchange
 def or_die(work):
     return lambda *given: os._exit(9) if next(count) == {calls} else work(*given)
