@@ -4,7 +4,9 @@ A board is imprecise in four ways: each dot is printed off its place, the whole 
 (along x, along y, as a twist), and each dot stands out by its own. Each way has one standard deviation. The sightings of many
 poses show the deviations themselves; the standard deviations follow from these by the evidence: the probability of the sightings
 when deviations are drawn with them (empirical Bayes). Those of a flat board come out as the little that sightings can't exclude.
-A common scale leaves no trace, but is a stretch like aspect and shear, which do.
+A common scale leaves no trace in the sightings: it stays that of the design, and is as uncertain as aspect and shear, which do, show
+the print to be. Departures are those from a board of that scale, in the prior as in the evidence: else a smaller board, whose departures
+are smaller as well, would be the likelier one.
 
 Source: MacKay 1992, "Bayesian interpolation" (evidence).
 """
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SIGMAS_MM = np.geomspace(1e-4, 1.0, 81)  # tolerances that are thought of, each decade as likely as the next
+SAME_SCALE = 1e-6  # relative: to how much the board's scale is held to the design's
 SWEEPS = 4  # over the four tolerances, each given the others
 WAYS = ("print_mm", "stretch_mm", "bow_mm", "dent_mm")
 
@@ -37,6 +40,23 @@ class Tolerances:
         ways, which = departures(design)
         scaled = ways * self.sigmas[which]
         return scaled @ scaled.T
+
+    def information(self, design: Array) -> Array:
+        """Information : (3 n, 3 n) 1/mm^2 of a board of the design's scale; tolerances of each point above zero.
+
+        That of the tolerances, and an exact scale, as generalised least squares measure it.
+        """
+        known = np.linalg.inv(self.covariance(design))
+        larger = (design - design.mean(axis=0)).ravel()
+        scale = known @ larger / (larger @ known @ larger)  # of departures from the design
+        return known + np.outer(scale, scale) / SAME_SCALE**2
+
+    def scale_sigma(self, design: Array) -> float:
+        """Standard deviation of the scale : a ratio; of a board : (n, 3) mm that is as large as its design in the mean."""
+        if not self.sigmas[0] > 0:
+            return float(self.stretch_mm / np.sqrt(np.mean(np.sum((design - design.mean(axis=0)) ** 2, axis=1))))
+        larger = (design - design.mean(axis=0)).ravel()
+        return float(1 / np.sqrt(larger @ np.linalg.solve(self.covariance(design), larger)))
 
     @property
     def sigmas(self) -> Array:
@@ -69,6 +89,12 @@ def _stretches(design: Array) -> Array:
     return _unit([np.column_stack(way) for way in ((x, y, none), (x, -y, none), (y, x, none))])
 
 
+def _without_scale(ways: Array, design: Array) -> Array:
+    """Departures : (3 n, k) less what they change of the scale of a design : (n, 3) mm, by least squares."""
+    larger = (design - design.mean(axis=0)).ravel()
+    return ways - np.outer(larger, larger @ ways) / (larger @ larger)
+
+
 def _unit(ways: Sequence[Array]) -> Array:
     """Displacements, each (n, 3) mm, scaled to an RMS of 1 mm, side by side."""
     return np.stack([each.ravel() / np.sqrt(np.mean(np.sum(each**2, axis=1)) + 1e-30) for each in ways], axis=1)
@@ -87,6 +113,7 @@ def estimated(information: Array, pull: Array, design: Array, given: Tolerances)
         Information times the departures from the design that the sightings ask for.
     """
     ways, which = departures(design)
+    ways = _without_scale(ways, design)
     gram, along = ways.T @ information @ ways, ways.T @ pull
     sigmas = np.where(given.sigmas > 0, given.sigmas, WIDE.sigmas)
     for _ in range(SWEEPS):

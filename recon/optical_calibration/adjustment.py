@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from recon.geometry import rigid
 from recon.geometry.board_shape import AS_DESIGNED, Tolerances
 from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
 from recon.geometry.lens_domain import is_one_to_one
@@ -196,7 +197,7 @@ def prior_information(problem: Problem, estimate: Estimate) -> Array:
     lenses = np.diag(lens_sigmas(problem, estimate.cameras) ** -2)
     if not problem.released:
         return lenses
-    return block_diag(lenses, np.linalg.inv(problem.tolerances.covariance(problem.observations.points)))
+    return block_diag(lenses, problem.tolerances.information(problem.observations.points))
 
 
 def _deviation(estimate: Estimate, problem: Problem) -> Array:
@@ -250,11 +251,11 @@ def _measured_noise(system: System, problem: Problem) -> Array:
     """Noise of each device on the residuals over the noise assumed : (d,); 1 for a device that sees nothing.
 
     The median is used, as it doesn't mind outliers. The unknowns take their part of the residuals, evenly; a released board has
-    three a point, less the six of its place, which the poses have already, or fewer, if tolerances hold it.
+    three a point, less the six of its place, which the poses have already, and its scale, or fewer, if tolerances hold it.
     """
     used = problem.observations.used
     determined = problem.tolerances.determined
-    board = (3 * used.shape[1] - 6 if determined is None else determined) if problem.released else 0
+    board = (3 * used.shape[1] - 7 if determined is None else determined) if problem.released else 0
     unknowns = len(problem.names) + board + 6 * np.count_nonzero(used.any(axis=(1, 2)))
     left = 1 - unknowns / max(2 * np.count_nonzero(used), 1)
     if left <= 0:
@@ -295,7 +296,7 @@ def lens_information(
     information, right = without_poses(system)
     held, departures = np.isfinite(adjusted.lenses), _deviation(adjusted.estimate, problem)
     if released:
-        own, prior = len(problem.names), np.linalg.inv(tolerances.covariance(observations.points))
+        own, prior = len(problem.names), tolerances.information(observations.points)
         information[own:, own:] += prior
         right[own:] -= prior @ departures[own:]
     chosen = np.flatnonzero(held)
@@ -322,12 +323,23 @@ def _covariance(system: System, problem: Problem, estimate: Estimate) -> Array:
         prior_information(replace(problem, tightness={}), estimate),
     )
     if problem.released:
-        return inverse(reduced + prior)[:own, :own]
+        scale = scale_errors(problem, estimate)
+        return inverse(reduced + prior)[:own, :own] + np.outer(scale, scale)
     covariance = inverse(reduced[:own, :own] + prior)
     if len(reduced) > own:  # errors of the board that are not estimated carry over to the parameters
         carried = covariance @ reduced[:own, own:]
         covariance = covariance + carried @ problem.tolerances.covariance(problem.observations.points) @ carried.T
     return covariance
+
+
+def scale_errors(problem: Problem, estimate: Estimate) -> Array:
+    """Errors : (g,) of the devices' parameters by the board's scale, 1 sigma: it moves them away from the first one, no more."""
+    by_parameter, first = [], estimate.cameras[problem.observations.devices[0]]
+    for device in problem.observations.devices:
+        shift = rigid.apply(estimate.cameras[device].camera_from_world, first.centre[None])[0]
+        larger = dict(zip(MOTION[3:], shift, strict=True))
+        by_parameter += [larger.get(name, 0.0) for name in problem.free.get(device, ())]
+    return np.array(by_parameter) * problem.tolerances.scale_sigma(problem.observations.points)
 
 
 def inverse(information: Array) -> Array:
