@@ -4,6 +4,7 @@ A film is the sweep part of a capture with images of both cameras, `sweep/cam1` 
 The cameras share a clock. Frames belong together by their time stamps, whatever their numbers. Three pairs at most are in memory.
 """
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +21,13 @@ from recon.geometry.camera import Camera
 from recon.model.calibration import Uncertainty
 from recon.threads import mapped
 
+log = logging.getLogger(__name__)
+
 AT_ONCE = 2  # pairs that are read, while one more waits or is worked on
 ALONE_NS = 33_000_000  # taken for the period where a single frame tells none
+NEAR = 0.75  # of a period, that frames of a pair are apart at most: half, where cameras run freely, and their jitter
+MOST_ALONE = 0.25  # share of a camera's frames that may be without a partner
+APART, APART_NS = 0.1, 2_000_000  # of the period, and in time, that pairs are apart before it is said
 Pair = tuple[Images, Images]
 
 
@@ -72,8 +78,8 @@ def read_film(folder: Path, calibration_file: Path | None = None, sweep: str = "
     Raises
     ------
     InputError
-        If the manifest, the calibration or a table is wrong, a camera or a frame is missing, or frames have no partner. The very
-        last frame needs none: a recording may have been ended between both cameras.
+        If the manifest, the calibration or a table is wrong, a camera or a frame is missing, or more than a quarter of the frames
+        have no partner. The very last frame needs none: a recording may have been ended between both cameras.
     """
     folder = Path(folder)
     read = manifest.read_manifest(folder)
@@ -98,25 +104,64 @@ def read_film(folder: Path, calibration_file: Path | None = None, sweep: str = "
 def _partners(
     places: Sequence[Path], tables: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows : (n,), (n,) of both tables that belong together: each the other's nearest in time, within half a period."""
+    """Rows : (n,), (n,) of both tables that belong together: in order, as many and as near as can be.
+
+    Cameras that run freely drift against each other, so that the nearest frame may be nearer to another; single frames that one
+    of them lost leave the other's without a partner.
+    """
     tables = _without_a_last_one(tables)
     times = [table[1] for table in tables]
     periods = [float(np.median(np.diff(each))) for each in times if len(each) > 1]
-    allowed = (min(periods) if periods else ALONE_NS) / 2
-    nearest = [_nearest(times[0], times[1]), _nearest(times[1], times[0])]
-    for one, other in ((0, 1), (1, 0)):
-        own = np.arange(len(times[one]))
-        alone = (nearest[other][nearest[one]] != own) | (np.abs(times[other][nearest[one]] - times[one]) > allowed)
-        if alone.any():
-            k = int(np.flatnonzero(alone)[0])
-            away = abs(int(times[other][nearest[one][k]]) - int(times[one][k])) * 1e-6
-            wanted = f"a frame of its own within {allowed * 1e-6:.1f} ms of {CAMERAS[one]}'s frame {tables[one][0][k]}"
-            counts = " and ".join(f"{len(each)} frames of {name}" for each, name in zip(times, CAMERAS, strict=True))
+    period = min(periods) if periods else ALONE_NS
+    first, second = _matched(times[0], times[1], NEAR * period)
+    for one, other, paired in ((0, 1, first), (1, 0, second)):
+        alone = np.setdiff1d(np.arange(len(times[one])), paired)
+        if not len(alone):
+            continue
+        k = int(alone[0])
+        away = abs(int(times[other][_nearest(times[one][[k]], times[other])[0]]) - int(times[one][k])) * 1e-6
+        wanted = f"a frame of its own within {NEAR * period * 1e-6:.1f} ms of {CAMERAS[one]}'s frame {tables[one][0][k]}"
+        counts = " and ".join(f"{len(each)} frames of {name}" for each, name in zip(times, CAMERAS, strict=True))
+        found = f"the nearest {away:.1f} ms away ({len(alone)} such, in {counts})"
+        if len(alone) > MOST_ALONE * len(times[one]):
             raise InputError(
-                f"{places[other] / STAMPS}: expected {wanted}, found the nearest {away:.1f} ms away ({alone.sum()} such, "
-                f"in {counts}); leave frames without a partner out of both tables"
+                f"{places[other] / STAMPS}: expected {wanted}, found {found}; leave frames without a partner out of both tables"
             )
-    return np.arange(len(times[0])), nearest[0]
+        log.warning("%s: left out %d frames without a partner; of the first, %s", places[one] / STAMPS, len(alone), found)
+    apart = np.abs(times[0][first] - times[1][second])
+    if np.median(apart) > max(APART * period, APART_NS):
+        how = "as of cameras that run freely"
+        text = f"pairs are mostly {np.median(apart) * 1e-6:.1f} ms apart, up to {apart.max() * 1e-6:.1f} ms, {how}"
+        log.warning(
+            "%s: %s: a target that moves is seen at two places; with sweep_triggers by hardware both take it at once",
+            places[0].parent,
+            text,
+        )
+    return first, second
+
+
+def _matched(first: NDArray[np.int64], second: NDArray[np.int64], most_ns: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of rows, both rising, less than `most_ns` apart, of which the sum of what is left of that is the greatest."""
+    low = np.searchsorted(second, first - most_ns, "right").tolist()
+    high = np.searchsorted(second, first + most_ns, "left").tolist()
+    pairs: list[tuple[int, int, int]] = []  # row of each table, and the pair before
+    best = [(0.0, -1)]  # sum and last pair, by the number of the second table's rows that may be used
+    for i, (start, end) in enumerate(zip(low, high, strict=True)):
+        best += [best[-1]] * (end + 1 - len(best))
+        before = best[start : end + 1]
+        for j in range(start, end):
+            score, last = before[j - start]
+            score += most_ns - abs(int(second[j]) - int(first[i]))
+            if score > best[j + 1][0]:
+                pairs.append((i, j, last))
+                for used in range(j + 1, len(best)):
+                    best[used] = max(best[used], (score, len(pairs) - 1))
+    rows, last = [], best[-1][1]
+    while last >= 0:
+        i, j, last = pairs[last]
+        rows.append((i, j))
+    found = np.array(rows[::-1], np.int64).reshape(-1, 2)
+    return found[:, 0], found[:, 1]
 
 
 def _without_a_last_one(

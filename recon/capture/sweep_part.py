@@ -4,7 +4,7 @@ B-scans are read one at a time: a sweep of some minutes is larger than it needs 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ from recon.capture.images import Size, frame_file, read_image
 from recon.capture.manifest import MANIFEST, SCANNER, STAMPS, Purpose, image_name
 from recon.errors import InputError
 from recon.files.regular import check_there
-from recon.model import tracks
+from recon.model import pose_checks, tracks
+from recon.model.pose_checks import Implausible
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 
@@ -33,6 +34,7 @@ class SweepCapture:
     times: NDArray[np.int64]  # (n,) ns, of the scanner's clock
     track: Track  # of the target, of the tracker's clock
     probe: ProbeCalibration | None = None
+    left_out: int = 0  # poses that no hand makes, which the track has no longer
 
     def image(self, number: int) -> NDArray[np.uint8]:
         """Read one B-scan : (h, w), counted from 0 whatever its frame's number; InputError if it is damaged."""
@@ -57,10 +59,18 @@ class SweepCapture:
         """
         poses = tracks.poses_at(self.track, self.times, lag_s)
         if not np.isfinite(poses).any():
-            scans, track = (f"{_span(times)} s" for times in (self.times - round(lag_s * 1e9), self.track.times))
-            found = f"B-scans at {scans} and poses at {track}: are the clocks others?" if self.track.found.any() else "none found"
+            found = self._unplaced(lag_s) if self.track.found.any() else "none found"
             raise InputError(f"{self.name}: expected poses of the target while the B-scans were taken, found {found}")
         return poses
+
+    def _unplaced(self, lag_s: float) -> str:
+        """The likely reason why no B-scan lies between poses."""
+        taken, known = self.times - round(lag_s * 1e9), self.track.times[self.track.found]
+        spans = f"B-scans at {_span(taken)} s and poses at {_span(known)} s"
+        if taken[-1] < known[0] or taken[0] > known[-1] or len(known) < 2:
+            return f"{spans}: are the clocks others?"
+        apart = f"poses mostly {1e-9 * float(np.median(np.diff(known))):.3g} s apart"
+        return f"{spans}, {apart}: between two of them that are more than {tracks.MAX_GAP_S:g} s apart the probe may be anywhere"
 
     def pose_covariance(self, lag_s: float = 0.0) -> Array | None:
         """Covariance : (n, 6, 6) of these poses, as in `recon.model.tracks`; NaN where there is none. None if the track has none.
@@ -84,13 +94,17 @@ class SweepCapture:
         return tracks.shares_at(self.track, self.times, lag_s)
 
 
-def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None) -> SweepCapture:
+def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None, implausible: Implausible = "refuse") -> SweepCapture:
     """Open a sweep of a capture folder: that of a name, else the only one, else the only one that is for a purpose.
+
+    Poses that no hand makes are left out, with a warning, or taken all the same; images are read only to look into poses that
+    repeat.
 
     Raises
     ------
     InputError
-        If the manifest is wrong or has no such sweep, a table or the probe's calibration is wrong, or an image is not there.
+        If the manifest is wrong or has no such sweep, a table or the probe's calibration is wrong, an image is not there, or too
+        many poses are implausible; see `recon.model.pose_checks`.
     """
     folder = Path(folder)
     read = manifest.read_manifest(folder)
@@ -109,9 +123,23 @@ def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None) -> 
     frames, times = sweep_tables.read_stamps(scans / STAMPS)
     paths = tuple(frame_file(scans, image_name(frame)) for frame in frames.tolist())
     check_there(paths)
-    track = sweep_tables.read_track(root / str(part.track))
+    listed = root / str(part.track)
+    track, left_out = _believed(listed, sweep_tables.read_track(listed), paths, times, device.size, implausible)
     probe = None if read.probe is None else probe_files.read(folder / read.probe)
-    return SweepCapture(read.name or folder.resolve().name, device.size, paths, frames, times, track, probe)
+    return SweepCapture(read.name or folder.resolve().name, device.size, paths, frames, times, track, probe, left_out)
+
+
+def _believed(
+    listed: Path, track: Track, paths: tuple[Path, ...], times: NDArray[np.int64], size: Size, implausible: Implausible
+) -> tuple[Track, int]:
+    """The track without poses that no hand makes, and their number."""
+    seconds, taken = ((each - track.times[0]) * 1e-9 for each in (track.times, times))
+
+    def changes() -> tuple[Array, Array]:
+        return taken, pose_checks.image_changes(read_image(path, size, bits=8) for path in paths)
+
+    poses, found = pose_checks.checked(str(listed), seconds, track.poses, implausible, changes)
+    return replace(track, poses=poses), len(found.all)
 
 
 def _span(times: NDArray[np.int64]) -> str:

@@ -15,7 +15,7 @@ from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.files.volumes import Volume
-from recon.freehand import hole_filling, place_uncertainty, sequence_sweep, sequences, volume_compounding
+from recon.freehand import hole_filling, place_uncertainty, sequence_checks, sequence_sweep, sequences, volume_compounding
 from recon.freehand.place_uncertainty import PlaceErrors
 from recon.freehand.sequence_sweep import SequenceFields
 from recon.freehand.sequences import FrameName, FrameNames
@@ -23,6 +23,7 @@ from recon.freehand.volume_compounding import MOST_BYTES, Clip, Compounding, Int
 from recon.geometry import rigid
 from recon.model import fan, tracks
 from recon.model.fan import Fan
+from recon.model.pose_checks import Implausible
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration, Speed, SpeedSigma
 from recon.model.rig import NotNegative
 from recon.model.tracks import LagSeconds
@@ -105,6 +106,7 @@ class Scans:
     probe: ProbeCalibration | None = None  # converted likewise; None where the sequence has its own
     errors: PlaceErrors | None = None  # of their places; None where nothing is known of them
     elsewhere: bool = False  # 3D Slicer shows their sequence elsewhere than results in the world
+    left_out: int = 0  # poses of their track that no hand makes
 
     @property
     def placed(self) -> int:
@@ -162,6 +164,8 @@ def of_sequence(
     fixed: Mapping[str, Array] | None = None,
     lag_s: float = 0.0,
     tissue_m_s: float | None = None,
+    tracker: Path | None = None,
+    implausible: Implausible = "refuse",
 ) -> Scans:
     """Place the B-scans of a PLUS sequence in its reference frame.
 
@@ -171,6 +175,10 @@ def of_sequence(
         Takes the place of the sequence's own, which counts as one for 1540 m/s.
     fixed : (4, 4) by name, optional
         Transforms that go before those of the sequence, such as "ImageToProbe".
+    tracker : Path, optional
+        The sequence file of the poses, where they were saved apart from the images.
+    implausible : "refuse" or "take"
+        Whether poses and lengths that no hand and no scanner makes are used all the same.
 
     Raises
     ------
@@ -178,11 +186,12 @@ def of_sequence(
         If the file is damaged, no transforms lead from the images to the reference frame, or that is RAS, which results aren't
         written in.
     """
-    frames, shape = sequences.read_tracking(path), sequences.image_shape(path)
+    frames, shape = sequence_checks.read_tracking(path, tracker), sequences.image_shape(path)
     image, target, reference = names or FrameNames()
     if reference.upper() == sequences.RAS:
         expected = f"{sequences.LPS}, which files of volumes and surfaces are declared to be in; 3D Slicer turns them to RAS"
         raise InputError(f"{path}: reference: expected {expected}, found {reference}")
+    frames, left_out = sequence_checks.believed(path, frames, reference, image if probe is None else target, fixed, implausible)
     try:
         if probe is None:
             world_from_pixel = sequences.poses(frames, reference, image, fixed)
@@ -200,7 +209,7 @@ def of_sequence(
     )
     converted = None if probe is None else sound_in_water.for_tissue(probe, tissue_m_s)
     elsewhere = sequences.lies_elsewhere(frames, reference)
-    return Scans(shape, matrices, lambda: sequences.stream_images(path), speed, calibrated, converted, elsewhere=elsewhere)
+    return Scans(shape, matrices, lambda: sequences.stream_images(path), speed, calibrated, converted, None, elsewhere, left_out)
 
 
 def cut(scans: Scans, clip: Clip) -> Scans:
@@ -293,6 +302,7 @@ def measure(scans: Scans, pasted: Reconstruction, filled: Reconstruction) -> Met
     return {
         "frames": len(scans.world_from_pixel),
         "frames_placed": scans.placed,
+        "poses_left_out": scans.left_out,
         "speed_m_per_s": scans.speed_m_s,
         **dict(zip(("voxels_x", "voxels_y", "voxels_z"), (nx, ny, nz), strict=True)),
         **{f"spacing_{axis}_mm": float(step) for axis, step in zip("xyz", volume.spacing, strict=True)},

@@ -14,27 +14,30 @@ from pydantic import model_validator
 
 from recon.capture.images import Size
 from recon.errors import InputError
-from recon.freehand import sequences
-from recon.freehand.sequences import FrameName, FrameNames
+from recon.freehand import sequence_checks, sequences
+from recon.freehand.sequences import MOST_SECONDS, FrameName, FrameNames
 from recon.geometry import rigid
 from recon.model import tracks
+from recon.model.pose_checks import Implausible
 from recon.model.rig import Part
 from recon.model.tracks import MAX_GAP_S, Track
 
 Array = NDArray[np.float64]
-
-MOST_SECONDS = 9e9  # that nanoseconds of 64 bits can hold
 
 
 class SequenceFields(Part):
     """Fields of a verb that takes a sequence in place of a capture."""
 
     sequence: Path | None = None
+    tracker: Path | None = None
     target: FrameName | None = None
     reference: FrameName | None = None
+    implausible: Implausible = "refuse"
 
     @model_validator(mode="after")
     def _of_a_sequence(self) -> "SequenceFields":
+        if self.sequence is None and self.tracker is not None:
+            raise ValueError(f"tracker: expected none without a sequence, whose poses it holds, found {self.tracker}")
         given = {name: getattr(self, name, None) for name in FrameNames._fields}
         for name, value in given.items():
             if self.sequence is None and value is not None:
@@ -90,15 +93,21 @@ class SequenceSweep:
         """None: no sequence has a covariance."""
 
 
-def read_sequence_sweep(path: Path, names: FrameNames) -> SequenceSweep:
-    """Open a sequence as a sweep; no image is read yet.
+def read_sequence_sweep(
+    path: Path, names: FrameNames, tracker: Path | None = None, implausible: Implausible = "refuse"
+) -> SequenceSweep:
+    """Open a sequence as a sweep, without poses that no hand makes; images are read only to look into poses that repeat.
+
+    tracker : the sequence file of the poses, where they were saved apart from the images
 
     Raises
     ------
     InputError
-        If the file is damaged, holds no images, or no transforms that lead from the target to the reference frame.
+        If the file is damaged, holds no images, or no transforms that lead from the target to the reference frame; or too many
+        poses are implausible.
     """
-    frames, (height, width) = sequences.read_tracking(path), sequences.image_shape(path)
+    frames, (height, width) = sequence_checks.read_tracking(path, tracker), sequences.image_shape(path)
+    frames, _ = sequence_checks.believed(path, frames, names.reference, names.target, None, implausible)
     try:
         poses = sequences.poses(frames, names.reference, names.target)
     except InputError as error:
@@ -132,6 +141,9 @@ def lagged(name: str, times_s: Array, poses: Array, lag_s: float) -> Array:
     known = np.isfinite(times_s)
     result = np.full(poses.shape, np.nan)
     result[known] = tracks.poses_at(motion, _nanoseconds(name, times_s[known]), lag_s) @ start
+    if len(moving.times) * 2 < known.sum():
+        found = f"{len(moving.times)} different ones in {known.sum()} frames, from {times_s[known][0]:.15g} s on"
+        raise InputError(f"{name}: Timestamp: expected one of each frame's own, by which poses are interpolated, found {found}")
     if not np.isfinite(result).any():
         found = "none: is the lag right, or the frame rate too low?"
         raise InputError(f"{name}: lag_s: expected B-scans between poses at most {MAX_GAP_S:g} s apart, found {found}")

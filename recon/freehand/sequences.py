@@ -22,6 +22,7 @@ from recon.errors import InputError
 from recon.files import atomic, medical_images
 from recon.files.medical_images import ImageFile
 from recon.freehand import sequence_images
+from recon.model import pose_checks
 from recon.model.probe import ProbeCalibration
 
 Array = NDArray[np.float64]
@@ -56,7 +57,7 @@ STRUCTURE = {  # fields given by the images and the format, in either of the two
     *("data file", "datafile", "ultrasound image orientation", "ultrasound image type"),
 }
 MOST_EMPTY, FEW_FRAMES = 10, 10_000  # times the fields that are there, which all frames may lack; frames of a file without any
-FARTHEST_MM = 1e7
+FARTHEST_MM, MOST_SECONDS = 1e7, 9e9  # of a matrix; of a time stamp, that nanoseconds of 64 bits can hold
 FRAME_STRUCTURE = {"Timestamp", "ImageStatus", "Status", ""}
 RAS, LPS = "RAS", "LPS"
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # and LPS from RAS
@@ -283,10 +284,10 @@ def _matrices(file: ImageFile, key: str, texts: list[str], words: list[str]) -> 
             continue
         name = _key(index, key)
         matrix = medical_images.numbers(file.path, name, text, 16).reshape(4, 4)
-        valid[index] = word.upper() in ("", "OK")
+        valid[index] = word.upper() in ("", "OK") and not pose_checks.is_lost(matrix)
         if valid[index] and not is_usable(matrix):
             raise file.fault(name, "an invertible matrix with the last row 0 0 0 1", repr(text))
-        matrices[index] = matrix
+        matrices[index] = np.eye(4) if pose_checks.is_lost(matrix) else matrix
     return matrices, valid
 
 

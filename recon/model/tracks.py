@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s that images' time stamps are late; of a setting
 
 MAX_GAP_S = 0.25  # between two poses, over which none is interpolated
+SAME_S = 0.5e-3  # a time that is rounded to ms: at it a pose holds, however far away the next is
 
 
 @dataclass(frozen=True)
@@ -36,17 +37,23 @@ class Track:
 def at(track: Track, times: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> Array:
     """Poses at other moments : (m,) ns of the track's clock, as (m, 4, 4); NaN outside, and within gaps of the track.
 
-    Between two poses the rotation turns about one axis at constant speed and the origin moves along a straight line.
+    At the moment of a pose that pose holds, as of stills that are taken one by one. Between two poses the rotation
+    turns about one axis at constant speed and the origin moves along a straight line.
     """
     known = track.found
     result = np.full((len(times), 4, 4), np.nan)
-    if known.sum() < 2:
+    if not known.any():
         return result
     seconds = (track.times[known] - track.times[0]) * 1e-9
     wanted = (np.asarray(times) - track.times[0]) * 1e-9
-    after = np.clip(np.searchsorted(seconds, wanted), 1, len(seconds) - 1)
+    poses, after = track.poses[known], np.searchsorted(seconds, wanted)
+    for near in (np.clip(after - 1, 0, len(seconds) - 1), np.clip(after, 0, len(seconds) - 1)):
+        coinciding = np.abs(seconds[near] - wanted) <= SAME_S
+        result[coinciding] = poses[near[coinciding]]
+    if len(seconds) < 2:
+        return result
+    after = np.clip(after, 1, len(seconds) - 1)
     inside = (wanted >= seconds[0]) & (wanted <= seconds[-1]) & (seconds[after] - seconds[after - 1] <= max_gap_s)
-    poses = track.poses[known]
     result[inside] = np.eye(4)
     result[inside, :3, :3] = Slerp(seconds, Rotation.from_matrix(poses[:, :3, :3]))(wanted[inside]).as_matrix()
     result[inside, :3, 3] = np.column_stack([np.interp(wanted[inside], seconds, poses[:, axis, 3]) for axis in range(3)])
@@ -59,12 +66,13 @@ def shares_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:
     wanted = np.asarray(times, np.int64) - np.int64(round(lag_s * 1e9))
     shares = np.zeros((len(wanted), len(moments)))
     if len(moments) < 2:
-        return np.full_like(shares, np.nan)
+        return np.where(np.abs(wanted[:, None] - moments) <= SAME_S * 1e9, 1.0, np.nan)
     after = np.clip(np.searchsorted(moments, wanted), 1, len(moments) - 1)
     share = (wanted - moments[after - 1]) / (moments[after] - moments[after - 1])
     rows = np.arange(len(wanted))
     shares[rows, after - 1], shares[rows, after] = 1 - share, share
-    shares[(share < 0) | (share > 1)] = np.nan
+    slack = SAME_S * 1e9 / (moments[after] - moments[after - 1])
+    shares[(share < -slack) | (share > 1 + slack)] = np.nan
     return shares
 
 

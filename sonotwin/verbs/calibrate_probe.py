@@ -93,7 +93,8 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     source = config.capture or config.sequence or config.pairs
     assert source is not None
-    atomic.check_folder(config.out, "calibrate-probe", inputs=[source, *([] if config.earlier is None else [config.earlier])])
+    inputs = [source, *(path for path in (config.earlier, config.tracker) if path is not None)]
+    atomic.check_folder(config.out, "calibrate-probe", inputs=inputs)
     earlier = None if config.earlier is None else probe_files.read(config.earlier)
     if config.temperature_c is not None:
         sound_in_water.speed_of_sound(config.temperature_c)  # a mistake shows before the work
@@ -139,9 +140,11 @@ def look(config: Config, console: Console) -> CrossingFrames:
 def read(config: Config) -> SweepCapture | SequenceSweep:
     """Open the sweep over the wires."""
     if config.capture is not None:
-        return sweep_part.read_sweep(config.capture, config.sweep, "probe")
+        return sweep_part.read_sweep(config.capture, config.sweep, "probe", config.implausible)
     assert config.sequence is not None
-    return sequence_sweep.read_sequence_sweep(config.sequence, config.frame_names(FrameNames()))
+    return sequence_sweep.read_sequence_sweep(
+        config.sequence, config.frame_names(FrameNames()), config.tracker, config.implausible
+    )
 
 
 def write(out: Path, frames: CrossingFrames, result: Result, figures: Metrics) -> list[str]:

@@ -81,7 +81,7 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     plus = None if config.config is None else plus_config.read_config(config.config)
     settings = settings_of(config, plus)
-    inputs = [path for path in (config.capture, config.probe, config.sequence, config.config) if path is not None]
+    inputs = [path for path in (config.capture, config.probe, config.sequence, config.tracker, config.config) if path is not None]
     atomic.check_folder(config.out, "freehand", inputs=inputs)
     sweep, scans = read(config, plus)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
@@ -138,8 +138,10 @@ def read(config: Config, plus: PlusConfig | None) -> tuple[SweepCapture | None, 
         names = config.frame_names(FrameNames() if plus is None else plus.names)
         probe = None if config.probe is None else probe_files.read(config.probe)
         fixed = {} if plus is None else plus.transforms
-        return None, freehand_scans.of_sequence(config.sequence, names, probe, fixed, config.lag_s, config.tissue_m_s)
-    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
+        return None, freehand_scans.of_sequence(
+            config.sequence, names, probe, fixed, config.lag_s, config.tissue_m_s, config.tracker, config.implausible
+        )
+    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume", config.implausible)
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
     unsure = Unsure(config.lag_sigma_s, config.tissue_sigma_m_s)
     return sweep, freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s, unsure)

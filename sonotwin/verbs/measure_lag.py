@@ -81,7 +81,7 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     atomic.check_folder(
-        config.out, "measure-lag", inputs=[path for path in (config.capture, config.sequence) if path is not None]
+        config.out, "measure-lag", inputs=[path for path in (config.capture, config.sequence, config.tracker) if path is not None]
     )
     sweep = read(config)
     start = perf_counter()
@@ -115,9 +115,11 @@ def run(config: Config) -> None:
 def read(config: Config) -> SweepCapture | SequenceSweep:
     """Open the sweep; of a sequence its B-scans with a time stamp."""
     if config.capture is not None:
-        return sweep_part.read_sweep(config.capture, config.sweep, "latency")
+        return sweep_part.read_sweep(config.capture, config.sweep, "latency", config.implausible)
     assert config.sequence is not None
-    return sequence_sweep.read_sequence_sweep(config.sequence, config.frame_names(FrameNames())).timed()
+    return sequence_sweep.read_sequence_sweep(
+        config.sequence, config.frame_names(FrameNames()), config.tracker, config.implausible
+    ).timed()
 
 
 def bottom_depths(sweep: SweepCapture | SequenceSweep, clip: Clip, top_px: int, fan: Fan | None = None) -> Array:

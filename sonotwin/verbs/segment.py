@@ -95,7 +95,7 @@ def run(config: Config) -> None:
         If the input is incomplete or damaged, there is no tube where one is looked for, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    sources = (config.capture, config.probe, config.sequence, config.config, config.surface)
+    sources = (config.capture, config.probe, config.sequence, config.tracker, config.config, config.surface)
     inputs = [path for path in sources if path is not None]
     atomic.check_folder(config.out, "segment", inputs=inputs)
     skin = None if config.surface is None else containment.read_skin(config.surface)
@@ -109,7 +109,12 @@ def run(config: Config) -> None:
         found = found_in(scans, config, skin)
     for line in found.lines:
         console.print(line, markup=False)
-    figures = {"frames": len(scans.world_from_pixel), "frames_placed": scans.placed, "speed_m_per_s": scans.speed_m_s}
+    figures = {
+        "frames": len(scans.world_from_pixel),
+        "frames_placed": scans.placed,
+        "poses_left_out": scans.left_out,
+        "speed_m_per_s": scans.speed_m_s,
+    }
     with console.status("writing"), atomic.new_folder(config.out, "segment") as folder:
         for name, mesh in found.meshes.items():
             meshes.write_ply(folder / f"{name}.ply", mesh)
@@ -126,7 +131,7 @@ def read(config: Config) -> Scans:
     if config.sequence is not None:
         return read_sequence(config, config.sequence)
     assert config.capture is not None
-    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
+    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume", config.implausible)
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
     unsure = Unsure(config.lag_sigma_s, config.tissue_sigma_m_s)
     scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s, unsure)
@@ -142,7 +147,9 @@ def read_sequence(config: Config, path: Path) -> Scans:
     names = config.frame_names(FrameNames() if plus is None else plus.names)
     probe = None if config.probe is None else probe_files.read(config.probe)
     fixed = {} if plus is None else plus.transforms
-    scans = freehand_scans.of_sequence(path, names, probe, fixed, config.lag_s, config.tissue_m_s)
+    scans = freehand_scans.of_sequence(
+        path, names, probe, fixed, config.lag_s, config.tissue_m_s, config.tracker, config.implausible
+    )
     clip = Clip(*config.clip) if config.clip is not None else None if plus is None or plus.volume is None else plus.volume.clip
     return scans if clip is None else freehand_scans.cut(scans, clip)
 

@@ -255,3 +255,19 @@ def test_what_errs_alike_in_all_poses_comes_back_and_does_not_average_out(tmp_pa
     np.testing.assert_allclose(found.pose_covariance()[1], own[0] / 2, atol=1e-15)
     with pytest.raises(ValueError, match="shared: expected with a covariance"):
         Track(track().times, track().poses, None, shared)
+
+
+def test_poses_that_no_hand_makes_are_left_out(tmp_path, caplog):
+    """Lost ones that a tracker wrote as the identity, one a second off, and ten that froze while the B-scans changed."""
+    seconds = np.arange(60) / 40
+    poses = np.array([rigid.transform(np.eye(3), [20 * t, -3, 700]) for t in seconds])
+    moved = poses.copy()
+    moved[[3, 4]], moved[50, 0, 3], moved[20:32] = np.eye(4), 4000, poses[20]
+    stamps = START_NS + np.round(seconds * 1e9).astype(np.int64)
+    shown = np.random.default_rng(1).integers(0, 256, (30, SIZE[1], SIZE[0]), np.uint8)
+    captures.write_sweep(tmp_path / "capture", shown, stamps[::2] + 4_000_000, Track(stamps, moved), SIZE)
+    sweep = sweep_part.read_sweep(tmp_path / "capture")
+    assert np.flatnonzero(~sweep.track.found).tolist() == [3, 4, *range(21, 32), 50] and sweep.left_out == 14
+    assert "track.csv: left out 11 of 60 poses, from pose 21 on: the same to the last digit" in caplog.text
+    assert np.nanmax(np.abs(sweep.poses()[:, 0, 3] - 20 * (seconds[::2] + 0.004))) < 1e-6
+    assert sweep_part.read_sweep(tmp_path / "capture", implausible="take").track.found.all()

@@ -1,0 +1,305 @@
+"""Plausibility of a sweep's poses: lost ones written as the identity, a tracker that froze, jumps that no hand makes, units.
+
+What fits no motion is left out by name and number, and a sweep of which too much would be left out is refused. Poses that are the
+same to the last digit are suspicious only while the images change: a probe on a motor may rest.
+"""
+
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+Cause = Literal["identity", "frozen", "jump"]
+Implausible = Literal["refuse", "take"]  # a setting: what to do about lengths and poses that no scanner and no hand makes
+Changes = Callable[
+    [], tuple[Array, Array]
+]  # moments : (m,) of images, and change of each since the one before : (m,), grey levels
+
+STEP_PX = 4  # of the pixels that are compared from image to image
+LOST = -3.697314e28  # of a coordinate, which NDI's trackers write where a tool isn't seen
+WORDS: dict[Cause, str] = {
+    "identity": "the identity, as of a tool that is not seen",
+    "frozen": "the same to the last digit as the one before while the images change, as of a tracker that stood still",
+    "jump": "farther off its neighbours than a hand moves",
+}
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Limits of a plausible motion. Hands scan at 5 to 100 mm/s, and swing from place to place at up to some 1000."""
+
+    speed_mm_s: float = 3000.0
+    turn_rad_s: float = 20.0  # of a tool that is flicked about; one that is seen from its other side turns by pi in a frame
+    least_mm: float = 20.0  # of a jump, by which stamps that come in bursts make no speed
+    least_rad: float = 0.35
+    acceleration_mm_s2: float = 30e3  # three times that of gravity; of a single pose between two that fit
+    spike_mm: float = 2.0  # off the way between its neighbours, at least
+    usual: float = 12.0  # times the median over the sweep, which tells a noisy tracker from a jump
+    near: float = 5.0  # times the median step, within which a pose that is the identity lies on the way
+    away_mm: float = 1000.0  # from the sweep's middle
+    untimed_mm: float = 100.0  # of a step, where no times tell its speed
+    repeats: int = 4  # poses in a row that are the same, at least, before images are compared
+    changed: float = 0.7  # times the usual change from image to image of a moving probe
+    changed_before_jump: float = 0.3  # the same, where the pose jumps when it goes on
+    most_share: float = 1 / 3  # of poses that may be left out
+
+
+LIMITS = MotionLimits()
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Poses that are implausible, by their cause; rows count from 0."""
+
+    count: int = 0  # of the poses that there were
+    rows: dict[Cause, Rows] = field(default_factory=dict)
+    resting: str = ""  # said of a sweep whose poses are all the same
+
+    @property
+    def all(self) -> Rows:
+        """All rows : (m,), increasing."""
+        return np.unique(np.concatenate([np.empty(0, np.int64), *self.rows.values()]))
+
+    def lines(self, what: str = "pose") -> list[str]:
+        """A sentence for each cause: the number of poses, and the first of them."""
+        said = [self.resting] if self.resting else []
+        return said + [
+            f"{len(rows)} of {self.count} poses, from {what} {rows[0]} on: {WORDS[cause]}" for cause, rows in self.rows.items()
+        ]
+
+
+def is_lost(values: Array) -> bool:
+    """Whether numbers of a pose hold the mark of a tool that is not seen."""
+    return bool(np.isclose(values, LOST, rtol=1e-3, atol=0).any())
+
+
+def checked(
+    place: str,
+    times_s: Array,
+    poses: Array,
+    implausible: Implausible = "refuse",
+    changes: Changes | None = None,
+    clock: Array | None = None,
+    what: str = "pose",
+) -> tuple[Array, Findings]:
+    """The poses of a sweep without those that are implausible, and these; all of them where they are to be taken.
+
+    Parameters
+    ----------
+    place : of the poses, for messages
+    what : word for one of them
+    times_s, poses, changes, clock : as of `find`
+
+    Raises
+    ------
+    InputError
+        If their lengths are of another unit, or more would be left out than may be.
+    """
+    found, fault = find(times_s, poses, changes, clock), unit_fault(poses)
+    way = "to use them all the same, give implausible=take"
+    if implausible == "take":
+        for line in [*([fault] if fault else []), *found.lines(what)]:
+            log.warning("%s: taken all the same: %s", place, line)
+        return poses, Findings(found.count)
+    kept = without(poses, found.all)
+    if len(found.all) > LIMITS.most_share * found.count:
+        expected = f"a motion that a hand makes, but for {100 * LIMITS.most_share:.0f} % at most"
+        raise InputError(f"{place}: poses: expected {expected}, found {'; '.join(found.lines(what))}; {way}")
+    if fault := unit_fault(kept):
+        raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
+    for line in found.lines(what):
+        log.warning("%s: %s%s", place, "" if found.resting == line else "left out ", line)
+    return kept, found
+
+
+def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Array | None = None) -> Findings:
+    """Implausible poses of a sweep.
+
+    Parameters
+    ----------
+    times_s : (n,) s, NaN where a pose has none; any order
+    poses : (n, 4, 4) mm, rigid or nearly so, or times a scale; NaN where there is none
+    changes : of the images; looked at only where poses repeat
+    clock : (n,) of the poses, by which the images' moments count; the times without it
+    """
+    clock = times_s if clock is None else clock
+    there = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
+    rows: dict[Cause, Rows] = {}
+    lost = _lost(poses[there])
+    left = there[~lost]
+    if lost.any():
+        rows["identity"] = there[lost]
+    frozen, resting = _frozen(clock[left], poses[left], changes)
+    if len(frozen):
+        rows["frozen"], left = left[frozen], np.delete(left, frozen)
+    jumped = _jumps(times_s[left], poses[left])
+    if len(jumped):
+        rows["jump"] = left[jumped]
+    return Findings(len(there), rows, resting)
+
+
+def unit_fault(poses: Array) -> str | None:
+    """The fault of poses : (n, 4, 4) whose shifts seem to be in another unit than mm, with the likely one; None as a rule."""
+    places = poses[np.isfinite(poses).all(axis=(1, 2)), :3, 3]
+    if len(places) < 3:
+        return None
+    span, farthest = float(np.linalg.norm(np.ptp(places, axis=0))), float(np.abs(places).max())
+    if 1e-6 < span < 1 and farthest < 5:
+        return f"all within {span:.3g} mm, and {farthest:.3g} mm from the origin: metres?"
+    if span > 5000:
+        return f"a sweep over {span:.4g} mm: micrometres?"
+    return None
+
+
+def image_changes(images: Iterable[NDArray]) -> Array:
+    """Mean change : (n,) of each image's grey levels since the one before; NaN of the first."""
+    before, found = None, []
+    for image in images:
+        now = image[::STEP_PX, ::STEP_PX].astype(np.float32)
+        found.append(np.nan if before is None else float(np.abs(now - before).mean()))
+        before = now
+    return np.array(found)
+
+
+def _lost(poses: Array) -> NDArray[np.bool_]:
+    """Where a pose is the identity and doesn't lie on the way; a sweep may begin there, as of poses relative to the first one."""
+    same = np.abs(poses - np.eye(4)).max(axis=(1, 2), initial=0) < 1e-9
+    others = np.flatnonzero(~same)
+    if not same.any() or len(others) < 2:
+        return np.zeros(len(poses), bool)
+    places, turns = poses[others, :3, 3], poses[others, :3, :3]
+    usual_mm = LIMITS.near * np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)) + 1e-6
+    usual_rad = LIMITS.near * np.median(_turns(turns[:-1], turns[1:])) + 1e-6
+    for row in np.flatnonzero(same):
+        after = np.searchsorted(others, row)
+        beside = np.unique(np.clip([after - 1, after], 0, len(others) - 1))
+        fits = np.linalg.norm(places[beside], axis=1) <= usual_mm
+        same[row] = not (fits & (_turns(np.eye(3)[None], turns[beside]) <= usual_rad)).any()
+    return same
+
+
+def _frozen(times_s: Array, poses: Array, changes: Changes | None) -> tuple[Rows, str]:
+    """Rows of poses that repeat the one before to the last digit, long, while the images change; and a word on one that rests."""
+    same = (poses[1:] == poses[:-1]).all(axis=(1, 2))
+    starts = np.concatenate([[0], np.flatnonzero(~same) + 1])
+    lengths = np.diff([*starts, len(poses)])
+    if len(poses) > LIMITS.repeats and len(lengths) == 1:
+        return np.empty(0, np.int64), f"all {len(poses)} poses are the same to the last digit: a probe at rest, or no tracking"
+    long = (lengths > LIMITS.repeats) & (lengths > 3 * np.median(lengths))
+    if not long.any() or changes is None:
+        return np.empty(0, np.int64), ""
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[~same]
+    moments, change = changes()
+    resting = np.zeros(len(moments), bool)
+    for start, length in zip(starts[long], lengths[long], strict=True):
+        resting |= _during(moments, times_s[start : start + length])
+    usual = np.median(change[~resting & np.isfinite(change)]) if (~resting & np.isfinite(change)).any() else np.nan
+    frozen = []
+    for start, length in zip(starts[long], lengths[long], strict=True):
+        own = change[_during(moments, times_s[start : start + length]) & np.isfinite(change)]
+        end = start + length
+        jump = np.linalg.norm(poses[end, :3, 3] - poses[start, :3, 3]) > 3 * np.median(steps) if end < len(poses) else False
+        least = LIMITS.changed_before_jump if jump else LIMITS.changed
+        if len(own) >= 3 and np.median(own) > least * usual > 0:
+            frozen.append(np.arange(start + 1, end))
+    return np.concatenate([np.empty(0, np.int64), *frozen]), ""
+
+
+def _during(moments: Array, times_s: Array) -> NDArray[np.bool_]:
+    """Images that were taken within a run of poses, and the one before too."""
+    return (moments > times_s[0]) & (moments <= times_s[-1])
+
+
+def _jumps(times_s: Array, poses: Array) -> Rows:
+    """Rows of poses that no motion of a hand leads to."""
+    if len(poses) < 3:
+        return np.empty(0, np.int64)
+    places = poses[:, :3, 3]
+    away = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    kept = np.flatnonzero(away <= max(LIMITS.away_mm, 8 * np.percentile(away, 75)))
+    kept = kept[_joined(times_s[kept], poses[kept])]
+    kept = kept[~_spikes(times_s[kept], places[kept])]
+    return np.setdiff1d(np.arange(len(poses)), kept)
+
+
+def _seconds(times_s: Array) -> Array | None:
+    """Times that rise; None where they tell nothing of speeds."""
+    steps = np.diff(times_s)
+    return times_s if len(steps) and np.isfinite(steps).all() and steps.min() >= 0 and _shortest(times_s) > 0 else None
+
+
+def _shortest(seconds: Array) -> float:
+    """The least time between two poses that is believed: half of most periods, as stamps may come in bursts."""
+    return 0.5 * float(np.percentile(np.diff(seconds), 90))
+
+
+def _joined(times_s: Array, poses: Array) -> Rows:
+    """Rows of the longest piece of the motion, and of those that can be reached from it."""
+    seconds, places = _seconds(times_s), poses[:, :3, 3]
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    turns = _turns(poses[:-1, :3, :3], poses[1:, :3, :3])
+    shortest = 0.0 if seconds is None else _shortest(seconds)
+    most_mm = max(LIMITS.untimed_mm, 20 * float(np.median(steps, axis=0)))
+    most_rad = max(1.0, 20 * float(np.median(turns)))
+
+    def fits(step_mm: Array, turn_rad: Array, a: Rows, b: Rows) -> NDArray[np.bool_]:
+        if seconds is None:
+            return (step_mm <= most_mm) & (turn_rad <= most_rad)
+        duration = np.maximum(np.abs(seconds[b] - seconds[a]), shortest)
+        near = (step_mm <= LIMITS.least_mm) | (step_mm <= LIMITS.speed_mm_s * duration)
+        return near & ((turn_rad <= LIMITS.least_rad) | (turn_rad <= LIMITS.turn_rad_s * duration))
+
+    rows = np.arange(len(poses))
+    ends = np.flatnonzero(~fits(steps, turns, rows[:-1], rows[1:]))
+    pieces = np.split(rows, ends + 1)
+    longest = max(range(len(pieces)), key=lambda k: len(pieces[k]))
+    kept = [pieces[longest]]
+    for others, last, first in ((pieces[longest + 1 :], -1, 0), (pieces[:longest][::-1], 0, -1)):
+        at = pieces[longest][[last]]
+        for piece in others:
+            to = piece[[first]]
+            step = np.linalg.norm(places[to] - places[at], axis=1)
+            if fits(step, _turns(poses[at, :3, :3], poses[to, :3, :3]), at, to)[0]:
+                kept.append(piece)
+                at = piece[[last]]
+    return np.sort(np.concatenate(kept))
+
+
+def _spikes(times_s: Array, places: Array) -> NDArray[np.bool_]:
+    """Where a single place : (n, 3) mm lies off the way between its two neighbours, by more than any hand could."""
+    result, seconds = np.zeros(len(places), bool), _seconds(times_s)
+    if len(places) < 5:
+        return result
+    if seconds is None:
+        early = late = np.ones(len(places) - 2)
+    else:
+        shortest = _shortest(seconds)
+        early, late = (np.maximum(part, shortest) for part in (np.diff(seconds)[:-1], np.diff(seconds)[1:]))
+    share = (early / (early + late))[:, None]
+    off = np.linalg.norm(places[1:-1] - (1 - share) * places[:-2] - share * places[2:], axis=1)
+    across = np.linalg.norm(places[2:] - places[:-2], axis=1)
+    least = LIMITS.untimed_mm if seconds is None else np.maximum(LIMITS.spike_mm, LIMITS.acceleration_mm_s2 * early * late / 2)
+    result[1:-1] = (off > least) & (off > LIMITS.usual * np.median(off)) & (off > across)
+    return result
+
+
+def _turns(before: Array, after: Array) -> Array:
+    """Angles : (n,) rad between rotations : (n, 3, 3), each perhaps times a scale of its axes."""
+    before, after = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (before, after))
+    return np.arccos(np.clip((np.einsum("nij,nij->n", before, after) - 1) / 2, -1, 1))
+
+
+def without(poses: Array, rows: Rows) -> Array:
+    """The poses, NaN in some rows."""
+    result = np.array(poses)
+    result[rows] = np.nan
+    return result

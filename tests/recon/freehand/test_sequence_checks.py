@@ -1,0 +1,132 @@
+"""Sequences with poses that can't be believed, and with poses in a file of their own."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.errors import InputError
+from recon.freehand import sequence_checks, sequence_sweep, sequences
+from recon.freehand.sequences import FrameNames, Frames
+from recon.geometry import rigid
+from recon.model.pose_checks import LOST
+from sonotwin.cli import main
+
+COUNT = 30
+NAMES = FrameNames(reference="Tracker")
+IMAGE = np.diag([0.9, 0.9, 0.9, 1.0])
+TIMES_S = 100 + np.arange(COUNT) / 20
+
+
+def sweep(rng) -> Frames:
+    """A sweep of 29 steps of 1.5 mm over tissue that changes from image to image, small and coarse."""
+    poses = np.array([rigid.from_rotation_vector([0, 0.01 * k, 0], [300, 1.5 * k, 650]) for k in range(COUNT)])
+    images = rng.integers(0, 255, (COUNT, 40, 30), np.uint8)
+    transforms = {"ProbeToTracker": poses, "ImageToProbe": np.tile(IMAGE, (COUNT, 1, 1))}
+    return Frames(TIMES_S, transforms, dict.fromkeys([*transforms, "Image"], np.ones(COUNT, bool)), images)
+
+
+def with_poses(frames: Frames, poses) -> Frames:
+    return replace(frames, transforms=frames.transforms | {"ProbeToTracker": poses})
+
+
+@pytest.fixture
+def frames(rng) -> Frames:
+    return sweep(rng)
+
+
+def spoiled(frames: Frames, fault: str):
+    poses = frames.transforms["ProbeToTracker"].copy()
+    if fault == "identity":
+        poses[[4, 9, 20]] = np.eye(4)
+    elif fault == "frozen":
+        poses[10:20] = poses[10]
+    elif fault == "far":
+        poses[7, 0, 3] += 5000
+    return with_poses(frames, poses)
+
+
+@pytest.mark.parametrize(
+    ("fault", "left_out"), [("identity", [4, 9, 20]), ("frozen", list(range(11, 20))), ("far", [7]), ("", [])]
+)
+def test_a_volume_is_made_of_what_can_be_believed(fault, left_out, frames, tmp_path, caplog):
+    """As large as without the fault, where it was 13 times as large by three lost poses, and beyond memory by one 5 m away."""
+    path, out = tmp_path / "s.igs.mha", tmp_path / "out"
+    sequences.write_sequence(path, spoiled(frames, fault))
+    assert main(["freehand", f"sequence={path}", "reference=Tracker", "spacing_mm=1", f"out={out}"]) == 0
+    figures = json.loads((out / "metrics.json").read_text())
+    assert (figures["poses_left_out"], figures["frames_placed"]) == (len(left_out), COUNT - len(left_out))
+    assert max(figures[f"voxels_{axis}"] for axis in "xyz") < 100
+    said = caplog.text
+    assert (
+        (f"ProbeToTracker: left out {len(left_out)} of 30 poses, from frame {left_out[0]} on" in said) if left_out else not said
+    )
+    sweep = sequence_sweep.read_sequence_sweep(path, NAMES)
+    assert np.flatnonzero(np.isnan(sweep.poses()[:, 0, 0])).tolist() == left_out
+
+
+def test_a_reference_that_is_lost_counts_as_well(frames, tmp_path):
+    reference = np.array([rigid.from_rotation_vector([0.2, 0, 0], [0.01 * (k % 3), 20, 900]) for k in range(COUNT)])
+    reference[5] = np.eye(4)
+    yes = np.ones(COUNT, bool)
+    path = tmp_path / "s.igs.mha"
+    transforms, valid = frames.transforms | {"ReferenceToTracker": reference}, frames.valid | {"ReferenceToTracker": yes}
+    sequences.write_sequence(path, replace(frames, transforms=transforms, valid=valid))
+    believed, left_out = sequence_checks.believed(path, sequences.read_tracking(path), "Reference", "Image")
+    assert left_out == 1 and np.flatnonzero(~believed.valid["ReferenceToTracker"]).tolist() == [5]
+    assert sequence_checks.believed(path, sequences.read_tracking(path), "Tracker", "Image")[1] == 0, "it isn't on the way"
+
+
+def test_the_mark_of_a_tool_that_is_not_seen_is_no_pose(frames, tmp_path):
+    path = tmp_path / "s.igs.mha"
+    sequences.write_sequence(path, frames)
+    data = path.read_bytes()
+    head, _, rest = data.partition(b"Seq_Frame0003_ProbeToTrackerTransform = ")
+    text = " ".join([*(["1", "0", "0", repr(LOST)] * 3), "0 0 0 1"]).encode()
+    path.write_bytes(head + b"Seq_Frame0003_ProbeToTrackerTransform = " + text + rest[rest.index(b"\n") :])
+    assert np.flatnonzero(~sequences.read_tracking(path).valid["ProbeToTracker"]).tolist() == [3]
+
+
+def test_time_stamps_that_are_all_the_same_are_named(frames, tmp_path):
+    path = tmp_path / "s.igs.mha"
+    sequences.write_sequence(path, replace(frames, times_s=np.full(COUNT, 5.0)))
+    with pytest.raises(InputError, match=r"Timestamp: expected one of each frame's own.*found 1 different ones in 30 frames"):
+        sequence_sweep.read_sequence_sweep(path, NAMES).poses(0.05)
+
+
+@pytest.fixture
+def apart(frames, tmp_path):
+    """The same sweep saved as PLUS saves each device's buffer: images at 20 a second, poses at 40."""
+    video, tracker = tmp_path / "Video.igs.mha", tmp_path / "Tracker.igs.mha"
+    sequences.write_sequence(video, Frames(TIMES_S, {}, {"Image": np.ones(COUNT, bool)}, frames.images))
+    steps = np.arange(2 * COUNT) / 2
+    poses = np.array([rigid.from_rotation_vector([0, 0.01 * k, 0], [300, 1.5 * k, 650]) for k in steps])
+    yes = np.ones(2 * COUNT, bool)
+    transforms = {"ProbeToTracker": poses, "ImageToProbe": np.tile(IMAGE, (2 * COUNT, 1, 1))}
+    sequences.write_sequence(tracker, Frames(100 + steps / 20 + 0.003, transforms, dict.fromkeys(transforms, yes)))
+    return video, tracker
+
+
+def test_images_and_poses_in_a_file_each(apart, frames, tmp_path):
+    """Poses lie between those of the tracker's file, which were 3 ms later: 0.09 mm of 1.5 mm a frame."""
+    video, tracker = apart
+    at = sequence_sweep.read_sequence_sweep(video, NAMES, tracker).poses()
+    assert np.isnan(at[0]).all() and np.isfinite(at[1:]).all()
+    np.testing.assert_allclose(at[1:, :3, 3], frames.transforms["ProbeToTracker"][1:, :3, 3] - [0, 0.09, 0], atol=1e-6)
+    out = tmp_path / "out"
+    assert main(["freehand", f"sequence={video}", f"tracker={tracker}", "reference=Tracker", f"out={out}"]) == 0
+    assert json.loads((out / "metrics.json").read_text())["frames_placed"] == COUNT - 1
+
+
+def test_files_of_other_times_are_refused(apart, frames, tmp_path, capsys):
+    video, tracker = apart
+    late = tmp_path / "Late.igs.mha"
+    sequences.write_sequence(late, replace(sequences.read_sequence(video), times_s=TIMES_S + 50))
+    for path, given, complaint in (
+        (late, tracker, "tracker: expected poses while the images were taken, at 150.000 to 151.450 s, found some at 100.003"),
+        (video, video, "tracker: expected transforms in each frame, such as ProbeToTracker, found none"),
+    ):
+        assert main(["freehand", f"sequence={path}", f"tracker={given}", "reference=Tracker", f"out={tmp_path / 'out'}"]) == 2
+        said = capsys.readouterr().err
+        assert complaint in said and said.count("\n") == 1 and not (tmp_path / "out").exists()

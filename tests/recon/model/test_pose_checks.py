@@ -1,0 +1,134 @@
+"""Poses of whole sweeps: what no hand makes is left out by name; what is fast, noisy, at rest or on a motor isn't."""
+
+import logging
+
+import numpy as np
+import pytest
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.model import pose_checks, tracks
+from recon.model.tracks import Track
+
+COUNT, RATE_HZ = 60, 20.0
+TIMES = np.arange(COUNT) / RATE_HZ
+
+
+def sweep(rng, speed_mm_s=30.0, rate_hz=RATE_HZ, noise_mm=0.05, count=COUNT):
+    """A hand that sweeps to and fro, 650 mm from the tracker."""
+    times = np.arange(count) / rate_hz
+    places = np.column_stack([100 * np.sin(speed_mm_s * times / 100), 5 * np.sin(3 * times), np.full(count, 650.0)])
+    turns = np.column_stack([0.3 * np.sin(times), np.full(count, 0.1), 0.2 * times])
+    poses = np.array([rigid.from_rotation_vector(turn, place) for turn, place in zip(turns, places, strict=True)])
+    poses[:, :3, 3] += rng.normal(0, noise_mm, (count, 3))
+    return poses
+
+
+def found(poses, times=TIMES, change=None) -> dict:
+    changes = None if change is None else lambda: (times, change)
+    return {cause: rows.tolist() for cause, rows in pose_checks.find(times, poses, changes).rows.items()}
+
+
+@pytest.mark.parametrize("speed_mm_s", [5, 100, 500, 2000])
+@pytest.mark.parametrize("rate_hz", [1, 5, 20, 200, 1000])
+def test_what_hands_do_is_no_fault(speed_mm_s, rate_hz, rng):
+    """From a slow sweep to one faster than any that makes images, by trackers of any rate and 0.2 mm of noise."""
+    poses = sweep(rng, speed_mm_s, rate_hz, 0.2, 200)
+    times = np.arange(200) / rate_hz
+    assert not found(poses, times, np.full(200, 3.0))
+    bursts = np.floor(times * rate_hz / 3) * 3 / rate_hz + 1e-4 * np.arange(200)  # stamps of packets of three
+    assert not found(poses, bursts)
+
+
+def test_poses_relative_to_the_first_begin_with_the_identity(rng):
+    poses = sweep(rng)
+    assert not found(np.linalg.inv(poses[0]) @ poses)
+
+
+def test_lost_poses_that_are_written_as_the_identity(rng):
+    poses = sweep(rng)
+    poses[[3, 9, 10, 40]] = np.eye(4)
+    assert found(poses) == {"identity": [3, 9, 10, 40]}
+
+
+@pytest.mark.parametrize("times", [TIMES, np.zeros(COUNT), np.full(COUNT, np.nan)], ids=["timed", "equal", "none"])
+@pytest.mark.parametrize(
+    ("rows", "off_mm"), [([20], 5000.0), ([20], 300.0), ([0], 5000.0), ([30, 31, 32], 1500.0), ([59], 400.0)]
+)
+def test_jumps_are_found_with_times_and_without(rows, off_mm, times, rng):
+    poses = sweep(rng)
+    poses[rows, 0, 3] += off_mm
+    assert found(poses, times) == {"jump": rows}
+
+
+def test_a_single_pose_a_little_aside_is_a_jump(rng):
+    """80 mm within a twentieth of a second and back, 64 m/s^2, are beyond any hand."""
+    poses = sweep(rng)
+    poses[20, 1, 3] += 80
+    assert found(poses) == {"jump": [20]}
+
+
+def test_a_target_seen_from_its_other_side_turns_at_once(rng):
+    poses = sweep(rng)
+    poses[50:55] = poses[50:55] @ np.diag([-1.0, 1, -1, 1])
+    assert found(poses) == {"jump": [50, 51, 52, 53, 54]}
+
+
+@pytest.mark.parametrize(("end", "jumps"), [(30, True), (COUNT, False)])
+def test_a_tracker_that_froze_while_images_change(end, jumps, rng):
+    """Where the pose jumps afterwards a third of the usual change tells it; at the end nearly all of it must be there."""
+    poses = sweep(rng)
+    poses[20:end] = poses[20]
+    assert found(poses, change=np.full(COUNT, 3.0)) == {"frozen": list(range(21, end))}
+    still = np.where((np.arange(COUNT) > 20) & (np.arange(COUNT) < end), 1.5, 3.0)
+    assert found(poses, change=still) == ({"frozen": list(range(21, end))} if jumps else {})
+
+
+def test_a_motor_that_pauses_is_at_rest(rng):
+    """Poses of an encoder repeat to the last digit; images then differ by noise, some third of what motion makes."""
+    steps = np.concatenate([np.full(20, 1.5), np.zeros(15), np.full(COUNT - 35, 1.5)])
+    poses = np.tile(rigid.transform(np.eye(3), [0, 0, 650]), (COUNT, 1, 1))
+    poses[:, 0, 3] = np.cumsum(steps)
+    assert not found(poses, change=np.where(steps > 0, 3.0, 1.2))
+
+
+def test_a_slow_tracker_repeats_each_pose(rng):
+    """As where the latest pose is stored with each image: ten poses a second, 60 images."""
+    poses = np.repeat(sweep(rng), 6, axis=0)
+    assert not found(poses, np.arange(len(poses)) / 60, np.full(len(poses), 3.0))
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "metres?"), (1e3, "micrometres?")])
+def test_another_unit_is_named(factor, unit, rng):
+    poses = sweep(rng)
+    poses[:, :3, 3] *= factor
+    with pytest.raises(InputError, match="poses: expected") as fault:
+        pose_checks.checked("s", TIMES, poses)
+    assert unit in str(fault.value) or "farther off" in str(fault.value)
+    assert str(fault.value).endswith("implausible=take")
+    assert pose_checks.checked("s", TIMES, poses, "take")[0] is poses
+
+
+def test_what_is_left_out_is_counted_and_beyond_a_share_refused(rng, caplog):
+    poses = sweep(rng)
+    poses[5:20] = np.eye(4)
+    with caplog.at_level(logging.WARNING):
+        kept, findings = pose_checks.checked("s", TIMES, poses)
+    assert "s: left out 15 of 60 poses, from pose 5 on: the identity" in caplog.text
+    assert np.isnan(kept[5:20]).all() and np.isfinite(kept[20:]).all() and len(findings.all) == 15
+    poses[20:30] = np.eye(4)
+    with pytest.raises(InputError, match=r"found 25 of 60 poses, from pose 5 on: the identity.* give implausible=take"):
+        pose_checks.checked("s", TIMES, poses)
+
+
+def test_stills_have_the_pose_of_their_moment(rng):
+    """One pose a second; a still a second with the same time, up to its rounding to ms, and one between."""
+    poses = sweep(rng, rate_hz=1.0, count=5)
+    track = Track(np.arange(5) * 10**9, poses)
+    at = np.array([0, 10**9 + 400_000, 3 * 10**9, 3_500_000_000])
+    np.testing.assert_array_equal(tracks.at(track, at)[:3], poses[[0, 1, 3]])
+    assert np.isnan(tracks.at(track, at)[3]).all()
+    assert np.isfinite(tracks.shares_at(track, at, 0.0)[:3]).all()
+    one = Track(np.array([7]), poses[:1])
+    np.testing.assert_array_equal(tracks.at(one, np.array([7])), poses[:1])
+    assert tracks.shares_at(one, np.array([7]), 0.0).tolist() == [[1.0]]
