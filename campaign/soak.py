@@ -82,7 +82,7 @@ def _track(place: Path, count: int, folder: Path) -> tuple[Iterator[object], int
 
     film = stereo_frames.read_film(place / "film" / "capture")
     rig: Rig = config.load("track", ["capture=none", "out=none"], verb.Config).rig
-    tracker = Tracker(film.cameras, rig.target, networks.load(), film.bits)
+    tracker = Tracker(film.cameras, rig.target, networks.load(), film.bits, film.optics)
     pairs = (pair for _ in cycle([None]) for pair in film.pairs())
     return (tracker.step(*pair, k / 30) for k, pair in enumerate(islice(pairs, count))), 1
 

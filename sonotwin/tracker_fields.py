@@ -6,9 +6,8 @@ from typing import Annotated
 from pydantic import Field
 
 from recon.capture import target_files
-from recon.capture.manifest import CAMERAS
 from recon.geometry.camera import Camera
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty, in_use
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty
 from recon.model.rig import Part, Rig, Target
 from recon.tracking import networks
 from recon.tracking.tracker import Tracker
@@ -52,6 +51,5 @@ def make_tracker(
     InputError
         If a network is missing, or isn't one.
     """
-    optics = in_use(known, dict(zip(CAMERAS, cameras, strict=True)), fields.board_scale, fields.drift_px)
     loaded = networks.load(fields.networks or networks.WEIGHTS, fields.threads)
-    return Tracker(cameras, target, loaded, bits, optics)
+    return Tracker(cameras, target, loaded, bits, known, fields.drift_px, fields.board_scale)

@@ -6,18 +6,20 @@ of sizes against distances, and of both views against each other; so what is wro
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.capture.manifest import CAMERAS
 from recon.errors import InputError
 from recon.geometry import pose_hypotheses, rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_outline import ellipses_of
 from recon.geometry.ellipses import Ellipses, joined
 from recon.model import circle_layout
-from recon.model.calibration import Uncertainty
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty, in_use
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, views
 from recon.tracking.frames import grey
@@ -57,15 +59,26 @@ class Tracking:
 
 @dataclass
 class Tracker:
-    """Follows a target through pairs of frames. Its state is the last poses; `forget` clears it."""
+    """Follows a target through pairs of frames. Its state is the last poses; `forget` clears it.
+
+    Cameras count as used some time after their calibration, by `drift_px` and `board_scale`: without that allowance sharp rims
+    would refuse the target to cameras that have warmed by a kelvin.
+    """
 
     cameras: tuple[Camera, Camera]
     target: Target
     networks: Networks | None = None  # without them it only follows from a pose that it is given by `remember`
     bits: int | None = None  # of frames deeper than 8 bits, see `frames.grey`
-    optics: Uncertainty | None = None  # of the cameras' calibration; None where it isn't known, or exact
+    optics: Uncertainty | None = None  # of the cameras' calibration, as its file has it; None where it isn't known, or exact
+    drift_px: float = DRIFT_PX  # standard deviation of principal points since the calibration; 0 of exact cameras
+    board_scale: float = PRINT_SCALE  # relative, of the board that the cameras were calibrated with; 0 of an exact one
     _past: list[tuple[float, Array]] = field(default_factory=list, init=False)  # times and poses, the last one last, two at most
     _clock: float = field(default=0.0, init=False)  # counts frames that come without a time
+
+    @cached_property
+    def optics_in_use(self) -> Uncertainty | None:
+        """Uncertainty of the cameras as they are now: of their calibration, and by drift and the board's scale since."""
+        return in_use(self.optics, dict(zip(CAMERAS, self.cameras, strict=True)), self.board_scale, self.drift_px)
 
     def step(self, left: NDArray, right: NDArray, time_s: float | None = None) -> Tracking:
         """Track one pair of frames, camera 1's and camera 2's. Never raises on what they show.
@@ -153,7 +166,7 @@ class Tracker:
         if result.found:
             return result
         rims = [view.outlines for view in seen]
-        for choices in covered_circle.sought_again(frames, rims, self.cameras, self.target, self.optics):
+        for choices in covered_circle.sought_again(frames, rims, self.cameras, self.target, self.optics_in_use):
             judged = [tuple(views.judged(outlines, self.target) for outlines in pair) for pair in choices]
             found = [each for each in (self._posed((one, other), how) for one, other in judged) if each.found]
             if found:
@@ -166,7 +179,7 @@ class Tracker:
         if not (all(view.useful for view in seen) and any(view.found for view in seen)):
             each = self._unconfirmed(seen)
             return Tracking(lost(_unseen(each)), each)
-        found = estimate(*self._sightings(seen), self.target, self.optics)
+        found = estimate(*self._sightings(seen), self.target, self.optics_in_use)
         if not found.found:
             both = all(view.found for view in seen)
             return Tracking(found, views.doubted(seen, found.reason) if both else self._unconfirmed(seen))

@@ -60,7 +60,7 @@ def run(config: Config) -> None:
     console.print(f"found       {len(seen)} of {len(film.times)} pairs whole, {len(pairs)} poses that differ", markup=False)
     target_poses.check(pairs, film.name, faults, config.least_tilt_deg, config.least_range_mm)
     with console.status("adjusting"):
-        adjusted = target_bundle.adjust(pairs, design, tracker.optics)
+        adjusted = target_bundle.adjust(pairs, design, tracker.optics_in_use)
     figures = target_figures.measure(adjusted, pairs, design)
     for line in target_figures.describe(figures):
         console.print(line, markup=False)

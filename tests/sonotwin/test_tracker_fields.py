@@ -17,13 +17,13 @@ def cameras(rig):
 def test_cameras_may_have_drifted_and_their_board_may_have_stretched(rig, cameras):
     """Without a covariance of the calibration the optics are as uncertain as the fields say, and exact where these are 0."""
     fields = MeasuredTargetFields(rig=rig, drift_px=0.2, board_scale=1e-3, threads=1)
-    optics = make_tracker(fields, rig.target, cameras, None, None).optics
+    optics = make_tracker(fields, rig.target, cameras, None, None).optics_in_use
     sigma = dict(zip(optics.names, np.sqrt(np.diag(optics.covariance)), strict=True))
     baseline = np.sqrt(sum(sigma[f"cam2.{axis}"] ** 2 for axis in ("tx", "ty", "tz")))
     assert [sigma[f"{name}.{axis}"] for name in CAMERAS for axis in ("cx", "cy")] == pytest.approx([0.2] * 4)
     assert baseline == pytest.approx(1e-3 * np.linalg.norm(cameras[1].camera_from_world[:3, 3]))
     exact = fields.model_copy(update={"drift_px": 0.0, "board_scale": 0.0})
-    assert make_tracker(exact, rig.target, cameras, None, None).optics is None
+    assert make_tracker(exact, rig.target, cameras, None, None).optics_in_use is None
 
 
 def test_the_target_is_the_measured_one_where_there_is_one(rig, tmp_path):

@@ -7,8 +7,6 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.capture.manifest import CAMERAS
-from recon.model.calibration import DRIFT_PX, with_drift
 from recon.model.rig import Target
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
@@ -76,8 +74,7 @@ def scored(samples: Iterable[tuple[Take, Frames]], target: Target, networks: Net
     """Track each sample as if nothing were known before, with the usual allowance for drift, and score both views."""
     for take, given in samples:
         first, second = (device.optics.camera() for device in take.cameras)
-        drift = with_drift(None, dict(zip(CAMERAS, (first, second), strict=True)), DRIFT_PX)
-        result = Tracker((first, second), target, networks, optics=drift).step(*given.views)
+        result = Tracker((first, second), target, networks).step(*given.views)
         for view, truth in zip(result.views, given.truth, strict=True):
             yield score(view, truth, take.present)
 

@@ -94,7 +94,7 @@ def pose_rows(setup: Setup, networks: Networks) -> list[Row]:
 def located(take: Take, given: Frames, target: Target, networks: Networks) -> Located:
     """Track one sample as if nothing were known before."""
     cameras = cameras_of(take)
-    result = Tracker(cameras, target, networks).step(*given.views)
+    result = Tracker(cameras, target, networks, drift_px=0, board_scale=0).step(*given.views)
     truth = np.concatenate([view.ellipses[:, :2] for view in given.truth])
     limit = np.concatenate([centre_limit(take, camera, view, target) for camera, view in zip((0, 1), given.truth, strict=True)])
     nothing = Located(np.full(6, np.nan), limit, np.nan, np.nan, np.nan)

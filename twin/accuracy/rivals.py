@@ -130,7 +130,7 @@ def ours(target: Target, networks: Networks) -> Locate:
     """The tracker, knowing nothing before."""
 
     def locate(cameras: Pair, images: Images) -> Array | None:
-        result = Tracker(cameras, target, networks).step(*images)
+        result = Tracker(cameras, target, networks, drift_px=0, board_scale=0).step(*images)
         return result.pose.world_from_target if result.found else None
 
     return locate

@@ -117,7 +117,7 @@ def _errors(one: Shown, design: Target, networks: Networks) -> tuple[float, floa
 
 def _step(one: Shown, design: Target, networks: Networks):
     take, frames = one
-    return Tracker(cameras_of(take), design, networks).step(*frames.views)
+    return Tracker(cameras_of(take), design, networks, drift_px=0, board_scale=0).step(*frames.views)
 
 
 def _wrong(one: Shown, design: Target, networks: Networks) -> bool:

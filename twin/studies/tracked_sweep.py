@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from recon.capture.images import write_images
 from recon.capture.manifest import image_name
 from recon.capture.sweep_part import SweepCapture
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Calibration, in_use
+from recon.model.calibration import Calibration
 from recon.tracking import results
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
@@ -56,8 +56,7 @@ def track(planned: PlannedSweep, optics: Optics, networks: Networks, ranges: Dat
     folder : for the B-scans
     """
     settings, plan = planned.settings, planned.plan
-    known = in_use(optics.ours.uncertainty, optics.ours.cameras, PRINT_SCALE, DRIFT_PX)
-    tracker = Tracker(pair(optics.ours), settings.rig.target, networks, optics=known)
+    tracker = Tracker(pair(optics.ours), settings.rig.target, networks, optics=optics.ours.uncertainty)
     recipe, theirs = published_recipe(networks), pair(optics.cameras)
     steps, matrices = [], []
     film = planned.film(ranges)

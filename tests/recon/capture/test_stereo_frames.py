@@ -184,7 +184,7 @@ def followed(rig, tmp_path_factory):
     """Three frames, the last one not seen by camera 2, tracked, and the folder with what is told of them."""
     folder = tmp_path_factory.mktemp("drawn")
     film = stereo_frames.read_film(films.film(folder / "capture", rig, np.random.default_rng(3), count=3, missing=(2,)))
-    tracker = Tracker(film.cameras, rig.target, Told(films.centres(rig, films.places(1)[0])))
+    tracker = Tracker(film.cameras, rig.target, Told(films.centres(rig, films.places(1)[0])), drift_px=0, board_scale=0)
     pictures = folder / "out"
     pictures.mkdir()
     steps = []

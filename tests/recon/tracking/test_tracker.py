@@ -237,6 +237,22 @@ def test_a_wrong_size_is_refused_by_name(tracker, pair):
         assert "expected an image" in str(tracker.step(pair[0], nonsense).pose.reason)
 
 
+@pytest.mark.parametrize("drift_px", [None, 0.0])
+def test_cameras_that_have_warmed_see_the_target_by_default(cameras, rig, pair, told, drift_px):
+    """Principal points 0.06 px off the calibration, a kelvin's worth, along opposite ways, which exact cameras refuse.
+
+    The same frames, so the calibration is what moves.
+    """
+    warm = []
+    for camera, sign in zip(cameras, (1, -1), strict=True):
+        matrix = camera.matrix.copy()
+        matrix[:2, 2] += sign * np.array([0.03, 0.06])
+        warm.append(replace(camera, matrix=matrix))
+    exact = {} if drift_px is None else {"drift_px": drift_px, "board_scale": 0.0}
+    found = Tracker((warm[0], warm[1]), rig.target, told, **exact).step(*pair)
+    assert found.found == (drift_px is None), found.pose.reason
+
+
 def test_colour_and_depth_make_no_difference(cameras, rig, pair, told):
     deep = [(image.astype(np.uint16) * 16).clip(0, 4095) for image in pair]
     for images in ([np.repeat(i[..., None], 3, axis=2) for i in pair], deep, [i.astype(np.float32) / 255 for i in pair]):

@@ -10,11 +10,9 @@ from scipy.spatial.transform import Rotation
 from recon.capture import stereo_frames
 from recon.capture.manifest import CAMERAS
 from recon.geometry import rigid
-from recon.model.calibration import with_drift
 from recon.tracking.tracker import Tracker
 from sonotwin.cli import main
 from sonotwin.config import load
-from sonotwin.verbs import track
 from sonotwin.verbs.film import Config, ranges
 from tests.twin.tracking import takes
 from twin.conditions import Motion
@@ -173,9 +171,7 @@ def test_a_rendered_film_is_tracked(tmp_path, config):
     read = stereo_frames.read_film(tmp_path / "film" / "capture")
     truth = track_errors.read_truth(tmp_path / "film" / "truth")
     assert track_errors.visible_whole(truth).all()
-    drift_px = load("track", ["capture=unused", "out=unused"], track.Config).drift_px
-    optics = with_drift(read.optics, dict(zip(CAMERAS, read.cameras, strict=True)), drift_px)
-    tracker = Tracker(read.cameras, config.rig.target, optics=optics)
+    tracker = Tracker(read.cameras, config.rig.target, optics=read.optics)
     tracker.remember(rigid.transform(truth.poses[0][:3, :3], truth.poses[0][:3, 3] + [0.3, 0, 0]), -0.03)
     for (left, right), time, true in itertools.islice(zip(read.pairs(), read.times, truth.poses, strict=True), 3):
         found = tracker.step(left, right, time * 1e-9)
