@@ -16,14 +16,16 @@ import cv2
 import numpy as np
 import pydicom
 from numpy.typing import NDArray
+from pydicom.encaps import generate_frames
 from pydicom.errors import BytesLengthException, InvalidDicomError
 from pydicom.filereader import read_dataset
-from pydicom.pixels import apply_color_lut, iter_pixels
-from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian
+from pydicom.pixels import apply_color_lut, convert_color_space, get_decoder, iter_pixels, pixel_array
+from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, JPEGLossless, JPEGLosslessSV1
 
 from recon.capture.image_formats import MOST_PX
+from recon.clips import lossless_jpeg
 from recon.clips.clip import Box, Clip, checked_seconds
-from recon.errors import InputError, reason
+from recon.errors import InputError, reason, short
 from recon.files.regular import check_there, opened
 
 Dataset = Any
@@ -35,6 +37,7 @@ MOST_UNPACKED = 1 << 30  # bytes, of a file that is packed as a whole
 PREAMBLE, PREFIX = 128, b"DICM"
 META = 2  # group of the tags before the part that may be packed
 
+LOSSLESS = (JPEGLossless, JPEGLosslessSV1)
 TWO_D, TISSUE, CENTIMETRES = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits
 DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or compressed in ways that need other packages
     *(InvalidDicomError, BytesLengthException, AttributeError, EOFError, LookupError, OSError, OverflowError),
@@ -61,6 +64,7 @@ def read(path: Path) -> Clip:
 
 def _clip(path: Path) -> Clip:
     header = _dataset(path, stop_before_pixels=True)
+    check_compression(path, header.file_meta.get("TransferSyntaxUID"))
     count = int(header.get("NumberOfFrames") or 1)
     if not 1 <= count <= MOST_FRAMES:
         raise ValueError(f"NumberOfFrames {count}")
@@ -78,7 +82,7 @@ def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np
     read = 0
     try:
         header = _quietly(lambda: _dataset(path))
-        frames = iter_pixels(header)
+        frames = _frames(header, count)
         while True:
             frame = _quietly(lambda: next(frames, None))
             if frame is None:
@@ -91,6 +95,43 @@ def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np
         raise InputError(f"{path}: frame {read}: expected an image of {size[0]}x{size[1]}, found {reason(error)}") from None
     if read != count:
         raise InputError(f"{path}: expected {count} frames, as NumberOfFrames says, found {read}")
+
+
+def check_compression(path: Path, syntax: UID | None) -> None:
+    """InputError if pixels are compressed in a way that can't be read here."""
+    if syntax is None or not syntax.is_transfer_syntax or not syntax.is_encapsulated or syntax in LOSSLESS:
+        return
+    try:
+        known = get_decoder(syntax).is_available
+    except NotImplementedError:
+        known = False
+    if not known:
+        expected = "expected pixels uncompressed, or as RLE, JPEG, lossless JPEG or JPEG 2000"
+        raise InputError(f"{path}: TransferSyntaxUID: {expected}, found {short(syntax.name)}: gdcmconv --raw undoes it")
+
+
+def _frames(header: Dataset, count: int) -> Iterator[NDArray]:
+    """Frames of a file, of colours as RGB, unless its palette has them."""
+    syntax = header.file_meta.TransferSyntaxUID
+    if syntax in LOSSLESS:
+        return _lossless(header, count)
+    if syntax.is_encapsulated or header.get("PhotometricInterpretation") != "YBR_FULL_422":
+        return iter_pixels(header)
+    there = len(header.PixelData) // (2 * int(header.Rows) * int(header.Columns))  # of which iter_pixels errs
+    if there != count:
+        raise ValueError(f"pixels of {there} frames, NumberOfFrames {count}")
+    return (pixel_array(header, index=index) for index in range(count))
+
+
+def _lossless(header: Dataset, count: int) -> Iterator[NDArray]:
+    """Frames of lossless JPEG; its samples are the stored ones, whatever colours they mean."""
+    shape, levels = (int(header.Rows), int(header.Columns)), {8: np.uint8, 16: np.uint16}[int(header.BitsAllocated)]
+    colours = str(header.PhotometricInterpretation)
+    for packed in generate_frames(header.PixelData, number_of_frames=count):
+        frame = lossless_jpeg.decode(packed).astype(levels)
+        if frame.shape[:2] != shape or frame.ndim != (2 if int(header.SamplesPerPixel) == 1 else 3):
+            raise ValueError(f"a JPEG image of {' x '.join(map(str, frame.shape))}")
+        yield convert_color_space(frame, colours, "RGB") if colours.startswith("YBR") else frame
 
 
 def _dataset(path: Path, stop_before_pixels: bool = False) -> Dataset:

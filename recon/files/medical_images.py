@@ -33,8 +33,11 @@ NRRD_TYPES = {  # those of sequences, each with many names
     **dict.fromkeys(("unsigned char", "uchar", "uint8", "uint8_t"), "u1"),
     **dict.fromkeys(("unsigned short", "unsigned short int", "ushort", "uint16", "uint16_t"), "u2"),
     **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
+    "float": "f4",
+    "double": "f8",
 }
 NO_PIXELS = ("MET_OTHER", "MET_NONE", "")  # types, in either format, of PLUS's files without images
+MATROSKA = b"\x1a\x45\xdf\xa3"  # the beginning of an .mkv file
 MOST_WHOLE = 1 << 40  # of any number of a header
 MOST_HEADER = 1 << 28  # bytes; a sequence of five hours has half as many
 LONGEST_LINE = 1 << 20  # bytes; a file of another kind may have no line breaks at all
@@ -81,8 +84,11 @@ def read_header(path: Path) -> ImageFile:
     """
     path = Path(path)
     with opened(path) as stream:
-        start = stream.read(4)
+        start = stream.read(len(MATROSKA))
         stream.seek(0)
+        if start == MATROSKA:
+            advice = "PLUS's EditSequenceFile writes it as .igs.mha; its images alone are a clip for import-sweep"
+            raise InputError(f"{path}: expected a MetaImage or NRRD file, found a Matroska video (.mkv): {advice}")
         file = _nrrd(path, stream) if start == b"NRRD" else _metaimage(path, stream)
     _check_length(file)
     return file
@@ -146,7 +152,7 @@ def _metaimage(path: Path, stream: BinaryIO) -> ImageFile:
             raise fault(path, "ElementDataFile", "a value at the header's end", "the end of the file")
         name, sign, value = line.partition("=")
         if not sign:
-            raise InputError(f"{path}: expected lines of a MetaImage header, 'name = value', found {brief(line.strip())}")
+            raise InputError(f"{path}: expected lines of a MetaImage header, 'name = value', found {_shown(line)}")
         fields[name.strip()] = value.strip()
     size = whole_numbers(path, "DimSize", _value(path, fields, "DimSize"))
     dimensions = whole_numbers(path, "NDims", fields.get("NDims", str(len(size))))
@@ -173,7 +179,7 @@ def _metaimage(path: Path, stream: BinaryIO) -> ImageFile:
 
 
 def _nrrd(path: Path, stream: BinaryIO) -> ImageFile:
-    """The header of an NRRD file of levels of 8 or 16 bits, the pixels of sequences; files of others are read by pynrrd."""
+    """The header of an NRRD file of levels as sequences have them; files of others are read by pynrrd."""
     fields: dict[str, str] = {}
     _line(path, stream)
     while (line := _line(path, stream)).strip():
@@ -181,7 +187,7 @@ def _nrrd(path: Path, stream: BinaryIO) -> ImageFile:
             continue
         name, sign, value = line.partition(":")
         if not sign:
-            raise InputError(f"{path}: expected lines of an NRRD header, 'name: value', found {brief(line.strip())}")
+            raise InputError(f"{path}: expected lines of an NRRD header, 'name: value', found {_shown(line)}")
         fields[name.strip()] = value.removeprefix("=").strip()  # PLUS writes some fields of its own with ":", some with ":="
     detached = fields.get("data file", fields.get("datafile"))
     if not line and not detached:
@@ -191,7 +197,7 @@ def _nrrd(path: Path, stream: BinaryIO) -> ImageFile:
         raise fault(path, "sizes", f"{fields['dimension']} numbers as in dimension", repr(fields["sizes"]))
     kind = _value(path, fields, "type")
     if kind not in NRRD_TYPES and kind not in NO_PIXELS:
-        raise fault(path, "type", "unsigned char, unsigned short or short", kind)
+        raise fault(path, "type", "unsigned char, unsigned short, short, float or double", kind)
     pixel = np.dtype((">" if fields.get("endian", "little") == "big" else "<") + NRRD_TYPES.get(kind, "V0"))
     encoding = _value(path, fields, "encoding")
     if encoding not in ("raw", "gz", "gzip"):
@@ -207,6 +213,11 @@ def _line(path: Path, stream: BinaryIO) -> str:
     if len(line) == LONGEST_LINE:
         raise InputError(f"{path}: expected a MetaImage or NRRD header, found a line of {LONGEST_LINE} bytes")
     return line.decode("utf-8", "surrogateescape")
+
+
+def _shown(line: str) -> str:
+    """A line for a message."""
+    return brief(line.strip()) if line.strip().isprintable() else "no text"
 
 
 def _value(path: Path, fields: Mapping[str, str], name: str) -> str:

@@ -69,19 +69,23 @@ def images(file: ImageFile) -> Iterator[NDArray[np.uint8]]:
     """The images (h, w), one by one.
 
     Colours become their luminance. Of 16-bit levels the upper eight bits are taken, of as many as the greatest of the file needs:
-    8, 10, 12, 14 or 16. For these the pixels are read twice.
+    8, 10, 12, 14 or 16. Floating-point levels are rounded, after the same scale, or after one of 255 if none exceeds 1. For both
+    the pixels are read twice.
 
     Raises
     ------
     InputError
-        If the data ends early, or isn't grey or coloured levels of 8 or 16 bits, such as radio-frequency data.
+        If the data ends early, or isn't grey or coloured levels from 0 on, such as radio-frequency data.
     """
     _, shape, channels = layout(file)
     orientation = _orientation(file)
     _check_levels(file, channels)
-    spare = _bits(file) - 8
+    most = _greatest(file)
+    spare = next(bits for bits in DEPTHS if most < 1 << bits) - 8
+    scale = 255.0 if most <= 1 else 0.5**spare
     for block in medical_images.blocks(file, shape[0] * shape[1] * channels * file.pixel.itemsize):
-        levels = np.frombuffer(block, file.pixel).reshape(*shape, channels) >> spare
+        stored = np.frombuffer(block, file.pixel).reshape(*shape, channels)
+        levels = np.minimum(np.rint(stored * scale), 255).astype(np.int64) if file.pixel.kind == "f" else stored >> spare
         grey = levels[..., 0] if channels == 1 else (levels[..., :3] @ LUMINANCE + 500) // 1000
         yield _turned(grey.astype(np.uint8, copy=False), orientation)
 
@@ -106,22 +110,24 @@ def _check_levels(file: ImageFile, channels: int) -> None:
     found = file.fields.get("UltrasoundImageType", file.fields.get("ultrasound image type", "BRIGHTNESS"))
     if found.upper().startswith("RF"):
         raise file.fault("UltrasoundImageType", "BRIGHTNESS or RGB_COLOR", f"{found}, no images but radio-frequency data")
-    if file.pixel.newbyteorder("=") not in (np.uint8, np.uint16, np.int16):
+    if file.pixel.newbyteorder("=") not in (np.uint8, np.uint16, np.int16, np.float32, np.float64):
         field = "ElementType" if "ElementType" in file.fields else "type"
-        raise file.fault(field, "grey levels of 8 or 16 bits", file.fields[field])
+        raise file.fault(field, "grey levels of 8 or 16 bits, or floating-point ones", file.fields[field])
     if channels not in (1, 3, 4):
         raise file.fault("ElementNumberOfChannels", "1, 3 or 4", channels)
 
 
-def _bits(file: ImageFile) -> int:
-    """Number of bits that the greatest level needs, of those that scanners have."""
+def _greatest(file: ImageFile) -> float:
+    """The greatest level of all images, 255 where no more is possible."""
     if file.pixel == np.uint8:
-        return 8
-    least, most = 0, 0
+        return 255
+    least, most = 0.0, 0.0
     _, (rows, columns), channels = layout(file)
     for block in medical_images.blocks(file, rows * columns * channels * file.pixel.itemsize):
         levels = np.frombuffer(block, file.pixel)
-        least, most = min(least, int(levels.min())), max(most, int(levels.max()))
+        least, most = float(np.fmin(least, levels.min())), float(np.maximum(most, levels.max()))
     if least < 0:
-        raise file.fault("pixels", "grey levels from 0 on", f"{least}: radio-frequency data?")
-    return next(bits for bits in DEPTHS if most < 1 << bits)
+        raise file.fault("pixels", "grey levels from 0 on", f"{least:g}: radio-frequency data?")
+    if not most < 1 << DEPTHS[-1]:
+        raise file.fault("pixels", f"grey levels below {1 << DEPTHS[-1]}", f"{most:g}")
+    return most

@@ -4,10 +4,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import SimpleITK as sitk
 from numpy.typing import NDArray
+from pydicom import dcmread
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.encaps import encapsulate, generate_frames
 from pydicom.sequence import Sequence
-from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage, generate_uid
+from pydicom.uid import UID, ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage, generate_uid
 
 BOX = (40, 30, 120, 96)  # u, v, width, height of the B-scan in the screen
 SCREEN = (240, 160)
@@ -52,6 +55,26 @@ def write_dicom(path: Path, frames: NDArray, region: bool = True, **tags: object
         setattr(made, name, value)
     made.PixelData = frames.tobytes()
     made.save_as(path, enforce_file_format=True)
+
+
+def compress(path: Path, encoded: list[bytes], syntax: UID) -> None:
+    """Put frames that are encoded in the place of those of a file."""
+    read = dcmread(path)
+    read.PixelData = encapsulate(encoded)
+    read["PixelData"].is_undefined_length = True
+    read.file_meta.TransferSyntaxUID = syntax
+    read.save_as(path)
+
+
+def lossless_jpeg(path: Path, frame: NDArray) -> bytes:
+    """A frame : (h, w) or (h, w, 3) as lossless JPEG, encoded by GDCM by way of a file."""
+    writer = sitk.ImageFileWriter()
+    writer.SetImageIO("GDCMImageIO")
+    writer.SetUseCompression(True)
+    writer.SetCompressor("JPEG")
+    writer.SetFileName(path)
+    writer.Execute(sitk.GetImageFromArray(frame[None], isVector=frame.ndim == 3))
+    return next(generate_frames(dcmread(path).PixelData, number_of_frames=1))
 
 
 def region_of(box: tuple[int, int, int, int], form: int, kind: int) -> Dataset:

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pydicom
 import pytest
-from pydicom.encaps import encapsulate
-from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGLSLossless
+from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGLosslessSV1, JPEGLSLossless
 
 from recon.clips import clip_reader, dicom_clip, image_region, video_clip
 from recon.errors import InputError
@@ -65,12 +64,8 @@ def test_times_are_the_most_exact_that_the_file_has(tags, seconds, tmp_path):
 def compressed(path, frames, syntax) -> None:
     """A file whose frames are JPEG, whatever its header says."""
     made_clips.write_dicom(path, frames, region=False, FrameTime=50)
-    read = pydicom.dcmread(path)
     encoded = [cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes() for frame in frames]
-    read.PixelData = encapsulate(encoded)
-    read["PixelData"].is_undefined_length = True
-    read.file_meta.TransferSyntaxUID = syntax
-    read.save_as(path)
+    made_clips.compress(path, encoded, syntax)
 
 
 def test_grey_levels_are_those_that_the_file_means(tmp_path):
@@ -108,6 +103,33 @@ def test_jpeg_in_a_dicom_file_is_read(tmp_path):
     assert np.abs(np.int32(frames_of(clip_reader.read(tmp_path / "scan.dcm"))) - smooth).max() <= 4
 
 
+@pytest.mark.parametrize("kind", ["grey", "colour", "sixteen bits"])
+def test_lossless_jpeg_in_a_dicom_file_is_read_to_the_last_bit(kind, tmp_path):
+    """As GDCM writes it."""
+    shown = made_clips.screens(made_clips.scans(3))
+    colours = np.stack([shown, np.roll(shown, 1, axis=1), shown // 2], axis=-1)
+    stored = {"grey": shown, "colour": colours, "sixteen bits": np.uint16(shown) * 257}[kind]
+    made_clips.write_dicom(tmp_path / "plain.dcm", stored, FrameTime=50)
+    made_clips.write_dicom(tmp_path / "scan.dcm", stored, FrameTime=50)
+    encoded = [made_clips.lossless_jpeg(tmp_path / "frame.dcm", frame) for frame in stored]
+    made_clips.compress(tmp_path / "scan.dcm", encoded, JPEGLosslessSV1)
+    plain, read = (clip_reader.read(tmp_path / name) for name in ("plain.dcm", "scan.dcm"))
+    assert read.image == BOX and (frames_of(read) == frames_of(plain)).all()
+
+
+def test_colours_that_share_their_chroma_are_read_frame_by_frame(tmp_path):
+    """YBR_FULL_422, uncompressed: of each two pixels both lumas and one chroma, two bytes a pixel."""
+    shown = made_clips.screens(made_clips.scans(5))
+    made_clips.write_dicom(tmp_path / "scan.dcm", np.repeat(shown[..., None], 3, axis=-1), FrameTime=50)
+    held = pydicom.dcmread(tmp_path / "scan.dcm")
+    pairs = np.full((*shown.shape[:2], SCREEN[0] // 2, 4), 128, np.uint8)
+    pairs[..., 0], pairs[..., 1] = shown[..., 0::2], shown[..., 1::2]
+    held.PixelData, held.PhotometricInterpretation = pairs.tobytes(), "YBR_FULL_422"
+    held.save_as(tmp_path / "scan.dcm")
+    clip = clip_reader.read(tmp_path / "scan.dcm")
+    assert clip.image == BOX and (frames_of(clip) == shown).all()
+
+
 def test_a_file_that_is_deflated_is_unpacked_up_to_a_bound(tmp_path, monkeypatch):
     """All of it but the first tags is packed."""
     shown = made_clips.screens(made_clips.scans(5))
@@ -126,8 +148,8 @@ def test_a_file_that_is_deflated_is_unpacked_up_to_a_bound(tmp_path, monkeypatch
 
 def test_a_compression_that_cant_be_read_is_named(tmp_path):
     compressed(tmp_path / "scan.dcm", made_clips.scans(3), JPEGLSLossless)
-    with pytest.raises(InputError, match=r"scan\.dcm: frame 0: .* found .*JPEG-LS"):
-        frames_of(clip_reader.read(tmp_path / "scan.dcm"))
+    with pytest.raises(InputError, match=r"scan\.dcm: TransferSyntaxUID: .* or JPEG 2000, found JPEG-LS.*: gdcmconv"):
+        clip_reader.read(tmp_path / "scan.dcm")
 
 
 def test_damaged_files_are_refused_by_name(tmp_path):
@@ -144,9 +166,14 @@ def test_damaged_files_are_refused_by_name(tmp_path):
         clip_reader.read(tmp_path / "back.dcm")
 
 
-def test_flipped_bytes_never_end_in_a_traceback(tmp_path):
+@pytest.mark.parametrize("packed", [False, True])
+def test_flipped_bytes_never_end_in_a_traceback(packed, tmp_path):
     """Any damage is refused in one line, or leaves frames of the size that the header has."""
-    made_clips.write_dicom(tmp_path / "scan.dcm", made_clips.scans(2, (16, 12)), FrameTime=50)
+    small = made_clips.scans(2, (16, 12))
+    made_clips.write_dicom(tmp_path / "scan.dcm", small, FrameTime=50)
+    if packed:
+        encoded = [made_clips.lossless_jpeg(tmp_path / "frame.dcm", frame) for frame in small]
+        made_clips.compress(tmp_path / "scan.dcm", encoded, JPEGLosslessSV1)
     content, rng = np.frombuffer((tmp_path / "scan.dcm").read_bytes(), np.uint8), np.random.default_rng(1)
     for _ in range(150):
         spoilt = content.copy()
@@ -168,6 +195,8 @@ def test_a_video_gives_its_frames_and_times(tmp_path):
     assert [stamp for stamp, _, _ in video_clip._frames(tmp_path / "screen.avi")] == pytest.approx(np.arange(6) / 25), (
         "not even by the rate"
     )
+    (tmp_path / "screen.avi").rename(tmp_path / "screen.MKV")
+    assert clip_reader.read(tmp_path / "screen.MKV").count == 6
     (tmp_path / "none.mp4").write_bytes(b"none")
     with pytest.raises(InputError, match=r"none\.mp4: expected a video"):
         clip_reader.read(tmp_path / "none.mp4")

@@ -279,6 +279,30 @@ def test_sixteen_bits_become_eight_by_the_greatest_level(tmp_path, greatest, div
     assert np.array_equal(sequences.read_sequence(plus_file(tmp_path, text, levels.tobytes(), ".nrrd")).images, read.images)
 
 
+@pytest.mark.parametrize(("greatest", "scale"), [(1, 255), (255, 1), (1023, 0.25), (65535, 1 / 256)])
+@pytest.mark.parametrize(("element", "name", "code"), [("MET_FLOAT", "float", "<f4"), ("MET_DOUBLE", "double", "<f8")])
+def test_floating_point_levels_are_rounded(tmp_path, greatest, scale, element, name, code, rng):
+    """As PLUS's own of 0 to 255, and as fractions."""
+    levels = np.append(rng.uniform(0, greatest, 11), greatest).astype(code)
+    expected = np.minimum(np.rint(levels * scale), 255)
+    read = sequences.read_sequence(plus_file(tmp_path, PLUS_2D.replace("MET_UCHAR", element), levels.tobytes()))
+    assert np.array_equal(read.images.ravel(), expected)
+    text = f"NRRD0004\ntype: {name}\ndimension: 3\nsizes: 3 2 2\nendian: little\nencoding: raw\n\n"
+    assert np.array_equal(sequences.read_sequence(plus_file(tmp_path, text, levels.tobytes(), ".nrrd")).images, read.images)
+    levels[3] = np.nan
+    with pytest.raises(InputError, match="pixels: expected grey levels below 65536, found nan"):
+        sequences.read_sequence(plus_file(tmp_path, PLUS_2D.replace("MET_UCHAR", element), levels.tobytes()))
+
+
+def test_a_matroska_file_is_named(tmp_path):
+    (tmp_path / "s.mkv").write_bytes(b"\x1a\x45\xdf\xa3" + bytes(200))
+    with pytest.raises(InputError, match=r"s\.mkv: expected a MetaImage or NRRD file, found a Matroska video .* EditSeq"):
+        sequences.read_sequence(tmp_path / "s.mkv")
+    (tmp_path / "s.mha").write_bytes(bytes(range(128, 200)) * 2)
+    with pytest.raises(InputError, match=r"s\.mha: expected lines of a MetaImage header, 'name = value', found no text$"):
+        sequences.read_sequence(tmp_path / "s.mha")
+
+
 def test_negative_levels_are_no_image(tmp_path):
     path = plus_file(tmp_path, PLUS_2D.replace("MET_UCHAR", "MET_SHORT"), np.full(12, -5, "<i2").tobytes())
     with pytest.raises(InputError, match=r"pixels: expected grey levels from 0 on, found -5: radio-frequency data\?"):
@@ -324,7 +348,7 @@ def test_pixels_in_a_file_of_their_own(tmp_path):
         ("DimSize", "Dimsize", "DimSize: expected a value, found none"),
         ("{orientation}", "AMF", "UltrasoundImageOrientation: expected one of MF, UF, MN, UN, FM, FU, NM, NU, found AMF"),
         ("ObjectType", "UltrasoundImageType = RF_REAL\nObjectType", "UltrasoundImageType: expected BRIGHTNESS or RGB_COLOR, f"),
-        ("MET_UCHAR", "MET_OTHER", "ElementType: expected grey levels of 8 or 16 bits, found MET_OTHER"),
+        ("MET_UCHAR", "MET_OTHER", "ElementType: expected grey levels of 8 or 16 bits, or floating-point ones, found"),
         ("MET_UCHAR", "MET_LONG", "ElementType: expected one of MET_UCHAR, MET_CHAR, MET_USHORT"),
         ("CompressedData = False", "CompressedData = True", "pixels: expected packed data, found damaged ones"),
         ("ElementDataFile = LOCAL", "ElementDataFile = .", "data file: expected LOCAL or the name of a file that is there"),
