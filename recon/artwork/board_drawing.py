@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 
 from recon.artwork.paper_sheet import CAPTION_MM, Array, Card, Ink, Size
-from recon.board_detection.checkerboard import charuco_of
-from recon.model.boards import Board, Charuco, Chessboard
+from recon.board_detection.checkerboard import TAG_FAMILY, charuco_of
+from recon.model.boards import AprilGrid, Board, Charuco, Chessboard, Squares
 
 QUIET = 0.4  # of a step of the pattern, clear around it
 LEAST_QUIET_MM = 6.0
@@ -25,9 +25,13 @@ def card_of(board: Board) -> Card:
 def in_words(board: Board) -> str:
     """A board's design on one line, such as `asymmetric_circles, 4 x 11, spacing 15 mm, diameter 9 mm`."""
     fields = board.model_dump(exclude={"kind", "columns", "rows"}, exclude_defaults=True)
-    others = [name if value is True else str(value) for name, value in fields.items() if not name.endswith("_mm")]
+    others = [_other(name, value) for name, value in fields.items() if not name.endswith("_mm")]
     dictionary = [board.dictionary] if isinstance(board, Charuco) and board.dictionary not in others else []
     return ", ".join([board.kind, f"{board.columns} x {board.rows}", lengths_in_words(board), *dictionary, *others])
+
+
+def _other(name: str, value: object) -> str:
+    return name if value is True else value if isinstance(value, str) else f"{name} {_plain(value)}"
 
 
 def lengths_in_words(board: Board) -> str:
@@ -53,20 +57,24 @@ def _plain(value: object) -> str:
 
 
 def _step(board: Board) -> float:
+    if isinstance(board, AprilGrid):
+        return board.rim_mm
     return board.square_mm if isinstance(board, Chessboard | Charuco) else board.spacing_mm
 
 
 def _extent(board: Board) -> tuple[Array, Array]:
     """Corners of what is drawn in the board's frame, smallest and largest : (2,), (2,) mm."""
     points = board.points()[:, :2]
-    beyond = board.square_mm if isinstance(board, Chessboard | Charuco) else board.diameter_mm / 2
-    return points.min(axis=0) - beyond, points.max(axis=0) + beyond
+    return points.min(axis=0) - board.rim_mm, points.max(axis=0) + board.rim_mm
 
 
 def _inks(board: Board, origin: Array, size: Size) -> tuple[Ink, ...]:
     """The shapes on a card, of which the pattern with its border has a size."""
-    if isinstance(board, Chessboard | Charuco):
-        corners = _chessboard(board) if isinstance(board, Chessboard) else _charuco(board)
+    if isinstance(board, Squares):
+        if isinstance(board, AprilGrid):
+            corners = _aprilgrid(board)
+        else:
+            corners = _chessboard(board) if isinstance(board, Chessboard) else _charuco(board)
         x, y, width, height = corners.T
         return (Ink(False, boxes=np.column_stack([origin[0] + x, origin[1] - y - height, width, height])),)
     centres = origin + board.points()[:, :2] * [1, -1]
@@ -97,3 +105,19 @@ def _charuco(board: Charuco) -> Array:
         image = cv2.aruco.generateImageMarker(dictionary, number, cells)
         boxes += [[left + x * side, top + y * side, side, side] for y, x in np.argwhere(image == 0)]
     return np.array(boxes) - [board.square_mm, board.square_mm, 0, 0]
+
+
+def _aprilgrid(board: AprilGrid) -> Array:
+    """Black cells of the tags, and the squares that stand corner to corner with them, as `_chessboard` has them."""
+    family, gap, cells = cv2.aruco.getPredefinedDictionary(TAG_FAMILY), board.rim_mm, 6 + 2 * board.border_cells
+    points, boxes, side = board.points()[:, :2], [], board.tag_mm / cells
+    for number, corners in enumerate(board.corners_of_tags()):
+        left, top = points[corners[0]]
+        image = cv2.aruco.generateImageMarker(family, number, cells, borderBits=board.border_cells)[
+            ::-1, ::-1
+        ]  # see `find_aprilgrid`
+        boxes += [[left + x * side, top + y * side, side, side] for y, x in np.argwhere(image == 0)]
+    ends = [np.unique(points[:, axis]) for axis in range(2)]
+    x, y = ([line[0] - gap, *line[1::2]] for line in ends)  # where gaps begin
+    boxes += [[left, top, gap, gap] for left in x for top in y]
+    return np.array(boxes)

@@ -1,13 +1,14 @@
-"""Chessboards and ChArUco boards in images."""
+"""Chessboards, ChArUco boards and AprilGrids in images."""
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from recon.board_detection.corners import Corners, refine_corners
-from recon.board_detection.findings import BoardNotFound, Detection, first_faults, refuse_bad, spread
+from recon.board_detection.findings import MIRRORED, BoardNotFound, Detection, first_faults, refuse_bad, spread
 from recon.errors import InputError
-from recon.model.boards import Charuco, Chessboard
+from recon.model.boards import AprilGrid, Charuco, Chessboard
 
 Array = NDArray[np.float64]
 
@@ -25,6 +26,10 @@ LEAST_MARKERS = 4  # that a mirrored image must show before it is called so
 LEAST_SPREAD = 0.5  # of a square: smaller singular value of corners that tell a homography, whichever one is left out
 ASTRAY = 0.25  # of a square, RMS of markers about where the board has them
 ALTERNATING = 0.3  # of the usual step from one square to the next: least one of a whole board
+
+TAG_FAMILY = cv2.aruco.DICT_APRILTAG_36h11
+RATIOS, WRONG_RATIO = (0.02, 1.0), 0.02  # of gaps to tags, and what isn't an error of corners
+SHRUNK = (1, 3, 5)  # px: breadths of what is taken off dark areas, so that tags don't hang together by their corners
 
 _CHESSBOARD = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY  # OpenCV 5 misses clean boards with CALIB_CB_NORMALIZE_IMAGE
 
@@ -50,7 +55,7 @@ def find_charuco(image: Array, board: Charuco, full: float) -> Detection:
     design = charuco_of(board)
     markers, numbers = _markers(grey, design)
     if len(numbers) < LEAST_MARKERS and len(_markers(np.ascontiguousarray(grey[:, ::-1]), design)[1]) >= LEAST_MARKERS:
-        raise BoardNotFound("image is mirrored")
+        raise BoardNotFound(MIRRORED)
     if not len(numbers):
         raise BoardNotFound(f"found no markers of {board.dictionary}")
     _check_markers(markers, numbers, design, board)
@@ -72,6 +77,85 @@ def find_charuco(image: Array, board: Charuco, full: float) -> Detection:
     return Detection(
         spread(measured.pixels[good], at[good], len(points)), spread(measured.covariance[good], at[good], len(points)), None
     )
+
+
+def find_aprilgrid(image: Array, board: AprilGrid, full: float) -> Detection:
+    """Find those corners of an AprilGrid that are in view; see `recon.board_detection.detect.detect`.
+
+    OpenCV has each tag turned by half against AprilTag's own drawing and Kalibr's: its first corner is the lower right one.
+    """
+    grey = _eight_bits(image, full)
+    tags, numbers = _tags(grey, board.border_cells)
+    if len(numbers) < min(LEAST_MARKERS, board.columns * board.rows):
+        others = {
+            MIRRORED: (np.ascontiguousarray(grey[:, ::-1]), board.border_cells),
+            f"tags have a border of {3 - board.border_cells} cells: give the board border_cells: {3 - board.border_cells}": (
+                grey,
+                3 - board.border_cells,
+            ),
+        }
+        for reason, (other, border) in others.items():
+            if len(_tags(other, border)[1]) > 2 * len(numbers):
+                raise BoardNotFound(reason)
+    if not len(numbers):
+        raise BoardNotFound("found no tags of 36h11")
+    places = board.corners_of_tags()
+    known, several = numbers < len(places), f"{board.columns} x {board.rows}"
+    if known.sum() <= len(known) / 2:
+        raise BoardNotFound(f"tag {numbers[~known][0]} isn't on a grid of {several} tags: wrong board size")
+    at, rough, points = places[numbers[known]].ravel(), tags[known].reshape(-1, 2), board.points()
+    if not _astray(points[at], rough, board.tag_mm) < ASTRAY:
+        turned = board.columns != board.rows and _fits_exchanged(tags[known], numbers[known], board)
+        cause = "rows and columns exchanged?" if turned else "wrong columns, rows or spacing_ratio?"
+        raise BoardNotFound(f"tags lie otherwise than on a grid of {several} tags: {cause}")
+    cell = board.tag_mm / (6 + 2 * board.border_cells)
+    clear = (
+        MARGIN * min(np.sqrt(2) * board.border_cells * cell, board.rim_mm) / board.tag_mm
+    )  # of a tag, to what isn't the corner's
+    window = min(min(WINDOW[0], clear) * _shortest_side(rough, points[at], board.tag_mm), WINDOW[1])
+    if window < LEAST_WINDOW:
+        raise BoardNotFound(f"too small: {window:.1f} px between a corner and the cells of its tag")
+    measured = _refine(image, rough, points[at], window, full)
+    good = refuse_bad(_faults(measured, window, full), len(at), "corners")
+    if good.sum() < LEAST_CORNERS:
+        raise BoardNotFound(f"found {good.sum()} corners, fewer than {LEAST_CORNERS}")
+    _check_gaps(measured.pixels[good], at[good], board)
+    return Detection(
+        spread(measured.pixels[good], at[good], len(points)), spread(measured.covariance[good], at[good], len(points)), None
+    )
+
+
+def _check_gaps(pixels: Array, at: NDArray[np.intp], board: AprilGrid) -> None:
+    """Refuse a grid whose tags stand at other distances : pixels (n, 2) of the corners `at` (n,)."""
+
+    def misfit(ratio: float) -> float:
+        return _astray(board.model_copy(update={"spacing_ratio": ratio}).points()[at], pixels, board.tag_mm)
+
+    found = float(minimize_scalar(misfit, bounds=RATIOS, method="bounded").x)
+    if abs(found - board.spacing_ratio) > WRONG_RATIO and misfit(found) < misfit(board.spacing_ratio) / 2:
+        raise BoardNotFound(
+            f"tags stand as with spacing_ratio {found:.2f}, not {board.spacing_ratio:g}: is that gap over tag_mm?"
+        )
+
+
+def _tags(grey: NDArray[np.uint8], border: int) -> tuple[Array, NDArray[np.int64]]:
+    """Corners : (k, 4, 2) px, from the upper left one clockwise, and numbers : (k,) of AprilTags, each of them once."""
+    settings = cv2.aruco.DetectorParameters()
+    settings.markerBorderBits = border
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(TAG_FAMILY), settings)
+    found: dict[int, Array] = {}
+    for breadth in SHRUNK:
+        apart = grey if breadth == 1 else cv2.dilate(grey, np.ones((breadth, breadth), np.uint8))
+        for number, corners in zip(*reversed(_detected(detector, apart)), strict=True):
+            found.setdefault(int(number), corners[[2, 3, 0, 1]])
+    return np.array(list(found.values())).reshape(-1, 4, 2), np.array(list(found), np.int64)
+
+
+def _fits_exchanged(tags: Array, numbers: NDArray[np.int64], board: AprilGrid) -> bool:
+    """Whether tags : (k, 4, 2) px lie as on a grid that has as many columns as this one has rows."""
+    other = board.model_copy(update={"columns": board.rows, "rows": board.columns})
+    at = other.corners_of_tags()[numbers].ravel()
+    return _astray(other.points()[at], tags.reshape(-1, 2), board.tag_mm) < ASTRAY
 
 
 def _eight_bits(image: Array, full: float) -> NDArray[np.uint8]:
@@ -201,7 +285,12 @@ def charuco_of(board: Charuco) -> cv2.aruco.CharucoBoard:
 
 def _markers(grey: NDArray[np.uint8], design: cv2.aruco.CharucoBoard) -> tuple[Array, NDArray[np.int64]]:
     """Corners : (k, 4, 2) px and numbers : (k,) of the markers in view."""
-    corners, numbers, _ = cv2.aruco.ArucoDetector(design.getDictionary()).detectMarkers(grey)
+    return _detected(cv2.aruco.ArucoDetector(design.getDictionary()), grey)
+
+
+def _detected(detector: cv2.aruco.ArucoDetector, grey: NDArray[np.uint8]) -> tuple[Array, NDArray[np.int64]]:
+    """Corners : (k, 4, 2) px and numbers : (k,)."""
+    corners, numbers, _ = detector.detectMarkers(grey)
     if numbers is None or not len(numbers):
         return np.empty((0, 4, 2)), np.empty(0, np.int64)
     return np.asarray(corners, float).reshape(-1, 4, 2), np.asarray(numbers, np.int64).ravel()
@@ -218,7 +307,27 @@ def _check_markers(markers: Array, numbers: NDArray[np.int64], design: cv2.aruco
         )
     points = np.concatenate([places[int(number)] for number in numbers[known]])
     pixels = markers[known].reshape(-1, 2)
+    if not _astray(points, pixels, board.square_mm) < ASTRAY:
+        raise BoardNotFound(f"markers lie otherwise than on the board: {_likely_charuco(markers[known], numbers[known], board)}")
+
+
+def _astray(points: Array, pixels: Array, side: float) -> float:
+    """RMS distance of pixels : (n, 2) from where the best map has the board's points : (n, 3), in sides on the board."""
     back = _moved(np.linalg.inv(_board_to_image(points, pixels)), pixels)
-    astray = np.sqrt(np.mean(np.sum((back - points[:, :2]) ** 2, axis=1))) / board.square_mm
-    if not astray < ASTRAY:
-        raise BoardNotFound("markers lie otherwise than on the board: wrong board size, or its pattern is OpenCV's other one")
+    return float(np.sqrt(np.mean(np.sum((back - points[:, :2]) ** 2, axis=1))) / side)
+
+
+def _likely_charuco(markers: Array, numbers: NDArray[np.int64], board: Charuco) -> str:
+    """The fields of a board on which markers : (k, 4, 2) px lie as they do here, in words."""
+    exchanged, other = {"columns": board.rows, "rows": board.columns}, not board.legacy
+    which, field = "older" if other else "newer", f"legacy: {str(other).lower()}"
+    for update, words in (
+        ({"legacy": other}, f"its pattern is OpenCV's {which} one: give the board {field}"),
+        (exchanged, "rows and columns exchanged?"),
+        (exchanged | {"legacy": other}, f"rows and columns exchanged, and {field}?"),
+    ):
+        places = charuco_of(board.model_copy(update=update)).getObjPoints()
+        points = np.concatenate([np.asarray(places[int(number)], float) for number in numbers])
+        if _astray(points, markers.reshape(-1, 2), board.square_mm) < ASTRAY:
+            return words
+    return "wrong board size?"

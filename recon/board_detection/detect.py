@@ -8,17 +8,17 @@ same after a turn: a symmetric one, an asymmetric one with an even number of row
 odd or both even. The first point is then the one nearer to the image's upper left. Of other chessboards the square before the
 first corner is the dark one.
 
-That an image is mirrored is told of a ChArUco board, and of an asymmetric grid with an even number of rows. An odd number makes
-the grid its own mirror image, as symmetric grids and most chessboards are.
+That an image is mirrored is told of a ChArUco board, of an AprilGrid, and of an asymmetric grid with an even number of rows. An
+odd number makes the grid its own mirror image, as symmetric grids and most chessboards are.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.board_detection.checkerboard import find_charuco, find_chessboard
+from recon.board_detection.checkerboard import find_aprilgrid, find_charuco, find_chessboard
 from recon.board_detection.circle_grid import find_circles
 from recon.board_detection.findings import BoardNotFound, Detection
-from recon.model.boards import Board, Charuco, Chessboard
+from recon.model.boards import AprilGrid, Board, Charuco, Chessboard
 
 __all__ = ["BoardNotFound", "Detection", "detect"]
 
@@ -39,12 +39,14 @@ def detect(image: NDArray, board: Board, *, full: float = 255) -> Detection:
     ------
     BoardNotFound
         With the reason: points that are missing, a mirrored image, another board, too little contrast, blur, glare. Up to a
-        quarter of the points may be unusable, as by glare on their rims; they become NaN. Of a ChArUco board six corners are
-        enough.
+        quarter of the points may be unusable, as by glare on their rims; they become NaN. Of a ChArUco board, and of an
+        AprilGrid, six corners are enough.
     """
     image = np.asarray(image, np.float32)
     if isinstance(board, Chessboard):
         return find_chessboard(image, board, full)
     if isinstance(board, Charuco):
         return find_charuco(image, board, full)
+    if isinstance(board, AprilGrid):
+        return find_aprilgrid(image, board, full)
     return find_circles(image, board, full)

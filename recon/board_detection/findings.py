@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+MIRRORED = "image is mirrored: turn off the flip of the camera's driver, or flip the images"
 ENOUGH = 0.75  # of a board's points must be well measured
 
 

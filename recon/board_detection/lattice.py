@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from recon.board_detection.findings import ENOUGH, BoardNotFound
+from recon.board_detection.findings import ENOUGH, MIRRORED, BoardNotFound
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -58,7 +58,7 @@ def assign(points: Array, cells: Integers, steps: Integers) -> Integers:
             break
         most_mirrored = max(most_mirrored, max(map(_size, _placements(grown, cells, [t @ MIRROR for t in TURNS])), default=0))
     if most_mirrored > count and most_mirrored >= ENOUGH * len(cells):
-        raise BoardNotFound("image is mirrored")
+        raise BoardNotFound(MIRRORED)
     if count < ENOUGH * len(cells):
         raise BoardNotFound(f"found {count} of {len(cells)} circles")
     symmetries = _symmetries(cells)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry.camera import Camera
-from recon.model.boards import AsymmetricCircles, Board, Charuco, Chessboard, SymmetricCircles
+from recon.model.boards import AsymmetricCircles, Board, Chessboard, SymmetricCircles
 from recon.model.rig import Lens, NotNegative, Optics, Part, Positive, Rig
 
 Array = NDArray[np.float64]
@@ -98,9 +98,8 @@ def _sharp_depths(rig: Rig, blur_px: Mapping[str, float], field: str) -> tuple[f
 
 def outline(board: Board) -> Array:
     """The rectangle around all of a board's discs or squares : (4 STEPS, 3) mm in the board's frame, from its first corner on."""
-    beyond = board.square_mm if isinstance(board, Chessboard | Charuco) else board.diameter_mm / 2
     points = board.points()[:, :2]
-    low, high = points.min(axis=0) - beyond, points.max(axis=0) + beyond
+    low, high = points.min(axis=0) - board.rim_mm, points.max(axis=0) + board.rim_mm
     corners = np.array([low, (high[0], low[1]), high, (low[0], high[1]), low])
     along = np.arange(STEPS)[:, None] / STEPS
     sides = [start + along * (end - start) for start, end in pairwise(corners)]

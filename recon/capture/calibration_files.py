@@ -6,6 +6,8 @@
 - two cameras of SLMaster and OpenCV's stereo_calib: FileStorage with M1, D1, M2, D2, and Rlr, Tlr or R, T (camera 2 from 1).
 - stereo pair of the rig's authors: npz, MATLAB file, or FileStorage XML, with K1, dist1, K2, dist2, R, t. Device 1 is camera 1;
   which device 2 is, the content doesn't say: the projector if the file's name has `proj` in it, else camera 2.
+- camera and projector of SLStudio: FileStorage XML with Kc, kc, Kp, kp, Rp, Tp (projector from camera).
+- Kalibr's camchain YAML, ROS's camera_info YAML and mrcal's cameramodel: see `recon.capture.camera_dialects`.
 """
 
 from collections.abc import Mapping
@@ -15,6 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.capture import camera_dialects
+from recon.capture.camera_dialects import Stored
 from recon.capture.manifest import SCANNER, read_manifest
 from recon.errors import InputError, short
 from recon.files import matlab, npz, opencv_storage
@@ -32,6 +36,7 @@ STEREO_KEYS = ("K1", "dist1", "K2", "dist2", "R", "t")
 OLD_KEYS = {"distCoeffs1": "dist1", "distCoeffs2": "dist2"}  # of the authors' first files
 FEW_DIGITS = 1.1e-5  # of a rotation's products, in any of the files: five decimals mostly pass
 LARGEST = 1e8  # px, of a focal length; and of any coefficient
+DIALECTS = "schema, or M1 and M4, or M1 and M2, or K1 and K2, or Kc and Kp, or a file of Kalibr, ROS or mrcal"
 OWN_KEYS = ("schema", "parameters", "covariance")  # any other is a device
 
 
@@ -52,6 +57,8 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
     forms = dict.fromkeys(STEREO_KEYS, npz.Form("fiu"))
     if path.is_file() and matlab.is_matlab(path):
         return _stereo_pair(path, _decimal(matlab.read(path, forms, OLD_KEYS)), sizes or {})
+    if (stored := camera_dialects.read(path)) is not None:
+        return _of_stored(path, stored)
     values = opencv_storage.read(path, "a calibration file")
     if values is None:
         return _stereo_pair(path, _decimal(npz.read(path, forms)), sizes or {})
@@ -59,12 +66,14 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
         return _own(path, values)
     if "K1" in values or "K2" in values:
         return _stereo_pair(path, _matrices(path, values, STEREO_KEYS), sizes or {})
+    if "Kc" in values or "Kp" in values:
+        return _of_stored(path, camera_dialects.slstudio(path, values, sizes or {}))
     if "M2" in values and "M4" not in values:
         return _two_cameras(path, values, sizes or {})
     if "M1" in values or "M4" in values:
         return _slmaster(path, _matrices(path, values, SLMASTER_KEYS), sizes or {})
     found = short(", ".join(values)) or "no keys"
-    raise InputError(f"{path}: expected schema, or M1 and M4, or M1 and M2, or K1 and K2, found {found}")
+    raise InputError(f"{path}: expected {DIALECTS}, found {found}")
 
 
 def of_capture(folder: Path, given: Path | None = None) -> Calibration | None:
@@ -131,6 +140,10 @@ def complete(path: Path, calibration: Calibration) -> None:
     if missing:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path, Calibration({**before.cameras, **missing}, before.uncertainty))
+
+
+def _of_stored(path: Path, stored: Mapping[str, Stored]) -> Calibration:
+    return Calibration({name: _camera(path, name, *one) for name, one in stored.items()})
 
 
 def _own(path: Path, values: Values) -> Calibration:

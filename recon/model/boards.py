@@ -13,6 +13,7 @@ from recon.model.rig import Part, Positive
 
 Array = NDArray[np.float64]
 Few = Annotated[int, Field(ge=2, le=100)]
+TAGS = 587  # of AprilTag's family 36h11
 
 
 class AsymmetricCircles(Part):
@@ -30,6 +31,11 @@ class AsymmetricCircles(Part):
         row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
         return np.column_stack([2 * column + row % 2, row, np.zeros(row.size)]) * self.spacing_mm
 
+    @property
+    def rim_mm(self) -> float:
+        """Breadth of what is printed beyond the outermost points."""
+        return self.diameter_mm / 2
+
 
 class SymmetricCircles(Part):
     """Discs in a square grid. Half a turn maps it onto itself, so poses must keep to one half."""
@@ -45,6 +51,11 @@ class SymmetricCircles(Part):
         """Centres of the discs : (columns * rows, 3) mm."""
         return _grid(self.columns, self.rows, self.spacing_mm)
 
+    @property
+    def rim_mm(self) -> float:
+        """Breadth of what is printed beyond the outermost points."""
+        return self.diameter_mm / 2
+
 
 class Chessboard(Part):
     """Black and white squares."""
@@ -57,6 +68,11 @@ class Chessboard(Part):
     def points(self) -> Array:
         """Inner corners : (columns * rows, 3) mm."""
         return _grid(self.columns, self.rows, self.square_mm)
+
+    @property
+    def rim_mm(self) -> float:
+        """Breadth of what is printed beyond the outermost points."""
+        return self.square_mm
 
 
 class Charuco(Part):
@@ -80,11 +96,60 @@ class Charuco(Part):
         """Inner corners : ((columns - 1) * (rows - 1), 3) mm, relative to the first."""
         return _grid(self.columns - 1, self.rows - 1, self.square_mm)
 
+    @property
+    def rim_mm(self) -> float:
+        """Breadth of what is printed beyond the outermost points."""
+        return self.square_mm
+
+
+class AprilGrid(Part):
+    """Kalibr's grid of AprilTags 36h11, black squares between their corners: each corner is known by itself, as of `Charuco`.
+
+    Tags are numbered row by row from the lower left one, 0, as Kalibr prints them.
+    """
+
+    kind: Literal["aprilgrid"] = "aprilgrid"
+    columns: Annotated[int, Field(ge=1, le=100)]  # tags a row: Kalibr's tagCols
+    rows: Annotated[int, Field(ge=1, le=100)]  # tagRows
+    tag_mm: Positive  # side of a tag, its black border included: tagSize
+    spacing_ratio: Annotated[float, Field(gt=0, le=1)] = 0.3  # gap between two tags over tag_mm: tagSpacing
+    border_cells: Annotated[int, Field(ge=1, le=2)] = 2  # breadth of a tag's black border; Kalibr's is 2, AprilTag's own 1
+
+    @model_validator(mode="after")
+    def _few_enough(self) -> "AprilGrid":
+        if self.columns * self.rows > TAGS:
+            raise ValueError(f"rows: expected {TAGS} tags in all at most, as 36h11 has, found {self.columns} x {self.rows}")
+        return self
+
+    @property
+    def rim_mm(self) -> float:
+        """Breadth of what is printed beyond the outermost points: a gap, with its black squares."""
+        return self.spacing_ratio * self.tag_mm
+
+    def points(self) -> Array:
+        """Corners of the tags : (4 * columns * rows, 3) mm, row by row, two of each tag in a row."""
+        along, down = (_ends(count, self.tag_mm, self.spacing_ratio) for count in (self.columns, self.rows))
+        y, x = np.meshgrid(down, along, indexing="ij")
+        return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+
+    def corners_of_tags(self) -> NDArray[np.intp]:
+        """Which points are each tag's corners : (columns * rows, 4), from its upper left one clockwise, by the tags' numbers."""
+        tag = np.arange(self.columns * self.rows)
+        row, column = self.rows - 1 - tag // self.columns, tag % self.columns
+        first = 4 * row * self.columns + 2 * column
+        return first[:, None] + np.array([0, 1, 2 * self.columns + 1, 2 * self.columns])
+
 
 Circles = AsymmetricCircles | SymmetricCircles
-Board = Annotated[AsymmetricCircles | SymmetricCircles | Chessboard | Charuco, Field(discriminator="kind")]
+Squares = Chessboard | Charuco | AprilGrid
+Board = Annotated[AsymmetricCircles | SymmetricCircles | Chessboard | Charuco | AprilGrid, Field(discriminator="kind")]
 
 
 def _grid(columns: int, rows: int, step: float) -> Array:
     row, column = np.divmod(np.arange(rows * columns), columns)
     return np.column_stack([column, row, np.zeros(row.size)]) * step
+
+
+def _ends(count: int, side: float, ratio: float) -> Array:
+    """Both ends of sides in a row with gaps between them : (2 * count,)."""
+    return (np.arange(count)[:, None] * side * (1 + ratio) + np.array([0, side])).ravel()

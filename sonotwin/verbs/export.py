@@ -1,5 +1,7 @@
 """Write a capture in another group's layout, for their programs.
 
+`layout=kalibr`, `ros`, `mrcal` and `slstudio` are for the calibration of cameras and projector alone, of a capture or as a file:
+Kalibr's camchain.yaml, ROS's camera_info and mrcal's cameramodel with a file a device, SLStudio's calibration.xml.
 `layout=meza2021` is that of the rig's authors: SLdata/images and mask.png, USdata/L, R, US and USmasks with target_pose.npy, and
 the files of all calibrations, US_params.npz for a chosen speed of sound. Reads a capture folder, of a sweep with poses, as
 `sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs for what a capture doesn't hold. B-scans without
@@ -7,6 +9,7 @@ a pose are left out. Writes into the folder `out`; an earlier export there is re
 seconds.
 
     sonotwin export capture=session/capture out=dataset
+    sonotwin export layout=kalibr calibration=optics.yaml out=for_kalibr
     sonotwin export capture=result/poses/scan probe=result/probe/probe.yaml lag_s=0.05 tissue_m_s=1450 out=dataset
     sonotwin export capture=result/poses/scan surface=result/surface masses=result/masses/scan lag_s=0.05 out=dataset
 """
@@ -22,6 +25,7 @@ from rich.console import Console
 
 from recon.capture import (
     calibration_files,
+    camera_exports,
     manifest,
     meza2021,
     meza2021_sweep,
@@ -49,8 +53,8 @@ from sonotwin.verbs.surface import POINTS
 class Config(Part):
     """Fields of `conf/export.yaml`."""
 
-    layout: Literal["meza2021"] = "meza2021"
-    capture: Path
+    layout: Literal["meza2021", "kalibr", "ros", "mrcal", "slstudio"] = "meza2021"
+    capture: Path | None = None
     out: Path
     calibration: Path | None = None
     surface: Path | None = None
@@ -59,6 +63,13 @@ class Config(Part):
     lag_s: LagSeconds = 0.0
     tissue_m_s: Speed | None = None
     masses: Path | None = None
+
+    @property
+    def source(self) -> Path:
+        """The capture; InputError if none is given."""
+        if self.capture is None:
+            raise InputError("export: capture: needs a value; give capture=...")
+        return self.capture
 
 
 def run(config: Config) -> None:
@@ -70,10 +81,13 @@ def run(config: Config) -> None:
         If the capture is incomplete or damaged, has nothing for the layout, or `out` can't be written to.
     """
     console = Console(soft_wrap=True, highlight=False)
-    given = (config.calibration, config.surface, config.probe, config.masses)
-    atomic.check_folder(config.out, "export", inputs=[config.capture, *(path for path in given if path is not None)])
-    held = manifest.read_manifest(config.capture)
+    given = (config.capture, config.calibration, config.surface, config.probe, config.masses)
+    atomic.check_folder(config.out, "export", inputs=[path for path in given if path is not None])
     written = []
+    if config.layout != "meza2021":
+        export_cameras(config, console)
+        return
+    held = manifest.read_manifest(config.source)
     with console.status("writing"), meza2021.new_folder(config.out) as folder:
         if held.surface is not None and "cam1" in held.surface.images:
             written += [write_surface(folder, config)]
@@ -83,15 +97,39 @@ def run(config: Config) -> None:
             written += write_sweep(folder, config, held)
         written += write_optics(folder, config)
         if not written:
-            raise InputError(f"{config.capture / MANIFEST}: expected a surface of cam1, a sweep or a calibration, found none")
+            raise InputError(f"{config.source / MANIFEST}: expected a surface of cam1, a sweep or a calibration, found none")
     for line in written:
         console.print(line, markup=False)
     console.print(f"wrote       {config.out}", markup=False)
 
 
+def export_cameras(config: Config, console: Console) -> None:
+    """Write a calibration of cameras for another program.
+
+    Raises
+    ------
+    InputError
+        If there is none, or one that the layout can't say.
+    """
+    if config.capture is not None:
+        optics = calibration_files.of_capture(config.capture, config.calibration)
+    else:
+        optics = None if config.calibration is None else calibration_files.read(config.calibration)
+    if optics is None:
+        raise InputError(f"export: calibration: expected one of cameras for layout={config.layout}, found none")
+    with meza2021.new_folder(config.out, config.layout) as folder:
+        names = camera_exports.WRITERS[config.layout](folder, optics)
+    devices = camera_exports.taken(config.layout, optics)
+    console.print(f"optics      {', '.join(devices)}: {', '.join(names)}", markup=False)
+    lost = [name for name in optics.cameras if name not in devices] + ["the covariance"] * (optics.uncertainty is not None)
+    if lost:
+        console.print(f"left out    {', '.join(lost)}: the layout has no place for it", markup=False)
+    console.print(f"wrote       {config.out}", markup=False)
+
+
 def write_surface(folder: Path, config: Config) -> str:
     """Write the fringe images and the mask; returns a line about them."""
-    surface = surface_part.read_surface(config.capture, "cam1", config.calibration)
+    surface = surface_part.read_surface(config.source, "cam1", config.calibration)
     if not meza2021.is_theirs(surface):
         return "left out    surface: expected 8 bits, a centre line and 8 fringes of 12 px, whose shifts are numbered from one"
     mask = np.ones(surface.images.shape[1:], bool)
@@ -104,16 +142,16 @@ def write_surface(folder: Path, config: Config) -> str:
 
 def write_sweep(folder: Path, config: Config, held: Manifest) -> list[str]:
     """Write the B-scans with their poses, frames and masks, and the probe's file; returns lines about them."""
-    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
+    sweep = sweep_part.read_sweep(config.source, config.sweep, "volume")
     poses = sweep.poses(config.lag_s)
     placed = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
-    _, part = held.sweep_of(config.capture / MANIFEST, "a sweep", config.sweep, "volume")
+    _, part = held.sweep_of(config.source / MANIFEST, "a sweep", config.sweep, "volume")
     filmed = set(CAMERAS) <= part.images.keys()
-    film = stereo_frames.read_film(config.capture, config.calibration, config.sweep) if filmed else None
+    film = stereo_frames.read_film(config.source, config.calibration, config.sweep) if filmed else None
     masks: Iterator[NDArray[np.uint8]] = iter(())
     frames = ", with frames of both cameras" if film else ""
     lines = [f"sweep       {len(placed)} of {len(poses)} B-scans, those with a pose{frames}"]
-    probe = None if config.probe is None and sweep.probe is None else freehand_scans.probe_of(sweep, config.capture, config.probe)
+    probe = None if config.probe is None and sweep.probe is None else freehand_scans.probe_of(sweep, config.source, config.probe)
     if probe is not None:
         converted = sound_in_water.for_tissue(probe, config.tissue_m_s)
         probe_files.write_authors(folder / probe_files.AUTHORS, converted)
@@ -131,7 +169,7 @@ def write_sweep(folder: Path, config: Config, held: Manifest) -> list[str]:
 
 def write_optics(folder: Path, config: Config) -> list[str]:
     """Write the files of all pairs of cameras; returns a line about them."""
-    optics = calibration_files.of_capture(config.capture, config.calibration)
+    optics = calibration_files.of_capture(config.source, config.calibration)
     return [] if optics is None else [f"optics      {', '.join(meza2021.write_parameters(folder, optics))}"]
 
 

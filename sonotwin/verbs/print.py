@@ -9,6 +9,7 @@ target are described: docs/calibration.md says how.
 
     sonotwin print part=board out=board.pdf
     sonotwin print part=board board='{kind: charuco, columns: 8, rows: 11, square_mm: 20, marker_mm: 15}' paper=a4 out=charuco.pdf
+    sonotwin print part=board board='{kind: aprilgrid, columns: 6, rows: 6, tag_mm: 24}' paper=a4 out=aprilgrid.pdf
     sonotwin print part=target out=target.pdf
 """
 

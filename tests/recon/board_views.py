@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from recon.geometry import rigid
-from recon.model.boards import AsymmetricCircles, Charuco, SymmetricCircles
+from recon.model.boards import AprilGrid, AsymmetricCircles, Charuco, SymmetricCircles
 
 SUB = 4  # sub-pixels a pixel and axis
 
@@ -26,6 +26,8 @@ def shares(board, xy, footprint):
         return np.clip((_to_nearest(board, xy) - board.diameter_mm / 2) / footprint + 0.5, 0, 1)
     if isinstance(board, Charuco):
         return _of_charuco(board, xy)
+    if isinstance(board, AprilGrid):
+        return _of_aprilgrid(board, xy)
     squares = xy / board.square_mm
     line = np.rint(squares)
     signs = np.where(line % 2 == 0, 1, -1) * np.clip(2 * (squares - line) * board.square_mm / footprint, -1, 1)
@@ -36,12 +38,33 @@ def shares(board, xy, footprint):
 def _of_charuco(board, xy):
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     design = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_mm, board.marker_mm, dictionary)
+    design.setLegacyPattern(board.legacy)
     scale = 16  # px/mm
     picture = design.generateImage((int(board.columns * board.square_mm * scale), int(board.rows * board.square_mm * scale)))
     at = np.floor((xy + board.square_mm) * scale).astype(int)
     inside = ((at >= 0) & (at < picture.shape[::-1])).all(axis=-1)
     at = np.clip(at, 0, np.array(picture.shape[::-1]) - 1)
     return np.where(inside, picture[at[..., 1], at[..., 0]] / 255, 1.0)
+
+
+def _of_aprilgrid(board, xy):
+    """As Kalibr prints it: tag 0 at the lower left, tags turned by half against OpenCV's, black squares in the corners."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    cells = 6 + 2 * board.border_cells
+    tags = [
+        np.rot90(cv2.aruco.generateImageMarker(dictionary, number, cells, borderBits=board.border_cells), 2) / 255
+        for number in range(board.columns * board.rows)
+    ]
+    tags = np.array(tags).reshape(board.rows, board.columns, cells, cells)[::-1]
+    side, pitch = board.tag_mm, board.tag_mm * (1 + board.spacing_ratio)
+    at = np.floor(xy / pitch).astype(int)
+    within = xy - at * pitch  # of a tag and the gap after it
+    column, row = at[..., 0], at[..., 1]
+    there = (column >= 0) & (column < board.columns) & (row >= 0) & (row < board.rows) & (within < side).all(axis=-1)
+    cell = np.clip((within * cells / side).astype(int), 0, cells - 1)
+    white = tags[np.clip(row, 0, board.rows - 1), np.clip(column, 0, board.columns - 1), cell[..., 1], cell[..., 0]]
+    squares = (within >= side).all(axis=-1) & (at >= -1).all(axis=-1) & (column < board.columns) & (row < board.rows)
+    return np.where(there, white, np.where(squares, 0.0, 1.0))
 
 
 def _to_nearest(board, xy):

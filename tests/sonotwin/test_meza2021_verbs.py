@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from recon.capture import meza2021, stereo_frames, surface_part, sweep_part, sweep_tables
+from recon.capture import calibration_files, meza2021, stereo_frames, surface_part, sweep_part, sweep_tables
 from recon.capture.manifest import CAMERAS, SCANNER, Device, read_manifest
 from recon.capture.writer import new_capture
 from recon.geometry import rigid
@@ -194,3 +194,19 @@ def test_other_fringes_are_left_out_by_name(capture, tmp_path, capsys):
     assert main(["export", f"capture={capture}", f"lag_s={LAG_S}", f"out={tmp_path / 'theirs'}"]) == 0
     assert "left out    surface: expected 8 bits, a centre line and 8 fringes of 12 px" in capsys.readouterr().out
     assert not (tmp_path / "theirs" / "SLdata").exists()
+
+
+def test_a_calibration_goes_out_for_other_programs_and_comes_back(capture, tmp_path, capsys):
+    """From a capture or a file, beside one of the same kind alone; what has no place is said."""
+    out = tmp_path / "out"
+    assert main(["export", "layout=ros", f"capture={capture}", f"out={out}"]) == 0
+    assert "left out    projector: the layout has no place for it" in capsys.readouterr().out
+    assert sorted(path.name for path in out.iterdir()) == ["cam1.yaml", "cam2.yaml", "sonotwin-export.json"]
+    found = calibration_files.read(out).cameras
+    assert found["cam2"].camera_from_world == pytest.approx(optics().cameras["cam2"].camera_from_world)
+    assert main(["export", "layout=kalibr", f"calibration={out}", f"out={tmp_path / 'chain'}"]) == 0
+    assert list(calibration_files.read(tmp_path / "chain" / "camchain.yaml").cameras) == ["cam1", "cam2"]
+    assert main(["export", "layout=slstudio", f"calibration={out}", f"out={tmp_path / 'none'}"]) == 2
+    assert "layout: expected cam1 and projector for SLStudio, found cam1, cam2" in capsys.readouterr().err
+    assert main(["export", f"out={tmp_path / 'none'}"]) == 2 and not (tmp_path / "none").exists()
+    assert "export: capture: needs a value" in capsys.readouterr().err

@@ -6,7 +6,7 @@ import pytest
 
 from recon.artwork import board_drawing, paper_sheet
 from recon.board_detection.detect import detect
-from recon.model.boards import AsymmetricCircles, Charuco, Chessboard, SymmetricCircles
+from recon.model.boards import AprilGrid, AsymmetricCircles, Charuco, Chessboard, SymmetricCircles
 from tests.recon.artwork.rasters import raster, rigid_misfit
 
 A4 = paper_sheet.PAPERS["a4"]
@@ -18,6 +18,7 @@ BOARDS = {
     "chessboard": Chessboard(columns=8, rows=5, square_mm=20),
     "charuco": Charuco(columns=8, rows=11, square_mm=20, marker_mm=15),
     "charuco_legacy": Charuco(columns=7, rows=10, square_mm=20, marker_mm=14, dictionary="DICT_4X4_50", legacy=True),
+    "aprilgrid": AprilGrid(columns=4, rows=5, tag_mm=30),
 }
 
 

@@ -3,13 +3,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from recon.board_detection import checkerboard
 from recon.board_detection.detect import BoardNotFound, detect
 from recon.board_detection.lattice import assign
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_projection import centre_offsets
-from recon.model.boards import AsymmetricCircles, Charuco, Chessboard, SymmetricCircles
+from recon.model.boards import AprilGrid, AsymmetricCircles, Charuco, Chessboard, SymmetricCircles
 from tests.recon import board_views
 from tests.recon.board_views import pose, view
 
@@ -18,6 +19,7 @@ ASYMMETRIC = AsymmetricCircles(columns=4, rows=7, spacing_mm=15, diameter_mm=10)
 SYMMETRIC = SymmetricCircles(columns=5, rows=4, spacing_mm=22, diameter_mm=12)
 CHESSBOARD = Chessboard(columns=6, rows=5, square_mm=18)
 CHARUCO = Charuco(columns=5, rows=4, square_mm=26, marker_mm=18)
+APRILGRID = AprilGrid(columns=3, rows=2, tag_mm=28)
 TILTED = (0.35, -0.3)
 
 
@@ -46,7 +48,7 @@ def truth(board, at):
     return centres
 
 
-@pytest.mark.parametrize("board", [ASYMMETRIC, SYMMETRIC, CHESSBOARD, CHARUCO], ids=lambda b: b.kind)
+@pytest.mark.parametrize("board", [ASYMMETRIC, SYMMETRIC, CHESSBOARD, CHARUCO, APRILGRID], ids=lambda b: b.kind)
 def test_points_lie_where_they_should_as_well_as_predicted(board, clean, rng):
     image, at = clean(board)
     errors, z = [], []
@@ -94,10 +96,41 @@ def test_a_view_of_the_back_of_an_even_grid_is_mirrored(rng):
         assign(pixels, np.rint(board.points()[:, :2] / 15).astype(int), np.array([[1, 1], [-1, 1]]))
 
 
-def test_a_mirrored_charuco_board_is_named(clean, rng):
-    image = noisy(clean(CHARUCO)[0], rng)
-    with pytest.raises(BoardNotFound, match="mirrored"):
-        detect(np.ascontiguousarray(image[:, ::-1]), CHARUCO)
+@pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=lambda b: b.kind)
+def test_a_mirrored_board_of_markers_is_named(board, clean, rng):
+    image = noisy(clean(board)[0], rng)
+    with pytest.raises(BoardNotFound, match="image is mirrored: turn off the flip"):
+        detect(np.ascontiguousarray(image[:, ::-1]), board)
+
+
+@pytest.mark.parametrize(
+    ("board", "given", "hint"),
+    [
+        (CHARUCO, {"legacy": True}, "OpenCV's newer one: give the board legacy: false"),
+        (CHARUCO.model_copy(update={"legacy": True}), {"legacy": False}, "OpenCV's older one: give the board legacy: true"),
+        (CHARUCO, {"columns": 4, "rows": 5}, "rows and columns exchanged"),
+        (APRILGRID, {"columns": 2, "rows": 3}, "rows and columns exchanged"),
+        (APRILGRID, {"border_cells": 1}, "tags have a border of 2 cells: give the board border_cells: 2"),
+        (APRILGRID, {"spacing_ratio": 0.9}, "as with spacing_ratio 0.30, not 0.9"),
+        (APRILGRID, {"spacing_ratio": 0.25}, "as with spacing_ratio 0.30, not 0.25"),
+        (APRILGRID, {"columns": 2, "rows": 1}, "tag [2-5] isn't on a grid of 2 x 1 tags: wrong board size"),
+    ],
+)
+def test_another_layout_is_named_with_the_field_that_takes_it(board, given, hint, clean, rng):
+    image = noisy(clean(board)[0], rng)
+    with pytest.raises(BoardNotFound, match=hint):
+        detect(image, board.model_copy(update=given))
+
+
+def test_tags_lie_as_kalibr_prints_them():
+    """Tag 0 by AprilTag's code of 36 bits, row by row from the upper left, white where set; it stands at the lower left."""
+    white = np.array([int(bit) for bit in f"{0xD5D628584:036b}"], np.uint8).reshape(6, 6)
+    image = np.full((300, 300), 200, np.uint8)
+    image[50:250, 50:250] = 20 + 180 * np.kron(np.pad(white, 2), np.ones((20, 20), np.uint8))
+    corners, numbers = checkerboard._tags(image, border=2)
+    assert numbers.tolist() == [0]
+    np.testing.assert_allclose(corners[0], [[50, 50], [250, 50], [250, 250], [50, 250]], atol=2)
+    assert APRILGRID.points()[APRILGRID.corners_of_tags()[0, 0]] == pytest.approx([0, 28 * 1.3, 0])
 
 
 @pytest.mark.parametrize(

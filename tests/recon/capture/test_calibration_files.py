@@ -3,11 +3,12 @@
 import cv2
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from recon.capture import calibration_files, meza2021
+from recon.capture import calibration_files, camera_exports, meza2021
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
@@ -136,6 +137,149 @@ def test_any_calibration_comes_back(data, tmp_path_factory):
         assert found.cameras[name].size == camera.size
         for part in ("matrix", "distortion", "camera_from_world"):
             assert np.array_equal(getattr(found.cameras[name], part), getattr(camera, part))
+
+
+PLACES = {"kalibr": (4, 3), "ros": (8, 2), "mrcal": (12, 3), "slstudio": (5, 2)}  # coefficients and devices, at most
+
+
+@pytest.mark.parametrize("layout", PLACES)
+@settings(max_examples=10, deadline=None)
+@given(data=st.data())
+def test_any_calibration_comes_back_from_other_programs_files(layout, data, tmp_path_factory):
+    """As far as they have places: metres, chains and rectified pairs are ours again, whatever the devices' order and numbers."""
+    small, number = st.floats(-3, 3), st.floats(-900, 900)
+    most, several = PLACES[layout]
+    second = "projector" if layout == "slstudio" else data.draw(st.sampled_from(["cam2", "projector"]))
+    cameras = {}
+    for name in ["cam1", second, "projector"][: several if second == "cam2" else 2]:
+        focal = data.draw(st.tuples(*[st.floats(500, 5000)] * 2))
+        matrix = np.array([[focal[0], 0, data.draw(number)], [0, focal[1], data.draw(number)], [0, 0, 1]])
+        k = np.array(data.draw(st.lists(st.floats(-0.1, 0.1), max_size=most)))
+        k = np.pad(k, (0, next(count for count in (0, 4, 5, 8, 12) if count >= len(k)) - len(k)))
+        turn, shift = data.draw(st.tuples(small, small, small)), data.draw(st.tuples(st.floats(1, 900), number, number))
+        pose = np.eye(4) if name == "cam1" else rigid.from_rotation_vector(turn, shift)
+        if layout == "ros" and pose[2, 2] < 0.1:
+            pose[:3, :3] = np.eye(3)  # a pair that looks to opposite sides has no common image
+        cameras[name] = Camera(data.draw(st.tuples(*[st.integers(8, 9000)] * 2)), matrix, k, pose)
+    folder = tmp_path_factory.mktemp(layout)
+    names = camera_exports.WRITERS[layout](folder, Calibration(cameras))
+    found = calibration_files.read(folder / names[0] if len(names) == 1 else folder).cameras
+    assert list(found) == list(cameras)
+    for name, camera in cameras.items():
+        long = np.pad(found[name].distortion, (0, 14 - found[name].distortion.size))
+        assert found[name].size == camera.size and np.array_equal(found[name].matrix, camera.matrix)
+        assert np.array_equal(long, np.pad(camera.distortion, (0, 14 - camera.distortion.size)))
+        assert found[name].camera_from_world == pytest.approx(camera.camera_from_world, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("layout", "coefficients", "complaint"),
+    [
+        ("kalibr", 5, "cam1.distortion: expected k1 k2 p1 p2 alone, all that Kalibr's radtan has, found k3 = "),
+        ("ros", 12, "expected k1 k2 p1 p2 k3 k4 k5 k6 alone, .* found s1 = .*: calibrate-optics distortion=rational"),
+        ("mrcal", 14, "cam1.distortion: .* found tau_x = "),
+        ("slstudio", 8, "cam1.distortion: .* all that SLStudio has, found k4 = "),
+    ],
+)
+def test_what_a_layout_has_no_place_for_is_refused(layout, coefficients, complaint, tmp_path):
+    optics = Calibration({"cam1": device("cam1", 1, coefficients), "projector": device("projector", 3)})
+    with pytest.raises(InputError, match=complaint):
+        camera_exports.WRITERS[layout](tmp_path, optics)
+    skew = device("cam1", 1, 4)
+    skew.matrix[0, 1] = 0.5
+    if layout != "slstudio":
+        with pytest.raises(InputError, match=r"cam1.matrix: expected no skew, .* found 0.5"):
+            camera_exports.WRITERS[layout](tmp_path, Calibration({"cam1": skew, "projector": device("projector", 3, 4)}))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_rectified_pair_has_its_shift_along_x_and_one_focal_length(optics, tmp_path):
+    """As ROS has them: points of both, turned by R, differ by P[0, 3] over the focal length, in metres; so rows are alike."""
+    beside = rigid.from_rotation_vector([0.05, -0.2, 0.02], [-150, 20, 5])
+    second = device("cam2", 4)
+    few = Calibration({"cam1": device("cam1", 3), "cam2": Camera(second.size, second.matrix, second.distortion, beside)})
+    camera_exports.write_ros(tmp_path, few)
+    files = [yaml.safe_load((tmp_path / f"{name}.yaml").read_text()) for name in few.cameras]
+    projections = [np.reshape(file["projection_matrix"]["data"], (3, 4)) for file in files]
+    turns = [np.reshape(file["rectification_matrix"]["data"], (3, 3)) for file in files]
+    assert np.array_equal(projections[0][:, :3], projections[1][:, :3]) and not projections[0][:, 3].any()
+    assert projections[1][1:, 3] == pytest.approx([0, 0]) and projections[1][0, 3] < 0, "camera 2 stands to the right"
+    points = np.random.default_rng(5).normal([0, 0, 900], 60, (20, 3))
+    seen = []
+    for camera, turn, projection in zip(few.cameras.values(), turns, projections, strict=True):
+        local = rigid.apply(camera.camera_from_world, points) @ turn.T / 1000
+        seen.append((local @ projection[:, :3].T)[:, 1] / local[:, 2])
+    assert seen[0] == pytest.approx(seen[1])
+
+
+KALIBR = """
+cam0:
+  camera_model: pinhole
+  intrinsics: [461.6, 460.1, 362.6, 246.0]
+  distortion_model: radtan
+  distortion_coeffs: [-0.277, 0.067, 8.0e-04, 1e-05]
+  rostopic: /cam0/image_raw
+  resolution: [752, 480]
+cam1:
+  camera_model: pinhole
+  intrinsics: [458.6, 457.2, 367.2, 248.3]
+  distortion_model: none
+  distortion_coeffs: []
+  T_cn_cnm1: [[1.0, 0.0, 0.0, -0.11], [0.0, 1.0, 0.0, 0.0005], [0.0, 0.0, 1.0, -0.0002], [0.0, 0.0, 0.0, 1.0]]
+  rostopic: /cam1/image_raw
+  resolution: [752, 480]
+"""
+MRCAL = """# generated with a program, 'extrinsics': in vain
+{
+    'lensmodel':  'LENSMODEL_OPENCV4',
+
+    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....
+    'intrinsics': [ 1766.07, 1765.89, 1944.06, 1064.52, 2.1, -1.1, -9.3e-05, 0.0007,],
+    'valid_intrinsics_region': [ [ 0, 0 ], [ 10, 0 ], [ 10, 10 ], [ 0, 0 ] ],
+    'rt_cam_ref': [ 0.1, 0., 0, -.25, 0, 0,],
+    'imagersize': [ 3840, 2160,],
+    'optimization_inputs': b'P)h>@6aWAK2mk;8ApigX00;'
+}
+"""
+
+
+def test_files_as_kalibr_and_mrcal_write_them(tmp_path):
+    """Their first camera is camera 1, its frame the world; metres become mm."""
+    (tmp_path / "camchain.yaml").write_text(KALIBR)
+    found = calibration_files.read(tmp_path / "camchain.yaml").cameras
+    assert found["cam2"].camera_from_world[:3, 3] == pytest.approx([-110, 0.5, -0.2]) and found["cam1"].distortion[3] == 1e-5
+    folder = tmp_path / "models"
+    folder.mkdir()
+    (folder / "camera-0.cameramodel").write_text(MRCAL)
+    (folder / "camera-1.cameramodel").write_text(MRCAL.replace("0.1, 0., 0, -.25", "0.1, 0., 0, -.5"))
+    both = calibration_files.read(folder).cameras
+    assert list(both) == ["cam1", "cam2"] and both["cam1"].size == (3840, 2160)
+    assert np.array_equal(both["cam1"].camera_from_world, np.eye(4))
+    assert both["cam2"].camera_from_world == pytest.approx(rigid.transform(np.eye(3), [-250, 0, 0]))
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new", "complaint"),
+    [
+        (KALIBR, "distortion_model: radtan", "distortion_model: equidistant", "cam0: .*none, found .*'equidistant'"),
+        (KALIBR, "-0.11]", "-110.0]", r"T_cn_cnm1: expected a shift of up to 20 m, found 110: is it in mm\?"),
+        (KALIBR, "[752, 480]", "[752]", r"cam0.resolution: expected 2 numbers, found \[752\]"),
+        (KALIBR, "461.6, ", "", "cam0.intrinsics: expected 4 numbers"),
+        (KALIBR, "T_cn_cnm1", "T_cam_imu", "cam1.T_cn_cnm1: expected 4 rows of 4 numbers, found None"),
+        (KALIBR, "[1.0, 0.0, 0.0, -0.11]", "[0.9, 0.0, 0.0, -0.11]", "cam2.camera_from_world: expected a rigid transform"),
+        (MRCAL, "OPENCV4", "SPLINED_STEREOGRAPHIC_order=3", "lensmodel: expected one of .*mrcal-convert-lensmodel"),
+        (MRCAL, "2.1, -1.1,", "2.1,", "intrinsics: expected 8 numbers"),
+        (MRCAL, "-.25", "-250.0", "extrinsics: expected a shift of up to 20 m, found 250"),
+        (MRCAL, "'imagersize'", "'imagesize'", "imagersize: expected a list of numbers once, found none"),
+        (MRCAL, "-.25", "__import__('os')", "extrinsics: expected a list of numbers once, found something else"),
+    ],
+)  # fmt: skip
+def test_other_programs_files_are_refused_by_field(text, old, new, complaint, tmp_path):
+    path = tmp_path / "theirs.txt"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=complaint) as refusal:
+        calibration_files.read(path)
+    assert str(refusal.value).startswith(f"{path}: ") and "\n" not in str(refusal.value)
 
 
 def test_a_standard_deviation_is_asked_for_by_name():
@@ -272,7 +416,10 @@ def without(values, key):
         (lambda v: v | {"Rlp": np.eye(2)}, "Rlp, Tlp: expected a 3x3 rotation"),
         (lambda v: v | {"S": np.array([[0.0], [10.0]])}, "S: expected the camera's width and height"),
         (lambda v: v | {"M4": "text"}, "M4: expected a matrix, found something else"),
-        (lambda v: {"A": np.eye(3)}, "expected schema, or M1 and M4, or M1 and M2, or K1 and K2, found A"),
+        (
+            lambda v: {"A": np.eye(3)},
+            f"expected {calibration_files.DIALECTS}, found A",
+        ),
     ],
 )
 def test_wrong_values_are_refused_in_one_line(optics, tmp_path, fault, complaint):
