@@ -81,6 +81,7 @@ class Charuco(Part):
         return _grid(self.columns - 1, self.rows - 1, self.square_mm)
 
 
+BOARDS = (AsymmetricCircles, SymmetricCircles, Chessboard, Charuco)
 Circles = AsymmetricCircles | SymmetricCircles
 Board = Annotated[AsymmetricCircles | SymmetricCircles | Chessboard | Charuco, Field(discriminator="kind")]
 
