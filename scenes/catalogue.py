@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 import scenes.kinds
+from recon import arguments
 from recon.errors import InputError, one_line
 from scenes.scene_types import Scene
 
@@ -37,6 +38,7 @@ def build_scene(config: Mapping[str, Any]) -> Scene:
 
 def parse_scene(config: Mapping[str, Any]) -> tuple[ModuleType, Any]:
     """The module of a scene's kind, and its checked `Config`; raises InputError as `build_scene` does."""
+    arguments.of_kind("scene", config, Mapping, way="such as {'kind': 'sphere', 'radius_mm': 19.8}")
     if "kind" not in config:
         raise InputError(f"scene: kind: expected one of {', '.join(kinds())}, found none")
     kind = config["kind"]

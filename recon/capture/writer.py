@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import arguments
 from recon.capture import calibration_files, manifest, probe_files, sweep_tables
 from recon.capture.images import Images, write_images
 from recon.capture.manifest import (
@@ -241,6 +242,16 @@ def write_surface(
     ValueError
         If images, patterns and devices don't fit together.
     """
+    for field, value in (("images", images), ("devices", devices)):
+        arguments.of_kind(f"write_surface: {field}", value, Mapping, way="one entry a device: {'cam1': ...}")
+    arguments.of_kind("write_surface: patterns", patterns, Patterns, way="sonotwin.read_patterns reads them by name or file")
+    arguments.of_kind("write_surface: optics", optics, Calibration)
+    for device, value in devices.items():
+        arguments.of_kind(f"write_surface: devices: {device}", value, Device)
+    for camera, stack in images.items():
+        arguments.numbers(f"write_surface: images: {camera}", stack, (patterns.count, "h", "w"))
+    if lacking := [device for device in (*images, "projector") if device not in devices]:
+        raise InputError(f"write_surface: devices: expected {', '.join(lacking)}, found {', '.join(devices) or 'none'}")
     with new_capture(folder, name, by="write_surface") as capture:
         capture.add_calibration(optics)
         capture.add_surface(images, patterns, devices)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from recon import arguments
 from recon.compiled import njit
 from recon.errors import InputError
 from recon.files.volumes import Volume
@@ -140,6 +141,7 @@ def principal_grid(around: Array, spacing_mm: ArrayLike) -> Grid:
 
     It is much smaller than the other where the sweep runs across the world's axes.
     """
+    around = np.asarray(arguments.numbers("around", around, ("n", 3)), float)
     _, _, rows = np.linalg.svd(around - around.mean(axis=0), full_matrices=False)
     rows *= np.sign(rows[np.arange(3), np.abs(rows).argmax(axis=1)])[:, None]  # along the world's axes, not against
     rows[2] *= np.sign(np.linalg.det(rows))
@@ -181,6 +183,9 @@ def reconstruct(
     InputError
         If the volume would be larger than that, or the numbers of images and poses differ, or an image or mask is no such array.
     """
+    arguments.of_kind("grid", grid, Grid, way="sonotwin.principal_grid makes one")
+    arguments.of_kind("images", images, Iterable)
+    world_from_pixel = arguments.places_of_pixels("world_from_pixel", world_from_pixel)
     if compounding not in RULES or interpolation not in ("nearest", "linear"):
         raise ValueError(f"no compounding {compounding!r} or interpolation {interpolation!r}")
     if compounding == "integer_mean" and interpolation == "linear":
@@ -195,6 +200,7 @@ def reconstruct(
     paste = _paste_nearest if interpolation == "nearest" else _paste_linear
     count = 0
     for image, mask in zip(images, masks if masks is not None else repeat(None), strict=False):
+        arguments.of_kind(f"image {count}", image, np.ndarray)
         if count == len(world_from_pixel):
             raise InputError(f"images: expected as many as poses, {count}, found more")
         matrix = voxel_from_world @ world_from_pixel[count]
@@ -214,9 +220,10 @@ def reconstruct(
 
 
 def _grid(around: Array, spacing_mm: ArrayLike, directions: Array) -> Grid:
-    spacing = np.broadcast_to(np.asarray(spacing_mm, float), (3,)).copy()
-    if not (np.isfinite(spacing).all() and spacing.min() > 0):
-        raise InputError(f"spacing: expected lengths above 0 mm, found {spacing_mm}")
+    given = np.asarray(arguments.numbers("spacing_mm", spacing_mm), float)
+    if given.shape not in ((), (1,), (3,)) or not given.min() > 0:
+        raise InputError(f"spacing_mm: expected lengths above 0 mm, one or three, found {spacing_mm}")
+    spacing = np.broadcast_to(given, (3,)).copy()
     along = around @ directions
     low, high = along.min(axis=0), along.max(axis=0)
     nx, ny, nz = np.floor((high - low) / spacing + 0.5).astype(int) + 1

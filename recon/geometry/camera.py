@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from recon import arguments
 from recon.compiled import kernel, njit
 from recon.geometry import rigid
 from recon.threads import in_threads
@@ -41,14 +42,16 @@ class Camera:
     matrix: Array  # (3, 3), px
     distortion: Array  # (0 | 4 | 5 | 8 | 12 | 14,), OpenCV order
     camera_from_world: Array = field(default_factory=lambda: np.eye(4))  # (4, 4), mm
+    name: str = ""  # of the device, as its calibration has it
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "size", arguments.image_size("size", self.size))
         for name, shape in (("matrix", (3, 3)), ("camera_from_world", (4, 4))):
-            value = np.asarray(getattr(self, name), float)
-            if value.shape != shape or not np.isfinite(value).all():
+            value = np.asarray(arguments.numbers(name, getattr(self, name), shape, finite=False), float)
+            if not np.isfinite(value).all():
                 raise ValueError(f"{name}: expected a finite {shape[0]}x{shape[1]} matrix, found {value.tolist()}")
             object.__setattr__(self, name, value)
-        distortion = np.asarray(self.distortion, float).ravel()
+        distortion = np.asarray(arguments.numbers("distortion", self.distortion, finite=False), float).ravel()
         if distortion.size not in DISTORTION_LENGTHS or not np.isfinite(distortion).all():
             raise ValueError(f"distortion: expected 0, 4, 5, 8, 12 or 14 finite coefficients, found {distortion.tolist()}")
         object.__setattr__(self, "distortion", distortion)

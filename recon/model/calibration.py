@@ -1,10 +1,11 @@
 """A calibration: the devices of the rig in one world, and the covariance of their parameters."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from recon import arguments
 from recon.geometry import camera_jacobian
 from recon.geometry.camera import Array, Camera
 
@@ -46,8 +47,16 @@ class Uncertainty:
 class Calibration:
     """The calibrated devices by name: `cam1`, `cam2`, `projector`. World is the frame of camera 1."""
 
-    cameras: Mapping[str, Camera]
+    cameras: Mapping[str, Camera]  # each with its name
     uncertainty: Uncertainty | None = None
+
+    def __post_init__(self) -> None:
+        arguments.of_kind("cameras", self.cameras, Mapping)
+        arguments.of_kind("uncertainty", self.uncertainty, Uncertainty, type(None))
+        for name, camera in self.cameras.items():
+            arguments.of_kind(f"cameras: {name}", camera, Camera)
+        named = {name: camera if camera.name == name else replace(camera, name=name) for name, camera in self.cameras.items()}
+        object.__setattr__(self, "cameras", named)
 
 
 def in_use(known: Uncertainty | None, cameras: Mapping[str, Camera], scale: float, drift_px: float) -> Uncertainty | None:

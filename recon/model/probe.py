@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from recon import arguments
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 
@@ -31,6 +32,11 @@ class ProbeCalibration:
     uncertainty: Uncertainty | None = None
     speed_m_s: float = SCANNER_SPEED  # m/s, of the sound for which sy holds
     face_row: float = 0.0  # px, row of the image at which an echo has no delay: depths count from there
+
+    def __post_init__(self) -> None:
+        for name, shape in (("target_from_image", (4, 4)), ("scale", (2,))):
+            object.__setattr__(self, name, np.asarray(arguments.numbers(name, getattr(self, name), shape), float))
+        arguments.of_kind("uncertainty", self.uncertainty, Uncertainty, type(None))
 
     def to_target(self, pixels: ArrayLike) -> Array:
         """Pixels : (..., 2) of a B-scan, to points : (..., 3) mm in the target's frame."""

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation, Slerp
 
+from recon import arguments
+from recon.errors import InputError
+
 Array = NDArray[np.float64]
 LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s that images' time stamps are late; of a setting
 
@@ -25,6 +28,15 @@ class Track:
     shared: Array | None = None  # (n, 6, 6) the same by what errs alike in all poses: tolerances of target and cameras
 
     def __post_init__(self) -> None:
+        times = arguments.numbers("times", self.times, ("n",))
+        if times.dtype.kind == "f":
+            raise InputError(f"times: expected whole ns, found {arguments.described(times)}: seconds?")
+        arguments.numbers("poses", self.poses, (len(times), 4, 4), finite=False)
+        for name in ("covariance", "shared"):
+            if (value := getattr(self, name)) is not None:
+                arguments.numbers(name, value, (len(times), 6, 6), finite=False)
+        if len(times) > 1 and (late := int(np.argmax(np.diff(times) <= 0))) + 1 and times[late + 1] <= times[late]:
+            raise InputError(f"times: expected each later than the one before, found {times[late]}, then {times[late + 1]} ns")
         if self.shared is not None and self.covariance is None:
             raise ValueError("shared: expected with a covariance of each pose alone, found without")
 

@@ -7,12 +7,13 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from recon import arguments
 from recon.errors import InputError
 from recon.geometry import board_shape, usual_lenses
 from recon.geometry.board_shape import Tolerances
 from recon.geometry.camera_jacobian import difference
 from recon.geometry.circle_projection import centre_offsets
-from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
+from recon.model.boards import BOARDS, AsymmetricCircles, Board, SymmetricCircles
 from recon.model.calibration import Calibration
 from recon.model.rig import NotNegative, Part
 from recon.optical_calibration import initial_estimate
@@ -25,6 +26,7 @@ from recon.optical_calibration.pose_consistency import consistency, widened
 from recon.optical_calibration.sightings import Sighting, gather, without_scraps
 
 BAD_POSE = 5.0  # times the noise: median residual of a pose in one device that doesn't fit the others
+OUTSIDE_PX = 50.0  # of an image, where points may be found yet: the projector's, carried on
 MANY_POINTS = 400  # of a board: the shape of one with more takes too long to find
 ENOUGH = 2.0  # sightings' coordinates an unknown, the board's points among these, to find its shape by
 BENT = 0.9  # of a flatness tolerance's variance: bowing, which neighbours share
@@ -95,12 +97,36 @@ def calibrate(
     InputError
         If the sightings don't determine the devices, or contradict each other or the board's design.
     """
+    _check(sightings, board, sizes, settings, name)
     try:
         return _calibrate([without_scraps(sighting) for sighting in sightings], board, sizes, settings or Settings(), name)
     except InputError:
         raise
     except ValueError as error:  # LinAlgError among them
         raise InputError(f"{name}: expected sightings that determine all devices, found {error}") from None
+
+
+def _check(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size], settings: Settings | None, name: str) -> None:
+    """Refuse what `calibrate` can't take, and points outside of their device's image."""
+    arguments.of_kind(f"{name}: sightings", sightings, Sequence)
+    arguments.of_kind(f"{name}: board", board, *BOARDS)
+    arguments.of_kind(f"{name}: sizes", sizes, Mapping, way="width and height of each device: {'cam1': (1280, 1024)}")
+    arguments.of_kind(f"{name}: settings", settings, Settings, type(None))
+    extents = {device: np.array(arguments.image_size(f"{name}: sizes: {device}", size)) for device, size in sizes.items()}
+    count = len(board.points())
+    for sighting in sightings:
+        arguments.of_kind(f"{name}: sightings", sighting, Sighting, way="sonotwin.find_board makes one of a pose's images")
+        for device, pixels in sighting.pixels.items():
+            place = f"{name}: {sighting.name} {device}"
+            arguments.numbers(place, pixels, (count, 2), finite=False, what=f"{count} points of this board")
+            if device in extents:
+                middle = (extents[device] - 1) / 2
+                beyond = (np.abs(pixels - middle) > middle + OUTSIDE_PX).any(axis=1)
+                if beyond.any():
+                    (u, v), size = pixels[beyond][0], "x".join(map(str, extents[device]))
+                    raise InputError(
+                        f"{place}: expected points in its image of {size} px, found ({u:.0f}, {v:.0f}): another size?"
+                    )
 
 
 def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size], settings: Settings, name: str) -> Result:

@@ -7,9 +7,10 @@ from enum import Enum, auto
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import arguments
 from recon.board_detection.detect import BoardNotFound, Detection, detect
 from recon.errors import InputError
-from recon.model.boards import Board
+from recon.model.boards import BOARDS, Board
 from recon.model.patterns import Patterns
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
 from recon.optical_calibration.projector_points import correspondences
@@ -78,7 +79,13 @@ def sight(
     -------
     Sighting
         A camera that doesn't find the board is left out, with the reason; so is the projector if its fringes can't be decoded.
+
+    Raises
+    ------
+    InputError
+        If an image is none of grey levels of its camera's bits, or there are fringes without patterns, or other ones.
     """
+    _check(name, board, lit, fringes, patterns, bits)
     found: dict[str, Detection] = {}
     failures: dict[str, Failure] = {}
     for camera, image in lit.items():
@@ -93,6 +100,27 @@ def sight(
     if fringes is None or patterns is None or FIRST not in lit:
         return without_scraps(sighting)
     return with_projector(sighting, board, lit[FIRST], fringes, patterns, bits[FIRST])
+
+
+def _check(
+    name: str, board: Board, lit: Mapping[str, Image], fringes: Image | None, patterns: Patterns | None, bits: Mapping[str, int]
+) -> None:
+    """Refuse what `sight` can't take."""
+    place = f"find_board: {name}"
+    arguments.of_kind(f"{place}: board", board, *BOARDS)
+    for argument, value in (("lit", lit), ("bits", bits)):
+        arguments.of_kind(f"{place}: {argument}", value, Mapping, way="one entry a camera: {'cam1': ...}")
+    arguments.of_kind(f"{place}: patterns", patterns, Patterns, type(None), way="sonotwin.read_patterns reads them")
+    if lacking := [camera for camera in lit if camera not in bits]:
+        raise InputError(f"{place}: bits: expected those of {', '.join(lacking)}, found {', '.join(bits) or 'none'}")
+    for camera, image in lit.items():
+        arguments.grey_levels(f"{place}: lit: {camera}", image, ("h", "w"), bits[camera])
+    if (fringes is None) != (patterns is None):
+        given, lacking = ("patterns", "fringes") if fringes is None else ("fringes", "patterns")
+        raise InputError(f"{place}: {lacking}: expected them with {given}, found none")
+    if fringes is not None and patterns is not None and FIRST in lit:
+        shape = (patterns.count, *np.shape(lit[FIRST]))
+        arguments.grey_levels(f"{place}: fringes", fringes, shape, bits[FIRST])
 
 
 def with_projector(sighting: Sighting, board: Board, lit: Image, fringes: Image, patterns: Patterns, bits: int) -> Sighting:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from recon import arguments
 from recon.geometry.order_statistics import NORMAL_MAD
 
 Array = NDArray[np.float64]
@@ -80,8 +81,9 @@ class Crossing:
 
 def find(image: NDArray, appearance: Appearance | None = None) -> Crossing:
     """Find the crossing in a B-scan : (h, w), 8-bit grey levels, log-compressed. A spot, or else the meeting of two lines."""
+    arguments.of_kind("appearance", appearance, Appearance, type(None))
     look = appearance or Appearance()
-    level = np.asarray(image, np.float32)
+    level = np.asarray(arguments.numbers("image", image), np.float32)
     if level.ndim != 2 or min(level.shape) < 32:
         return _none(f"expected a grey image of at least 32x32 px, found shape {level.shape}")
     spot = _spot(level, look)

@@ -26,6 +26,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from recon import arguments
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.levenberg_marquardt import descend
@@ -158,6 +159,7 @@ def calibrate(
         If there are too few frames, the poses or pixels are none, the motion leaves something undetermined, most frames
         contradict each other, or the outcome is impossible for a probe.
     """
+    arguments.of_kind("sightings", sightings, Sightings)
     noise = noise or Noise()
     sightings = _checked(sightings, size)
     probe_checks.motion(sightings.poses, sightings.pixels, size)
@@ -250,9 +252,7 @@ def motion(size: Size, count: int = 30, tilt_deg: float = 35.0, roll_deg: float 
 
 def _checked(sightings: Sightings, size: Size) -> Sightings:
     """As float arrays, or refused."""
-    poses, pixels = np.asarray(sightings.poses, float), np.asarray(sightings.pixels, float)
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or pixels.shape != (len(poses), 2):
-        raise InputError(f"sightings: expected n poses of 4x4 and n pixels of 2, found {poses.shape} and {pixels.shape}")
+    poses, pixels = probe_checks.arrays(sightings)
     if len(poses) < MIN_FRAMES:
         raise InputError(f"sightings: expected at least {MIN_FRAMES} frames with a pose and a crossing, found {len(poses)}")
     probe_checks.poses(poses)

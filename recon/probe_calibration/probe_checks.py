@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from recon import arguments
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.probe import SPEEDS, ProbeCalibration
@@ -32,6 +33,25 @@ class _Frames(Protocol):
     def poses(self) -> Array: ...
     @property
     def pixels(self) -> Array: ...
+
+
+class _Sightings(_Frames, Protocol):
+    @property
+    def pose_covariance(self) -> Array | None: ...
+    @property
+    def pixel_covariance(self) -> Array | None: ...
+    @property
+    def slice_mm(self) -> Array | None: ...
+
+
+def arrays(sightings: _Sightings) -> tuple[Array, Array]:
+    """Poses and pixels as float arrays; refuses all that are no numbers of n frames."""
+    count = len(arguments.numbers("sightings: poses", sightings.poses, ("n", 4, 4), finite=False))
+    fields = {"poses": (4, 4), "pixels": (2,)}
+    for name, shape in (fields | {"pose_covariance": (6, 6), "pixel_covariance": (2, 2), "slice_mm": ()}).items():
+        if name in fields or getattr(sightings, name) is not None:
+            arguments.numbers(f"sightings: {name}", getattr(sightings, name), (count, *shape), finite=name not in fields)
+    return np.asarray(sightings.poses, float), np.asarray(sightings.pixels, float)
 
 
 def poses(world_from_target: Array) -> None:

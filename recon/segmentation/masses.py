@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon import threads
+from recon import arguments, threads
 from recon.errors import InputError
 from recon.freehand.volume_compounding import Clip
 from recon.geometry import rigid
@@ -78,6 +78,13 @@ def from_scans(
     InputError
         If no image has a pose, or they show no tissue.
     """
+    if not callable(images):
+        expected = "a function that gives the B-scans from the first on, such as lambda: iter(scans)"
+        raise InputError(f"images: expected {expected}, found {arguments.described(images)}")
+    arguments.of_kind("sound", sound, Sound, type(None))
+    arguments.of_kind("blur", blur, Blur, type(None))
+    shape = arguments.image_size("shape", shape)
+    world_from_pixel = arguments.places_of_pixels("world_from_pixel", world_from_pixel)
     sound = sound or Sound()
     clip = below_face(shape, world_from_pixel)
     grey = tissue_grey(images(), shape, world_from_pixel) if grey is None else grey

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import arguments
 from recon.compiled import kernel
 from recon.errors import InputError
 from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns, Uniform
@@ -103,6 +104,8 @@ class ProjectorMap:
     noise: Noise  # of one image
     summary: dict[str, int]  # pixels by status in lower case; regions, islands, disputed with a centre line
     noise_source: NoiseSource = "given"  # by the caller, measured on the fringes, or assumed, as they are too few to measure it
+    camera: str = ""  # that took the images, by its name in the calibration; nothing where it wasn't told
+    projector_size: tuple[int, int] | None = None  # width, height of the patterns, px
 
 
 def decode(
@@ -113,6 +116,7 @@ def decode(
     noise: Noise | None = None,
     min_modulation_dn: float | None = None,
     name: str = "images",
+    camera: str = "",
 ) -> ProjectorMap:
     """Decode a camera's images of a pattern sequence.
 
@@ -134,15 +138,17 @@ def decode(
         Least modulation, below which a pixel is dark; 4 DN of 255 if not given.
     name : str
         Of the images, for messages, such as `surface/cam1`.
+    camera : str
+        That took the images, by its name in the calibration, such as `cam1`: the map then fits no other.
 
     Raises
     ------
     InputError
         If the number or the size of the images is wrong, they are black or saturated, or they do not follow the sequence.
     """
-    images = np.asarray(images)
-    if images.ndim != 3 or len(images) != patterns.count:
-        raise InputError(f"{name}: expected {patterns.count} grey images of one size, found an array of shape {images.shape}")
+    arguments.of_kind(f"{name}: patterns", patterns, Patterns, way="sonotwin.read_patterns reads them by name or file")
+    arguments.of_kind(f"{name}: noise", noise, Noise, type(None))
+    images = arguments.grey_levels(name, images, (patterns.count, "h", "w"), bits)
     if min(images.shape[1:]) < SMALLEST:
         found = f"{images.shape[2]}x{images.shape[1]}"
         raise InputError(f"{name}: expected images of {SMALLEST}x{SMALLEST} px or more, found {found}")
@@ -169,7 +175,7 @@ def decode(
     pixels = cv2.calcHist([status], [0], None, [len(Status)], [0, len(Status)]).astype(int).ravel().tolist()
     summary = {s.name.lower(): pixels[s] for s in Status} | dict(counts)
     shown = (first.modulation, first.offset, first.phase, status, lit)
-    return ProjectorMap(columns[0], rows[0], columns[1], rows[1], *shown, noise, summary, source)
+    return ProjectorMap(columns[0], rows[0], columns[1], rows[1], *shown, noise, summary, source, camera, patterns.projector_size)
 
 
 def _from_fringes(shots: _Shots, axis: Axis) -> _AxisMap:

@@ -5,6 +5,7 @@ than a surface seen at a grazing angle, or far steeper than the steps before and
 steps too, but each is like its neighbours.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -14,6 +15,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from recon import arguments
 from recon.compiled import kernel, njit
 from recon.files import meshes
 from recon.geometry.camera import Camera
@@ -67,6 +69,8 @@ def clean(point_map: PointMap, camera: Camera, modulation: ArrayLike | None = No
     PointMap
         The same, with NaN in place of removed points.
     """
+    arguments.of_kind("clean_surface: limits", limits, Limits, type(None))
+    _check("clean_surface", point_map, camera, {"modulation": modulation})
     limits = limits or Limits()
     distance, step = _distances(point_map.points, camera)
     noise = _difference(point_map.sigma)
@@ -104,6 +108,7 @@ def mesh(
         Points of the map, in mm, as far as they are in a triangle; area-weighted normals as `vertex_normals`; sigma in mm
         as `vertex_attributes["sigma_mm"]`.
     """
+    _check("mesh_surface", point_map, camera, {"grey": grey})
     distance, step = _distances(point_map.points, camera)
     faces = _triangles(distance, max_slope * step + _difference(point_map.sigma))
     used = np.zeros(distance.size, bool)
@@ -117,6 +122,18 @@ def mesh(
         full = max(float(np.percentile(shown, BRIGHTEST)), 1e-6)
         meshes.set_greys(result, np.uint8(np.clip(np.rint(WHITE * shown / full), 0, 255)))
     return result
+
+
+def _check(name: str, point_map: PointMap, camera: Camera, images: Mapping[str, ArrayLike | None]) -> None:
+    """Refuse a map, or images beside it, of another size than the camera's."""
+    arguments.of_kind(f"{name}: point_map", point_map, PointMap, way="sonotwin.triangulate makes one")
+    arguments.of_kind(f"{name}: camera", camera, Camera)
+    shape = camera.size[::-1]
+    arguments.numbers(f"{name}: point_map.points", point_map.points, (*shape, 3), finite=False)
+    arguments.numbers(f"{name}: point_map.sigma", point_map.sigma, shape, finite=False)
+    for field, image in images.items():
+        if image is not None:
+            arguments.numbers(f"{name}: {field}", image, shape, finite=False)
 
 
 def _distances(points: Float32, camera: Camera) -> tuple[Float32, Float32]:

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import arguments
 from recon.compiled import njit
+from recon.errors import InputError
 from recon.geometry.camera import Camera, distort_side_by_side
 from recon.structured_light.decode import ProjectorMap
 from recon.threads import in_threads
@@ -20,6 +22,8 @@ MAX_STEPS = 15
 TOLERANCE = 1e-6  # projector px, of the solution
 LAST_STEP = 1e-3  # projector px: a secant step after one so short leaves far less than the tolerance
 SECANT = 1e-4  # mm: below it, two projections are too close to each other for their difference to give a slope
+MISSED_PX = 10.0  # projector px by which columns and rows may contradict each other in the median; a device that moved: some px
+CHECKED, FEWEST = 5000, 50  # pixels that tell that median, at most and at least
 SIGMA_FLOOR = 1e-6  # projector px: keeps weights finite where a map claims to be perfect
 
 
@@ -41,6 +45,12 @@ class Triangulator:
     """
 
     def __init__(self, camera: Camera, projector: Camera) -> None:
+        arguments.of_kind("triangulate: camera", camera, Camera)
+        arguments.of_kind("triangulate: projector", projector, Camera)
+        if camera is projector or (camera.name and camera.name == projector.name):
+            raise InputError(
+                f"triangulate: projector: expected another device than the camera, found {camera.name or 'the same'}"
+            )
         self.camera, self.projector = camera, projector
         self._rays = camera.pixel_rays()  # (h, w, 3), unit, in the world
         self._matrix = projector.matrix[:2].ravel()
@@ -48,6 +58,7 @@ class Triangulator:
     def __call__(self, projector_map: ProjectorMap) -> PointMap:
         """Triangulate a map of the camera's size; see `triangulate`."""
         shape = self._rays.shape[:2]
+        _check_devices(projector_map, self.camera, self.projector)
         decoded = (
             *_axis("columns", projector_map.columns, projector_map.sigma_columns, shape),
             *_axis("rows", projector_map.rows, projector_map.sigma_rows, shape),
@@ -59,6 +70,7 @@ class Triangulator:
         projector = (self.projector.camera_from_world, self._matrix, self.projector.coefficients)
         centre = np.ascontiguousarray(self.camera.centre)
         in_threads(_triangulate, shape[0], self._rays, centre, projector, decoded, points, sigma)
+        _check_rows(projector_map, points, self.projector)
         return PointMap(points, sigma)
 
 
@@ -71,7 +83,8 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera) 
         Projector columns, rows or both, in px, and their standard deviations. Where both are known they are weighted by the
         inverse variance. One axis with no sigma counts with a sigma of 1 px in the solution and leaves sigma NaN.
     camera, projector : Camera
-        In a common world.
+        In a common world. Columns alone, or rows, agree with any camera: only both show that it is another than took the
+        images, else the name that `decode` was given.
 
     Returns
     -------
@@ -84,8 +97,42 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera) 
     ------
     ValueError
         If a coordinate or a sigma has another size than the camera.
+    InputError
+        If the images were taken by another camera, or the patterns have another size than the projector; if columns and rows
+        contradict each other by these devices.
     """
     return Triangulator(camera, projector)(projector_map)
+
+
+def _check_devices(found: ProjectorMap, camera: Camera, projector: Camera) -> None:
+    """Refuse a map of another camera's images, or of patterns of another size than the projector's."""
+    if not all(hasattr(found, name) for name in ("columns", "rows", "sigma_columns", "sigma_rows")):
+        raise InputError(f"triangulate: projector_map: expected what decode makes of images, found {arguments.described(found)}")
+    taken_by, size = getattr(found, "camera", ""), getattr(found, "projector_size", None)
+    if taken_by and camera.name and taken_by != camera.name:
+        raise InputError(f"triangulate: camera: expected {taken_by}, which took the images, found {camera.name}")
+    if size is not None and size != projector.size:
+        expected, size = ("x".join(map(str, size)) for size in (size, projector.size))
+        raise InputError(f"triangulate: projector: expected {expected} px, as of the patterns, found {size}: another device?")
+
+
+def _check_rows(found: ProjectorMap, points: Float32, projector: Camera) -> None:
+    """Refuse devices by which columns and rows contradict each other: the points lie on rays that miss the projector's."""
+    if found.columns is None or found.rows is None:
+        return
+    rows, columns = np.nonzero(np.isfinite(points[..., 0]) & np.isfinite(found.columns) & np.isfinite(found.rows))
+    if len(rows) < FEWEST:
+        return
+    chosen = slice(None, None, max(1, len(rows) // CHECKED))
+    pixels = rows[chosen], columns[chosen]
+    missed = projector.project(points[pixels]) - np.column_stack([found.columns[pixels], found.rows[pixels]])
+    typical = float(np.nanmedian(np.linalg.norm(missed, axis=1)))
+    if typical > MISSED_PX:
+        cause = "another camera's calibration or images, images mirrored or turned, or devices that moved since"
+        raise InputError(
+            f"triangulate: camera: expected columns and rows that agree to {MISSED_PX:g} projector px, found {typical:.3g} px "
+            f"in the median: {cause}?"
+        )
 
 
 def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:

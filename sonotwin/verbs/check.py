@@ -192,7 +192,7 @@ def matched(config: Config, calibration: Calibration, console: Console) -> Match
     maps = []
     for camera in CAMERAS:
         shots = surface_part.read_surface(config.capture, camera, config.calibration)
-        maps.append(decode.decode(shots.images, shots.patterns, bits=shots.bits, name=f"{shots.name}: {camera}"))
+        maps.append(decode.decode(shots.images, shots.patterns, bits=shots.bits, name=f"{shots.name}: {camera}", camera=camera))
     matches = fringe_matches.match((maps[0], maps[1]), calibration.cameras, np.random.default_rng(SEED), str(config.capture))
     axes = " and ".join(("columns", "rows")[k] for k in matches.axes)
     console.print(f"fringes     {len(matches.pixels)} points in both cameras, {axes}", markup=False)

@@ -72,7 +72,7 @@ def run(config: Config) -> None:
     camera, projector = shots.calibration.cameras[config.camera], shots.calibration.cameras["projector"]
 
     with watch.stage("decode"):
-        found = decode.decode(shots.images, shots.patterns, bits=shots.bits, name=shots.name)
+        found = decode.decode(shots.images, shots.patterns, bits=shots.bits, name=shots.name, camera=config.camera)
     for line in surface_figures.describe_decoding(shots.patterns, found):
         print(line)
 

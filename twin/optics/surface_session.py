@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from recon import arguments
 from recon.capture.manifest import Device
 from recon.errors import InputError
 from recon.model.calibration import Calibration
@@ -60,6 +61,14 @@ def shoot(
     The same seed gives the same bytes. Rendering noise, sensor noise and the two cameras draw from separate streams; errors of
     frames are the same for both cameras.
     """
+    arguments.of_kind("render: rig", rig, Rig, way="sonotwin.read_rig reads one by name or file")
+    arguments.of_kind("render: scene", scene, Scene, way="sonotwin.build_scene builds one")
+    arguments.of_kind("render: patterns", patterns, Patterns, way="sonotwin.read_patterns reads them by name or file")
+    arguments.of_kind("render: tracing", tracing, Tracing)
+    arguments.of_kind("render: shooting", shooting, Shooting)
+    arguments.whole("render: seed", seed, 0, 2**63 - 1)
+    if not isinstance(camera, str) or camera not in ("cam1", "cam2"):
+        raise InputError(f"render: camera: expected cam1 or cam2, found {arguments.described(camera)}")
     device: CameraDevice = getattr(rig, camera)
     light_seed, sensor_seed = np.random.SeedSequence([seed, ("cam1", "cam2").index(camera)]).generate_state(2).tolist()
     optics = camera_optics(rig, camera)

@@ -191,5 +191,5 @@ def test_what_cannot_be_reconstructed(sweep):
         volume_compounding.reconstruct(images, matrices, grid, masks=[np.ones((3, 3), bool)] * 12)
     with pytest.raises(InputError, match="poses: expected at least one that is valid, found none in 12"):
         volume_compounding.corners(np.full((12, 4, 4), np.nan), SHAPE)
-    with pytest.raises(InputError, match="spacing: expected lengths above 0 mm, found -1"):
+    with pytest.raises(InputError, match="spacing_mm: expected lengths above 0 mm, one or three, found -1"):
         volume_compounding.aligned_grid(around, -1)
