@@ -144,7 +144,7 @@ def test_a_folder_too_deep_or_not_deep_enough_is_named(tmp_path, made, given):
 
 
 def test_a_surface_is_replaced_only_if_told(tmp_path, capsys, monkeypatch):
-    """Its truth wouldn't fit the recorded one; and a recorded one may be all there is of it. What is replaced is said by its day."""
+    """Its truth may stand beside it, and a recorded one may be all there is of it. What is replaced is said by its day."""
     rendered, recorded = with_surface(tmp_path / "demo/capture"), with_surface(tmp_path / "demo/own")
     (tmp_path / "demo/truth/surface").mkdir(parents=True)
     for there in (rendered, recorded):

@@ -247,7 +247,7 @@ def test_a_folder_of_other_files_is_left_alone(tmp_path):
     ids=["cut", "empty", "list", "number", "other map", "survey", "no text", "deep"],
 )
 def test_a_file_of_the_same_name_is_left_alone(content, tmp_path):
-    """`study.json` is what another program may call its own: only the list of what sonotwin wrote marks a folder as one of ours."""
+    """`study.json` is what another program may call its own: only the list of what sonotwin wrote marks a folder as ours."""
     for name, held in (("study.json", content), ("thesis.tex", b"years of work")):
         (tmp_path / name).write_bytes(held)
     with pytest.raises(InputError, match=r"found other files, such as study\.json, and no list of ours"):
