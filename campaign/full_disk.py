@@ -94,7 +94,7 @@ def fill(place: Path, command: Command, folder: Path) -> list[Full]:
     for share in SHARES:
         with small_disk(disk, size + int(share * size)):
             shutil.copytree(old, disk, dirs_exist_ok=True)
-            outcome = commands.run((*line, *_anew(command.verb)), folder, LONGEST_S)
+            outcome = commands.run((*line, *anew(command.verb)), folder, LONGEST_S)
             kept = outcome.status == 0 or _kept(results.digests(old), results.digests(disk), command.verb in GROWING)
             found.append(Full(command.verb, share, outcome, kept, tuple(results.leftovers(disk))))
     return found
@@ -105,9 +105,15 @@ def _kept(old: dict[str, str], found: dict[str, str], grows: bool) -> bool:
     return old.keys() <= found.keys() if grows else old.items() <= found.items()
 
 
-def _anew(verb: str) -> tuple[str, ...]:
+def anew(verb: str) -> tuple[str, ...]:
     """Fields by which a verb that goes on with its own result makes another one."""
-    given = {"dataset": ("samples=2",), "train": ("steps=4",), "study": ("seeds=2",), "reconstruct": ("spacing_mm=0.4",)}
+    given = {
+        "dataset": ("samples=2",),
+        "train": ("steps=4",),
+        "study": ("seeds=2",),
+        "reconstruct": ("spacing_mm=0.4",),
+        "record": ("replace=true",),
+    }
     return given.get(verb, ())
 
 

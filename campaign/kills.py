@@ -47,7 +47,7 @@ KILLED = (
     Killed("train", (), (*TRAIN, "steps=40", "out=new"), ("data",), grows=True),
     Killed("reconstruct", ("reconstruct", "capture=scan/capture", "spacing_mm=1.0", "out=new"),
            ("reconstruct", "capture=scan/capture", "spacing_mm=0.5", "out=new"), ("scan",), grows=True),
-    Killed("record", (*RECORD, "seed=1", "out=new"), (*RECORD, "seed=2", "out=new"), recorded=True),
+    Killed("record", (*RECORD, "seed=1", "out=new"), (*RECORD, "replace=true", "seed=2", "out=new"), recorded=True),
 )  # fmt: skip
 
 

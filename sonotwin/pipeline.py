@@ -51,7 +51,7 @@ def play(steps: Sequence[Step], folder: Path, settings: Mapping[str, object], an
     atomic.begin_filled(folder, DEMO)
     with atomic.listed_file(folder, MARKER, DEMO) as temporary:
         temporary.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
-    for name in (MARKER, *files):
+    for name in (MARKER, metrics.FILE, *(name for step in steps for name in step.makes)):
         atomic.remove_leftovers(folder / name)
     atomic.remove_listed(folder, files, DEMO)
     found: Metrics = {}

@@ -193,9 +193,9 @@ def test_a_run_that_was_killed_leaves_nothing_to_the_next(tmp_path):
     (folder / ".demo.4194305.new.json").write_text("half")
     with pytest.raises(KeyboardInterrupt):
         pipeline.play([step("render", works=False, makes=("truth",)), report], folder, {}, silent)
-    assert sorted(path.name for path in folder.iterdir()) == ["demo.json"]  # no old report beside a new capture
+    assert sorted(path.name for path in folder.iterdir()) == [".sonotwin.json", "demo.json"]  # no old report beside a new capture
     pipeline.play([step("render"), report], folder, {}, silent)
-    assert sorted(path.name for path in folder.iterdir()) == ["demo.json", "metrics.json", "report.html"]
+    assert sorted(path.name for path in folder.iterdir()) == [".sonotwin.json", "demo.json", "metrics.json", "report.html"]
 
 
 def test_hidden_files_of_others_stay(tmp_path):
@@ -328,5 +328,5 @@ def test_a_folder_of_others_is_no_place_for_the_board(tmp_path, capsys):
     (tmp_path / "paper").mkdir()
     (tmp_path / "paper" / "thesis.tex").write_text("years of work")
     assert main(["demo", f"board={tmp_path / 'paper'}", f"out={tmp_path / 'demo'}"]) == 2
-    assert "paper: expected a new or empty folder or one with capture/manifest.json" in capsys.readouterr().err
+    assert "paper: expected a new or empty folder, or one that the twin wrote" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "paper").iterdir()] == ["thesis.tex"] and not (tmp_path / "demo").exists()

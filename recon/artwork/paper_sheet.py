@@ -3,6 +3,7 @@
 Lengths are mm; the origin is the lower left corner, of the card or of the paper, y upwards.
 """
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from reportlab.pdfgen.canvas import Canvas
 Array = NDArray[np.float64]
 Size = tuple[float, float]  # width, height, mm
 
+MARK = b"% sonotwin sha256 "  # of all before it, by which a sheet as it was written is known
 POINT_MM = 25.4 / 72  # PDF's unit
 PAPERS: dict[str, Size] = {  # upright, the smallest first
     "a4": (210.0, 297.0),
@@ -104,11 +106,19 @@ def write(path: Path, card: Card, sheet: Sheet, margin_mm: float, title: str, li
     _write_lines(canvas, lines, (left, margin_mm + BELOW_MM - 3.5), sheet.paper[0] - margin_mm - left)
     canvas.showPage()
     canvas.save()
+    content = path.read_bytes()
+    path.write_bytes(content + _mark_of(content))
 
 
 def is_sheet(path: Path) -> bool:
-    """Whether a file is a sheet that `write` has written."""
-    return b"/Creator (sonotwin)" in path.read_bytes()
+    """Whether a file is a sheet as `write` wrote it: one with a note or a signature added is somebody else's."""
+    content, begins, _ = path.read_bytes().rpartition(MARK)
+    return bool(begins) and path.read_bytes() == content + _mark_of(content)
+
+
+def _mark_of(content: bytes) -> bytes:
+    """A comment after the end of a PDF."""
+    return MARK + hashlib.sha256(content).hexdigest().encode("ascii") + b"\n"
 
 
 def _draw_card(canvas: Canvas, card: Card, at: Size) -> None:

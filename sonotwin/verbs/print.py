@@ -65,7 +65,8 @@ def run(config: Config) -> None:
     if blocking := next((each for each in config.out.parents if each.exists() and not each.is_dir()), None):
         raise InputError(f"{config.out}: expected a place in a folder, found {blocking} to be a file")
     if config.out.is_file() and not paper_sheet.is_sheet(config.out):
-        raise InputError(f"{config.out}: expected nothing or a sheet to replace, found a file of others; choose another out")
+        expected, found = "expected nothing or a sheet as it was written", "found a file of others, or a changed one"
+        raise InputError(f"{config.out}: {expected}, {found}; choose another out")
     if config.part == "target":
         draw_target(config, config.rig.target)
     else:

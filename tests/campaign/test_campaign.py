@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from campaign import bad_inputs, full_disk, fuzzing, kills, soak, sources, two_writers
+from campaign import bad_inputs, foreign, full_disk, fuzzing, kills, soak, sources, two_writers
 from campaign.sources import COMMANDS
 
 NAMES = {"ball", "scan", "skin", "volume"}
@@ -26,6 +26,16 @@ def test_bad_inputs_are_refused(place):
     found = bad_inputs.run(chosen, place, workers=1)
     wrong = {f"{one.case.command.verb} {one.case.fault}": (one.fault, one.outcome.said) for one in found if one.fault}
     assert not {name: fault for name, fault in wrong.items() if fault[0] != "slow"}
+
+
+@pytest.mark.slow
+def test_files_of_others_stay(place):
+    """Of one verb and of the interface, each over the other's result too."""
+    found = foreign.run(place, 1, only=["surface", foreign.INTERFACE])
+    assert not [one for one in found if one.lost or one.status < 0 or (one.status == 2) != one.said.startswith("sonotwin: ")]
+    statuses = {(one.writer, one.content): one.status for one in found}
+    assert len(found) >= 28 and all(statuses["surface", content] == 0 for content in list(foreign.IN_A_RESULT)[:6])
+    assert all(statuses["surface", content] == 2 for content in ("one of ours, changed by hand", *foreign.INSTEAD))
 
 
 @pytest.mark.slow

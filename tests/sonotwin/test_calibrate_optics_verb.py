@@ -24,7 +24,7 @@ from tests.recon import board_views
 
 SIZE = (320, 256)
 BOARD = Chessboard(columns=8, rows=6, square_mm=20)
-FILES = ["StereoParams.xml", "calibration.html", "cam1_cam2_params.npz", "metrics.json", "optics.yaml"]
+FILES = [".sonotwin.json", "StereoParams.xml", "calibration.html", "cam1_cam2_params.npz", "metrics.json", "optics.yaml"]
 
 
 def cameras() -> dict[str, Camera]:
@@ -159,7 +159,7 @@ def test_one_camera_alone_is_calibrated_by_command(session, tmp_path, capsys):
     assert re.fullmatch(r"detect +9 poses: cam1 9, \d+ s", lines[0])
     assert re.fullmatch(r"uncertain +projection 0\.\d+ px \(1 sigma\); one camera alone measures no points", lines[1])
     assert not [line for line in lines if "cam2" in line]
-    assert sorted(path.name for path in out.iterdir()) == ["calibration.html", "metrics.json", "optics.yaml"]
+    assert sorted(path.name for path in out.iterdir()) == [".sonotwin.json", "calibration.html", "metrics.json", "optics.yaml"]
     found = calibration_files.read(out / "optics.yaml")
     assert list(found.cameras) == ["cam1"]
     assert abs(found.cameras["cam1"].matrix[0, 0] - 830) < 4 * found.uncertainty.sigma("cam1.fx") < 40

@@ -19,7 +19,7 @@ from sonotwin.cli import main
 from tests.recon import bscans, probe_motions, sweep_sets
 
 LAG_S = 0.03
-FILES = ["US_params.npz", "frames.csv", "metrics.json", "probe.yaml"]
+FILES = [".sonotwin.json", "US_params.npz", "frames.csv", "metrics.json", "probe.yaml"]
 
 
 @pytest.fixture(scope="module")
@@ -307,6 +307,8 @@ def test_other_folders_are_not_replaced(capture, tmp_path, capsys):
     out.mkdir()
     for name in ("probe.yaml", "optics.yaml"):
         (out / name).write_text("mine")
-    assert "expected a new or empty folder or one with frames.csv" in complaint(capsys, f"capture={capture}", f"out={out}")
+    assert "expected a new or empty folder, or one that calibrate-probe wrote" in complaint(
+        capsys, f"capture={capture}", f"out={out}"
+    )
     assert "apart from what is read" in complaint(capsys, f"capture={capture}", f"out={capture.parent}")
     assert len(list(out.iterdir())) == 2

@@ -70,7 +70,7 @@ def test_the_sequence_is_the_sweep_for_slicer(capture, reconstructed, rig):
     ours = sweep.poses(LAG_S) @ sequences.target_from_pixel(sweep.probe)
     np.testing.assert_allclose(sequences.poses(frames, "Reference", "Image"), ours, atol=1e-9)
     np.testing.assert_allclose(np.diff(frames.times_s), 0.05, atol=1e-6)
-    names = ["metrics.json", "sequence.igs.mha", "volume.nrrd"]  # no sigma.nrrd: the poses have no covariance
+    names = [".sonotwin.json", "metrics.json", "sequence.igs.mha", "volume.nrrd"]  # no sigma.nrrd: the poses have no covariance
     assert sorted(path.name for path in reconstructed.iterdir()) == names
 
 

@@ -108,7 +108,7 @@ def test_their_program_finds_its_files(capture, tmp_path):
     names = {path.rpartition("/")[0] or path for path in contents(tmp_path / "theirs")}
     assert names == {
         "SLdata", "SLdata/images", "USdata", "USdata/L", "USdata/R", "USdata/US", "USdata/USmasks", "cam1_proj_params.npz",
-        "cam1_cam2_params.npz", "StereoParams.xml", "US_params.npz", "sonotwin-export.json",
+        "cam1_cam2_params.npz", "StereoParams.xml", "US_params.npz", "sonotwin-export.json", ".sonotwin.json",
     }  # fmt: skip
     assert np.load(tmp_path / "theirs" / "USdata" / "target_pose.npy").shape == (COUNT, 4, 4)
     with np.load(tmp_path / "theirs" / "US_params.npz") as given:
@@ -121,10 +121,10 @@ def test_their_program_finds_its_files(capture, tmp_path):
 def test_a_data_set_of_theirs_is_never_replaced(capture, tmp_path, capsys):
     """Its files are as ours, but nothing says that we wrote them."""
     assert main(["export", f"capture={capture}", f"lag_s={LAG_S}", f"out={tmp_path / 'theirs'}"]) == 0
-    (tmp_path / "theirs" / meza2021.MARKER).unlink()
+    (tmp_path / "theirs" / ".sonotwin.json").unlink()
     before = contents(tmp_path / "theirs")
     assert main(["export", f"capture={capture}", f"out={tmp_path / 'theirs'}"]) == 2
-    assert "expected a new or empty folder or one with sonotwin-export.json" in capsys.readouterr().err
+    assert "expected a new or empty folder, or one that export wrote" in capsys.readouterr().err
     assert contents(tmp_path / "theirs") == before
 
 

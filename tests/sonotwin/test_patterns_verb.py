@@ -92,7 +92,7 @@ def test_the_same_bytes_and_no_other_folder_replaced(place, capsys):
     Path("mine").mkdir()
     Path("mine/0000.png").write_bytes(b"")
     assert main(["patterns", *SMALL, "out=mine"]) == 2
-    assert "expected a new or empty folder or one with timing_sheet.csv to replace" in capsys.readouterr().err
+    assert "expected a new or empty folder, or one that patterns wrote" in capsys.readouterr().err
 
 
 def test_another_projector_is_refused_with_both_ways_on(place, capsys):

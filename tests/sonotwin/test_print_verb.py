@@ -98,7 +98,7 @@ def test_a_pdf_of_others_is_left_alone(tmp_path, capsys):
     """One of ours is replaced."""
     (tmp_path / "thesis.pdf").write_bytes(b"%PDF-1.4 years of work")
     assert main(["print", "part=board", f"out={tmp_path / 'thesis.pdf'}"]) == 2
-    assert "thesis.pdf: expected nothing or a sheet to replace, found a file of others" in capsys.readouterr().err
+    assert "thesis.pdf: expected nothing or a sheet as it was written, found a file of others" in capsys.readouterr().err
     assert (tmp_path / "thesis.pdf").read_bytes() == b"%PDF-1.4 years of work"
     for _ in range(2):
         assert main(["print", "part=board", f"out={tmp_path / 'board.pdf'}"]) == 0

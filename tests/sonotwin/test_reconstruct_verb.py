@@ -11,6 +11,7 @@ import pytest
 from recon.capture import manifest, probe_files
 from recon.capture.manifest import Manifest
 from recon.files import metrics, volumes
+from recon.files.written_files import LIST
 from sonotwin.cli import main
 from tests.recon import probe_motions, sweep_sets
 from tests.recon.tracking import films
@@ -19,7 +20,9 @@ LAG_S = 0.06
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    """All files but the lists, which hold digests of files with times."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != LIST)
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 @pytest.fixture(scope="module")

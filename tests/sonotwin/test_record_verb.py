@@ -143,17 +143,18 @@ def test_a_folder_too_deep_or_not_deep_enough_is_named(tmp_path, made, given):
         read_manifest(tmp_path / given)
 
 
-def test_a_rendered_surface_is_replaced_only_if_told(tmp_path, capsys, monkeypatch):
-    """Its truth wouldn't fit the recorded one. A surface without truth is replaced, and said by its day."""
+def test_a_surface_is_replaced_only_if_told(tmp_path, capsys, monkeypatch):
+    """Its truth may stand beside it, and a recorded one may be all there is of it. What is replaced is said by its day."""
     rendered, recorded = with_surface(tmp_path / "demo/capture"), with_surface(tmp_path / "demo/own")
     (tmp_path / "demo/truth/surface").mkdir(parents=True)
-    assert "replace=true" in refused(capsys, "part=surface", f"out={rendered}")
+    for there in (rendered, recorded):
+        assert "replace=true" in refused(capsys, "part=surface", f"out={there}")
 
     def none(*_):
         raise DeviceError("cam1: not there")
 
     monkeypatch.setattr(record, "still_devices", none)
-    for fields in ([f"out={rendered}", "replace=true"], [f"out={recorded}"]):
+    for fields in ([f"out={rendered}", "replace=true"], [f"out={recorded}", "replace=true"]):
         assert cli.main(["record", "part=surface", "preview.serve=false", *fields]) == 2
         assert f"replaces the surface of {date.today()}" in capsys.readouterr().out
     assert read_manifest(rendered).surface == read_manifest(recorded).surface

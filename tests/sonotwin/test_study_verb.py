@@ -216,12 +216,12 @@ def test_a_place_that_is_taken_is_refused_before_any_trial(tmp_path, capsys):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("years of work")
     assert main(["study", "name=sweep", f"out={tmp_path / 'out'}", *SMALL, SWEEP]) == 2
-    assert "expected a new or empty folder or one with study.json to replace" in capsys.readouterr().err
+    assert "expected a new or empty folder, or one that study wrote" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
     (tmp_path / "out" / "study.json").write_text("{")
     assert main(["study", "name=sweep", f"out={tmp_path / 'out'}", *SMALL, SWEEP]) == 2
     message = capsys.readouterr().err
-    assert "study.json: expected a study's description to replace, found other" in message and message.count("\n") == 1
+    assert "found other files, such as study.json" in message and message.count("\n") == 1
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["study.json", "thesis.tex"]
     assert (tmp_path / "out" / "study.json").read_text() == "{"
 

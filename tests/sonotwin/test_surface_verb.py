@@ -72,7 +72,13 @@ def test_a_capture_becomes_a_surface(shots, tmp_path, capsys):
     assert main(["surface", f"capture={folder}", f"out={out}"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["decode", "unwrap", "triangulate", "wrote"]
-    assert sorted(path.name for path in out.iterdir()) == ["metrics.json", "points.npz", "surface.glb", "surface.ply"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        ".sonotwin.json",
+        "metrics.json",
+        "points.npz",
+        "surface.glb",
+        "surface.ply",
+    ]
 
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["points"] > 0.95 * SIZE[0] * SIZE[1]

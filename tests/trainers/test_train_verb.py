@@ -32,13 +32,13 @@ def test_writes_the_network_and_goes_on(data_set, tmp_path, capsys):
     files = {"metrics.json", "curves.png", "training.json", "checkpoint.pt", "log.jsonl"}
     files |= {f"segmenter.{suffix}" for suffix in ("onnx", "safetensors", "pt")}
     assert train(data_set, out, "steps=2") == 0
-    assert {path.name for path in out.iterdir()} == files
+    assert {path.name for path in out.iterdir()} == files | {".sonotwin.json"}
     assert json.loads((out / "metrics.json").read_text())["patches"] == 6
     assert "wrote" in capsys.readouterr().out
     for file in files:
         (out / f".{file.replace('.', '.4194305.new.')}").write_bytes(b"half")
     assert train(data_set, out, "steps=3") == 0
-    assert {path.name for path in out.iterdir()} == files
+    assert {path.name for path in out.iterdir()} == files | {".sonotwin.json"}
     assert "3 steps of 2" in (said := capsys.readouterr().out) and "from step 2 on" in said
     assert train(data_set, out, "steps=3", "seed=1") == 2
     assert "expected seed=0 as its checkpoint has, or resume=false" in capsys.readouterr().err

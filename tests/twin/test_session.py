@@ -13,6 +13,7 @@ from recon.capture.images import read_image
 from recon.capture.manifest import CAMERAS, SCANNER, SCHEMA, BoardPart, Device, Manifest, SweepPart, is_sweep
 from recon.capture.writer import CaptureWriter, write_pose
 from recon.errors import InputError
+from recon.files import written_files
 from recon.files.npz import Form
 from recon.geometry.camera import Camera
 from recon.model.boards import AsymmetricCircles
@@ -98,6 +99,10 @@ def test_only_the_same_kind_is_replaced(tmp_path, devices, label):
     part = SweepPart(images={name: f"sweep/{name}" for name in devices})
     content = Manifest(schema=SCHEMA, devices={name: Device(size=SIZE) for name in devices}, sweep=part)
     manifest.write_manifest(tmp_path / "capture", content)
+    with pytest.raises(InputError, match="no list of ours"):  # as of a recording
+        Session(tmp_path, "sweep", {}, devices=devices).check()
+    listed = written_files.written(tmp_path / "capture" / "manifest.json", "the twin")
+    written_files.write_list(tmp_path / "capture" / written_files.LIST, {"manifest.json": (listed,)})
     Session(tmp_path, "sweep", {}, devices=devices).check()
     for kind, others in KINDS:
         if (kind, others) == ("sweep", devices):

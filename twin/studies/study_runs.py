@@ -28,7 +28,6 @@ from twin.studies.factors import Point
 
 STUDY, TABLE, TRIALS = "study.json", "table.parquet", "trials"
 BY = "study"  # who writes
-MARKS = ("of", "settings")  # fields of a study's description, by which it is known
 ERROR = "error"  # of a trial: in one line why it has no figures
 SEED = "seed"
 
@@ -76,7 +75,6 @@ class StudyFolder:
     def open(self, description: Mapping[str, Any]) -> None:
         """Begin or go on with a study; raises InputError if the folder holds something else."""
         atomic.check_filled_folder(self.folder, BY)
-        _check_mark(self.folder / STUDY)
         atomic.begin_filled(self.folder, BY)
         self.trials.mkdir(parents=True, exist_ok=True)
         for leftover in self.trials.glob(".*.new.json"):  # of a run that was killed while it wrote a trial
@@ -113,18 +111,6 @@ class StudyFolder:
 
     def _path(self, key: str) -> Path:
         return self.trials / f"{key}.json"
-
-
-def _check_mark(path: Path) -> None:
-    """Refuse a file that isn't a study's description, as another program may have one of this name; raises InputError."""
-    if not path.exists():
-        return
-    try:
-        found = json_text.read(path)
-    except InputError:  # other text, or no text at all
-        found = None
-    if not (isinstance(found, dict) and all(name in found for name in MARKS)):
-        raise InputError(f"{path}: expected a study's description to replace, found other or damaged data; choose another out")
 
 
 def plan(name: str, points: Sequence[tuple[Point, Settings]], seeds: Sequence[int]) -> list[Trial]:

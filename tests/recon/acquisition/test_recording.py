@@ -87,6 +87,45 @@ def test_what_would_be_lost_or_mixed_is_refused(tmp_path, rng):
         pass
 
 
+def test_files_of_others_stay(tmp_path, rng):
+    """In a take that another replaces, in the folder that the next pose would have, and where a sweep is to be recorded."""
+    out, cameras = tmp_path / "out", {"cam1": CAMERA, "projector": PROJECTOR}
+    lit = {"cam1": image(rng)}
+    with recording.open_recording(out) as capture:
+        capture.add_pose(lit, {}, BOARD, None, cameras)
+        for name in ("board/01", "sweep/scan/cam1", "surface/take07"):
+            (out / name).mkdir(parents=True)
+            (out / name / "0000.png").write_bytes(b"years of work")
+        assert capture.add_pose(lit, {}, BOARD, None, cameras) == "02"
+        with (
+            pytest.raises(InputError, match=r"sweep/scan/cam1: .*found 0000\.png"),
+            capture.sweep("scan", None, {"cam1": CAMERA}),
+        ):
+            pass
+    with recording.open_recording(out):
+        pass
+    assert all(
+        (out / name / "0000.png").read_bytes() == b"years of work" for name in ("board/01", "sweep/scan/cam1", "surface/take07")
+    )
+
+
+def test_a_sweep_that_was_never_entered_is_begun_anew(tmp_path, rng, monkeypatch):
+    """As after a kill between its first frame and the manifest."""
+    out = tmp_path / "out"
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, recording.open_recording(out) as capture:
+        capture.add_pose({"cam1": image(rng)}, {}, BOARD, None, {"cam1": CAMERA, "projector": PROJECTOR})
+        patch.setattr(recording.Recording, "_enter", killed)
+        with pytest.raises(KeyboardInterrupt), capture.sweep("scan", None, {"cam1": CAMERA}) as sweep:
+            sweep.add("cam1", 7, 5, image(rng))
+    with recording.open_recording(out) as capture, capture.sweep("scan", None, {"cam1": CAMERA}) as sweep:
+        sweep.add("cam1", 0, 5, image(rng))
+    assert sorted(path.name for path in (out / "sweep/scan/cam1").iterdir()) == ["0000.png", "timestamps.csv"]
+
+
 def test_nothing_is_left_of_a_recording_of_nothing(tmp_path):
     with pytest.raises(InputError, match="optics"), recording.open_recording(tmp_path / "out") as capture:
         capture.add_calibration(tmp_path / "optics.yaml", {})

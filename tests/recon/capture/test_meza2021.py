@@ -92,11 +92,11 @@ def test_other_kinds_of_images_count_in_colour_too(surface, tmp_path, suffix, of
 
 
 def test_a_folder_of_theirs_is_never_replaced(surface, tmp_path):
-    """It has the same files as ours, but for the marker."""
+    """It has the same files as ours, but for the list."""
     write(tmp_path / "rig", surface, np.ones((24, 1280), bool))
-    (tmp_path / "rig" / meza2021.MARKER).unlink()
+    (tmp_path / "rig" / ".sonotwin.json").unlink()
     before = {path: path.read_bytes() for path in (tmp_path / "rig").rglob("*") if path.is_file()}
-    with pytest.raises(InputError, match=r"expected a new or empty folder or one with sonotwin-export.json to replace"):
+    with pytest.raises(InputError, match="expected a new or empty folder, or one that export wrote"):
         write(tmp_path / "rig", surface, np.zeros((24, 1280), bool))
     assert {path: path.read_bytes() for path in (tmp_path / "rig").rglob("*") if path.is_file()} == before
 

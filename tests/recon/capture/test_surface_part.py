@@ -60,13 +60,14 @@ def test_the_same_capture_is_the_same_bytes(tmp_path, optics):
     for name in ("a", "b"):
         write(tmp_path / name, optics)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    assert sorted(contents(tmp_path / "a"))[:2] == ["calibration/optics.yaml", "manifest.json"]
+    assert sorted(contents(tmp_path / "a"))[:3] == [".sonotwin.json", "calibration/optics.yaml", "manifest.json"]
 
 
 def test_an_older_capture_is_replaced_and_nothing_is_left_beside(folder, optics):
-    (folder / "old.txt").write_text("of the older capture")
+    """But for what others put into it."""
+    (folder / "old.txt").write_text("of somebody")
     write(folder, optics)
-    assert "old.txt" not in contents(folder) and [path.name for path in folder.parent.iterdir()] == ["capture"]
+    assert contents(folder)["old.txt"] == b"of somebody" and [path.name for path in folder.parent.iterdir()] == ["capture"]
 
 
 def test_a_folder_of_something_else_is_not_touched(tmp_path, optics):

@@ -232,7 +232,7 @@ def test_cells_hold_numbers_and_words(value, expected):
 def test_a_folder_of_other_files_is_left_alone(tmp_path):
     """A study's own is gone on with, and described as it now is."""
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(InputError, match=r"expected a new or empty folder or one with study\.json to replace, found other files"):
+    with pytest.raises(InputError, match="expected a new or empty folder, or one that study wrote, found other files"):
         StudyFolder(tmp_path).open(DESCRIPTION)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     own = StudyFolder(tmp_path / "own")
@@ -247,10 +247,10 @@ def test_a_folder_of_other_files_is_left_alone(tmp_path):
     ids=["cut", "empty", "list", "number", "other map", "survey", "no text", "deep"],
 )
 def test_a_file_of_the_same_name_is_left_alone(content, tmp_path):
-    """`study.json` is what another program may call its own: only a study's description marks a folder as one to replace."""
+    """`study.json` is what another program may call its own: only the list of what sonotwin wrote marks a folder as ours."""
     for name, held in (("study.json", content), ("thesis.tex", b"years of work")):
         (tmp_path / name).write_bytes(held)
-    with pytest.raises(InputError, match=r"study\.json: expected a study's description to replace, found other or damaged data"):
+    with pytest.raises(InputError, match=r"found other files, such as study\.json, and no list of ours"):
         StudyFolder(tmp_path).open(DESCRIPTION)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {
         "study.json": content,

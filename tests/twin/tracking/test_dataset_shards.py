@@ -65,6 +65,23 @@ def test_a_killed_run_goes_on_to_the_same_bytes(made, tmp_path, monkeypatch):
         assert place.shard(number).read_bytes() == made.shard(number).read_bytes()
 
 
+def test_what_workers_were_at_when_they_were_ended_is_removed(tmp_path, monkeypatch):
+    """Ctrl-C ends them amid a shard: its half and the locks that they held go; hidden files of others stay."""
+    place, wanted = Place(tmp_path / "set"), settings()
+    missing = prepare(place, wanted)
+
+    def interrupted(*_):
+        for name in (".shard-00000.4194305.new.tar", ".shard-00000.tar.lock", ".shard-00001.tar.lock", ".shard-notes.tar"):
+            (place.folder / name).write_bytes(b"half")
+        yield 1
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(dataset_shards, "results", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        list(generate(place, wanted, missing, Engine()))
+    assert {path.name for path in place.folder.iterdir()} == {".shard-notes.tar", ".sonotwin.json", "dataset.json"}
+
+
 def test_a_sample_does_not_know_its_batch(made, monkeypatch, tmp_path):
     monkeypatch.setattr(dataset_shards, "BATCH", 1)
     place = Place(tmp_path / "set")
