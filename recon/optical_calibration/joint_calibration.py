@@ -1,7 +1,7 @@
 """Joint optics calibration: from sightings of a board's points to the devices' parameters and their covariance."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from recon.geometry.circle_projection import centre_offsets
 from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
 from recon.model.calibration import Calibration
 from recon.model.rig import NotNegative, Part
-from recon.optical_calibration import initial_estimate
+from recon.optical_calibration import half_turns, initial_estimate
 from recon.optical_calibration import optical_checks as checks
 from recon.optical_calibration.adjustment import Adjustment, adjust, board_information, free_parameters, lens_information
 from recon.optical_calibration.bundle import Array, Estimate
@@ -66,6 +66,7 @@ class Result:
     board: Board
     tolerances: Tolerances  # of the board, as given or as the sightings show
     released: bool  # the board's points were adjusted
+    turned: Mapping[str, Sequence[str]] = field(default_factory=dict)  # device, or all: poses with points numbered the other way
 
     @property
     def rms(self) -> dict[str, float]:
@@ -110,6 +111,8 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
         raise InputError(f"{name}: expected the board in {len(sightings)} poses, found it in none: {_commonest(dropped)}")
     observations = gather(sightings, board, sizes)
     checks.refuse_unusable(observations, name)
+    turn = half_turns.half_turn(board)
+    observations, flipped = (observations, {}) if turn is None else half_turns.agreeing(observations, turn)
     first = initial_estimate.estimate(observations)
     checks.refuse_parallel(observations, first, name)
     seen = [sighting.radii for sighting in sightings if sighting.pixels]
@@ -120,6 +123,10 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     checks.refuse_unusable(observations, name)
     estimate, offsets = adjusted.estimate, circle_offsets(observations, adjusted.estimate, board)
     released = settings.shape.released and _determine_shape(observations)
+    if released and turn is not None:
+        observations, estimate, others = half_turns.consistent(observations, adjusted, free, offsets, turn)
+        flipped |= {"all devices": others} if others else {}
+        offsets = circle_offsets(observations, estimate, board)
     tolerances = settings.shape.tolerances
     estimate, tolerances = _shaped(observations, estimate, free, offsets, settings.shape) if released else (estimate, tolerances)
     estimate = adjust(observations, estimate, free, offsets, tolerances, released).estimate
@@ -138,7 +145,9 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     adjusted = widened(adjusted, agreement.covariance)
     found = [*checks.warnings(observations, adjusted), *filter(None, (agreement.warning, size_warning))]
     dropped |= contradicting
-    return Result(observations, adjusted, model, scores, dropped, halves, tuple(found), offsets, board, tolerances, released)
+    return Result(
+        observations, adjusted, model, scores, dropped, halves, tuple(found), offsets, board, tolerances, released, flipped
+    )
 
 
 def _determine_shape(observations: Observations) -> bool:

@@ -112,7 +112,7 @@ def run(config: Config) -> None:
     seconds["seconds_adjust"] = round(perf_counter() - start, 3)
     figures = figures_of_merit.measure(result, truth)
     contradicting = {name: reason for name, reason in result.dropped.items() if name not in missed}
-    for line in (*dropped(contradicting), *describe(result, figures, seconds["seconds_adjust"])):
+    for line in (*dropped(contradicting), *turned(result), *describe(result, figures, seconds["seconds_adjust"])):
         console.print(line, markup=False)
     written = write(config, result, figures | seconds, truth)
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
@@ -131,6 +131,12 @@ def dropped(reasons: Mapping[str, str | Failure]) -> Iterator[str]:
     """Lines: poses and devices left out, with the reasons."""
     for name, reason in reasons.items():
         yield f"dropped     {name}: {reason}"
+
+
+def turned(result: Result) -> Iterator[str]:
+    """Lines: poses in which a board that maps onto itself was taken for turned."""
+    for device, poses in result.turned.items():
+        yield f"turned      {', '.join(poses)}: {device} took the board the other way round than in other poses"
 
 
 def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
