@@ -17,11 +17,18 @@ from recon.model.calibration import Calibration
 from recon.model.rig import NotNegative, Part
 from recon.optical_calibration import half_turns, initial_estimate
 from recon.optical_calibration import optical_checks as checks
-from recon.optical_calibration.adjustment import Adjustment, adjust, board_information, free_parameters, lens_information
-from recon.optical_calibration.bundle import Array, Estimate
+from recon.optical_calibration.adjustment import (
+    Adjustment,
+    adjust,
+    board_information,
+    free_parameters,
+    lens_information,
+    scale_errors,
+)
+from recon.optical_calibration.bundle import Array, Estimate, Problem
 from recon.optical_calibration.distortion_selection import MODELS, TRIED, ModelName, choose
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
-from recon.optical_calibration.pose_consistency import consistency, widened
+from recon.optical_calibration.pose_consistency import Consistency, added, consistency, widened
 from recon.optical_calibration.sightings import Sighting, gather, without_scraps
 
 BAD_POSE = 5.0  # times the noise: median residual of a pose in one device that doesn't fit the others
@@ -140,8 +147,8 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
         tolerances = _tolerances(observations, adjusted, free, offsets, settings.shape)
     lenses = _lenses(observations, adjusted, free, offsets, tolerances, released)
     adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released, lenses)
-    halves = compare_halves(observations, adjusted, free, offsets, tolerances, released)
     agreement = consistency(observations, adjusted, free, offsets, tolerances, released)
+    halves = compare_halves(observations, adjusted, free, offsets, tolerances, released, agreement)
     adjusted = widened(adjusted, agreement.covariance)
     found = [*checks.warnings(observations, adjusted), *filter(None, (agreement.warning, size_warning))]
     dropped |= contradicting
@@ -222,11 +229,14 @@ def compare_halves(
     offsets: Array,
     tolerances: Tolerances | None = None,
     released: bool = False,
+    agreement: Consistency | None = None,
 ) -> Array:
     """Calibrate every other pose, and the rest, and compare : (g,) differences over their predicted standard deviation.
 
-    Standard normal if the predicted covariance is honest. What both halves share, as the board and what lenses usually are,
-    doesn't show. NaN if a device sees too few poses of a half.
+    Standard normal if the predicted covariance is honest. What both halves share, as the board's scale and what lenses usually
+    are, doesn't show. NaN if a device sees too few poses of a half.
+
+    agreement : of all poses, whose causes of contradictions count in the halves as well
     """
     uncertainty = adjusted.calibration.uncertainty
     assert uncertainty is not None
@@ -234,14 +244,21 @@ def compare_halves(
     if min(observations.seen[half].any(axis=1).sum(axis=0).min() for half in halves) < checks.FEWEST_POSES:
         return np.full(len(uncertainty.names), np.nan)
     alone = tolerances if released else None  # of a board as designed the tolerances are common to both halves
-    fits = []
+    tolerances = tolerances or board_shape.AS_DESIGNED
+    fits, variance = [], np.zeros(len(uncertainty.names))
     for half in halves:
         begin = Estimate(adjusted.calibration.cameras, adjusted.poses[half], adjusted.points)
-        fits.append(adjust(observations.of_poses(half), begin, free, offsets[half], alone, released, adjusted.lenses))
-    first, second = (fit.calibration for fit in fits)
-    assert first.uncertainty is not None and second.uncertainty is not None
-    variance = np.diag(first.uncertainty.covariance) + np.diag(second.uncertainty.covariance)
-    return deviation(first, second) / np.sqrt(variance)
+        seen = observations.of_poses(half)
+        fit = adjust(seen, begin, free, offsets[half], alone, released, adjusted.lenses)
+        assert fit.calibration.uncertainty is not None
+        fits.append(fit.calibration)
+        variance += np.diag(fit.calibration.uncertainty.covariance)
+        if released:
+            problem = Problem(seen, offsets[half], free, tolerances, released)
+            variance -= scale_errors(problem, fit.estimate) ** 2
+        if agreement is not None:
+            variance += np.diag(added(seen, fit, free, offsets[half], tolerances, released, agreement))
+    return deviation(*fits) / np.sqrt(variance)
 
 
 def deviation(first: Calibration, second: Calibration) -> Array:

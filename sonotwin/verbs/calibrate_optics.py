@@ -152,6 +152,9 @@ def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
         seen = shown(figures[f"projection_sigma_{devices[0]}_px"], ".4f", " px")
         yield f"uncertain   projection {seen} (1 sigma); one camera alone measures no points"
     yield f"adjust      {figures['poses']} poses, {models}; reprojection RMS {remaining} px; {seconds:.0f} s"
+    if "halves_rms_sigma" in figures:
+        rms, worst = (shown(figures[f"halves_{name}_sigma"], ".1f") for name in ("rms", "worst"))
+        yield f"halves      two halves of the poses differ by {rms} predicted sigma (RMS), at most {worst}; 1 is expected"
     yield f"board       {figures_of_merit.describe_board(result, figures)}"
     if "point_error_rms_mm" in figures:
         point, shape = (shown(figures[f"{name}_error_rms_mm"], ".4f", " mm") for name in ("point", "shape"))
