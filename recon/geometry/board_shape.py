@@ -4,9 +4,9 @@ A board is imprecise in four ways: each dot is printed off its place, the whole 
 (along x, along y, as a twist), and each dot stands out by its own. Each way has one standard deviation. The sightings of many
 poses show the deviations themselves; the standard deviations follow from these by the evidence: the probability of the sightings
 when deviations are drawn with them (empirical Bayes). Those of a flat board come out as the little that sightings can't exclude.
-A common scale leaves no trace in the sightings: it stays that of the design, and is as uncertain as aspect and shear, which do, show
-the print to be. Departures are those from a board of that scale, in the prior as in the evidence: else a smaller board, whose departures
-are smaller as well, would be the likelier one.
+A common scale leaves no trace in the sightings: it stays the design's, and is as uncertain as aspect and shear, which leave one,
+show the print to be. Departures are those from a board of that scale, in the prior as in the evidence: else a smaller board,
+whose departures are smaller as well, would be the likelier one.
 
 Source: MacKay 1992, "Bayesian interpolation" (evidence).
 """

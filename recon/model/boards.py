@@ -38,7 +38,7 @@ class AsymmetricCircles(Part):
 
 
 class SymmetricCircles(Part):
-    """Discs in a square grid. Half a turn maps it onto itself, so poses must keep to one half."""
+    """Discs in a square grid. Half a turn maps it onto itself: which way a pose shows it, its errors tell."""
 
     kind: Literal["symmetric_circles"] = "symmetric_circles"
     columns: Few

@@ -1,7 +1,7 @@
 """Joint optics calibration: from sightings of a board's points to the devices' parameters and their covariance."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -16,13 +16,20 @@ from recon.geometry.circle_projection import centre_offsets
 from recon.model.boards import BOARDS, AsymmetricCircles, Board, SymmetricCircles
 from recon.model.calibration import Calibration
 from recon.model.rig import NotNegative, Part
-from recon.optical_calibration import initial_estimate
+from recon.optical_calibration import half_turns, initial_estimate
 from recon.optical_calibration import optical_checks as checks
-from recon.optical_calibration.adjustment import Adjustment, adjust, board_information, free_parameters, lens_information
-from recon.optical_calibration.bundle import Array, Estimate
+from recon.optical_calibration.adjustment import (
+    Adjustment,
+    adjust,
+    board_information,
+    free_parameters,
+    lens_information,
+    scale_errors,
+)
+from recon.optical_calibration.bundle import Array, Estimate, Problem
 from recon.optical_calibration.distortion_selection import MODELS, TRIED, ModelName, choose
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
-from recon.optical_calibration.pose_consistency import consistency, widened
+from recon.optical_calibration.pose_consistency import Consistency, added, consistency, widened
 from recon.optical_calibration.sightings import Sighting, gather, without_scraps
 
 BAD_POSE = 5.0  # times the noise: median residual of a pose in one device that doesn't fit the others
@@ -68,6 +75,7 @@ class Result:
     board: Board
     tolerances: Tolerances  # of the board, as given or as the sightings show
     released: bool  # the board's points were adjusted
+    turned: Mapping[str, Sequence[str]] = field(default_factory=dict)  # device, or all: poses with points numbered the other way
 
     @property
     def rms(self) -> dict[str, float]:
@@ -136,6 +144,8 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
         raise InputError(f"{name}: expected the board in {len(sightings)} poses, found it in none: {_commonest(dropped)}")
     observations = gather(sightings, board, sizes)
     checks.refuse_unusable(observations, name)
+    turn = half_turns.half_turn(board)
+    observations, flipped = (observations, {}) if turn is None else half_turns.agreeing(observations, turn)
     first = initial_estimate.estimate(observations)
     checks.refuse_parallel(observations, first, name)
     seen = [sighting.radii for sighting in sightings if sighting.pixels]
@@ -146,6 +156,10 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     checks.refuse_unusable(observations, name)
     estimate, offsets = adjusted.estimate, circle_offsets(observations, adjusted.estimate, board)
     released = settings.shape.released and _determine_shape(observations)
+    if released and turn is not None:
+        observations, estimate, others = half_turns.consistent(observations, adjusted, free, offsets, turn)
+        flipped |= {"all devices": others} if others else {}
+        offsets = circle_offsets(observations, estimate, board)
     tolerances = settings.shape.tolerances
     estimate, tolerances = _shaped(observations, estimate, free, offsets, settings.shape) if released else (estimate, tolerances)
     estimate = adjust(observations, estimate, free, offsets, tolerances, released).estimate
@@ -159,12 +173,14 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
         tolerances = _tolerances(observations, adjusted, free, offsets, settings.shape)
     lenses = _lenses(observations, adjusted, free, offsets, tolerances, released)
     adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released, lenses)
-    halves = compare_halves(observations, adjusted, free, offsets, tolerances, released)
     agreement = consistency(observations, adjusted, free, offsets, tolerances, released)
+    halves = compare_halves(observations, adjusted, free, offsets, tolerances, released, agreement)
     adjusted = widened(adjusted, agreement.covariance)
     found = [*checks.warnings(observations, adjusted), *filter(None, (agreement.warning, size_warning))]
     dropped |= contradicting
-    return Result(observations, adjusted, model, scores, dropped, halves, tuple(found), offsets, board, tolerances, released)
+    return Result(
+        observations, adjusted, model, scores, dropped, halves, tuple(found), offsets, board, tolerances, released, flipped
+    )
 
 
 def _determine_shape(observations: Observations) -> bool:
@@ -239,11 +255,14 @@ def compare_halves(
     offsets: Array,
     tolerances: Tolerances | None = None,
     released: bool = False,
+    agreement: Consistency | None = None,
 ) -> Array:
     """Calibrate every other pose, and the rest, and compare : (g,) differences over their predicted standard deviation.
 
-    Standard normal if the predicted covariance is honest. What both halves share, as the board and what lenses usually are,
-    doesn't show. NaN if a device sees too few poses of a half.
+    Standard normal if the predicted covariance is honest. What both halves share, as the board's scale and what lenses usually
+    are, doesn't show. NaN if a device sees too few poses of a half.
+
+    agreement : of all poses, whose causes of contradictions count in the halves as well
     """
     uncertainty = adjusted.calibration.uncertainty
     assert uncertainty is not None
@@ -251,14 +270,21 @@ def compare_halves(
     if min(observations.seen[half].any(axis=1).sum(axis=0).min() for half in halves) < checks.FEWEST_POSES:
         return np.full(len(uncertainty.names), np.nan)
     alone = tolerances if released else None  # of a board as designed the tolerances are common to both halves
-    fits = []
+    tolerances = tolerances or board_shape.AS_DESIGNED
+    fits, variance = [], np.zeros(len(uncertainty.names))
     for half in halves:
         begin = Estimate(adjusted.calibration.cameras, adjusted.poses[half], adjusted.points)
-        fits.append(adjust(observations.of_poses(half), begin, free, offsets[half], alone, released, adjusted.lenses))
-    first, second = (fit.calibration for fit in fits)
-    assert first.uncertainty is not None and second.uncertainty is not None
-    variance = np.diag(first.uncertainty.covariance) + np.diag(second.uncertainty.covariance)
-    return deviation(first, second) / np.sqrt(variance)
+        seen = observations.of_poses(half)
+        fit = adjust(seen, begin, free, offsets[half], alone, released, adjusted.lenses)
+        assert fit.calibration.uncertainty is not None
+        fits.append(fit.calibration)
+        variance += np.diag(fit.calibration.uncertainty.covariance)
+        if released:
+            problem = Problem(seen, offsets[half], free, tolerances, released)
+            variance -= scale_errors(problem, fit.estimate) ** 2
+        if agreement is not None:
+            variance += np.diag(added(seen, fit, free, offsets[half], tolerances, released, agreement))
+    return deviation(*fits) / np.sqrt(variance)
 
 
 def deviation(first: Calibration, second: Calibration) -> Array:

@@ -78,8 +78,7 @@ def consistency(
     problem = Problem(observations, offsets, free, tolerances, released, adjusted.lenses)
     ways = bends(observations.points)
     parts = [_of_pose(problem, adjusted, p, ways) for p in range(len(observations.poses))]
-    total = sum(information for information, _, _ in parts)
-    whole = inverse(total + prior_information(problem, adjusted.estimate))
+    whole = inverse(sum(information for information, _, _ in parts) + prior_information(problem, adjusted.estimate))
     carry = whole[: len(problem.names)]
     covariances = np.array([carry @ (part - part @ whole @ part) @ carry.T for part, _, _ in parts])
     scale = 1 / np.sqrt(np.maximum(np.diag(covariances.sum(axis=0)), 1e-300))
@@ -101,10 +100,33 @@ def consistency(
     place = np.unravel_index(np.argmax(likely), likely.shape)
     bend, factor = float(BENDS_MM[place[0]]), float(FACTORS[place[1]])
     evidence = float(np.sqrt(2 * (likely.max() - likely[0].max())))  # BENDS_MM begins with none
-    moved = np.hstack([carry @ slopes for _, _, slopes in parts])
-    added = (factor - 1) * carry @ total @ carry.T + bend**2 * moved @ moved.T
-    wider = covariance + (added + added.T) / 2
+    wider = covariance + _added(parts, carry, bend, factor)
     return Consistency(scatter, bend, evidence, float(np.sqrt(factor)), _rise(observations, adjusted, wider), wider)
+
+
+def added(
+    observations: Observations,
+    adjusted: Adjustment,
+    free: Mapping[str, Sequence[str]],
+    offsets: Array,
+    tolerances: Tolerances,
+    released: bool,
+    causes: Consistency,
+) -> Array:
+    """Covariance : (g, g) that causes, found in these and other poses, add to that of an adjustment's devices."""
+    if not causes.bend_mm and causes.factor == 1:
+        return np.zeros_like(causes.covariance)
+    problem = Problem(observations, offsets, free, tolerances, released, adjusted.lenses)
+    parts = [_of_pose(problem, adjusted, p, bends(observations.points)) for p in range(len(observations.poses))]
+    whole = inverse(sum(information for information, _, _ in parts) + prior_information(problem, adjusted.estimate))
+    return _added(parts, whole[: len(problem.names)], causes.bend_mm, causes.factor**2)
+
+
+def _added(parts: Sequence[tuple[Array, Array, Array]], carry: Array, bend: float, factor: float) -> Array:
+    """Covariance : (g, g) by bends and a factor of variances, carried to the parameters from all unknowns : (g, h)."""
+    moved = np.hstack([carry @ slopes for _, _, slopes in parts])
+    found = (factor - 1) * carry @ sum(information for information, _, _ in parts) @ carry.T + bend**2 * moved @ moved.T
+    return (found + found.T) / 2
 
 
 def widened(adjusted: Adjustment, covariance: Array) -> Adjustment:

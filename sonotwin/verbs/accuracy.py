@@ -25,7 +25,7 @@ from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
 Group = Literal[
-    "optics", "surface", "reality", "calibration", "lifelike", "ultrasound", "tracking", "session", "studies", "strangers",
+    "optics", "surface", "reality", "calibration", "scale", "lifelike", "ultrasound", "tracking", "session", "studies", "strangers",
     "trust", "live",
 ]  # fmt: skip
 MODULES = {

@@ -112,7 +112,7 @@ def run(config: Config) -> None:
     seconds["seconds_adjust"] = round(perf_counter() - start, 3)
     figures = figures_of_merit.measure(result, truth)
     contradicting = {name: reason for name, reason in result.dropped.items() if name not in missed}
-    for line in (*dropped(contradicting), *describe(result, figures, seconds["seconds_adjust"])):
+    for line in (*dropped(contradicting), *turned(result), *describe(result, figures, seconds["seconds_adjust"])):
         console.print(line, markup=False)
     written = write(config, result, figures | seconds, truth)
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
@@ -133,6 +133,12 @@ def dropped(reasons: Mapping[str, str | Failure]) -> Iterator[str]:
         yield f"dropped     {name}: {reason}"
 
 
+def turned(result: Result) -> Iterator[str]:
+    """Lines: poses in which a board that maps onto itself was taken for turned."""
+    for device, poses in result.turned.items():
+        yield f"turned      {', '.join(poses)}: {device} took the board the other way round than in other poses"
+
+
 def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
     """Lines: predicted errors of points, which are what a calibration is worth; residuals of the poses; true errors; warnings."""
     devices = result.observations.devices
@@ -146,6 +152,9 @@ def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
         seen = shown(figures[f"projection_sigma_{devices[0]}_px"], ".4f", " px")
         yield f"uncertain   projection {seen} (1 sigma); one camera alone measures no points"
     yield f"adjust      {figures['poses']} poses, {models}; reprojection RMS {remaining} px; {seconds:.0f} s"
+    if "halves_rms_sigma" in figures:
+        rms, worst = (shown(figures[f"halves_{name}_sigma"], ".1f") for name in ("rms", "worst"))
+        yield f"halves      two halves of the poses differ by {rms} predicted sigma (RMS), at most {worst}; 1 is expected"
     yield f"board       {figures_of_merit.describe_board(result, figures)}"
     if "point_error_rms_mm" in figures:
         point, shape = (shown(figures[f"{name}_error_rms_mm"], ".4f", " mm") for name in ("point", "shape"))

@@ -41,8 +41,8 @@ def test_rows_are_written_and_missed_bars_told(quick, value, status, tmp_path, c
         ("real=nowhere", "accuracy: real: expected a folder of recordings, found none at nowhere"),
         (
             "only=acoustics",
-            "accuracy: only: expected 'optics', 'surface', 'reality', 'calibration', 'lifelike', 'ultrasound', 'tracking', "
-            "'session', 'studies', 'strangers', 'trust' or 'live', found 'acoustics'",
+            "accuracy: only: expected 'optics', 'surface', 'reality', 'calibration', 'scale', 'lifelike', 'ultrasound', "
+            "'tracking', 'session', 'studies', 'strangers', 'trust' or 'live', found 'acoustics'",
         ),
     ],
 )

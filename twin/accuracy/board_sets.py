@@ -10,7 +10,7 @@ import numpy as np
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
 from recon.geometry.camera_jacobian import linearise
-from recon.model.boards import AsymmetricCircles
+from recon.model.boards import AsymmetricCircles, Board, Circles, SymmetricCircles
 from recon.model.calibration import Calibration
 from recon.model.rig import Rig
 from recon.optical_calibration.board_frames import MOST_AT_ONCE
@@ -36,7 +36,7 @@ class BoardSet:
     """Observations of a board, and the truth."""
 
     sightings: tuple[Sighting, ...]  # (p,)
-    board: AsymmetricCircles  # as designed
+    board: Board  # as designed
     truth: Calibration
     poses: Array  # (p, 4, 4) world_from_board
     points: Array  # (n, 3) mm, the board as it is
@@ -85,14 +85,14 @@ def _look(shot: Mapping[int, Shot], settings: board_session.Settings, bits: Mapp
 
 def drawn(
     truth: Calibration,
-    design: AsymmetricCircles,
+    design: Board,
     poses: Array,
     noise: Mapping[str, float],
     rng: np.random.Generator,
     points: Array | None = None,
     times: float = 1.0,
 ) -> BoardSet:
-    """Simulated detections of discs, with noise of known size.
+    """Simulated detections of discs or corners, with noise of known size.
 
     Parameters
     ----------
@@ -119,7 +119,11 @@ def drawn(
             {name: pixels[p, :, d] for d, name in enumerate(exact.devices)},
             {name: exact.covariance[p, :, d] for d, name in enumerate(exact.devices)},
             exact.gradient[p],
-            {name: disc_radii(camera, pose, design) for name, camera in truth.cameras.items() if name in CAMERAS},
+            {
+                name: disc_radii(camera, pose, design)
+                for name, camera in truth.cameras.items()
+                if name in CAMERAS and isinstance(design, AsymmetricCircles | SymmetricCircles)
+            },
         )
         for p, pose in enumerate(poses)
     )
@@ -169,7 +173,7 @@ def on_board(camera: Camera, pose: Array, world: Array) -> Array:
     return linearise(camera, world, ()).by_point @ pose[:3, :2]
 
 
-def disc_radii(camera: Camera, pose: Array, design: AsymmetricCircles) -> Array:
+def disc_radii(camera: Camera, pose: Array, design: Circles) -> Array:
     """Semi-axes of the discs' images, both the radius of a circle of the same area : (n, 2) px."""
     magnified = np.abs(np.linalg.det(on_board(camera, pose, rigid.apply(pose, design.points()))))
     return np.repeat(design.diameter_mm / 2 * np.sqrt(magnified)[:, None], 2, axis=1)

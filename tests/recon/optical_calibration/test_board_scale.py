@@ -1,5 +1,7 @@
 """The board's scale is the design's, whatever the sightings show of its shape."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -50,3 +52,20 @@ def test_an_even_shrink_is_no_likelier_than_the_design(pair):
     place = found.adjustment.calibration.cameras["cam2"].camera_from_world
     assert np.linalg.norm(place[:3, 3]) == pytest.approx(BASELINE_MM, rel=3e-4)
     assert found.tolerances.stretch_mm < 0.01
+
+
+def test_half_turns_are_found_pose_by_pose(pair):
+    """A board of 9x7 corners, printed to 20 um: both cameras took poses 1 and 4 the other way, camera 2 also pose 2."""
+    rng, board = np.random.default_rng(5), Chessboard(columns=9, rows=7, square_mm=15)
+    points = board.points() + [0.02, 0.02, 0] * rng.standard_normal((63, 3))
+    seen = sightings(pair, points, 8, rng, 0.02, 0.02)
+    seen = [with_half_turns(one, (pair if k in (1, 4) else ["cam2"] if k == 2 else [])) for k, one in enumerate(seen)]
+    found = calibrate(seen, board, dict.fromkeys(pair, SIZE), Settings(distortion="radial1"))
+    assert found.turned == {"cam2": ["02"], "all devices": ["01", "04"]}
+    assert not found.dropped and max(found.rms.values()) < 0.03
+    assert found.tolerances.print_mm == pytest.approx(0.02, rel=0.2)
+
+
+def with_half_turns(sighting, devices):
+    """The same of which some devices took the last point for the first."""
+    return replace(sighting, pixels={name: at[::-1] if name in devices else at for name, at in sighting.pixels.items()})
