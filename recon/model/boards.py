@@ -3,19 +3,34 @@
 Board frame: x to the right, y down, z away from the viewer, origin at the first point. Points come in OpenCV's order, row by row.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from recon.model.lengths import BOARD_STEP
 from recon.model.rig import Part, Positive
 
 Array = NDArray[np.float64]
 Few = Annotated[int, Field(ge=2, le=100)]
 
 
-class AsymmetricCircles(Part):
+class Printed(Part):
+    """A board, by the distance of its points."""
+
+    unusual: bool = False  # a distance of points that no usual board has, such as below 0.5 mm, is meant
+
+    @model_validator(mode="after")
+    def _usual_step(self) -> Self:
+        name = next(name for name in ("spacing_mm", "square_mm") if name in type(self).model_fields)
+        fault = BOARD_STEP.fault(getattr(self, name))
+        if fault and not self.unusual:
+            raise ValueError(f"{name}: expected {BOARD_STEP}, found {fault} If it is right, give unusual=true with it")
+        return self
+
+
+class AsymmetricCircles(Printed):
     """Discs in rows that stand half a step off each other."""
 
     kind: Literal["asymmetric_circles"] = "asymmetric_circles"
@@ -31,7 +46,7 @@ class AsymmetricCircles(Part):
         return np.column_stack([2 * column + row % 2, row, np.zeros(row.size)]) * self.spacing_mm
 
 
-class SymmetricCircles(Part):
+class SymmetricCircles(Printed):
     """Discs in a square grid. Half a turn maps it onto itself, so poses must keep to one half."""
 
     kind: Literal["symmetric_circles"] = "symmetric_circles"
@@ -46,7 +61,7 @@ class SymmetricCircles(Part):
         return _grid(self.columns, self.rows, self.spacing_mm)
 
 
-class Chessboard(Part):
+class Chessboard(Printed):
     """Black and white squares."""
 
     kind: Literal["chessboard"] = "chessboard"
@@ -59,7 +74,7 @@ class Chessboard(Part):
         return _grid(self.columns, self.rows, self.square_mm)
 
 
-class Charuco(Part):
+class Charuco(Printed):
     """A chessboard with ArUco markers in its white squares: each corner is known by itself, so a part of the board is enough."""
 
     kind: Literal["charuco"] = "charuco"
