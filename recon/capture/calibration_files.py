@@ -8,9 +8,13 @@
   which device 2 is, the content doesn't say: the projector if the file's name has `proj` in it, else camera 2.
 - camera and projector of SLStudio: FileStorage XML with Kc, kc, Kp, kp, Rp, Tp (projector from camera).
 - Kalibr's camchain YAML, ROS's camera_info YAML and mrcal's cameramodel: see `recon.capture.camera_dialects`.
+
+Those in OpenCV's storage, npz and MATLAB's files may state the unit of their translations by a number `mm_per_unit`: 1000 for
+metres. Without it they are in mm, and devices that would stand apart as none do are refused.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -26,7 +30,9 @@ from recon.files.opencv_storage import Values
 from recon.geometry import rigid
 from recon.geometry.camera import ROTATION, Array, Camera
 from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
+from recon.model import lengths
 from recon.model.calibration import WORLD, Calibration, Uncertainty
+from recon.model.lengths import UNIT_KEY
 
 SCHEMA = "sonotwin-optics/1"
 SLMASTER_KEYS = ("M1", "D1", "M4", "D4", "Rlp", "Tlp", "S")
@@ -37,7 +43,7 @@ OLD_KEYS = {"distCoeffs1": "dist1", "distCoeffs2": "dist2"}  # of the authors' f
 FEW_DIGITS = 1.1e-5  # of a rotation's products, in any of the files: five decimals mostly pass
 LARGEST = 1e8  # px, of a focal length; and of any coefficient
 DIALECTS = "schema, or M1 and M4, or M1 and M2, or K1 and K2, or Kc and Kp, or a file of Kalibr, ROS or mrcal"
-OWN_KEYS = ("schema", "parameters", "covariance")  # any other is a device
+OWN_KEYS = ("schema", "parameters", "covariance", UNIT_KEY)  # any other is a device
 
 
 def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Calibration:
@@ -54,14 +60,20 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
         If the file is missing, damaged, of no known dialect, or a value is missing, not finite, or no rotation.
     """
     path = Path(path)
-    forms = dict.fromkeys(STEREO_KEYS, npz.Form("fiu"))
+    forms = dict.fromkeys(STEREO_KEYS, npz.Form("fiu")) | {UNIT_KEY: npz.Form("fiu", optional=True)}
     if path.is_file() and matlab.is_matlab(path):
-        return _stereo_pair(path, _decimal(matlab.read(path, forms, OLD_KEYS)), sizes or {})
+        arrays = _decimal(matlab.read(path, forms, OLD_KEYS))
+        return _in_mm(path, _stereo_pair(path, arrays, sizes or {}), arrays.get(UNIT_KEY))
     if (stored := camera_dialects.read(path)) is not None:
         return _of_stored(path, stored)
     values = opencv_storage.read(path, "a calibration file")
     if values is None:
-        return _stereo_pair(path, _decimal(npz.read(path, forms)), sizes or {})
+        arrays = _decimal(npz.read(path, forms))
+        return _in_mm(path, _stereo_pair(path, arrays, sizes or {}), arrays.get(UNIT_KEY))
+    return _in_mm(path, _of_storage(path, values, sizes), values.get(UNIT_KEY))
+
+
+def _of_storage(path: Path, values: Values, sizes: Mapping[str, tuple[int, int]] | None) -> Calibration:
     if "schema" in values:
         return _own(path, values)
     if "K1" in values or "K2" in values:
@@ -74,6 +86,41 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
         return _slmaster(path, _matrices(path, values, SLMASTER_KEYS), sizes or {})
     found = short(", ".join(values)) or "no keys"
     raise InputError(f"{path}: expected {DIALECTS}, found {found}")
+
+
+def _in_mm(path: Path, read: Calibration, stated: object) -> Calibration:
+    """The calibration in mm, by the unit that its file states; without one, the usual distances between devices tell another.
+
+    Raises
+    ------
+    InputError
+        If they do, or the unit is none.
+    """
+    if stated is None:
+        for name, fault in _unusual(read).items():
+            raise InputError(f"{path}: {name}: expected {lengths.DEVICES_APART} from {WORLD}, found {fault} {lengths.SAID}")
+        return read
+    unit = lengths.unit_of(path, stated)
+    if unit == 1:
+        return read
+    if read.uncertainty is not None:
+        raise InputError(f"{path}: {UNIT_KEY}: expected 1 with a covariance, which is in mm, found {unit:g}")
+    scaled = {
+        name: replace(
+            camera, camera_from_world=rigid.transform(camera.camera_from_world[:3, :3], unit * camera.camera_from_world[:3, 3])
+        )
+        for name, camera in read.cameras.items()
+    }
+    return Calibration(scaled)
+
+
+def _unusual(calibration: Calibration) -> dict[str, str]:
+    """Devices at unusual distances, and these."""
+    faults = {
+        name: lengths.shift_fault(lengths.DEVICES_APART, camera.camera_from_world[:3, 3])
+        for name, camera in calibration.cameras.items()
+    }
+    return {name: fault for name, fault in faults.items() if fault}
 
 
 def of_capture(folder: Path, given: Path | None = None) -> Calibration | None:
@@ -111,6 +158,8 @@ def write(path: Path, calibration: Calibration) -> None:
     """Write sonotwin's own format, whole or not at all. The suffix should be `.yaml`."""
     storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     storage.write("schema", SCHEMA)
+    if _unusual(calibration):
+        storage.write(UNIT_KEY, 1.0)
     for name, camera in calibration.cameras.items():
         storage.startWriteStruct(name, cv2.FileNode_MAP)
         storage.startWriteStruct("size", cv2.FileNode_SEQ | cv2.FileNode_FLOW)

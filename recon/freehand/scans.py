@@ -1,5 +1,6 @@
 """B-scans in space, of a capture or of a PLUS sequence, and the volume that they are compounded into."""
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import repeat
@@ -21,13 +22,15 @@ from recon.freehand.sequence_sweep import SequenceFields
 from recon.freehand.sequences import FrameName, FrameNames
 from recon.freehand.volume_compounding import MOST_BYTES, Clip, Compounding, Interpolation, Mask, Reconstruction, grid_of
 from recon.geometry import rigid
-from recon.model import fan, tracks
+from recon.model import fan, lengths, tracks
 from recon.model.fan import Fan
 from recon.model.pose_checks import Implausible
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration, Speed, SpeedSigma
 from recon.model.rig import NotNegative
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Extent = Literal["aligned", "principal"]
@@ -252,6 +255,38 @@ def cautions(scans: Scans) -> Iterator[str]:
     """Lines of warning about where results lie; none as a rule."""
     if scans.elsewhere:
         yield "3D Slicer shows the sequence where its transforms to RAS put it, and these results elsewhere: give reference=LPS"
+
+
+def size_faults(scans: Scans, clip: Clip | None = None) -> list[str]:
+    """Faults of the size of the B-scans, or of their part within a clip, and of their axes; none as a rule."""
+    placed = scans.world_from_pixel[np.isfinite(scans.world_from_pixel).all(axis=(1, 2))]
+    if not len(placed):
+        return []
+    left, right, top, bottom = (clip or Clip(0, 0, scans.shape[1], scans.shape[0])).bounds(scans.shape)
+    pixel_mm = np.median(np.linalg.norm(placed[:, :3, :2], axis=1), axis=0)
+    sides = pixel_mm * [right - left + 1, bottom - top + 1]
+    faults = []
+    wrong = [fault for side in sides.tolist() if (fault := lengths.B_SCAN.fault(side))]
+    if wrong:
+        cause = ", pixels of 1 mm: the identity in place of the probe's calibration?" if np.abs(pixel_mm - 1).max() < 1e-6 else ""
+        faults.append(f"sides of {lengths.B_SCAN}, found {wrong[0]}{cause}")
+    if found := lengths.axes_fault(placed[0]):
+        faults.append(f"square axes, found {found}")
+    return faults
+
+
+def check_size(scans: Scans, place: str, clip: Clip | None, implausible: Implausible) -> None:
+    """Refuse B-scans of a size or with axes that no scanner's have, or warn of them.
+
+    Raises
+    ------
+    InputError
+        If they are, and not to be taken.
+    """
+    for fault in size_faults(scans, clip):
+        if implausible == "refuse":
+            raise InputError(f"{place}: B-scans: expected {fault}; to use them all the same, give implausible=take")
+        log.warning("%s: B-scans: taken all the same, though expected were %s", place, fault)
 
 
 def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES) -> tuple[Reconstruction, Reconstruction]:

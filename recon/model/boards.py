@@ -3,12 +3,13 @@
 Board frame: x to the right, y down, z away from the viewer, origin at the first point. Points come in OpenCV's order, row by row.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from recon.model.lengths import BOARD_STEP
 from recon.model.rig import Part, Positive
 
 Array = NDArray[np.float64]
@@ -16,7 +17,21 @@ Few = Annotated[int, Field(ge=2, le=100)]
 TAGS = 587  # of AprilTag's family 36h11
 
 
-class AsymmetricCircles(Part):
+class Printed(Part):
+    """A board, by the distance of its points."""
+
+    unusual: bool = False  # a distance of points that no usual board has, such as below 0.5 mm, is meant
+
+    @model_validator(mode="after")
+    def _usual_step(self) -> Self:
+        name = next(name for name in ("spacing_mm", "square_mm", "tag_mm") if name in type(self).model_fields)
+        fault = BOARD_STEP.fault(getattr(self, name))
+        if fault and not self.unusual:
+            raise ValueError(f"{name}: expected {BOARD_STEP}, found {fault} If it is right, give unusual=true with it")
+        return self
+
+
+class AsymmetricCircles(Printed):
     """Discs in rows that stand half a step off each other."""
 
     kind: Literal["asymmetric_circles"] = "asymmetric_circles"
@@ -37,7 +52,7 @@ class AsymmetricCircles(Part):
         return self.diameter_mm / 2
 
 
-class SymmetricCircles(Part):
+class SymmetricCircles(Printed):
     """Discs in a square grid. Half a turn maps it onto itself: which way a pose shows it, its errors tell."""
 
     kind: Literal["symmetric_circles"] = "symmetric_circles"
@@ -57,7 +72,7 @@ class SymmetricCircles(Part):
         return self.diameter_mm / 2
 
 
-class Chessboard(Part):
+class Chessboard(Printed):
     """Black and white squares."""
 
     kind: Literal["chessboard"] = "chessboard"
@@ -75,7 +90,7 @@ class Chessboard(Part):
         return self.square_mm
 
 
-class Charuco(Part):
+class Charuco(Printed):
     """A chessboard with ArUco markers in its white squares: each corner is known by itself, so a part of the board is enough."""
 
     kind: Literal["charuco"] = "charuco"
@@ -102,7 +117,7 @@ class Charuco(Part):
         return self.square_mm
 
 
-class AprilGrid(Part):
+class AprilGrid(Printed):
     """Kalibr's grid of AprilTags 36h11, black squares between their corners: each corner is known by itself, as of `Charuco`.
 
     Tags are numbered row by row from the lower left one, 0, as Kalibr prints them.

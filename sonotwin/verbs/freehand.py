@@ -98,6 +98,7 @@ def run(config: Config) -> None:
     elif plus is not None and config.fan is None and settings.fan is not None:
         console.print(f"fan         of {config.config}, {settings.fan}; all of each B-scan by fan=none", markup=False)
 
+    freehand_scans.check_size(scans, str(config.capture or config.sequence), settings.part(scans.shape)[0], config.implausible)
     start = perf_counter()
     with console.status("putting B-scans into the volume"):
         pasted, filled = freehand_scans.volume(scans, settings, int(config.most_gib * 2**30))

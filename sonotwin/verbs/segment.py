@@ -100,6 +100,7 @@ def run(config: Config) -> None:
     atomic.check_folder(config.out, "segment", inputs=inputs)
     skin = None if config.surface is None else containment.read_skin(config.surface)
     scans = read(config)
+    freehand_scans.check_size(scans, str(config.capture or config.sequence), None, config.implausible)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
     for line in freehand_scans.cautions(scans):
