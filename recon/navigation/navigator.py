@@ -108,7 +108,8 @@ class Navigator:
         self, number: int, pair: FramePair, found: Tracking, scan: PlacedScan | None, distances: tuple[MassDistance, ...]
     ) -> Moment:
         pose = found.pose.world_from_target if found.found else None
-        state = f"target {found.how}" if found.found else f"target not found: {found.pose.reason}"
+        beside = ", beside a second one of its design" if found.others else ""
+        state = f"target {found.how}{beside}" if found.found else f"target not found: {found.pose.reason}"
         latency = self.outlets[0].latencies.figures() if self.outlets else None
         return Moment(number, pair.exposed_ns, pose, state, scan, distances, self._troubles(), latency)
 

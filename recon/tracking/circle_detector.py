@@ -1,6 +1,13 @@
-"""Where circles may be in a frame, and which ones: the detector's answer, read."""
+"""Where circles may be in a frame, and which ones: the detector's answer, read.
 
+The network knows circles of some tenths of its image's width. So a frame of any size is seen through windows: one over the whole,
+and, where circles may be smaller, finer levels of windows that overlap by what the target takes up.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,7 +19,79 @@ Array = NDArray[np.float64]
 
 APART = 4  # px of the detector's image: of two maxima nearer than that the higher one counts
 LEAST_SCORE = 0.015
-MOST = 12  # candidates; the target needs three
+MOST = 12  # candidates of a window; the target needs three
+FRAME = (1280, 1024)  # width, height, px, of the cameras that the networks know: to these a window is scaled
+LEAST_PX = 16.0  # of the frame, of the diameter of a circle that is looked for
+SEEN_PX = 36.0  # of a window at the size of FRAME, of the smallest circle that the network finds in it
+USUAL_PX = 90.0  # and of one that it is used to
+FINER = 2.5  # most, from one level of windows to the next
+APART_OF_WINDOWS = 0.65  # of a window's size, from one to the next: the target takes up less than the rest
+AT_ONCE = 8  # windows that go through the network at once
+
+
+class Window(NamedTuple):
+    """A part of a frame, which ends beyond the frame where that has another aspect."""
+
+    left: int  # px, its first column and row
+    top: int
+    scale: float  # px of FRAME that make one of the frame
+
+    @property
+    def width(self) -> float:
+        """Width, px of the frame."""
+        return FRAME[0] / self.scale
+
+    def cut(self, frame: NDArray) -> NDArray:
+        """The part at the size of FRAME : (1024, 1280); beyond the frame its border goes on."""
+        width, height = (round(length / self.scale) for length in FRAME)
+        left, top = max(self.left, 0), max(self.top, 0)
+        part = frame[top : self.top + height, left : self.left + width]
+        size = tuple(max(round(length * self.scale), 1) for length in part.shape[::-1])
+        size = min(size[0], FRAME[0]), min(size[1], FRAME[1])
+        if size != part.shape[::-1]:
+            part = cv2.resize(part, size, interpolation=cv2.INTER_AREA if self.scale < 1 else cv2.INTER_LINEAR)
+        if size == FRAME:
+            return part
+        before = [round((first - given) * self.scale) for first, given in ((top, self.top), (left, self.left))]
+        gaps = [(gap, length - gap - own) for gap, length, own in zip(before, FRAME[::-1], part.shape, strict=True)]
+        return np.pad(part, gaps, mode="edge")
+
+    def back(self, points: Array) -> Array:
+        """Places : (n, 2) px of the frame, of those in the window at the size of FRAME."""
+        return points if self.scale == 1 and not (self.left or self.top) else self._back(points)
+
+    def _back(self, points: Array) -> Array:
+        return (points + 0.5) / self.scale - 0.5 + [self.left, self.top]
+
+
+@cache
+def levels(size: tuple[int, int]) -> tuple[tuple[Window, ...], ...]:
+    """Windows of a frame of a size, width and height in px: one over the whole, one twice as large for circles that are too large
+    for the network in that, and then ever finer ones.
+    """
+    whole = min(FRAME[0] / size[0], FRAME[1] / size[1])
+    finest = SEEN_PX / LEAST_PX
+    count = max(int(np.ceil(np.log(finest / whole) / np.log(FINER))), 0)
+    scales = [whole * (finest / whole) ** (k / count) for k in range(count + 1)] if count else [whole]
+    around = Window(-size[0] // 2, -size[1] // 2, whole / 2)
+    first, *finer = (tuple(_windows(size, scale)) for scale in scales)
+    return first, (around,), *finer
+
+
+def usual_level(windows: Sequence[Sequence[Window]], disc_px: float | None) -> int:
+    """Number of the level in which circles of a diameter, px of the frame, are as large as usual; 0 if it isn't known."""
+    if disc_px is None:
+        return 0
+    return int(np.argmin([abs(np.log(disc_px * each[0].scale / USUAL_PX)) for each in windows]))
+
+
+def _windows(size: tuple[int, int], scale: float) -> list[Window]:
+    """Windows of one scale all over a frame."""
+    across, down = (
+        np.linspace(0, max(length - of / scale, 0), 1 + int(np.ceil(max(length * scale / of - 1, 0) / APART_OF_WINDOWS)))
+        for length, of in zip(size, FRAME, strict=True)
+    )
+    return [Window(round(left), round(top), scale) for top in down.tolist() for left in across.tolist()]
 
 
 @dataclass(frozen=True)
@@ -23,12 +102,23 @@ class Candidates:
     scores: Array  # (n,) probability of a circle there
     identity: Array  # (n, 4) probabilities of c0, c1, c2, none
 
+    def apart_from(self, places: Array, near: float) -> "Candidates":
+        """Those farther than `near` (px) from all places : (m, 2)."""
+        away = np.linalg.norm(self.points[:, None] - places, axis=2).min(axis=1) > near
+        return Candidates(self.points[away], self.scores[away], self.identity[away])
 
-def detect(frames: list[NDArray], networks: Networks) -> list[Candidates]:
-    """Candidates in each frame : (h, w) of 0 to 255; all frames go through the network at once."""
-    small = np.stack([network_image(frame) for frame in frames])
-    detection, identity = networks.detect(small)
-    return [read(where, who, frame.shape) for where, who, frame in zip(detection, identity, frames, strict=True)]
+
+def detect(frames: Sequence[NDArray], windows: Sequence[Window], networks: Networks) -> list[Candidates]:
+    """Candidates in a window of each frame : (h, w) of 0 to 255, in px of the frame."""
+    found = []
+    both = list(zip(frames, windows, strict=True))
+    for first in range(0, len(both), AT_ONCE):
+        some = both[first : first + AT_ONCE]
+        detection, identity = networks.detect(np.stack([network_image(window.cut(frame)) for frame, window in some]))
+        for where, who, (_, window) in zip(detection, identity, some, strict=True):
+            seen = read(where, who, FRAME[::-1])
+            found.append(Candidates(window.back(seen.points), seen.scores, seen.identity))
+    return found
 
 
 def network_image(frame: NDArray) -> NDArray[np.float32]:

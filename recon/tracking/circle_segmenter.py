@@ -15,10 +15,12 @@ Array = NDArray[np.float64]
 
 OFFSET = 59  # px from a patch's corner to the point that it is about
 WIDEST = 105.0  # px of a disc's width that a patch holds
-COARSEST = 3  # px of the image that make one of a patch, most; no disc is wider, see identity.DISC
+NARROWEST = 40.0  # px of the patch, of a disc's width that it is sure of; smaller ones are magnified
+FINEST, COARSEST = 0.25, 12  # px of the image that make one of a patch; no disc is wider, see identity.DISC
 SIZE = (14.0, 75.0)  # px of the patch, of the semi-axes
 FLATTEST = 0.35
 AREA = (0.8, 1.15)  # of a blob to that of its ellipse
+OFF = 0.11  # of a disc's mean semi-axis, by which its ellipses may be off
 ASTRAY = 40.0  # px of the patch, from the patch's middle
 
 
@@ -27,8 +29,8 @@ class Patches:
     """Patches for the segmenter, and their places."""
 
     images: NDArray[np.float32]  # (n, 120, 120) from 0 to 1
-    corners: NDArray[np.int64]  # (n, 2) px, the first pixel in the image
-    step: int = 1  # px of the image that make one of a patch
+    corners: Array  # (n, 2) px, the first pixel in the image
+    step: float = 1  # px of the image that make one of a patch: whole ones, or a half or a quarter
 
 
 def rough_ellipses(image: NDArray, points: Array, networks: Networks, target: Target) -> Ellipses:
@@ -39,22 +41,43 @@ def rough_ellipses(image: NDArray, points: Array, networks: Networks, target: Ta
     return Ellipses(np.where(there[:, None], found.centre, np.nan), np.where(there[:, None, None], found.shape, np.nan))
 
 
-def step_for(points: Array, target: Target) -> int:
-    """Scale of patches that hold the discs, from the distances of two or three circles : (3, 2) px."""
+def step_for(points: Array, target: Target) -> float:
+    """Scale of patches that hold the discs and show them large enough, from the distances of two or three circles : (3, 2) px."""
     affine = affinity(points, target)
     scale = np.linalg.svd(affine, compute_uv=False)[0] if np.isfinite(affine).all() else stretch(points, target)
-    return int(np.clip(np.ceil(scale * target.outer_diameter_mm / WIDEST), 1, COARSEST))
+    wide = scale * target.outer_diameter_mm
+    if wide >= NARROWEST:
+        return float(np.clip(np.ceil(wide / WIDEST), 1, COARSEST))
+    return 0.5 if 2 * wide >= NARROWEST else FINEST
 
 
-def patches(image: NDArray, points: Array, step: int = 1) -> Patches:
+def patches(image: NDArray, points: Array, step: float = 1) -> Patches:
     """Patches about points : (n, 2) px; beyond the image its border goes on."""
     height, width = image.shape
-    corners = np.rint(np.nan_to_num(points)).astype(np.int64) - OFFSET * step
-    along = np.arange(PATCH * step)
-    rows = np.clip(corners[:, 1, None] + along, 0, height - 1)
-    columns = np.clip(corners[:, 0, None] + along, 0, width - 1)
+    corners = np.rint(np.nan_to_num(points)) - OFFSET * step
+    if step < 1:
+        return Patches(_magnified(image, corners, step), corners, step)
+    within = int(step)
+    along = np.arange(PATCH * within)
+    first = corners.astype(np.int64)
+    rows = np.clip(first[:, 1, None] + along, 0, height - 1)
+    columns = np.clip(first[:, 0, None] + along, 0, width - 1)
     cut = image[rows[:, :, None], columns[:, None, :]].astype(np.float32) / np.float32(255)
-    return Patches(cut.reshape(-1, PATCH, step, PATCH, step).mean(axis=(2, 4)), corners, step)
+    return Patches(cut.reshape(-1, PATCH, within, PATCH, within).mean(axis=(2, 4)), corners, step)
+
+
+def _magnified(image: NDArray, corners: Array, step: float) -> NDArray[np.float32]:
+    """Patches of which several pixels lie within one of the image, between which light is interpolated."""
+    most = np.array(image.shape[::-1]) - 1
+    places = corners[:, :, None] + (step - 1) / 2 + step * np.arange(PATCH)
+    lower = np.floor(places)
+    share = (places - lower).astype(np.float32)
+    near, far = (np.clip(lower + k, 0, most[:, None]).astype(np.int64) for k in (0, 1))
+    made = np.zeros((len(corners), PATCH, PATCH), np.float32)
+    for columns, across in ((near[:, 0], 1 - share[:, 0]), (far[:, 0], share[:, 0])):
+        for rows, down in ((near[:, 1], 1 - share[:, 1]), (far[:, 1], share[:, 1])):
+            made += down[:, :, None] * across[:, None, :] * image[rows[:, :, None], columns[:, None, :]]
+    return made / np.float32(255)
 
 
 def read(masks: NDArray, cut: Patches) -> Ellipses:

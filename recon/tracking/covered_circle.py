@@ -28,11 +28,11 @@ from recon.tracking.identity import ALIKE
 from recon.tracking.pose import APART_MM, same
 from recon.tracking.pose_fit import NAMES, Sighting, TargetPose, meet, refined
 from recon.tracking.rim_fit.sectors import STEEP
-from recon.tracking.rims import WHOLE, Known, Outlines, measure_covered
+from recon.tracking.rims import WHOLE, Known, Outlines, measure_covered, reach_px
 
 Array = NDArray[np.float64]
 
-REACH_PX = 8.0  # by which the place may be off
+REACH = 0.18  # of a disc's mean semi-axis, by which the place may be off: perspective
 REACH_AGAIN_PX = 3.0  # the same of a pose by some circles of both views
 PLACE_AGAIN_PX = 0.2  # least standard deviation of a place by such a pose: at 1 px the edge of a cable still bent a rim by 2.8 px
 BENT_AGAIN_PX = 0.3  # standard deviation that such an edge, a pixel or two beside the rim, leaves of what is found again
@@ -51,7 +51,7 @@ def completed(image: NDArray, outlines: Outlines, target: Target) -> Outlines:
     if which is None:
         return outlines
     rough = third(outlines.ellipses, which, target)
-    again = measure_covered(image, rough, REACH_PX, Known(np.inf, SHAPE), target)
+    again = measure_covered(image, rough, reach_px(rough, REACH), Known(np.inf, SHAPE), target)
     return outlines.replaced(which, again) if alike(again, outlines) else outlines
 
 

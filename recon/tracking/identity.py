@@ -21,7 +21,7 @@ from recon.tracking.pose import distances
 Array = NDArray[np.float64]
 
 TILTED = 0.36  # least ratio of scales across and along the tilt: 69 degrees
-DISC = (0.03, 0.19)  # diameter of a disc, of the image's width
+DISC = (0.027, 0.25)  # diameter of a disc, of the width of the detector's window
 UNNAMED = 1e-3  # no identity is less likely than that: a network may be wrong
 ALIKE = 0.15  # of a disc's size, by which an ellipse may differ from what the distances ask for
 KEPT = 6  # triples a view
@@ -40,8 +40,8 @@ class Triple:
         return {tuple(point) for point in self.points if np.isfinite(point).all()} <= {tuple(point) for point in other.points}
 
 
-def triples(candidates: Candidates, target: Target, width: int) -> list[Triple]:
-    """Hypotheses of the target in an image of this width (px), the likeliest first: three candidates, or two and one unseen."""
+def triples(candidates: Candidates, target: Target, width: float) -> list[Triple]:
+    """Hypotheses of the target in a window of this width (px), the likeliest first: three candidates, or two and one unseen."""
     points = np.vstack([candidates.points.reshape(-1, 2), np.full(2, np.nan)])
     scores = np.append(candidates.scores, LEAST_SCORE)
     names = np.vstack([candidates.identity[:, :3], np.full(3, 1 / 4)])
@@ -56,7 +56,7 @@ def triples(candidates: Candidates, target: Target, width: int) -> list[Triple]:
     return [Triple(points[order[k]], float(likely[k])) for k in sorted(best, key=lambda k: -likely[k])]
 
 
-def _possible(points: Array, target: Target, width: int) -> NDArray[np.bool_]:
+def _possible(points: Array, target: Target, width: float) -> NDArray[np.bool_]:
     """Whether three points : (n, 3, 2) px can be the circles, by the view's scale and tilt."""
     affine = affinity(points, target)
     scales = np.linalg.svd(affine, compute_uv=False)
@@ -64,7 +64,7 @@ def _possible(points: Array, target: Target, width: int) -> NDArray[np.bool_]:
     return (np.linalg.det(affine) < 0) & (scales[:, 1] > TILTED * scales[:, 0]) & (size > DISC[0]) & (size < DISC[1])
 
 
-def _half_possible(points: Array, target: Target, width: int) -> NDArray[np.bool_]:
+def _half_possible(points: Array, target: Target, width: float) -> NDArray[np.bool_]:
     """The same of points of which one is NaN, by the distance of the other two."""
     size = stretch(points, target) * target.outer_diameter_mm / width
     return (size > TILTED * DISC[0]) & (size < DISC[1])

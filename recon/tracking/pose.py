@@ -6,6 +6,7 @@ ellipses' shapes tell one.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,14 +81,20 @@ def _fits(views: tuple[Sighting, Sighting], target: Target, optics: Uncertainty 
         return [lost("a centre whose rays do not meet in front of the cameras")]
     if apart[both].max() > APART_MM:
         worst = int(np.where(both, apart, 0).argmax())
-        return [lost(f"rays of {NAMES[worst]} miss each other by {apart[worst]:.1f} mm: other circles, or cameras swapped")]
+        return [lost(f"rays that miss each other: of {NAMES[worst]} by {apart[worst]:.1f} mm; other circles, or cameras swapped")]
     expected, found = distances(model), distances(points)
     if np.nanmax(np.abs(found - expected)) > GROSS_MM:
         pairs = [k for k in range(3) if np.isfinite(found[k])]
-        shown = ", ".join(f"{PAIRS[k]} {found[k]:.1f} mm apart, expected {expected[k]:.1f}" for k in pairs)
-        return [lost(f"centres {shown}")]
+        shown = ", ".join(f"{PAIRS[k]} {found[k]:.1f} mm, expected {expected[k]:.1f}" for k in pairs)
+        return [lost(f"circles not as far apart as the target's: {shown}")]
     starts = [aligned(model, points)] if both.all() else _starts(views, model)
     return [refined(start, views, target, optics) for start in starts] or [lost("no pose shows three circles so")]
+
+
+def exchanged(first: Sighting, second: Sighting, target: Target, optics: Uncertainty | None = None) -> bool:
+    """Whether two views that give no pose give one as each other's: of cameras of which the frames, or names, are exchanged."""
+    crossed = replace(first, camera=second.camera), replace(second, camera=first.camera)
+    return estimate(*crossed, target, optics).found
 
 
 def allowed(sighting: Sighting, covered: NDArray[np.bool_], target: Target) -> bool:
@@ -118,11 +125,11 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
     best = int(np.argmin(total))
     off, sigma = shapes[best]
     if not _like(off, sigma, SIZES):
-        return lost(f"circles whose sizes are {100 * np.abs(off).max():.0f} % off those at their distance")
+        return lost(f"circles of other sizes than at their distance: {100 * np.abs(off).max():.0f} % off")
     rivals = [fit for k, fit in enumerate(good) if k != best and total[k] < total[best] + DISTINCT]
     if any(fit.merging for fit in (good[best], *rivals)):
         turn = np.degrees(np.sqrt(np.trace(good[best].total[:3, :3])))
-        return lost(f"views that leave the target's turn uncertain by {turn:.1f} deg", good[best].misfit)
+        return lost(f"views that leave the target's turn uncertain: by {turn:.1f} deg", good[best].misfit)
     if not all(same(good[best], rival) for rival in rivals):
         return lost("two poses that the circles seen do not tell apart")
     return good[best]

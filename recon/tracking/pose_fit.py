@@ -178,7 +178,7 @@ def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Unc
     triangle = _triangle(guess, problem)
     if not misfit < chdtri(freedom, IMPLAUSIBLE if freedom == PARAMETERS else SUSPICIOUS):
         times = np.sqrt(misfit / freedom)
-        reason = f"a misfit of {times:.0f} times the centres' uncertainty: other circles, or cameras swapped or moved"
+        reason = f"a misfit of centres: {times:.0f} times their uncertainty; other circles, or cameras swapped or moved"
         return lost(reason, misfit, triangle)
     pose = guess.world_from_target
     if not all(pose[:3, 2] @ (pose[:3, 3] - view.camera.centre) < 0 for view in views):

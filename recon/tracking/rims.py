@@ -35,6 +35,8 @@ SHRUNK = 0.3  # of the path, standard deviation of a semi-axis by clipped white;
 UNEVEN = 0.05  # of the contrast: white of a larger spread over the sectors isn't even within one
 BENT_PX = 0.1  # times that share: standard deviation of a centre by uneven white
 LARGEST_BLUR = 0.35  # of the ring's width; beyond that its dark ring is gone
+LEAST_REACH_PX = 1.5
+FARTHEST = 0.4  # of the smaller semi-axis, that a rough rim may be off
 ELSEWHERE = "not at the place that the others predict"
 
 
@@ -125,7 +127,7 @@ def measure(image: NDArray, rough: Ellipses, reach: float | Array, target: Targe
     rough : Ellipses
         n rough ellipses.
     reach : float or (n,) px
-        Largest error of the rough rims; up to a third of the smaller semi-axis.
+        Largest error of the rough rims; beyond 0.4 of the smaller semi-axis as if it were that: neighbours come into reach.
     """
     return measure_both(image, image, rough, np.zeros(len(rough.centre), bool), reach, target)
 
@@ -143,7 +145,12 @@ def measure_both(
     return _judged(fits, np.zeros((len(fits), 5)), target, middles=True)
 
 
-def measure_covered(image: NDArray, rough: Ellipses, reach: float, known: Known, target: Target) -> Outlines:
+def reach_px(rough: Ellipses, share: float) -> Array:
+    """Largest errors : (n,) px of n rough ellipses, a share of a disc's mean semi-axis: they grow with the discs."""
+    return np.maximum(share * np.trace(rough.shape, axis1=1, axis2=2) / 2, LEAST_REACH_PX)
+
+
+def measure_covered(image: NDArray, rough: Ellipses, reach: float | Array, known: Known, target: Target) -> Outlines:
     """The same for rings whose middle may be hidden, of which something is known before."""
     fits = _fitted(image, image, rough, np.zeros(len(rough.centre), bool), reach, known, target)
     return _judged(fits, known.certainty(rough.shape), target, middles=False)
@@ -160,7 +167,7 @@ def _fitted(
 ) -> NDArray:
     kind = np.uint8 if first.dtype == second.dtype == np.uint8 else np.float32
     starts, fits = np.empty(len(rough.centre), START), np.zeros(len(rough.centre), FIT)
-    starts["second"], starts["reach"] = of_second, reach
+    starts["second"], starts["reach"] = of_second, np.minimum(reach, _smaller_axis(rough) * FARTHEST)
     starts["place_sigma"], starts["shape_sigma"] = known.place_px, known.shape * np.trace(rough.shape, axis1=1, axis2=2) / 2
     starts["x"], starts["y"] = rough.centre.T
     starts["a"], starts["b"], starts["c"] = rough.shape[:, 0, 0], rough.shape[:, 0, 1], rough.shape[:, 1, 1]
@@ -168,6 +175,12 @@ def _fitted(
         fits[name] = np.nan
     fit_rims(np.ascontiguousarray(first, kind), np.ascontiguousarray(second, kind), starts, _hole(target), fits)
     return fits
+
+
+def _smaller_axis(ellipses: Ellipses) -> Array:
+    """Smaller semi-axes : (n,) px; NaN of ellipses that are none."""
+    a, b, c = ellipses.shape[:, 0, 0], ellipses.shape[:, 0, 1], ellipses.shape[:, 1, 1]
+    return (a + c) / 2 - np.hypot((a - c) / 2, b)
 
 
 def _hole(target: Target) -> float:

@@ -13,6 +13,7 @@ from recon.model import circle_layout
 from recon.model.circle_layout import LENGTHS
 from recon.model.rig import Target
 from recon.tracking.results import Step
+from recon.tracking.tracker import EXCHANGED
 
 Array = NDArray[np.float64]
 
@@ -23,6 +24,16 @@ GAP_MM = 0.06  # of the rays: 0.3 px of the rig, twice what a calibration with r
 OFF_MM = 0.02  # of a length
 ALIKE = 2.0  # times the spread from pair to pair
 BEYOND = 3.0  # times the tolerance
+CAUSES = {  # of views without the target, by a part of their reason, the first that fits
+    "^too dark": "too dark, or even",
+    "^too small": "circles of less than 16 px",
+    "^out of view": "circles out of view",
+    "blurred by": "blurred by motion or out of focus",
+    "a contrast of|an uncertainty of": "too little contrast",
+    "of its rim seen|no white middle": "circles covered, or cut off",
+    "no rim": "no rims where circles are expected",
+    r"\d of 3 circles|places like circles": "no three circles like the target's, of 16 px and more",
+}
 MEASURE = "measure it with calibrate-target"
 MOVED = "a camera was moved after its calibration, or that is of others; calibrate-optics anew"
 
@@ -35,6 +46,7 @@ def measure(steps: Sequence[Step]) -> Metrics:
     return {
         "frames": len(steps),
         "frames_found": len(found),
+        "frames_with_a_second_target": sum(bool(step.others) for step in steps),
         **{f"frames_{way}": sum(step.how == way for step in found) for way in WAYS},
         "sigma_median_mm": float(typical[0]),
         "sigma_median_deg": float(typical[1]),
@@ -47,15 +59,26 @@ def measure(steps: Sequence[Step]) -> Metrics:
 def describe(steps: Sequence[Step], figures: Metrics) -> list[str]:
     """Lines: number of poses and reasons of missing ones, speed with the ways of finding, predicted standard deviations."""
     found, count = figures["frames_found"], figures["frames"]
+    lost = [f"lost        {line}" for line in _lost(steps)]
     missed = ", ".join(f"{kind} ({number})" for kind, number in kinds([step.reason for step in steps]))
     left = f", {count - found} not: {missed}" if found < count else ""
     ways = ", ".join(f"{figures[f'frames_{way}']} {way}" for way in WAYS if figures[f"frames_{way}"])
     return [
         f"found       {found} of {count} frames{left}",
+        *lost,
         f"speed       {figures['frames_per_s']:.1f} frames a second, in the median{f'; {ways}' if ways else ''}",
         f"sigma       {shown(figures['sigma_median_mm'], '.3f', ' mm')}, {shown(figures['sigma_median_deg'], '.3f', ' deg')}, "
         f"predicted, median; {shown(figures['shared_median_mm'], '.3f', ' mm')} by tolerances, alike in all pairs",
     ]
+
+
+def _lost(steps: Sequence[Step]) -> Iterator[str]:
+    """Lines: causes of the views that don't show the target, with their numbers, a line a camera."""
+    seen = [views_of(step.reason) for step in steps if step.reason is not None]
+    for name in ("camera 1", "camera 2"):
+        counted = Counter(views[name] for views in seen if name in views).most_common(KINDS)
+        if counted:
+            yield f"{name}: {', '.join(f'{why} ({number})' for why, number in counted)}"
 
 
 def _triangle(steps: Sequence[Step]) -> Metrics:
@@ -68,6 +91,13 @@ def _triangle(steps: Sequence[Step]) -> Metrics:
 
 def causes(steps: Sequence[Step], target: Target) -> Iterator[str]:
     """Lines: errors alike in all pairs, found or not, with the likely cause."""
+    crossed = sum(step.reason == EXCHANGED for step in steps)
+    if crossed > sum(step.found for step in steps):
+        yield (
+            f"warning     cameras exchanged? In {crossed} of {len(steps)} pairs the views show the target as each other's: "
+            "exchange the frames of cam1 and cam2, or their names in the calibration"
+        )
+    yield from _second_target(steps)
     known = [step.triangle for step in steps if step.triangle is not None]
     if len(known) < FEW:
         return
@@ -88,6 +118,19 @@ def causes(steps: Sequence[Step], target: Target) -> Iterator[str]:
         yield f"target      off its design within the tolerance, {found}: {MEASURE}, and poses get more exact"
 
 
+def _second_target(steps: Sequence[Step]) -> Iterator[str]:
+    """A line on further targets of the design, if there are any."""
+    searched = [step for step in steps if step.others is not None]
+    two = [step for step in searched if step.others]
+    if two:
+        first = next(k for k, step in enumerate(steps) if step.others)
+        yield (
+            f"warning     a second target of this design in {len(two)} of {len(searched)} pairs searched for one, first in pair "
+            f"{first}, {two[0].apart_mm:.0f} mm from the one that is followed: the surer one at first, after a loss "
+            "the nearer to the last pose; cover the other one"
+        )
+
+
 def _middle(values: Array) -> tuple[Array, Array]:
     """Medians over the first axis, and standard deviations by the median deviation."""
     middle = np.median(values, axis=0)
@@ -103,6 +146,18 @@ def kinds(reasons: Sequence[str | None]) -> list[tuple[str, int]]:
 
 def kind(reason: str) -> str:
     """A reason without its details."""
-    if reason.startswith("camera 1:"):
+    if reason.startswith("camera ") and "expected an image" not in reason:
         return "no camera sees all three circles"
-    return re.sub(r"(?<!\w)(?<!camera )\d[\d.]*", "…", re.split(r"[;:]", reason)[0])
+    return re.sub(r"^camera \d: ", "", re.split(r"[;:] (?!expected an image)", reason)[0])
+
+
+def views_of(reason: str) -> dict[str, str]:
+    """Of a pair that views give no pose of: the cause in each camera's view that doesn't show the target, by camera."""
+    parts = re.split(r"(?:^|; )(camera [12]): ", reason)
+    return {name: cause(why) for name, why in zip(parts[1::2], parts[2::2], strict=True)}
+
+
+def cause(reason: str) -> str:
+    """The cause, in a few words, that a view doesn't show three circles."""
+    told = next((words for part, words in CAUSES.items() if re.search(part, reason)), None)
+    return told or re.split(r"[;:]", reason)[0]

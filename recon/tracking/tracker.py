@@ -5,6 +5,7 @@ fails the segmenter looks at those places, and then the detector at the whole fr
 of sizes against distances, and of both views against each other; so what is wrong is not found rather than found wrongly.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from time import perf_counter
@@ -22,24 +23,31 @@ from recon.model import circle_layout
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty, in_use
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, views
+from recon.tracking.circle_detector import Window
 from recon.tracking.frames import grey
 from recon.tracking.identity import Triple
 from recon.tracking.networks import Networks
-from recon.tracking.pose import estimate, same
+from recon.tracking.pose import estimate, exchanged, same
 from recon.tracking.pose_fit import Sighting, TargetPose, lost
-from recon.tracking.rims import Outlines, measure, measure_both
+from recon.tracking.rims import Outlines, measure, measure_both, reach_px
 from recon.tracking.views import View
 
 Array = NDArray[np.float64]
 Frames = tuple[NDArray, NDArray]
+Views = tuple[View, View]
 
-REACH_PX = 8.0  # by which a prediction may be off with a known velocity
-BLIND_PX = 14.0  # and without
-ROUGH_PX = 5.0  # by which the segmenter's ellipses may be off
+FOLLOWED = 0.18  # of a disc's mean semi-axis, by which a prediction may be off with a known velocity
+BLIND = 0.31  # and without
 FORGOTTEN_S = 0.25  # after which the target may be anywhere
 FORGOTTEN_FRAMES = 4.0  # the same without times
+EXCHANGED = "cameras exchanged: as camera 2's and camera 1's these views show the target"
+GONE_S, GONE_FRAMES = 0.5, 15.0  # for which the last poses tell where it has gone
+LOOK_S, LOOK_FRAMES = 1.0, 30.0  # after which a second target is looked for again, while one is followed
+OTHERS = 4  # triples that are looked at then
+APART_DISCS = 1.0  # least distance of two targets, in circles' diameters
 NO_NETWORKS = "no networks to find it by"
 TRIALS = 10  # triples of both views that are looked at
+ALL_LEVELS = 16  # frames without the target, after which it is looked for at any size again
 
 
 @dataclass(frozen=True)
@@ -47,9 +55,10 @@ class Tracking:
     """The result of a pair of frames."""
 
     pose: TargetPose
-    views: tuple[View, View]
+    views: Views
     how: str | None = None  # "predicted", "segmented" or "detected"; None if it isn't found
-    seconds: dict[str, float] = field(default_factory=dict)  # a stage: frames, predict, segment, detect
+    seconds: dict[str, float] = field(default_factory=dict)  # a stage: frames, predict, segment, detect, look
+    others: tuple[Array, ...] | None = None  # poses of further targets of the design; None of a pair not searched for them
 
     @property
     def found(self) -> bool:
@@ -73,6 +82,10 @@ class Tracker:
     drift_px: float = DRIFT_PX  # standard deviation of principal points since the calibration; 0 of exact cameras
     board_scale: float = PRINT_SCALE  # relative, of the board that the cameras were calibrated with; 0 of an exact one
     _past: list[tuple[float, Array]] = field(default_factory=list, init=False)  # times and poses, the last one last, two at most
+    _disc_px: float | None = field(default=None, init=False)  # diameter when it was seen last
+    _last: Array | None = field(default=None, init=False)  # the last pose, however old
+    _looked: float | None = field(default=None, init=False)  # when a second target was looked for
+    _missed: int = field(default=0, init=False)  # frames since then
     _clock: float = field(default=0.0, init=False)  # counts frames that come without a time
 
     @cached_property
@@ -97,7 +110,7 @@ class Tracker:
         if self._past and 0 < now - self._past[-1][0] <= limit:
             rough = self._rough(self._predicted(now))
             if np.isfinite(rough.centre).all():
-                result = self._fitted(frames, rough, REACH_PX if len(self._past) > 1 else BLIND_PX, "predicted")
+                result = self._fitted(frames, rough, FOLLOWED if len(self._past) > 1 else BLIND, "predicted")
                 watch.stop("predict")
                 if not result.found and self.networks is not None:
                     result = self._segmented(frames, self.networks, rough, result)
@@ -107,10 +120,29 @@ class Tracker:
             watch.stop("detect")
         if result is None:
             seen = (views.nothing(NO_NETWORKS), views.nothing(NO_NETWORKS))
-            result = Tracking(lost(_unseen(seen)), seen)
+            result = Tracking(lost(views.unseen(seen)), seen)
         if result.found:
+            if self.networks is not None and self._is_due(result, now, LOOK_FRAMES if time_s is None else LOOK_S):
+                result, self._looked = self._nearest(result, self._beside(frames, self.networks, result)), now
+                watch.stop("look")
             self.remember(result.pose.world_from_target, now)
+            self._last = result.pose.world_from_target
+            self._disc_px = min(views.diameter(view.outlines.ellipses) for view in result.views)
+        else:
+            result = self._explained(result, now, GONE_FRAMES if time_s is None else GONE_S)
+        self._missed = 0 if result.found else self._missed + 1
         return replace(result, seconds=watch.seconds)
+
+    def _explained(self, result: Tracking, now: float, limit: float) -> Tracking:
+        """A result without a pose, with the reasons that the last poses know: circles that have left a view, or got too small."""
+        if not self._past or not 0 < now - self._past[-1][0] <= limit or "camera" not in str(result.pose.reason).split(":")[0]:
+            return result
+        pose = self._predicted(now)
+        seen = [views.gone(view, self._expected(k, pose), self.cameras[k].size) for k, view in enumerate(result.views)]
+        changed = seen[0], seen[1]
+        if all(new is old for new, old in zip(changed, result.views, strict=True)):
+            return result
+        return replace(result, pose=replace(result.pose, reason=views.unseen(changed)), views=changed)
 
     def remember(self, world_from_target: Array, time_s: float) -> None:
         """Take a pose as known, of a time in s, or of the frame counted so."""
@@ -119,7 +151,58 @@ class Tracker:
 
     def forget(self) -> None:
         """Clear the last poses."""
-        self._past = []
+        self._past, self._disc_px, self._missed, self._last, self._looked = [], None, 0, None, None
+
+    def _is_due(self, result: Tracking, now: float, every: float) -> bool:
+        """Whether a second target is to be looked for: in the pair after the first that shows one, then now and then, and where a
+        target that was lost is found again.
+        """
+        if result.how == "detected":
+            return self._last is not None
+        return self._looked is None or not 0 <= now - self._looked < every
+
+    def _beside(self, frames: Frames, networks: Networks, result: Tracking) -> list[Tracking]:
+        """Further targets beside the one that is found, all of them by both views."""
+        known = [view.outlines.ellipses for view in result.views]
+        wide = min(map(views.diameter, known))
+        windows = [
+            each[circle_detector.usual_level(each, wide)] for each in map(circle_detector.levels, (c.size for c in self.cameras))
+        ]
+        places = [(k, window) for k, each in enumerate(windows) for window in each]
+        seen = circle_detector.detect([frames[k] for k, _ in places], [window for _, window in places], networks)
+        choices = [
+            (k, triple)
+            for (k, window), candidates in zip(places, seen, strict=True)
+            for triple in identity.triples(candidates.apart_from(known[k].centre, wide / 2), self.target, window.width)
+            if np.isfinite(triple.points).all()
+        ]
+        found: list[Tracking] = []
+        for k, triple in sorted(choices, key=lambda choice: -choice[1].score)[:OTHERS]:
+            view = self._seen_at(frames, networks, k, triple)
+            again = self._confirmed(frames, k, view) if view.found else None
+            if again is not None and all(self._differ(again, other) for other in (result, *found)):
+                found.append(again)
+        return found
+
+    def _differ(self, one: Tracking, other: Tracking) -> bool:
+        """Whether two results are of two targets."""
+        way = one.pose.world_from_target[:3, 3] - other.pose.world_from_target[:3, 3]
+        return bool(np.linalg.norm(way) > APART_DISCS * self.target.outer_diameter_mm)
+
+    def _nearest(self, result: Tracking, others: Sequence[Tracking]) -> Tracking:
+        """Of several targets the one nearest to the last pose, else the first; the others beside it."""
+        all_of_them = [result, *others]
+        if self._last is not None:
+            last = self._last[:3, 3]
+            all_of_them.sort(key=lambda one: float(np.linalg.norm(one.pose.world_from_target[:3, 3] - last)))
+        return replace(all_of_them[0], others=tuple(one.pose.world_from_target for one in all_of_them[1:]))
+
+    def _confirmed(self, frames: Frames, k: int, view: View) -> Tracking | None:
+        """The pose by camera k's view and the other's at the circles that it predicts; None if these show none."""
+        results = [
+            self._posed((view, other) if k == 0 else (other, view), "detected") for other in self._opposite_views(frames, k, view)
+        ]
+        return min((one for one in results if one.found), key=_rank, default=None)
 
     def _frames(self, left: NDArray, right: NDArray) -> Frames:
         frames = []
@@ -154,44 +237,47 @@ class Tracker:
         return Ellipses(*ellipses_of(self.cameras[k], world_from_target, *circle_layout.circles(self.target)))
 
     def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str) -> Tracking:
-        """From six rough ellipses to the pose."""
-        outlines = measure_both(*frames, rough, np.arange(6) >= 3, reach, self.target)
+        """From six rough ellipses, off by a share of a disc at most, to the pose."""
+        outlines = measure_both(*frames, rough, np.arange(6) >= 3, reach_px(rough, reach), self.target)
         halves = [covered_circle.completed(*each, self.target) for each in zip(frames, (outlines[:3], outlines[3:]), strict=True)]
-        seen = (views.judged(halves[0], self.target), views.judged(halves[1], self.target))
+        seen = (self._judged(0, halves[0]), self._judged(1, halves[1]))
         return self._settled(frames, seen, how)
 
-    def _settled(self, frames: Frames, seen: tuple[View, View], how: str) -> Tracking:
+    def _settled(self, frames: Frames, seen: Views, how: str) -> Tracking:
         """From two views to the pose; where they give none, by a second look for circles that something covers."""
         result = self._posed(seen, how)
         if result.found:
             return result
         rims = [view.outlines for view in seen]
         for choices in covered_circle.sought_again(frames, rims, self.cameras, self.target, self.optics_in_use):
-            judged = [tuple(views.judged(outlines, self.target) for outlines in pair) for pair in choices]
+            judged = [(self._judged(0, one), self._judged(1, other)) for one, other in choices]
             found = [each for each in (self._posed((one, other), how) for one, other in judged) if each.found]
             if found:
                 best = min(found, key=_rank)
                 return best if all(same(best.pose, each.pose) for each in found) else result
         return result
 
-    def _posed(self, seen: tuple[View, View], how: str) -> Tracking:
+    def _posed(self, seen: Views, how: str) -> Tracking:
         """From two views to the pose."""
         if not (all(view.useful for view in seen) and any(view.found for view in seen)):
             each = self._unconfirmed(seen)
-            return Tracking(lost(_unseen(each)), each)
+            return Tracking(lost(views.unseen(each)), each)
         found = estimate(*self._sightings(seen), self.target, self.optics_in_use)
         if not found.found:
-            both = all(view.found for view in seen)
-            return Tracking(found, views.doubted(seen, found.reason) if both else self._unconfirmed(seen))
+            if not all(view.found for view in seen):
+                return Tracking(found, self._unconfirmed(seen))
+            if exchanged(*self._sightings(seen), self.target, self.optics_in_use):
+                found = lost(EXCHANGED)
+            return Tracking(found, views.doubted(seen, found.reason))
         if not found.used.all():
             one, other = self._expected(0, found.world_from_target), self._expected(1, found.world_from_target)
             seen = views.with_predicted(seen[0], one, found.used[0]), views.with_predicted(seen[1], other, found.used[1])
         return Tracking(found, seen, how)
 
-    def _sightings(self, seen: tuple[View, View]) -> tuple[Sighting, Sighting]:
+    def _sightings(self, seen: Views) -> tuple[Sighting, Sighting]:
         return seen[0].outlines.sighting(self.cameras[0]), seen[1].outlines.sighting(self.cameras[1])
 
-    def _unconfirmed(self, seen: tuple[View, View]) -> tuple[View, View]:
+    def _unconfirmed(self, seen: Views) -> Views:
         """Two views that don't confirm each other."""
         return views.unconfirmed(seen[0], self.cameras[0], self.target), views.unconfirmed(seen[1], self.cameras[1], self.target)
 
@@ -205,16 +291,45 @@ class Tracker:
         halves = [circle_segmenter.read(half, cut) for half, cut in zip((masks[:3], masks[3:]), cuts, strict=True)]
         if min(np.isfinite(half.centre[:, 0]).sum() for half in halves) < 2:
             return before
-        return self._fitted(frames, joined(halves), ROUGH_PX, "segmented")
+        return self._fitted(frames, joined(halves), circle_segmenter.OFF, "segmented")
 
     def _detected(self, frames: Frames, networks: Networks) -> Tracking:
-        """Search both frames; verify each pose hypothesis (P3P) of one view in the other."""
-        candidates = circle_detector.detect(list(frames), networks)
+        """Search both frames, level by level of what the detector sees of them."""
+        levels = [circle_detector.levels(camera.size) for camera in self.cameras]
+        usual = [circle_detector.usual_level(each, self._disc_px) for each in levels]
+        result, shown = None, list[tuple[bool, int]]()
+        for number in range(max(map(len, levels))):
+            windows = [each[number] if number < len(each) else () for each in levels]
+            if number and not self._at_any_size() and number not in usual:
+                continue
+            seen = self._detected_in(frames, networks, windows)
+            if isinstance(seen, Tracking):
+                return seen
+            most = sorted(map(_shown, seen), reverse=True)
+            if result is None or most > shown:
+                result, shown = self._settled(frames, seen, "detected"), most
+            if any(view.found for view in result.views) or all(view.found for view in seen):
+                return result  # its size is known, so finer levels show nothing else
+        assert result is not None  # there is a level of the whole frame
+        return result
+
+    def _at_any_size(self) -> bool:
+        """Whether the target may be of any size: now and then, as a search for small circles takes its time."""
+        return self._missed % ALL_LEVELS == (0 if self._disc_px is None else ALL_LEVELS - 1)
+
+    def _detected_in(self, frames: Frames, networks: Networks, windows: Sequence[Sequence[Window]]) -> Tracking | Views:
+        """Search windows of both frames; verify each pose hypothesis (P3P) of one view in the other.
+
+        Without a pose the views that show most of the target.
+        """
+        places = [(k, window) for k, each in enumerate(windows) for window in each]
+        seen = circle_detector.detect([frames[k] for k, _ in places], [window for _, window in places], networks)
         choices = [
             (k, triple)
-            for k, frame in enumerate(frames)
-            for triple in identity.triples(candidates[k], self.target, frame.shape[1])
+            for (k, window), candidates in zip(places, seen, strict=True)
+            for triple in identity.triples(candidates, self.target, window.width)
         ]
+        counts = [sum(len(each.points) for (k, _), each in zip(places, seen, strict=True) if k == view) for view in (0, 1)]
         likeliest: dict[int, View] = {}
         settled: dict[int, Triple] = {}
         for k, triple in sorted(choices, key=lambda choice: -choice[1].score)[:TRIALS]:
@@ -230,25 +345,30 @@ class Tracker:
                 if any(result.found for result in results):
                     return min((one for one in results if one.found), key=_rank)
                 likeliest.update((1 - k, other) for other in others if other.found)
-        first, second = (likeliest.get(k, views.nothing(_absent(each))) for k, each in enumerate(candidates))
-        return self._settled(frames, (first, second), "detected")
+        first, second = (likeliest.get(k, views.nothing(views.absent(count))) for k, count in enumerate(counts))
+        return views.in_light(first, frames[0]), views.in_light(second, frames[1])
 
     def _opposite_views(self, frames: Frames, k: int, view: View) -> list[View]:
         """Views of the other camera at the circles that each pose hypothesis of camera k's view predicts."""
         poses = pose_hypotheses.poses(self.cameras[k], view.outlines.ellipses.centre, circle_layout.circle_centres(self.target))
         expected = [self._expected(1 - k, pose) for pose in poses]
-        return [views.judged(self._view(frames, 1 - k, rough, REACH_PX), self.target) for rough in expected]
+        return [self._judged(1 - k, self._view(frames, 1 - k, rough, FOLLOWED)) for rough in expected]
 
     def _seen_at(self, frames: Frames, networks: Networks, k: int, triple: Triple) -> View:
         """View of one camera at predicted places of its three circles."""
         rough = circle_segmenter.rough_ellipses(frames[k], triple.points, networks, self.target)
-        rims = measure(frames[k], rough, ROUGH_PX, self.target)
+        rims = measure(frames[k], rough, reach_px(rough, circle_segmenter.OFF), self.target)
         rims = covered_circle.named_and_completed(frames[k], rims, self.target)
-        return views.judged(views.renamed(rims, self.target), self.target)
+        view, wide = self._judged(k, views.renamed(rims, self.target, self.cameras[k])), views.diameter(rough)
+        return replace(view, reason=views.too_small(wide)) if not view.found and wide < circle_detector.LEAST_PX else view
+
+    def _judged(self, k: int, outlines: Outlines) -> View:
+        """Camera k's view of three rims."""
+        return views.judged(outlines, self.target, self.cameras[k])
 
     def _view(self, frames: Frames, k: int, rough: Ellipses, reach: float) -> Outlines:
         """Camera k's rims, from three rough ellipses."""
-        return covered_circle.completed(frames[k], measure(frames[k], rough, reach, self.target), self.target)
+        return covered_circle.completed(frames[k], measure(frames[k], rough, reach_px(rough, reach), self.target), self.target)
 
 
 @dataclass
@@ -271,16 +391,3 @@ def _rank(result: Tracking) -> tuple[int, float]:
 def _shown(view: View) -> tuple[bool, int]:
     """To prefer the view that shows most of the target."""
     return view.found, int(view.outlines.found.sum())
-
-
-def _absent(candidates: circle_detector.Candidates) -> str:
-    count = len(candidates.points)
-    return f"{count} of 3 circles" if count < 3 else f"{count} places like circles, no three that lie like the target's"
-
-
-def _unseen(seen: tuple[View, View]) -> str:
-    """Why two views, not both with the target, give no pose."""
-    for k in (0, 1):
-        if seen[k].found:
-            return f"only camera {k + 1} sees the target; camera {2 - k}: {seen[1 - k].reason}"
-    return f"camera 1: {seen[0].reason}; camera 2: {seen[1].reason}"

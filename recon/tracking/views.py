@@ -9,11 +9,15 @@ from recon.geometry.camera import Camera
 from recon.geometry.ellipses import Ellipses
 from recon.model.rig import Target
 from recon.tracking import identity
+from recon.tracking.circle_detector import LEAST_PX
 from recon.tracking.pose import allowed
 from recon.tracking.pose_fit import NAMES
 from recon.tracking.rims import ELSEWHERE, WHOLE, Outlines
 
 Array = NDArray[np.float64]
+
+DARK_DN = 6.0  # of 255, range of grey levels below which an image shows nothing: a white of 8 is found in 95 of 100
+NEAR = 0.6  # of a disc's size, by which it differs from an affine view's where the target is as near as it is high
 
 
 @dataclass(frozen=True)
@@ -57,17 +61,25 @@ def nothing(reason: str) -> View:
     return View(outlines, reason)
 
 
-def judged(outlines: Outlines, target: Target) -> View:
-    """A view of three rims: the target if all are rings, of the sizes that their distances imply."""
+def judged(outlines: Outlines, target: Target, camera: Camera | None = None) -> View:
+    """A view of three rims: the target if all are rings, of the sizes that their distances imply.
+
+    camera : by which sizes may differ by perspective; None of a view that counts as affine.
+    """
     bad = [f"{name}: {reason}" for name, reason in zip(NAMES, outlines.reasons, strict=True) if reason is not None]
     if bad:
         return View(outlines, "; ".join(bad))
     off = identity.disagreement(outlines.ellipses, target)
     if not np.isfinite(off):
         return View(outlines, "circles of which the names are mirrored")
-    if off > identity.ALIKE:
-        return View(outlines, f"circles whose sizes are {100 * off:.0f} % off those at their distances")
+    if off > identity.ALIKE and not (camera is not None and off < NEAR and _in_perspective(outlines, camera, target)):
+        return View(outlines, f"circles of other sizes than at their distances: {100 * off:.0f} % off")
     return View(outlines)
+
+
+def _in_perspective(outlines: Outlines, camera: Camera, target: Target) -> bool:
+    """Whether some pose gives all three rims their places and shapes."""
+    return allowed(outlines.sighting(camera), outlines.seen < WHOLE, target)
 
 
 def unconfirmed(view: View, camera: Camera, target: Target) -> View:
@@ -75,6 +87,48 @@ def unconfirmed(view: View, camera: Camera, target: Target) -> View:
     if not view.found or allowed(view.outlines.sighting(camera), view.outlines.seen < WHOLE, target):
         return view
     return replace(view, reason="circles of shapes that no pose gives them")
+
+
+def gone(view: View, expected: Ellipses, size: tuple[int, int]) -> View:
+    """A view without the target, with the reason that the expected place gives: beyond the view, or too far off."""
+    if view.found:
+        return view
+    beyond = ~((expected.centre > 0) & (expected.centre < np.array(size) - 1)).all(axis=1)
+    if beyond.any():
+        return replace(view, reason=f"out of view: {', '.join(np.array(NAMES)[beyond])}")
+    wide = diameter(expected)
+    return replace(view, reason=too_small(wide)) if wide < LEAST_PX else view
+
+
+def in_light(view: View, frame: NDArray) -> View:
+    """A view, without a ring for the reason that its frame : (h, w) DN is dark, if it is."""
+    if view.outlines.found.any():
+        return view
+    low, high = np.percentile(frame[::8, ::8], (1, 99.5))
+    return nothing(f"too dark, or even: grey levels over {high - low:.0f} of 255") if high - low < DARK_DN else view
+
+
+def absent(count: int) -> str:
+    """Why a number of places like circles isn't the target."""
+    return f"{count} of 3 circles" if count < 3 else f"{count} places like circles, no three that lie like the target's"
+
+
+def too_small(wide: float) -> str:
+    """Why circles of a diameter (px) are not found."""
+    return f"too small: circles of {wide:.0f} px, expected {LEAST_PX:.0f} at least"
+
+
+def unseen(seen: tuple[View, View]) -> str:
+    """Why two views, not both with the target, give no pose."""
+    for k in (0, 1):
+        if seen[k].found:
+            return f"only camera {k + 1} sees the target; camera {2 - k}: {seen[1 - k].reason}"
+    return f"camera 1: {seen[0].reason}; camera 2: {seen[1].reason}"
+
+
+def diameter(ellipses: Ellipses) -> float:
+    """Of the smallest of some circles, px; NaN if there is none."""
+    return float(np.fmin.reduce(np.trace(ellipses.shape, axis1=1, axis2=2), initial=np.nan))
 
 
 def with_predicted(view: View, predicted: Ellipses, used: NDArray[np.bool_]) -> View:
@@ -92,6 +146,12 @@ def doubted(pair: tuple[View, View], reason: str | None) -> tuple[View, View]:
     return replace(first, reason=reason), replace(second, reason=reason)
 
 
-def renamed(outlines: Outlines, target: Target) -> Outlines:
-    """The same rims in the order of the target's geometry, if all are rings."""
-    return outlines[identity.named(outlines.ellipses, target)[0]] if outlines.found.all() else outlines
+def renamed(outlines: Outlines, target: Target, camera: Camera | None = None) -> Outlines:
+    """The same rims in the order of the target's geometry, if all are rings; close to a camera, that of a pose."""
+    if not outlines.found.all():
+        return outlines
+    order, off = identity.named(outlines.ellipses, target)
+    if camera is None or not identity.ALIKE < off < np.inf:
+        return outlines[order]
+    turned = [outlines[np.roll(order, k)] for k in range(3)]
+    return next((one for one in turned if _in_perspective(one, camera, target)), turned[0])

@@ -3,6 +3,7 @@
 Reads a capture folder with frames of both cameras (sweep/cam1, sweep/cam2) and their calibration; frames are paired by their time
 stamps. Writes into the folder `out`: poses.csv, poses with their covariance in the layout that all verbs read; frames.csv, the
 way in which each pose was found, or the reason why not; overlays/, both views side by side with the rims found; and metrics.json.
+Exit status 1 if no pair shows the target.
 Frames are read one after the other, so a film may be of any length. Results that are there already are replaced. Takes some
 seconds, the first time a minute to compile, and 20 to 60 frames a second from then on.
 
@@ -16,6 +17,7 @@ poses are given it instead:
     sonotwin freehand capture=tracked probe=probe.yaml lag_s=0.05 out=volume
 """
 
+import sys
 from pathlib import Path
 from time import perf_counter
 
@@ -41,8 +43,8 @@ class Config(MeasuredTargetFields):
     overlays: bool = True
 
 
-def run(config: Config) -> None:
-    """Read, track and write.
+def run(config: Config) -> int:
+    """Read, track and write; returns 1 if no pair shows the target.
 
     Raises
     ------
@@ -70,6 +72,10 @@ def run(config: Config) -> None:
         results.hand_on(folder, config.capture, config.out, config.calibration, config.sweep)
         written = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
+    if figures["frames_found"] == 0:
+        reason, number = track_figures.kinds([step.reason for step in steps])[0]
+        print(f"sonotwin: {film.name}: no pose in {len(steps)} pairs: {reason} ({number}); see frames.csv", file=sys.stderr)
+    return int(figures["frames_found"] == 0)
 
 
 def follow(film: Film, tracker: Tracker, pictures: Path | None, console: Console) -> list[Step]:

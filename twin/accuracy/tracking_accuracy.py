@@ -10,7 +10,7 @@ from recon.model.rig import Target
 from recon.tracking import networks as nets
 from recon.tracking import photographs
 from recon.tracking.networks import Networks
-from twin.accuracy import detection_rates, pose_accuracy, rivals
+from twin.accuracy import detection_rates, pose_accuracy, rivals, tracking_reach
 from twin.accuracy.table_rows import Measurement, Row, Setup
 
 PHOTO = "tracking_photo/cam2.png"
@@ -26,6 +26,7 @@ def measurements(setup: Setup) -> list[Measurement]:
     setup = replace(setup, rig=setup.rig.model_copy(update={"target": exact}))
     return [
         lambda: detection_rates.rows(setup, networks),
+        lambda: tracking_reach.rows(setup, networks),
         lambda: pose_accuracy.centre_rows(setup, networks),
         lambda: pose_accuracy.pose_rows(setup, networks),
         lambda: rivals.rows(setup, networks),

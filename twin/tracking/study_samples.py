@@ -43,7 +43,7 @@ def study_take(rig: Rig, ranges: DataRanges, seed: int, k: int, white_dn: float,
         present=True,
         motion=motion,
         scene_from_world=scene,
-        lighting=_lighting(pose, rng),
+        lighting=lit_from_the_front(pose, rng),
         face=CLEAN,
         white_dn=white_dn,
         gain=GAIN,
@@ -70,7 +70,7 @@ def _within(pixels: Array, size: tuple[int, int]) -> bool:
     return bool((pixels > MARGIN_PX).all() and (pixels < np.array(size) - 1 - MARGIN_PX).all())
 
 
-def _lighting(pose: Array, rng: np.random.Generator) -> Lighting:
+def lit_from_the_front(pose: Array, rng: np.random.Generator) -> Lighting:
     """Half the light from a lamp in front, half from around."""
     lamps = np.zeros((LAMPS, 5))
     lamps[:, 3] = 1

@@ -65,7 +65,7 @@ def test_a_name_that_is_no_text_is_refused_in_one_line(folder, name):
 
 def test_candidates_are_where_the_logits_are(rng):
     places = np.array([[400.0, 300.0], [520.0, 700.0], [900.0, 310.0]])
-    found = circle_detector.detect([np.zeros((1024, 1280), np.uint8)], Told([places]))[0]
+    found = circle_detector.detect([np.zeros((1024, 1280), np.uint8)], circle_detector.levels((1280, 1024))[0], Told([places]))[0]
     order = np.argmax(found.identity[:, :3], axis=1)
     assert np.abs(found.points[np.argsort(order)] - places).max() <= 2.2
     assert (found.scores > 0.5).all()
@@ -130,3 +130,23 @@ def test_depths_become_0_to_255():
         assert np.abs(grey(np.rint(ramp * levels).astype(np.uint16)) - 255 * ramp).max() < 0.2
     assert np.abs(grey(ramp) - 255 * ramp).max() < 1e-3
     assert np.abs(grey(np.full((4, 4), 300, np.uint16), bits=12) - 300 * 255 / 4095).max() < 1e-3
+
+
+@pytest.mark.parametrize("size", [(640, 480), (1280, 1024), (1920, 1080), (4000, 3000), (1024, 1280)])
+def test_each_level_of_windows_shows_all_of_a_frame(size):
+    """And each target, of 3.6 circles' height, whole in one of them, as long as the level before doesn't show it large enough."""
+    coarser, (whole, (around,), *finer) = None, circle_detector.levels(size)
+    for windows in (whole, *finer):
+        (scale,) = {window.scale for window in windows}
+        wide, high = (length / scale for length in circle_detector.FRAME)
+        largest = 3.6 * circle_detector.SEEN_PX / coarser if coarser else 0.0
+        corners = np.array([[window.left, window.top] for window in windows])
+        for place in np.stack(
+            np.meshgrid(np.linspace(0, size[0] - largest, 23), np.linspace(0, size[1] - largest, 19)), -1
+        ).reshape(-1, 2):
+            assert ((corners <= place + 1) & (place + largest <= corners + np.array([wide, high]) + 1)).all(axis=1).any()
+        coarser = scale
+    assert coarser >= circle_detector.SEEN_PX / circle_detector.LEAST_PX * 0.99
+    frame = np.add.outer(np.arange(size[1]), 2 * np.arange(size[0])) % 251
+    for window in (around, whole[0], windows[-1]):
+        assert window.cut(frame.astype(np.uint8)).shape == circle_detector.FRAME[::-1]
