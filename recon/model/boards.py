@@ -53,7 +53,7 @@ class AsymmetricCircles(Printed):
 
 
 class SymmetricCircles(Printed):
-    """Discs in a square grid. Half a turn maps it onto itself: which way a pose shows it, its errors tell."""
+    """Discs in a square grid. Half a turn maps it onto itself; the turn of each pose follows from the errors of the print."""
 
     kind: Literal["symmetric_circles"] = "symmetric_circles"
     columns: Few

@@ -13,9 +13,10 @@ from recon import arguments
 from recon.compiled import kernel
 from recon.errors import InputError
 from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns, Uniform
-from recon.structured_light import frame_errors, gray_cells, gray_code, multi_frequency, plausibility
+from recon.structured_light import frame_errors, gray_cells, gray_code, multi_frequency, plausibility, straightening
 from recon.structured_light.gray_code import Orders
 from recon.structured_light.phase import DEFAULT_NOISE, FrameErrors, Fringe, Noise, estimate_noise, wrapped_phase
+from recon.structured_light.phase_bend import Bend
 from recon.structured_light.unwrapping import continuity, spatial
 from recon.threads import in_threads
 
@@ -61,6 +62,16 @@ class Coordinates(NamedTuple):
     status: NDArray[np.uint8]  # Status
 
 
+class Linearity(NamedTuple):
+    """Bends of phases by light that isn't linear, which fringes of three or four steps show."""
+
+    bends: tuple[Bend, ...] = ()  # measured and undone
+    unknown: tuple[Fringes, ...] = ()  # fringes that don't show theirs: too few periods, or steps of the surface all over
+
+
+LINEAR = Linearity()
+
+
 class _Shots(NamedTuple):
     """Images of a sequence, and what is known of them."""
 
@@ -86,6 +97,7 @@ class _AxisMap(NamedTuple):
     phase: Image  # rad, NaN without fringes
     lit: Mask
     counts: dict[str, int]  # for the summary
+    linearity: Linearity = LINEAR
 
 
 @dataclass(frozen=True)
@@ -104,7 +116,8 @@ class ProjectorMap:
     noise: Noise  # of one image
     summary: dict[str, int]  # pixels by status in lower case; regions, islands, disputed with a centre line
     noise_source: NoiseSource = "given"  # by the caller, measured on the fringes, or assumed, as they are too few to measure it
-    camera: str = ""  # that took the images, by its name in the calibration; nothing where it wasn't told
+    linearity: Linearity = LINEAR
+    camera: str = ""  # that took the images, by its name in the calibration; empty where it isn't known
     projector_size: tuple[int, int] | None = None  # width, height of the patterns, px
 
 
@@ -166,16 +179,18 @@ def decode(
         axis: (_from_fringes if patterns.has_fringes(axis) else _from_code)(shots, axis) for axis in patterns.axes
     }
     first, *others = (axes[axis] for axis in patterns.axes)
-    status, lit, counts = first.coordinates.status, first.lit, Counter(first.counts)
+    status, lit, counts, linearity = first.coordinates.status, first.lit, Counter(first.counts), first.linearity
     for found in others:
         counts.update(found.counts)
+        linearity = Linearity(linearity.bends + found.linearity.bends, linearity.unknown + found.linearity.unknown)
         lit = lit & found.lit
         status = np.where(status == Status.OK, found.coordinates.status, status)
     columns, rows = (axes[axis].coordinates[:2] if axis in axes else (None, None) for axis in ("columns", "rows"))
     pixels = cv2.calcHist([status], [0], None, [len(Status)], [0, len(Status)]).astype(int).ravel().tolist()
     summary = {s.name.lower(): pixels[s] for s in Status} | dict(counts)
     shown = (first.modulation, first.offset, first.phase, status, lit)
-    return ProjectorMap(columns[0], rows[0], columns[1], rows[1], *shown, noise, summary, source, camera, patterns.projector_size)
+    taken = noise, summary, source, linearity, camera, patterns.projector_size
+    return ProjectorMap(columns[0], rows[0], columns[1], rows[1], *shown, *taken)
 
 
 def _from_fringes(shots: _Shots, axis: Axis) -> _AxisMap:
@@ -187,13 +202,15 @@ def _from_fringes(shots: _Shots, axis: Axis) -> _AxisMap:
             fringe = wrapped_phase(images, part.shifts, noise=shots.noise, saturation=shots.full, errors=frames)
             plausibility.check_fringes(images, part, fringe, shots.least, shots.full, shots.where(place), place.start)
             sets.append((part, fringe))
-    part, fringe = min(sets, key=lambda pair: pair[0].pitch)
     status, lit = _quality([f for _, f in sets], shots.least)
-    orders, unreachable, counts = _orders(shots, axis, sets, status == Status.OK)
     length = shots.patterns.length(axis)
+    sets, bends, unknown = straightening.straighten(sets, status == Status.OK, length)
+    part, fringe = min(sets, key=lambda pair: pair[0].pitch)
+    orders, unreachable, counts = _orders(shots, axis, sets, status == Status.OK)
     scale = Scale(float(part.zero(length)), part.pitch, length)
     x, sigma = _coordinates(fringe, orders, unreachable, status, scale)
-    return _AxisMap(Coordinates(x, sigma, status), fringe.modulation, fringe.offset, fringe.phase, lit, counts)
+    shown = (fringe.modulation, fringe.offset, fringe.phase)
+    return _AxisMap(Coordinates(x, sigma, status), *shown, lit, counts, Linearity(bends, unknown))
 
 
 def _from_code(shots: _Shots, axis: Axis) -> _AxisMap:

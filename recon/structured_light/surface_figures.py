@@ -18,6 +18,9 @@ ADVICE = {
     Status.UNCERTAIN: "of uncertain order, near steps or in noise",
     Status.OUTSIDE: "out of the projector's image: check that the patterns are those projected",
 }
+LINEAR_LIGHT = "set projector and camera to linear, project patterns of linearise_gamma, or take 5 steps or more"
+BENT_PX = 0.05  # projector px by which phases may be bent before it is said
+FEWEST_STEPS = 3  # whose bend is that of one gamma; the same of four is that of two
 SPARSE = 1 / 3  # of the lit pixels: a warning comes first where fewer are decoded
 
 
@@ -25,6 +28,10 @@ def measure(found: ProjectorMap, raw: PointMap, cleaned: PointMap) -> Metrics:
     """Figures of a reconstruction, each named with its unit."""
     before, after = np.isfinite(raw.points[..., 0]), np.isfinite(cleaned.points[..., 0])
     points = int(after.sum())
+    bends = {
+        "bend_undone_px": max((bend.most_px for bend in found.linearity.bends), default=0.0),
+        "bend_left_px": max((bend.left_px for bend in found.linearity.bends), default=0.0),
+    }
     return {
         "points": points,
         "coverage_of_lit": points / max(int(np.count_nonzero(found.lit)), 1),
@@ -33,6 +40,7 @@ def measure(found: ProjectorMap, raw: PointMap, cleaned: PointMap) -> Metrics:
         "uncertain_px": found.summary["uncertain"],
         "saturated_fraction": found.summary["saturated"] / found.status.size,
         "modulation_median_dn": float(np.median(found.modulation[after])),
+        **(bends if found.linearity.bends else {}),
     }
 
 
@@ -49,7 +57,7 @@ def predicted_rms(mesh: trimesh.Trimesh, camera: Camera) -> float:
 
 
 def describe_decoding(patterns: Patterns, found: ProjectorMap) -> Iterator[str]:
-    """Lines: a warning of little coverage; modulation and saturation; regions, islands and uncertain pixels of the unwrapping."""
+    """Lines: a warning of little coverage; modulation and saturation; bent phases; the unwrapping."""
     height, width = found.status.shape
     if found.summary["ok"] < SPARSE * np.count_nonzero(found.lit):
         yield _warn(found)
@@ -57,12 +65,29 @@ def describe_decoding(patterns: Patterns, found: ProjectorMap) -> Iterator[str]:
     strength = np.median(lit) if lit.size else 0.0
     saturated = 100 * found.summary["saturated"] / found.status.size
     yield f"decode      {patterns.count} images, {width}x{height}, modulation {strength:.0f} DN, {saturated:.1f} % saturated"
+    yield from _bent(found)
     notes = [str(patterns.unwrap).replace("_", " ")]
     if "regions" in found.summary:
         regions, islands = _counted(found.summary["regions"], "region"), _counted(found.summary["islands"], "island")
         notes.append(f"{regions}, {islands} left out ({found.summary['unreachable']} px)")
     notes.append(f"{found.summary['uncertain']} px uncertain")
     yield f"unwrap      {', '.join(notes)}"
+
+
+def _bent(found: ProjectorMap) -> Iterator[str]:
+    """Warnings of phases that light bends which isn't linear: of those that were straightened, and those that don't show it."""
+    for bend in found.linearity.bends:
+        if bend.most_px > BENT_PX:
+            law = f", it goes with level^{bend.gamma:.1f} or so" if bend.steps == FEWEST_STEPS else ""
+            yield (
+                f"linearity   light isn't linear{law}: {bend.steps} steps of {bend.pitch:g} px were bent by up to "
+                f"{bend.most_px:.2f} px, which is undone to {bend.left_px:.3f} px; {LINEAR_LIGHT}"
+            )
+    for part in found.linearity.unknown:
+        yield (
+            f"linearity   {part.steps} steps of {part.pitch:g} px would be bent by a gamma, which too few periods are seen to "
+            f"show; it isn't in sigma: {LINEAR_LIGHT}"
+        )
 
 
 def _warn(found: ProjectorMap) -> str:
