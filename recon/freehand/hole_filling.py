@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from recon.compiled import njit
 from recon.files.volumes import Volume
+from recon.freehand import plus_arithmetic
 from recon.freehand.volume_compounding import Reconstruction
 
 STICKS = np.array(  # one of each pair of opposite directions to the 26 neighbours
@@ -20,17 +21,23 @@ STICKS = np.array(  # one of each pair of opposite directions to the 26 neighbou
 MOST_VOXELS = 9  # of a stick, both ends included
 
 
-def fill_holes(reconstruction: Reconstruction, most_voxels: int = MOST_VOXELS, sticks: int = 1) -> Reconstruction:
+def fill_holes(
+    reconstruction: Reconstruction, most_voxels: int = MOST_VOXELS, sticks: int = 1, as_plus: bool = False
+) -> Reconstruction:
     """Fill empty voxels by linear interpolation along sticks.
 
     A stick is a straight line through the empty voxel, in one of 13 directions, from one filled voxel to another. The value is
     the mean, weighted by 1/length, over the `sticks` shortest ones and all as short as these. Voxels without a stick of at most
     `most_voxels` stay empty, so the volume does not grow past the scan. Filled voxels keep their values.
 
-    Source: sticks and their limit are those of the PLUS toolkit's hole filling, which weights the two ends slightly otherwise.
+    Source: sticks and their limit are those of the PLUS toolkit's hole filling, which weights the two ends slightly otherwise and
+    rounds down; with `as_plus` both are done as there.
     """
     volume = reconstruction.volume
     voxels, filled = volume.voxels.copy(), reconstruction.filled.copy()
+    if as_plus:
+        plus_arithmetic.fill(volume.voxels, reconstruction.filled, most_voxels, sticks, voxels, filled)
+        return Reconstruction(Volume(voxels, volume.origin, volume.spacing, volume.directions), filled)
     lengths = np.linalg.norm(STICKS * volume.spacing, axis=1)
     _fill(volume.voxels, reconstruction.filled, lengths, most_voxels, sticks, voxels, filled)
     return Reconstruction(Volume(voxels, volume.origin, volume.spacing, volume.directions), filled)

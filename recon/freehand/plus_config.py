@@ -13,6 +13,7 @@ from recon.files import medical_images, xml_text
 from recon.files.medical_images import fault
 from recon.freehand import scans as freehand_scans
 from recon.freehand import sequences
+from recon.freehand.plus_arithmetic import Arithmetic
 from recon.freehand.scans import VolumeSettings
 from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction
@@ -20,8 +21,9 @@ from recon.model.fan import Fan
 
 Array = NDArray[np.float64]
 
-COMPOUNDING: dict[str, Compounding] = {"MEAN": "integer_mean", "MAXIMUM": "maximum", "LATEST": "latest"}
+COMPOUNDING: dict[str, Compounding] = {"MEAN": "mean", "MAXIMUM": "maximum", "LATEST": "latest"}
 INTERPOLATION: dict[str, Interpolation] = {"NEAREST_NEIGHBOR": "nearest", "LINEAR": "linear"}
+ARITHMETIC: dict[str, Arithmetic] = {"FULL": "plus_full", "PARTIAL": "plus_partial", "NONE": "plus_none"}
 EARLIER = {"WEIGHTED_AVERAGE": "MEAN", "MAXIMUM": "MAXIMUM"}
 FAN_RADIUS_STOP = 500.0  # px, as PLUS has it where none is given
 SWITCH = {"ON": True, "TRUE": True, "OFF": False, "FALSE": False}
@@ -113,10 +115,10 @@ def _volume(path: Path, element: Element) -> VolumeSettings:
         raise fault(path, "OutputSpacing", "3 lengths above 0", repr(element.get("OutputSpacing")))
     interpolation = INTERPOLATION[_choice(path, element, "Interpolation", "NEAREST_NEIGHBOR", INTERPOLATION)]
     compounding = COMPOUNDING[_choice(path, element, "CompoundingMode", _earlier_compounding(path, element), COMPOUNDING)]
-    if interpolation == "linear" and compounding == "integer_mean":
-        compounding = "mean"  # PLUS rounds it at each pixel, to the nearest level, and its weights to 1/255
+    arithmetic = ARITHMETIC[_choice(path, element, "Optimization", "FULL", ARITHMETIC)]
     x, y, z = spacing.tolist()
-    return VolumeSettings((x, y, z), "aligned", compounding, interpolation, _clip(path, element), *_sticks(path, element))
+    holes, clip = _sticks(path, element), _clip(path, element)
+    return VolumeSettings((x, y, z), "aligned", compounding, interpolation, clip, *holes, arithmetic=arithmetic)
 
 
 def _earlier_compounding(path: Path, element: Element) -> str:

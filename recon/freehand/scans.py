@@ -18,6 +18,7 @@ from recon.files.metrics import Metrics
 from recon.files.volumes import Volume
 from recon.freehand import hole_filling, place_uncertainty, sequence_checks, sequence_sweep, sequences, volume_compounding
 from recon.freehand.place_uncertainty import PlaceErrors
+from recon.freehand.plus_arithmetic import Arithmetic
 from recon.freehand.sequence_sweep import SequenceFields
 from recon.freehand.sequences import FrameName, FrameNames
 from recon.freehand.volume_compounding import MOST_BYTES, Clip, Compounding, Interpolation, Mask, Reconstruction, grid_of
@@ -86,12 +87,13 @@ class VolumeSettings:
     hole_voxels: int = hole_filling.MOST_VOXELS  # longest stick across a hole; 0 leaves holes open
     hole_sticks: int = 1  # the shortest ones that count
     fan: Fan | None = None  # within the clip
+    arithmetic: Arithmetic = "floating"  # or that of the PLUS toolkit
 
     def part(self, shape: tuple[int, int]) -> tuple[Clip | None, Mask | None]:
         """Rectangle and pixels, of images (h, w), that are used; without a clip the rectangle about the fan."""
         if self.fan is None:
             return self.clip, None
-        mask = self.fan.mask(shape)
+        mask = self.fan.mask(shape, 0 if self.arithmetic == "plus_none" else 1)
         if not mask.any():
             raise InputError(f"fan: expected a part of an image of {shape[1]}x{shape[0]}, found {self.fan}")
         return self.clip or Clip(*fan.box(mask)), mask
@@ -314,10 +316,11 @@ def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES)
         clip,
         None if mask is None else repeat(mask),
         most_bytes=most_bytes,
+        arithmetic=settings.arithmetic,
     )
     if settings.hole_voxels == 0:
         return pasted, pasted
-    return pasted, hole_filling.fill_holes(pasted, settings.hole_voxels, settings.hole_sticks)
+    return pasted, hole_filling.fill_holes(pasted, settings.hole_voxels, settings.hole_sticks, settings.arithmetic != "floating")
 
 
 def sigma_volume(scans: Scans, volume: Volume, settings: VolumeSettings) -> Volume | None:

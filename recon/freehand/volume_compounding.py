@@ -17,16 +17,18 @@ from recon import arguments
 from recon.compiled import njit
 from recon.errors import InputError
 from recon.files.volumes import Volume
+from recon.freehand import plus_arithmetic
+from recon.freehand.plus_arithmetic import Arithmetic
 from recon.geometry import rigid
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Compounding = Literal["mean", "maximum", "latest", "integer_mean"]
+Compounding = Literal["mean", "maximum", "latest"]
 Interpolation = Literal["nearest", "linear"]
 Length = Annotated[int, Field(gt=0)]
 Rectangle = tuple[int, int, Length, Length]  # u, v, width, height of a clip, px; of a setting
 
-RULES = {"mean": 0, "maximum": 1, "latest": 2, "integer_mean": 3}
+RULES = {"mean": 0, "maximum": 1, "latest": 2}
 LEAST_WEIGHT = 0.125  # of a voxel that a pixel is the maximum or the latest of: that of all eight where it lies in their middle
 BYTES_PER_VOXEL = 10  # sum and weight in float32; the grey value, and whether it is filled
 MOST_BYTES = 4 << 30
@@ -157,6 +159,7 @@ def reconstruct(
     clip: Clip | None = None,
     masks: Iterable[Mask | None] | None = None,
     most_bytes: int = MOST_BYTES,
+    arithmetic: Arithmetic = "floating",
 ) -> Reconstruction:
     """Put B-scans into a volume.
 
@@ -169,14 +172,15 @@ def reconstruct(
     grid : Grid
         Pixels outside are left out.
     compounding
-        Rule for the pixels in a voxel: their mean, the greatest, or the latest. `integer_mean` is the running mean in whole
-        grey levels, rounded down at each pixel, of the PLUS toolkit with `nearest`: too dark by several levels, to compare.
+        Rule for the pixels in a voxel: their mean, the greatest, or the latest.
     interpolation
         A pixel counts for the nearest voxel or, by its distance, for the eight around it.
     masks : n times (h, w) bool, optional
         Pixels to take.
     most_bytes : int
         Largest memory of the volume, 10 bytes a voxel.
+    arithmetic
+        Other than floating: that of the PLUS toolkit, see `recon.freehand.plus_arithmetic`.
 
     Raises
     ------
@@ -188,16 +192,15 @@ def reconstruct(
     world_from_pixel = arguments.places_of_pixels("world_from_pixel", world_from_pixel)
     if compounding not in RULES or interpolation not in ("nearest", "linear"):
         raise ValueError(f"no compounding {compounding!r} or interpolation {interpolation!r}")
-    if compounding == "integer_mean" and interpolation == "linear":
-        raise ValueError("integer_mean counts whole pixels: nearest only")
     shape = grid.size[::-1]
     if np.prod(grid.size, dtype=float) * BYTES_PER_VOXEL > most_bytes:
         needed = np.prod(grid.size, dtype=float) * BYTES_PER_VOXEL / 2**30
         found = f"{needed:.1f} GiB for {' x '.join(map(str, grid.size))} voxels; take a larger spacing or clip"
         raise InputError(f"volume: expected at most {most_bytes / 2**30:.1f} GiB, found {found}")
-    sums = Sums(np.zeros(shape, np.float32), np.zeros(shape, np.float32))
-    voxel_from_world = np.linalg.inv(Volume(sums.value, grid.origin, grid.spacing, grid.directions).world_from_voxel)
-    paste = _paste_nearest if interpolation == "nearest" else _paste_linear
+    as_plus = arithmetic != "floating"
+    sums = None if as_plus else Sums(np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+    voxels, weight = np.zeros(shape, np.uint8), np.zeros(shape if as_plus else (0, 0, 0), np.uint16)
+    voxel_from_world = np.linalg.inv(Volume(voxels, grid.origin, grid.spacing, grid.directions).world_from_voxel)
     count = 0
     for image, mask in zip(images, masks if masks is not None else repeat(None), strict=False):
         arguments.of_kind(f"image {count}", image, np.ndarray)
@@ -211,12 +214,18 @@ def reconstruct(
                 found = f"{image.shape} of {image.dtype}, mask {taken.shape}"
                 raise InputError(f"image {count - 1}: expected height x width of uint8 and a mask like it, found {found}")
             bounds = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
-            paste(np.ascontiguousarray(image), taken, bounds, matrix, sums, RULES[compounding])
+            plain, rule, linear = np.ascontiguousarray(image), RULES[compounding], interpolation == "linear"
+            if sums is not None:
+                (_paste_linear if linear else _paste_nearest)(plain, taken, bounds, matrix, sums, rule)
+            else:
+                levels, fixed = plus_arithmetic.Levels(voxels, weight), arithmetic == "plus_full"
+                plus_arithmetic.paste(plain, taken, bounds, matrix, levels, rule, linear, fixed)
     if count < len(world_from_pixel):
         raise InputError(f"images: expected as many as poses, {len(world_from_pixel)}, found {count}")
-    voxels = np.empty(shape, np.uint8)
-    _finish(sums, compounding == "mean", voxels)
-    return Reconstruction(Volume(voxels, grid.origin, grid.spacing, grid.directions), sums.weight > 0)
+    if sums is not None:
+        _finish(sums, compounding == "mean", voxels)
+    filled = (weight if sums is None else sums.weight) > 0
+    return Reconstruction(Volume(voxels, grid.origin, grid.spacing, grid.directions), filled)
 
 
 def _grid(around: Array, spacing_mm: ArrayLike, directions: Array) -> Grid:
@@ -233,7 +242,7 @@ def _grid(around: Array, spacing_mm: ArrayLike, directions: Array) -> Grid:
 class Sums(NamedTuple):
     """Grey levels of the voxels before `_finish`, (nz, ny, nx) float32."""
 
-    value: NDArray[np.float32]  # their sum, or the greatest, latest or running mean
+    value: NDArray[np.float32]  # their sum, or the greatest or latest
     weight: NDArray[np.float32]  # of all pixels so far, 0 where there is none
 
 
@@ -289,13 +298,9 @@ def _compound(sums: Sums, k, j, i, grey, share, rule):
     elif rule == 1:
         value[k, j, i] = max(value[k, j, i], np.float32(grey))
         weight[k, j, i] = 1
-    elif rule == 2:
+    else:
         value[k, j, i] = grey
         weight[k, j, i] = 1
-    else:
-        before = int(weight[k, j, i])
-        value[k, j, i] = (int(value[k, j, i]) * before + int(grey)) // (before + 1)
-        weight[k, j, i] = before + 1
 
 
 @njit

@@ -12,6 +12,7 @@ Mask = NDArray[np.bool_]
 Numbers = tuple[float, ...]  # six
 
 STEEPEST_DEG = 89.0  # of a side
+NEARLY_PX = 2.0**-17  # as near to the border a pixel counts for one on it, as in PLUS: sides at 45 deg run through centres
 
 
 @dataclass(frozen=True)
@@ -37,17 +38,18 @@ class Fan:
         numbers = self.u, self.v, self.first_px, self.last_px, self.left_deg, self.right_deg
         return f"fan=[{','.join(f'{number:.1f}' for number in numbers)}]"
 
-    def mask(self, shape: tuple[int, int]) -> Mask:
-        """Pixels of an image (h, w) in the fan, but for one at the sides and the end, that scan conversion has blended.
+    def mask(self, shape: tuple[int, int], less_px: int = 1) -> Mask:
+        """Pixels of an image (h, w) in the fan, but for some at the sides and the end: one, that scan conversion has blended.
 
         These are the pixels that the PLUS toolkit takes, for its volumes to be compared with ours.
         """
         down = np.arange(shape[0])[:, None] - self.v
         across = np.arange(shape[1]) - self.u
         left, right = np.tan(np.deg2rad([self.left_deg, self.right_deg]))
-        within = (across >= left * down + 1) & (across <= right * down - 1) & (down > 0)
-        begun = np.abs(across) > np.sqrt(np.maximum(self.first_px**2 - down**2, 0)) - 1
-        ended = np.abs(across) > np.sqrt(np.maximum(self.last_px**2 - down**2, 0)) - 1
+        less = less_px - NEARLY_PX
+        within = (across >= left * down + less) & (across <= right * down - less) & (down > 0)
+        begun = np.abs(across) > np.sqrt(np.maximum(self.first_px**2 - down**2, 0)) - less
+        ended = np.abs(across) > np.sqrt(np.maximum(self.last_px**2 - down**2, 0)) - less
         return within & (begun | (down >= self.first_px)) & ~ended & (down <= self.last_px)
 
 

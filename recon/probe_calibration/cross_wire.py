@@ -24,6 +24,7 @@ from recon.geometry.order_statistics import NORMAL_MAD
 
 Array = NDArray[np.float64]
 
+SEVERAL = "several candidates"  # reason of images as N-wires and other phantoms of many wires give
 MATCHED_PX = (3.0, 1.5)  # along the array, in depth: smoothing before the search, somewhat narrower than a spot
 APART_PX = (25, 13)  # no second candidate within half of this
 CANDIDATES = 12  # the brightest looked at
@@ -113,7 +114,8 @@ def _spot(level: NDArray[np.float32], look: Appearance) -> Crossing:
     chosen, rivals = _first_arrival(peaks, contrasts, look.rival_db)
     if len(rivals):
         places = ", ".join(f"({u}, {v})" for u, v in (peaks[chosen], peaks[rivals[0]]))
-        return _none(f"two candidates: {places}", float(contrasts[chosen]))
+        kind = "two candidates" if len(rivals) == 1 else f"{SEVERAL}: {len(rivals) + 1} spots, such as at"
+        return _none(f"{kind}{':' if len(rivals) == 1 else ''} {places}", float(contrasts[chosen]))
     return _fitted(level, smooth, peaks[chosen], float(contrasts[chosen]), grey, look)
 
 

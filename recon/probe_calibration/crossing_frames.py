@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
-from recon.probe_calibration import point_calibration
+from recon.probe_calibration import cross_wire, point_calibration
 from recon.probe_calibration.cross_wire import Appearance, Crossing
 from recon.probe_calibration.point_calibration import MIN_FRAMES, Sightings
 
@@ -20,6 +20,9 @@ FIELDS = {  # of an appearance, by the reason of a rejection that another scanne
     "no echo stands out": "min_contrast_db",
     "two candidates": "rival_db",
 }
+ONE_CROSSING = (
+    "Of phantoms only two crossed wires are read: take such ones, or give pairs=... of one point's pixels found elsewhere"
+)
 
 
 @dataclass(frozen=True)
@@ -89,5 +92,7 @@ def refuse_few(frames: CrossingFrames) -> None:
         kind = next(iter(rejected(frames)), "no more were given")
         reason = next((each.reason for each in frames.crossings if (each.reason or "").startswith(kind)), kind)
         way = f"; another scanner? give appearance.{FIELDS[kind]}" if kind in FIELDS else ""
+        if kind == cross_wire.SEVERAL:
+            way = f"; N-wires, or other things in the water? {ONE_CROSSING}"
         expected = f"{MIN_FRAMES} frames or more with a pose and the crossing"
         raise InputError(f"{frames.name}: expected {expected}, found {len(frames.usable)} (most often: {reason}{way})")

@@ -49,6 +49,7 @@ GATE = 16.27  # squared normalised residual of an outlier; exceeded by 1 of 1000
 MEDIAN = 2.366  # of chi-square with 3 degrees of freedom
 MAX_FACTOR = 8.0  # measured over assumed noise, of frames of one point at rest
 MAX_RMS_MM = 3.0  # of their residuals, for any lever; Meza et al. 2021 have 0.423 in each coordinate
+NAMED = 5  # frames, of a refusal
 MIN_INLIERS = 0.5  # of the frames
 REACH = (0.43, 0.40)  # of the crossing from the middle, of the image's width and height: spots stay whole and clear of the face
 ROCK = 0.6  # greatest part of a tilt about the image's normal, by which wires are seen edge-on
@@ -131,6 +132,8 @@ def calibrate(
     seed: int = 0,
     ahead_mm: float = 0.0,
     ahead_sigma_mm: float = 0.0,
+    max_sigma_mm: float = probe_checks.MAX_SIGMA_MM,
+    numbers: NDArray[np.int64] | None = None,
 ) -> Adjustment:
     """Calibrate a probe from poses and pixels of one point at rest: of two wires, the midpoint between their axes.
 
@@ -152,6 +155,10 @@ def calibrate(
         Distance of the echo before the wires' axes: see `recon.probe_calibration.wires.echo_ahead`.
     ahead_sigma_mm : float
         Its standard deviation, common to all frames.
+    max_sigma_mm : float
+        Standard deviation of a pixel's place beyond which the outcome is refused.
+    numbers : (n,)
+        Of the frames, for messages; from 0 on without them.
 
     Raises
     ------
@@ -170,7 +177,7 @@ def calibrate(
         estimate, inliers, factor = _without_outliers(estimate, sightings, noise)
     rms = float(np.sqrt((_residuals(estimate, sightings.of(inliers)) ** 2).sum(axis=1).mean()))
     if factor > MAX_FACTOR or rms > MAX_RMS_MM or inliers.mean() < MIN_INLIERS:
-        _say_why(sightings, noise, rms, factor, inliers)
+        _say_why(sightings, noise, rms, factor, inliers, _farthest(estimate, sightings, numbers))
     slopes, left = _whitened(estimate, sightings, noise)
     known = np.append(np.zeros(11), [] if sightings.beside is None else APART_MM**-2)
     equations = Equations(slopes[..., : len(known)], left, PROBE, WIRE, known)
@@ -181,9 +188,11 @@ def calibrate(
     probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
     try:
         information = np.linalg.inv(whole)
-        probe_checks.information(estimate.target_from_image, estimate.scale, information, sightings.of(inliers), size)
+        used = sightings.of(inliers)
+        probe_checks.information(estimate.target_from_image, estimate.scale, information, used, size, max_sigma_mm)
     except InputError as error:
-        raise InputError(str(error) if moved is None else f"{error}; {moved.described}") from None
+        text = f"{error}; {_farthest(estimate, sightings, numbers)}"
+        raise InputError(text if moved is None else f"{text}; {moved.described}") from None
     covariance = whole[: len(NAMES), : len(NAMES)].copy()
     covariance[np.ix_(SHIFT, SHIFT)] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
@@ -384,7 +393,14 @@ def _without_outliers(start: _Estimate, sightings: Sightings, noise: Noise) -> t
     return estimate, inliers, float(factor)
 
 
-def _say_why(sightings: Sightings, noise: Noise, rms: float, factor: float, inliers: Mask) -> None:
+def _farthest(estimate: _Estimate, sightings: Sightings, numbers: NDArray[np.int64] | None) -> str:
+    """The frames whose sightings lie farthest from the others', in words."""
+    away = np.linalg.norm(_residuals(estimate, sightings), axis=1)
+    names = np.arange(len(away)) if numbers is None else numbers
+    return "farthest off: " + ", ".join(f"frame {names[k]} by {away[k]:.2g} mm" for k in np.argsort(-away)[:NAMED])
+
+
+def _say_why(sightings: Sightings, noise: Noise, rms: float, factor: float, inliers: Mask, farthest: str) -> None:
     """Refuse frames that don't show one point at rest, and name the reading of the poses under which they would."""
     distances = {}
     for meaning, poses in probe_checks.readings(sightings.poses).items():
@@ -397,4 +413,4 @@ def _say_why(sightings: Sightings, noise: Noise, rms: float, factor: float, inli
         raise InputError(f"poses: expected world_from_target, found {likely}: read so, the crossing is at rest")
     few = f"only {inliers.sum()} of {len(inliers)} that agree"
     found = few if inliers.mean() < MIN_INLIERS else f"residuals of {rms:.1f} mm (rms), {factor:.1f} times the assumed noise"
-    raise InputError(f"sightings: expected frames of one point at rest, found {found}")
+    raise InputError(f"sightings: expected frames of one point at rest, found {found}; {farthest}")

@@ -104,13 +104,17 @@ def turns(world_from_target: Array) -> tuple[Array, Array]:
     return axes, np.pad(lengths, (0, 3 - len(lengths))) / np.sqrt(len(vectors))
 
 
-def information(target_from_image: Array, scale: Array, matrix: Array, frames: _Frames, size: Size) -> None:
-    """Refuse a motion that leaves some pixel's place uncertain by more than MAX_SIGMA_MM, and name its weakest part.
+def information(
+    target_from_image: Array, scale: Array, matrix: Array, frames: _Frames, size: Size, most_mm: float = MAX_SIGMA_MM
+) -> None:
+    """Refuse a motion that leaves some pixel's place uncertain by more than some mm, and name its weakest part.
 
     Parameters
     ----------
     matrix : (12, 12)
         Normal equations by sx, sy, turn, shift, wire and the wires' distance, with the measured noise.
+    most_mm : float
+        Standard deviation in any direction.
     """
     unit = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
     values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
@@ -124,7 +128,7 @@ def information(target_from_image: Array, scale: Array, matrix: Array, frames: _
         left, lengths, _ = np.linalg.svd(moved)
         if lengths[0] > worst:
             worst, open_ = float(lengths[0]), left[:, 0]
-    if worst <= MAX_SIGMA_MM:
+    if worst <= most_mm:
         return
     axes, rms = turns(frames.poses)
     spread = frames.pixels.std(axis=0) / size
@@ -135,7 +139,7 @@ def information(target_from_image: Array, scale: Array, matrix: Array, frames: _
     }
     named = min(weak, key=lambda name: weak[name])
     found = f"{worst:.2g} mm along {_axis(open_)}: {named}" if weak[named] < 1 else f"{worst:.2g} mm: too few or too noisy frames"
-    raise InputError(f"motion: expected pixels to be placed to {MAX_SIGMA_MM:g} mm (1 sigma), found {found}")
+    raise InputError(f"motion: expected pixels to be placed to {most_mm:g} mm (1 sigma; max_sigma_mm), found {found}")
 
 
 def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -> None:

@@ -32,6 +32,7 @@ class Settings(Part):
     wire_radius_mm: NotNegative = 0.1
     wire_radius_sigma_mm: NotNegative = 0.03
     wire_speed: Annotated[float, Field(ge=300, le=10000)] = 2600.0
+    max_sigma_mm: Annotated[float, Field(gt=0, le=100)] = probe_checks.MAX_SIGMA_MM
     appearance: Appearance = Appearance()
     noise: Noise = Noise()
     seed: Annotated[int, Field(ge=0)] = 0
@@ -143,6 +144,8 @@ def calibrate(frames: CrossingFrames, design: Probe, settings: Settings, scanner
             settings.seed,
             settings.echo_ahead_mm,
             settings.echo_ahead_sigma_mm,
+            settings.max_sigma_mm,
+            frames.numbers[frames.usable],
         )
         found = replace(found, calibration=replace(found.calibration, face_row=float(face_row)))
         shown_sy = _design_sy(found.calibration, frames.size, design) if scanner_sy is None else scanner_sy

@@ -9,7 +9,7 @@ are replaced. Takes a second for a hundred B-scans, and some seconds more when i
 
     sonotwin freehand capture=outputs/sweep/capture probe=outputs/probe/probe.yaml lag_s=0.0503 out=outputs/volume
     sonotwin freehand capture=outputs/sweep/capture tissue_m_s=1450 spacing_mm=0.3 compounding=maximum out=outputs/volume
-    sonotwin freehand sequence=sweep.igs.mha config=config.xml compounding=mean out=outputs/volume
+    sonotwin freehand sequence=sweep.igs.mha config=config.xml arithmetic=floating out=outputs/volume
     sonotwin freehand sequence=sweep.igs.mha probe=outputs/probe/probe.yaml reference=Tracker lag_s=0.0503 out=outputs/volume
     sonotwin freehand sequence=abdomen.igs.mha fan=find out=outputs/volume
 """
@@ -20,7 +20,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import Field
 from rich.console import Console
 
 from recon.capture import probe_files, sweep_part
@@ -31,6 +31,7 @@ from recon.files import atomic, metrics, volumes
 from recon.files.metrics import Metrics
 from recon.freehand import hole_filling, plus_config, volume_compounding
 from recon.freehand import scans as freehand_scans
+from recon.freehand.plus_arithmetic import Arithmetic
 from recon.freehand.plus_config import PlusConfig
 from recon.freehand.scans import Extent, Scans, ScansFields, Unsure, VolumeSettings
 from recon.freehand.sequences import FrameNames
@@ -53,13 +54,8 @@ class Config(ScansFields):
     fan: Sector | None = None
     hole_voxels: Annotated[int, Field(ge=0, le=1000)] | None = None
     hole_sticks: Annotated[int, Field(ge=1, le=len(hole_filling.STICKS))] | None = None
+    arithmetic: Arithmetic | None = None
     most_gib: Annotated[float, Field(gt=0, le=1024)] = volume_compounding.MOST_BYTES / 2**30
-
-    @model_validator(mode="after")
-    def _whole_pixels(self) -> "Config":
-        if self.compounding == "integer_mean" and self.interpolation == "linear":
-            raise ValueError("interpolation: expected nearest with integer_mean, which counts whole pixels, found linear")
-        return self
 
     @property
     def given(self) -> dict[str, Any]:
@@ -122,14 +118,8 @@ def run(config: Config) -> None:
 def settings_of(config: Config, plus: PlusConfig | None) -> VolumeSettings:
     """The given settings of the volume; those of the PLUS configuration where none are given, and the usual ones else."""
     usual = VolumeSettings() if plus is None or plus.volume is None else plus.volume
-    if config.interpolation == "linear" and usual.compounding == "integer_mean":
-        usual = replace(usual, compounding="mean")  # as in a configuration that has LINEAR itself
     settings = replace(usual, **config.given)
-    settings = replace(settings, fan=None) if config.fan == "none" else settings
-    if (settings.compounding, settings.interpolation) == ("integer_mean", "linear"):
-        expected = "interpolation=nearest with integer_mean, which counts whole pixels"
-        raise InputError(f"freehand: compounding: expected {expected}, found the LINEAR of {config.config}")
-    return settings
+    return replace(settings, fan=None) if config.fan == "none" else settings
 
 
 def read(config: Config, plus: PlusConfig | None) -> tuple[SweepCapture | None, Scans]:
@@ -155,6 +145,8 @@ def describe(filled: Reconstruction, figures: Metrics, settings: VolumeSettings,
     how = f"{settings.extent}, {settings.compounding}, {settings.interpolation}"
     how += "" if config.config is None else f" by {config.config}"
     how += f" but for {', '.join(config.given)}" if config.config is not None and config.given else ""
+    if settings.arithmetic != "floating" and settings.compounding == "mean":
+        how += f", rounded at each pixel as in PLUS, darker by some levels than by arithmetic=floating ({settings.arithmetic})"
     yield f"paste       {size} voxels of {spacing} mm, {how}: {100 * figures['pasted_fraction']:.1f} % seen"
     level = metrics.shown(figures["mean_level"], ".0f")
     filling = f"{100 * figures['filled_fraction']:.1f} % after filling holes" if settings.hole_voxels else "holes stay open"

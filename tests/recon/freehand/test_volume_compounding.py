@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
+from recon.files.volumes import Volume
 from recon.freehand import volume_compounding
 from recon.freehand.volume_compounding import Clip, Grid
 from recon.geometry import rigid
@@ -93,15 +94,53 @@ def test_linear_shares_add_up_to_the_pixels(rng):
     assert (found.volume.voxels[found.filled] == 255).all()
 
 
-def test_the_mean_of_plus_is_too_dark(rng):
+@pytest.mark.parametrize("arithmetic", ["plus_full", "plus_partial"])
+def test_the_mean_of_plus_is_too_dark(arithmetic, rng):
     """Rounding down at each of 36 pixels loses some levels of the mean; the true mean is within half of one."""
     images = rng.integers(90, 111, (1, 6, 6), np.uint8)
     grid = Grid((1, 1, 1), np.zeros(3), np.full(3, 10.0), np.eye(3))
-    true, whole = (
-        volume_compounding.reconstruct(images, np.eye(4)[None] * [0.1, 0.1, 1, 1], grid, c) for c in ("mean", "integer_mean")
-    )
+    matrices = np.eye(4)[None] * [0.1, 0.1, 1, 1]
+    true = volume_compounding.reconstruct(images, matrices, grid)
+    whole = volume_compounding.reconstruct(images, matrices, grid, arithmetic=arithmetic)
     assert abs(true.volume.voxels[0, 0, 0] - images.mean()) <= 0.5
     assert images.mean() - 15 < whole.volume.voxels[0, 0, 0] < images.mean() - 2
+
+
+@pytest.mark.parametrize("arithmetic", ["plus_full", "plus_partial"])
+@pytest.mark.parametrize("compounding", ["mean", "maximum", "latest"])
+def test_shares_of_pixels_are_whole_levels_in_plus(arithmetic, compounding, rng):
+    """Slow and readable: places and shares in steps of 2^-14 or without, weights of 1/256, levels rounded at each share."""
+    matrices, images = fan(rng, 2), rng.integers(0, 256, (2, *SHAPE), np.uint8)
+    grid = volume_compounding.principal_grid(volume_compounding.corners(matrices, SHAPE), [0.8, 0.9, 0.7])
+    step = 2.0**-14 if arithmetic == "plus_full" else 0.0
+    levels, weights = np.zeros(grid.size[::-1], int), np.zeros(grid.size[::-1], int)
+    for image, matrix in zip(images, matrices, strict=True):
+        placed = np.linalg.inv(Volume(levels, grid.origin, grid.spacing, grid.directions).world_from_voxel) @ matrix
+        placed = np.rint(placed / step) * step if step else placed
+        for v, u in np.ndindex(SHAPE):
+            place = (placed @ [u, v, 0, 1])[:3]
+            first = np.floor(place + 2.0**-17).astype(int)  # PLUS's tolerance
+            if (first < 0).any() or (first + (place != first) >= grid.size).any():
+                continue
+            for corner in np.ndindex(2, 2, 2):
+                wx, wy, wz = np.where(corner, place - first, 1 - place + first)
+                share = np.floor(wx * (np.floor(wy * wz / step + 0.5) * step) / step + 0.5) * step if step else wx * wy * wz
+                if share == 0:
+                    continue
+                at = tuple((first + corner)[::-1])
+                before, known, total = levels[at], weights[at] / 256, share
+                if compounding == "mean":
+                    total = share + known
+                    mean = (share * image[v, u] + known * before) / total
+                    levels[at] = np.floor((np.rint(mean / step) * step if step else mean + 2.0**-17) + 0.5)
+                elif share >= 0.125 and (compounding == "latest" or image[v, u] > before):
+                    levels[at] = image[v, u]
+                else:
+                    continue
+                weights[at] = np.floor(total * 256 + 0.5 + 2.0**-17)
+    found = volume_compounding.reconstruct(images, matrices, grid, compounding, "linear", arithmetic=arithmetic)
+    assert np.array_equal(found.filled, weights > 0) and found.filled.sum() > 50
+    assert (found.volume.voxels == levels).all()
 
 
 def test_points_of_a_segmented_ball_lie_on_it(rng):

@@ -284,6 +284,23 @@ def test_pixels_from_another_origin_are_of_no_other_scanner(probe, frames, rng):
     assert "another scanner" not in str(raised.value)
 
 
+def test_a_refusal_names_the_worst_frames_and_its_limit_is_a_setting(probe, frames, rng):
+    """Frames known by their numbers; three of them 40 mm off, and all noisy."""
+    sightings, numbers = observe(probe, *frames, rng), np.arange(len(frames[1])) + 100
+    jump = rng.normal(0, 4.0, (len(numbers), 3))
+    jump[[4, 9, 17]] = [[40, 0, 0], [0, 40, 0], [0, 0, 40]]
+    poses = sightings.poses.copy()
+    poses[:, :3, 3] += jump
+    with pytest.raises(InputError, match="one point at rest") as raised:
+        calibrate(Sightings(poses, sightings.pixels), SIZE, NOISE, numbers=numbers)
+    assert {int(word) for word in re.findall(r"frame (\d+) by", str(raised.value))} > {104, 109, 117}
+    poses[:, :3, 3] -= 0.8 * jump
+    few = Sightings(poses[:14], sightings.pixels[:14])
+    with pytest.raises(InputError, match=r"placed to 0.05 mm \(1 sigma; max_sigma_mm\).* farthest off: frame ") as raised:
+        calibrate(few, SIZE, NOISE, max_sigma_mm=0.05)
+    assert calibrate(few, SIZE, NOISE, max_sigma_mm=50.0)
+
+
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("designed", [False, True])
 def test_a_bracket_to_any_side_is_calibrated_whatever_the_design(rig, seed, designed):

@@ -1,0 +1,218 @@
+"""B-scans put into a volume with the PLUS toolkit's arithmetic, to the last bit: to compare, and to go on with its volumes.
+
+Its volume has whole grey levels after each pixel, and weights in steps of 1/256: the mean is a running one, rounded at each
+pixel, down with the nearest voxel and to the nearest level with linear shares. So it is too dark by some levels, and shares below
+half a level change nothing. Places are of 14 binary digits with full optimization, and in floating point otherwise; a pixel whose
+eight voxels don't all lie in the volume is left out. From the 256th pixel of a voxel on, each counts one part in 256.
+
+Source: the arithmetic was followed in the source text of PLUS (vtkIGSIOPasteSliceIntoVolume, vtkIGSIOFillHolesInVolume), and its
+volumes are reproduced; this is written anew.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.compiled import njit
+
+Arithmetic = Literal["floating", "plus_full", "plus_partial", "plus_none"]  # ours, and PLUS's by its setting Optimization
+
+DIGITS = 14  # binary ones, of a place and a share
+ONE = 1 << DIGITS
+WHOLE = 256  # weight of a pixel
+FULL, MOST = 65535 - WHOLE, 65535  # weight from which on a voxel changes slowly, and the greatest
+NEARLY = 7.62939453125e-06  # 2^-17; a place in floating point that is as near below a whole number counts for it
+LEAST_SHARE = 0.125  # of a voxel that a pixel is the maximum or the latest of
+MEAN, MAXIMUM = 0, 1  # rules; LATEST else
+
+STICKS = np.array(  # x, y, z; of those as short as each other, sums are made in this order
+    [
+        *((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        *((1, 1, 0), (1, 0, 1), (0, 1, 1), (1, -1, 0), (1, 0, -1), (0, 1, -1)),
+        *((1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 1)),
+    ],
+    np.int64,
+)
+
+
+class Levels(NamedTuple):
+    """Voxels as PLUS has them."""
+
+    grey: NDArray[np.uint8]  # (nz, ny, nx)
+    weight: NDArray[np.uint16]  # 256 a pixel, 0 where there is none
+
+
+def paste(image, mask, bounds, voxel_from_pixel, levels: Levels, rule: int, linear: bool, fixed: bool) -> None:
+    """Put a B-scan : (h, w) uint8, as far as its mask and `bounds`, left, right, top and bottom, go, into the volume."""
+    if not fixed:
+        _paste_floating(image, mask, bounds, np.ascontiguousarray(voxel_from_pixel[:3]), levels, rule, linear)
+        return
+    matrix = np.rint(voxel_from_pixel[:3] * ONE).astype(np.int64)
+    _paste_fixed(image, mask, bounds, matrix, levels, rule, linear)
+
+
+@njit
+def _paste_fixed(image, mask, bounds, matrix, levels: Levels, rule, linear):
+    left, right, top, bottom = bounds
+    m, half = matrix, ONE // 2
+    for v in range(top, bottom + 1):
+        for u in range(left, right + 1):
+            if not mask[v, u]:
+                continue
+            x = m[0, 0] * u + m[0, 1] * v + m[0, 3]
+            y = m[1, 0] * u + m[1, 1] * v + m[1, 3]
+            z = m[2, 0] * u + m[2, 1] * v + m[2, 3]
+            if linear:
+                _share_fixed(levels, x, y, z, np.int64(image[v, u]), rule)
+            else:
+                _nearest(levels, (x + half) >> DIGITS, (y + half) >> DIGITS, (z + half) >> DIGITS, np.int64(image[v, u]), rule)
+
+
+@njit
+def _paste_floating(image, mask, bounds, matrix, levels: Levels, rule, linear):
+    left, right, top, bottom = bounds
+    m, half = matrix, 0.5 + NEARLY
+    for v in range(top, bottom + 1):
+        for u in range(left, right + 1):
+            if not mask[v, u]:
+                continue
+            x = m[0, 0] * u + m[0, 1] * v + m[0, 3]
+            y = m[1, 0] * u + m[1, 1] * v + m[1, 3]
+            z = m[2, 0] * u + m[2, 1] * v + m[2, 3]
+            if linear:
+                _share_floating(levels, x, y, z, np.int64(image[v, u]), rule)
+            else:
+                i, j, k = np.int64(np.floor(x + half)), np.int64(np.floor(y + half)), np.int64(np.floor(z + half))
+                _nearest(levels, i, j, k, np.int64(image[v, u]), rule)
+
+
+@njit(inline="always")
+def _nearest(levels: Levels, i, j, k, grey, rule):
+    """Count a pixel for one voxel, if that is in the volume."""
+    nz, ny, nx = levels.grey.shape
+    if not (0 <= i < nx and 0 <= j < ny and 0 <= k < nz):
+        return
+    before, weight = np.int64(levels.grey[k, j, i]), np.int64(levels.weight[k, j, i])
+    if rule == MEAN:
+        if weight <= FULL:
+            levels.grey[k, j, i] = (grey * WHOLE + before * weight) // (weight + WHOLE)
+            levels.weight[k, j, i] = min(weight + WHOLE, MOST)
+        else:
+            levels.grey[k, j, i] = np.uint8(grey * (1.0 / 256) + before * (255.0 / 256))
+        return
+    if rule != MAXIMUM or grey > before:
+        levels.grey[k, j, i] = grey
+    levels.weight[k, j, i] = WHOLE
+
+
+@njit(inline="always")
+def _share_fixed(levels: Levels, x, y, z, grey, rule):
+    """Share a pixel out to the eight voxels around it, if all of those with a share are in the volume."""
+    nz, ny, nx = levels.grey.shape
+    i, j, k = x >> DIGITS, y >> DIGITS, z >> DIGITS
+    fx, fy, fz, half = x & (ONE - 1), y & (ONE - 1), z & (ONE - 1), ONE // 2
+    if i < 0 or j < 0 or k < 0 or i + (fx > 0) >= nx or j + (fy > 0) >= ny or k + (fz > 0) >= nz:
+        return
+    for di in range(2):
+        for dj in range(2):
+            for dk in range(2):
+                wx, wy, wz = fx if di else ONE - fx, fy if dj else ONE - fy, fz if dk else ONE - fz
+                share = (wx * ((wy * wz + half) >> DIGITS) + half) >> DIGITS
+                if share == 0:
+                    continue
+                before, weight = np.int64(levels.grey[k + dk, j + dj, i + di]), np.int64(levels.weight[k + dk, j + dj, i + di])
+                if rule == MEAN:
+                    known = weight * (ONE // WHOLE)
+                    total = share + known
+                    mean = np.int64(np.rint(ONE * ((share * grey + known * before) / total)))
+                    levels.grey[k + dk, j + dj, i + di] = (mean + half) >> DIGITS
+                elif share >= ONE * LEAST_SHARE and (rule != MAXIMUM or grey > before):
+                    levels.grey[k + dk, j + dj, i + di] = grey
+                    total = share
+                else:
+                    continue
+                levels.weight[k + dk, j + dj, i + di] = min((total * WHOLE + half) >> DIGITS, MOST)
+
+
+@njit(inline="always")
+def _share_floating(levels: Levels, x, y, z, grey, rule):
+    """The same in floating point."""
+    nz, ny, nx = levels.grey.shape
+    i, j, k = np.int64(np.floor(x + NEARLY)), np.int64(np.floor(y + NEARLY)), np.int64(np.floor(z + NEARLY))
+    fx, fy, fz = x - i, y - j, z - k
+    if i < 0 or j < 0 or k < 0 or i + (fx != 0) >= nx or j + (fy != 0) >= ny or k + (fz != 0) >= nz:
+        return
+    for di in range(2):
+        for dj in range(2):
+            for dk in range(2):
+                wx, wy, wz = fx if di else 1 - fx, fy if dj else 1 - fy, fz if dk else 1 - fz
+                share = wx * (wy * wz)
+                if share == 0:
+                    continue
+                before, weight = np.int64(levels.grey[k + dk, j + dj, i + di]), np.int64(levels.weight[k + dk, j + dj, i + di])
+                if rule == MEAN:
+                    known = weight / WHOLE
+                    total = share + known
+                    mean = (share * grey + known * before) / total
+                    levels.grey[k + dk, j + dj, i + di] = np.int64(np.floor(mean + 0.5 + NEARLY))
+                elif share >= LEAST_SHARE and (rule != MAXIMUM or grey > before):
+                    levels.grey[k + dk, j + dj, i + di] = grey
+                    total = share
+                else:
+                    continue
+                levels.weight[k + dk, j + dj, i + di] = min(np.int64(np.floor(total * WHOLE + 0.5 + NEARLY)), MOST)
+
+
+@njit
+def fill(before, known, most_voxels, sticks, voxels, filled):
+    """Fill holes by sticks : as `recon.freehand.hole_filling.fill_holes`, but for whole levels, rounded down, and other weights.
+
+    A stick is longer by one than its ends are apart, and each end counts by one step more than the other's distance; spacings
+    don't count.
+    """
+    nz, ny, nx = before.shape
+    weight, grey = np.empty(len(STICKS)), np.empty(len(STICKS))
+    for k in range(nz):
+        for j in range(ny):
+            for i in range(nx):
+                if known[k, j, i]:
+                    continue
+                for s in range(len(STICKS)):
+                    di, dj, dk = STICKS[s]
+                    weight[s] = 0.0
+                    forth = _reach(known, k, j, i, dk, dj, di, most_voxels - 1)
+                    back = _reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth) if forth else 0
+                    if back:
+                        ahead = before[k + forth * dk, j + forth * dj, i + forth * di]
+                        behind = before[k - back * dk, j - back * dj, i - back * di]
+                        length = np.float64(forth + back + 1)
+                        part = (back + 1) / length
+                        grey[s] = np.floor((1.0 - part) * behind + part * ahead)
+                        weight[s] = 1.0 / (length * np.sqrt(np.float64(di * di + dj * dj + dk * dk)))
+                total, weights, used = 0.0, 0.0, 0
+                while used < sticks and weight.max() > 0:
+                    most = weight.max()
+                    for s in range(len(STICKS)):
+                        if weight[s] == most:
+                            total += grey[s] * weight[s]
+                            weights += weight[s]
+                            weight[s] = 0.0
+                            used += 1
+                voxels[k, j, i] = 0  # though a share below 1/512 may have left a level there
+                if used:
+                    voxels[k, j, i] = np.uint8(total / weights)
+                    filled[k, j, i] = True
+
+
+@njit
+def _reach(filled, k, j, i, dk, dj, di, most):
+    """Steps to the next filled voxel, 0 if there is none within `most`."""
+    nz, ny, nx = filled.shape
+    for step in range(1, most + 1):
+        k, j, i = k + dk, j + dj, i + di
+        if not (0 <= k < nz and 0 <= j < ny and 0 <= i < nx):
+            return 0
+        if filled[k, j, i]:
+            return step
+    return 0
