@@ -109,16 +109,30 @@ def _sha256(path: Path) -> str:
 
 
 def entries(folder: Path) -> set[str]:
-    """All in a folder but its list and folders that hold something: files, links, which aren't followed, and empty folders."""
+    """All in a folder but its list and folders that hold something: files, links, which aren't followed, and empty folders.
+
+    Raises
+    ------
+    OSError
+        If a folder can't be read, of which there may be more than is seen.
+    """
     found = set[str]()
-    for place, folders, files in os.walk(folder):
+    for place, folders, files in os.walk(folder, onerror=_raised):
         links = [name for name in folders if os.path.islink(os.path.join(place, name))]
         inside = PurePosixPath(Path(place).relative_to(folder).as_posix())
         found |= {str(inside / name) for name in (*files, *links)}
         if not folders and not files and inside.name:
             found.add(str(inside))
-    ours = (LIST, UNPLACED, f".{folder.name}.occupied")
-    return {name for name in found if name not in ours and not name.startswith(f".{LIST.removesuffix('json')}")}
+    return {name for name in found if not _is_mark(folder, name)}
+
+
+def _raised(error: OSError) -> None:
+    raise error
+
+
+def _is_mark(folder: Path, name: str) -> bool:
+    """Whether a name in a folder is that of its list, half of it, or a mark of a process at work there."""
+    return name in (LIST, UNPLACED, f".{folder.name}.occupied") or name.startswith(f".{LIST.removesuffix('json')}")
 
 
 def replaceable(folder: Path, by: str, amends: Collection[str] = ()) -> Files:
@@ -134,11 +148,14 @@ def replaceable(folder: Path, by: str, amends: Collection[str] = ()) -> Files:
     InputError
         If the folder is of others, or a file that would be replaced isn't as it was written, or can't stay where it is.
     """
-    files, there = read_list(folder), entries(folder)
-    if not there:
+    files, top = read_list(folder), sorted(name for name in os.listdir(folder) if not _is_mark(folder, name))
+    if not top:
         return {}
-    if not (amends and (folder / next(iter(amends))).is_file()):
-        _check_owner(folder, by, files, there)
+    amended = bool(amends) and (folder / next(iter(amends))).is_file()
+    if not amended:
+        _check_owner(folder, by, files, top[0])
+    there = entries(folder)
+    if not amended:
         for name in sorted(there & (files or {}).keys()):
             if _is_by(files, name, by) and not is_unchanged(folder / name, (files or {})[name]):
                 raise InputError(f"{folder / name}: expected it as {by} wrote it, found it changed since; {ELSEWHERE}")
@@ -152,12 +169,12 @@ def replaceable(folder: Path, by: str, amends: Collection[str] = ()) -> Files:
     return files or {}
 
 
-def _check_owner(folder: Path, by: str, files: Files | None, there: set[str]) -> None:
+def _check_owner(folder: Path, by: str, files: Files | None, first: str) -> None:
     """Refuse a folder into which another has written."""
     expected = f"expected a new or empty folder, or one that {by} wrote"
     others = {one.by for each in (files or {}).values() for one in each}
     if files is None:
-        found = f"found other files, such as {short(min(there))}, and no list of ours ({LIST}), as earlier versions wrote none"
+        found = f"found other files, such as {short(first)}, and no list of ours ({LIST}), as earlier versions wrote none"
         raise InputError(f"{folder}: {expected}, {found}; give another place, or move this folder away")
     if by not in others:
         found = " and ".join(sorted(others)) or "others"
