@@ -64,6 +64,8 @@ def choose(observations: Observations, start: Estimate, device: str, offsets: Ar
     camera = start.cameras[device]
     ideal = Camera(camera.size, camera.matrix, np.zeros(0))  # at the origin: alone, a device is its own world
     errors = held_out(own, Estimate({device: ideal}, camera.camera_from_world @ start.poses[seeing], start.points), offset)
+    if not all(np.count_nonzero(np.isfinite(error)) >= 2 for error in errors.values()):
+        return TRIED[0], {}
     best = min(errors, key=lambda name: float(np.nanmean(errors[name])))
     chosen = next(name for name in errors if _no_worse(errors[name] - errors[best]))
     return chosen, {name: float(np.sqrt(np.nanmean(error))) for name, error in errors.items()}
@@ -101,7 +103,9 @@ def _squares(problem: Problem, estimate: Estimate, noise: Array) -> Array:
     """Mean squared distance of each pose's points from where a device is expected to see them, outliers left out : (p,) px^2."""
     system = linearised(problem, estimate, noise, shaped=False)
     counting = problem.observations.seen & (system.lengths <= OUTLIER)
-    return np.nanmean(np.where(counting[..., None], system.plain, np.nan) ** 2, axis=(1, 2, 3)) * 2
+    squares = np.where(counting, np.sum(system.plain**2, axis=-1), 0.0).sum(axis=(1, 2))
+    number = counting.sum(axis=(1, 2))
+    return np.where(number > 0, squares / np.maximum(number, 1), np.nan)
 
 
 def _no_worse(difference: Array) -> bool:

@@ -107,10 +107,16 @@ def calibrate(
     """
     _check(sightings, board, sizes, settings, name)
     try:
-        return _calibrate([without_scraps(sighting) for sighting in sightings], board, sizes, settings or Settings(), name)
+        with np.errstate(all="ignore"):  # what isn't finite is refused
+            return _calibrate([without_scraps(sighting) for sighting in sightings], board, sizes, settings or Settings(), name)
     except InputError:
         raise
-    except ValueError as error:  # LinAlgError among them
+    except np.linalg.LinAlgError:
+        raise InputError(
+            f"{name}: expected sightings that determine all devices, found equations without a solution: are poses few or nearly "
+            "parallel, or is the board another one? shape.released=false takes it as designed, which needs less"
+        ) from None
+    except ValueError as error:
         raise InputError(f"{name}: expected sightings that determine all devices, found {error}") from None
 
 
@@ -174,6 +180,8 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     lenses = _lenses(observations, adjusted, free, offsets, tolerances, released)
     adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released, lenses)
     agreement = consistency(observations, adjusted, free, offsets, tolerances, released)
+    if not np.isfinite(agreement.covariance).all():
+        raise np.linalg.LinAlgError
     halves = compare_halves(observations, adjusted, free, offsets, tolerances, released, agreement)
     adjusted = widened(adjusted, agreement.covariance)
     found = [*checks.warnings(observations, adjusted), *filter(None, (agreement.warning, size_warning))]
@@ -245,7 +253,9 @@ def circle_offsets(observations: Observations, estimate: Estimate, board: Board)
 def reprojection_rms(observations: Observations, adjusted: Adjustment) -> dict[str, float]:
     """Root mean square of the points' distances from where they are expected, by device, px; outliers left out."""
     squares = np.sum(np.where(adjusted.outliers[..., None], np.nan, adjusted.residuals) ** 2, axis=-1)
-    return dict(zip(observations.devices, np.sqrt(np.nanmean(squares, axis=(0, 1))).tolist(), strict=True))
+    number = np.isfinite(squares).sum(axis=(0, 1))
+    means = np.where(number > 0, np.nansum(squares, axis=(0, 1)) / np.maximum(number, 1), np.nan)
+    return dict(zip(observations.devices, np.sqrt(means).tolist(), strict=True))
 
 
 def compare_halves(

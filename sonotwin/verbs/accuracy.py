@@ -25,8 +25,8 @@ from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
 Group = Literal[
-    "optics", "surface", "reality", "calibration", "scale", "lifelike", "ultrasound", "tracking", "session", "studies", "strangers",
-    "trust", "live",
+    "optics", "surface", "reality", "calibration", "scale", "lifelike", "ultrasound", "tracking", "session", "studies",
+    "strangers", "trust", "live",
 ]  # fmt: skip
 MODULES = {
     "session": "sonotwin.session_accuracy",
