@@ -23,7 +23,7 @@ from recon.freehand.sequence_sweep import SequenceFields
 from recon.freehand.sequences import FrameName, FrameNames
 from recon.freehand.volume_compounding import MOST_BYTES, Clip, Compounding, Interpolation, Mask, Reconstruction, grid_of
 from recon.geometry import rigid
-from recon.model import fan, lengths, tracks
+from recon.model import fan, lengths, pose_checks, tracks
 from recon.model.fan import Fan
 from recon.model.pose_checks import Implausible
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration, Speed, SpeedSigma
@@ -254,7 +254,9 @@ def depths(scans: Scans) -> str:
 
 
 def cautions(scans: Scans) -> Iterator[str]:
-    """Lines of warning about where results lie; none as a rule."""
+    """Lines of warning about where results lie, and of what they are made; none as a rule."""
+    if line := pose_checks.coverage(np.isfinite(scans.world_from_pixel).all(axis=(1, 2))):
+        yield line
     if scans.elsewhere:
         yield "3D Slicer shows the sequence where its transforms to RAS put it, and these results elsewhere: give reference=LPS"
 

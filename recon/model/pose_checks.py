@@ -50,6 +50,7 @@ class MotionLimits:
     repeats: int = 4  # poses in a row that are the same, at least, before images are compared
     changed: float = 0.7  # times the usual change from image to image of a moving probe
     changed_before_jump: float = 0.3  # the same, where the pose jumps when it goes on
+    least_covered: float = 0.8  # share of the images with a pose, below which it is said
     most_share: float = 1 / 3  # of poses that may be left out
 
 
@@ -75,6 +76,16 @@ class Findings:
         return said + [
             f"{len(rows)} of {self.count} poses, from {what} {rows[0]} on: {WORDS[cause]}" for cause, rows in self.rows.items()
         ]
+
+
+def coverage(found: NDArray[np.bool_]) -> str | None:
+    """Say where images : (n,), in order, have no pose, if that are many."""
+    if not found.any() or found.mean() >= LIMITS.least_covered:
+        return None
+    first, last = np.flatnonzero(found)[[0, -1]]
+    between = int((~found[first:last]).sum())
+    where = f"{first} before the first pose, {len(found) - 1 - last} after the last, {between} in gaps"
+    return f"{(~found).sum()} of {len(found)} B-scans have no pose: {where}"
 
 
 def is_lost(values: Array) -> bool:

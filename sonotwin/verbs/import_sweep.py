@@ -2,15 +2,17 @@
 
 A clip is a DICOM file of many frames, a video of the scanner's screen, or a folder of images. Its B-scan's part is cut out: the
 region that a DICOM file names, else what changes from frame to frame; colours become grey. Times are the clip's own, or even by
-`rate_hz`. The table is CSV with columns of any name: a time, and a translation with a quaternion or a matrix; a row without
-values is one in which the probe wasn't seen. Writes the capture folder `out`; one that is there already is replaced. Takes
-seconds.
+`rate_hz`. The table is CSV with columns of any name, or by number without a header: a time, or null where it has a row a frame,
+and a translation with a quaternion or a matrix; a row without values is one in which the probe wasn't seen. Writes the capture
+folder `out`; one that is there already is replaced. Takes seconds.
 
     sonotwin import-sweep clip=scan.dcm poses=poses.csv columns='{time: t, matrix: [a,b,c,d,e,f,g,h,i,j,k,l]}' out=sweep/capture
     sonotwin import-sweep clip=screen.mp4 poses=p.csv columns='{time: t, translation: [x,y,z], quaternion: [a,b,c,d]}' out=capture
+    sonotwin import-sweep clip=stills poses=p.txt columns='{time: null, matrix: [1,2,3,4,5,6,7,8,9,10,11,12]}' out=capture
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,6 +29,8 @@ from recon.clips.pose_tables import MOST_SECONDS, Columns
 from recon.errors import InputError
 from recon.files import atomic
 from recon.freehand import volume_compounding
+from recon.model import pose_checks, tracks
+from recon.model.pose_checks import Implausible
 from recon.model.rig import Part
 from recon.model.tracks import Track
 
@@ -45,6 +49,7 @@ class Config(Part):
     starts_s: Annotated[float, Field(gt=-MOST_SECONDS, lt=MOST_SECONDS)] | None = None
     crop: Literal["auto", "whole"] | tuple[Least, Least, Size, Size] = "auto"
     purpose: Purpose = "volume"
+    implausible: Implausible = "refuse"
 
 
 def run(config: Config) -> None:
@@ -57,11 +62,12 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     atomic.check_folder(config.out, "import-sweep", inputs=[config.clip, config.poses])
-    track = pose_tables.read(config.poses, config.columns)
+    track = None if config.columns.time is None else pose_tables.read(config.poses, config.columns)
     with console.status("reading the clip"):
         clip = clip_reader.read(config.clip)
         times = stamps(config, clip, track)
         box = b_scan(config, clip)
+        track = believed(config, clip, times, track or pose_tables.read(config.poses, config.columns, times))
     width, height = box[2:]
     with console.status("writing"), new_capture(config.out, config.clip.stem, by="import-sweep") as capture:
         devices = {SCANNER: Device(size=(width, height))}
@@ -71,8 +77,19 @@ def run(config: Config) -> None:
     console.print(f"wrote       {config.out}", markup=False)
 
 
-def stamps(config: Config, clip: Clip, track: Track) -> NDArray[np.int64]:
-    """Times : (n,) ns of the clip's frames, by the table's clock.
+def believed(config: Config, clip: Clip, times: NDArray[np.int64], track: Track) -> Track:
+    """The poses without those that no hand makes; InputError if these are many, see `recon.model.pose_checks`."""
+
+    def changes() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return 1e-9 * (times - track.times[0]), pose_checks.image_changes(clip.stream())
+
+    seconds = 1e-9 * (track.times - track.times[0])
+    poses, _ = pose_checks.checked(str(config.poses), seconds, track.poses, config.implausible, changes)
+    return replace(track, poses=poses)
+
+
+def stamps(config: Config, clip: Clip, track: Track | None) -> NDArray[np.int64]:
+    """Times : (n,) ns of the clip's frames, by the table's clock; of a table without times, by the clip's or a second apart.
 
     Raises
     ------
@@ -82,10 +99,15 @@ def stamps(config: Config, clip: Clip, track: Track) -> NDArray[np.int64]:
     seconds = clip.seconds
     if config.rate_hz is not None:
         seconds = np.arange(clip.count) / config.rate_hz
+    if seconds is None and track is None:
+        seconds = np.arange(clip.count, dtype=float)
     if seconds is None:
         raise InputError(f"{config.clip}: expected times of the frames, found none; give rate_hz=...")
-    start = int(track.times[0]) if config.starts_s is None else round(1e9 * config.starts_s)
+    begin = 0 if track is None else int(track.times[0])
+    start = begin if config.starts_s is None else round(1e9 * config.starts_s)
     times = start + np.rint(1e9 * seconds).astype(np.int64)
+    if track is None:
+        return times
     if times[-1] < track.times[0] or times[0] > track.times[-1]:
         found, expected = (f"{1e-9 * some[0]:.3f} to {1e-9 * some[-1]:.3f} s" for some in (times, track.times))
         raise InputError(f"starts_s: expected frames while there are poses, {expected}, found {found}")
@@ -124,7 +146,11 @@ def describe(config: Config, clip: Clip, times: NDArray[np.int64], box: Box, tra
     if clip.mm_per_px is not None:
         fields += " rig.probe.scale_mm_per_px=[{:.6g},{:.6g}]".format(*clip.mm_per_px)
     yield f"give        {fields} to calibrate-probe"
-    yield f"poses       {track.found.sum()} of {len(track.times)} rows, {1e-9 * (track.times[-1] - track.times[0]):.4g} s"
+    placed = np.isfinite(tracks.at(track, times)).all(axis=(1, 2))
+    span = f"{1e-9 * (track.times[-1] - track.times[0]):.4g} s"
+    yield f"poses       {track.found.sum()} of {len(track.times)} rows, {span}; {placed.sum()} of {len(times)} frames have one"
+    if line := pose_checks.coverage(placed):
+        yield f"warning     {line}; does the clip begin with the table? give starts_s"
 
 
 def _cut(clip: Clip, box: Box) -> Iterator[tuple[str, NDArray[np.uint8]]]:

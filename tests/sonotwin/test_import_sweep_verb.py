@@ -105,3 +105,28 @@ def test_images_need_a_rate(folder, capsys):
     assert imported(folder, f"clip={folder / 'images'}", "rate_hz=10", "crop=whole") == 0
     assert np.diff(sweep_part.read_sweep(folder / "capture").times).tolist() == [10**8] * (COUNT - 1)
     assert BOX[2:] != SCREEN
+
+
+def test_stills_with_a_row_each_in_a_plain_table(folder, capsys):
+    """Neither header nor times: each image has the pose of its row, and a volume is made of them."""
+    import cv2
+
+    (folder / "images").mkdir()
+    for number, image in enumerate(made_clips.scans(COUNT)):
+        cv2.imwrite(str(folder / "images" / f"{number}.png"), image)
+    rows = [f"{0.0} {k} 650 0 0 0 1" for k in range(COUNT)]
+    (folder / "poses.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    columns = "columns={time: null, translation: [1,2,3], quaternion: [4,5,6,7]}"
+    fields = [f"clip={folder / 'images'}", f"poses={folder / 'poses.csv'}", columns, "crop=whole", f"out={folder / 'capture'}"]
+    assert main(["import-sweep", *fields]) == 0
+    assert f"{COUNT} of {COUNT} frames have one" in capsys.readouterr().out
+    assert sweep_part.read_sweep(folder / "capture").poses()[:, 1, 3].tolist() == list(range(COUNT))
+    (folder / "probe.txt").write_text("0.125 0 0 5\n0 0 -1 0\n0 0.119 0 20\n0 0 0 1\n")
+    given = [f"capture={folder / 'capture'}", f"probe={folder / 'probe.txt'}", f"out={folder / 'volume'}", "hole_voxels=0"]
+    assert main(["freehand", *given]) == 0
+
+
+def test_poses_that_cover_a_part_of_the_clip_are_counted(folder, capsys):
+    assert imported(folder, f"clip={folder / 'scan.dcm'}", "starts_s=101.5") == 0
+    said = capsys.readouterr().out
+    assert "B-scans have no pose: 0 before the first pose, " in said and "does the clip begin with the table?" in said

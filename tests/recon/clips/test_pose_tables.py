@@ -88,7 +88,7 @@ def test_rows_without_values_are_poses_that_were_not_found(tmp_path):
         ("t,x,y,z,a,b,c\n", r"line 1: expected a column d, found t, x, y, z, a, b, c; give columns="),
         (HEADER + "0,0,0,0,0,0,0,1\n", "expected two rows or more"),
         (
-            "t,x,y,z,a,b,c,d\n0,0,0,0,0,0,0,1\n0,0,0,0,0,0,0,1\n",
+            "t,x,y,z,a,b,c,d\n1,0,0,0,0,0,0,1\n0,0,0,0,0,0,0,1\n",
             r"line 3: t: expected a time after that of the row before, found 0",
         ),
         (HEADER + "0,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,2\n", r"line 3: quaternion: expected a length of 1, found 2"),
@@ -126,3 +126,34 @@ def test_a_mirrored_matrix_is_refused(tmp_path):
 def test_columns_that_make_no_pose_are_refused(fields, complaint):
     with pytest.raises(ValueError, match=complaint):
         Columns(time="t", **fields)
+
+
+NUMBERED = Columns.model_validate({"time": 1, "translation": [2, 3, 4], "quaternion": [5, 6, 7, 8]})
+ROWS = np.column_stack([SECONDS, POSES[:, :3, 3], Rotation.from_matrix(POSES[:, :3, :3]).as_quat()])
+
+
+def test_tables_without_a_header_have_numbered_columns(tmp_path):
+    np.savetxt(tmp_path / "t.txt", ROWS, "%.12g")
+    assert_same(pose_tables.read(tmp_path / "t.txt", NUMBERED))
+    with pytest.raises(InputError, match=r"line 1: expected a column t, found 8 numbers; without a header give columns by their"):
+        pose_tables.read(tmp_path / "t.txt", NUMBERED.model_copy(update={"time": "t"}))
+
+
+def test_tables_without_times_have_a_row_a_frame(tmp_path):
+    np.savetxt(tmp_path / "t.txt", ROWS, "%.12g")
+    times, columns = np.rint(1e9 * SECONDS).astype(int), NUMBERED.model_copy(update={"time": None})
+    assert_same(pose_tables.read(tmp_path / "t.txt", columns, times))
+    with pytest.raises(InputError, match=r"expected a row for each of 2 frames of the clip, where columns.time is null, found"):
+        pose_tables.read(tmp_path / "t.txt", columns, times[:2])
+
+
+def test_rows_that_repeat_a_time_are_left_out_with_a_count(tmp_path, caplog):
+    """The first of them counts, or the first with a pose; where most repeat, the clock stood still."""
+    lost = ROWS[1].copy()
+    lost[1:] = -3.697314e28
+    np.savetxt(tmp_path / "t.txt", np.vstack([ROWS[:1], lost, ROWS[1], ROWS[1] + [0, 5, 0, 0, 0, 0, 0, 0], ROWS[2:]]), "%.12g")
+    assert_same(pose_tables.read(tmp_path / "t.txt", NUMBERED))
+    assert f"left out 2 of {len(ROWS) + 2} rows, from line 3 on, with the time of the row before" in caplog.text
+    np.savetxt(tmp_path / "t.txt", ROWS * [0, 1, 1, 1, 1, 1, 1, 1], "%.12g")
+    with pytest.raises(InputError, match=r": 1: expected a time of its own in most rows, found"):
+        pose_tables.read(tmp_path / "t.txt", NUMBERED)
