@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 APART_MM, APART_DEG = 2.0, 1.0  # of poses that differ: a rim in the same pixels errs in the same way
 LEAST = 8  # pairs
-Fault = Literal["without a pose", "with a covered circle", "with a rim in uneven light or shadow"]
+Fault = Literal["without a pose", "with a covered circle", "with a rim that is clipped, smeared or in shadow"]
 
 
 @dataclass(frozen=True)
@@ -26,24 +26,32 @@ class Seen:
 
     views: tuple[Sighting, Sighting]
     world_from_target: Array  # (4, 4) mm, as the tracker found it
+    even: bool = True  # whether the light is even on all rims; else their centres are less certain, as their covariances have it
 
 
 def whole(found: Tracking, cameras: tuple[Camera, Camera]) -> Seen | Fault:
-    """The pair if all six rims are whole, evenly lit and sharp; else the fault."""
+    """The pair if all six rims are whole and sharp; else the fault."""
     if not found.found:
         return "without a pose"
     if not found.pose.used.all():
         return "with a covered circle"
     first, second = (view.outlines.sighting(camera) for view, camera in zip(found.views, cameras, strict=True))
-    if first.doubtful.any() or second.doubtful.any():
-        return "with a rim in uneven light or shadow"
-    return Seen((first, second), found.pose.world_from_target)
+    if any((view.outlines.doubtful & ~view.outlines.uneven).any() for view in found.views):
+        return "with a rim that is clipped, smeared or in shadow"
+    even = not any(view.outlines.uneven.any() for view in found.views)
+    return Seen((first, second), found.pose.world_from_target, even)
 
 
 def spread(pairs: Sequence[Seen], most: int) -> list[Seen]:
     """Evenly chosen ones, not more than some."""
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int))
     return [pairs[k] for k in chosen]
+
+
+def evenly_lit(pairs: Sequence[Seen], least: int = LEAST) -> list[Seen]:
+    """Pairs in even light whose poses differ; if these are fewer than `least`, those in uneven light, too."""
+    even = distinct([pair for pair in pairs if pair.even])
+    return even if len(even) >= least else distinct(pairs)
 
 
 def distinct(pairs: Sequence[Seen]) -> list[Seen]:
@@ -95,7 +103,7 @@ def check(pairs: Sequence[Seen], name: str, faults: Mapping[Fault, int], least_t
         If pairs, tilts or distances are missing, with what to do.
     """
     if len(pairs) < LEAST:
-        expected = f"{LEAST} poses in which both cameras see all three circles whole and evenly lit"
+        expected = f"{LEAST} poses in which both cameras see all three circles whole"
         raise InputError(f"{name}: expected {expected}, found {len(pairs)}{counted(faults)}")
     missing = []
     if (tilt := tilt_deg(pairs)) < least_tilt_deg:

@@ -70,6 +70,7 @@ class Outlines:
     motion: Array  # (n, 2) px, path over the exposure, up to its sign
     seen: Array  # (n,) share of the rim that looks like one
     doubtful: NDArray[np.bool_]  # (n,) covered in part, clipped, unevenly lit or smeared: errors may exceed the covariances
+    uneven: NDArray[np.bool_]  # (n,) those of them that are in uneven light alone, which their covariances hold
     reasons: tuple[str | None, ...]  # of the rejection; None of a ring
 
     @property
@@ -114,7 +115,7 @@ class Outlines:
         return Outlines(self.ellipses[chosen], **arrays, reasons=tuple(np.array(self.reasons, object)[chosen]))
 
 
-ARRAYS = ("joint", "inside", "outside", "middle", "noise", "motion", "seen", "doubtful")
+ARRAYS = ("joint", "inside", "outside", "middle", "noise", "motion", "seen", "doubtful", "uneven")
 
 
 def measure(image: NDArray, rough: Ellipses, reach: float | Array, target: Target) -> Outlines:
@@ -234,5 +235,8 @@ def _judged(fits: NDArray, known: Array, target: Target, middles: bool) -> Outli
             reasons.append(f"an uncertainty of {sigma[i]:.1f} px")
         else:
             reasons.append(None)
-    doubtful = beyond | (uneven > UNEVEN) | (seen < WHOLE)
-    return Outlines(Ellipses(centre, shape), joint, inside, outside, middle, noise, motion, seen, doubtful, tuple(reasons))
+    worse = beyond | (seen < WHOLE)
+    lit = (uneven > UNEVEN) & ~worse
+    return Outlines(
+        Ellipses(centre, shape), joint, inside, outside, middle, noise, motion, seen, worse | lit, lit, tuple(reasons)
+    )

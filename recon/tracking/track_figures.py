@@ -112,7 +112,9 @@ def causes(steps: Sequence[Step], target: Target) -> Iterator[str]:
     names = (name.removesuffix("_mm").replace("_", " ") for name in LENGTHS)
     found = ", ".join(f"{name} by {value:+.2f} mm" for name, value, one in zip(names, off, alike, strict=True) if one)
     tolerance = np.sqrt(np.diag(circle_layout.length_covariance(target)))
-    if (np.abs(off) > BEYOND * tolerance).any():
+    if (np.abs(off) > BEYOND * tolerance).any() and target.covariance_mm2 is not None:
+        yield f"warning     the target isn't the one that was measured, off {found}, {of}: another print? Measure this one, too"
+    elif (np.abs(off) > BEYOND * tolerance).any():
         yield f"warning     the target's circles aren't where rig.target has them, off {found}, {of}: {MEASURE}"
     else:
         yield f"target      off its design within the tolerance, {found}: {MEASURE}, and poses get more exact"

@@ -56,6 +56,7 @@ def nothing(reason: str) -> View:
         motion=pairs,
         seen=numbers,
         doubtful=np.zeros(3, bool),
+        uneven=np.zeros(3, bool),
         reasons=(reason,) * 3,
     )
     return View(outlines, reason)

@@ -5,9 +5,11 @@ film in which both cameras see the target whole, slowly moved, tilted to all sid
 `out`: target.yaml (with the covariance) and metrics.json. What is there already is replaced. Takes half a second a pose, besides
 tracking the film.
 
-    sonotwin film out=outputs/turned path.turn_deg=20 white_dn=120 seed=1
+    sonotwin film out=outputs/turned path.turn_deg=20 white_dn=120
     sonotwin calibrate-target capture=outputs/turned/capture out=outputs/target
     sonotwin track capture=outputs/film/capture target=outputs/target/target.yaml out=outputs/track
+
+Both films are of one seed: those of another show another print, of which this one's measures are wrong.
 """
 
 from collections import Counter
@@ -56,8 +58,10 @@ def run(config: Config) -> None:
     design = config.rig.target
     tracker = make_tracker(config, design, film.cameras, film.optics, film.bits)
     seen, faults = collect(film, tracker, console)
-    pairs = target_poses.spread(target_poses.distinct(seen), config.most_poses)
-    console.print(f"found       {len(seen)} of {len(film.times)} pairs whole, {len(pairs)} poses that differ", markup=False)
+    pairs = target_poses.spread(target_poses.evenly_lit(seen), config.most_poses)
+    uneven = sum(not pair.even for pair in pairs)
+    dim = f", {uneven} of them in uneven light: less exact" if uneven else ""
+    console.print(f"found       {len(seen)} of {len(film.times)} pairs whole, {len(pairs)} poses that differ{dim}", markup=False)
     target_poses.check(pairs, film.name, faults, config.least_tilt_deg, config.least_range_mm)
     with console.status("adjusting"):
         adjusted = target_bundle.adjust(pairs, design, tracker.optics_in_use)

@@ -174,7 +174,7 @@ def filmed(
     wide = config.model_copy(update={"drift_px": SEARCH_PX})
     tracker = make_tracker(wide, target, film.cameras, film.optics, film.bits)
     seen, faults = collect(film, tracker, console)
-    poses = target_poses.spread(target_poses.distinct(seen), config.most_poses)
+    poses = target_poses.spread(target_poses.evenly_lit(seen, LEAST_POSES), config.most_poses)
     if len(poses) < LEAST_POSES:
         found = (
             f"{len(poses)} in {len(film.times)} pairs{target_poses.counted(faults)}: move it about, clean, uncovered and well lit"

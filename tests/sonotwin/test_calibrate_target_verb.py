@@ -67,6 +67,21 @@ def test_the_target_is_measured_and_poses_are_exact_with_it(drawn, poses, told, 
     assert errors["measured"] < 0.7 * errors["designed"]
 
 
+def test_a_film_in_uneven_light_will_do_if_there_is_no_other(rig, poses, told, tmp_path, capsys):
+    """Stripes of 12 % across all rims, as of a window blind: less exact, and so by what is predicted."""
+    columns = np.arange(rig.cam1.optics.size[0])
+    light = 1 + 0.12 * np.sin(2 * np.pi * columns / 150)
+    actual = rig.target.model_copy(update=ACTUAL)
+    cameras, rng = [getattr(rig, name).optics.camera() for name in ("cam1", "cam2")], np.random.default_rng(4)
+    pairs = (tuple(drawings.frame(camera, [pose], actual, 65.0, rng, light=light) for camera in cameras) for pose in poses)
+    captures.write_film(tmp_path / "dim", pairs, films.stamps(COUNT), films.optics(rig), films.devices(rig), "dim")
+    assert main(["calibrate-target", f"capture={tmp_path / 'dim'}", f"out={tmp_path / 'target'}"]) == 0
+    assert "9 poses that differ, 9 of them in uneven light: less exact" in capsys.readouterr().out
+    found = target_files.read(tmp_path / "target" / "target.yaml", rig.target)
+    off = circle_layout.lengths(found) - [ACTUAL[name] for name in circle_layout.LENGTHS]
+    assert np.all(np.abs(off) < 4 * np.sqrt(np.diag(found.covariance_mm2))) and np.abs(off).max() < 0.05
+
+
 def test_what_is_wrong_is_said_in_one_line(drawn, told, tmp_path, capsys):
     def complaint(*fields: str) -> str:
         assert main(["calibrate-target", f"capture={drawn}", f"out={tmp_path / 'out'}", *fields]) == 2
@@ -87,4 +102,4 @@ def test_what_is_wrong_is_said_in_one_line(drawn, told, tmp_path, capsys):
 def test_a_film_too_short_is_refused(rig, told, tmp_path, capsys):
     capture = films.film(tmp_path / "capture", rig, np.random.default_rng(4), count=2)
     assert main(["calibrate-target", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 2
-    assert "expected 8 poses in which both cameras see all three circles whole and evenly lit, found" in capsys.readouterr().err
+    assert "expected 8 poses in which both cameras see all three circles whole, found" in capsys.readouterr().err

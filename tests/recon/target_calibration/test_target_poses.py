@@ -1,5 +1,7 @@
 """Pairs that a target can be measured from, and refusals that name what is missing."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,14 @@ def test_poses_that_differ_are_kept(cameras, rig, rng):
     given = [at(pair), at(pair, 1.0, 0.5), at(pair, 3.0), at(pair, 0.0, 2.0), at(pair, 2.9)]
     kept = target_poses.distinct(given)
     assert places(kept, given) == [0, 2, 3]
+
+
+def test_uneven_light_is_taken_where_even_is_lacking(cameras, rig, rng):
+    pairs = target_pairs.many(cameras, rig.target, 10, rng)
+    dim = [dataclasses.replace(pair, even=False) for pair in pairs]
+    mixed = [*dim[:2], *pairs[2:]]
+    assert places(target_poses.evenly_lit(mixed), mixed) == list(range(2, 10))
+    assert places(target_poses.evenly_lit(mixed, 9), mixed) == places(target_poses.evenly_lit(dim), dim) == list(range(10))
 
 
 def test_chosen_pairs_are_spread(cameras, rig, rng):
