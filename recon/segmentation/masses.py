@@ -45,7 +45,12 @@ SAMPLED = 40  # images for the level of tissue
 LEAST_GREY = 5.0  # of 255, of tissue
 CORE = 0.6  # of a mass's extent: its darkest part
 MOSTLY_AROUND = 0.6  # share of a cut body's shell that shows tissue: elsewhere than behind phantoms
-CUT = "a dark body of %.0f mm3 at %.0f, %.0f, %.0f mm lies at the scan's end, and is left out: scan on there"
+LEAST_CUT_MM3 = 15.0  # of what is seen of a cut body
+DARKEST = 0.1  # share of a cut body that is as dark as a mass's core: of a small piece most lies within the blur of its border
+LEAST_CUT_MM = 2.5  # of it down the beam; speckle has no holes as deep
+STREAK = 2.5  # height of a body down the beam over its thickness, above which it is the shadow of a border
+CUT = "a dark body is cut by %s, and is left out: %.0f mm3 of it at %.0f, %.0f, %.0f mm, %.0f x %.0f x %.0f mm; scan on there"
+SHADOW = "a dark streak at %.0f, %.0f, %.0f mm, %.0f mm down the beam and %.0f mm thick, is left out as the shadow of a border"
 LEAST_SEEN = 0.3  # of the core, by sound that came through other masses
 
 
@@ -165,7 +170,7 @@ def refined(masses: Sequence[Mass], power: EchoPower, times: int) -> list[Mass]:
 def rough(power: EchoPower) -> list[Mass]:
     """Dark bodies with tissue all around, without the shadows that hang on to them.
 
-    A warning is logged of one with tissue around most of it that the scan's end cuts.
+    Warnings are logged of bodies that the scan's side or end cuts, and of streaks down the beam, which are shadows of borders.
     """
     spacing = power.volume.spacing[::-1]
     smooth = _smoothed(power.volume.voxels, power.weight, SMOOTH_MM / spacing)
@@ -191,17 +196,89 @@ def rough(power: EchoPower) -> list[Mass]:
         touches = (_widened(inside, EDGE_MM, spacing) & unknown[part]).any()
         cut = any(s.start < m or s.stop > n - m for s, m, n in zip(parts[number - 1], edge, dark.shape, strict=True))
         core = np.median(ratio[part][inside])
-        if volume < LEAST_MM3 or core > SEED:
+        if volume < LEAST_MM3 or core > SEED or touches or cut:
             continue
-        if touches or cut:
-            grown, tissues = (np.pad(field, 2 * edge.max()) for field in (inside, seen[part] & (ratio[part] > DARK)))
-            if tissues[_widened(grown, 2 * EDGE_MM, spacing) & ~grown].mean() > MOSTLY_AROUND:
-                middle = [np.mean(axis) + s.start for axis, s in zip(np.nonzero(inside), part, strict=True)][::-1]
-                log.warning(CUT, volume, *rigid.apply(power.volume.world_from_voxel, np.array(middle)))
+        height, thick = np.ptp(np.nonzero(inside)[1]) * spacing[1], _thickness(inside, spacing)
+        if height > STREAK * thick:
+            log.warning(SHADOW, *_middle(inside, part, power), height, thick)
             continue
         field = np.where(_widened(inside, GROW_MM, spacing), ratio[part], 1.0)
         result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))
+    for text in _cut_bodies(dark, ratio, seen, power):
+        log.warning(text)
     return result
+
+
+def _cut_bodies(dark: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> Iterator[str]:
+    """A line of each dark body with tissue around what is seen of it, at the sides or ends of what was scanned.
+
+    The part behind it, down the beam, doesn't count, as its shadow lies there; nor does what is dark from the face on, or all
+    along the images' lower end, as behind a phantom.
+    """
+    spacing = power.volume.spacing[::-1]
+    pad = int(np.ceil(2 * OPEN_MM / spacing.min()))
+    dark, known = np.pad(dark, pad), np.pad(seen, pad)
+    body = dark & _opened(dark | ~known, OPEN_MM, spacing)
+    labels, _ = ndimage.label(body)
+    margin = np.ceil(4 * EDGE_MM / spacing).astype(int)
+    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+        part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(box, margin, strict=True))
+        inside, here = labels[part] == number, known[part]
+        middle = tuple(slice(s.start - pad, s.stop - pad) for s in part)
+        shell = _widened(inside, 2 * EDGE_MM, spacing) & ~inside
+        if not (_widened(inside, EDGE_MM, spacing) & ~here).any():
+            continue
+        levels = np.ones(inside.shape)
+        within = tuple(slice(max(0, s.start), min(n, s.stop)) for s, n in zip(middle, ratio.shape, strict=True))
+        at = tuple(slice(w.start - m.start, w.stop - m.start) for w, m in zip(within, middle, strict=True))
+        levels[at] = ratio[within]
+        rows = np.nonzero(inside)[1]
+        height, volume = (np.ptp(rows) + 1) * spacing[1], inside.sum() * float(np.prod(spacing))
+        extents = [(np.ptp(axis) + 1) * step for axis, step in zip(np.nonzero(inside), spacing, strict=True)][::-1]
+        if volume < LEAST_CUT_MM3 or height < LEAST_CUT_MM or np.quantile(levels[inside], DARKEST) > SEED:
+            continue
+        behind = np.logical_or.accumulate(inside, axis=1)
+        before = np.logical_or.accumulate(inside[:, ::-1], axis=1)[:, ::-1]
+        sides = {"the images' side": _open(shell & ~here, 2), "the sweep's end": _open(shell & ~here, 0)}
+        below = (shell & behind & ~here).sum() / max((shell & behind).sum(), 1)
+        above = shell & before & ~behind
+        around = shell & here & ~(behind & ~inside)
+        if (
+            below > 1 - MOSTLY_AROUND
+            or (above & here).sum() < MOSTLY_AROUND * above.sum()
+            or height > STREAK * max(extents[0], extents[2])
+        ):
+            continue
+        if min(_bright(levels[above & here]), _bright(levels[around])) < MOSTLY_AROUND:
+            continue
+        where = max(sides, key=lambda name: sides[name])
+        yield CUT % (where, volume, *_middle(inside, middle, power), *extents)
+
+
+def _bright(levels: NDArray) -> float:
+    """Share of levels that tissue has; 0 without any."""
+    return float((levels > DARK).mean()) if levels.size else 0.0
+
+
+def _open(unseen: Mask, axis: int) -> int:
+    """Number of unseen voxels in a body's shell at its outermost layers along an axis."""
+    filled = unseen.sum(axis=tuple(one for one in range(3) if one != axis))
+    return int(filled.max()) if filled.any() else 0
+
+
+def _thickness(inside: Mask, spacing: Array) -> float:
+    """Diameter of the largest ball within a body, mm."""
+    return 2 * float(ndimage.distance_transform_edt(np.pad(inside, 1), spacing).max())
+
+
+def _centre(inside: Mask, part: tuple[slice, ...]) -> Array:
+    """Voxel : (3,) x, y, z in the middle of a body in a part of a volume."""
+    return np.array([np.mean(axis) + s.start for axis, s in zip(np.nonzero(inside), part, strict=True)][::-1])
+
+
+def _middle(inside: Mask, part: tuple[slice, ...], power: EchoPower) -> Array:
+    """The same place in the world : (3,) mm."""
+    return rigid.apply(power.volume.world_from_voxel, _centre(inside, part))
 
 
 def _risen(ratio: NDArray) -> Mask:

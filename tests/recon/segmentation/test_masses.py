@@ -95,11 +95,53 @@ def test_a_mass_that_the_scans_end_cuts_is_told(rng, caplog):
     seen = speckled(mean[:last], rng)
     assert not find(seen)
     (told,) = caplog.messages
-    found = re.fullmatch(r"a dark body of (\d+) mm3 at 3, 698, 1[34] mm lies at the scan's end, .*: scan on there", told)
+    found = re.fullmatch(
+        r"a dark body is cut by the sweep's end, .*: (\d+) mm3 of it at 3, 698, 1[34] mm, 10 x .*; scan on there", told
+    )
     assert 0.6 * VOLUME < float(found[1]) < VOLUME
     caplog.clear()
     mean[:, -20:] = DARK
     assert len(find(speckled(mean, rng))) == 1 and not caplog.messages
+
+
+@pytest.mark.parametrize(("axis", "border"), [(0, "the sweep's end"), (2, "the images' side")])
+@pytest.mark.parametrize("share", [0.25, 0.45, 0.65])
+def test_a_body_of_which_any_part_is_seen_is_named_with_what_cuts_it(axis, border, share, rng, caplog):
+    """A quarter of its width, 13 % of its volume, and more; it shadows what lies behind, most just behind its edges."""
+    mean, distance = ball()
+    places = grid() - CENTRE
+    beside = np.hypot(places[..., 0], places[..., 2]) - RADIUS
+    behind = (places[..., 1] > 0) & (distance > 0)
+    edges = behind * np.exp(-((beside / 0.9) ** 2) / 2 - np.maximum(places[..., 1], 0) / 14)
+    mean = mean * np.where(behind & (beside < -0.9), 0.3, 1) * (1 - 0.9 * edges)
+    last = int(((CENTRE - ORIGIN)[::-1][axis] + (2 * share - 1) * RADIUS) / SPACING[::-1][axis])
+    part = tuple(slice(last) if one == axis else slice(None) for one in range(3))
+    assert not find(speckled(mean[part], rng))
+    (told,) = caplog.messages
+    volume, *extents = (float(word) for word in re.findall(r"([\d.]+) (?:mm3|x|mm;)", told))
+    assert f"cut by {border}" in told and (distance[part] < 0).sum() * SPACING.prod() == pytest.approx(volume, rel=0.4)
+    assert extents[2 - axis] == pytest.approx(2 * share * RADIUS, abs=1) and min(extents[1], extents[axis]) > 6
+
+
+@pytest.mark.parametrize("dark", ["from the face on", "along the lower end", "at the side, all the way down"])
+def test_what_is_dark_without_tissue_before_it_is_no_body(dark, rng, caplog):
+    """Where the array's end is lifted off, behind a phantom, and in the shadow of something beside the images."""
+    places, size = grid() - CENTRE, grid()[-1, -1, -1] - CENTRE
+    lifted, lower = (places[..., 0] > size[0] - 5) & (places[..., 1] < 0), places[..., 1] > size[1] - 6
+    shadow = places[..., 0] > size[0] - 3
+    where = {"from the face on": lifted, "along the lower end": lower, "at the side, all the way down": shadow}[dark]
+    assert not find(speckled(np.where(where, DARK, 1.0), rng)) and not caplog.messages
+
+
+def test_a_streak_down_the_beam_is_no_mass(rng, caplog):
+    """The shadow of a border beside the scan: 6 mm thick, 20 mm down the beam, with tissue on all sides."""
+    places = grid() - CENTRE
+    streak = (np.abs(places[..., 0]) < 3) & (np.abs(places[..., 1] - 1) < 10) & (np.abs(places[..., 2]) < 4)
+    assert not find(speckled(np.where(streak, DARK, 1.0), rng))
+    (told,) = caplog.messages
+    assert re.fullmatch(
+        r"a dark streak at 3, 699, 14 mm, (19|20) mm down the beam and [56] mm thick, is left out as the shadow.*", told
+    )
 
 
 def test_the_level_of_tissue_is_that_of_images_with_a_pose():
