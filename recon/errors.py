@@ -1,7 +1,8 @@
 """The exception for a user's mistake, reported in one line."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -62,6 +63,12 @@ def validated(model: type[Model], content: object, place: object) -> Model:
         return model.model_validate(content)
     except ValidationError as error:
         raise InputError(f"{place}: {one_line(error)}") from None
+
+
+def did_you_mean(word: str, known: Sequence[str], before: str = "") -> str:
+    """The nearest of known words, for the end of a message: one that is nearly alike, else one that has the word in it."""
+    close = get_close_matches(word, known, n=1) or [name for name in known if len(word) > 2 and word in name][:1]
+    return f"; did you mean {before}{close[0]}?" if close else ""
 
 
 def printable(text: str) -> str:

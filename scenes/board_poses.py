@@ -28,6 +28,7 @@ TRIES = 200  # of orientations for one pose
 GRID = 24  # places across and down the view where room is looked for
 STEPS = 12  # of the bisection to the border of the room: a 2000th of the way
 OUTWARDS = 0.3  # power that draws poses from the middle to the corners of the room
+DEPTHS_MM = (606.0, 713.0)  # the working range of the rig of Meza et al. 2021
 ASKEW = 2.0  # power that draws turns to the quarters: half of them lie within 11 deg
 
 
@@ -36,16 +37,21 @@ class Config(Part):
 
     count: Annotated[int, Field(ge=1, le=1000)] = 34
     tilt_deg: Annotated[float, Field(ge=0, le=70)] = 40.0  # largest angle between the board's normal and camera 1's axis
-    depth_mm: tuple[Positive, Positive] = (606.0, 713.0)  # nearest and farthest z of the board's middle
+    depth_mm: tuple[Positive, Positive] | None = None  # nearest and farthest z of the board's middle; DEPTHS_MM if not given
     margin_px: NotNegative = 10.0  # that every circle keeps from the border, in both cameras and the projector
     seed: Seed = 1
 
     @field_validator("depth_mm")
     @classmethod
-    def _near_to_far(cls, value: tuple[float, float]) -> tuple[float, float]:
-        if value[0] > value[1]:
+    def _near_to_far(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None and value[0] > value[1]:
             raise ValueError(f"expected the nearer depth first, found {value[0]:g}, {value[1]:g}")
         return value
+
+    @property
+    def depths_mm(self) -> tuple[float, float]:
+        """The nearest and the farthest."""
+        return self.depth_mm or DEPTHS_MM
 
 
 def random_poses(config: Config, design: AsymmetricCircles, devices: Sequence[Camera]) -> Array:
@@ -86,7 +92,8 @@ def outline(design: AsymmetricCircles) -> Array:
 def _pose(config: Config, k: int, draw: Array, design: AsymmetricCircles, devices: Sequence[Camera]) -> Array:
     """Pose k. Where its orientation finds no room, as a board held upright close to the cameras, others are tried."""
     rng = np.random.default_rng([config.seed, k])
-    depth = config.depth_mm[0] + draw[0] * (config.depth_mm[1] - config.depth_mm[0])
+    near, far = config.depths_mm
+    depth = near + draw[0] * (far - near)
     points = design.points()
     middle, hull, angles = (points.min(axis=0) + points.max(axis=0)) / 2, outline(design), draw[1:4]
     for _ in range(TRIES):

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from recon.capture import surface_part
-from recon.errors import validated
+from recon.errors import InputError, did_you_mean, short, validated
 from recon.files import yaml_text
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
@@ -23,16 +23,22 @@ def read_rig(source: str | Path = "meza2021") -> Rig:
     InputError
         If there is no such file, it is not YAML, or a field is wrong.
     """
-    path = _file("rig", source)
+    path = file_of("rig", source)
     return validated(Rig, yaml_text.read(path), path)
 
 
 def read_patterns(source: str | Path = "paper_surface") -> Patterns:
     """Read a pattern sequence, by a name from `conf/patterns` or by the path of a YAML file; raises as `read_rig` does."""
-    return surface_part.read_patterns(_file("patterns", source))
+    return surface_part.read_patterns(file_of("patterns", source))
 
 
-def _file(group: str, source: str | Path) -> Path:
-    """The file itself where there is one, else the choice of that name."""
-    known = config.folder() / group / f"{source}.yaml"
-    return known if known.is_file() and not Path(source).is_file() else Path(source)
+def file_of(group: str, source: str | Path) -> Path:
+    """The file itself where there is one, else the choice of that name; raises InputError if there is neither."""
+    known, given = config.folder() / group / f"{source}.yaml", Path(source)
+    if given.exists() or len(given.parts) != 1 or given.suffix:
+        return given
+    if not known.is_file():
+        names = sorted(choice.stem for choice in known.parent.glob("*.yaml"))
+        expected = f"{group}: expected one of {', '.join(names)}, or a YAML file"
+        raise InputError(f"{expected}, found {short(str(source))}{did_you_mean(str(source), names)}")
+    return known

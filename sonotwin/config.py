@@ -5,14 +5,17 @@ composes them; pydantic validates what comes out; the mistakes that either finds
 """
 
 import re
+import shutil
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
+from contextlib import nullcontext
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from recon.errors import InputError, one_line, short
+from recon.errors import InputError, did_you_mean, one_line, short
+from recon.files import yaml_text
 
 OF_ONE_VERB = {"devices/virtual": "record"}  # choices of a group that only this verb takes
 MOST_NAMES = 12  # of keys in a message
@@ -49,7 +52,8 @@ def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
     verb : str
         Names `conf/VERB.yaml`; a verb without that file starts from no fields.
     overrides : sequence of str
-        Hydra's `field=value`, `group=choice`, `+new=value`, `~field`. A value that isn't in Hydra's grammar, such as a path
+        Hydra's `field=value`, `group=choice`, `+new=value`, `~field`. A choice is a name in `conf/GROUP`, or the path of a YAML
+        file of one's own with the same fields. A value that isn't in Hydra's grammar, such as a path
         with a comma, a bracket or an accent, is taken as it stands; quotes force text: `out='"12"'`.
     model : type
         The verb's pydantic model.
@@ -76,10 +80,14 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
 
     name = verb if (folder() / f"{verb}.yaml").is_file() else None
     plain = [override for override in overrides if override.partition("=")[0] in _fields_named_like_groups(verb)]
-    quoted = [_literal_if_not_grammar(verb, override) for override in overrides if override not in plain]
-    for override in quoted:
-        _check_choice(verb, override)
-    with initialize_config_dir(str(folder()), version_base=None):
+    files = {k: file for k, override in enumerate(overrides) if (file := _own_choice(verb, override)) is not None}
+    with TemporaryDirectory() if files else nullcontext("") as own, initialize_config_dir(str(folder()), version_base=None):
+        named = [_named(Path(own), k, files[k]) if k in files else override for k, override in enumerate(overrides)]
+        quoted = [_literal_if_not_grammar(verb, override) for override in named if override not in plain]
+        for override in quoted:
+            _check_choice(verb, override)
+        if files:
+            quoted.append(f"hydra.searchpath=[file://{own}]")
         try:
             composed = hydra_compose(name, quoted)
             for override in plain:
@@ -103,6 +111,25 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
             raise InputError(f"{verb}: {error.full_key}: {_first_line(error)}") from error
     assert isinstance(result, dict)
     return {str(key): value for key, value in result.items()}
+
+
+def _own_choice(verb: str, override: str) -> tuple[str, Path] | None:
+    """The group, as it was written, and the file of a choice that is the path of a YAML file."""
+    key, _, value = override.partition("=")
+    path = Path(value.strip("'\""))
+    if key.partition("@")[0] not in groups(verb) or path.suffix not in (".yaml", ".yml") or not path.is_file():
+        return None
+    yaml_text.read(path)  # which refuses what is no YAML, in one line
+    return key, path
+
+
+def _named(place: Path, number: int, choice: tuple[str, Path]) -> str:
+    """An override that names a file of one's own, copied to where Hydra looks for the choices of its group."""
+    key, path = choice
+    group, name = key.partition("@")[0], f"own{number}"
+    (place / group).mkdir(exist_ok=True)
+    shutil.copyfile(path, place / group / f"{name}.yaml")
+    return f"{key}={name}"
 
 
 def _check_choice(verb: str, override: str) -> None:
@@ -197,10 +224,11 @@ def _missing_choice(verb: str, file: str) -> str:
     known = groups(verb)
     group = next((name for name in known if file.startswith(f"{name}/")), file.rpartition("/")[0])
     choice, names = file.removeprefix(f"{group}/"), known.get(group, [])
+    expected = f"{group}: expected one of {', '.join(names) or 'nothing'}"
+    example = folder() / group / f"{next(iter(names), 'own')}.yaml"
     if "/" in choice or choice.endswith((".yaml", ".yml")):
-        way_on = f"copy the file to {folder() / group} and give its name"
-        return f"{group}: expected one of {', '.join(names) or 'nothing'}, found the path {choice}; {way_on}"
-    return f"{group}: expected one of {', '.join(names) or 'nothing'}, found {choice}" + _did_you_mean(choice, names)
+        return f"{expected}, or a YAML file, found none at {choice}; begin with a copy of {example}"
+    return f"{expected}, found {choice}{did_you_mean(choice, names) or f'; a copy of {example} is given as {group}=FILE.yaml'}"
 
 
 def _unknown_key(key: str, tree: Any) -> str:
@@ -213,17 +241,11 @@ def _unknown_key(key: str, tree: Any) -> str:
         way.append(part)
     names = [str(name) for name in tree] if isinstance(tree, Mapping) else []
     missing = key.split(".")[min(len(way), key.count("."))]
-    near = _did_you_mean(missing, names, ".".join([*way, ""]))
+    near = did_you_mean(missing, names, ".".join([*way, ""]))
     if not names:
         return f"unknown key; expected none{' below ' + '.'.join(way) if way else ''}"
     listed = ", ".join(names) if len(names) <= MOST_NAMES else f"{', '.join(names[:MOST_NAMES])}, ..."
     return f"unknown key; expected one of {listed}{near}"
-
-
-def _did_you_mean(word: str, known: Sequence[str], before: str = "") -> str:
-    """The nearest of known words: one that is nearly alike, else one that has the word in it."""
-    close = get_close_matches(word, known, n=1) or [name for name in known if len(word) > 2 and word in name][:1]
-    return f"; did you mean {before}{close[0]}?" if close else ""
 
 
 def _first_line(error: Exception) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
-from recon.errors import InputError, one_line, validated
+from recon.errors import InputError, did_you_mean, one_line, validated
 from recon.files import yaml_text
 from recon.model.rig import Part
 from sonotwin.config import folder
@@ -57,7 +57,9 @@ def read_study(name: object) -> Study | None:
     path = known if known.is_file() else Path(name)
     if path.suffix not in (".yaml", ".yml"):
         names = sorted(each.stem for each in known.parent.glob("*.yaml"))
-        raise InputError(f"name: expected {SWEEP}, one of {', '.join(names)}, or a YAML file, found {name}")
+        raise InputError(
+            f"name: expected {SWEEP}, one of {', '.join(names)}, or a YAML file, found {name}{did_you_mean(name, names)}"
+        )
     return validated(Study, yaml_text.read(path), path)
 
 

@@ -133,7 +133,7 @@ def closest_pose(settings: Settings) -> rigid.Array:
     optics = calibration_of(settings.rig).cameras
     view = optics["cam1"]
     axis = view.rays((np.array(view.size) - 1.0) / 2)
-    middle = axis * settings.poses.depth_mm[0] / axis[2]
+    middle = axis * settings.poses.depths_mm[0] / axis[2]
     away = middle - optics["projector"].centre
     away /= np.linalg.norm(away)
     across = np.cross([0.0, 1.0, 0.0], away)

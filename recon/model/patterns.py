@@ -150,6 +150,11 @@ class Uniform(Part):
         return np.full((1, length), self.level, np.float32)
 
 
+def _bits(periods: float) -> int:
+    """Of a code of so many periods."""
+    return max(1, int(np.ceil(np.log2(periods))))
+
+
 AnyPart = Annotated[Fringes | GrayCode | CentreLine | Uniform, Field(discriminator="kind")]
 
 
@@ -234,6 +239,30 @@ class Patterns(Part):
         axes: tuple[Axis, ...] = ("columns", "rows")
         encoding = Fringes | GrayCode if self.unwrap == "gray" else Fringes
         return tuple(axis for axis in axes if any(isinstance(part, encoding) and part.axis == axis for part in self.parts))
+
+    def on(self, size: tuple[int, int]) -> "Patterns":
+        """The same sequence on another projector's raster, of width and height px.
+
+        Pitches stay, but for those that cover the axis once, and so do starts that are given; what lies by the middle stays
+        there, to the pixel. Codes get the bits that the axis needs.
+        """
+        if size == self.projector_size:
+            return self
+        parts = []
+        for part in self.parts:
+            before, after = (lengths[0 if part.axis == "columns" else 1] for lengths in (self.projector_size, size))
+            changed: dict[str, object] = {}
+            if isinstance(part, Fringes) and part.pitch >= before:
+                changed["pitch"] = part.pitch * after / before
+            if isinstance(part, Fringes) and part.origin is not None and part.origin >= part.pitch:
+                changed["origin"] = part.origin + (after - before) // 2
+            if isinstance(part, GrayCode):
+                spare = part.bits - _bits(before / part.pitch)
+                changed["bits"] = _bits(after / part.pitch) + max(spare, 0)
+            if isinstance(part, CentreLine) and part.position is not None:
+                changed["position"] = part.position + (after - before) // 2
+            parts.append(part.model_copy(update=changed).model_dump())
+        return Patterns.model_validate({"projector_size": size, "unwrap": self.unwrap, "parts": parts})
 
     def has_fringes(self, axis: Axis) -> bool:
         """Whether an axis is encoded by fringes, not by Gray code alone."""

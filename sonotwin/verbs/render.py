@@ -33,6 +33,7 @@ from twin.conditions import IDEAL, Conditions, check_board, drifted
 from twin.optics import surface_session
 from twin.optics.light_transport import Tracing
 from twin.session import Session
+from twin.working_range import working_range
 
 
 class Config(Part):
@@ -82,6 +83,8 @@ class Config(Part):
 def run(config: Config) -> None:
     """Render, and say what was written."""
     console = Console(soft_wrap=True, highlight=False)
+    if config.poses is not None:
+        config = config.model_copy(update={"poses": working_range(config.rig).poses(config.poses)})
     settings = config.model_dump(mode="json", exclude={"out", "add"})
     if config.poses is None:
         render_surface(config, Session(config.out, "surface", settings, config.add), console)

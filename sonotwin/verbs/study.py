@@ -10,14 +10,16 @@ that was stopped, or has more values or seeds. A trial takes from a second (chai
     sonotwin study name=budget out=outputs/budget engine.workers=2
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import Field, ValidationInfo, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, model_validator
 from rich.console import Console
 
-from recon.model.rig import Part
+from recon.model.patterns import Patterns
+from recon.model.rig import Part, Rig
 from sonotwin import study_steps
 from sonotwin.config import compose, folder
 from sonotwin.study_plan import SWEEP, Points, Seeds, read_study
@@ -27,6 +29,7 @@ from twin.studies.error_budget import Budget
 from twin.studies.experiments import MODULES, Settings
 from twin.studies.factors import Filling
 from twin.studies.rig_search import Goal
+from twin.working_range import working_range
 
 
 class Config(Part):
@@ -63,6 +66,7 @@ class Config(Part):
         own = {} if study is None else study.model_dump(exclude={"fields"})
         ranges = yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"]
         settings = {name: value for name, value in given.items() if name in Settings.model_fields} | {"ranges": ranges}
+        settings |= _on_raster(settings)
         fields = {name: value for name, value in given.items() if name not in Settings.model_fields and value is not None}
         for name in ("search", "budget"):
             if own.get(name) and isinstance(fields.get(name), dict):
@@ -83,6 +87,16 @@ class Config(Part):
         return self
 
 
+def _on_raster(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Pattern sequences on the raster of the rig's projector; those that are wrong are left for their own complaint."""
+    try:
+        size = Rig.model_validate(settings.get("rig")).projector.optics.size
+        named = {name: Patterns.model_validate(settings.get(name)) for name in ("patterns", "board_patterns")}
+        return {name: patterns.on(size) for name, patterns in named.items()}
+    except ValidationError:
+        return {}
+
+
 def run(config: Config) -> int:
     """Do the trials that are missing, write table, plots and page; returns 1 if nothing came of it.
 
@@ -92,6 +106,7 @@ def run(config: Config) -> int:
         If a factor isn't a field of the experiment, a value is nonsense, or `out` holds something else.
     """
     console = Console(soft_wrap=True, highlight=False)
+    console.print(f"rig         {working_range(config.settings.rig).in_words()}", markup=False)
     if config.search is not None:
         return 0 if study_steps.search(config, config.search, console) else 1
     if config.budget is not None:

@@ -26,7 +26,7 @@ from recon.files.metrics import shown
 from recon.model.rig import Part
 from recon.structured_light import decode, surface_figures, surface_mesh
 from recon.structured_light.triangulate import PointMap, Triangulator
-from sonotwin import config as configuration
+from sonotwin import choices
 
 POINTS = "points.npz"  # by which the folder of a surface is known
 
@@ -130,16 +130,10 @@ def read(config: Config) -> SurfaceCapture:
     if config.images is None or config.patterns is None or config.calibration is None:
         found = ", ".join(given) or "none of them"
         raise InputError(f"surface: expected capture, or images with patterns and calibration, found {found}")
-    return surface_part.read_bare(config.images, patterns_file(config.patterns), config.calibration, config.camera)
+    return surface_part.read_bare(config.images, choices.file_of("patterns", config.patterns), config.calibration, config.camera)
 
 
 def sources(config: Config) -> list[Path]:
     """Files and folders to be read."""
-    patterns = None if config.patterns is None else patterns_file(config.patterns)
+    patterns = None if config.patterns is None else choices.file_of("patterns", config.patterns)
     return [path for path in (config.capture, config.images, patterns, config.calibration) if path is not None]
-
-
-def patterns_file(name: str) -> Path:
-    """The file of a pattern sequence, given as a path or as a name from `conf/patterns`."""
-    known = configuration.folder() / "patterns" / f"{name}.yaml"
-    return known if known.is_file() and not Path(name).is_file() else Path(name)

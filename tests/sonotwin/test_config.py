@@ -114,12 +114,23 @@ def test_nonsense_is_one_line(override):
 
 
 @pytest.mark.parametrize("path", ["/home/me/mine.yaml", "mine.yaml", "./mine.yml", "~/rigs/mine", "rigs/mine"])
-def test_a_path_where_a_name_is_expected_is_said_so(path, tmp_path):
-    """With the way on: where the file has to be for its name to be known."""
+def test_a_path_without_a_file_is_said_so(path, tmp_path):
+    """With the way on: a file to begin with."""
     with pytest.raises(InputError) as caught:
         load(f"rig={path}")
-    way_on = f"copy the file to {tmp_path / 'rig'} and give its name"
-    assert str(caught.value) == f"surface: rig: expected one of narrow, wide, found the path {path}; {way_on}"
+    way_on = f"begin with a copy of {tmp_path / 'rig' / 'narrow.yaml'}"
+    assert str(caught.value) == f"surface: rig: expected one of narrow, wide, or a YAML file, found none at {path}; {way_on}"
+
+
+def test_a_choice_may_be_a_file_of_ones_own(tmp_path_factory, tmp_path):
+    """From anywhere, as after an installation, with fields of it changed on top; what is no YAML is refused in one line."""
+    path = tmp_path_factory.mktemp("own") / "mine.yaml"
+    path.write_text("gamma: 1.5\n")
+    assert load(f"rig={path}").rig.gamma == 1.5 and load(f"rig={path}", "rig.gamma=1.8").rig.gamma == 1.8
+    assert sorted(each.name for each in (tmp_path / "rig").iterdir()) == ["narrow.yaml", "wide.yaml"], "nothing is copied there"
+    path.write_text("a: [")
+    with pytest.raises(InputError, match=rf"^{path}: expected YAML, found"):
+        load(f"rig={path}")
 
 
 def test_brackets_and_quotes_are_balanced():

@@ -1,6 +1,6 @@
 """Accuracy with boards that bow and are printed imprecisely, against the best fixed choice, which is told their tolerances."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,9 +101,9 @@ def judged(found: Calibration, truth: Calibration) -> Calibrated:
     return Calibrated(form(found, truth), parameters, points, inside_region(found, truth, PAIRS[1], volume))
 
 
-def form(found: Calibration, truth: Calibration) -> float:
+def form(found: Calibration, truth: Calibration, depths: Sequence[float] = DEPTHS) -> float:
     """Form error of planes at three depths, seen by camera 1 and projector without noise, RMS, mm."""
-    return rms(np.array([_flatness(found, truth, depth) for depth in DEPTHS]))
+    return rms(np.array([_flatness(found, truth, depth) for depth in depths]))
 
 
 def _bow(seed: int) -> float:

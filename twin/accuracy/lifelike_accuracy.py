@@ -16,8 +16,7 @@ from recon.optical_calibration import figures_of_merit
 from recon.optical_calibration.joint_calibration import calibrate
 from scenes.board_poses import Config as Poses
 from scenes.board_poses import random_poses
-from scenes.catalogue import build_scene
-from scenes.kinds import board, plane
+from scenes.kinds import board, plane, sphere
 from twin import board_session
 from twin.accuracy import board_accuracy, lens_accuracy, paper_causes, surface_accuracy
 from twin.accuracy.baselines import opencv_peer
@@ -28,6 +27,7 @@ from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.conditions import BoardPrint, drifted, flexed, printed_board
 from twin.evaluation.surface_errors import rms
 from twin.optics.surface_session import Shooting, calibration_of
+from twin.working_range import working_range
 
 Array = NDArray[np.float64]
 
@@ -123,7 +123,11 @@ def session(setup: Setup, seed: int) -> board_session.Settings:
 def shoot(session: board_session.Settings, patterns: Patterns) -> tuple[Experiment, Experiment]:
     """A plane and a sphere, rendered by devices that have drifted since they were calibrated, and decoded."""
     seed, life = session.seed, session.conditions
-    scenes = plane.build(plane.PAPER_POSES[seed % len(plane.PAPER_POSES)]), build_scene({"kind": "sphere"})
+    where, ball = working_range(session.rig), sphere.Config()
+    pose = where.plate(plane.PAPER_POSES[seed % len(plane.PAPER_POSES)])
+    behind = None if ball.background_mm is None else where.depth(ball.background_mm)
+    moved = ball.model_copy(update={"centre_mm": where.place(*ball.centre_mm), "background_mm": behind})
+    scenes = plane.build(pose), sphere.build(moved)
     rig = drifted(session.rig, life.drift, seed)
     first, second = (
         surface_accuracy.experiment(rig, scene, patterns, seed, session.tracing, session.shooting, life) for scene in scenes

@@ -6,8 +6,10 @@ from recon.optical_calibration.joint_calibration import calibrate
 from twin import board_session
 from twin.accuracy import board_accuracy
 from twin.accuracy.board_sets import rendered
+from twin.accuracy.calibration_errors import DEPTHS
 from twin.studies.experiments import Experiment, Settings
 from twin.studies.layout import laid_out
+from twin.working_range import working_range
 
 KEPT = ("point_sigma_mm", "shape_sigma_mm", "scale_sigma_ppm")
 
@@ -18,10 +20,11 @@ def measure(settings: Settings, seed: int) -> Metrics:
     result = calibrate(seen.sightings, seen.board, seen.sizes)
     found = figures_of_merit.measure(result, seen.truth)
     calibration = result.adjustment.calibration
+    depths = [working_range(settings.rig).depth(z) for z in DEPTHS]
     return {
         "point_error_mm": found["point_error_rms_mm"],
         **{name: found[name] for name in KEPT},
-        "plane_form_mm": board_accuracy.form(calibration, seen.truth),
+        "plane_form_mm": board_accuracy.form(calibration, seen.truth, depths),
         "error_over_sigma": figures_of_merit.normalised_error(calibration, seen.truth),
         **{f"reprojection_rms_{name}_px": rms for name, rms in result.rms.items()},
         "poses_used": len(result.observations.poses),
@@ -30,10 +33,11 @@ def measure(settings: Settings, seed: int) -> Metrics:
 
 def session(settings: Settings, seed: int) -> board_session.Settings:
     """The board in the hands of one laboratory."""
+    where = working_range(settings.rig)
     return board_session.Settings(
         laid_out(settings.rig, settings.layout),
-        settings.board,
-        settings.poses.model_copy(update={"seed": settings.poses.seed + seed}),
+        where.board(settings.board),
+        where.poses(settings.poses).model_copy(update={"seed": settings.poses.seed + seed}),
         settings.board_patterns,
         board_session.CAMERAS,
         settings.tracing,

@@ -24,6 +24,7 @@ from twin.studies import drawn_session
 from twin.studies.drawn_session import Noise, Session
 from twin.studies.experiments import Experiment, Settings
 from twin.studies.layout import laid_out
+from twin.working_range import working_range
 
 Array = NDArray[np.float64]
 
@@ -35,21 +36,17 @@ CONDITIONS = (  # that act on drawn measurements
     "conditions.sound",
     "conditions.drift",
 )
-RIG = (
-    *(f"rig.{device}.optics" for device in ("cam1", "cam2", "projector")),
-    "rig.target",
-    "rig.probe",
-)  # sensors act in images only
 NEWTON_STEPS = 5
-DEPTHS_MM = (620.0, 660.0, 700.0)  # z of the surface's points
+DEPTHS_MM = (620.0, 660.0, 700.0)  # z of the surface's points in the paper's rig
 GRID = (7, 7)  # pixels of a B-scan, across and down
 MASS_MM, DEEP_MM = 7.0, 25.0  # radius of the mass, depth of its middle in the image
 
 
 def measure(settings: Settings, seed: int) -> Metrics:
     """Figures of one session: root mean squares over points and pixels."""
-    rig, noise = laid_out(settings.rig, settings.layout), settings.noise
-    found = drawn_session.draw(rig, settings.conditions, noise, settings.ultrasound, settings.poses, seed)
+    where = working_range(settings.rig)
+    rig, noise = laid_out(settings.rig, settings.layout), settings.noise.at(where)
+    found = drawn_session.draw(rig, settings.conditions, noise, settings.ultrasound, settings.poses, seed, where)
     points, sigmas = surface_errors(found, noise, seed)
     width, height = rig.probe.image_size
     pixels = np.stack(np.meshgrid(np.linspace(0, width - 1, GRID[0]), np.linspace(0, height - 1, GRID[1])), axis=-1).reshape(
@@ -73,7 +70,7 @@ def surface_errors(found: Session, level: Noise, seed: int) -> tuple[Array, Arra
 
     The devices that are used see the points, and the calibration places them.
     """
-    points = uncertainty.working_volume(found.used, DEPTHS_MM)
+    points = uncertainty.working_volume(found.used, [found.where.depth(z) for z in DEPTHS_MM])
     noise = level.drawn.column * level.column_px * np.random.default_rng([seed, 26]).standard_normal(len(points))
     by_noise, by_optics = predicted_points(found, points, level.column_px)
     return (measured(found, points, noise) - points)[:, 2], np.sqrt(by_noise + by_optics)
@@ -87,7 +84,7 @@ def measured(found: Session, points: Array, noise_px: Array | float = 0.0) -> Ar
 
 def skin_error(found: Session) -> Array:
     """Error : (3,) mm of the skin under the array's face, by light."""
-    face = np.array([drawn_session.MIDDLE_MM])
+    face = np.array([found.face_mm])
     return (measured(found, face) - face)[0]
 
 
@@ -129,7 +126,7 @@ def place_errors(found: Session, k: int, pixels: Array) -> Array:
 def mass_error(found: Session) -> Array:
     """Error : (3,) mm of the centre of a ball: the mean error of its pixels, of all B-scans that cut it."""
     offsets = np.stack(np.meshgrid(*2 * [np.arange(-MASS_MM, MASS_MM + 1.0)]), axis=-1).reshape(-1, 2)
-    middle, errors = np.add(drawn_session.MIDDLE_MM, (0.0, 0.0, DEEP_MM)), []
+    middle, errors = np.add(found.face_mm, (0.0, 0.0, DEEP_MM)), []
     for k, pose in enumerate(found.true_poses):
         x, y, beside = rigid.apply(rigid.invert(pose), middle)
         inside = (offsets**2).sum(axis=1) + beside**2 < MASS_MM**2
@@ -162,7 +159,7 @@ def predicted_places(found: Session, latency_s: float, tissue: float, pixels: Ar
 
 
 EXPERIMENT = Experiment(
-    (*RIG, "layout", *CONDITIONS, "noise", "poses", "ultrasound"),
+    ("rig", "layout", *CONDITIONS, "noise", "poses", "ultrasound"),
     measure,
     {"surface_rms_mm": "surface_predicted_mm", "pixel_rms_mm": "pixel_predicted_mm", "mass_error_mm": "", "mass_to_skin_mm": ""},
     "predicted by the software's covariances",

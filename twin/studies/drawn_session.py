@@ -35,6 +35,7 @@ from twin.optics.surface_session import calibration_of
 from twin.ultrasound.echo_solids import body
 from twin.ultrasound.probe_path import WirePath, about_crossing, crossing
 from twin.ultrasound.transducer import Transducer
+from twin.working_range import PAPER, WorkingRange
 
 Array = NDArray[np.float64]
 
@@ -64,7 +65,20 @@ class Noise(Part):
     scans: Annotated[int, Field(ge=8, le=1000, multiple_of=2)] = 40  # B-scans over the mass, half of them there and half back
     span_mm: Positive = 20.0  # way of the probe over the mass
     speed_mm_s: Positive = 10.0
+    of_paper: bool = True  # whether board_px, circle_px and column_px are those of the paper's rig, and others for another one
     drawn: "Drawn" = Field(default_factory=lambda: Drawn())
+
+    def at(self, where: WorkingRange) -> "Noise":
+        """The noise in a rig."""
+        if not self.of_paper:
+            return self
+        board, circle = where.rims
+        sizes = {
+            "board_px": board * self.board_px,
+            "circle_px": circle * self.circle_px,
+            "column_px": where.noise * self.column_px,
+        }
+        return self.model_copy(update=sizes | {"of_paper": False})
 
 
 class Drawn(Part):
@@ -113,17 +127,27 @@ class Session:
     velocity: Array  # (n, 3) mm/s
     tracked: Tracked
     latency_s: float  # error of the measured latency
+    where: WorkingRange = PAPER
+
+    @property
+    def face_mm(self) -> tuple[float, float, float]:
+        """Place of the array's face in the middle of the scan."""
+        return self.where.place(*MIDDLE_MM)
 
 
-def draw(rig: Rig, life: Conditions, noise: Noise, transducer: Transducer, poses: Poses, seed: int) -> Session:
+def draw(
+    rig: Rig, life: Conditions, noise: Noise, transducer: Transducer, poses: Poses, seed: int, where: WorkingRange = PAPER
+) -> Session:
     """Draw a session, the same for the same seed.
+
+    where : in which range board, wires and scan lie
 
     Raises
     ------
     InputError
         If a calibration is refused, or the target is lost over the scan.
     """
-    optics = calibrated_optics(rig, life, noise, poses, seed)
+    optics = calibrated_optics(rig, life, noise, poses, seed, where)
     used = calibration_of(conditions.drifted(rig, life.drift, seed))
     printed = conditions.printed(rig.target, life.target, seed)
     known = in_use(optics.uncertainty, optics.cameras, PRINT_SCALE, DRIFT_PX)
@@ -131,8 +155,8 @@ def draw(rig: Rig, life: Conditions, noise: Noise, transducer: Transducer, poses
     faster, warmer = conditions.speeds(life.sound, seed)
     water = float(speed_of_sound(WATER_C + warmer) / speed_of_sound(WATER_C))
     at_wires = eye._replace(times=noise.drawn.circle_at_wires)
-    probe = calibrated_probe(rig, at_wires, life, noise, water, transducer, seed)
-    true_poses, velocity = led(rig, noise, np.random.default_rng([seed, 22]))
+    probe = calibrated_probe(rig, at_wires, life, noise, water, transducer, seed, where)
+    true_poses, velocity = led(rig, noise, np.random.default_rng([seed, 22]), where.place(*MIDDLE_MM))
     later = conditions.triggered(life.motion, len(true_poses), seed + SCAN_STREAM)
     tracked = look(
         eye,
@@ -146,19 +170,23 @@ def draw(rig: Rig, life: Conditions, noise: Noise, transducer: Transducer, poses
         raise InputError(f"target: expected to be seen in all {len(true_poses)} poses of the scan, found it lost in some")
     true_probe = ProbeCalibration(rig.probe.target_from_image.matrix(), np.array(rig.probe.scale_mm_per_px) * [1.0, faster])
     latency = noise.drawn.latency * noise.latency_s * float(np.random.default_rng([seed, 24]).standard_normal())
-    return Session(used, optics, probe, true_probe, true_poses, velocity, tracked, latency)
+    return Session(used, optics, probe, true_probe, true_poses, velocity, tracked, latency, where)
 
 
-def calibrated_optics(rig: Rig, life: Conditions, noise: Noise, chosen: Poses, seed: int) -> Calibration:
+def calibrated_optics(
+    rig: Rig, life: Conditions, noise: Noise, chosen: Poses, seed: int, where: WorkingRange = PAPER
+) -> Calibration:
     """Calibrate from a board whose discs are found with noise."""
-    return calibrated_board(rig, life, noise, chosen, seed).adjustment.calibration
+    return calibrated_board(rig, life, noise, chosen, seed, where).adjustment.calibration
 
 
-def calibrated_board(rig: Rig, life: Conditions, noise: Noise, chosen: Poses, seed: int) -> Result:
+def calibrated_board(rig: Rig, life: Conditions, noise: Noise, chosen: Poses, seed: int, where: WorkingRange = PAPER) -> Result:
     """The same, with the board's observations."""
-    truth, config = calibration_of(rig), board.Config()
+    truth, config = calibration_of(rig), where.board(board.Config())
     design = board.design(config)
-    poses = random_poses(chosen.model_copy(update={"seed": chosen.seed + seed}), design, list(truth.cameras.values()))
+    poses = random_poses(
+        where.poses(chosen).model_copy(update={"seed": chosen.seed + seed}), design, list(truth.cameras.values())
+    )
     printed = conditions.printed_board(config, life.board, seed)
     points = np.stack([board.printed_centres(conditions.flexed(printed, life.board, seed, k)) for k in range(chosen.count)])
     claimed = {name: noise.board_px * (0.75 if name == "projector" else 1) for name in truth.cameras}
@@ -167,10 +195,19 @@ def calibrated_board(rig: Rig, life: Conditions, noise: Noise, chosen: Poses, se
 
 
 def calibrated_probe(
-    rig: Rig, eye: Eye, life: Conditions, noise: Noise, water: float, transducer: Transducer, seed: int
+    rig: Rig,
+    eye: Eye,
+    life: Conditions,
+    noise: Noise,
+    water: float,
+    transducer: Transducer,
+    seed: int,
+    where: WorkingRange = PAPER,
 ) -> ProbeCalibration:
     """Calibrate from the crossing of two wires in water of a speed of sound, relative to that which is taken for it."""
-    rng, wired, drawn_too = np.random.default_rng([seed, 21]), body(crosswire.build(crosswire.Config())), noise.drawn
+    wires = crosswire.Config()
+    wires = wires.model_copy(update={"cross_mm": where.place(*wires.cross_mm)})
+    rng, wired, drawn_too = np.random.default_rng([seed, 21]), body(crosswire.build(wires)), noise.drawn
     path = WirePath(count=noise.wires, roll_deg=ROLL_DEG, miss_mm=drawn_too.beside * noise.beside_mm)
     rests, moments = about_crossing(path, wired, transducer, seed)
     images = tracks.at(rests, moments)
@@ -188,7 +225,9 @@ def calibrated_probe(
     return point_calibration.calibrate(seen, rig.probe.image_size).calibration
 
 
-def led(rig: Rig, noise: Noise, rng: np.random.Generator) -> tuple[Array, Array]:
+def led(
+    rig: Rig, noise: Noise, rng: np.random.Generator, middle_mm: tuple[float, float, float] = MIDDLE_MM
+) -> tuple[Array, Array]:
     """Poses `world_from_image` : (n, 4, 4) over a mass, there and back, and their velocities : (n, 3) mm/s."""
     half = noise.scans // 2
     there = np.linspace(-0.5, 0.5, half) * noise.span_mm
@@ -197,7 +236,7 @@ def led(rig: Rig, noise: Noise, rng: np.random.Generator) -> tuple[Array, Array]
     foot = np.array([rig.probe.image_size[0] * rig.probe.scale_mm_per_px[0] / 2, 0.0, 0.0])
     tilts = np.deg2rad(TILT_DEG) * rng.standard_normal(3) + np.deg2rad(1.0) * rng.standard_normal((len(along), 3))
     turns = [rigid.from_rotation_vector(tilt, np.zeros(3))[:3, :3] @ upright for tilt in tilts]
-    faces = np.array(MIDDLE_MM) + along[:, None] * [0.0, 1.0, 0.0]
+    faces = np.array(middle_mm) + along[:, None] * [0.0, 1.0, 0.0]
     poses = np.stack([rigid.transform(turn, face - turn @ foot) for turn, face in zip(turns, faces, strict=True)])
     velocity = np.zeros((len(along), 3))
     velocity[:, 1] = np.repeat([noise.speed_mm_s, -noise.speed_mm_s], half)

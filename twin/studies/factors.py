@@ -7,14 +7,13 @@ so many points of a space-filling one (scipy.stats.qmc) take any of them by thei
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
-from difflib import get_close_matches
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from scipy.stats import norm, qmc
 
-from recon.errors import InputError, one_line
+from recon.errors import InputError, did_you_mean, one_line
 from recon.model.rig import Part
 
 Value = Any  # what YAML holds
@@ -169,6 +168,4 @@ def _keys(place: Any, part: str, name: str) -> list[Any]:
         known = [*map(str, range(len(place))), *sorted({kind for kind in kinds if kind})]
     else:
         raise InputError(f"over: {name}: {part}: expected a field, found that a value stands there already")
-    close = get_close_matches(part, known, n=1) or [key for key in known if len(part) > 2 and part in key]
-    advice = f"; did you mean {close[0]}?" if close else ""
-    raise InputError(f"over: {name}: unknown key {part}; expected one of {', '.join(known)}{advice}")
+    raise InputError(f"over: {name}: unknown key {part}; expected one of {', '.join(known)}{did_you_mean(part, known)}")

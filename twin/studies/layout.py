@@ -6,8 +6,9 @@ from scipy.spatial.transform import Rotation
 from recon.geometry import rigid
 from recon.geometry.camera import Array
 from recon.model.rig import Optics, Part, Pose, Positive, Rig
+from twin.working_range import working_range
 
-AIM_MM = 660.0  # z of what a device keeps looking at: the middle of the working range of Meza et al. 2021
+AIM_MM = 660.0  # z of what a device keeps looking at: the middle of the working range of Meza et al. 2021, and likewise of others
 
 
 class Layout(Part):
@@ -20,21 +21,21 @@ class Layout(Part):
 
 def laid_out(rig: Rig, layout: Layout) -> Rig:
     """The rig in another layout: devices that move keep looking at the same place."""
-    changed = {}
+    changed, aim_mm = {}, working_range(rig).depth(AIM_MM)
     for name, distance in (("projector", layout.projector_mm), ("cam2", layout.camera_mm)):
         if distance is not None:
             device = getattr(rig, name)
-            changed[name] = device.model_copy(update={"optics": moved(device.optics, distance)})
+            changed[name] = device.model_copy(update={"optics": moved(device.optics, distance, aim_mm)})
     if layout.target_scale != 1:
         changed["target"] = _scaled(rig, layout.target_scale)
     return rig.model_copy(update=changed)
 
 
-def moved(optics: Optics, distance_mm: float) -> Optics:
+def moved(optics: Optics, distance_mm: float, aim_mm: float = AIM_MM) -> Optics:
     """A device farther from or nearer to the world's origin, turned so that its image's middle shows the same place."""
     camera = optics.camera()
     ray = camera.rays((np.array(camera.size) - 1) / 2)
-    aim = camera.centre + ray * (AIM_MM - camera.centre[2]) / ray[2]
+    aim = camera.centre + ray * (aim_mm - camera.centre[2]) / ray[2]
     centre = camera.centre * distance_mm / np.linalg.norm(camera.centre)
     turn = least_turn(aim - camera.centre, aim - centre)
     rotation = camera.camera_from_world[:3, :3] @ turn.T

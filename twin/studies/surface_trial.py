@@ -13,12 +13,13 @@ from twin.sensor import Exposure, electrons_per_radiance, number_per_electron
 from twin.studies import closed_forms
 from twin.studies.experiments import Experiment, Settings
 from twin.studies.layout import laid_out
+from twin.working_range import working_range
 
 
 def measure(settings: Settings, seed: int) -> Metrics:
     """Figures of a plane, tilted as one of the paper's, in turn by the seed."""
     rig = drifted(laid_out(settings.rig, settings.layout), settings.conditions.drift, seed)
-    pose = plane.PAPER_POSES[seed % len(plane.PAPER_POSES)]
+    pose = working_range(settings.rig).plate(plane.PAPER_POSES[seed % len(plane.PAPER_POSES)])
     if settings.plane.depth_mm is not None:
         pose = pose.model_copy(update={"centre_mm": (*pose.centre_mm[:2], settings.plane.depth_mm)})
     result = surface_accuracy.experiment(

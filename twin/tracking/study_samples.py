@@ -14,10 +14,11 @@ from recon.model.rig import Rig
 from twin.tracking.samples import LAMPS, SCRATCHES, SPOTS, Lighting, Motion, Print, Take, draw, facing
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import board_corners
+from twin.working_range import working_range
 
 Array = NDArray[np.float64]
 
-VOLUME_MM = ((-125.0, -100.0, 606.0), (125.0, 100.0, 713.0))  # the paper's: 253 x 199 x 107 mm at 606 to 713 mm
+HALF_MM = (125.0, 100.0)  # half the breadth and the height of the paper's volume: 253 x 199 x 107 mm at 606 to 713 mm
 TILT_DEG = 45.0  # most, of the target's normal from the way to the cameras
 MARGIN_PX = 12.0  # of the board from the images' borders
 TRIES = 200
@@ -55,9 +56,11 @@ def _pose(rig: Rig, rng: np.random.Generator) -> Array:
     views = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
     eyes = (views[0].centre + views[1].centre) / 2
     middle_target = circle_centres(rig.target)[1:].sum(axis=0) / 2
+    where = working_range(rig)
+    half, (near, far) = where.breadth * np.array(HALF_MM), where.depths_mm
     for _ in range(TRIES):
-        middle = rng.uniform(*VOLUME_MM)
-        middle[0] += eyes[0]
+        middle = rng.uniform([*-half, near], [*half, far])
+        middle[:2] += [eyes[0] + where.aside_mm[0], where.aside_mm[1]]
         pose = rigid.transform(facing(eyes - middle, TILT_DEG, rng), np.zeros(3))
         pose[:3, 3] = middle - pose[:3, :3] @ middle_target
         corners = [view.project(rigid.apply(pose, board_corners(rig.target))) for view in views]

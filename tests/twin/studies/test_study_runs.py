@@ -284,7 +284,6 @@ def test_parts_of_a_field_that_would_change_nothing_are_refused():
         "conditions.board.diameter_mm",
         "conditions.board.bow",
         "conditions.frames",
-        "rig.cam1.sensor",
         "nois",
     ):
         with pytest.raises(InputError, match=rf"over: {inert}: expected a field that of=chain reads, .* would change nothing"):

@@ -8,7 +8,7 @@ from recon.model.circle_layout import circle_centres
 from tests.twin.tracking.takes import ranges, rig
 from twin.tracking.samples import draw, facing
 from twin.tracking.sampling_ranges import PoseRanges
-from twin.tracking.study_samples import TILT_DEG, VOLUME_MM, study_take
+from twin.tracking.study_samples import HALF_MM, TILT_DEG, study_take
 from twin.tracking.target_truth import view_truth
 
 RIG, COUNT = rig(), 150
@@ -70,7 +70,7 @@ def test_tilts_fill_the_cone_evenly(rng):
 
 
 def test_studies_keep_to_the_working_volume():
-    low, high = np.array(VOLUME_MM)
+    low, high = np.array([-HALF_MM[0], -HALF_MM[1], 606]), np.array([*HALF_MM, 713])
     for k in range(20):
         take = study_take(RIG, ranges(), 3, k, 100.0, 12.0)
         pose = take.motion.world_from_target
