@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from campaign import bad_inputs, full_disk, fuzzing, kills, soak, sources, two_writers
+from campaign import bad_inputs, full_disk, fuzzing, kills, mistaken_tasks, mistakes, soak, sources, two_writers
 from campaign.sources import COMMANDS
 
 NAMES = {"ball", "scan", "skin", "volume"}
@@ -26,6 +26,16 @@ def test_bad_inputs_are_refused(place):
     found = bad_inputs.run(chosen, place, workers=1)
     wrong = {f"{one.case.command.verb} {one.case.fault}": (one.fault, one.outcome.said) for one in found if one.fault}
     assert not {name: fault for name, fault in wrong.items() if fault[0] != "slow"}
+
+
+@pytest.mark.slow
+def test_mistakes_are_made_and_judged(place, tmp_path):
+    """A few with one sweep; a run that was ended goes on, and the right commands have no distance from themselves."""
+    tasks, kept = [mistaken_tasks.FREEHAND], tmp_path / "mistakes.csv"
+    first = mistakes.run(place, 4, workers=1, kept=kept, tasks=tasks)
+    assert mistakes.run(place, 4, workers=1, kept=kept, tasks=tasks) == first
+    assert all(one.outcome != "traceback" for one in first), first
+    assert mistakes.table(first)[2].startswith("| freehand | 4 |")
 
 
 @pytest.mark.slow
