@@ -67,7 +67,7 @@ benchmark: setup  ## measure speed
 	@$(BIN)/python -m benchmarks $(ONLY)
 
 # Hours; parts that have a table in outputs/campaign/ are kept, and ONLY=part does one anew.
-campaign: setup  ## attack every command: bad inputs, fuzzing, kills, full disks, two writers, long runs
+campaign: setup  ## attack every command: bad inputs, mistakes, fuzzing, kills, full disks, two writers, long runs
 	@$(BIN)/python -m campaign $(ONLY) $(ARGS)
 
 # Hours; goes on where it was stopped. Trials are shared: planes, sphere and optics are figures of the same laboratories, and so are

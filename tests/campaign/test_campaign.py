@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from campaign import bad_inputs, foreign, full_disk, fuzzing, kills, soak, sources, two_writers
+from campaign import bad_inputs, foreign, full_disk, fuzzing, kills, mistaken_tasks, mistakes, soak, sources, two_writers
 from campaign.sources import COMMANDS
 
 NAMES = {"ball", "scan", "skin", "volume"}
@@ -36,6 +36,16 @@ def test_files_of_others_stay(place):
     statuses = {(one.writer, one.content): one.status for one in found}
     assert len(found) >= 28 and all(statuses["surface", content] == 0 for content in list(foreign.IN_A_RESULT)[:6])
     assert all(statuses["surface", content] == 2 for content in ("one of ours, changed by hand", *foreign.INSTEAD))
+
+
+@pytest.mark.slow
+def test_mistakes_are_made_and_judged(place, tmp_path):
+    """A few with one sweep; a run that was ended goes on, and the right commands have no distance from themselves."""
+    tasks, kept = [mistaken_tasks.FREEHAND], tmp_path / "mistakes.csv"
+    first = mistakes.run(place, 4, workers=1, kept=kept, tasks=tasks)
+    assert mistakes.run(place, 4, workers=1, kept=kept, tasks=tasks) == first
+    assert all(one.outcome != "traceback" for one in first), first
+    assert mistakes.table(first)[2].startswith("| freehand | 4 |")
 
 
 @pytest.mark.slow
