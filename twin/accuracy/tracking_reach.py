@@ -57,9 +57,9 @@ class Reached:
     wrong: bool
 
 
-def rows(setup: Setup, networks: Networks, count: int = COUNT) -> list[Row]:
-    """Shares found, and wrong ones."""
-    reached = list(tracked(setup, networks, SEED, count))
+def rows(setup: Setup, networks: Networks, count: int = COUNT, most_px: float = np.inf) -> list[Row]:
+    """Shares found, and wrong ones; of rigs of `most_px` pixels at most."""
+    reached = list(tracked(setup, networks, SEED, count, most_px))
     found = np.array([one.how is not None for one in reached])
     wrong = sum(one.wrong for one in reached)
     what = f"drawn rigs of 0.3 to 12 MP, circles of {LEAST_PX:g} px and more ({len(reached)} pairs)"
@@ -69,9 +69,9 @@ def rows(setup: Setup, networks: Networks, count: int = COUNT) -> list[Row]:
     ]
 
 
-def tracked(setup: Setup, networks: Networks, seed: int, count: int) -> Iterator[Reached]:
+def tracked(setup: Setup, networks: Networks, seed: int, count: int, most_px: float = np.inf) -> Iterator[Reached]:
     """Track each pair as if nothing were known before."""
-    for take, given in drawn(setup, seed, count):
+    for take, given in drawn(setup, seed, count, most_px):
         cameras = cameras_of(take)
         result = Tracker(cameras, setup.rig.target, networks).step(*given.views)
         distance = float(np.linalg.norm(take.motion.world_from_target[:3, 3]))
@@ -81,13 +81,15 @@ def tracked(setup: Setup, networks: Networks, seed: int, count: int) -> Iterator
         yield Reached(take.k, cameras[0].size, disc, distance, result.how, result.pose.reason, wrong)
 
 
-def drawn(setup: Setup, seed: int, count: int) -> Iterator[tuple[Take, Frames]]:
+def drawn(setup: Setup, seed: int, count: int, most_px: float = np.inf) -> Iterator[tuple[Take, Frames]]:
     """Pairs of frames of drawn rigs, their target uncovered."""
     bank = build_bank(setup.rig.target, VARIANTS, seed)
     k = given = 0
     while given < count:
         take = reach_take(setup, seed, k)
         k += 1
+        if np.prod(take.cameras[0].optics.size) > most_px:
+            continue
         shown = render_film(bank, setup.rig, [take], FilmQuality(), seed)[0]
         if min(view.visible.min() for view in shown.truth) > WHOLLY:
             given += 1
