@@ -297,3 +297,18 @@ def test_too_few_steps_say_that_the_noise_is_assumed(rng):
     patterns = Patterns(projector_size=(1280, 800), unwrap="centre_line", parts=parts)
     found = decode(photograph(patterns, smooth_maps(patterns, rng), rng), patterns)
     assert found.noise_source == "assumed"
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+@pytest.mark.parametrize("steps", [3, 4])
+def test_a_step_taken_twice_is_refused(rng, steps, share):
+    """One step shows that before it, as of a projector that lags, be it of the fine fringes or of a cue; or half of it, of the fine ones."""
+    parts = (Fringes(pitch=64, steps=steps), Fringes(pitch=1280, steps=steps))
+    patterns = Patterns(projector_size=(1280, 800), unwrap="heterodyne", parts=parts)
+    columns = 639.5 + 1.4 * (np.mgrid[:120, :480][1] - 240.0)
+    images = photograph(patterns, {"columns": columns}, rng)
+    assert np.mean(decode(images, patterns).status == Status.OK) > 0.9
+    for late in (1, steps - 1, *((steps + 1, 2 * steps - 1) if share == 1 else ())):
+        wrong = images.copy()
+        wrong[late] = np.uint8(share * images[late - 1] + (1 - share) * images[late])
+        refused(wrong, patterns, "taken twice|contradict each other in .* taken once")
