@@ -263,7 +263,7 @@ def _check_residuals(residual: Image, place: str) -> None:
     """Refuse fringes that don't fit the cells of the code; in the right order the residual spreads over +-0.25 cycle."""
     above, below = (np.count_nonzero(side) for side in (residual > 0.25, residual < -0.25))
     if max(abs(above - below) - LOPSIDED * residual.size, above + below - ASTRAY * residual.size) > FEW:
-        off = abs(float(residual.mean()))
+        off = abs(float(np.angle(np.mean(np.exp(2j * np.pi * residual))))) / (2 * np.pi)
         raise InputError(
             f"{place}: the code lies {off:.2f} period off the fringes in the mean, and over a quarter period in "
             f"{100 * (above + below) / residual.size:.0f} % of the pixels: are the images in the manifest's order?"
