@@ -7,6 +7,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
 from recon.geometry.lens_domain import is_one_to_one
 from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
@@ -17,6 +18,8 @@ from recon.optical_calibration.observations import PROJECTOR, Observations
 FEWEST_POSES = 3
 FEW_POSES = 10
 LEAST_TILT_DEG = 5.0  # between two boards, without which focal length and distance are one unknown
+STRETCHED = 0.02  # of fx / fy from 1; square pixels and ordinary lenses stay within 0.005
+SURE = 5.0  # standard deviations likewise
 COVERED = 0.5  # least share of the image within the points' hull
 FAR_OFF = 0.15  # of the image's side, from it to the nearest point
 DIAMETER_REFUSED, DIAMETER_DOUBTED = 0.04, 0.015  # relative error of the discs' size; ink spreads by up to 1 %
@@ -139,9 +142,23 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
                 f"{device}: points surround {100 * share:.0f} % of the image; "
                 f"none {_where(seen, part)}, where distortion is a guess"
             )
+        spread = uncertainty.sigma(f"{device}.fx") / camera.matrix[0, 0] if uncertainty else 0.0
+        if stretched := stretch(device, camera, spread):
+            found.append(stretched)
         if uncertainty and (sigma := uncertainty.sigma(f"{device}.fx") / camera.matrix[0, 0]) > UNSURE_FOCAL:
             found.append(f"{device}: focal length is known to {100 * sigma:.2g} % only: more poses, tilted more")
     return found
+
+
+def stretch(device: str, camera: Camera, sigma: float) -> str | None:
+    """A warning of focal lengths that differ by more than those of square pixels, and than their relative standard deviation."""
+    aspect = float(camera.matrix[0, 0] / camera.matrix[1, 1])
+    if abs(aspect - 1) <= max(STRETCHED, SURE * sigma):
+        return None
+    return (
+        f"{device}: focal lengths fx / fy are {aspect:.2f}, expected 1: is its image stretched, as a display of another "
+        "resolution than the projector's own, or are its pixels no squares?"
+    )
 
 
 def _contradictions(observations: Observations, adjustment: Adjustment) -> list[str]:

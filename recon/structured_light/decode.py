@@ -276,7 +276,7 @@ def _orders(shots: _Shots, axis: Axis, sets: list[Measured], valid: Mask) -> tup
     part, fringe = min(sets, key=lambda pair: pair[0].pitch)
     if patterns.unwrap == "heterodyne":
         orders = multi_frequency.fringe_order(sets, length)
-        plausibility.check_pitches(orders.trusted, valid, f"{name}: fringes of {axis}")
+        plausibility.check_pitches(orders.trusted, valid, fringe.sigma, f"{name}: fringes of {axis}")
         return orders, nowhere, {}
     guide, place = next((p, at) for p, at in patterns.slices() if isinstance(p, GrayCode | CentreLine) and p.axis == axis)
     if isinstance(guide, CentreLine):

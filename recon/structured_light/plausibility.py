@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.model.patterns import Fringes, GrayCode
-from recon.structured_light.phase import Fringe, sample_pixels
+from recon.structured_light.phase import Fringe, pseudo_inverse, sample_pixels
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -16,6 +16,10 @@ CHECK_SAMPLES = 10_000  # pixels of a check
 LIT_SHARE = 0.002  # share of the image that must carry fringes
 SATURATED_SHARE = 0.5  # share of the lit image that may be saturated
 HARMONIC_SHARE = 0.08  # of the modulation, in the high harmonics: beyond, it is no N-step sequence
+AROUND = 0.25  # of the RMS phasor: a larger mean is of phases that are not seen all around
+SLIM = 0.25  # of the power, in the mean square of the phasors: 1 of a doubled step, 0.03 of a shift off by 5 % of a step
+SPARSE_STEPS = 7  # at most, of which neighbours differ by a third of the swing; more have harmonics that show errors
+ALIKE = 0.15  # of the swing: a median difference of two images that noise makes; share of the pixels of either phase
 LINE_SHARE = 0.3  # share of the fringes' area that may be lit in the image of a line
 MIN_SIGHTINGS = 10  # least rows with the line
 LINE_OFF = 0.06  # cycle, largest offset of the line from the fringes; a fringe image out of its place is a step, 1/8 or so
@@ -29,6 +33,7 @@ FEW = 20  # pixels, too few for a decision
 OUTSIDE_SHARE = 0.2  # of the lit pixels, that a code may place beyond the projector's image: shadows lit by what stands around
 RUSH = 0.05  # of all cells, between one pixel and the next: more than any image of a surface shows in the mean
 LEAPS = 3.0  # times the usual change of the cell: of two bits exchanged it is 3 at least, of most others hundreds
+UNEXPLAINED = 0.15  # share likewise of the half of the pixels with less noise
 CONTRADICTED = 0.7  # share of the pixels whose pitches contradict each other; of unrelated phases it is 0.8 or more
 
 
@@ -48,7 +53,35 @@ def check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, 
         raise InputError(f"{place} are saturated in {share:.0f} % of the lit pixels, expected under half: shorten the exposure")
     useful = (swing > 2 * least) & (samples.max(axis=0) < full)
     if useful.any():
+        _check_steps(samples[:, useful], part, place, start)
         _check_order(samples[:, useful], beside[:, useful], part, place, start)
+
+
+def _check_steps(samples: Image, part: Fringes, place: str, start: int) -> None:
+    """Refuse a step that was taken twice, is late or far off: phasors lie on a line or a slim ellipse, not around a circle.
+
+    Three steps leave no residual by which an error shows, but phases all around show it. Of a wave so wide that few phases are
+    seen, two images that are one: a pixel of theirs is of one of two phases.
+    """
+    if part.steps > SPARSE_STEPS or samples.shape[1] < FEW:
+        return
+    swing = np.median(np.ptp(samples, axis=0))
+    pairs = list(itertools.combinations(range(part.steps), 2))
+    differences = [float(np.median(np.abs(samples[a] - samples[b]))) for a, b in pairs]
+    a, b = pairs[int(np.argmin(differences))]
+    others = [samples[k] - samples[a] for k in range(part.steps) if k not in (a, b)]
+    both = max(min(np.mean(other > swing / 4), np.mean(other < -swing / 4)) for other in others)
+    doubled = min(differences) < ALIKE * swing and both > ALIKE
+    _, c, s = pseudo_inverse(part.shifts) @ samples
+    phasor = c + 1j * s
+    power = float(np.mean(np.abs(phasor) ** 2))
+    around = abs(np.mean(phasor)) < AROUND * np.sqrt(power)
+    if doubled or (around and abs(np.mean(phasor**2)) > SLIM * power):
+        cause = f"images {start + a} and {start + b} show the same" if doubled else "the steps are uneven"
+        raise InputError(
+            f"{place} do not follow the {part.steps}-step sequence, {cause}: was one taken twice, or before the projector had "
+            "changed, or with another exposure?"
+        )
 
 
 def _check_order(samples: Image, beside: Image, part: Fringes, place: str, start: int) -> None:
@@ -230,18 +263,25 @@ def _check_residuals(residual: Image, place: str) -> None:
     """Refuse fringes that don't fit the cells of the code; in the right order the residual spreads over +-0.25 cycle."""
     above, below = (np.count_nonzero(side) for side in (residual > 0.25, residual < -0.25))
     if max(abs(above - below) - LOPSIDED * residual.size, above + below - ASTRAY * residual.size) > FEW:
-        off = abs(float(residual.mean()))
+        off = abs(float(np.angle(np.mean(np.exp(2j * np.pi * residual))))) / (2 * np.pi)
         raise InputError(
             f"{place}: the code lies {off:.2f} period off the fringes in the mean, and over a quarter period in "
             f"{100 * (above + below) / residual.size:.0f} % of the pixels: are the images in the manifest's order?"
         )
 
 
-def check_pitches(trusted: Mask, valid: Mask, place: str) -> None:
-    """Refuse sets of fringes whose phases contradict each other nearly everywhere."""
+def check_pitches(trusted: Mask, valid: Mask, sigma: Image, place: str) -> None:
+    """Refuse sets of fringes whose phases contradict each other nearly everywhere, or in many pixels in which noise is small.
+
+    trusted, valid : (h, w) bool
+    sigma : (h, w) rad, of the finest phase
+    """
     lit = np.count_nonzero(valid)
     lost = lit - np.count_nonzero(trusted & valid)
-    if lost > max(CONTRADICTED * lit, FEW):
+    clear = valid & (sigma <= np.median(sigma[valid])) if lit else valid
+    contradicting = np.count_nonzero(clear & ~trusted)
+    if lost > max(CONTRADICTED * lit, FEW) or contradicting > max(UNEXPLAINED * np.count_nonzero(clear), FEW):
         raise InputError(
-            f"{place} contradict each other in {100 * lost / lit:.0f} % of the pixels: are they in the manifest's order?"
+            f"{place} contradict each other in {100 * lost / lit:.0f} % of the pixels: are they in the manifest's order, each "
+            "step taken once, and are the pitches those projected?"
         )

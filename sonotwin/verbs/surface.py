@@ -24,7 +24,7 @@ from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
 from recon.files.metrics import shown
 from recon.model.rig import Part
-from recon.structured_light import decode, surface_figures, surface_mesh
+from recon.structured_light import decode, ray_checks, surface_figures, surface_mesh
 from recon.structured_light.triangulate import PointMap, Triangulator
 from sonotwin import choices
 
@@ -80,6 +80,7 @@ def run(config: Config) -> None:
         triangulate = Triangulator(camera, projector)
     with watch.stage("triangulate"):
         raw = triangulate(found)
+        ray_checks.check(found, raw, camera, projector, shots.name)
     with watch.stage("clean"):
         cleaned = surface_mesh.clean(raw, camera, found.modulation, config.limits)
     if not np.isfinite(cleaned.points).any():

@@ -96,6 +96,14 @@ def test_a_given_noise_is_used(rng):
     assert loud.sigma_columns == pytest.approx(2 * quiet.sigma_columns, rel=1e-3, nan_ok=True)
 
 
+def test_a_code_half_a_period_off_is_named(rng):
+    """The middle of remainders around half a period is half a period, not none."""
+    patterns = load("gray_surface")
+    images = photograph(patterns, smooth_maps(patterns, rng), rng)
+    code = patterns.parts[1].model_copy(update={"start": 640 - 0.5 - 64 * 12 + 6})
+    refused(images, patterns.model_copy(update={"parts": (patterns.parts[0], code)}), r"lies 0\.(4[5-9]|50) period off")
+
+
 def test_islands_are_no_obstacle_to_gray_code(rng):
     """Steps that break spatial unwrapping leave Gray code and heterodyne untouched."""
     u = np.mgrid[:200, :260][1].astype(float)
@@ -297,3 +305,18 @@ def test_too_few_steps_say_that_the_noise_is_assumed(rng):
     patterns = Patterns(projector_size=(1280, 800), unwrap="centre_line", parts=parts)
     found = decode(photograph(patterns, smooth_maps(patterns, rng), rng), patterns)
     assert found.noise_source == "assumed"
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+@pytest.mark.parametrize("steps", [3, 4])
+def test_a_step_taken_twice_is_refused(rng, steps, share):
+    """One step shows that before it, as of a projector that lags, of fine fringes or a cue; or half of it, of the fine ones."""
+    parts = (Fringes(pitch=64, steps=steps), Fringes(pitch=1280, steps=steps))
+    patterns = Patterns(projector_size=(1280, 800), unwrap="heterodyne", parts=parts)
+    columns = 639.5 + 1.4 * (np.mgrid[:120, :480][1] - 240.0)
+    images = photograph(patterns, {"columns": columns}, rng)
+    assert np.mean(decode(images, patterns).status == Status.OK) > 0.9
+    for late in (1, steps - 1, *((steps + 1, 2 * steps - 1) if share == 1 else ())):
+        wrong = images.copy()
+        wrong[late] = np.uint8(share * images[late - 1] + (1 - share) * images[late])
+        refused(wrong, patterns, "taken twice|contradict each other in .* taken once")

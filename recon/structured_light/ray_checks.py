@@ -1,0 +1,100 @@
+"""Checks that camera, projector and decoded columns make one scene: images of another rig, mirrored or turned ones don't.
+
+A mirrored sequence decodes perfectly. But what both devices see, both see from its front; its points lie in front of both and in
+the projector's image; and if columns and rows are known, rays of camera and projector meet.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.geometry.camera import Camera
+from recon.structured_light.decode import ProjectorMap
+from recon.structured_light.triangulate import PointMap
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RayLimits:
+    """Shares of the points beyond which a scene is none. Of right captures all are below 0.01."""
+
+    behind: float = 0.5  # lit from behind; mirrored left to right it is 1
+    nowhere: float = 0.1  # rays that don't meet in front of both devices
+    beyond: float = 0.1  # of points by columns alone, in rows that the projector doesn't have
+    apart_px: float = 8.0  # projector px by which rays pass each other in the median; some are of a rig that moved
+    margin: float = 0.05  # of the projector's image, that its model may be off at the borders
+    reach: int = 8  # px between the points of a normal, so that noise doesn't turn it
+    every: int = 4  # rows and columns, of which one is looked at
+    fewest: int = 200  # points that decide
+
+
+def check(
+    found: ProjectorMap, raw: PointMap, camera: Camera, projector: Camera, name: str, limits: RayLimits | None = None
+) -> None:
+    """Refuse a map whose rays make no scene that camera and projector both see.
+
+    Parameters
+    ----------
+    found : ProjectorMap
+    raw : PointMap
+        Its points, not cleaned.
+    name : str
+        Of the images, for messages.
+
+    Raises
+    ------
+    InputError
+        If more points than `limits` allow are lit from behind, lie behind a device, or outside of the projector's image, or if
+        columns and rows contradict each other.
+    """
+    limits = limits or RayLimits()
+    axes = [axis for axis in (found.columns, found.rows) if axis is not None]
+    decoded, solved = np.isfinite(np.stack(axes)).any(axis=0), np.isfinite(raw.points[..., 0])
+    if np.count_nonzero(solved) < limits.fewest * limits.every**2:
+        return
+    if (share := lit_from_behind(raw, camera, projector, limits)) > limits.behind:
+        raise InputError(
+            f"{name}: the projector would light the back of what the camera sees in {100 * share:.0f} % of the points: are the "
+            "camera's images mirrored or turned by 180 degrees, the patterns projected mirrored, or is it another calibration?"
+        )
+    lost = 1 - np.count_nonzero(decoded & solved) / np.count_nonzero(decoded)
+    if lost > limits.nowhere:
+        raise InputError(
+            f"{name}: rays of camera and projector don't meet in front of both in {100 * lost:.0f} % of the decoded pixels: is "
+            "the calibration that of this rig, are images and patterns those of this capture, and neither mirrored nor turned?"
+        )
+    thin = np.s_[:: limits.every, :: limits.every]
+    use = solved[thin]
+    seen = projector.project(raw.points[thin][use].astype(float))
+    if found.columns is not None and found.rows is not None:
+        both = np.stack([found.columns[thin][use], found.rows[thin][use]], axis=1) - seen
+        apart = float(np.nanmedian(np.hypot(*both.T)))
+        if apart > limits.apart_px:
+            raise InputError(
+                f"{name}: rays of camera and projector pass each other by {apart:.0f} projector px in the median: are the images "
+                "mirrored or turned, or has a device moved since the calibration?"
+            )
+        return
+    other, name_of = (1, "rows") if found.rows is None else (0, "columns")
+    length = projector.size[other]
+    beyond = np.mean((seen[:, other] < -limits.margin * length) | (seen[:, other] > (1 + limits.margin) * length))
+    if beyond > limits.beyond:
+        raise InputError(
+            f"{name}: {100 * beyond:.0f} % of the points lie where the projector has no {name_of} to light them: is the "
+            "calibration that of this rig, and are images and patterns those of this capture?"
+        )
+
+
+def lit_from_behind(raw: PointMap, camera: Camera, projector: Camera, limits: RayLimits) -> float:
+    """Share of the points whose surface faces one device and turns its back to the other; 0 of too few."""
+    points, reach = raw.points, limits.reach
+    corner = points[: -reach : limits.every, : -reach : limits.every].astype(float)
+    across = points[: -reach : limits.every, reach :: limits.every][: len(corner), : corner.shape[1]] - corner
+    down = points[reach :: limits.every, : -reach : limits.every][: len(corner), : corner.shape[1]] - corner
+    normal = np.cross(across, down)
+    facing = [np.sum(normal * (device.centre - corner), axis=-1) for device in (camera, projector)]
+    known = np.isfinite(facing[0])
+    return float(np.mean((facing[0] * facing[1])[known] < 0)) if np.count_nonzero(known) >= limits.fewest else 0.0

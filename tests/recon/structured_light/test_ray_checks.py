@@ -1,0 +1,61 @@
+"""Images of a wall, mirrored, turned, or with another calibration: what both devices see, both see from its front."""
+
+import numpy as np
+import pytest
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.geometry.camera import Camera
+from recon.structured_light import ray_checks
+from recon.structured_light.decode import ProjectorMap
+from recon.structured_light.phase import Noise
+from recon.structured_light.triangulate import triangulate
+
+SIZE = (160, 120)
+CAMERA = Camera(SIZE, np.array([[400.0, 0, 80], [0, 400, 60], [0, 0, 1]]), np.zeros(5))
+MATRIX = np.array([[1900.0, 0, 640], [0, 1900, 400], [0, 0, 1]])
+
+
+def projector():
+    """A projector 150 mm to the left of the camera that looks at the middle of the wall, 650 mm away."""
+    turned, place = rigid.from_rotation_vector(np.array([0, -np.arctan2(150, 650), 0]), np.zeros(3)), np.eye(4)
+    place[0, 3] = 150
+    return Camera((1280, 800), MATRIX, np.zeros(5), turned @ place)
+
+
+PROJECTOR = projector()
+
+
+def seen(rng, rows):
+    """The projector's coordinates : (h, w) px of a tilted, bowed wall, to 0.03 px."""
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    wall = rays / rays[..., 2:] * (650 + 60 * x - 40 * y + 100 * x * x)[..., None]
+    pixels = PROJECTOR.project(wall.reshape(-1, 3)).reshape(*wall.shape[:2], 2)
+    pixels = np.float32(pixels + rng.normal(scale=0.03, size=pixels.shape))
+    return pixels[..., 0], pixels[..., 1] if rows else None
+
+
+@pytest.mark.parametrize(
+    ("turn", "rows", "off_px", "match"),
+    [
+        ((1, 1), False, 0, None),
+        ((1, 1), True, 0, None),
+        ((1, -1), False, 0, "light the back .* mirrored or turned"),
+        ((-1, -1), False, 0, "light the back .* mirrored or turned"),
+        ((-1, 1), True, 0, "pass each other by .* mirrored or turned"),
+    ],
+)
+def test_only_images_of_this_rig_make_a_scene(rng, turn, rows, off_px, match):
+    columns, its_rows = (None if image is None else image[:: turn[0], :: turn[1]].copy() for image in seen(rng, rows))
+    columns += off_px
+    sigma, status = np.full(columns.shape, 0.03, np.float32), np.zeros(columns.shape, np.uint8)
+    shown = (sigma, sigma, sigma, status, status == 0)
+    found = ProjectorMap(columns, its_rows, sigma, sigma if rows else None, *shown, Noise(1, 0), {})
+    raw = triangulate(found, CAMERA, PROJECTOR)
+    if match is None:
+        ray_checks.check(found, raw, CAMERA, PROJECTOR, "shots")
+        return
+    with pytest.raises(InputError, match=match) as caught:
+        ray_checks.check(found, raw, CAMERA, PROJECTOR, "shots")
+    assert "\n" not in str(caught.value) and str(caught.value).startswith("shots: ")
