@@ -271,7 +271,7 @@ def _open(unseen: Mask, axis: int) -> int:
 
 def _thickness(inside: Mask, spacing: Array) -> float:
     """Diameter of the largest ball within a body, mm."""
-    return 2 * float(ndimage.distance_transform_edt(np.pad(inside, 1), spacing).max())
+    return 2 * float(np.max(np.asarray(ndimage.distance_transform_edt(np.pad(inside, 1), spacing))))
 
 
 def _centre(inside: Mask, part: tuple[slice, ...]) -> Array:
