@@ -45,11 +45,14 @@ SAMPLED = 40  # images for the level of tissue
 LEAST_GREY = 5.0  # of 255, of tissue
 CORE = 0.6  # of a mass's extent: its darkest part
 MOSTLY_AROUND = 0.6  # share of a cut body's shell that shows tissue: elsewhere than behind phantoms
+BOTTOM = 0.8  # share of what lies just behind a cut body that isn't seen, above which it is the dark behind a phantom
 LEAST_CUT_MM3 = 15.0  # of what is seen of a cut body
 DARKEST = 0.1  # share of a cut body that is as dark as a mass's core: of a small piece most lies within the blur of its border
 LEAST_CUT_MM = 2.5  # of it down the beam; speckle has no holes as deep
 STREAK = 2.5  # height of a body down the beam over its thickness, above which it is the shadow of a border
 CUT = "a dark body is cut by %s, and is left out: %.0f mm3 of it at %.0f, %.0f, %.0f mm, %.0f x %.0f x %.0f mm; scan on there"
+BEHIND = 0.5  # share of a body within the shadow of one that is cut, which can't be cleared
+HIDDEN = "a dark body of %.0f mm3 at %.0f, %.0f, %.0f mm is left out: it lies behind one that is cut, and may be its shadow"
 SHADOW = "a dark streak at %.0f, %.0f, %.0f mm, %.0f mm down the beam and %.0f mm thick, is left out as the shadow of a border"
 LEAST_SEEN = 0.3  # of the core, by sound that came through other masses
 
@@ -170,7 +173,8 @@ def refined(masses: Sequence[Mass], power: EchoPower, times: int) -> list[Mass]:
 def rough(power: EchoPower) -> list[Mass]:
     """Dark bodies with tissue all around, without the shadows that hang on to them.
 
-    Warnings are logged of bodies that the scan's side or end cuts, and of streaks down the beam, which are shadows of borders.
+    Warnings are logged of bodies that the scan's side or end cuts, of those behind them, and of streaks down the beam, which are
+    shadows of borders.
     """
     spacing = power.volume.spacing[::-1]
     smooth = _smoothed(power.volume.voxels, power.weight, SMOOTH_MM / spacing)
@@ -188,6 +192,9 @@ def rough(power: EchoPower) -> list[Mass]:
     labels, count = ndimage.label(body)
     parts = ndimage.find_objects(labels)
     margin, edge = (np.ceil(one / spacing).astype(int) for one in (2 * GROW_MM, EDGE_MM))
+    shadowed, texts = _cut_bodies(dark, ratio, seen, power)
+    for text in texts:
+        log.warning(text)
     result = []
     for number in range(1, count + 1):
         part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(parts[number - 1], margin, strict=True))
@@ -202,15 +209,16 @@ def rough(power: EchoPower) -> list[Mass]:
         if height > STREAK * thick:
             log.warning(SHADOW, *_middle(inside, part, power), height, thick)
             continue
+        if shadowed[part][inside].mean() > BEHIND:
+            log.warning(HIDDEN, volume, *_middle(inside, part, power))
+            continue
         field = np.where(_widened(inside, GROW_MM, spacing), ratio[part], 1.0)
         result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))
-    for text in _cut_bodies(dark, ratio, seen, power):
-        log.warning(text)
     return result
 
 
-def _cut_bodies(dark: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> Iterator[str]:
-    """A line of each dark body with tissue around what is seen of it, at the sides or ends of what was scanned.
+def _cut_bodies(dark: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> tuple[Mask, list[str]]:
+    """Dark bodies with tissue around what is seen of them, at the sides or ends of the scan: what they may shadow, and lines.
 
     The part behind it, down the beam, doesn't count, as its shadow lies there; nor does what is dark from the face on, or all
     along the images' lower end, as behind a phantom.
@@ -221,6 +229,7 @@ def _cut_bodies(dark: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> Ite
     body = dark & _opened(dark | ~known, OPEN_MM, spacing)
     labels, _ = ndimage.label(body)
     margin = np.ceil(4 * EDGE_MM / spacing).astype(int)
+    shadowed, texts = np.zeros(dark.shape, bool), []
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
         part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(box, margin, strict=True))
         inside, here = labels[part] == number, known[part]
@@ -243,16 +252,17 @@ def _cut_bodies(dark: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> Ite
         below = (shell & behind & ~here).sum() / max((shell & behind).sum(), 1)
         above = shell & before & ~behind
         around = shell & here & ~(behind & ~inside)
-        if (
-            below > 1 - MOSTLY_AROUND
-            or (above & here).sum() < MOSTLY_AROUND * above.sum()
-            or height > STREAK * max(extents[0], extents[2])
-        ):
+        if below > BOTTOM or (above & here).sum() < MOSTLY_AROUND * above.sum() or height > STREAK * max(extents[0], extents[2]):
             continue
         if min(_bright(levels[above & here]), _bright(levels[around])) < MOSTLY_AROUND:
             continue
         where = max(sides, key=lambda name: sides[name])
-        yield CUT % (where, volume, *_middle(inside, middle, power), *extents)
+        texts.append(CUT % (where, volume, *_middle(inside, middle, power), *extents))
+        near = _widened(inside, 2 * GROW_MM, spacing)
+        shadowed[part[0], part[1].start :, part[2]] |= np.logical_or.accumulate(
+            np.pad(near, ((0, 0), (0, dark.shape[1] - part[1].start - near.shape[1]), (0, 0))), axis=1
+        )
+    return shadowed[pad:-pad, pad:-pad, pad:-pad], texts
 
 
 def _bright(levels: NDArray) -> float:
@@ -268,7 +278,7 @@ def _open(unseen: Mask, axis: int) -> int:
 
 def _thickness(inside: Mask, spacing: Array) -> float:
     """Diameter of the largest ball within a body, mm."""
-    return 2 * float(ndimage.distance_transform_edt(np.pad(inside, 1), spacing).max())
+    return 2 * float(np.max(np.asarray(ndimage.distance_transform_edt(np.pad(inside, 1), spacing))))
 
 
 def _centre(inside: Mask, part: tuple[slice, ...]) -> Array:
