@@ -7,6 +7,7 @@ from scipy.optimize import minimize_scalar
 
 from recon.board_detection.corners import Corners, refine_corners
 from recon.board_detection.findings import MIRRORED, BoardNotFound, Detection, first_faults, refuse_bad, spread
+from recon.board_detection.reduced_images import reduced
 from recon.errors import InputError
 from recon.model.boards import AprilGrid, Charuco, Chessboard
 
@@ -27,6 +28,7 @@ LEAST_SPREAD = 0.5  # of a square: smaller singular value of corners that tell a
 ASTRAY = 0.25  # of a square, RMS of markers about where the board has them
 ALTERNATING = 0.3  # of the usual step from one square to the next: least one of a whole board
 
+FEWEST_PX = 1.5e6  # pixels of a large image in which a chessboard is looked for first; see `reduced_images`
 TAG_FAMILY = cv2.aruco.DICT_APRILTAG_36h11
 RATIOS, WRONG_RATIO = (0.02, 1.0), 0.02  # of gaps to tags, and what isn't an error of corners
 SHRUNK = (1, 3, 5)  # px: breadths of what is taken off dark areas, so that tags don't hang together by their corners
@@ -37,10 +39,16 @@ _CHESSBOARD = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY  # OpenCV 5 misses
 def find_chessboard(image: Array, board: Chessboard, full: float) -> Detection:
     """Find all inner corners of a chessboard; see `recon.board_detection.detect.detect`."""
     grey = _eight_bits(image, full)
-    found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=_CHESSBOARD)
+    looked = reduced(grey, FEWEST_PX)
+    found, corners = cv2.findChessboardCornersSB(looked.image, (board.columns, board.rows), flags=_CHESSBOARD)
+    if not found and looked.times > 1:
+        closer = reduced(grey)
+        found, corners = cv2.findChessboardCornersSB(closer.image, (board.columns, board.rows), flags=cv2.CALIB_CB_ACCURACY)
+        looked = closer if found else looked
     if not found:
-        raise BoardNotFound(_why_no_chessboard(grey, board))
-    grid = _begun_rightly(np.asarray(corners, float).reshape(board.rows, board.columns, 2), grey)
+        small = f", looked for in {looked.image.shape[1]}x{looked.image.shape[0]} px" if looked.times > 1 else ""
+        raise BoardNotFound(_why_no_chessboard(looked.image, board) + small)
+    grid = _begun_rightly(looked.full(np.asarray(corners, float).reshape(board.rows, board.columns, 2)), grey)
     rough, points = grid.reshape(-1, 2), board.points()
     window = min(WINDOW[0] * _shortest_side(rough, points, board.square_mm), WINDOW[1])
     measured = _refine(image, rough, points, window, full)
@@ -142,12 +150,12 @@ def _tags(grey: NDArray[np.uint8], border: int) -> tuple[Array, NDArray[np.int64
     """Corners : (k, 4, 2) px, from the upper left one clockwise, and numbers : (k,) of AprilTags, each of them once."""
     settings = cv2.aruco.DetectorParameters()
     settings.markerBorderBits = border
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(TAG_FAMILY), settings)
+    detector, looked = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(TAG_FAMILY), settings), reduced(grey)
     found: dict[int, Array] = {}
     for breadth in SHRUNK:
-        apart = grey if breadth == 1 else cv2.dilate(grey, np.ones((breadth, breadth), np.uint8))
+        apart = looked.image if breadth == 1 else cv2.dilate(looked.image, np.ones((breadth, breadth), np.uint8))
         for number, corners in zip(*reversed(_detected(detector, apart)), strict=True):
-            found.setdefault(int(number), corners[[2, 3, 0, 1]])
+            found.setdefault(int(number), looked.full(corners[[2, 3, 0, 1]]))
     return np.array(list(found.values())).reshape(-1, 4, 2), np.array(list(found), np.int64)
 
 

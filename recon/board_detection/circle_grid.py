@@ -4,12 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.board_detection import discs, lattice
-from recon.board_detection.findings import Detection, first_faults, refuse_bad, spread
+from recon.board_detection.findings import BoardNotFound, Detection, first_faults, refuse_bad, spread
+from recon.board_detection.reduced_images import reduced
 from recon.geometry.ellipses import Ellipses
 from recon.model.boards import AsymmetricCircles, Circles
 
 Array = NDArray[np.float64]
 
+MOST_PLACES = 20  # times the board's discs that are tried for another design
 ROOM = 0.45  # of the gap between neighbours, and of a disc's radius, is looked at
 MOST_BLUR = 0.25  # of the disc's shorter radius
 LEAST_CONTRAST = 0.03  # of the full scale
@@ -23,9 +25,13 @@ LEAST_RATIO = 0.3  # of the semi-axes
 def find_circles(image: Array, board: Circles, full: float) -> Detection:
     """Find the discs of a board and measure their ellipses; see `recon.board_detection.detect.detect`."""
     image = full - image if board.white else image
-    rough = discs.candidates(image, full)
+    looked = reduced(image)
+    rough = looked.full_ellipses(discs.candidates(looked.image, full)) if looked.times > 1 else discs.candidates(image, full)
     cells, steps = _grid(board)
-    assignment = lattice.assign(rough.centre, cells, steps)
+    try:
+        assignment = lattice.assign(rough.centre, cells, steps)
+    except BoardNotFound as reason:
+        raise BoardNotFound(f"{reason}{_likely(rough.centre, board)}") from None
     present = np.flatnonzero(assignment >= 0)
     chosen = rough[assignment[present]]
     measured = discs.measure(image, chosen, _room(chosen, board), full)
@@ -36,6 +42,22 @@ def find_circles(image: Array, board: Circles, full: float) -> Detection:
         spread(measured.covariance[good], at, len(cells)),
         spread(ellipses.semi_axes, at, len(cells)),
     )
+
+
+def _likely(centres: Array, board: Circles) -> str:
+    """The design that centres : (k, 2) px fit better, in words: rows and columns exchanged; nothing if they don't."""
+    exchanged = board.model_copy(update={"columns": board.rows, "rows": board.columns})
+    if (
+        board.columns == board.rows
+        or not isinstance(board, AsymmetricCircles)
+        or len(centres) > MOST_PLACES * len(board.points())
+    ):
+        return ""
+    try:
+        lattice.assign(centres, *_grid(exchanged))
+    except BoardNotFound:
+        return ""
+    return f"; rows and columns exchanged? They fit columns: {exchanged.columns}, rows: {exchanged.rows}"
 
 
 def _grid(board: Circles) -> tuple[lattice.Integers, lattice.Integers]:

@@ -38,6 +38,8 @@ OF_BOARDS = (  # usual names
     "<camera>/<image>/<pose>",
     "<camera>/<image>_<pose>",
     "<camera>_<image>_<pose>",
+    "*/<camera>_<pose>",
+    "*/<camera><pose>",
     "<image>/<pose>",
     "<image>_<pose>",
 )

@@ -13,6 +13,8 @@ from recon.image_folders.file_templates import FIRST, Name, Words
 
 LIKE_CAMERAS = re.compile(r"(?<![a-z0-9])(cam(?:era)?[ _-]?\d+|left|right|[lr])(?![a-z0-9])", re.IGNORECASE)
 
+NUMBER = re.compile(r"\d+")
+
 
 @dataclass(frozen=True)
 class View:
@@ -66,6 +68,11 @@ class Reading:
         """Poses of which a camera has no image."""
         return [pose for pose in self.poses if (pose, camera) not in self.views]
 
+    @property
+    def is_shared(self) -> bool:
+        """Whether some pose was seen by several cameras, or there is one camera alone."""
+        return len(self.cameras) < 2 or len(self.poses) < len(self.views)
+
     def without_sequence(self, camera: str) -> list[str]:
         """Poses that a camera saw lit alone; none of a camera that saw the patterns in no pose."""
         seen = {pose: view for (pose, own), view in self.views.items() if own == camera}
@@ -112,12 +119,22 @@ def find(folder: Path, paths: Sequence[str], expected: Expected, words: Words) -
         readings = whole
     if not readings:
         raise InputError(f"{folder}: {_strange(paths, by_template, expected)}")
+    readings = [reading for reading in readings if reading.is_shared] or readings
     fitting = {frozenset(reading.views.values()): reading for reading in reversed(readings) if not _faults(reading, expected)}
     if len(fitting) > 1:
         several = " or ".join(f"'{reading.templates[0]}'" for reading in reversed(fitting.values()))
         raise InputError(f"{folder}: expected names of one meaning, found {paths[0]}, which may be {several}; give one as files=")
     nearest = min(readings, key=lambda reading: len(_faults(reading, expected)) / len(reading.views))
     _refuse(folder, nearest, expected)
+    if not nearest.is_shared:
+        examples = ", ".join(
+            f"{camera} in {next(pose for pose, own in nearest.views if own == camera)}" for camera in nearest.cameras
+        )
+        how = f"give files={expected.example} with <pose> where both have the same text"
+        raise InputError(
+            f"{folder}: expected poses that {' and '.join(nearest.cameras)} saw together, found none, but {examples}, read as "
+            f"{' or '.join(nearest.templates)}; {how}"
+        )
     return nearest
 
 
@@ -150,7 +167,20 @@ def _reading(templates: tuple[str, ...], names: Sequence[Name], words: Words) ->
     views: dict[tuple[str, str], list[Name]] = {}
     for name in sorted(names, key=lambda name: (_natural(name.pose), name.camera, _natural(name.image), name.path)):
         views.setdefault((name.pose, name.camera), []).append(name)
-    return Reading(templates, {place: _view(images, words) for place, images in views.items()})
+    return _paired(Reading(templates, {place: _view(images, words) for place, images in views.items()}))
+
+
+def _paired(reading: Reading) -> Reading:
+    """The same with poses by their numbers alone, where cameras have other words for them, as `left01` and `right01`."""
+    if reading.is_shared:
+        return reading
+    places = {place: NUMBER.findall(place[0]) for place in reading.views}
+    words = {(camera, NUMBER.sub("#", pose)) for pose, camera in places}
+    numbered = {("_".join(numbers), camera): reading.views[pose, camera] for (pose, camera), numbers in places.items() if numbers}
+    if len(words) > len(reading.cameras) or len(numbered) < len(places):
+        return reading
+    paired = Reading(reading.templates, dict(sorted(numbered.items(), key=lambda item: (_natural(item[0][0]), item[0][1]))))
+    return paired if paired.is_shared else reading
 
 
 def _view(names: Sequence[Name], words: Words) -> View:

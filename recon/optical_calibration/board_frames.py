@@ -1,5 +1,6 @@
 """From the board part of a capture to sightings: the devices that take part, and the poses in which each found the board."""
 
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
@@ -89,7 +90,8 @@ def refuse_lonely(sightings: Sequence[Sighting], devices: Collection[str], name:
     if len(seeing) >= min(len(devices), 2):
         return
     reasons = [f"{device}: {reason}" for sighting in sightings for device, reason in sighting.failures.items()]
-    why = f" ({max(set(reasons), key=reasons.count)})" if reasons else ""
+    kinds = [re.sub(r"\d+(\.\d+)?", "#", reason) for reason in reasons]
+    why = f" ({reasons[kinds.index(max(kinds, key=kinds.count))]})" if reasons else ""
     expected = "two devices or more that see" if len(devices) > 1 else f"{', '.join(devices)} to see"
     alone = "; devices=[cam1] calibrates it alone" if seeing == {DEVICES[0]} else ""
     raise InputError(f"{name}: expected {expected} the board, found {', '.join(seeing) or 'none'}{why}{alone}")

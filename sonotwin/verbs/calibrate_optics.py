@@ -13,6 +13,7 @@ fringes are refused, other patterns are tried on three poses.
     sonotwin calibrate-optics capture=board/capture devices=[cam1] out=board/camera
 """
 
+import re
 import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -39,6 +40,7 @@ from recon.pattern_trials import likely_patterns
 
 PAGE = "calibration.html"  # by which the folder of a calibration is known
 OPTICS = "optics.yaml"
+MANY, MOST_LISTED = 4, 40  # poses that are dropped alike, which are one line; and of these that it lists
 CONTENTS = {
     OPTICS: "all devices with the covariance of their parameters; OpenCV FileStorage",
     meza2021.PARAMETERS: "camera 1 and projector in the rig authors' layout",
@@ -128,9 +130,17 @@ def other_patterns(captured: BoardCapture, sizes: Collection[str], console: Cons
 
 
 def dropped(reasons: Mapping[str, str | Failure]) -> Iterator[str]:
-    """Lines: poses and devices left out, with the reasons."""
+    """Lines: poses and devices left out, with the reasons; one line for many that differ in numbers alone."""
+    alike: dict[tuple[str, str], list[str]] = {}
     for name, reason in reasons.items():
-        yield f"dropped     {name}: {reason}"
+        alike.setdefault((name.rpartition(" ")[2], re.sub(r"\d+(\.\d+)?", "#", str(reason))), []).append(name)
+    for (device, _), names in alike.items():
+        if len(names) < MANY:
+            yield from (f"dropped     {name}: {reasons[name]}" for name in names)
+            continue
+        poses = [name.removesuffix(f" {device}") for name in names]
+        listed = ", ".join(poses) if len(poses) <= MOST_LISTED else f"{', '.join(poses[:MOST_LISTED])} and others"
+        yield f"dropped     {device} in {len(names)} poses alike, such as {names[0]}: {reasons[names[0]]} (poses {listed})"
 
 
 def turned(result: Result) -> Iterator[str]:

@@ -20,6 +20,7 @@ from recon.model.boards import Chessboard
 from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes, GrayCode, Patterns
 from sonotwin.cli import main
+from sonotwin.verbs.calibrate_optics import dropped
 from tests.recon import board_views
 
 SIZE = (320, 256)
@@ -251,8 +252,18 @@ def test_reasons_are_told_though_nothing_can_be_calibrated(copied, tmp_path, cap
     said = capsys.readouterr()
     detect, *dropped = said.out.splitlines()
     assert re.fullmatch(r"detect +9 poses: cam1 0, \d+ s", detect)
-    assert len(dropped) == 9 and dropped[4].startswith("dropped     04 cam1: ")
+    assert len(dropped) == 1 and dropped[0].startswith("dropped     cam1 in 9 poses alike, such as 00 cam1: ")
+    assert dropped[0].endswith("(poses 00, 01, 02, 03, 04, 05, 06, 07, 08)")
     assert said.err.startswith("sonotwin: small: expected cam1 to see the board, found none (cam1: ")
+
+
+def test_poses_that_fail_alike_are_one_line():
+    """By their words, whatever the numbers; a few keep a line each, and so do those of another cause."""
+    reasons = {f"{k:02d} cam1": f"found {29 + k % 3} of 44 circles" for k in range(52)}
+    few = {"03 cam2": "image is mirrored", "my pose cam2": "image is mirrored"}
+    many, *others = dropped(reasons | few)
+    assert many.startswith("dropped     cam1 in 52 poses alike, such as 00 cam1: found 29 of 44 circles (poses 00, 01,")
+    assert many.endswith(", 39 and others)") and others == [f"dropped     {name}: {reason}" for name, reason in few.items()]
 
 
 def test_a_third_camera_is_warned_of(copied, tmp_path, capsys):

@@ -118,6 +118,27 @@ def test_pairs_without_patterns(place):
     assert [pose["lit"] for pose in part["board"]["poses"]][2] == {"cam1": "left02.png", "cam2": "right02.png"}
 
 
+@pytest.mark.parametrize(
+    "fields", [(), ("cameras={cam1: L, cam2: R}",), ("files=<camera>/<pose>.bmp", "cameras={cam1: L, cam2: R}")]
+)
+def test_pairs_in_two_folders_with_other_names_in_each(fields, place):
+    """`L/left01.bmp` and `R/right01.bmp` are one pose, not two halves, as the advice for such folders makes them, too."""
+    for number in range(1, 4):
+        draw(place / f"images/L/left{number:02d}.bmp")
+        draw(place / f"images/R/right{number:02d}.bmp")
+    poses = described(CHESS, *fields)["board"]["poses"]
+    assert [pose["name"] for pose in poses] == ["01", "02", "03"]
+    assert poses[2]["lit"] == {"cam1": "L/left03.bmp", "cam2": "R/right03.bmp"}
+
+
+def test_cameras_without_a_pose_in_common_are_refused(place, capsys):
+    for number in range(3):
+        draw(place / f"images/left/a{number}.png")
+        draw(place / f"images/right/b{number + 5}.png")
+    line = "expected poses that cam1 and cam2 saw together, found none, but cam1 in a0, cam2 in b5, read as <camera>/<pose>"
+    assert line in refusal(capsys, CHESS)
+
+
 def test_given_names(place, capsys):
     """Cameras by their own words; lit images by a template of their own; others are left out."""
     for pose in "ab":

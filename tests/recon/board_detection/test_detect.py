@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from recon.board_detection import checkerboard
+from recon.board_detection import checkerboard, reduced_images
 from recon.board_detection.detect import BoardNotFound, detect
 from recon.board_detection.lattice import assign
 from recon.errors import InputError
@@ -120,6 +120,28 @@ def test_another_layout_is_named_with_the_field_that_takes_it(board, given, hint
     image = noisy(clean(board)[0], rng)
     with pytest.raises(BoardNotFound, match=hint):
         detect(image, board.model_copy(update=given))
+
+
+@pytest.mark.parametrize("board", [ASYMMETRIC, CHESSBOARD, APRILGRID], ids=lambda b: b.kind)
+def test_large_images_are_looked_at_reduced_and_measured_whole(board, clean, rng, monkeypatch):
+    """So a photograph without a board costs no more than a small one; points are as well measured as without."""
+    image = noisy(clean(board)[0], rng)
+    whole = detect(image, board)
+    monkeypatch.setattr(reduced_images, "LARGE_PX", 1e5)  # of 192 000
+    monkeypatch.setattr(checkerboard, "FEWEST_PX", 7e4)
+    assert reduced_images.reduced(image).image.size <= 1e5
+    np.testing.assert_allclose(detect(image, board).pixels, whole.pixels, atol=0.02)  # of 0.01 px by noise: windows differ
+    at = np.array([[10.0, 20.0], [100.25, 7.5]])
+    small = reduced_images.reduced(image)
+    np.testing.assert_allclose(small.full((at + 0.5) / small.times - 0.5), at)
+
+
+def test_exchanged_rows_and_columns_of_circles_are_named(rng):
+    board = AsymmetricCircles(columns=4, rows=11, spacing_mm=10, diameter_mm=6)
+    image = noisy(view(board, CAMERA, pose(board, 640, (0.2, -0.2), 0.3)), rng)
+    hint = r"of 44 circles; rows and columns exchanged\? They fit columns: 4, rows: 11$"
+    with pytest.raises(BoardNotFound, match=hint):
+        detect(image, board.model_copy(update={"columns": 11, "rows": 4}))
 
 
 def test_tags_lie_as_kalibr_prints_them():
