@@ -8,6 +8,8 @@ from recon.files.volumes import Volume
 from recon.freehand import plus_arithmetic
 from recon.freehand.volume_compounding import Reconstruction
 
+Array = NDArray[np.float64]
+
 STICKS = np.array(  # one of each pair of opposite directions to the 26 neighbours
     [
         (i, j, k)
@@ -19,6 +21,7 @@ STICKS = np.array(  # one of each pair of opposite directions to the 26 neighbou
     np.int64,
 )  # fmt: skip
 MOST_VOXELS = 9  # of a stick, both ends included
+MOSTLY = 90  # percentile of the gaps between B-scans that are to be filled
 
 
 def fill_holes(
@@ -41,6 +44,29 @@ def fill_holes(
     lengths = np.linalg.norm(STICKS * volume.spacing, axis=1)
     _fill(volume.voxels, reconstruction.filled, lengths, most_voxels, sticks, voxels, filled)
     return Reconstruction(Volume(voxels, volume.origin, volume.spacing, volume.directions), filled)
+
+
+def spacing_that_fills(world_from_pixel: Array, corners: Array, most_voxels: int = MOST_VOXELS) -> float:
+    """Spacing of voxels, mm, from which on sticks reach from most B-scans to the next, and between pixels; 0 of a single one.
+
+    Parameters
+    ----------
+    world_from_pixel : (n, 4, 4)
+        Of B-scans one after the other; those with a NaN are left out.
+    corners : (m, 2) px
+    most_voxels : int
+        Of a stick, both ends included.
+    """
+    placed = world_from_pixel[np.isfinite(world_from_pixel).all(axis=(1, 2))]
+    if len(placed) < 2:
+        return 0.0
+    pixels = np.column_stack([corners, np.zeros(len(corners)), np.ones(len(corners))])
+    steps = np.diff((placed @ pixels.T)[:, :3], axis=0)
+    normals = np.cross(placed[:-1, :3, 0], placed[:-1, :3, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    gaps = np.abs(np.einsum("nik,ni->nk", steps, normals)).max(axis=1)
+    widest = max(float(np.percentile(gaps, MOSTLY)), float(np.linalg.norm(placed[0, :3, :2], axis=0).max()))
+    return widest / max(most_voxels - 1, 1)
 
 
 @njit

@@ -47,16 +47,20 @@ class Unsure(NamedTuple):
     tissue_m_s: float = 0.0
 
 
+ASSUMED = Unsure(0.1, 50.0)  # of a lag that is taken as none: scanners show images 0 to 200 ms late; and of any tissue's sound
+KNOWN_TISSUE_M_S = 25.0  # m/s, standard deviation of the speed of sound in tissue that is known by its kind
+
+
 class ScansFields(SequenceFields):
     """Fields of a verb that places the B-scans of a capture or of a sequence in the world."""
 
     capture: Path | None = None
     sweep: str = ""
     probe: Path | None = None
-    lag_s: LagSeconds = 0.0
-    lag_sigma_s: NotNegative = 0.0
+    lag_s: LagSeconds | None = None
+    lag_sigma_s: NotNegative | None = None
     tissue_m_s: Speed | None = None
-    tissue_sigma_m_s: SpeedSigma = 25.0
+    tissue_sigma_m_s: SpeedSigma | None = None
     image: FrameName | None = None
     config: Path | None = None
 
@@ -66,13 +70,37 @@ class ScansFields(SequenceFields):
             raise ValueError(f"expected capture or sequence, found {'neither' if self.capture is None else 'both'}")
         if self.capture is not None and self.config is not None:
             raise ValueError("config: expected a configuration with a sequence only, found one with a capture")
-        if self.sequence is not None and self.lag_sigma_s != 0:
+        if self.sequence is not None and self.lag_sigma_s:
             raise ValueError(f"lag_sigma_s: expected none with a sequence, without covariances, found {self.lag_sigma_s:g}")
         if self.target is not None and self.probe is None:
             raise ValueError(
                 f"target: expected a probe with it, whose calibration holds in that frame, found {self.target} alone"
             )
         return self
+
+    @property
+    def lag(self) -> float:
+        """Lag of the B-scans, s; none where it isn't given."""
+        return self.lag_s or 0.0
+
+    @property
+    def unsure(self) -> Unsure:
+        """Standard deviations, wider of what isn't given but assumed."""
+        lag = self.lag_sigma_s if self.lag_sigma_s is not None else ASSUMED.lag_s if self._lag_assumed else 0.0
+        known = ASSUMED.tissue_m_s if self.tissue_m_s is None else KNOWN_TISSUE_M_S
+        return Unsure(lag, known if self.tissue_sigma_m_s is None else self.tissue_sigma_m_s)
+
+    @property
+    def _lag_assumed(self) -> bool:
+        return self.capture is not None and self.lag_s is None
+
+    def assumptions(self, speed_m_s: float) -> Iterator[str]:
+        """Lines on what was assumed, as it wasn't given."""
+        if self._lag_assumed:
+            yield f"no lag of the B-scans, to {1e3 * self.unsure.lag_s:g} ms (1 sigma); measure-lag finds it, give lag_s"
+        if self.tissue_m_s is None:
+            sigma = f"{self.unsure.tissue_m_s:g} m/s (1 sigma)"
+            yield f"sound of {speed_m_s:.0f} m/s in what was scanned, as calibrated, to {sigma}; give tissue_m_s"
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, model_validator
 from rich.console import Console
 
 from recon.capture import probe_files, sweep_part
@@ -33,12 +34,13 @@ from recon.freehand import hole_filling, plus_config, volume_compounding
 from recon.freehand import scans as freehand_scans
 from recon.freehand.plus_arithmetic import Arithmetic
 from recon.freehand.plus_config import PlusConfig
-from recon.freehand.scans import Extent, Scans, ScansFields, Unsure, VolumeSettings
+from recon.freehand.scans import Extent, Scans, ScansFields, VolumeSettings
 from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction, Rectangle
 from recon.model.fan import Fan, Sector
 
 VOLUME = "volume.nrrd"  # by which the folder of a volume is known
+ROOM = 1.1  # by which gaps may be wider than sticks reach, before it is said
 SIGMA, SEQUENCE = "sigma.nrrd", "sequence.igs.mha"
 
 
@@ -82,6 +84,8 @@ def run(config: Config) -> None:
     sweep, scans = read(config, plus)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
+    for line in config.assumptions(scans.speed_m_s):
+        console.print(f"assumed     {line}", markup=False)
     for line in freehand_scans.cautions(scans):
         console.print(f"warning     {line}", markup=False)
     if (config.fan == "find" or settings.fan) and scans.speed_m_s != scans.calibrated_m_s:
@@ -101,7 +105,7 @@ def run(config: Config) -> None:
         sigma = freehand_scans.sigma_volume(scans, filled.volume, settings)
     seconds = {"seconds_reconstruct": round(perf_counter() - start, 3)}
     figures = freehand_scans.measure(scans, pasted, filled) | freehand_scans.measure_sigma(sigma)
-    for line in describe(filled, figures, settings, config):
+    for line in (*describe(filled, figures, settings, config), *advice(scans, settings)):
         console.print(line, markup=False)
 
     with console.status("writing"), atomic.new_folder(config.out, "freehand") as folder:
@@ -109,7 +113,7 @@ def run(config: Config) -> None:
         if sigma is not None:
             volumes.write_volume(folder / SIGMA, sigma)
         if sweep is not None and scans.probe is not None:
-            freehand_scans.write_sequence(folder / SEQUENCE, sweep, scans.probe, config.lag_s)
+            freehand_scans.write_sequence(folder / SEQUENCE, sweep, scans.probe, config.lag)
         metrics.write(folder / metrics.FILE, figures | seconds)
         written = [name for name in (VOLUME, SIGMA, SEQUENCE, metrics.FILE) if (folder / name).exists()]
     console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
@@ -130,12 +134,22 @@ def read(config: Config, plus: PlusConfig | None) -> tuple[SweepCapture | None, 
         probe = None if config.probe is None else probe_files.read(config.probe)
         fixed = {} if plus is None else plus.transforms
         return None, freehand_scans.of_sequence(
-            config.sequence, names, probe, fixed, config.lag_s, config.tissue_m_s, config.tracker, config.implausible
+            config.sequence, names, probe, fixed, config.lag, config.tissue_m_s, config.tracker, config.implausible
         )
     sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume", config.implausible)
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
-    unsure = Unsure(config.lag_sigma_s, config.tissue_sigma_m_s)
-    return sweep, freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s, unsure)
+    return sweep, freehand_scans.of_sweep(sweep, probe, config.lag, config.tissue_m_s, config.unsure)
+
+
+def advice(scans: Scans, settings: VolumeSettings) -> Iterator[str]:
+    """A line on voxels so fine that gaps between B-scans stay empty; none as a rule."""
+    left, right, top, bottom = (settings.part(scans.shape)[0] or Clip(0, 0, *scans.shape[::-1])).bounds(scans.shape)
+    corners = np.array([[u, v] for u in (left, right) for v in (top, bottom)], float)
+    needed = hole_filling.spacing_that_fills(scans.world_from_pixel, corners, settings.hole_voxels)
+    if needed > ROOM * np.max(settings.spacing_mm):
+        gap = needed * max(settings.hole_voxels - 1, 1)
+        give = f"give spacing_mm={np.ceil(20 * needed) / 20:.4g}, or a larger hole_voxels"
+        yield f"advice      B-scans or pixels are up to {gap:.2g} mm apart, too far for such voxels to be filled; {give}"
 
 
 def describe(filled: Reconstruction, figures: Metrics, settings: VolumeSettings, config: Config) -> Iterator[str]:

@@ -65,7 +65,7 @@ class Config(Part):
     lag_sigma_s: NotNegative = 0.0
     temperature_c: Finite | None = None
     tissue_m_s: Speed | None = None
-    tissue_sigma_m_s: SpeedSigma = 25.0
+    tissue_sigma_m_s: SpeedSigma | None = None
     spacing_mm: Positive = 0.5
     find: Literal["masses", "tube", "nothing"] = "masses"
     spread_mm: segment.Spreads = SPREAD_MM
@@ -284,7 +284,8 @@ def look_inside(
         return None
     placing = [f"capture={capture}", f"sweep={name}", f"probe={probe}"]
     placing += [] if config.tissue_m_s is None else [f"tissue_m_s={config.tissue_m_s:.15g}"]
-    fields = [*placing, *lag.fields, f"tissue_sigma_m_s={config.tissue_sigma_m_s:.15g}"]
+    sigma = [] if config.tissue_sigma_m_s is None else [f"tissue_sigma_m_s={config.tissue_sigma_m_s:.15g}"]
+    fields = [*placing, *lag.fields, *sigma]
     made_of = _scans(steps, sources, name) | _known_by(steps, "probe", probe)
     spacing = f"spacing_mm={config.spacing_mm:.15g}"
     voxels = steps.do(volume, "B-scans in a volume", "freehand", [*fields, spacing], (freehand.VOLUME,), made_of)

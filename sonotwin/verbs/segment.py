@@ -27,7 +27,7 @@ from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
 from recon.freehand import plus_config
 from recon.freehand import scans as freehand_scans
-from recon.freehand.scans import Scans, ScansFields, Unsure
+from recon.freehand.scans import Scans, ScansFields
 from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.probe import SCANNER_SPEED, Speed, SpeedSigma
@@ -103,6 +103,8 @@ def run(config: Config) -> None:
     freehand_scans.check_size(scans, str(config.capture or config.sequence), None, config.implausible)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
+    for line in config.assumptions(scans.speed_m_s):
+        console.print(f"assumed     {line}", markup=False)
     for line in freehand_scans.cautions(scans):
         console.print(f"warning     {line}", markup=False)
     start = perf_counter()
@@ -134,8 +136,7 @@ def read(config: Config) -> Scans:
     assert config.capture is not None
     sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume", config.implausible)
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
-    unsure = Unsure(config.lag_sigma_s, config.tissue_sigma_m_s)
-    scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s, unsure)
+    scans = freehand_scans.of_sweep(sweep, probe, config.lag, config.tissue_m_s, config.unsure)
     return scans if config.clip is None else freehand_scans.cut(scans, Clip(*config.clip))
 
 
@@ -149,7 +150,7 @@ def read_sequence(config: Config, path: Path) -> Scans:
     probe = None if config.probe is None else probe_files.read(config.probe)
     fixed = {} if plus is None else plus.transforms
     scans = freehand_scans.of_sequence(
-        path, names, probe, fixed, config.lag_s, config.tissue_m_s, config.tracker, config.implausible
+        path, names, probe, fixed, config.lag, config.tissue_m_s, config.tracker, config.implausible
     )
     clip = Clip(*config.clip) if config.clip is not None else None if plus is None or plus.volume is None else plus.volume.clip
     return scans if clip is None else freehand_scans.cut(scans, clip)
@@ -160,7 +161,7 @@ def found_in(scans: Scans, config: Config, skin: trimesh.Trimesh | None) -> Segm
     try:
         if config.kind == "tube":
             return segmented_scans.find_tube(scans, config.tube, config.overlays, skin)
-        sigmas = config.tissue_sigma_m_s, config.mass_sigma_m_s
+        sigmas = config.unsure.tissue_m_s, config.mass_sigma_m_s
         return segmented_scans.find_masses(
             scans, skin, config.mass_m_s, config.dynamic_range_db, config.overlays, sigmas, config.blur
         )

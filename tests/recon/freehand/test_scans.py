@@ -1,5 +1,7 @@
 """B-scans in space: are they read no more often than need be, and no more kept than there is room for?"""
 
+from pathlib import Path
+
 import numpy as np
 
 from recon.freehand import scans
@@ -37,3 +39,15 @@ def test_what_is_said_of_them():
     few = recorded([])
     assert scans.summary(few) == "3 B-scans, 5x4, 2 with a pose"
     assert scans.depths(few) == "right where sound makes 1540 m/s, converted from 1488 m/s, for which the probe is calibrated"
+
+
+def test_what_is_assumed_is_said_and_counts():
+    """A lag that isn't given is 0 to 0.2 s, a tissue's speed of sound any; known ones count as told."""
+    fields = scans.ScansFields(capture=Path("c"))
+    assert fields.unsure == (0.1, 50.0) and fields.lag == 0
+    said = list(fields.assumptions(1540.0))
+    assert said[0].startswith("no lag of the B-scans, to 100 ms") and said[1].startswith("sound of 1540 m/s in what was scanned")
+    known = scans.ScansFields(capture=Path("c"), lag_s=0.05, tissue_m_s=1450.0)
+    assert known.unsure == (0.0, 25.0) and not list(known.assumptions(1450.0))
+    assert scans.ScansFields(capture=Path("c"), lag_sigma_s=0.02, tissue_sigma_m_s=3.0).unsure == (0.02, 3.0)
+    assert scans.ScansFields(sequence=Path("s")).unsure.lag_s == 0, "its poses are those of the images' own time"

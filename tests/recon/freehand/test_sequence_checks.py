@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 
 from recon.errors import InputError
-from recon.freehand import sequence_checks, sequence_sweep, sequences
+from recon.freehand import scans, sequence_checks, sequence_sweep, sequences
 from recon.freehand.sequences import FrameNames, Frames
 from recon.geometry import rigid
 from recon.model.pose_checks import LOST
 from sonotwin.cli import main
+from sonotwin.verbs import freehand
 
 COUNT = 30
 NAMES = FrameNames(reference="Tracker")
-IMAGE = np.diag([0.9, 0.9, 0.9, 1.0])
+IMAGE = np.array([[0.9, 0, 0, 0], [0, 0, -0.9, 0], [0, 0.9, 0, 0], [0, 0, 0, 1.0]])  # depth across the sweep
 TIMES_S = 100 + np.arange(COUNT) / 20
 
 
@@ -130,3 +131,14 @@ def test_files_of_other_times_are_refused(apart, frames, tmp_path, capsys):
         assert main(["freehand", f"sequence={path}", f"tracker={given}", "reference=Tracker", f"out={tmp_path / 'out'}"]) == 2
         said = capsys.readouterr().err
         assert complaint in said and said.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_a_spacing_that_leaves_gaps_is_advised_against(frames, tmp_path):
+    """B-scans 1.5 mm apart: sticks of nine voxels reach over eight steps, of 0.19 mm and more."""
+    path = tmp_path / "s.igs.mha"
+    sequences.write_sequence(path, frames)
+    placed = scans.of_sequence(path, NAMES)
+    (said,) = freehand.advice(placed, scans.VolumeSettings(spacing_mm=0.1))
+    assert said.startswith("advice      B-scans or pixels are up to 1.5 mm apart") and "give spacing_mm=0.2, " in said
+    assert not list(freehand.advice(placed, scans.VolumeSettings(spacing_mm=0.2)))
+    assert "give spacing_mm=1.5, " in next(freehand.advice(placed, scans.VolumeSettings(spacing_mm=0.5, hole_voxels=0)))
