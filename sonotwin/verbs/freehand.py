@@ -21,7 +21,7 @@ from time import perf_counter
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 from rich.console import Console
 
 from recon.capture import probe_files, sweep_part
