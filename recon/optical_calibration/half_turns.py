@@ -24,6 +24,7 @@ from recon.optical_calibration.observations import PROJECTOR, Observations
 Turn = NDArray[np.intp]
 
 CLEAR = 25.0  # fall of a pose's cost by which it counts as turned: odds of 3e5
+SHARE = 1 / 3  # of the cost of all poses, that it falls at least: errors of detection may look like those of a print
 ROUNDS = 5  # in which poses are turned one by one, until none is
 ALMOST = 1e-7  # relative change of the cost of poses alone
 NEAR = 1e-6  # of a board's size: points on each other
@@ -95,7 +96,10 @@ def consistent(
     start = _Views(observations, offsets, Estimate(adjusted.calibration.cameras, adjusted.poses, adjusted.points))
     proposed, noise = _alike(observations, adjusted, turn), np.array(list(adjusted.noise.values()))
     found = [_settled(start, flips, free, turn, noise) for flips in (np.zeros_like(proposed), proposed)[: 1 + proposed.any()]]
-    views, chosen, _ = min(found, key=lambda each: each[2])
+    views, chosen, cost = min(found, key=lambda each: each[2])
+    if chosen.any():
+        unturned = _settled(start, np.zeros_like(chosen), free, turn, noise, rounds=1)
+        views, chosen, _ = (views, chosen, cost) if cost < (1 - SHARE) * unturned[2] else unturned
     if 2 * chosen.sum() > len(chosen):  # which of both ways is the first doesn't matter: that of most poses
         chosen = ~chosen
         views = _turned(views, range(len(chosen)), turn)
@@ -115,16 +119,17 @@ class _Views(NamedTuple):
 
 
 def _settled(
-    views: _Views, flips: NDArray[np.bool_], free: Mapping[str, Sequence[str]], turn: Turn, noise: Array
+    views: _Views, flips: NDArray[np.bool_], free: Mapping[str, Sequence[str]], turn: Turn, noise: Array, rounds: int = ROUNDS
 ) -> tuple[_Views, NDArray[np.bool_], float]:
     """Views with some poses turned, and others until none fits better the other way; which these are, and the cost of all."""
     chosen = np.zeros_like(flips)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         views, chosen = _turned(views, np.flatnonzero(flips), turn), chosen ^ flips
         fit = adjust(views.observations, views.estimate, free, views.offsets, board_shape.WIDE, released=True)
         views = views._replace(estimate=fit.estimate)
         finer = np.array(list(fit.noise.values()))
-        flips = _costs(views, finer) - _costs(_turned(views, range(len(flips)), turn), finer) > CLEAR
+        costs = _costs(views, finer)
+        flips = costs - _costs(_turned(views, range(len(flips)), turn), finer) > CLEAR
         if not flips.any():
             break
     return views, chosen, float(_costs(views, noise).sum())
