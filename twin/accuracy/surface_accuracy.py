@@ -1,5 +1,6 @@
 """Accuracy of the surface: the paper's planes and sphere, the breast, unwrapping under stress, and a real relief."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.typing import NDArray
 
 from recon.capture import calibration_files
 from recon.capture.images import read_images
-from recon.model.patterns import Patterns
+from recon.model.patterns import Fringes, GrayCode, Patterns
 from recon.model.rig import Rig
 from recon.structured_light.decode import ProjectorMap, Status, decode
 from recon.structured_light.surface_mesh import clean
@@ -26,6 +27,7 @@ from twin.optics.surface_session import Shooting, View, calibration_of, shoot
 TRACING, SHOOTING = Tracing(samples=16, room_lux=20), Shooting()
 PAPER_SPHERE_RADIUS_MM, PAPER_SPHERE_RMS_MM = 0.045, 0.040
 REAL_DEPTH_MM = (690.0, 780.0)
+GAMMAS = (1.4, 1.8, 2.2, 2.6)  # of light, between usual projectors and too steep ones
 WINDOW = 9  # px; patches of the real surface in which noise is told from shape by a quadratic fit
 
 
@@ -75,6 +77,7 @@ def measurements(setup: Setup) -> list[Measurement]:
         lambda: sphere(setup),
         lambda: breast(setup),
         lambda: orders_under_stress(setup),
+        lambda: bent_light(setup),
         *([lambda: real_capture(setup)] if setup.real else []),
     ]
 
@@ -141,6 +144,25 @@ def orders_under_stress(setup: Setup) -> list[Row]:
             )
         else:
             rows.append(Row("g", f"two objects, {name}: coverage", result.metrics["coverage"], 0.9, 1.0, "", at_least=True))
+    return rows
+
+
+def bent_light(setup: Setup, gammas: Sequence[float] = GAMMAS) -> list[Row]:
+    """Row g: a plane by three steps under gammas that the pipeline isn't given, against the same under linear light."""
+    fringes = Fringes(pitch=18, steps=3)
+    code = GrayCode(pitch=18, bits=7, complementary=True)
+    patterns = Patterns(projector_size=setup.rig.projector.optics.size, unwrap="gray", parts=(fringes, code))
+
+    def shot(gamma: float) -> Metrics:
+        rig = setup.rig.model_copy(update={"projector": setup.rig.projector.model_copy(update={"gamma": gamma})})
+        return experiment(rig, plane.build(plane.PAPER_POSES[2]), patterns, seed=40).metrics
+
+    linear, rows = shot(1.0), []
+    for gamma in gammas:
+        metrics = shot(gamma)
+        ratio, what = metrics["surface_rms_mm"] / linear["surface_rms_mm"], f"plane, three steps under a gamma of {gamma:g}"
+        rows.append(Row("g", f"{what}: RMS, as a share of that of linear light", ratio, 1.3, None, ""))
+        rows.append(Row("g", f"{what}: spread of error / predicted sigma, off from 1", abs(metrics["z_std"] - 1), 0.1, 0.0, ""))
     return rows
 
 
