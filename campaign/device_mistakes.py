@@ -121,7 +121,7 @@ ALIKE = np.diag([-1.0, 1, -1, 1])  # a probe held the other way round
 
 def of_probe(path: str) -> list[Mistake]:
     """Mistakes in a calibration of the probe that is given."""
-    scale, place = r"scale|sx|sy|mm/px|unit", r"unit|bracket|mm|far|target_from_image"
+    scale, place = r"scale|sx|sy|mm/px|unit", r"unit|bracket|target_from_image"
     return [
         *(
             Mistake("units", f"scales in {name} a pixel", scale, probe(path, lambda p, f=factor: replace(p, scale=p.scale * f)))
@@ -143,7 +143,7 @@ def of_probe(path: str) -> list[Mistake]:
 
 def of_optics(path: str, devices: tuple[str, ...]) -> list[Mistake]:
     """Mistakes in a calibration of cameras and projector."""
-    words = r"calibration|unit|baseline|translation|mm|metres"
+    words = r"unit|baseline|translation|metres"
     found = [Mistake("units", f"translations in {name}", words, optics(path, in_unit(f))) for name, f in UNITS.items()]
     found += [
         Mistake("frames", "world_from_device given", r"invers|calibration|behind|common|view|frame", optics(path, inverse)),

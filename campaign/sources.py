@@ -25,6 +25,7 @@ MADE = (  # command lines in the order in which they are run
     ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "path.count=12", "out=wires"),
     ("sweep", "scene=tank", "ultrasound=water", "path=bob", "path.seconds=2", "out=bottom"),
     ("sweep", *STROKE, "out=scan"),
+    ("sweep", "path.start_mm=[26,-34]", "path.end_mm=[26,34]", "path.speed_mm_s=30", "out=lumps"),
     ("sweep", *STROKE, "filmed=true", "clocks.camera_hz=20", "out=filmed"),
     ("film", "frames=24", "path.turn_deg=20", "white_dn=120", "seed=1", "out=film"),
     ("dataset", "samples=4", "shard=2", "out=data"),

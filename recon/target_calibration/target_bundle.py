@@ -4,7 +4,8 @@ Measured are the ellipses of all rims, centres and shapes; predicted are those o
 held by their covariance, so that the target's has their errors in it: its scale is that of the cameras' baseline.
 """
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from recon import arguments
 from recon.capture import target_files
 from recon.geometry import camera_jacobian, rigid
 from recon.geometry.camera import Camera
@@ -21,7 +23,9 @@ from recon.geometry.levenberg_marquardt import Rules, descend
 from recon.model import circle_layout
 from recon.model.calibration import Uncertainty
 from recon.model.rig import Target
-from recon.target_calibration.target_poses import Seen
+from recon.target_calibration import target_poses
+from recon.target_calibration.target_poses import Fault, Seen
+from recon.tracking.tracker import Tracking
 
 Array = NDArray[np.float64]
 
@@ -90,6 +94,46 @@ class _System(NamedTuple):
     own: Array  # (n, 6, 6)
     own_right: Array  # (n, 6)
     mixed: Array  # (n, 6, s)
+
+
+def calibrate(
+    tracked: Iterable[Tracking],
+    cameras: tuple[Camera, Camera],
+    design: Target,
+    optics: Uncertainty | None = None,
+    most_poses: int = 100,
+    least_tilt_deg: float = 5.0,
+    least_range_mm: float = 20.0,
+    name: str = "film",
+) -> Adjusted:
+    """Measure the target from what the tracker found in the pairs of frames of a film.
+
+    Parameters
+    ----------
+    tracked : n results of a tracker's steps
+        Taken one by one; those in which all six rims are whole and evenly lit count, of poses that differ.
+    cameras : the tracker's
+    design : where to start; its inner diameter and board stay.
+    optics : of the cameras' calibration; None where it isn't known, or exact.
+    name : str
+        Of the film, for messages.
+
+    Raises
+    ------
+    InputError
+        If poses, tilts or distances are missing.
+    """
+    arguments.of_kind("design", design, Target)
+    arguments.of_kind("optics", optics, Uncertainty, type(None))
+    arguments.of_kind("tracked", tracked, Iterable)
+    seen, faults = list[Seen](), Counter[Fault]()
+    for found in tracked:
+        arguments.of_kind("tracked", found, Tracking, way="sonotwin.Tracker.step gives them")
+        pair = target_poses.whole(found, cameras)
+        seen.append(pair) if isinstance(pair, Seen) else faults.update([pair])
+    pairs = target_poses.spread(target_poses.distinct(seen), most_poses)
+    target_poses.check(pairs, name, faults, least_tilt_deg, least_range_mm)
+    return adjust(pairs, design, optics)
 
 
 def adjust(pairs: Sequence[Seen], design: Target, optics: Uncertainty | None) -> Adjusted:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+import sonotwin
 from recon.capture import calibration_files
 from recon.capture.manifest import BoardPart, Device
 from recon.capture.writer import new_capture, write_pose
@@ -63,6 +64,20 @@ def calibrated(session) -> tuple[Path, list[str]]:
     with contextlib.redirect_stdout(io.StringIO()) as said:
         assert main(["calibrate-optics", *fields]) == 0
     return out, said.getvalue().splitlines()
+
+
+def test_the_interface_gives_the_verbs_calibration(session, calibrated):
+    """From images in memory."""
+    captured, bits = sonotwin.read_board(session / "capture"), dict.fromkeys(cameras(), 8)
+    poses = [captured.pose(number) for number in range(len(captured.poses))]
+    sightings = [sonotwin.find_board(pose.name, BOARD, pose.lit, None, None, bits) for pose in poses]
+    settings = sonotwin.OpticsSettings(distortion="radial2")
+    found = sonotwin.calibrate_optics(sightings, BOARD, dict.fromkeys(cameras(), SIZE), settings).adjustment.calibration
+    written = sonotwin.read_calibration(calibrated[0] / "optics.yaml")
+    for name, camera in found.cameras.items():
+        assert np.allclose(camera.matrix, written.cameras[name].matrix, rtol=1e-9)
+        assert np.allclose(camera.camera_from_world, written.cameras[name].camera_from_world, atol=1e-9)
+    assert np.allclose(found.uncertainty.covariance, written.uncertainty.covariance, rtol=1e-6)
 
 
 def test_a_capture_becomes_a_calibration(session, calibrated):

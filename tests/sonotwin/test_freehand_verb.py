@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sonotwin
 from recon.capture import probe_files, sweep_part
 from recon.files import volumes
 from recon.freehand import sequences
@@ -43,6 +44,19 @@ def ball_of(path: Path) -> tuple[np.ndarray, float]:
 
 
 BALL_MM3 = 4 / 3 * np.pi * sweep_sets.BALL_MM**3
+
+
+def test_the_interface_gives_the_verbs_volume(capture, reconstructed):
+    """From B-scans and poses in memory."""
+    sweep = sonotwin.read_sweep(capture)
+    width, height = sweep.size
+    target_from_pixel = sweep.probe.target_from_image @ np.diag([*sweep.probe.scale, 1, 1])
+    placed = sweep.poses(LAG_S) @ target_from_pixel  # in the verb's order: rounding decides on pixels at voxels' borders
+    corners = np.array([[u, v, 0, 1] for u in (0, width - 1) for v in (0, height - 1)])
+    around = (corners @ placed[np.isfinite(placed).all(axis=(1, 2))].transpose(0, 2, 1))[..., :3].reshape(-1, 3)
+    made = sonotwin.fill_holes(sonotwin.reconstruct_volume(sweep.images(), placed, sonotwin.principal_grid(around, 0.5))).volume
+    written = volumes.read_volume(reconstructed / "volume.nrrd")
+    assert np.array_equal(made.voxels, written.voxels) and np.allclose(made.origin, written.origin, atol=1e-6)
 
 
 def test_the_ball_is_where_it_is_and_as_large(reconstructed):

@@ -23,6 +23,7 @@ before = set(sys.modules)
 import sonotwin
 assert set(sonotwin.__all__) <= set(dir(sonotwin))
 assert not hasattr(sonotwin, "nothing_of_the_kind")
+assert sonotwin.__version__[0].isdigit()
 print(sorted({name.partition(".")[0] for name in set(sys.modules) - before} & {"numpy", "pydantic", "recon", "twin", "scenes"}))
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
@@ -57,7 +58,13 @@ def test_the_examples_name_what_there_is():
     used = {node.attr for example in EXAMPLES for node in ast.walk(ast.parse(example)) if is_of_sonotwin(node)}
     assert used <= set(sonotwin.__all__)
     functions = {name for name in sonotwin.__all__ if name[0].islower()}
-    assert functions - used == {"read_board", "read_film", "read_calibration", "read_probe"}  # described beside their sisters
+    assert functions - used == {
+        "read_board",
+        "read_film",
+        "read_calibration",
+        "read_probe",
+        "calibrate_target",
+    }  # described beside their sisters
     modules = {alias.name for example in EXAMPLES for node in ast.walk(ast.parse(example)) for alias in imports(node)}
     assert modules == {"cv2", "numpy", "sonotwin"}
 

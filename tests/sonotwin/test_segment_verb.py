@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from scipy.ndimage import gaussian_filter
 
+import sonotwin
 from recon.capture import sweep_part
 from recon.freehand import sequences
 from recon.geometry import rigid
@@ -71,6 +72,17 @@ def test_the_mass_is_where_it_is_and_as_large(segmented):
     assert 80 < figures["tissue_grey"] < 180 and figures["speed_m_per_s"] == 1540
     assert figures["mass0_inside"] == 1 and figures["mass0_covered"] == 1
     assert figures["mass0_depth_mm"] == pytest.approx(15 - RADIUS, abs=0.6)
+
+
+def test_the_interface_gives_the_verbs_mass(capture, segmented):
+    """From B-scans and poses in memory, with the blur that the verb corrects for."""
+    sweep = sonotwin.read_sweep(capture)
+    scans, target_from_pixel = list(sweep.images()), sweep.probe.target_from_image @ np.diag([*sweep.probe.scale, 1, 1])
+    placed = sweep.poses(LAG_S) @ target_from_pixel  # in the verb's order: rounding decides on pixels at voxels' borders
+    (mass,) = sonotwin.find_masses(lambda: iter(scans), SIZE[::-1], placed, sonotwin.Sound(), blur=sonotwin.Blur())
+    figures = json.loads((segmented / "metrics.json").read_text())
+    assert mass.volume == pytest.approx(figures["mass0_volume_mm3"], rel=1e-6)
+    assert np.allclose(mass.centre, [figures[f"mass0_centre_{axis}_mm"] for axis in "xyz"], atol=1e-6)
 
 
 def test_a_sequence_of_a_screen_shows_the_same_mass(capture, segmented, tmp_path):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+import sonotwin
 from recon.capture import calibration_files, images, surface_part, writer
 from recon.capture.manifest import Device, Manifest, SurfacePart, SweepPart
 from recon.geometry import primitives, rigid
@@ -64,6 +65,18 @@ def shots(request, optics, tmp_path) -> tuple[Path, np.ndarray, Patterns]:
     devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
     writer.write_surface(tmp_path / "capture", {"cam1": images}, patterns, optics, devices)
     return tmp_path / "capture", images, patterns
+
+
+def test_the_interface_gives_the_verbs_points(shots, optics, tmp_path):
+    """From arrays in memory."""
+    folder, images, patterns = shots
+    assert main(["surface", f"capture={folder}", f"out={tmp_path / 'surface'}"]) == 0
+    camera, projector = optics.cameras["cam1"], optics.cameras["projector"]
+    found = sonotwin.decode(images, patterns, camera="cam1")
+    points = sonotwin.clean_surface(sonotwin.triangulate(found, camera, projector), camera, found.modulation)
+    with np.load(tmp_path / "surface" / "points.npz") as written:
+        assert np.allclose(points.points, written["points"], atol=1e-4, equal_nan=True)
+        assert np.allclose(points.sigma, written["sigma"], rtol=1e-4, equal_nan=True)
 
 
 def test_a_capture_becomes_a_surface(shots, tmp_path, capsys):
