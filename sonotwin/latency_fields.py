@@ -11,6 +11,7 @@ class Latency(NamedTuple):
 
     lag_s: float
     sigma_s: float
+    assumed: bool = False  # for want of a measured or a given one
 
     @property
     def field(self) -> str:
@@ -19,8 +20,8 @@ class Latency(NamedTuple):
 
     @property
     def fields(self) -> list[str]:
-        """Both as fields of a verb."""
-        return [self.field, f"lag_sigma_s={self.sigma_s:.15g}"]
+        """Both as fields of a verb; none of a lag that is assumed, as the verb assumes it too, with its uncertainty."""
+        return [] if self.assumed else [self.field, f"lag_sigma_s={self.sigma_s:.15g}"]
 
 
 def measured(folder: Path) -> Latency:

@@ -111,12 +111,16 @@ def _sha256(path: Path) -> str:
 def entries(folder: Path) -> set[str]:
     """All in a folder but its list and folders that hold something: files, links, which aren't followed, and empty folders.
 
+    Nothing of a folder that isn't there.
+
     Raises
     ------
     OSError
         If a folder can't be read, of which there may be more than is seen.
     """
     found = set[str]()
+    if not folder.exists():
+        return found
     for place, folders, files in os.walk(folder, onerror=_raised):
         links = [name for name in folders if os.path.islink(os.path.join(place, name))]
         inside = PurePosixPath(Path(place).relative_to(folder).as_posix())

@@ -24,6 +24,7 @@ from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
 from recon.errors import InputError
 from recon.files import atomic
 from recon.model.calibration import Calibration, in_use
+from recon.model.pose_checks import Implausible
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import NotNegative, Positive, Target
 from recon.probe_calibration import sound_in_water
@@ -53,6 +54,7 @@ class Config(MeasuredTargetFields):
     film: manifest.SweepNameOrNone = ""
     bottom: manifest.SweepNameOrNone = ""
     tracked: Path | None = None
+    implausible: Implausible = "refuse"
     probe: Path | None = None
     lag: Path | None = None
     alarm_sigma: Annotated[float, Field(ge=1, le=20)] = 3.2
@@ -204,7 +206,7 @@ def tank(config: Config, held: Held, console: Console) -> list[Verdict]:
     parts = (bottom_equations.PROBE, bottom_equations.CLOCK)
     if held.bottom is None:
         return [Verdict(part, "unseen") for part in parts]
-    sweep = sweep_part.read_sweep(config.tracked or config.capture, held.bottom)
+    sweep = sweep_part.read_sweep(config.tracked or config.capture, held.bottom, implausible=config.implausible)
     probe = sweep.probe if config.probe is None else probe_files.read(config.probe)
     if probe is None:
         raise InputError(

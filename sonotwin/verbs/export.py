@@ -41,6 +41,7 @@ from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
 from recon.files import atomic, npz
 from recon.freehand import scans as freehand_scans
+from recon.model.pose_checks import Implausible
 from recon.model.probe import Speed
 from recon.model.rig import Part
 from recon.model.tracks import LagSeconds
@@ -59,6 +60,7 @@ class Config(Part):
     calibration: Path | None = None
     surface: Path | None = None
     sweep: str = ""
+    implausible: Implausible = "refuse"
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
     tissue_m_s: Speed | None = None
@@ -142,7 +144,7 @@ def write_surface(folder: Path, config: Config) -> str:
 
 def write_sweep(folder: Path, config: Config, held: Manifest) -> list[str]:
     """Write the B-scans with their poses, frames and masks, and the probe's file; returns lines about them."""
-    sweep = sweep_part.read_sweep(config.source, config.sweep, "volume")
+    sweep = sweep_part.read_sweep(config.source, config.sweep, "volume", config.implausible)
     poses = sweep.poses(config.lag_s)
     placed = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
     _, part = held.sweep_of(config.source / MANIFEST, "a sweep", config.sweep, "volume")

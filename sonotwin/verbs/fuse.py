@@ -28,6 +28,7 @@ from recon.fusion import fused_scene, scene_page, skin, slicer_folder
 from recon.fusion.fused_scene import FusedScene
 from recon.fusion.skin import Parted
 from recon.model.calibration import Calibration
+from recon.model.pose_checks import Implausible
 from recon.model.probe import Speed
 from recon.model.rig import Part, Rig
 from recon.model.tracks import LagSeconds
@@ -44,6 +45,7 @@ class Config(Part):
     capture: Path
     out: Path
     sweep: str = ""
+    implausible: Implausible = "refuse"
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
     tissue_m_s: Speed | None = None
@@ -90,7 +92,7 @@ def run(config: Config) -> None:
 
 def read(config: Config) -> FusedScene:
     """All that is given, in the world."""
-    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
+    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume", config.implausible)
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
     scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
     placed = np.isfinite(scans.world_from_pixel).all(axis=(1, 2))

@@ -37,6 +37,7 @@ from recon.fusion import fused_scene, probe_shape
 from recon.fusion import skin as skin_parts
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
+from recon.model.pose_checks import Implausible
 from recon.model.rig import NotNegative, Part, Rig, Vector
 from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, mass_files
@@ -77,6 +78,7 @@ class Config(Part):
     part_table: bool = True
     capture: Path | None = None
     sweep: str = ""
+    implausible: Implausible = "refuse"
     scan: Annotated[int, Field(ge=0)] = 0
     probe: Path | None = None
     lag_s: LagSeconds = 0.0
@@ -211,7 +213,7 @@ def read_probe(config: Config, skin: trimesh.Trimesh) -> Held:
         If the capture is incomplete or damaged, there is no such B-scan, or it has no pose.
     """
     assert config.capture is not None
-    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume")
+    sweep = sweep_part.read_sweep(config.capture, config.sweep, "volume", config.implausible)
     probe = freehand_scans.probe_of(sweep, config.capture, config.probe)
     scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, None)
     count = len(scans.world_from_pixel)

@@ -29,6 +29,7 @@ from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPa
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE
+from recon.model.pose_checks import Implausible
 from recon.model.probe import Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig
 from recon.model.tracks import LagSeconds
@@ -63,6 +64,7 @@ class Config(Part):
     probe: Path | None = None
     lag_s: LagSeconds | None = None
     lag_sigma_s: NotNegative = 0.0
+    implausible: Implausible = "refuse"
     temperature_c: Finite | None = None
     tissue_m_s: Speed | None = None
     tissue_sigma_m_s: SpeedSigma | None = None
@@ -83,6 +85,11 @@ class Config(Part):
         """Keep the overrides, of which the rig's are passed on to the steps."""
         if context:
             self._overrides = context["overrides"]
+
+    @property
+    def taken(self) -> str:
+        """The setting of poses that no hand makes, as a field of the steps that read a sweep."""
+        return f"implausible={self.implausible}"
 
     @property
     def rig_fields(self) -> list[str]:
@@ -231,10 +238,10 @@ def measured_latency(steps: KeptSteps, sources: Sources, tracked: Mapping[str, P
         return Latency(config.lag_s, config.lag_sigma_s)
     if name is None:
         steps.leave_out("latency", "no sweep over a flat bottom and no lag_s; the B-scans' time stamps are taken as they are")
-        return Latency(0.0, 0.0)
+        return Latency(0.0, 0.0, assumed=True)
     if tracked[name] is None:
         return steps.fail("latency", f"no poses of the sweep {name}")
-    fields = [f"capture={tracked[name]}", f"sweep={name}"]
+    fields = [f"capture={tracked[name]}", f"sweep={name}", config.taken]
     does, made_of = "the scanner's lag, from a flat bottom", _scans(steps, sources, name)
     made = steps.do("latency", does, "measure-lag", fields, (measure_lag.LAG,), made_of)
     return None if made is None else latency_fields.measured(made)
@@ -249,7 +256,7 @@ def calibrated_probe(steps: KeptSteps, sources: Sources, tracked: Mapping[str, P
         return None if sources.held.probe is None else _own_probe(steps, config, config.capture / sources.held.probe)
     if tracked[name] is None or lag is None:
         return steps.fail("probe", NO_LAG if lag is None else f"no poses of the sweep {name}; give probe=...")
-    fields = [f"capture={tracked[name]}", f"sweep={name}", lag.field, *config.rig_fields]
+    fields = [f"capture={tracked[name]}", f"sweep={name}", lag.field, config.taken, *config.rig_fields]
     fields += [] if config.temperature_c is None else [f"temperature_c={config.temperature_c:.15g}"]
     does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
     files = (calibrate_probe.PROBE, calibrate_probe.FRAMES)
@@ -282,7 +289,7 @@ def look_inside(
         for kind in wanted:
             steps.leave_out(_step_of(kind, name), reason)
         return None
-    placing = [f"capture={capture}", f"sweep={name}", f"probe={probe}"]
+    placing = [f"capture={capture}", f"sweep={name}", f"probe={probe}", config.taken]
     placing += [] if config.tissue_m_s is None else [f"tissue_m_s={config.tissue_m_s:.15g}"]
     sigma = [] if config.tissue_sigma_m_s is None else [f"tissue_sigma_m_s={config.tissue_sigma_m_s:.15g}"]
     fields = [*placing, *lag.fields, *sigma]
