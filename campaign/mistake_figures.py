@@ -16,6 +16,7 @@ from recon.geometry import rigid
 Array = NDArray[np.float64]
 Figures = Mapping[str, tuple[Array, Array]]  # name -> values, and their standard deviations; NaN where there is none
 
+UNKNOWN_MM, UNKNOWN_SHARE = 0.3, 0.03  # standard deviations of places and volumes for which a result has none
 NEAREST = 1e-4  # relative: figures aren't told apart below it, whatever is claimed
 
 
@@ -104,7 +105,7 @@ def volume(folder: Path) -> Figures:
     path = folder / "sequence.igs.mha"
     placed = scans.of_sequence(path)
     figures = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    sigma = np.array([figures.get("place_sigma_median_mm") or 0.3] * 3) / np.sqrt(3)
+    sigma = np.array([figures.get("place_sigma_median_mm") or UNKNOWN_MM] * 3) / np.sqrt(3)
     result = {}
     for image, matrix in zip(sequences.stream_images(path), placed.world_from_pixel, strict=True):
         weight = image.astype(float) ** 2
@@ -122,8 +123,11 @@ def masses(folder: Path) -> Figures:
     number = 0
     while f"mass{number}_volume_mm3" in figures:
         name = f"mass{number}"
-        result[name] = np.array([figures[f"{name}_volume_mm3"]]), np.array([figures[f"{name}_volume_sigma_mm3"]])
+        volume_mm3 = figures[f"{name}_volume_mm3"]
+        sigma_mm3 = figures[f"{name}_volume_sigma_mm3"] or UNKNOWN_SHARE * volume_mm3
+        sigma_mm = figures[f"{name}_centre_sigma_mm"] or UNKNOWN_MM
+        result[name] = np.array([volume_mm3]), np.array([sigma_mm3])
         centre = np.array([figures[f"{name}_centre_{axis}_mm"] for axis in "xyz"])
-        result[f"{name} centre"] = centre, np.full(3, figures[f"{name}_centre_sigma_mm"] / np.sqrt(3))
+        result[f"{name} centre"] = centre, np.full(3, sigma_mm / np.sqrt(3))
         number += 1
     return result
