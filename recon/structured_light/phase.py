@@ -18,6 +18,7 @@ GAMMA_HARMONICS = 3  # the highest that a gamma adds with some strength
 EVEN = 3.0  # condition number up to which shifts are even enough to tell harmonics apart: of even ones it is 1.4
 NOISIER = 1.02  # variance of the phase that being blind to them may cost
 ONE_SIGMA = 0.6827  # of normal values are within a standard deviation
+GOLDEN = 0.618034  # whose multiples fill the interval from 0 to 1 evenly, however many
 NOISE_SAMPLES = 40_000  # pixels of the estimate; enough for 1 % in the variance
 
 BRIGHTEST = 6  # row of the sums: the brightest image
@@ -288,9 +289,15 @@ def _harmonic(samples: Image, k: int) -> Image:
 
 
 def sample_pixels(images: NDArray, count: int) -> Image:
-    """About `count` pixels of all images, on a regular grid : (n, pixels) float32."""
-    step = max(1, int(np.sqrt(images[0].size / count)))
-    return images[:, step // 2 :: step, step // 2 :: step].reshape(len(images), -1).astype(np.float32)
+    """About `count` pixels of all images : (n, pixels) float32.
+
+    On a grid whose rows and columns are shifted against each other, as a regular one may see fringes in a few phases alone.
+    """
+    height, width = images[0].shape
+    step = max(1, int(np.sqrt(height * width / count)))
+    i, j = np.mgrid[: height // step, : width // step]
+    shifts = (step * (GOLDEN * np.arange(max(i.shape)) % 1)).astype(int)
+    return images[:, i * step + shifts[j], j * step + shifts[i]].reshape(len(images), -1).astype(np.float32)
 
 
 def _photon_transfer(level: Image, residuals: Image) -> Noise:

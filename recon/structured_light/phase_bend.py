@@ -154,7 +154,8 @@ def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Non
     period = 2 * np.pi / speed
     if PERIODS * WINDOW * period > max(valid.shape) / 2:
         return None
-    strides = [int(np.clip(2 * np.pi / max(turn, speed / 4) / (ALONG * steps), 1, period / ALONG)) for turn in turns]
+    longest = max(1.0, period / ALONG)
+    strides = [int(np.clip(2 * np.pi / max(turn, speed / 4) / (ALONG * steps), 1, longest)) for turn in turns]
     strides = [stride if 2 * turn < speed else 1 for stride, turn in zip(strides, turns, strict=True)]
     thin = np.s_[strides[0] // 2 :: strides[0], strides[1] // 2 :: strides[1]]
     seen, known, width = fringe.phase[thin], valid[thin], WINDOW * period / np.array(strides)
