@@ -8,6 +8,7 @@ PARTS = {  # the modules' beginnings, what the console calls them, and the secon
     "recon.tracking": ("fit of the target's rims", 20),
     "recon.optical_calibration": ("images of the board in the projector", 15),
     "recon.board_detection": ("edges of the board's circles", 5),
+    "recon.clips": ("lossless JPEG", 5),
     "recon.freehand": ("volume from B-scans", 5),
     "recon.segmentation": ("search for masses", 5),
     "recon.geometry": ("cameras", 5),

@@ -301,5 +301,5 @@ def test_other_folders_are_not_replaced(session, tmp_path, capsys):
     out.mkdir()
     (out / "mine.txt").write_text("mine")
     found = complaint(capsys, f"capture={session / 'capture'}", f"out={out}")
-    assert "expected a new or empty folder or one with calibration.html" in found
+    assert "expected a new or empty folder, or one that calibrate-optics wrote" in found
     assert [path.name for path in out.iterdir()] == ["mine.txt"]

@@ -105,20 +105,23 @@ def test_results_that_are_no_part_of_a_run_are_named_once(tmp_path, verb):
 
 
 def test_a_beginning_that_was_killed_is_no_obstacle(tmp_path, verb):
-    """Its record was not yet there, but the hidden files by which it is written."""
-    for name in (".reconstruct.json.lock", ".reconstruct.77.new.json"):
+    """Its list was not yet there, but the hidden files by which it is written."""
+    for name in ("..sonotwin.json.lock", "..sonotwin.77.new.json"):
         (tmp_path / name).write_text("")
     assert done(tmp_path).done == ["part"]
 
 
 @pytest.mark.parametrize("content", ["not JSON", "[1, 2]", ""])
-def test_a_damaged_record_costs_work_alone(tmp_path, verb, content):
+def test_a_changed_record_is_refused_and_a_lost_one_costs_work_alone(tmp_path, verb, content):
     done(tmp_path)
     (tmp_path / RECORD).write_text(content)
+    with pytest.raises(InputError, match=r"reconstruct\.json: expected it as reconstruct wrote it, found it changed since; move it"):
+        done(tmp_path)
+    (tmp_path / RECORD).unlink()
     assert done(tmp_path).done == ["part"] and verb.calls == ["1", "1"]
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(InputError, match=r"expected a new or empty folder or one with reconstruct.json"):
+    with pytest.raises(InputError, match=r"expected a new or empty folder, or one that reconstruct wrote"):
         done(tmp_path)

@@ -136,7 +136,7 @@ def test_bad_input_is_one_line(tank, tmp_path, capsys, fields, complaint):
 def test_a_folder_of_something_else_is_refused(tank, tmp_path, capsys):
     (tmp_path / "thesis.txt").write_text("mine")
     assert main(["reconstruct", f"capture={tank}", f"out={tmp_path}"]) == 2
-    assert "expected a new or empty folder or one with reconstruct.json" in capsys.readouterr().err
+    assert "expected a new or empty folder, or one that reconstruct wrote" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 

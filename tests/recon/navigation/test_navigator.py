@@ -26,6 +26,7 @@ class Found:
 
     pose: object
     how: str | None
+    others: tuple = ()
 
     @property
     def found(self):
