@@ -201,7 +201,7 @@ def test_a_calibration_goes_out_for_other_programs_and_comes_back(capture, tmp_p
     out = tmp_path / "out"
     assert main(["export", "layout=ros", f"capture={capture}", f"out={out}"]) == 0
     assert "left out    projector: the layout has no place for it" in capsys.readouterr().out
-    assert sorted(path.name for path in out.iterdir()) == ["cam1.yaml", "cam2.yaml", "sonotwin-export.json"]
+    assert sorted(path.name for path in out.glob("[!.]*")) == ["cam1.yaml", "cam2.yaml", "sonotwin-export.json"]
     found = calibration_files.read(out).cameras
     assert found["cam2"].camera_from_world == pytest.approx(optics().cameras["cam2"].camera_from_world)
     assert main(["export", "layout=kalibr", f"calibration={out}", f"out={tmp_path / 'chain'}"]) == 0
