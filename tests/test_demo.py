@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from recon.errors import InputError
+from recon.files import atomic
 from recon.tracking import networks
 from sonotwin import pipeline
 from sonotwin.cli import main
@@ -166,7 +167,8 @@ def step(name, works=True, makes=(), refines=(), figure=None):
     def work(folder, figures):
         for made in makes:
             if "." in made:
-                (folder / made).write_text(name, encoding="utf-8")
+                with atomic.listed_file(folder, made, pipeline.DEMO) as path:
+                    path.write_text(name, encoding="utf-8")
         if not works:
             raise KeyboardInterrupt
         return {figure or name: len(figures)}

@@ -268,7 +268,7 @@ def discard(folder: Path) -> None:
         for name in entries(listed) & files.keys():
             if is_unchanged(listed / name, files[name]):
                 (listed / name).unlink()
-        if not entries(listed) - empty:
+        if all((listed / name).is_dir() and not (listed / name).is_symlink() for name in entries(listed)):
             path.unlink()
     _remove_empty(folder, empty)
 

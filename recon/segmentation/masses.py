@@ -45,6 +45,7 @@ SAMPLED = 40  # images for the level of tissue
 LEAST_GREY = 5.0  # of 255, of tissue
 CORE = 0.6  # of a mass's extent: its darkest part
 MOSTLY_AROUND = 0.6  # share of a cut body's shell that shows tissue: elsewhere than behind phantoms
+ALL_DOWN = 0.9  # share of the images' depth, above which what is dark at their side is in the shadow of something beside them
 BOTTOM = 0.8  # share of what lies just behind a cut body that isn't seen, above which it is the dark behind a phantom
 LEAST_CUT_MM3 = 15.0  # of what is seen of a cut body
 DARKEST = 0.1  # share of a cut body that is as dark as a mass's core: of a small piece most lies within the blur of its border
@@ -220,8 +221,8 @@ def rough(power: EchoPower) -> list[Mass]:
 def _cut_bodies(dark: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> tuple[Mask, list[str]]:
     """Dark bodies with tissue around what is seen of them, at the sides or ends of the scan: what they may shadow, and lines.
 
-    The part behind it, down the beam, doesn't count, as its shadow lies there; nor does what is dark from the face on, or all
-    along the images' lower end, as behind a phantom.
+    The part behind it, down the beam, doesn't count, as its shadow lies there; nor does what is dark from the face on, all the way
+    down, or all along the images' lower end, as behind a phantom.
     """
     spacing = power.volume.spacing[::-1]
     pad = int(np.ceil(2 * OPEN_MM / spacing.min()))
@@ -244,6 +245,8 @@ def _cut_bodies(dark: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> tup
         rows = np.nonzero(inside)[1]
         height, volume = (np.ptp(rows) + 1) * spacing[1], inside.sum() * float(np.prod(spacing))
         extents = [(np.ptp(axis) + 1) * step for axis, step in zip(np.nonzero(inside), spacing, strict=True)][::-1]
+        if height > ALL_DOWN * ratio.shape[1] * spacing[1]:
+            continue
         if volume < LEAST_CUT_MM3 or height < LEAST_CUT_MM or np.quantile(levels[inside], DARKEST) > SEED:
             continue
         behind = np.logical_or.accumulate(inside, axis=1)

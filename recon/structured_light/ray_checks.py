@@ -1,7 +1,7 @@
 """Checks that camera, projector and decoded columns make one scene: images of another rig, mirrored or turned ones don't.
 
 A mirrored sequence decodes perfectly. But what both devices see, both see from its front; its points lie in front of both and in
-the projector's image; and if columns and rows are known, rays of camera and projector meet.
+the projector's image. Where both columns and rows are known, `triangulate` itself refuses rays that don't meet.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,6 @@ class RayLimits:
     behind: float = 0.5  # lit from behind; mirrored left to right it is 1
     nowhere: float = 0.1  # rays that don't meet in front of both devices
     beyond: float = 0.1  # of points by columns alone, in rows that the projector doesn't have
-    apart_px: float = 8.0  # projector px by which rays pass each other in the median; some are of a rig that moved
     margin: float = 0.05  # of the projector's image, that its model may be off at the borders
     reach: int = 8  # px between the points of a normal, so that noise doesn't turn it
     every: int = 4  # rows and columns, of which one is looked at
@@ -47,8 +46,7 @@ def check(
     Raises
     ------
     InputError
-        If more points than `limits` allow are lit from behind, lie behind a device, or outside of the projector's image, or if
-        columns and rows contradict each other.
+        If more points than `limits` allow are lit from behind, lie behind a device, or outside of the projector's image.
     """
     limits = limits or RayLimits()
     axes = [axis for axis in (found.columns, found.rows) if axis is not None]
@@ -66,18 +64,10 @@ def check(
             f"{name}: rays of camera and projector don't meet in front of both in {100 * lost:.0f} % of the decoded pixels: is "
             "the calibration that of this rig, are images and patterns those of this capture, and neither mirrored nor turned?"
         )
-    thin = np.s_[:: limits.every, :: limits.every]
-    use = solved[thin]
-    seen = projector.project(raw.points[thin][use].astype(float))
-    if found.columns is not None and found.rows is not None:
-        both = np.stack([found.columns[thin][use], found.rows[thin][use]], axis=1) - seen
-        apart = float(np.nanmedian(np.hypot(*both.T)))
-        if apart > limits.apart_px:
-            raise InputError(
-                f"{name}: rays of camera and projector pass each other by {apart:.0f} projector px in the median: are the images "
-                "mirrored or turned, or has a device moved since the calibration?"
-            )
+    if found.columns is not None and found.rows is not None:  # `triangulate` refuses rays that pass each other
         return
+    thin = np.s_[:: limits.every, :: limits.every]
+    seen = projector.project(raw.points[thin][solved[thin]].astype(float))
     other, name_of = (1, "rows") if found.rows is None else (0, "columns")
     length = projector.size[other]
     beyond = np.mean((seen[:, other] < -limits.margin * length) | (seen[:, other] > (1 + limits.margin) * length))

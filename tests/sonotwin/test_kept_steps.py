@@ -115,7 +115,9 @@ def test_a_beginning_that_was_killed_is_no_obstacle(tmp_path, verb):
 def test_a_changed_record_is_refused_and_a_lost_one_costs_work_alone(tmp_path, verb, content):
     done(tmp_path)
     (tmp_path / RECORD).write_text(content)
-    with pytest.raises(InputError, match=r"reconstruct\.json: expected it as reconstruct wrote it, found it changed since; move it"):
+    with pytest.raises(
+        InputError, match=r"reconstruct\.json: expected it as reconstruct wrote it, found it changed since; move it"
+    ):
         done(tmp_path)
     (tmp_path / RECORD).unlink()
     assert done(tmp_path).done == ["part"] and verb.calls == ["1", "1"]
