@@ -83,7 +83,7 @@ def test_files_and_modules_that_pages_name_exist(page):
             assert (ROOT / path).is_file(), path
     for name in re.findall(rf"\b((?:{'|'.join(PACKAGES)})(?:\.[a-z_0-9]+)+)\b", text):
         parts = name.split(".")
-        if parts[-1] in ("md", "py", "svg", "yaml"):
+        if parts[-1] in ("md", "py", "svg", "yaml", "json"):
             continue
         while len(parts) > 1 and not ((ROOT / Path(*parts)).is_dir() or (ROOT / Path(*parts)).with_suffix(".py").is_file()):
             parts.pop()  # a function or class of a module

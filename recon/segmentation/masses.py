@@ -221,8 +221,8 @@ def rough(power: EchoPower) -> list[Mass]:
 def _cut_bodies(dark: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> tuple[Mask, list[str]]:
     """Dark bodies with tissue around what is seen of them, at the sides or ends of the scan: what they may shadow, and lines.
 
-    The part behind it, down the beam, doesn't count, as its shadow lies there; nor does what is dark from the face on, all the way
-    down, or all along the images' lower end, as behind a phantom.
+    The part behind it, down the beam, doesn't count, as its shadow lies there; nor does what is dark from the face on, all the
+    way down, or all along the images' lower end, as behind a phantom.
     """
     spacing = power.volume.spacing[::-1]
     pad = int(np.ceil(2 * OPEN_MM / spacing.min()))

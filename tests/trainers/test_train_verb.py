@@ -11,6 +11,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from recon.files import atomic
 from recon.files.occupied import occupied
 from sonotwin.cli import main
 
@@ -106,6 +107,7 @@ def test_a_run_of_the_earlier_version_goes_on(data_set, trained, tmp_path):
     asked = json.loads((out / "training.json").read_text())
     del asked["memory_gb"]
     (out / "training.json").write_text(json.dumps(asked | {"data": asked["data"][0]}))
+    atomic.list_again(out, "training.json", "train")
     assert train(data_set, out, "steps=2") == 0
 
 
@@ -143,6 +145,7 @@ def test_what_was_asked_before_is_told_shortly(data_set, trained, tmp_path, caps
     out = shutil.copytree(trained, tmp_path / "out")
     asked = json.loads((out / "training.json").read_text())
     (out / "training.json").write_text(json.dumps(asked | {"seed": "\n\x1b[2J" * 10_000}))
+    atomic.list_again(out, "training.json", "train")
     assert train(data_set, out, "steps=2") == 2
     said = capsys.readouterr().err
     assert "expected seed=" in said and said.count("\n") == 1 and len(said) < 800

@@ -13,6 +13,7 @@ from recon.board_detection.detect import detect
 from recon.capture import board_part, manifest
 from recon.capture.manifest import SCHEMA, Device, Manifest, SweepPart
 from recon.errors import InputError
+from recon.files import atomic
 from recon.geometry import rigid
 from recon.geometry.circle_projection import centre_offsets
 from recon.model.patterns import Fringes, GrayCode, Patterns
@@ -26,7 +27,7 @@ from twin.optics.printed_edges import compute_edges
 from twin.optics.ray_world import is_convex
 from twin.optics.surface_session import Shooting, calibration_of
 from twin.sensor import electrons_per_radiance
-from twin.session import Session
+from twin.session import TWIN, Session
 
 PATTERNS = Patterns(
     projector_size=(1280, 800),
@@ -212,10 +213,10 @@ def test_a_board_out_of_sight_leaves_the_room(settings):
 
 
 def test_a_board_does_not_take_the_place_of_a_film(settings, tmp_path):
-    (tmp_path / "capture").mkdir()
     images = {"cam1": "sweep/cam1", "cam2": "sweep/cam2"}
     devices = {name: Device(size=(64, 48)) for name in images}
-    manifest.write_manifest(tmp_path / "capture", Manifest(schema=SCHEMA, devices=devices, sweep=SweepPart(images=images)))
+    with atomic.new_folder(tmp_path / "capture", TWIN) as folder:
+        manifest.write_manifest(folder, Manifest(schema=SCHEMA, devices=devices, sweep=SweepPart(images=images)))
     with pytest.raises(InputError, match="capture: expected nothing or an earlier board, found a sweep of cam1 and cam2"):
         board_session.missing_poses(Session(tmp_path, "board", DESCRIBED), settings)
 

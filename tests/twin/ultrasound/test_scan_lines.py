@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.clips import fan_region
@@ -48,6 +48,7 @@ def plate(depth: float) -> Body:
     return Body(TISSUES["water"], (solid(thing, PLATE, None),), ())
 
 
+@settings(deadline=None)
 @given(st.floats(0, 60), st.floats(0, 80))
 def test_a_place_on_a_line_is_found_there(along, depth):
     """And its line leaves the arc at a right angle, towards its depth."""
