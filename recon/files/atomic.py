@@ -82,6 +82,7 @@ def new_folders(
     paths = list(by)
     with ExitStack() as locks:
         for path in sorted(paths):
+            _check_no_file(path)
             _check_writable(path, path.parent)
             path.parent.mkdir(parents=True, exist_ok=True)
             locks.enter_context(alone(path))
@@ -320,11 +321,15 @@ def _checked(path: Path, by: str, inputs: Iterable[Path], amends: Collection[str
     for source in inputs:
         if Path(os.path.realpath(source)).is_relative_to(path):
             raise InputError(f"{path}: expected a folder apart from what is read, found it to hold {source}")
-    if path.exists() and not path.is_dir():
-        raise InputError(f"{path}: expected a folder or nothing, found a file")
+    _check_no_file(path)
     if path.is_dir():
         written_files.replaceable(path, by, amends)
     return path
+
+
+def _check_no_file(path: Path) -> None:
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: expected a folder or nothing, found a file")
 
 
 def _check_writable(path: Path, folder: Path) -> None:
