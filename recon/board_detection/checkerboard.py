@@ -7,7 +7,7 @@ from scipy.optimize import minimize_scalar
 
 from recon.board_detection.corners import Corners, refine_corners
 from recon.board_detection.findings import MIRRORED, BoardNotFound, Detection, first_faults, refuse_bad, spread
-from recon.board_detection.reduced_images import reduced
+from recon.board_detection.reduced_images import LARGE_PX, reduced
 from recon.errors import InputError
 from recon.model.boards import AprilGrid, Charuco, Chessboard
 
@@ -120,7 +120,8 @@ def find_aprilgrid(image: Array, board: AprilGrid, full: float) -> Detection:
     clear = (
         MARGIN * min(np.sqrt(2) * board.border_cells * cell, board.rim_mm) / board.tag_mm
     )  # of a tag, to what isn't the corner's
-    window = min(min(WINDOW[0], clear) * _shortest_side(rough, points[at], board.tag_mm), WINDOW[1])
+    widest = WINDOW[1] * max(1.0, np.sqrt(image.size / LARGE_PX))  # tags were found in a reduced image, as roughly
+    window = min(min(WINDOW[0], clear) * _shortest_side(rough, points[at], board.tag_mm), widest)
     if window < LEAST_WINDOW:
         raise BoardNotFound(f"too small: {window:.1f} px between a corner and the cells of its tag")
     measured = _refine(image, rough, points[at], window, full)
