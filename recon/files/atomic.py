@@ -137,8 +137,11 @@ def list_again(folder: Path, name: str, by: str) -> None:
 
 def check_listed(folder: Path, name: str, by: str) -> None:
     """Check that a file in a folder that is filled where it stands can be written; InputError if another's is there."""
-    path, files = folder / name, written_files.read_list(folder) or {}
-    if os.path.lexists(path) and not (name in files and written_files.is_unchanged(path, files[name])):
+    path = folder / name
+    if not os.path.lexists(path):
+        return
+    files = written_files.read_list(folder) or {}
+    if not (name in files and written_files.is_unchanged(path, files[name])):
         found = "found it changed since" if name in files else "found another file"
         raise InputError(f"{path}: expected nothing or a file as {by} wrote it, {found}; {written_files.ELSEWHERE}")
 
@@ -231,20 +234,15 @@ def _put_back(paths: Sequence[Path]) -> None:
     """
     *others, last = paths
     for aside in [] if last.exists() else _leftovers(last, "old"):
-        _return(aside, last)
+        aside.rename(last)
     state = "new" if (last / UNPLACED).exists() else "old"
     for path in others:
         for folder in [] if path.exists() else _leftovers(path, state):
-            _return(folder, path)
+            if state == "old" or (folder / LIST).is_file():
+                folder.rename(path)
     (last / UNPLACED).unlink(missing_ok=True)
     for path in paths:
         _remove(path)
-
-
-def _return(aside: Path, path: Path) -> None:
-    """Put a whole folder of ours back in its place."""
-    if (aside / LIST).is_file():
-        aside.rename(path)
 
 
 def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> None:

@@ -119,8 +119,6 @@ def entries(folder: Path) -> set[str]:
         If a folder can't be read, of which there may be more than is seen.
     """
     found = set[str]()
-    if not folder.exists():
-        return found
     for place, folders, files in os.walk(folder, onerror=_raised):
         links = [name for name in folders if os.path.islink(os.path.join(place, name))]
         inside = PurePosixPath(Path(place).relative_to(folder).as_posix())
@@ -131,7 +129,8 @@ def entries(folder: Path) -> set[str]:
 
 
 def _raised(error: OSError) -> None:
-    raise error
+    if not isinstance(error, FileNotFoundError):  # of another process at work there, whose folder has gone
+        raise error
 
 
 def _is_mark(folder: Path, name: str) -> bool:
@@ -168,7 +167,7 @@ def replaceable(folder: Path, by: str, amends: Collection[str] = ()) -> Files:
             raise InputError(f"{folder / blocking}: expected a folder that {by} wrote, found something else; {ELSEWHERE}")
     device = folder.stat().st_dev
     for name in sorted(there - (files or {}).keys()):
-        if (folder / name).lstat().st_dev != device:
+        if os.path.lexists(folder / name) and (folder / name).lstat().st_dev != device:
             raise InputError(f"{folder / name}: expected it on the disk of {folder}, found another disk; give another place")
     return files or {}
 
@@ -248,15 +247,18 @@ def take_away(left: Path, place: Path) -> None:
     for name in sorted(entries(left)):
         path, other = left / name, place / name
         listed = (*files.get(name, ()), *others.get(name, ()))
-        if os.path.lexists(other) and (_same(path, other) or path.is_dir()):
-            _remove(path)
-        elif is_unchanged(path, listed):
-            path.unlink()
-        elif place.is_dir() and not os.path.lexists(other):
-            _make_folders(left, place, name)
-            path.rename(other)
-        else:
-            log.warning("%s: left there, as sonotwin didn't write it", path)
+        try:
+            if os.path.lexists(other) and (_same(path, other) or path.is_dir()):
+                _remove(path)
+            elif is_unchanged(path, listed):
+                path.unlink()
+            elif place.is_dir() and not os.path.lexists(other):
+                _make_folders(left, place, name)
+                path.rename(other)
+            else:
+                log.warning("%s: left there, as sonotwin didn't write it", path)
+        except PermissionError as error:  # in a folder that its owner protects
+            log.warning("%s: left there: %s", path, error.strerror)
     _remove_empty(left, set())
 
 

@@ -155,7 +155,7 @@ class AprilGrid(Printed):
         return first[:, None] + np.array([0, 1, 2 * self.columns + 1, 2 * self.columns])
 
 
-BOARDS = (AsymmetricCircles, SymmetricCircles, Chessboard, Charuco)
+BOARDS = (AsymmetricCircles, SymmetricCircles, Chessboard, Charuco, AprilGrid)
 Circles = AsymmetricCircles | SymmetricCircles
 Squares = Chessboard | Charuco | AprilGrid
 Board = Annotated[AsymmetricCircles | SymmetricCircles | Chessboard | Charuco | AprilGrid, Field(discriminator="kind")]

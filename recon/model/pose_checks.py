@@ -123,6 +123,8 @@ def checked(
         return poses, Findings(found.count)
     kept = without(poses, found.all)
     if len(found.all) > LIMITS.most_share * found.count:
+        if fault:
+            raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
         expected = f"a motion that a hand makes, but for {100 * LIMITS.most_share:.0f} % at most"
         raise InputError(f"{place}: poses: expected {expected}, found {'; '.join(found.lines(what))}; {way}")
     if fault := unit_fault(kept):

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.geometry import board_shape, rigid
 from recon.geometry.camera_jacobian import linearise
-from recon.model.boards import Board, Charuco, Chessboard
+from recon.model.boards import AprilGrid, Board, Charuco, Chessboard
 from recon.optical_calibration.adjustment import Adjustment, adjust, fitted
 from recon.optical_calibration.bundle import ROBUST, Array, Estimate, Problem, linearised
 from recon.optical_calibration.initial_estimate import alone
@@ -32,7 +32,7 @@ NEAR = 1e-6  # of a board's size: points on each other
 
 def half_turn(board: Board) -> Turn | None:
     """The number of the point : (n,) on which half a turn puts each point; None of a board that isn't mapped onto itself."""
-    if isinstance(board, Charuco) or (isinstance(board, Chessboard) and (board.columns - board.rows) % 2):
+    if isinstance(board, Charuco | AprilGrid) or (isinstance(board, Chessboard) and (board.columns - board.rows) % 2):
         return None
     points = board.points()
     turned = points.min(axis=0) + points.max(axis=0) - points
@@ -68,6 +68,8 @@ def agreeing(observations: Observations, turn: Turn) -> tuple[Observations, dict
             continue
         _, boards = alone(observations, number)
         both = np.flatnonzero(np.isfinite(boards[:, 0, 0]) & np.isfinite(reference[:, 0, 0]))
+        if not len(both):
+            continue
         first = np.array([rigid.invert(pose) for pose in reference[both]])
         places = np.stack([boards[both] @ first, boards[both] @ back @ first], axis=1)  # (p, 2, 4, 4)
         turns = Rotation.from_matrix(places[:, :, :3, :3].reshape(-1, 3, 3))

@@ -115,11 +115,8 @@ def _check(
         raise InputError(f"{place}: bits: expected those of {', '.join(lacking)}, found {', '.join(bits) or 'none'}")
     for camera, image in lit.items():
         arguments.grey_levels(f"{place}: lit: {camera}", image, ("h", "w"), bits[camera])
-    if (fringes is None) != (patterns is None):
-        given, lacking = ("patterns", "fringes") if fringes is None else ("fringes", "patterns")
-        raise InputError(f"{place}: {lacking}: expected them with {given}, found none")
-    if fringes is not None and patterns is not None and FIRST in lit:
-        shape = (patterns.count, *np.shape(lit[FIRST]))
+    if fringes is not None and FIRST in lit:
+        shape = ("n" if patterns is None else patterns.count, *np.shape(lit[FIRST]))
         arguments.grey_levels(f"{place}: fringes", fringes, shape, bits[FIRST])
 
 

@@ -17,6 +17,8 @@ LIT_SHARE = 0.002  # share of the image that must carry fringes
 SATURATED_SHARE = 0.5  # share of the lit image that may be saturated
 HARMONIC_SHARE = 0.08  # of the modulation, in the high harmonics: beyond, it is no N-step sequence
 AROUND = 0.25  # of the RMS phasor: a larger mean is of phases that are not seen all around
+EACH_WAY = 0.02  # share of the phasors in each eighth of the circle, where phases are seen all around
+FLAT = 0.05  # share of short phasors, of a quarter of the RMS, where an ellipse is nearly a line: 0.1 of one
 SLIM = 0.25  # of the power, in the mean square of the phasors: 1 of a doubled step, 0.03 of a shift off by 5 % of a step
 SPARSE_STEPS = 7  # at most, of which neighbours differ by a third of the swing; more have harmonics that show errors
 ALIKE = 0.15  # of the swing: a median difference of two images that noise makes; share of the pixels of either phase
@@ -75,7 +77,9 @@ def _check_steps(samples: Image, part: Fringes, place: str, start: int) -> None:
     _, c, s = pseudo_inverse(part.shifts) @ samples
     phasor = c + 1j * s
     power = float(np.mean(np.abs(phasor) ** 2))
-    around = abs(np.mean(phasor)) < AROUND * np.sqrt(power)
+    sectors = np.bincount(((np.angle(phasor) + np.pi) * (4 / np.pi)).astype(int) % 8, minlength=8) / phasor.size
+    flat = np.mean(np.abs(phasor) < np.sqrt(power) / 4)
+    around = abs(np.mean(phasor)) < AROUND * np.sqrt(power) and (sectors.min() > EACH_WAY or flat > FLAT)
     if doubled or (around and abs(np.mean(phasor**2)) > SLIM * power):
         cause = f"images {start + a} and {start + b} show the same" if doubled else "the steps are uneven"
         raise InputError(

@@ -94,7 +94,7 @@ class StudyFolder:
 
     def keep(self, done: Done) -> None:
         """Keep a trial's figures; one that gave none is tried again by a later run. A damaged one is set aside."""
-        if isinstance(done.found, str):
+        if isinstance(done.found, str) or self.kept(done.trial) is not None:  # by another run, meanwhile
             return
         path = self._path(done.trial.key)
         if os.path.lexists(path):  # it wasn't kept, and so was changed by somebody

@@ -9,11 +9,11 @@ from recon.capture.writer import new_capture, write_pose
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.boards import Chessboard
+from recon.model.boards import AprilGrid, Chessboard
 from recon.model.patterns import Fringes, GrayCode, Patterns, Uniform
 from recon.optical_calibration import board_frames, sightings
 from recon.optical_calibration.sightings import Cause, sight
-from tests.recon.board_views import pose, under_patterns
+from tests.recon.board_views import pose, under_patterns, view
 
 BOARD = Chessboard(columns=5, rows=4, square_mm=28)
 CAMERA = Camera((320, 256), np.array([[830.0, 0, 158], [0, 832, 127], [0, 0, 1]]), np.zeros(4))
@@ -43,6 +43,13 @@ def test_images_of_any_depth_tell_the_points_of_camera_and_projector(bits, rng):
     check(found, world_from_board)
     error = camera_error(found, world_from_board)
     assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance["cam1"]), error)) < 4
+
+
+@pytest.mark.parametrize("board", [BOARD, AprilGrid(columns=3, rows=2, tag_mm=35)], ids=["chessboard", "aprilgrid"])
+def test_fringes_are_left_alone_where_the_projector_isnt_calibrated(board, rng):
+    image = view(board, CAMERA, pose(board, 640, (0.3, -0.25), 0.1), noise=1.0, rng=rng)
+    found = sight("00", board, {"cam1": image}, np.stack([image] * 3), None, {"cam1": 8})
+    assert list(found.pixels) == ["cam1"] and np.isfinite(found.pixels["cam1"]).all() and not found.failures
 
 
 def test_the_mean_of_the_fringes_stands_in_for_a_lit_image(tmp_path, rng):
