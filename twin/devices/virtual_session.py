@@ -64,7 +64,7 @@ def before_board(settings: StillSettings, design: Board, patterns: Sequence[Patt
     """Devices before a hand that holds a board where it is asked to; InputError of one other than of dark, asymmetric circles."""
     if not isinstance(design, AsymmetricCircles) or design.white:
         raise InputError("board.kind: expected asymmetric_circles, dark ones, as the twin prints no others, found another board")
-    printed = board.Config(**design.model_dump(exclude={"kind", "white"}))
+    printed = board.Config(**design.model_dump(exclude={"kind", "white", "unusual"}))
     held = HeldBoard(settings.rig, printed, known_to_board(patterns, settings.rig), settings.tracing, settings.seed)
     return _devices(settings, held, BoardHand(held.hold, PATIENCE * count))
 
