@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from recon.compiled import njit
 from recon.files.volumes import Volume
 from recon.freehand import plus_arithmetic
+from recon.freehand.plus_arithmetic import reach
 from recon.freehand.volume_compounding import Reconstruction
 
 Array = NDArray[np.float64]
@@ -92,28 +93,15 @@ def _measure(before, known, voxel, step_mm, most_voxels, length, grey):
     for s in range(len(step_mm)):
         di, dj, dk = STICKS[s]
         length[s] = np.inf
-        forth = _reach(known, k, j, i, dk, dj, di, most_voxels - 2)
+        forth = reach(known, k, j, i, dk, dj, di, most_voxels - 2)
         if forth == 0:
             continue
-        back = _reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth)
+        back = reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth)
         if back > 0:
             ahead = before[k + forth * dk, j + forth * dj, i + forth * di]
             behind = before[k - back * dk, j - back * dj, i - back * di]
             length[s] = (forth + back) * step_mm[s]
             grey[s] = (back * ahead + forth * behind) / (forth + back)
-
-
-@njit
-def _reach(filled: NDArray, k: int, j: int, i: int, dk: int, dj: int, di: int, most: int) -> int:
-    """Steps to the next filled voxel, 0 if there is none within `most`."""
-    nz, ny, nx = filled.shape
-    for step in range(1, most + 1):
-        k, j, i = k + dk, j + dj, i + di
-        if not (0 <= k < nz and 0 <= j < ny and 0 <= i < nx):
-            return 0
-        if filled[k, j, i]:
-            return step
-    return 0
 
 
 @njit(inline="always")

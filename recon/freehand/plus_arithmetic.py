@@ -181,8 +181,8 @@ def fill(before, known, most_voxels, sticks, voxels, filled):
                 for s in range(len(STICKS)):
                     di, dj, dk = STICKS[s]
                     weight[s] = 0.0
-                    forth = _reach(known, k, j, i, dk, dj, di, most_voxels - 1)
-                    back = _reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth) if forth else 0
+                    forth = reach(known, k, j, i, dk, dj, di, most_voxels - 1)
+                    back = reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth) if forth else 0
                     if back:
                         ahead = before[k + forth * dk, j + forth * dj, i + forth * di]
                         behind = before[k - back * dk, j - back * dj, i - back * di]
@@ -206,7 +206,7 @@ def fill(before, known, most_voxels, sticks, voxels, filled):
 
 
 @njit
-def _reach(filled, k, j, i, dk, dj, di, most):
+def reach(filled, k, j, i, dk, dj, di, most):
     """Steps to the next filled voxel, 0 if there is none within `most`."""
     nz, ny, nx = filled.shape
     for step in range(1, most + 1):
