@@ -44,14 +44,14 @@ REFINEMENTS = (2, 3)  # after each clearing
 SAMPLED = 40  # images for the level of tissue
 LEAST_GREY = 5.0  # of 255, of tissue
 CORE = 0.6  # of a mass's extent: its darkest part
-MOSTLY_AROUND = 0.6  # share of a cut body's shell that shows tissue: elsewhere than behind phantoms
-ALL_DOWN = 0.9  # share of the images' depth, above which what is dark at their side is in the shadow of something beside them
-BOTTOM = 0.8  # share of what lies just behind a cut body that isn't seen, above which it is the dark behind a phantom
+MOSTLY = 0.6  # share of what lies before a cut body that shows tissue: elsewhere the probe doesn't touch
+SAME = 0.5  # share of a cut body that is whole by itself
 LEAST_CUT_MM3 = 15.0  # of what is seen of a cut body
 DARKEST = 0.1  # share of a cut body that is as dark as a mass's core: of a small piece most lies within the blur of its border
 LEAST_CUT_MM = 2.5  # of it down the beam; speckle has no holes as deep
 STREAK = 2.5  # height of a body down the beam over its thickness, above which it is the shadow of a border
 CUT = "a dark body is cut by %s, and is left out: %.0f mm3 of it at %.0f, %.0f, %.0f mm, %.0f x %.0f x %.0f mm; scan on there"
+FLOOR = "the dark behind the tissue, %.0f mm3 about %.0f, %.0f, %.0f mm, holds no mass, or one that isn't told from it"
 BEHIND = 0.5  # share of a body within the shadow of one that is cut, which can't be cleared
 HIDDEN = "a dark body of %.0f mm3 at %.0f, %.0f, %.0f mm is left out: it lies behind one that is cut, and may be its shadow"
 SHADOW = "a dark streak at %.0f, %.0f, %.0f mm, %.0f mm down the beam and %.0f mm thick, is left out as the shadow of a border"
@@ -193,10 +193,7 @@ def rough(power: EchoPower) -> list[Mass]:
     labels, count = ndimage.label(body)
     parts = ndimage.find_objects(labels)
     margin, edge = (np.ceil(one / spacing).astype(int) for one in (2 * GROW_MM, EDGE_MM))
-    shadowed, texts = _cut_bodies(dark, ratio, seen, power)
-    for text in texts:
-        log.warning(text)
-    result = []
+    whole, candidates = np.zeros(dark.shape, bool), []
     for number in range(1, count + 1):
         part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(parts[number - 1], margin, strict=True))
         inside = labels[part] == number
@@ -206,71 +203,63 @@ def rough(power: EchoPower) -> list[Mass]:
         core = np.median(ratio[part][inside])
         if volume < LEAST_MM3 or core > SEED or touches or cut:
             continue
+        whole[part] |= inside
+        candidates.append((part, inside, core))
+    shadowed = _name_cut_bodies(dark, whole, ratio, seen, power)
+    result = []
+    for part, inside, core in candidates:
         height, thick = np.ptp(np.nonzero(inside)[1]) * spacing[1], _thickness(inside, spacing)
         if height > STREAK * thick:
             log.warning(SHADOW, *_middle(inside, part, power), height, thick)
-            continue
-        if shadowed[part][inside].mean() > BEHIND:
-            log.warning(HIDDEN, volume, *_middle(inside, part, power))
-            continue
-        field = np.where(_widened(inside, GROW_MM, spacing), ratio[part], 1.0)
-        result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))
+        elif shadowed[part][inside].mean() > BEHIND:
+            log.warning(HIDDEN, inside.sum() * float(np.prod(spacing)), *_middle(inside, part, power))
+        else:
+            field = np.where(_widened(inside, GROW_MM, spacing), ratio[part], 1.0)
+            result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))
     return result
 
 
-def _cut_bodies(dark: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> tuple[Mask, list[str]]:
-    """Dark bodies with tissue around what is seen of them, at the sides or ends of the scan: what they may shadow, and lines.
+def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> Mask:
+    """Log a line of each dark body, with tissue before it, that a side or an end of the scan cuts: voxels in their shadows.
 
-    The part behind it, down the beam, doesn't count, as its shadow lies there; nor does what is dark from the face on, all the
-    way down, or all along the images' lower end, as behind a phantom.
+    Bodies that are whole are left out. The dark behind a phantom has a line of its own: nothing bright is behind it, and it has
+    hardly a side.
     """
     spacing = power.volume.spacing[::-1]
     pad = int(np.ceil(2 * OPEN_MM / spacing.min()))
-    dark, known = np.pad(dark, pad), np.pad(seen, pad)
-    body = dark & _opened(dark | ~known, OPEN_MM, spacing)
-    labels, _ = ndimage.label(body)
+    whole, known = np.pad(whole, pad), np.pad(seen, pad)
+    ratio = np.pad(ratio, pad, constant_values=1.0)
+    dark = np.pad(dark, pad)
+    bright = known & (ratio > DARK)
+    last = ~np.logical_or.accumulate(bright[:, ::-1], axis=1)[:, ::-1]  # nothing behind is bright
+    labels, _ = ndimage.label(dark & _opened(dark | ~known, OPEN_MM, spacing))
     margin = np.ceil(4 * EDGE_MM / spacing).astype(int)
-    shadowed, texts = np.zeros(dark.shape, bool), []
+    shadowed = np.zeros(dark.shape, bool)
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
-        part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(box, margin, strict=True))
+        part = tuple(slice(s.start - m, s.stop + m) for s, m in zip(box, margin, strict=True))
         inside, here = labels[part] == number, known[part]
-        middle = tuple(slice(s.start - pad, s.stop - pad) for s in part)
-        shell = _widened(inside, 2 * EDGE_MM, spacing) & ~inside
-        if not (_widened(inside, EDGE_MM, spacing) & ~here).any():
+        volume = inside.sum() * float(np.prod(spacing))
+        extents = [(s.stop - s.start) * step for s, step in zip(box, spacing, strict=True)][::-1]
+        across, height, along = extents
+        small = volume < LEAST_CUT_MM3 or height < LEAST_CUT_MM or height > STREAK * max(across, along)
+        if small or np.quantile(ratio[part][inside], DARKEST) > SEED or whole[part][inside].mean() > SAME:
             continue
-        levels = np.ones(inside.shape)
-        within = tuple(slice(max(0, s.start), min(n, s.stop)) for s, n in zip(middle, ratio.shape, strict=True))
-        at = tuple(slice(w.start - m.start, w.stop - m.start) for w, m in zip(within, middle, strict=True))
-        levels[at] = ratio[within]
-        rows = np.nonzero(inside)[1]
-        height, volume = (np.ptp(rows) + 1) * spacing[1], inside.sum() * float(np.prod(spacing))
-        extents = [(np.ptp(axis) + 1) * step for axis, step in zip(np.nonzero(inside), spacing, strict=True)][::-1]
-        if height > ALL_DOWN * ratio.shape[1] * spacing[1]:
-            continue
-        if volume < LEAST_CUT_MM3 or height < LEAST_CUT_MM or np.quantile(levels[inside], DARKEST) > SEED:
-            continue
-        behind = np.logical_or.accumulate(inside, axis=1)
-        before = np.logical_or.accumulate(inside[:, ::-1], axis=1)[:, ::-1]
+        shell, behind = _widened(inside, 2 * EDGE_MM, spacing) & ~inside, np.logical_or.accumulate(inside, axis=1)
+        before = np.logical_or.accumulate(inside[:, ::-1], axis=1)[:, ::-1] & ~behind
+        beside, before = shell & ~behind & ~before, shell & before
         sides = {"the images' side": _open(shell & ~here, 2), "the sweep's end": _open(shell & ~here, 0)}
-        below = (shell & behind & ~here).sum() / max((shell & behind).sum(), 1)
-        above = shell & before & ~behind
-        around = shell & here & ~(behind & ~inside)
-        if below > BOTTOM or (above & here).sum() < MOSTLY_AROUND * above.sum() or height > STREAK * max(extents[0], extents[2]):
+        if not any(sides.values()) or (before & bright[part]).sum() < MOSTLY * before.sum():
             continue
-        if min(_bright(levels[above & here]), _bright(levels[around])) < MOSTLY_AROUND:
+        ends = (inside & last[part]).any(axis=1).sum() > (1 - MOSTLY) * inside.any(axis=1).sum()
+        middle = tuple(slice(s.start - pad, s.stop - pad) for s in part)
+        if ends and (beside & ~here).sum() > (1 - MOSTLY) * beside.sum():
+            log.info(FLOOR, volume, *_middle(inside, middle, power))
             continue
-        where = max(sides, key=lambda name: sides[name])
-        texts.append(CUT % (where, volume, *_middle(inside, middle, power), *extents))
+        log.warning(CUT, max(sides, key=lambda name: sides[name]), volume, *_middle(inside, middle, power), *extents)
         near = _widened(inside, 2 * GROW_MM, spacing)
-        shadowed[part[0], part[1].start :, part[2]] |= np.logical_or.accumulate(
-            np.pad(near, ((0, 0), (0, dark.shape[1] - part[1].start - near.shape[1]), (0, 0))), axis=1
-        )
-    return shadowed[pad:-pad, pad:-pad, pad:-pad], texts
-
-
-def _bright(levels: NDArray) -> float:
-    """Share of levels that tissue has; 0 without any."""
-    return float((levels > DARK).mean()) if levels.size else 0.0
+        below = np.pad(near, ((0, 0), (0, dark.shape[1] - part[1].start - near.shape[1]), (0, 0)))
+        shadowed[part[0], part[1].start :, part[2]] |= np.logical_or.accumulate(below, axis=1)
+    return shadowed[pad:-pad, pad:-pad, pad:-pad]
 
 
 def _open(unseen: Mask, axis: int) -> int:

@@ -133,6 +133,19 @@ def test_what_is_dark_without_tissue_before_it_is_no_body(dark, rng, caplog):
     assert not find(speckled(np.where(where, DARK, 1.0), rng)) and not caplog.messages
 
 
+def test_the_dark_behind_a_phantom_is_no_cut_body_and_hides_none(rng, caplog):
+    """Turned planes see it end at many depths, partly in noise that the scanner's gain lifts; the mass before it is whole."""
+    mean, _ = ball()
+    places = grid() - CENTRE
+    floor, deep = places[..., 1] - 8, 1.0 + np.abs(places[..., 2]) / 8
+    mean = np.where(floor > 0, np.where(floor > 7, 0.2, DARK), mean)
+    power = speckled(mean, rng)
+    power.weight[places[..., 1] > 20 - 3 * deep] = 0
+    power.weight[np.abs(places[..., 0]) > 16 - deep] = 0
+    (mass,) = find(power)
+    assert mass.volume == pytest.approx(VOLUME, rel=0.05) and not caplog.messages
+
+
 def test_a_streak_down_the_beam_is_no_mass(rng, caplog):
     """The shadow of a border beside the scan: 6 mm thick, 20 mm down the beam, with tissue on all sides."""
     places = grid() - CENTRE
