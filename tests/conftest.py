@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import zlib
 from pathlib import Path
 
@@ -16,6 +17,10 @@ from recon.model.rig import Rig
 from twin.ultrasound.transducer import Transducer
 
 ROOT = Path(__file__).resolve().parent.parent
+
+for number in (signal.SIGINT, signal.SIGHUP):  # ignored in jobs of the background and under nohup, and so in all that they start
+    if signal.getsignal(number) == signal.SIG_IGN:
+        signal.signal(number, lambda *_: None)  # a handler isn't inherited: what tests start has the default again
 
 logging.getLogger("recon.compiled").setLevel(logging.WARNING)  # verbs announce nothing: a test may count their lines
 

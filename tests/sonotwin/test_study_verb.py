@@ -308,8 +308,7 @@ def test_a_sweep_from_end_to_end(tmp_path, capsys):
     assert "6 trials, 4 of them there already" in capsys.readouterr().out
 
 
-HEARING = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"  # which a shell's background job isn't
-COMMAND = [sys.executable, "-c", f"{HEARING}; from sonotwin.cli import main; sys.exit(main())", "study"]
+COMMAND = [sys.executable, "-m", "sonotwin", "study"]
 
 
 @pytest.mark.slow
