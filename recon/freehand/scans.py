@@ -16,7 +16,7 @@ from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.files.volumes import Volume
-from recon.freehand import hole_filling, place_uncertainty, sequence_checks, sequence_sweep, sequences, volume_compounding
+from recon.freehand import hole_filling, place_uncertainty, scan_checks, sequence_checks, sequence_sweep, sequences, volume_compounding
 from recon.freehand.place_uncertainty import PlaceErrors
 from recon.freehand.plus_arithmetic import Arithmetic
 from recon.freehand.sequence_sweep import SequenceFields
@@ -282,11 +282,12 @@ def depths(scans: Scans) -> str:
 
 
 def cautions(scans: Scans) -> Iterator[str]:
-    """Lines of warning about where results lie, and of what they are made; none as a rule."""
+    """Lines of warning about where results lie, of what they are made, and what is unlike a sweep; none as a rule."""
     if line := pose_checks.coverage(np.isfinite(scans.world_from_pixel).all(axis=(1, 2))):
         yield line
     if scans.elsewhere:
         yield "3D Slicer shows the sequence where its transforms to RAS put it, and these results elsewhere: give reference=LPS"
+    yield from scan_checks.faults(scans.stream(), scans.world_from_pixel)
 
 
 def size_faults(scans: Scans, clip: Clip | None = None) -> list[str]:

@@ -86,7 +86,8 @@ def run(config: Config) -> None:
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
     for line in config.assumptions(scans.speed_m_s):
         console.print(f"assumed     {line}", markup=False)
-    for line in freehand_scans.cautions(scans):
+    clip = settings.part(scans.shape)[0]
+    for line in freehand_scans.cautions(scans if clip is None else freehand_scans.cut(scans, clip)):
         console.print(f"warning     {line}", markup=False)
     if (config.fan == "find" or settings.fan) and scans.speed_m_s != scans.calibrated_m_s:
         expected = f"none with a fan, whose lines run to all sides, or {scans.calibrated_m_s:g} m/s as calibrated"

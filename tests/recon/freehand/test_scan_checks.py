@@ -1,0 +1,52 @@
+"""Are images in another order, or upside down, told, and sweeps that look odd left alone?"""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from recon.freehand import scan_checks
+
+COUNT = 40
+
+
+def sweep(rng, smooth=3.0, face=True):
+    """Images of a medium that changes along the sweep : (n, 96, 80) uint8, and their places, 0.5 mm apart."""
+    medium = ndimage.gaussian_filter(rng.standard_normal((COUNT, 96, 80)), (smooth, smooth, smooth), mode="wrap")
+    images = 110 + 30 * medium / medium.std() + 10 * rng.standard_normal(medium.shape)
+    if face:
+        images[:, :3] = 220
+    places = np.tile(np.diag([0.1, 0.1, 1.0, 1.0]), (COUNT, 1, 1))
+    places[:, 2, 3] = 0.5 * np.arange(COUNT)
+    return np.clip(images, 0, 255).astype(np.uint8), places
+
+
+def told(images, places):
+    return list(scan_checks.faults(images, places))
+
+
+def test_a_sweep_is_no_fault_and_images_in_another_order_are(rng):
+    """Also where some poses are lost, and the sweep is scanned backwards."""
+    images, places = sweep(rng)
+    places[5:8] = np.nan
+    assert told(images, places) == [] and told(images[::-1], places[::-1]) == []
+    (line,) = told(images[rng.permutation(COUNT)], places)
+    assert "another order" in line
+
+
+@pytest.mark.parametrize("smooth", [0.0, 30.0])
+def test_images_of_which_no_two_resemble_each_other_have_no_order(smooth, rng):
+    """Speckle alone, anew in each image; and a medium that is the same all along, as a tube is."""
+    images, places = sweep(rng, smooth=0.0)
+    if smooth:
+        images = np.clip(images.mean(axis=0) + 10 * rng.standard_normal(images.shape), 0, 255).astype(np.uint8)
+    assert told(images[rng.permutation(COUNT)], places) == []
+
+
+def test_the_probes_face_at_the_bottom_is_told(rng):
+    """Not without a face, nor where a scanner draws a bar at both ends."""
+    images, places = sweep(rng)
+    (line,) = told(images[:, ::-1], places)
+    assert "upside down?" in line
+    bars = images.copy()
+    bars[:, -3:] = 220
+    assert told(bars, places) == told(sweep(rng, face=False)[0][:, ::-1], places) == []
