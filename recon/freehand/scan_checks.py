@@ -1,7 +1,8 @@
-"""Whether B-scans look like a sweep: alike where they were taken near each other, with the probe's face at the top."""
+"""Whether B-scans look like the sweep of their poses: alike near each other, shifted as these say, with the face at the top."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -13,13 +14,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SweepLimits:
-    """When B-scans are told to be in another order, or upside down."""
+    """When B-scans are said to be in another order, frozen, elsewhere, or upside down."""
 
     most: int = 1000  # B-scans that are compared, the first of the sweep
     least: int = 8
     side: int = 24  # blocks along each side of a B-scan, whose mean levels are compared; speckle averages out
     alike: float = 0.6  # difference of the most similar two over that of any two, at most: else there is nothing to compare
     apart: float = 0.85  # difference of neighbours in space over that of any two, at least, where the order is another
+    repeats: int = 3  # B-scans in a row that are the same to the last digit
+    wide: int = 128  # px, of the B-scans in which shifts are measured
+    clear: float = 0.15  # phase correlation's peak in the median, at least
+    within: float = 0.6  # shift within the plane by the poses over the whole step, at least, of transforms that are wrong
+    shown: float = 0.5  # shift that the images show over that by the poses, at most
     band: float = 0.02  # of the height, at the top and at the bottom
     brighter: float = 40.0  # grey levels above the B-scan's median row, of the ringing at the probe's face
     steadier: float = 0.5  # standard deviation from image to image over that of the median row
@@ -37,19 +43,33 @@ def faults(images: Iterable[NDArray[np.uint8]], world_from_pixel: Array) -> Iter
     world_from_pixel : (n, 4, 4) mm
         NaN where there is no pose.
     """
-    blocks, rows, centres = [], [], []
+    small, rows, places = [], [], []
     for image, pose in zip(images, world_from_pixel[: LIMITS.most], strict=False):
         if np.isfinite(pose).all():
-            blocks.append(cv2.resize(image, (LIMITS.side, LIMITS.side), interpolation=cv2.INTER_AREA).astype(np.float32).ravel())
+            size = LIMITS.wide, max(round(LIMITS.wide * image.shape[0] / image.shape[1]), LIMITS.side)
+            small.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
             rows.append(image.mean(axis=1))
-            centres.append(pose[:3] @ [image.shape[1] / 2, image.shape[0] / 2, 0, 1])
-    if len(blocks) < LIMITS.least:
+            places.append(pose @ np.diag([image.shape[1] / size[0], image.shape[0] / size[1], 1, 1]))
+    if len(small) < LIMITS.least:
         return
-    if _disordered(np.array(blocks), np.array(centres)):
+    blocks = np.array([cv2.resize(one, (LIMITS.side,) * 2, interpolation=cv2.INTER_AREA).astype(np.float32) for one in small])
+    centre = np.array([small[0].shape[1] / 2, small[0].shape[0] / 2, 0, 1])
+    if _disordered(blocks.reshape(len(blocks), -1), np.array(places)[:, :3] @ centre):
         yield (
             "B-scans that were taken near each other look no more alike than any two: images in another order, or poses of "
             "another sweep?"
         )
+    else:
+        by_poses, shown, step = _shifts(small, places, centre)
+        if by_poses > LIMITS.within * step and shown < LIMITS.shown * by_poses:
+            yield (
+                f"the poses shift B-scans within their own planes by {by_poses:.2g} mm from one to the next, and the images show "
+                f"{shown:.2g} mm: a transform the other way round, axes exchanged, or another probe's calibration?"
+            )
+    same = np.array([np.array_equal(one, other) for one, other in pairwise(small)])
+    run = max((len(part) for part in "".join("x" if one else " " for one in same).split()), default=0) + 1
+    if run >= LIMITS.repeats:
+        yield f"{run} B-scans in a row are the same to the last digit while the probe moves: a frozen image?"
     if _upside_down(np.array(rows)):
         yield "the lowest rows are as bright and as steady as the ringing at a probe's face is: upside down?"
 
@@ -63,6 +83,28 @@ def _disordered(blocks: NDArray[np.float32], centres: Array) -> bool:
     neighbours = float(np.median(differences[np.arange(len(blocks)), nearest]))
     np.fill_diagonal(differences, np.inf)
     return float(np.median(differences.min(axis=1))) < LIMITS.alike * usual and neighbours > LIMITS.apart * usual
+
+
+def _shifts(small: list[NDArray[np.uint8]], places: list[Array], centre: Array) -> tuple[float, float, float]:
+    """Medians, mm: shift within the plane from one B-scan to the next by poses, and in the images; step. Without, zeros.
+
+    Parameters
+    ----------
+    small : (h, w) each
+    places : (4, 4) each
+        world_from_pixel of them.
+    centre : (4,) px
+    """
+    mean = np.mean(small, axis=0, dtype=np.float32)  # what is alike in all is the scanner's, and never shifts
+    window = cv2.createHanningWindow(mean.shape[::-1], cv2.CV_32F)
+    found = []
+    for (before, here), (after, there) in pairwise(zip(small, places, strict=True)):
+        pixel_mm = np.linalg.norm(here[:3, :2], axis=0)
+        moved = (np.linalg.inv(here) @ there @ centre - centre)[:2] * pixel_mm
+        seen, peak = cv2.phaseCorrelate(before - mean, after - mean, window)
+        found.append([np.linalg.norm(moved), np.linalg.norm(seen * pixel_mm), np.linalg.norm((there - here)[:3] @ centre), peak])
+    by_poses, shown, step, peak = np.median(found, axis=0)
+    return (float(by_poses), float(shown), float(step)) if peak > LIMITS.clear else (0.0, 0.0, 0.0)
 
 
 def _upside_down(rows: Array) -> bool:

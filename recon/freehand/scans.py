@@ -16,7 +16,15 @@ from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.files.volumes import Volume
-from recon.freehand import hole_filling, place_uncertainty, scan_checks, sequence_checks, sequence_sweep, sequences, volume_compounding
+from recon.freehand import (
+    hole_filling,
+    place_uncertainty,
+    scan_checks,
+    sequence_checks,
+    sequence_sweep,
+    sequences,
+    volume_compounding,
+)
 from recon.freehand.place_uncertainty import PlaceErrors
 from recon.freehand.plus_arithmetic import Arithmetic
 from recon.freehand.sequence_sweep import SequenceFields

@@ -9,10 +9,10 @@ from recon.freehand import scan_checks
 COUNT = 40
 
 
-def sweep(rng, smooth=3.0, face=True):
+def sweep(rng, smooth=3.0, face=True, noise=10.0):
     """Images of a medium that changes along the sweep : (n, 96, 80) uint8, and their places, 0.5 mm apart."""
     medium = ndimage.gaussian_filter(rng.standard_normal((COUNT, 96, 80)), (smooth, smooth, smooth), mode="wrap")
-    images = 110 + 30 * medium / medium.std() + 10 * rng.standard_normal(medium.shape)
+    images = 110 + 30 * medium / medium.std() + noise * rng.standard_normal(medium.shape)
     if face:
         images[:, :3] = 220
     places = np.tile(np.diag([0.1, 0.1, 1.0, 1.0]), (COUNT, 1, 1))
@@ -40,6 +40,25 @@ def test_images_of_which_no_two_resemble_each_other_have_no_order(smooth, rng):
     if smooth:
         images = np.clip(images.mean(axis=0) + 10 * rng.standard_normal(images.shape), 0, 255).astype(np.uint8)
     assert told(images[rng.permutation(COUNT)], places) == []
+
+
+def test_poses_that_shift_the_images_otherwise_than_they_show_are_told(rng):
+    """A sweep across the planes whose poses say that it went along them; one that really went along them is right."""
+    images, places = sweep(rng, noise=3.0)
+    along = places.copy()
+    along[:, 0, 3], along[:, 2, 3] = along[:, 2, 3], 0
+    (line,) = told(images, along)
+    assert "by 0.5 mm from one to the next" in line
+    wide = ndimage.gaussian_filter(rng.standard_normal((96, 80 + 5 * COUNT)), 3.0)
+    wide = np.clip(110 + 30 * wide / wide.std(), 0, 255).astype(np.uint8)
+    assert told(np.stack([wide[:, 5 * k : 5 * k + 80] for k in range(COUNT)]), along) == []
+
+
+def test_frozen_images_are_told(rng):
+    images, places = sweep(rng)
+    images[20:] = images[20]
+    (line,) = told(images, places)
+    assert line.startswith("20 B-scans in a row are the same")
 
 
 def test_the_probes_face_at_the_bottom_is_told(rng):
