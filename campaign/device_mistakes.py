@@ -13,6 +13,7 @@ from campaign.capture_mistakes import UNITS, Change, Mistake, Rng
 from recon.capture import calibration_files, probe_files
 from recon.geometry import rigid
 from recon.model.calibration import Calibration
+from recon.model.lengths import UNIT_KEY
 
 Array = NDArray[np.float64]
 
@@ -24,9 +25,16 @@ def optics(path: str, how: Callable[[Calibration, Rng], Calibration]) -> Change:
         found = how(calibration_files.read(folder / path), rng)
         (folder / path).unlink()
         calibration_files.write(folder / path, found)
+        _leave_unit_out(folder / path)
         return ()
 
     return change
+
+
+def _leave_unit_out(path: Path) -> None:
+    """Take the unit out of a file that states it, as who mistakes it doesn't."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if not line.startswith(UNIT_KEY)), encoding="utf-8")
 
 
 def _of_cameras(how: Callable[[str, Any], Any], calibration: Calibration, rng: Rng) -> Calibration:
@@ -98,6 +106,7 @@ def probe(path: str, how: Callable[[Any], Any]) -> Change:
         found = how(probe_files.read(folder / path))
         (folder / path).unlink()
         probe_files.write(folder / path, found)
+        _leave_unit_out(folder / path)
         return ()
 
     return change
