@@ -7,7 +7,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 Array = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def _disordered(blocks: NDArray[np.float32], centres: Array) -> bool:
     squares = (blocks**2).sum(axis=1)
     differences = np.sqrt(np.maximum(squares[:, None] + squares - 2 * blocks @ blocks.T, 0))
     usual = float(np.median(differences[~np.eye(len(blocks), dtype=bool)]))
-    nearest = cKDTree(centres).query(centres, k=2)[1][:, 1]
+    nearest = KDTree(centres).query(centres, k=2)[1][:, 1]
     neighbours = float(np.median(differences[np.arange(len(blocks)), nearest]))
     np.fill_diagonal(differences, np.inf)
     return float(np.median(differences.min(axis=1))) < LIMITS.alike * usual and neighbours > LIMITS.apart * usual
