@@ -96,8 +96,12 @@ def measure(result: Result, truth: Calibration | None = None) -> Metrics:
 def describe_board(result: Result, figures: Metrics) -> str:
     """The board's departure from its design, in words."""
     if not result.released:
-        held = result.tolerances.sigmas.any()
-        return f"taken as designed{'' if held else ', and exact: no sigma holds what its print is off, unless shape.in_plane_mm says it'}"
+        exact = (
+            ""
+            if result.tolerances.sigmas.any()
+            else ", and exact: no sigma holds its print's errors, unless shape.in_plane_mm does"
+        )
+        return f"taken as designed{exact}"
     in_plane, out_of_plane = (shown(figures[f"board_{name}_mm"], ".4f", " mm") for name in ("in_plane", "out_of_plane"))
     return f"differs from its design by {in_plane} in its plane and {out_of_plane} out of it (RMS), which is corrected"
 
