@@ -38,7 +38,9 @@ def _bad_inputs(place: Path, count: int) -> tuple[list[str], int]:
 
 
 def _foreign(place: Path, count: int) -> tuple[list[str], int]:
-    found = foreign.run(place, WORKERS)
+    begun = OUT / "foreign_begun.jsonl"  # goes on from there after an end in between
+    found = foreign.run(place, WORKERS, kept=begun)
+    begun.unlink()
     for one in found:
         if one.lost or one.status == -1:
             print(f"{one.writer}: {one.content}: {one.said.strip()}: {', '.join(one.lost)}")

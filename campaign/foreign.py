@@ -7,11 +7,12 @@ something else where its result is to be; whatever it does, nothing may be lost 
 import contextlib
 import hashlib
 import io
+import json
 import os
 import shutil
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -119,16 +120,31 @@ def writers() -> list[Command]:
     return [*full_disk.writers(), DEMO, *WRITERS.values()]
 
 
-def run(place: Path, workers: int, only: Sequence[str] = ()) -> list[Case]:
-    """Attack each writer, those named or all."""
+def run(place: Path, workers: int, only: Sequence[str] = (), kept: Path | None = None) -> list[Case]:
+    """Attack each writer, those named or all; those in a file `kept` of cases, a line each, aren't attacked again."""
     chosen = [command for command in writers() if not only or command.verb in only]
     results = place.parent / "results"
     context = get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
         for _ in pool.map(_finish, [place] * len(chosen), [results] * len(chosen), chosen):
             pass
+    cases = [] if kept is None or not kept.exists() else [_of_line(line) for line in kept.read_text().splitlines()]
+    left = [command for command in chosen if command.verb not in {case.writer for case in cases}]
     with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=1) as pool:
-        return [case for found in pool.map(_attack, [place] * len(chosen), [results] * len(chosen), chosen) for case in found]
+        attacks = [pool.submit(_attack, place, results, command) for command in left]
+        for attack in as_completed(attacks):
+            found = attack.result()
+            cases += found
+            if kept is not None:
+                with kept.open("a", encoding="utf-8") as file:
+                    file.write("".join(json.dumps(asdict(case)) + "\n" for case in found))
+            print(f"{found[0].writer}: {len(found)} cases, {sum(len(case.lost) for case in found)} files lost", flush=True)
+    return sorted(cases, key=lambda case: [command.verb for command in chosen].index(case.writer))
+
+
+def _of_line(line: str) -> Case:
+    fields = json.loads(line)
+    return Case(**fields | {"lost": tuple(fields["lost"])})
 
 
 def _finish(place: Path, results: Path, command: Command) -> None:
