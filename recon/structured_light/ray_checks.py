@@ -4,6 +4,7 @@ A mirrored sequence decodes perfectly. But what both devices see, both see from 
 the projector's image. Where both columns and rows are known, `triangulate` itself refuses rays that don't meet.
 """
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +12,11 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.geometry.camera import Camera
+from recon.model.pose_checks import Implausible
 from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.triangulate import PointMap
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -31,9 +35,15 @@ class RayLimits:
 
 
 def check(
-    found: ProjectorMap, raw: PointMap, camera: Camera, projector: Camera, name: str, limits: RayLimits | None = None
+    found: ProjectorMap,
+    raw: PointMap,
+    camera: Camera,
+    projector: Camera,
+    name: str,
+    implausible: Implausible = "refuse",
+    limits: RayLimits | None = None,
 ) -> None:
-    """Refuse a map whose rays make no scene that camera and projector both see.
+    """Refuse a map whose rays make no scene that camera and projector both see, or warn of it where it is to be taken.
 
     Parameters
     ----------
@@ -48,34 +58,44 @@ def check(
     InputError
         If more points than `limits` allow are lit from behind, lie behind a device, or outside of the projector's image.
     """
-    limits = limits or RayLimits()
+    seen = fault(found, raw, camera, projector, limits or RayLimits())
+    if seen is None:
+        return
+    if implausible == "refuse":
+        raise InputError(f"{name}: {seen} To use them all the same, give implausible=take")
+    log.warning("%s: taken all the same: %s", name, seen)
+
+
+def fault(found: ProjectorMap, raw: PointMap, camera: Camera, projector: Camera, limits: RayLimits) -> str | None:
+    """The first thing that no scene shows to both devices, with its likely cause; None as a rule, and of few pixels."""
     axes = [axis for axis in (found.columns, found.rows) if axis is not None]
     decoded, solved = np.isfinite(np.stack(axes)).any(axis=0), np.isfinite(raw.points[..., 0])
-    if np.count_nonzero(solved) < limits.fewest * limits.every**2:
-        return
+    if np.count_nonzero(decoded) < limits.fewest * limits.every**2:
+        return None
     if (share := lit_from_behind(raw, camera, projector, limits)) > limits.behind:
-        raise InputError(
-            f"{name}: the projector would light the back of what the camera sees in {100 * share:.0f} % of the points: are the "
+        return (
+            f"the projector would light the back of what the camera sees in {100 * share:.0f} % of the points: are the "
             "camera's images mirrored or turned by 180 degrees, the patterns projected mirrored, or is it another calibration?"
         )
     lost = 1 - np.count_nonzero(decoded & solved) / np.count_nonzero(decoded)
     if lost > limits.nowhere:
-        raise InputError(
-            f"{name}: rays of camera and projector don't meet in front of both in {100 * lost:.0f} % of the decoded pixels: is "
+        return (
+            f"rays of camera and projector don't meet in front of both in {100 * lost:.0f} % of the decoded pixels: is "
             "the calibration that of this rig, are images and patterns those of this capture, and neither mirrored nor turned?"
         )
     if found.columns is not None and found.rows is not None:  # `triangulate` refuses rays that pass each other
-        return
+        return None
     thin = np.s_[:: limits.every, :: limits.every]
     seen = projector.project(raw.points[thin][solved[thin]].astype(float))
     other, name_of = (1, "rows") if found.rows is None else (0, "columns")
     length = projector.size[other]
     beyond = np.mean((seen[:, other] < -limits.margin * length) | (seen[:, other] > (1 + limits.margin) * length))
     if beyond > limits.beyond:
-        raise InputError(
-            f"{name}: {100 * beyond:.0f} % of the points lie where the projector has no {name_of} to light them: is the "
+        return (
+            f"{100 * beyond:.0f} % of the points lie where the projector has no {name_of} to light them: is the "
             "calibration that of this rig, and are images and patterns those of this capture?"
         )
+    return None
 
 
 def lit_from_behind(raw: PointMap, camera: Camera, projector: Camera, limits: RayLimits) -> float:

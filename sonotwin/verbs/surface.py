@@ -23,6 +23,7 @@ from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
 from recon.files.metrics import shown
+from recon.model.pose_checks import Implausible
 from recon.model.rig import Part
 from recon.structured_light import decode, ray_checks, surface_figures, surface_mesh
 from recon.structured_light.triangulate import PointMap, Triangulator
@@ -40,6 +41,7 @@ class Config(Part):
     patterns: str | None = None
     calibration: Path | None = None
     camera: str = "cam1"
+    implausible: Implausible = "refuse"
     limits: surface_mesh.Limits = surface_mesh.Limits()
 
 
@@ -80,7 +82,7 @@ def run(config: Config) -> None:
         triangulate = Triangulator(camera, projector)
     with watch.stage("triangulate"):
         raw = triangulate(found)
-        ray_checks.check(found, raw, camera, projector, shots.name)
+        ray_checks.check(found, raw, camera, projector, shots.name, config.implausible)
     with watch.stage("clean"):
         cleaned = surface_mesh.clean(raw, camera, found.modulation, config.limits)
     if not np.isfinite(cleaned.points).any():

@@ -133,6 +133,18 @@ def test_a_code_too_coarse_for_a_surface_is_refused_by_the_cause(optics, tmp_pat
     assert main(["surface", *fields, "limits.max_sigma=50"]) == 0
 
 
+def test_mirrored_images_are_refused_unless_they_are_to_be_taken(optics, tmp_path, capsys, caplog):
+    patterns = SEQUENCES["centre_line"]
+    mirrored = np.ascontiguousarray(photograph(patterns, optics)[..., ::-1])
+    devices = {"cam1": Device(size=SIZE), "projector": Device(size=PROJECTOR)}
+    writer.write_surface(tmp_path / "capture", {"cam1": mirrored}, patterns, optics, devices)
+    fields = [f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'surface'}"]
+    assert main(["surface", *fields]) == 2 and not (tmp_path / "surface").exists()
+    assert re.search("light the back .* mirrored .* give implausible=take\n$", capsys.readouterr().err)
+    assert main(["surface", *fields, "implausible=take"]) == 0
+    assert "taken all the same: the projector would light the back" in caplog.text
+
+
 def test_results_are_replaced_but_other_folders_are_not(shots, tmp_path, capsys):
     folder = shots[0]
     out = tmp_path / "surface"
