@@ -1,5 +1,7 @@
 """From the images of one pose to where each device sees the board, on synthetic photographs."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from recon.model.boards import AprilGrid, Chessboard
 from recon.model.patterns import Fringes, GrayCode, Patterns, Uniform
 from recon.optical_calibration import board_frames, sightings
 from recon.optical_calibration.sightings import Cause, sight
+from recon.structured_light import surface_figures
 from tests.recon.board_views import pose, under_patterns, view
 
 BOARD = Chessboard(columns=5, rows=4, square_mm=28)
@@ -93,6 +96,20 @@ def test_a_failure_has_its_cause(rng):
         assert {device: failure.cause for device, failure in failures.items()} == {"projector": cause}
     (failure,) = sight("00", BOARD, {"cam1": np.zeros_like(first)}, None, None, {"cam1": 8}).failures.values()
     assert failure.cause is Cause.NO_BOARD
+
+
+def test_the_light_of_few_steps_is_told(rng):
+    """Three steps through a camera's gamma of 1.6: undone, and said for all poses in one line, of the largest bend."""
+    parts = [p for a in ("columns", "rows") for p in (Fringes(axis=a, pitch=16, steps=3), GrayCode(axis=a, pitch=16, bits=4))]
+    patterns, found = Patterns(projector_size=PROJECTOR.size, unwrap="gray", parts=tuple(parts)), []
+    for turn, gamma in ((0.1, 1.3), (0.2, 1.6)):
+        world_from_board = pose(BOARD, 640, (0.3, -0.25), turn)
+        photographs = under_patterns(BOARD, CAMERA, PROJECTOR, patterns, world_from_board, rng)
+        photographs = np.uint8(np.rint(255 * (photographs / 255) ** gamma))
+        found.append(sight("00", BOARD, {"cam1": photographs[0]}, photographs[1:], patterns, {"cam1": 8}))
+        check(found[-1], world_from_board)
+    (said,) = surface_figures.bent(sightings.light(found))
+    assert re.match(r"linearity   light isn't linear, it goes with level\^1\.[56] or so: 3 steps of 16 px were bent", said)
 
 
 def camera_error(found, world_from_board):
