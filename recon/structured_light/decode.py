@@ -28,6 +28,7 @@ Measured = tuple[Fringes, Fringe]
 DARKEST = 4.0  # DN of 255: default of the least modulation
 SMALLEST = 8  # px, an image's shorter side: the extent of the stencil of continuity
 WORST_SIGMA = 0.3  # rad of predicted phase noise: beyond, orders can't be decided
+NOISIER = "is the dark noisier than a linear camera's, as of a gamma"  # where noise is assumed
 LIT_SIGMA = 0.25  # rad: fringes that strong come about by noise in one pixel of 3000
 
 
@@ -83,6 +84,7 @@ class _Shots(NamedTuple):
     least: float  # DN, of modulation
     full: float  # DN
     name: str
+    doubt: str  # of the noise where it is assumed, in words
 
     def where(self, place: slice) -> str:
         """Images of a part, for messages."""
@@ -175,7 +177,7 @@ def decode(
         if isinstance(part, Fringes)
     }
     noise, source = _noise(images, parts, errors, full, noise)
-    shots = _Shots(images, patterns, errors, noise, least, full, name)
+    shots = _Shots(images, patterns, errors, noise, least, full, name, NOISIER if source == "assumed" else "")
     axes: dict[Axis, _AxisMap] = {
         axis: (_from_fringes if patterns.has_fringes(axis) else _from_code)(shots, axis) for axis in patterns.axes
     }
@@ -288,7 +290,9 @@ def _orders(shots: _Shots, axis: Axis, sets: list[Measured], valid: Mask, light:
     if isinstance(guide, CentreLine):
         return _from_line(guide, shots.images[place.start], part, fringe, valid, length, axis, f"{name}: image {place.start}")
     orders, residual = gray_code.fringe_order(shots.images[place], guide, part, fringe, length, shots.noise)
-    plausibility.check_code(orders.order, residual, guide, part, fringe.phase, valid, length, shots.where(place))
+    plausibility.check_code(
+        orders.order, residual, guide, part, fringe.phase, valid, length, light or shots.doubt, shots.where(place)
+    )
     if not guide.complementary:  # a fifth of the pixels lies too near the period borders: fill in from both sides
         cycles = fringe.phase * np.float32(1 / (2 * np.pi))
         flags = continuity.continuity(cycles, fringe.sigma, valid)

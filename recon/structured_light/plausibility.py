@@ -192,6 +192,7 @@ def check_code(
     phase: Image,
     valid: Mask,
     length: int,
+    light: str,
     place: str,
 ) -> None:
     """Refuse bits or fringes in a wrong order.
@@ -204,6 +205,8 @@ def check_code(
     phase : (h, w), rad
     valid : (h, w) bool
     length : int, projector px
+    light : str
+        What is suspected of it, in words; empty as a rule.
     place : str
         The code's images, for messages.
     """
@@ -228,7 +231,10 @@ def check_code(
     wrong, chance = np.count_nonzero(jump & near), np.count_nonzero(jump & ~near) / max(elsewhere, 1) * there
     if wrong > max(JUMPS * borders, FEW, CROWDED * chance):
         share = 100 * min(wrong / max(borders, 1), 1)
-        raise InputError(f"{place}: fringe orders jump at {share:.0f} % of the code's borders: are they in the manifest's order?")
+        cause = f", or {light}" if light else ""
+        raise InputError(
+            f"{place}: fringe orders jump at {share:.0f} % of the code's borders: are they in the manifest's order{cause}?"
+        )
 
 
 def check_levels(modulation: Image, offset: Image, least: float, full: float, place: str) -> None:

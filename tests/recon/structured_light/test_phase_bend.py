@@ -84,3 +84,13 @@ def test_clipped_black_is_named(rng):
     decode(images, patterns)
     with pytest.raises(InputError, match=r"do not follow the 12-step sequence: \d\d % of the samples are 0: is black clipped"):
         decode(np.maximum(images, 108) - 108, patterns)
+
+
+def test_a_code_that_jumps_is_doubted_with_its_noise_where_that_is_assumed(rng):
+    """Three steps don't show their noise, so that orders that jump may be a dark image's that a gamma spread."""
+    for steps, doubted in ((3, True), (8, False)):
+        patterns, images = seen(steps, rng)
+        images[[steps + 3, steps + 4]] = images[[steps + 4, steps + 3]]
+        with pytest.raises(InputError, match="fringe orders jump") as caught:
+            decode(images, patterns)
+        assert ("is the dark noisier" in str(caught.value)) == doubted
