@@ -123,9 +123,9 @@ def check_beside(
 
 def _say(seen: str | None, name: str, implausible: Implausible) -> None:
     """Refuse what was seen, or warn of it."""
-    if seen is not None and implausible == "refuse":
+    if seen is not None and implausible != "take":
         raise InputError(f"{name}: {seen} To use them all the same, give implausible=take")
-    if seen is not None:
+    elif seen is not None:
         log.warning("%s: taken all the same: %s", name, seen)
 
 

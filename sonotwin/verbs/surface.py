@@ -83,7 +83,7 @@ def run(config: Config) -> None:
     with watch.stage("rays"):
         triangulate = Triangulator(camera, projector)
     with watch.stage("triangulate"):
-        raw = triangulate(found)
+        raw = triangulate(found, config.implausible)
         ray_checks.check(found, raw, camera, projector, shots.name, config.implausible)
     with watch.stage("compare"):
         for line in compared(config, shots, found, raw):

@@ -56,7 +56,7 @@ def decoded(columns, rows=None):
         ((-1, 1), True, "columns and rows that agree .* mirrored or turned"),
     ],
 )
-def test_only_images_of_this_rig_make_a_scene(rng, turn, rows, match):
+def test_only_images_of_this_rig_make_a_scene(rng, caplog, turn, rows, match):
     columns, its_rows = (None if image is None else image[:: turn[0], :: turn[1]].copy() for image in seen(rng, rows))
     found = decoded(columns, its_rows)
 
@@ -68,7 +68,14 @@ def test_only_images_of_this_rig_make_a_scene(rng, turn, rows, match):
         return
     with pytest.raises(InputError, match=match) as caught:
         scene()
-    assert "\n" not in str(caught.value) and str(caught.value).startswith("triangulate: " if rows else "shots: ")
+    assert (
+        str(caught.value).endswith("give implausible=take")
+        and "\n" not in str(caught.value)
+        and str(caught.value).startswith("triangulate: " if rows else "shots: ")
+    )
+    raw = triangulate(found, CAMERA, PROJECTOR, "take")
+    ray_checks.check(found, raw, CAMERA, PROJECTOR, "shots", "take")
+    assert "taken all the same" in caplog.text and np.isfinite(raw.points).any()
 
 
 @pytest.mark.parametrize(
