@@ -49,6 +49,12 @@ def read_surface(folder: Path, camera: str = "cam1", calibration_file: Path | No
     return SurfaceCapture(images, manifest.surface.patterns, device.bits, optics, manifest.name or folder.resolve().name)
 
 
+def cameras_beside(folder: Path, camera: str) -> list[str]:
+    """Cameras besides this one that took the fringe sequence, in the manifest's order."""
+    part = read_manifest(Path(folder)).surface
+    return [] if part is None else [name for name in part.images if name != camera]
+
+
 def read_bare(images_dir: Path, patterns_file: Path, calibration_file: Path, camera: str = "cam1") -> SurfaceCapture:
     """Read the images of a folder, in natural order (2.png before 10.png), with patterns and calibration from elsewhere.
 

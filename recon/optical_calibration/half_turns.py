@@ -25,6 +25,7 @@ Turn = NDArray[np.intp]
 
 CLEAR = 25.0  # fall of a pose's cost by which it counts as turned: odds of 3e5
 SHARE = 1 / 3  # of the cost of all poses, that it falls at least: errors of detection may look like those of a print
+STANDS_OUT = 1.9  # times the last eigenvalue's size, of the first: of noise it is 1 to 2, of errors that p poses share p - 1
 ROUNDS = 5  # in which poses are turned one by one, until none is
 ALMOST = 1e-7  # relative change of the cost of poses alone
 NEAR = 1e-6  # of a board's size: points on each other
@@ -163,7 +164,7 @@ def _alike(observations: Observations, adjusted: Adjustment, turn: Turn) -> NDAr
     """Poses : (p,) bool whose residuals, drawn back onto the board, are like the others' the other way round.
 
     The part of a print's errors that half a turn changes has another sign in poses that were taken the other way: that of the
-    first eigenvector of the products of all pairs of poses.
+    first eigenvector of the products of all pairs of poses. None are where that one doesn't stand out, as of noise alone.
     """
     count, points = observations.pixels.shape[:2]
     information, pull = np.zeros((count, points, 2, 2)), np.zeros((count, points, 2))
@@ -183,5 +184,6 @@ def _alike(observations: Observations, adjusted: Adjustment, turn: Turn) -> NDAr
     reversed_part = np.where(both[..., None], off + off[:, turn], 0.0).reshape(count, -1)
     products = reversed_part @ reversed_part.T
     np.fill_diagonal(products, 0.0)
-    signs = np.linalg.eigh(products)[1][:, -1]
+    shares, vectors = np.linalg.eigh(products)
+    signs = vectors[:, -1] if shares[-1] > STANDS_OUT * -shares[0] else np.ones(count)
     return (signs < 0) != (np.count_nonzero(signs < 0) * 2 > count)

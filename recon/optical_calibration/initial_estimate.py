@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.optical_calibration.bundle import Array, Estimate
-from recon.optical_calibration.observations import Observations
+from recon.optical_calibration.observations import PROJECTOR, Observations
 from recon.optical_calibration.sightings import ENOUGH
 from recon.threads import opencv_on_one_thread
 
@@ -19,11 +19,13 @@ STRAY_DEG = 3.0  # between a device's place by one pose and by most; noise makes
 CONTRADICTING = 1 / 3  # share of such poses from which on the captures contradict each other
 
 
-def estimate(observations: Observations) -> Estimate:
+def estimate(observations: Observations, light: str = "") -> Estimate:
     """Estimate devices and poses, well enough for `adjustment.adjust` to start from.
 
     Each device is calibrated alone (`cv2.calibrateCamera`, Zhang's method), and placed in the first one's frame by the median
     over the poses that both see, so that a few poses that contradict the others don't count.
+
+    light : suspicion of the fringes', in words, for messages of the projector
 
     Raises
     ------
@@ -37,7 +39,7 @@ def estimate(observations: Observations) -> Estimate:
         cameras[device] = camera
         places.append(boards)
     for device, boards in list(zip(observations.devices, places, strict=True))[1:]:
-        cameras[device] = _placed(cameras[device], boards, places[0], device)
+        cameras[device] = _placed(cameras[device], boards, places[0], device, causes(device, light))
     known = np.isfinite(places[0][:, 0, 0])
     poses = places[0].copy()
     for device, boards in list(zip(observations.devices, places, strict=True))[1:]:
@@ -80,7 +82,7 @@ def _zhang(objects: list, pixels: list, size: tuple[int, int], height: float) ->
     return cv2.calibrateCamera(objects, pixels, size, matrix, np.zeros(5), flags=flags, criteria=ENOUGH_STEPS)
 
 
-def _placed(camera: Camera, boards: Array, reference: Array, device: str) -> Camera:
+def _placed(camera: Camera, boards: Array, reference: Array, device: str, causes: str) -> Camera:
     """A device in the frame of the first: the median over the poses that both see."""
     both = np.isfinite(boards[:, 0, 0]) & np.isfinite(reference[:, 0, 0])
     if not both.any():
@@ -92,9 +94,15 @@ def _placed(camera: Camera, boards: Array, reference: Array, device: str) -> Cam
     if strays > CONTRADICTING * len(turns):
         raise ValueError(
             f"{device}: expected it to stand still beside the first device, found it turned in {strays} of {len(turns)} poses: "
-            "were images mixed up or mirrored, or did a device move?"
+            f"{causes}?"
         )
     return Camera(camera.size, camera.matrix, camera.distortion, found)
+
+
+def causes(device: str, light: str) -> str:
+    """Likely causes of poses that contradict each other in a device, the likeliest first; of the projector, the light as well."""
+    first = f"{light}, or " if device == PROJECTOR and light else ""
+    return f"{first}were images mixed up or mirrored, or did a device move"
 
 
 def middle(transforms: Sequence[Array] | Array) -> Array:

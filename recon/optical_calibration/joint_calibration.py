@@ -31,6 +31,8 @@ from recon.optical_calibration.distortion_selection import MODELS, TRIED, ModelN
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
 from recon.optical_calibration.pose_consistency import Consistency, added, consistency, widened
 from recon.optical_calibration.sightings import Sighting, gather, without_scraps
+from recon.optical_calibration.sightings import light as sighted_light
+from recon.structured_light import plausibility
 
 BAD_POSE = 5.0  # times the noise: median residual of a pose in one device that doesn't fit the others
 OUTSIDE_PX = 50.0  # of an image, where points may be found yet: the projector's, carried on
@@ -152,13 +154,15 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     checks.refuse_unusable(observations, name)
     turn = half_turns.half_turn(board)
     observations, flipped = (observations, {}) if turn is None else half_turns.agreeing(observations, turn)
-    first = initial_estimate.estimate(observations)
+    shown = sighted_light(sightings)
+    light = plausibility.suspected(shown.bends, bool(shown.unknown), shown.clipped)
+    first = initial_estimate.estimate(observations, light)
     checks.refuse_parallel(observations, first, name)
     seen = [sighting.radii for sighting in sightings if sighting.pixels]
     size_warning = checks.refuse_wrong_size(board, seen, first, name)
 
     free = _free(observations, dict.fromkeys(observations.devices, TRIED[0]))
-    adjusted, observations, contradicting = _consistent(observations, first, free, board, name)
+    adjusted, observations, contradicting = _consistent(observations, first, free, board, name, light)
     checks.refuse_unusable(observations, name)
     estimate, offsets = adjusted.estimate, circle_offsets(observations, adjusted.estimate, board)
     released = settings.shape.released and _determine_shape(observations)
@@ -311,7 +315,7 @@ def _free(observations: Observations, model: Mapping[str, ModelName]) -> dict[st
 
 
 def _consistent(
-    observations: Observations, estimate: Estimate, free: Mapping[str, Sequence[str]], board: Board, name: str
+    observations: Observations, estimate: Estimate, free: Mapping[str, Sequence[str]], board: Board, name: str, light: str
 ) -> tuple[Adjustment, Observations, dict[str, str]]:
     """Adjust, and leave out the pose that fits the others worst, until all fit.
 
@@ -335,7 +339,7 @@ def _consistent(
         if len(dropped) > initial_estimate.CONTRADICTING * total:
             raise InputError(
                 f"{name}: expected poses that fit one rig, found {len(dropped)} of {total} that don't, "
-                f"most in {observations.devices[device]}: were images mixed up or mirrored, or did a device move?"
+                f"most in {observations.devices[device]}: {initial_estimate.causes(observations.devices[device], light)}?"
             )
         rest = np.delete(np.arange(len(observations.poses)), worst)
         observations = observations.of_poses(rest)

@@ -14,7 +14,8 @@ from recon.model.boards import BOARDS, Board
 from recon.model.patterns import Patterns
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
 from recon.optical_calibration.projector_points import correspondences
-from recon.structured_light.decode import decode
+from recon.structured_light.decode import LINEAR, Linearity, decode
+from recon.structured_light.phase_bend import Bend
 from recon.structured_light.plausibility import CodeOutside
 
 Array = NDArray[np.float64]
@@ -57,6 +58,7 @@ class Sighting:
     gradient: Array  # (n, 2, 2) projector px / cam1 px
     radii: Mapping[str, Array] = field(default_factory=dict)  # camera: (n, 2) px, semi-axes of the discs
     failures: Mapping[str, Failure] = field(default_factory=dict)  # of devices that see nothing
+    linearity: Linearity = LINEAR  # of the fringes' light
 
 
 def sight(
@@ -139,7 +141,8 @@ def with_projector(sighting: Sighting, board: Board, lit: Image, fringes: Image,
     pixels, covariance = (
         {**own, PROJECTOR: its} for own, its in ((sighting.pixels, seen.pixels), (sighting.covariance, seen.covariance))
     )
-    return without_scraps(replace(sighting, pixels=pixels, covariance=covariance, gradient=seen.gradient))
+    seen_as = {"gradient": seen.gradient, "linearity": projector_map.linearity}
+    return without_scraps(replace(sighting, pixels=pixels, covariance=covariance, **seen_as))
 
 
 def without_scraps(sighting: Sighting) -> Sighting:
@@ -156,6 +159,17 @@ def without_scraps(sighting: Sighting) -> Sighting:
 
     pixels, covariance, radii = kept(sighting.pixels), kept(sighting.covariance), kept(sighting.radii)
     return replace(sighting, pixels=pixels, covariance=covariance, radii=radii, failures={**sighting.failures, **reasons})
+
+
+def light(sightings: Sequence[Sighting]) -> Linearity:
+    """The fringes' light in all poses: of each kind of fringes the largest bend, or the reason why some pose doesn't show it."""
+    seen = [sighting.linearity for sighting in sightings]
+    bends: dict[tuple[int, float], Bend] = {}
+    for bend in (bend for one in seen for bend in one.bends):
+        kind = bend.steps, bend.pitch
+        bends[kind] = max(bends.get(kind, bend), bend, key=lambda each: each.most_px)
+    unknown = {(part.steps, part.pitch): (part, why) for one in seen for part, why in one.unknown}
+    return Linearity(tuple(bends.values()), tuple(unknown.values()), max((one.clipped for one in seen), default=0.0))
 
 
 def gather(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size]) -> Observations:

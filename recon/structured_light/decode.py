@@ -16,7 +16,7 @@ from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, P
 from recon.structured_light import frame_errors, gray_cells, gray_code, multi_frequency, plausibility, straightening
 from recon.structured_light.gray_code import Orders
 from recon.structured_light.phase import DEFAULT_NOISE, FrameErrors, Fringe, Noise, estimate_noise, wrapped_phase
-from recon.structured_light.phase_bend import Bend
+from recon.structured_light.phase_bend import Bend, Hidden
 from recon.structured_light.unwrapping import continuity, spatial
 from recon.threads import in_threads
 
@@ -28,6 +28,7 @@ Measured = tuple[Fringes, Fringe]
 DARKEST = 4.0  # DN of 255: default of the least modulation
 SMALLEST = 8  # px, an image's shorter side: the extent of the stencil of continuity
 WORST_SIGMA = 0.3  # rad of predicted phase noise: beyond, orders can't be decided
+NOISIER = "is the dark noisier than a linear camera's, as of a gamma"  # where noise is assumed
 LIT_SIGMA = 0.25  # rad: fringes that strong come about by noise in one pixel of 3000
 
 
@@ -66,7 +67,8 @@ class Linearity(NamedTuple):
     """Bends of phases by light that isn't linear, which fringes of three or four steps show."""
 
     bends: tuple[Bend, ...] = ()  # measured and undone
-    unknown: tuple[Fringes, ...] = ()  # fringes that don't show theirs: too few periods, or steps of the surface all over
+    unknown: tuple[tuple[Fringes, Hidden], ...] = ()  # fringes that don't show theirs, and why
+    clipped: float = 0.0  # share of black samples in strong fringes; see `plausibility.clipped`
 
 
 LINEAR = Linearity()
@@ -82,6 +84,7 @@ class _Shots(NamedTuple):
     least: float  # DN, of modulation
     full: float  # DN
     name: str
+    doubt: str  # of the noise where it is assumed, in words
 
     def where(self, place: slice) -> str:
         """Images of a part, for messages."""
@@ -174,7 +177,7 @@ def decode(
         if isinstance(part, Fringes)
     }
     noise, source = _noise(images, parts, errors, full, noise)
-    shots = _Shots(images, patterns, errors, noise, least, full, name)
+    shots = _Shots(images, patterns, errors, noise, least, full, name, NOISIER if source == "assumed" else "")
     axes: dict[Axis, _AxisMap] = {
         axis: (_from_fringes if patterns.has_fringes(axis) else _from_code)(shots, axis) for axis in patterns.axes
     }
@@ -182,7 +185,8 @@ def decode(
     status, lit, counts, linearity = first.coordinates.status, first.lit, Counter(first.counts), first.linearity
     for found in others:
         counts.update(found.counts)
-        linearity = Linearity(linearity.bends + found.linearity.bends, linearity.unknown + found.linearity.unknown)
+        its = found.linearity
+        linearity = Linearity(linearity.bends + its.bends, linearity.unknown + its.unknown, max(linearity.clipped, its.clipped))
         lit = lit & found.lit
         status = np.where(status == Status.OK, found.coordinates.status, status)
     columns, rows = (axes[axis].coordinates[:2] if axis in axes else (None, None) for axis in ("columns", "rows"))
@@ -195,22 +199,26 @@ def decode(
 
 def _from_fringes(shots: _Shots, axis: Axis) -> _AxisMap:
     """Coordinates along an axis by the phase of its finest fringes and their orders."""
-    sets = []
+    sets, clipped = [], 0.0
     for part, place in shots.patterns.slices():
         if isinstance(part, Fringes) and part.axis == axis:
             images, frames = shots.images[place], shots.errors[place.start]
             fringe = wrapped_phase(images, part.shifts, noise=shots.noise, saturation=shots.full, errors=frames)
             plausibility.check_fringes(images, part, fringe, shots.least, shots.full, shots.where(place), place.start)
             sets.append((part, fringe))
+            clipped = max(clipped, plausibility.clipped(images, shots.full))
     status, lit = _quality([f for _, f in sets], shots.least)
     length = shots.patterns.length(axis)
     sets, bends, unknown = straightening.straighten(sets, status == Status.OK, length)
+    linearity = Linearity(bends, unknown, clipped)
+    plausibility.check_bends(bends, clipped, f"{shots.name}: fringes of {axis}")
     part, fringe = min(sets, key=lambda pair: pair[0].pitch)
-    orders, unreachable, counts = _orders(shots, axis, sets, status == Status.OK)
+    light = plausibility.suspected(bends, bool(unknown), clipped)
+    orders, unreachable, counts = _orders(shots, axis, sets, status == Status.OK, light)
     scale = Scale(float(part.zero(length)), part.pitch, length)
     x, sigma = _coordinates(fringe, orders, unreachable, status, scale)
     shown = (fringe.modulation, fringe.offset, fringe.phase)
-    return _AxisMap(Coordinates(x, sigma, status), *shown, lit, counts, Linearity(bends, unknown))
+    return _AxisMap(Coordinates(x, sigma, status), *shown, lit, counts, linearity)
 
 
 def _from_code(shots: _Shots, axis: Axis) -> _AxisMap:
@@ -269,20 +277,22 @@ def _judge(first, end, fringe: Fringe, least, status, lit):
             lit[v, u] &= sigma[v, u] < LIT_SIGMA
 
 
-def _orders(shots: _Shots, axis: Axis, sets: list[Measured], valid: Mask) -> tuple[Orders, Mask, dict[str, int]]:
+def _orders(shots: _Shots, axis: Axis, sets: list[Measured], valid: Mask, light: str) -> tuple[Orders, Mask, dict[str, int]]:
     """Fringe orders by the sequence's unwrapping, pixels out of the line's reach : (h, w) bool, and counts for the summary."""
     patterns, name, length = shots.patterns, shots.name, shots.patterns.length(axis)
     nowhere = np.zeros(valid.shape, bool)
     part, fringe = min(sets, key=lambda pair: pair[0].pitch)
     if patterns.unwrap == "heterodyne":
         orders = multi_frequency.fringe_order(sets, length)
-        plausibility.check_pitches(orders.trusted, valid, fringe.sigma, f"{name}: fringes of {axis}")
+        plausibility.check_pitches(orders.trusted, valid, fringe.sigma, light, f"{name}: fringes of {axis}")
         return orders, nowhere, {}
     guide, place = next((p, at) for p, at in patterns.slices() if isinstance(p, GrayCode | CentreLine) and p.axis == axis)
     if isinstance(guide, CentreLine):
         return _from_line(guide, shots.images[place.start], part, fringe, valid, length, axis, f"{name}: image {place.start}")
     orders, residual = gray_code.fringe_order(shots.images[place], guide, part, fringe, length, shots.noise)
-    plausibility.check_code(orders.order, residual, guide, part, fringe.phase, valid, length, shots.where(place))
+    plausibility.check_code(
+        orders.order, residual, guide, part, fringe.phase, valid, length, light or shots.doubt, shots.where(place)
+    )
     if not guide.complementary:  # a fifth of the pixels lies too near the period borders: fill in from both sides
         cycles = fringe.phase * np.float32(1 / (2 * np.pi))
         flags = continuity.continuity(cycles, fringe.sigma, valid)

@@ -10,7 +10,7 @@ less what blur takes; d is 0.02 and less. Two things show it without any knowled
 
 - Over whole periods of a smooth surface all phases are seen equally often. Means of `exp(i N phase)` and `exp(2 i N phase)` over
   windows vanish when c and the small rest, `e sin(2 N phase)`, are undone.
-- Fringes too wide for that, such as a coarse cue, are compared with finer ones; see `straightening`.
+- Fringes too wide for that, as a coarse cue, or too fine for the pixels, are compared with other ones; see `straightening`.
 
 The noise of the phase is magnified where it is stretched, and what may be left of the bend counts to it.
 
@@ -18,6 +18,7 @@ Sources: Guo, He and Chen 2004 (histogram of the phase); Liu and others 2010 (ha
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -30,6 +31,9 @@ from recon.threads import in_threads
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Hidden = Literal["few", "fine"]  # why fringes don't show their bend: too few whole periods, or periods of too few pixels
+
+LINEAR_LIGHT = "set projector and camera to linear, project patterns of linearise_gamma, or take 5 steps or more"
 
 MOST_STEPS = 4  # from five on a gamma bends the phase by less than a hundredth of a radian
 TABLE = 512  # entries a bend
@@ -44,7 +48,7 @@ LAGS = (1, 4, 16, 64)  # px
 UNAMBIGUOUS = 1.5  # rad, as far as one of the former turns over several pixels
 ROUNDS = 8
 SETTLED = 2e-4  # rad
-STRONGEST = {3: 0.44, 4: 0.3}  # c by steps: three at 0.5 have a phase that stands still
+STRONGEST = {3: 0.44, 4: 0.3}  # c by steps: three at 0.5 have a phase that stands still; no more can be undone
 SURE = 4.0  # standard errors, from which on a bend is undone
 NORMAL = 1.4826  # standard deviation of normal values over their median distance
 
@@ -56,8 +60,9 @@ class Bend:
     table: Array  # (TABLE, 2) of true less seen phase, rad, and the slope of true by seen, over the phase seen, one bend long
     steps: int
     pitch: float  # projector px
-    sigma: float  # rad, what may be left, a standard deviation over all phases
+    sigma: float  # rad, what may be left, a standard deviation over all phases; 0 where it isn't known
     gamma: float  # exponent of a law of light that bends as much; of blurred fringes it is nearer to 1 than the projector's
+    undone: bool = True  # False of more than can be undone
 
     @property
     def straight(self) -> bool:
@@ -132,7 +137,7 @@ def gamma_of(steps: int, c: float) -> float:
     return float(np.interp(c, (gammas - 1) * (gammas - 2) / ((gammas + 2) * (gammas + 3)), gammas))
 
 
-def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | None:
+def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Hidden:
     """Measure the bend of a set of fringes on windows of whole periods.
 
     Parameters
@@ -144,16 +149,18 @@ def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Non
 
     Returns
     -------
-    Bend or None
-        With a table of no bend if none is sure, and None if there are too few periods to see.
+    Bend, or the reason why there is none to see
+        With a table of no bend if none is sure.
     """
     turns = [_turn(fringe.phase, valid, axis) for axis in (0, 1)]
     speed = float(np.hypot(*turns))
-    if not 0 < steps * speed < FINEST * 2 * np.pi:
-        return None
+    if steps * speed >= FINEST * 2 * np.pi:
+        return "fine"
+    if speed == 0:
+        return "few"
     period = 2 * np.pi / speed
     if PERIODS * WINDOW * period > max(valid.shape) / 2:
-        return None
+        return "few"
     longest = max(1.0, period / ALONG)
     strides = [int(np.clip(2 * np.pi / max(turn, speed / 4) / (ALONG * steps), 1, longest)) for turn in turns]
     strides = [stride if 2 * turn < speed else 1 for stride, turn in zip(strides, turns, strict=True)]
@@ -164,12 +171,12 @@ def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Non
     for _ in range(ROUNDS):
         windows = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, width, steps)
         if windows.shape[1] < FEWEST:
-            return None
+            return "few"
         once, second = np.median(windows.real, axis=1)
         c, e = c + 2 * once / steps, e + second / steps if twice else 0.0
         if abs(c) > limit:
             c = float(np.copysign(limit, c))
-            break
+            return Bend(by_harmonics(steps, c, 0.0), steps, pitch, np.inf, float(gamma_of(steps, c)), undone=False)
         if 2 * abs(once) / steps < SETTLED:
             break
     return _judged(windows, steps, pitch, c, e if twice else 0.0)

@@ -1,6 +1,7 @@
 """Checks that images follow their pattern sequence: errors of order, exposure or file are refused, in one line."""
 
 import itertools
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from recon.errors import InputError
 from recon.model.patterns import Fringes, GrayCode
 from recon.structured_light.phase import Fringe, pseudo_inverse, sample_pixels
+from recon.structured_light.phase_bend import LINEAR_LIGHT, Bend
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -22,6 +24,9 @@ FLAT = 0.05  # share of short phasors, of a quarter of the RMS, where an ellipse
 SLIM = 0.25  # of the power, in the mean square of the phasors: 1 of a doubled step, 0.03 of a shift off by 5 % of a step
 SPARSE_STEPS = 7  # at most, of which neighbours differ by a third of the swing; more have harmonics that show errors
 ALIKE = 0.15  # of the swing: a median difference of two images that noise makes; share of the pixels of either phase
+STRONG = 0.15  # of full scale: the swing of fringes that show whether black is clipped
+CLIPPED = 0.12  # share of black samples in these; of dark fringes that just reach black, and of rounding, it is 0.07
+BENT = 0.02  # of a pitch, by which light bends phases, before it is suspected
 LINE_SHARE = 0.3  # share of the fringes' area that may be lit in the image of a line
 MIN_SIGHTINGS = 10  # least rows with the line
 LINE_OFF = 0.06  # cycle, largest offset of the line from the fringes; a fringe image out of its place is a step, 1/8 or so
@@ -55,11 +60,11 @@ def check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, 
         raise InputError(f"{place} are saturated in {share:.0f} % of the lit pixels, expected under half: shorten the exposure")
     useful = (swing > 2 * least) & (samples.max(axis=0) < full)
     if useful.any():
-        _check_steps(samples[:, useful], part, place, start)
-        _check_order(samples[:, useful], beside[:, useful], part, place, start)
+        _check_steps(samples[:, useful], part, full, place, start)
+        _check_order(samples[:, useful], beside[:, useful], part, full, place, start)
 
 
-def _check_steps(samples: Image, part: Fringes, place: str, start: int) -> None:
+def _check_steps(samples: Image, part: Fringes, full: float, place: str, start: int) -> None:
     """Refuse a step that was taken twice, is late or far off: phasors lie on a line or a slim ellipse, not around a circle.
 
     Three steps leave no residual by which an error shows, but phases all around show it. Of a wave so wide that few phases are
@@ -82,13 +87,15 @@ def _check_steps(samples: Image, part: Fringes, place: str, start: int) -> None:
     around = abs(np.mean(phasor)) < AROUND * np.sqrt(power) and (sectors.min() > EACH_WAY or flat > FLAT)
     if doubled or (around and abs(np.mean(phasor**2)) > SLIM * power):
         cause = f"images {start + a} and {start + b} show the same" if doubled else "the steps are uneven"
+        share = _clipped(samples, full)
+        black = f" {said_of_black(share)}? Or" if share > CLIPPED else ""
         raise InputError(
-            f"{place} do not follow the {part.steps}-step sequence, {cause}: was one taken twice, or before the projector had "
-            "changed, or with another exposure?"
+            f"{place} do not follow the {part.steps}-step sequence, {cause}:{black} was one taken twice, or before the projector "
+            "had changed, or with another exposure?"
         )
 
 
-def _check_order(samples: Image, beside: Image, part: Fringes, place: str, start: int) -> None:
+def _check_order(samples: Image, beside: Image, part: Fringes, full: float, place: str, start: int) -> None:
     """Refuse images that don't follow the N-step sequence: swapped images put power into the high temporal harmonics.
 
     A projector's gamma fills harmonic 2, binary fringes the odd ones; those are left out. Noise differs between the
@@ -113,7 +120,45 @@ def _check_order(samples: Image, beside: Image, part: Fringes, place: str, start
         order[[a, b]] = b, a
         if (left := strange(order)) < best:
             best, suspects = left, f", {start + a} and {start + b} look exchanged"
-    raise InputError(f"{place} do not follow the {n}-step sequence{suspects}: are they in the manifest's order?")
+    share = 0.0 if suspects else _clipped(samples, full)
+    cause = f"{said_of_black(share)}, or " if share > CLIPPED else ""
+    raise InputError(f"{place} do not follow the {n}-step sequence{suspects}: {cause}are they in the manifest's order?")
+
+
+def clipped(images: NDArray, full: float) -> float:
+    """Share of the samples of strong fringes : (n, h, w) that are black: of dark fringes that are clipped it is large."""
+    return _clipped(sample_pixels(images, CHECK_SAMPLES), full)
+
+
+def _clipped(samples: Image, full: float) -> float:
+    strong = np.ptp(samples, axis=0) > STRONG * full
+    return float(np.mean(samples[:, strong] == 0)) if np.count_nonzero(strong) >= FEW else 0.0
+
+
+def said_of_black(share: float) -> str:
+    """The cause of many black samples, in words."""
+    causes = "the camera's black level, a background subtracted or a gamma"
+    return f"{100 * share:.0f} % of the samples are 0: is black clipped by {causes}"
+
+
+def suspected(bends: Iterable[Bend], unknown: bool, clipped: float) -> str:
+    """A cause of phases that contradict each other, by what few steps show of their light, in words; empty as a rule."""
+    if clipped > CLIPPED:
+        return said_of_black(clipped)
+    if unknown or any(bend.most_px > BENT * bend.pitch for bend in bends):
+        return "is light too far from linear for so few steps (a gamma)"
+    return ""
+
+
+def check_bends(bends: Iterable[Bend], clipped: float, place: str) -> None:
+    """Refuse phases that are bent by more than can be undone."""
+    for bend in bends:
+        if not bend.undone:
+            cause = f" {said_of_black(clipped)}? Else" if clipped > CLIPPED else ""
+            raise InputError(
+                f"{place}: {bend.steps} steps of {bend.pitch:g} px are bent as by light that goes with level^{bend.gamma:.1f} or "
+                f"more, by which phases can't be told:{cause} {LINEAR_LIGHT}"
+            )
 
 
 def check_light(image: NDArray, fringe: Fringe, valid: Mask, place: str) -> None:
@@ -147,6 +192,7 @@ def check_code(
     phase: Image,
     valid: Mask,
     length: int,
+    light: str,
     place: str,
 ) -> None:
     """Refuse bits or fringes in a wrong order.
@@ -159,6 +205,8 @@ def check_code(
     phase : (h, w), rad
     valid : (h, w) bool
     length : int, projector px
+    light : str
+        What is suspected of it, in words; empty as a rule.
     place : str
         The code's images, for messages.
     """
@@ -183,7 +231,10 @@ def check_code(
     wrong, chance = np.count_nonzero(jump & near), np.count_nonzero(jump & ~near) / max(elsewhere, 1) * there
     if wrong > max(JUMPS * borders, FEW, CROWDED * chance):
         share = 100 * min(wrong / max(borders, 1), 1)
-        raise InputError(f"{place}: fringe orders jump at {share:.0f} % of the code's borders: are they in the manifest's order?")
+        cause = f", or {light}" if light else ""
+        raise InputError(
+            f"{place}: fringe orders jump at {share:.0f} % of the code's borders: are they in the manifest's order{cause}?"
+        )
 
 
 def check_levels(modulation: Image, offset: Image, least: float, full: float, place: str) -> None:
@@ -274,18 +325,20 @@ def _check_residuals(residual: Image, place: str) -> None:
         )
 
 
-def check_pitches(trusted: Mask, valid: Mask, sigma: Image, place: str) -> None:
+def check_pitches(trusted: Mask, valid: Mask, sigma: Image, light: str, place: str) -> None:
     """Refuse sets of fringes whose phases contradict each other nearly everywhere, or in many pixels in which noise is small.
 
     trusted, valid : (h, w) bool
     sigma : (h, w) rad, of the finest phase
+    light : what is suspected of it, in words; empty as a rule
     """
     lit = np.count_nonzero(valid)
     lost = lit - np.count_nonzero(trusted & valid)
     clear = valid & (sigma <= np.median(sigma[valid])) if lit else valid
     contradicting = np.count_nonzero(clear & ~trusted)
+    cause = f"{light}, or " if light else ""
     if lost > max(CONTRADICTED * lit, FEW) or contradicting > max(UNEXPLAINED * np.count_nonzero(clear), FEW):
         raise InputError(
-            f"{place} contradict each other in {100 * lost / lit:.0f} % of the pixels: are they in the manifest's order, each "
-            "step taken once, and are the pitches those projected?"
+            f"{place} contradict each other in {100 * lost / lit:.0f} % of the pixels: {cause}are they in the manifest's "
+            "order, each step taken once, and are the pitches those projected?"
         )

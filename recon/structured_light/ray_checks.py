@@ -1,18 +1,24 @@
 """Checks that camera, projector and decoded columns make one scene: images of another rig, mirrored or turned ones don't.
 
 A mirrored sequence decodes perfectly. But what both devices see, both see from its front; its points lie in front of both and in
-the projector's image. Where both columns and rows are known, `triangulate` itself refuses rays that don't meet.
+the projector's image. Where both columns and rows are known, `triangulate` itself refuses rays that don't meet. Images upside
+down of columns alone pass all that; a second camera shows them, as it sees other columns where the points would lie.
 """
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
+from recon.geometry import rigid
 from recon.geometry.camera import Camera
+from recon.model.pose_checks import Implausible
 from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.triangulate import PointMap
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -26,14 +32,22 @@ class RayLimits:
     beyond: float = 0.1  # of points by columns alone, in rows that the projector doesn't have
     margin: float = 0.05  # of the projector's image, that its model may be off at the borders
     reach: int = 8  # px between the points of a normal, so that noise doesn't turn it
+    apart_px: float = 10.0  # projector px, between what two cameras see of a point; a device that moved: some px
+    apart: float = 0.3  # share of such points; by what hides points from one of them it is 0.07 of two objects, upside down 0.5
     every: int = 4  # rows and columns, of which one is looked at
     fewest: int = 200  # points that decide
 
 
 def check(
-    found: ProjectorMap, raw: PointMap, camera: Camera, projector: Camera, name: str, limits: RayLimits | None = None
+    found: ProjectorMap,
+    raw: PointMap,
+    camera: Camera,
+    projector: Camera,
+    name: str,
+    implausible: Implausible = "refuse",
+    limits: RayLimits | None = None,
 ) -> None:
-    """Refuse a map whose rays make no scene that camera and projector both see.
+    """Refuse a map whose rays make no scene that camera and projector both see, or warn of it where it is to be taken.
 
     Parameters
     ----------
@@ -48,34 +62,103 @@ def check(
     InputError
         If more points than `limits` allow are lit from behind, lie behind a device, or outside of the projector's image.
     """
+    _say(fault(found, raw, camera, projector, limits or RayLimits()), name, implausible)
+
+
+def check_beside(
+    found: ProjectorMap,
+    raw: PointMap,
+    other: ProjectorMap,
+    beside: Camera,
+    name: str,
+    implausible: Implausible = "refuse",
+    limits: RayLimits | None = None,
+) -> float:
+    """Refuse a map whose points lie where a second camera sees other columns, or rows, or warn of it where it is to be taken.
+
+    Parameters
+    ----------
+    found, raw : ProjectorMap, PointMap
+        Of the first camera; points not cleaned.
+    other : ProjectorMap
+        Of the second camera `beside`.
+    name : str
+        Of the images, for messages.
+
+    Returns
+    -------
+    Share of the points in which both agree, of those that both see; NaN of few.
+
+    Raises
+    ------
+    InputError
+        If more points than `limits` allow contradict each other.
+    """
     limits = limits or RayLimits()
+    thin = np.s_[:: limits.every, :: limits.every]
+    first, second = (m.rows if found.columns is None or other.columns is None else m.columns for m in (found, other))
+    if first is None or second is None:
+        return np.nan
+    points, expected = raw.points[thin].reshape(-1, 3).astype(float), first[thin].ravel()
+    known = np.isfinite(points[:, 0]) & np.isfinite(expected)
+    points, expected = points[known], expected[known]
+    with np.errstate(all="ignore"):
+        pixels = beside.project(points)
+    height, width = second.shape
+    inside = (pixels > -0.5).all(axis=1) & (pixels < [width - 0.5, height - 0.5]).all(axis=1)
+    inside &= rigid.apply(beside.camera_from_world, points)[:, 2] > 0
+    u, v = np.rint(pixels[inside]).astype(int).T
+    apart = np.abs(second[v, u] - expected[inside])
+    apart = apart[np.isfinite(apart)]
+    if apart.size < limits.fewest:
+        return np.nan
+    share = float(np.mean(apart > limits.apart_px))
+    said = (
+        f"{100 * share:.0f} % of the points lie where {beside.name or 'the other camera'} sees the projector's image more than "
+        f"{limits.apart_px:g} px off: are the images of either camera upside down, or of another scene, or did one of them move?"
+    )
+    _say(said if share > limits.apart else None, name, implausible)
+    return 1 - share
+
+
+def _say(seen: str | None, name: str, implausible: Implausible) -> None:
+    """Refuse what was seen, or warn of it."""
+    if seen is not None and implausible != "take":
+        raise InputError(f"{name}: {seen} To use them all the same, give implausible=take")
+    elif seen is not None:
+        log.warning("%s: taken all the same: %s", name, seen)
+
+
+def fault(found: ProjectorMap, raw: PointMap, camera: Camera, projector: Camera, limits: RayLimits) -> str | None:
+    """The first thing that no scene shows to both devices, with its likely cause; None as a rule, and of few pixels."""
     axes = [axis for axis in (found.columns, found.rows) if axis is not None]
     decoded, solved = np.isfinite(np.stack(axes)).any(axis=0), np.isfinite(raw.points[..., 0])
-    if np.count_nonzero(solved) < limits.fewest * limits.every**2:
-        return
+    if np.count_nonzero(decoded) < limits.fewest * limits.every**2:
+        return None
     if (share := lit_from_behind(raw, camera, projector, limits)) > limits.behind:
-        raise InputError(
-            f"{name}: the projector would light the back of what the camera sees in {100 * share:.0f} % of the points: are the "
+        return (
+            f"the projector would light the back of what the camera sees in {100 * share:.0f} % of the points: are the "
             "camera's images mirrored or turned by 180 degrees, the patterns projected mirrored, or is it another calibration?"
         )
     lost = 1 - np.count_nonzero(decoded & solved) / np.count_nonzero(decoded)
     if lost > limits.nowhere:
-        raise InputError(
-            f"{name}: rays of camera and projector don't meet in front of both in {100 * lost:.0f} % of the decoded pixels: is "
+        return (
+            f"rays of camera and projector don't meet in front of both in {100 * lost:.0f} % of the decoded pixels: is "
             "the calibration that of this rig, are images and patterns those of this capture, and neither mirrored nor turned?"
         )
     if found.columns is not None and found.rows is not None:  # `triangulate` refuses rays that pass each other
-        return
+        return None
     thin = np.s_[:: limits.every, :: limits.every]
     seen = projector.project(raw.points[thin][solved[thin]].astype(float))
     other, name_of = (1, "rows") if found.rows is None else (0, "columns")
     length = projector.size[other]
     beyond = np.mean((seen[:, other] < -limits.margin * length) | (seen[:, other] > (1 + limits.margin) * length))
     if beyond > limits.beyond:
-        raise InputError(
-            f"{name}: {100 * beyond:.0f} % of the points lie where the projector has no {name_of} to light them: is the "
+        return (
+            f"{100 * beyond:.0f} % of the points lie where the projector has no {name_of} to light them: is the "
             "calibration that of this rig, and are images and patterns those of this capture?"
         )
+    return None
 
 
 def lit_from_behind(raw: PointMap, camera: Camera, projector: Camera, limits: RayLimits) -> float:

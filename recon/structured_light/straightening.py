@@ -1,4 +1,4 @@
-"""The fringes of an axis without the bends of their phases: each set by itself, wide ones by a gamma that all have in common."""
+"""The fringes of an axis without the bends of their phases: each set by itself, else by a gamma that all have in common."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -11,12 +11,12 @@ from recon.errors import InputError
 from recon.model.patterns import Fringes
 from recon.structured_light import multi_frequency, phase_bend
 from recon.structured_light.phase import Fringe
-from recon.structured_light.phase_bend import Bend
+from recon.structured_light.phase_bend import Bend, Hidden
 
 Mask = NDArray[np.bool_]
 Measured = tuple[Fringes, Fringe]
 
-GAMMAS = np.geomspace(0.4, 3.3, 25)  # tried on wide fringes
+GAMMAS = np.geomspace(0.4, 3.3, 25)  # tried on fringes that hide their bend
 FINER = 9  # more, about the best
 SAMPLES = 5_000  # pixels
 AGREES = 0.01  # by which the agreement of all sets, at most 1, must grow
@@ -28,7 +28,7 @@ class Straight(NamedTuple):
 
     sets: list[Measured]
     bends: tuple[Bend, ...]  # of the sets with few steps that show theirs
-    unknown: tuple[Fringes, ...]  # sets with few steps that don't
+    unknown: tuple[tuple[Fringes, Hidden], ...]  # sets with few steps that don't, and why
 
 
 def straighten(sets: Sequence[Measured], valid: Mask, length: int) -> Straight:
@@ -41,26 +41,28 @@ def straighten(sets: Sequence[Measured], valid: Mask, length: int) -> Straight:
         Pixels that count.
     length : projector px of the axis
     """
-    done, bends, wide = dict(enumerate(sets)), {}, []
+    done, bends, hidden = dict(enumerate(sets)), {}, {}
     for number, (part, fringe) in enumerate(sets):
         if part.steps > phase_bend.MOST_STEPS:
             continue
         bend = phase_bend.measure(fringe, part.steps, part.pitch, valid)
-        if bend is None:
-            wide.append(number)
+        if not isinstance(bend, Bend):
+            hidden[number] = bend
         else:
             bends[number] = bend
             done[number] = (part, bend.straightened(fringe))
-    if wide and len(sets) > 1 and (gamma := _common_gamma(list(done.values()), wide, valid, length)):
-        for number in wide:
+    if hidden and len(sets) > 1 and (gamma := _common_gamma(list(done.values()), list(hidden), valid, length)):
+        for number in hidden:
             part, fringe = sets[number]
             bends[number] = Bend(phase_bend.by_gamma(part.steps, gamma), part.steps, part.pitch, 0.0, gamma)
             done[number] = (part, bends[number].straightened(fringe))
-    return Straight(list(done.values()), tuple(bends.values()), tuple(sets[k][0] for k in wide if k not in bends))
+    return Straight(
+        list(done.values()), tuple(bends.values()), tuple((sets[k][0], why) for k, why in hidden.items() if k not in bends)
+    )
 
 
-def _common_gamma(sets: Sequence[Measured], wide: Sequence[int], valid: Mask, length: int) -> float | None:
-    """The gamma by which wide sets, by their numbers, agree best with all others; None if noise hides it."""
+def _common_gamma(sets: Sequence[Measured], hidden: Sequence[int], valid: Mask, length: int) -> float | None:
+    """The gamma by which sets that hide their bend, by their numbers, agree best with all others; None if noise hides it."""
     every = max(1, int(np.sqrt(valid.size / SAMPLES)))
     thin = np.s_[every // 2 :: every, every // 2 :: every]
     use = valid[thin]
@@ -70,7 +72,7 @@ def _common_gamma(sets: Sequence[Measured], wide: Sequence[int], valid: Mask, le
 
     def agreement(gamma: float) -> float:
         tried = list(few)
-        for number in wide:
+        for number in hidden:
             part, fringe = few[number]
             seen = phase_bend.straight(fringe.phase, phase_bend.by_gamma(part.steps, gamma), part.steps)
             tried[number] = (part, fringe._replace(phase=np.float32(seen)))

@@ -8,7 +8,9 @@ import trimesh
 from recon.files.metrics import Metrics
 from recon.geometry.camera import Camera
 from recon.model.patterns import Patterns
-from recon.structured_light.decode import ProjectorMap, Status
+from recon.structured_light.decode import Linearity, ProjectorMap, Status
+from recon.structured_light.phase_bend import LINEAR_LIGHT, Hidden
+from recon.structured_light.plausibility import CLIPPED, said_of_black
 from recon.structured_light.triangulate import PointMap
 
 ADVICE = {
@@ -18,7 +20,10 @@ ADVICE = {
     Status.UNCERTAIN: "of uncertain order, near steps or in noise",
     Status.OUTSIDE: "out of the projector's image: check that the patterns are those projected",
 }
-LINEAR_LIGHT = "set projector and camera to linear, project patterns of linearise_gamma, or take 5 steps or more"
+HIDDEN: dict[Hidden, str] = {
+    "few": "which too few periods are seen to show",
+    "fine": "which periods of so few camera pixels don't show",
+}
 BENT_PX = 0.05  # projector px by which phases may be bent before it is said
 FEWEST_STEPS = 3  # whose bend is that of one gamma; the same of four is that of two
 SPARSE = 1 / 3  # of the lit pixels: a warning comes first where fewer are decoded
@@ -65,7 +70,7 @@ def describe_decoding(patterns: Patterns, found: ProjectorMap) -> Iterator[str]:
     strength = np.median(lit) if lit.size else 0.0
     saturated = 100 * found.summary["saturated"] / found.status.size
     yield f"decode      {patterns.count} images, {width}x{height}, modulation {strength:.0f} DN, {saturated:.1f} % saturated"
-    yield from _bent(found)
+    yield from bent(found.linearity)
     notes = [str(patterns.unwrap).replace("_", " ")]
     if "regions" in found.summary:
         regions, islands = _counted(found.summary["regions"], "region"), _counted(found.summary["islands"], "island")
@@ -74,19 +79,21 @@ def describe_decoding(patterns: Patterns, found: ProjectorMap) -> Iterator[str]:
     yield f"unwrap      {', '.join(notes)}"
 
 
-def _bent(found: ProjectorMap) -> Iterator[str]:
+def bent(linearity: Linearity) -> Iterator[str]:
     """Warnings of phases that light bends which isn't linear: of those that were straightened, and those that don't show it."""
-    for bend in found.linearity.bends:
+    for bend in linearity.bends:
         if bend.most_px > BENT_PX:
             law = f", it goes with level^{bend.gamma:.1f} or so" if bend.steps == FEWEST_STEPS else ""
+            law += f" ({said_of_black(linearity.clipped)}?)" if linearity.clipped > CLIPPED else ""
+            left = f"to {bend.left_px:.3f} px" if bend.sigma else "by what other fringes show"
             yield (
                 f"linearity   light isn't linear{law}: {bend.steps} steps of {bend.pitch:g} px were bent by up to "
-                f"{bend.most_px:.2f} px, which is undone to {bend.left_px:.3f} px; {LINEAR_LIGHT}"
+                f"{bend.most_px:.2f} px, which is undone {left}; {LINEAR_LIGHT}"
             )
-    for part in found.linearity.unknown:
+    for part, why in linearity.unknown:
         yield (
-            f"linearity   {part.steps} steps of {part.pitch:g} px would be bent by a gamma, which too few periods are seen to "
-            f"show; it isn't in sigma: {LINEAR_LIGHT}"
+            f"linearity   {part.steps} steps of {part.pitch:g} px would be bent by a gamma, {HIDDEN[why]}; it isn't in "
+            f"sigma: {LINEAR_LIGHT}"
         )
 
 

@@ -4,6 +4,7 @@ A camera pixel's ray is `centre + t * direction`. The projector sees the point a
 solved for so that this is the decoded coordinate: one axis determines it, two do in the least-squares sense.
 """
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +14,11 @@ from recon import arguments
 from recon.compiled import njit
 from recon.errors import InputError
 from recon.geometry.camera import Camera, distort_side_by_side
+from recon.model.pose_checks import Implausible
 from recon.structured_light.decode import ProjectorMap
 from recon.threads import in_threads
+
+log = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
 
@@ -55,7 +59,7 @@ class Triangulator:
         self._rays = camera.pixel_rays()  # (h, w, 3), unit, in the world
         self._matrix = projector.matrix[:2].ravel()
 
-    def __call__(self, projector_map: ProjectorMap) -> PointMap:
+    def __call__(self, projector_map: ProjectorMap, implausible: Implausible = "refuse") -> PointMap:
         """Triangulate a map of the camera's size; see `triangulate`."""
         shape = self._rays.shape[:2]
         _check_devices(projector_map, self.camera, self.projector)
@@ -70,11 +74,11 @@ class Triangulator:
         projector = (self.projector.camera_from_world, self._matrix, self.projector.coefficients)
         centre = np.ascontiguousarray(self.camera.centre)
         in_threads(_triangulate, shape[0], self._rays, centre, projector, decoded, points, sigma)
-        _check_rows(projector_map, points, self.projector)
+        _check_rows(projector_map, points, self.projector, implausible)
         return PointMap(points, sigma)
 
 
-def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera) -> PointMap:
+def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera, implausible: Implausible = "refuse") -> PointMap:
     """Triangulate the decoded projector coordinates of every camera pixel.
 
     Parameters
@@ -85,6 +89,8 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera) 
     camera, projector : Camera
         In a common world. Columns alone, or rows, agree with any camera: only both show that it is another than took the
         images, else the name that `decode` was given.
+    implausible : "refuse" or "take"
+        What to do about columns and rows that contradict each other: `take` warns, and solves in the least-squares sense.
 
     Returns
     -------
@@ -101,7 +107,7 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera) 
         If the images were taken by another camera, or the patterns have another size than the projector; if columns and rows
         contradict each other by these devices.
     """
-    return Triangulator(camera, projector)(projector_map)
+    return Triangulator(camera, projector)(projector_map, implausible)
 
 
 def _check_devices(found: ProjectorMap, camera: Camera, projector: Camera) -> None:
@@ -116,8 +122,8 @@ def _check_devices(found: ProjectorMap, camera: Camera, projector: Camera) -> No
         raise InputError(f"triangulate: projector: expected {expected} px, as of the patterns, found {size}: another device?")
 
 
-def _check_rows(found: ProjectorMap, points: Float32, projector: Camera) -> None:
-    """Refuse devices by which columns and rows contradict each other: the points lie on rays that miss the projector's."""
+def _check_rows(found: ProjectorMap, points: Float32, projector: Camera, implausible: Implausible) -> None:
+    """Refuse devices by which columns and rows contradict each other, or warn of them: the points lie on rays that miss."""
     if found.columns is None or found.rows is None:
         return
     rows, columns = np.nonzero(np.isfinite(points[..., 0]) & np.isfinite(found.columns) & np.isfinite(found.rows))
@@ -129,10 +135,13 @@ def _check_rows(found: ProjectorMap, points: Float32, projector: Camera) -> None
     typical = float(np.nanmedian(np.linalg.norm(missed, axis=1)))
     if typical > MISSED_PX:
         cause = "another camera's calibration or images, images mirrored or turned, or devices that moved since"
-        raise InputError(
-            f"triangulate: camera: expected columns and rows that agree to {MISSED_PX:g} projector px, found {typical:.3g} px "
-            f"in the median: {cause}?"
-        )
+        said = f"{typical:.3g} px in the median: {cause}?"
+        if implausible != "take":
+            raise InputError(
+                f"triangulate: camera: expected columns and rows that agree to {MISSED_PX:g} projector px, found {said} To use "
+                "them all the same, give implausible=take"
+            )
+        log.warning("triangulate: camera: taken all the same: columns and rows that contradict each other by %s", said)
 
 
 def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:

@@ -35,8 +35,9 @@ from recon.optical_calibration.board_frames import DeviceName
 from recon.optical_calibration.distortion_selection import ModelName
 from recon.optical_calibration.joint_calibration import Result, Settings, calibrate
 from recon.optical_calibration.observations import PROJECTOR
-from recon.optical_calibration.sightings import Cause, Failure
+from recon.optical_calibration.sightings import Cause, Failure, light
 from recon.pattern_trials import likely_patterns
+from recon.structured_light import surface_figures
 
 PAGE = "calibration.html"  # by which the folder of a calibration is known
 OPTICS = "optics.yaml"
@@ -91,7 +92,7 @@ def run(config: Config) -> None:
     seconds = {"seconds_detect": round(perf_counter() - start, 3)}
     console.print(f"detect      {board_frames.found_by(sightings, sizes)}, {seconds['seconds_detect']:.0f} s", markup=False)
     missed = board_frames.not_found(sightings)
-    for line in dropped(missed):
+    for line in (*dropped(missed), *surface_figures.bent(light(sightings))):
         console.print(line, markup=False)
 
     start = perf_counter()

@@ -88,7 +88,7 @@ class Config(Part):
 
     @property
     def taken(self) -> str:
-        """The setting of poses that no hand makes, as a field of the steps that read a sweep."""
+        """The setting of what no hand makes and no rig sees, as a field of the steps that read a sweep or fringes."""
         return f"implausible={self.implausible}"
 
     @property
@@ -204,7 +204,7 @@ def measured_skin(steps: KeptSteps, sources: Sources, optics: Path | None) -> Pa
         return None
     if optics is None:
         return steps.leave_out("surface", _no(steps, "optics", NO_OPTICS))
-    fields = [f"capture={config.capture}", f"calibration={optics}", f"camera={config.camera}"]
+    fields = [f"capture={config.capture}", f"calibration={optics}", f"camera={config.camera}", config.taken]
     made_of = sources.files("surface") | _known_by(steps, "optics", optics)
     made = steps.do("surface", "the surface, from fringes", "surface", fields, (surface.POINTS, SKIN), made_of)
     return None if made is None else made / SKIN

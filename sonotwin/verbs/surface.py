@@ -4,7 +4,8 @@ Reads a capture folder, whether devices or the twin wrote it, or a bare folder o
 Writes surface.ply (mm, with the surface's grey), surface.glb (metres, y up), points.npz (the point of every pixel, with its
 predicted sigma) and metrics.json into the folder `out`; results that are there already are replaced. Takes three seconds for
 nine images of 1280x1024 and some seconds to start; the first run ever also compiles, for about a minute. Patterns are fringes
-with what numbers them, or Gray code alone, by which points are known to a projector pixel.
+with what numbers them, or Gray code alone, by which points are known to a projector pixel. If other cameras of the
+capture took the sequence as well, the share of the points that they see alike is said.
 
     sonotwin surface capture=outputs/demo/capture out=outputs/demo/surface
     sonotwin surface capture=shots calibration=calibration/optics.yaml out=outputs/shots
@@ -23,8 +24,10 @@ from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
 from recon.files.metrics import shown
+from recon.model.pose_checks import Implausible
 from recon.model.rig import Part
 from recon.structured_light import decode, ray_checks, surface_figures, surface_mesh
+from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.triangulate import PointMap, Triangulator
 from sonotwin import choices
 
@@ -40,6 +43,7 @@ class Config(Part):
     patterns: str | None = None
     calibration: Path | None = None
     camera: str = "cam1"
+    implausible: Implausible = "refuse"
     limits: surface_mesh.Limits = surface_mesh.Limits()
 
 
@@ -79,8 +83,11 @@ def run(config: Config) -> None:
     with watch.stage("rays"):
         triangulate = Triangulator(camera, projector)
     with watch.stage("triangulate"):
-        raw = triangulate(found)
-        ray_checks.check(found, raw, camera, projector, shots.name)
+        raw = triangulate(found, config.implausible)
+        ray_checks.check(found, raw, camera, projector, shots.name, config.implausible)
+    with watch.stage("compare"):
+        for line in compared(config, shots, found, raw):
+            print(line)
     with watch.stage("clean"):
         cleaned = surface_mesh.clean(raw, camera, found.modulation, config.limits)
     if not np.isfinite(cleaned.points).any():
@@ -101,6 +108,31 @@ def run(config: Config) -> None:
             np.savez_compressed(folder / POINTS, **images)
         metrics.write(folder / metrics.FILE, figures | watch.seconds)
     print(f"wrote       {config.out}/{{surface.ply,surface.glb,{POINTS},{metrics.FILE}}}")
+
+
+def compared(config: Config, shots: SurfaceCapture, found: ProjectorMap, raw: PointMap) -> Iterator[str]:
+    """Lines: the share of the points that the capture's other cameras see alike, or why one can't be compared.
+
+    Raises
+    ------
+    InputError
+        If one of them sees something else.
+    """
+    if config.capture is None:
+        return
+    for name in surface_part.cameras_beside(config.capture, config.camera):
+        if name not in shots.calibration.cameras:
+            continue
+        try:
+            its = surface_part.read_surface(config.capture, name, config.calibration)
+            other = decode.decode(its.images, its.patterns, bits=its.bits, name=f"{its.name}: {name}", camera=name)
+        except InputError as fault:
+            yield f"compare     {name} isn't compared: {fault}"
+            continue
+        beside = its.calibration.cameras[name]
+        alike = ray_checks.check_beside(found, raw, other, beside, shots.name, config.implausible)
+        if np.isfinite(alike):
+            yield f"compare     {name} sees {100 * alike:.0f} % of the points alike"
 
 
 def nothing_left(raw: PointMap, limits: surface_mesh.Limits) -> str:

@@ -188,8 +188,8 @@ def small_projector() -> Camera:
     return Camera((256, 160), np.array([[560.0, 0, 127], [0, 560, 80], [0, 0, 1]]), np.zeros(5), pose)
 
 
-def under_patterns_alone(folder, count: int, shown: Patterns, described: Patterns) -> None:
-    """A board in some poses under the small projector's patterns, seen by camera 1, and described as under others."""
+def under_patterns_alone(folder, count: int, shown: Patterns, described: Patterns, gamma: float = 1.0) -> None:
+    """A board in some poses under the small projector's patterns, seen by camera 1 of a gamma, and described as under others."""
     camera, projector, rng = cameras()["cam1"], small_projector(), np.random.default_rng(0)
     board = Chessboard(columns=6, rows=5, square_mm=24)
     with new_capture(folder, "patterns") as capture:
@@ -197,6 +197,7 @@ def under_patterns_alone(folder, count: int, shown: Patterns, described: Pattern
         for number in range(count):
             placed = board_views.pose(board, rng.uniform(640, 720), rng.uniform(-0.5, 0.5, 2), 0.1, rng.uniform(-15, 15, 2))
             stack = board_views.under_patterns(board, camera, projector, shown, placed, rng)[1:]
+            stack = np.uint8(np.rint(255 * (stack / 255) ** gamma))
             records.append(write_pose(capture.folder, f"{number:02d}", {}, {"cam1": stack}))
         devices = {"cam1": Device(size=SIZE), "projector": Device(size=projector.size)}
         capture.add_board(BoardPart(board=board, patterns=described, poses=tuple(records)), devices)
@@ -216,6 +217,20 @@ def test_camera_and_projector_by_gray_code_alone(tmp_path, capsys):
         assert abs(found.cameras[name].matrix[0, 0] - true.matrix[0, 0]) < 4 * found.uncertainty.sigma(f"{name}.fx") < 60, name
     figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert figures["reprojection_rms_projector_px"] < 0.15 and figures["point_sigma_mm"] < 3
+
+
+def test_three_steps_through_a_cameras_gamma_are_straightened_and_said(tmp_path, capsys):
+    projector = small_projector()
+    parts = [p for a in ("columns", "rows") for p in (Fringes(axis=a, pitch=16, steps=3), GrayCode(axis=a, pitch=16, bits=4))]
+    patterns = Patterns(projector_size=projector.size, unwrap="gray", parts=tuple(parts))
+    under_patterns_alone(tmp_path / "capture", 4, patterns, patterns, gamma=1.6)
+    assert main(["calibrate-optics", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}", "distortion=radial1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert re.match(
+        r"linearity +light isn't linear, it goes with level\^1\.[56] or so: 3 steps of 16 px were bent by up to", lines[1]
+    )
+    found = calibration_files.read(tmp_path / "out" / "optics.yaml")
+    assert abs(found.cameras["projector"].matrix[0, 0] - 560) < 4 * found.uncertainty.sigma("projector.fx") < 20
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,11 +47,12 @@ def optics() -> Calibration:
     return Calibration({"cam1": camera, "projector": projector})
 
 
-def photograph(patterns: Patterns, optics: Calibration) -> np.ndarray:
-    """What camera 1 sees of the patterns on the plane, with 1 DN of noise."""
-    camera, projector = optics.cameras["cam1"], optics.cameras["projector"]
-    rays, normal = camera.rays(camera.pixel_grid()), TILT[:3, 2]
-    points = rays * ((normal @ TILT[:3, 3]) / (rays @ normal))[..., None]
+def photograph(patterns: Patterns, optics: Calibration, name: str = "cam1", world_from_plane: np.ndarray = TILT) -> np.ndarray:
+    """What a camera sees of the patterns on the plane, with 1 DN of noise."""
+    camera, projector = optics.cameras[name], optics.cameras["projector"]
+    rays, normal = camera.pixel_rays(), world_from_plane[:3, 2]
+    away = normal @ (world_from_plane[:3, 3] - camera.centre)
+    points = camera.centre + rays * (away / (rays @ normal))[..., None]
     column = projector.project(points)[..., 0]
     profiles = np.array([profile for _, _, profile in patterns.profiles()], float)
     seen = np.array([np.interp(column, np.arange(len(profile)), profile) for profile in profiles])
@@ -131,6 +133,38 @@ def test_a_code_too_coarse_for_a_surface_is_refused_by_the_cause(optics, tmp_pat
     assert main(["surface", *fields]) == 2
     assert re.search(r"\d{5} points, all removed as unsure, .* is the pitch .* too coarse\?", capsys.readouterr().err)
     assert main(["surface", *fields, "limits.max_sigma=50"]) == 0
+
+
+def test_mirrored_images_are_refused_unless_they_are_to_be_taken(optics, tmp_path, capsys, caplog):
+    patterns = SEQUENCES["centre_line"]
+    mirrored = np.ascontiguousarray(photograph(patterns, optics)[..., ::-1])
+    devices = {"cam1": Device(size=SIZE), "projector": Device(size=PROJECTOR)}
+    writer.write_surface(tmp_path / "capture", {"cam1": mirrored}, patterns, optics, devices)
+    fields = [f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'surface'}"]
+    assert main(["surface", *fields]) == 2 and not (tmp_path / "surface").exists()
+    assert re.search("light the back .* mirrored .* give implausible=take\n$", capsys.readouterr().err)
+    assert main(["surface", *fields, "implausible=take"]) == 0
+    assert "taken all the same: the projector would light the back" in caplog.text
+
+
+@pytest.mark.parametrize(("down", "said"), [("cam1", "% of the points"), ("", "sees 100 %")])
+def test_a_second_camera_shows_images_upside_down(optics, tmp_path, capsys, caplog, down, said):
+    """Of columns alone one camera can't: the same plane seems tilted the other way. A damaged second image isn't in the way."""
+    patterns, steep = SEQUENCES["gray"], rigid.from_rotation_vector([0.9, -0.3, 0], [0, 0, 660])
+    beside = rigid.from_rotation_vector(np.deg2rad([0, 12.5, 0]), [-148.0, 0, 15])
+    optics = Calibration(optics.cameras | {"cam2": replace(optics.cameras["cam1"], camera_from_world=beside)})
+    seen = {name: photograph(patterns, optics, name, steep)[:, :: -1 if name == down else 1] for name in ("cam1", "cam2")}
+    devices = {"cam1": Device(size=SIZE), "cam2": Device(size=SIZE), "projector": Device(size=PROJECTOR)}
+    writer.write_surface(tmp_path / "capture", seen, patterns, optics, devices)
+    fields = [f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'surface'}"]
+    if down:
+        assert main(["surface", *fields]) == 2
+        assert re.search(said + " lie where cam2 sees .* upside down.* give implausible=take", capsys.readouterr().err)
+        assert main(["surface", *fields, "implausible=take"]) == 0 and "taken all the same" in caplog.text
+        return
+    assert main(["surface", *fields]) == 0 and said in capsys.readouterr().out
+    (tmp_path / "capture" / "surface" / "cam2" / "0003.png").write_bytes(b"")
+    assert main(["surface", *fields]) == 0 and "cam2 isn't compared: " in capsys.readouterr().out
 
 
 def test_results_are_replaced_but_other_folders_are_not(shots, tmp_path, capsys):

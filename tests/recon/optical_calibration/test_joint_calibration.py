@@ -11,11 +11,13 @@ from recon.geometry import rigid
 from recon.geometry.levenberg_marquardt import Rules
 from recon.model.boards import AsymmetricCircles, Charuco, Chessboard
 from recon.model.calibration import Calibration
+from recon.model.patterns import Fringes
 from recon.optical_calibration import adjustment, joint_calibration
 from recon.optical_calibration.adjustment import adjust, free_parameters
 from recon.optical_calibration.bundle import Estimate
 from recon.optical_calibration.joint_calibration import Settings, Shape, departure, deviation
 from recon.optical_calibration.sightings import Cause, Failure
+from recon.structured_light.decode import Linearity
 from tests.recon.board_sets import BOARD, DEVICES, corners, devices, observe, random_poses, sightings
 
 QUICK = Settings(distortion="decentred")
@@ -91,6 +93,19 @@ def test_poses_that_mostly_contradict_each_other_are_refused(sizes, good):
     shuffled = [replace(one, pixels={**one.pixels, "cam2": good[k].pixels["cam2"]}) for one, k in zip(good, order, strict=True)]
     with pytest.raises(InputError, match=r"stand still beside the first device.*mixed up"):
         joint_calibration.calibrate(shuffled, BOARD, sizes, QUICK)
+
+
+@pytest.mark.parametrize(("device", "named"), [("projector", True), ("cam2", False)])
+def test_light_that_is_not_linear_is_named_where_the_projector_contradicts(sizes, good, device, named):
+    """Phases that a gamma bends put the projector's points off, pose by pose otherwise; a camera's not."""
+    order, hidden = np.roll(np.arange(12), 1), Linearity(unknown=((Fringes(pitch=320, steps=3), "few"),))
+    mixed = [
+        replace(one, pixels={**one.pixels, device: good[k].pixels[device]}, linearity=hidden)
+        for one, k in zip(good, order, strict=True)
+    ]
+    with pytest.raises(InputError, match=r"contradict|stand still") as caught:
+        joint_calibration.calibrate(mixed, BOARD, sizes, QUICK)
+    assert ("light too far from linear for so few steps (a gamma), or were images mixed up" in str(caught.value)) == named
 
 
 def test_too_few_poses_are_refused_and_few_are_warned_of(sizes, good):

@@ -13,6 +13,9 @@ from recon.model.boards import AprilGrid, Chessboard
 from recon.model.patterns import Fringes, GrayCode, Patterns, Uniform
 from recon.optical_calibration import board_frames, sightings
 from recon.optical_calibration.sightings import Cause, sight
+from recon.structured_light import surface_figures
+from recon.structured_light.decode import Linearity
+from recon.structured_light.phase_bend import Bend, by_harmonics, gamma_of
 from tests.recon.board_views import pose, under_patterns, view
 
 BOARD = Chessboard(columns=5, rows=4, square_mm=28)
@@ -93,6 +96,20 @@ def test_a_failure_has_its_cause(rng):
         assert {device: failure.cause for device, failure in failures.items()} == {"projector": cause}
     (failure,) = sight("00", BOARD, {"cam1": np.zeros_like(first)}, None, None, {"cam1": 8}).failures.values()
     assert failure.cause is Cause.NO_BOARD
+
+
+def test_the_light_of_all_poses_is_told_once_by_the_largest_bend():
+    parts = Fringes(pitch=16, steps=3), Fringes(pitch=200, steps=3)
+    seen = []
+    for c in (0.1, 0.25, 0.15):
+        bends = (Bend(by_harmonics(3, c, 0.0), 3, 16.0, 0.01, gamma_of(3, c)),) * 2  # of columns and rows
+        light = Linearity(bends, ((parts[1], "few"),), clipped=c)
+        seen.append(sightings.Sighting("00", {}, {}, np.zeros((0, 2, 2)), linearity=light))
+    found = sightings.light(seen)
+    assert [bend.gamma for bend in found.bends] == [gamma_of(3, 0.25)] and found.clipped == 0.25
+    bent, unseen = surface_figures.bent(found)
+    assert "level^2.0 or so (25 % of the samples are 0: is black clipped" in bent and "3 steps of 16 px were bent" in bent
+    assert "3 steps of 200 px would be bent by a gamma, which too few periods are seen to show" in unseen
 
 
 def camera_error(found, world_from_board):

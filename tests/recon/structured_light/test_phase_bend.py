@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from recon.errors import InputError
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns
 from recon.structured_light.decode import Status, decode
 from recon.structured_light.surface_figures import describe_decoding
@@ -44,11 +45,52 @@ def test_an_unknown_gamma_costs_little_and_is_counted(rng, name):
         assert abs(z).max() < 7
 
 
-def test_too_few_periods_to_see_a_gamma_are_said(rng):
-    """Two periods on a wall: three steps are bent, and nothing shows by how much."""
-    patterns = Patterns(
-        projector_size=(1280, 800), unwrap="gray", parts=(Fringes(pitch=320, steps=3), GrayCode(pitch=320, bits=2))
-    )
+@pytest.mark.parametrize(
+    ("pitch", "across", "cause"), [(320, 1.4, "too few periods"), (18, 4.7, "periods of so few camera pixels")]
+)
+def test_fringes_that_hide_a_gamma_are_said(rng, pitch, across, cause):
+    """Two periods on a wall, or periods of 3.8 camera pixels: three steps are bent, and nothing shows by how much."""
+    parts = (Fringes(pitch=pitch, steps=3), GrayCode(pitch=pitch, bits=2 if pitch == 320 else 7))
+    columns = 639.5 + across * (np.mgrid[:160, :240][1] - 120.0)
+    found = decode(photograph(patterns_of(parts), {"columns": columns}, rng, light=150), patterns_of(parts))
+    (said,) = (line for line in describe_decoding(patterns_of(parts), found) if line.startswith("linearity"))
+    assert cause in said
+
+
+def patterns_of(parts):
+    return Patterns(projector_size=(1280, 800), unwrap="gray", parts=parts)
+
+
+def seen(steps, rng, gamma=1.0, ambient=8.0):
+    """Patterns of 36 px, and their images of a wall."""
+    patterns = patterns_of((Fringes(pitch=36, steps=steps), GrayCode(pitch=36, bits=6)))
     columns = 639.5 + 1.4 * (np.mgrid[:160, :480][1] - 240.0)
-    found = decode(photograph(patterns, {"columns": columns}, rng, light=150), patterns)
-    assert any("too few periods" in line for line in describe_decoding(patterns, found))
+    return patterns, photograph(patterns, {"columns": columns}, rng, light=150, ambient=ambient, gamma=gamma)
+
+
+def test_a_gamma_beyond_what_can_be_undone_is_refused(rng):
+    patterns, images = seen(3, rng, gamma=5.5)
+    with pytest.raises(InputError, match=r"fringes of columns: 3 steps of 36 px are bent .* level\^3\.4 or more.* take 5 steps"):
+        decode(images, patterns)
+
+
+def test_clipped_black_is_named(rng):
+    """Of 150 DN 30 subtracted: by the line of the bend with three steps; 100: in place of a wrong order with twelve."""
+    patterns, images = seen(3, rng)
+    found = decode(np.maximum(images, 38) - 38, patterns)
+    said = [line for line in describe_decoding(patterns, found) if line.startswith("linearity   light isn't linear")]
+    assert said and all("% of the samples are 0: is black clipped" in line for line in said)
+    patterns, images = seen(12, rng)
+    decode(images, patterns)
+    with pytest.raises(InputError, match=r"do not follow the 12-step sequence: \d\d % of the samples are 0: is black clipped"):
+        decode(np.maximum(images, 108) - 108, patterns)
+
+
+def test_a_code_that_jumps_is_doubted_with_its_noise_where_that_is_assumed(rng):
+    """Three steps don't show their noise, so that orders that jump may be a dark image's that a gamma spread."""
+    for steps, doubted in ((3, True), (8, False)):
+        patterns, images = seen(steps, rng)
+        images[[steps + 3, steps + 4]] = images[[steps + 4, steps + 3]]
+        with pytest.raises(InputError, match="fringe orders jump") as caught:
+            decode(images, patterns)
+        assert ("is the dark noisier" in str(caught.value)) == doubted

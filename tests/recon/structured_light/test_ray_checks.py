@@ -1,5 +1,8 @@
 """Images of a wall, mirrored, turned, or with another calibration: what both devices see, both see from its front."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -36,22 +39,26 @@ def seen(rng, rows):
     return pixels[..., 0], pixels[..., 1] if rows else None
 
 
-@pytest.mark.parametrize(
-    ("turn", "rows", "off_px", "match"),
-    [
-        ((1, 1), False, 0, None),
-        ((1, 1), True, 0, None),
-        ((1, -1), False, 0, "light the back .* mirrored or turned"),
-        ((-1, -1), False, 0, "light the back .* mirrored or turned"),
-        ((-1, 1), True, 0, "columns and rows that agree .* mirrored or turned"),
-    ],
-)
-def test_only_images_of_this_rig_make_a_scene(rng, turn, rows, off_px, match):
-    columns, its_rows = (None if image is None else image[:: turn[0], :: turn[1]].copy() for image in seen(rng, rows))
-    columns += off_px
+def decoded(columns, rows=None):
+    """A map of columns, and of rows perhaps."""
     sigma, status = np.full(columns.shape, 0.03, np.float32), np.zeros(columns.shape, np.uint8)
     shown = (sigma, sigma, sigma, status, status == 0)
-    found = ProjectorMap(columns, its_rows, sigma, sigma if rows else None, *shown, Noise(1, 0), {})
+    return ProjectorMap(columns, rows, sigma, None if rows is None else sigma, *shown, Noise(1, 0), {})
+
+
+@pytest.mark.parametrize(
+    ("turn", "rows", "match"),
+    [
+        ((1, 1), False, None),
+        ((1, 1), True, None),
+        ((1, -1), False, "light the back .* mirrored or turned"),
+        ((-1, -1), False, "light the back .* mirrored or turned"),
+        ((-1, 1), True, "columns and rows that agree .* mirrored or turned"),
+    ],
+)
+def test_only_images_of_this_rig_make_a_scene(rng, caplog, turn, rows, match):
+    columns, its_rows = (None if image is None else image[:: turn[0], :: turn[1]].copy() for image in seen(rng, rows))
+    found = decoded(columns, its_rows)
 
     def scene():
         ray_checks.check(found, triangulate(found, CAMERA, PROJECTOR), CAMERA, PROJECTOR, "shots")
@@ -61,4 +68,32 @@ def test_only_images_of_this_rig_make_a_scene(rng, turn, rows, off_px, match):
         return
     with pytest.raises(InputError, match=match) as caught:
         scene()
-    assert "\n" not in str(caught.value) and str(caught.value).startswith("triangulate: " if rows else "shots: ")
+    assert (
+        str(caught.value).endswith("give implausible=take")
+        and "\n" not in str(caught.value)
+        and str(caught.value).startswith("triangulate: " if rows else "shots: ")
+    )
+    raw = triangulate(found, CAMERA, PROJECTOR, "take")
+    ray_checks.check(found, raw, CAMERA, PROJECTOR, "shots", "take")
+    assert "taken all the same" in caplog.text and np.isfinite(raw.points).any()
+
+
+@pytest.mark.parametrize(
+    ("off_px", "tilt_deg", "match"),
+    [
+        (440, 0, r"don't meet in front of both in [45]\d % .* the calibration that of this rig"),
+        (900, 0, "don't meet in front of both in 100 % "),
+        (0, 20, r"\d\d % of the points lie where the projector has no rows"),
+    ],
+)
+def test_another_calibration_makes_none_unless_it_is_to_be_taken(rng, caplog, off_px, tilt_deg, match):
+    """Columns shifted as of a projector turned outwards, so that half of the rays run apart, or all; one above the wall."""
+    found = decoded(seen(rng, False)[0] - off_px)
+    tilt = rigid.from_rotation_vector([np.deg2rad(tilt_deg), 0, 0], np.zeros(3))
+    other = replace(PROJECTOR, camera_from_world=tilt @ PROJECTOR.camera_from_world)
+    raw = triangulate(found, CAMERA, other)
+    with pytest.raises(InputError, match=rf"^shots: .*{match}.*give implausible=take$"):
+        ray_checks.check(found, raw, CAMERA, other, "shots")
+    ray_checks.check(found, raw, CAMERA, other, "shots", implausible="take")
+    (said,) = caplog.messages
+    assert "taken all the same" in said and re.search(match, said)
