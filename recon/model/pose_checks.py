@@ -26,6 +26,7 @@ Changes = Callable[
 
 STEP_PX = 4  # of the pixels that are compared from image to image
 LOST = -3.697314e28  # of a coordinate, which NDI's trackers write where a tool isn't seen
+WAY = "to use them all the same, give implausible=take"
 WORDS: dict[Cause, str] = {
     "identity": "the identity, as of a tool that is not seen",
     "frozen": "the same to the last digit as the one before while the images change, as of a tracker that stood still",
@@ -63,7 +64,6 @@ class Findings:
 
     count: int = 0  # of the poses that there were
     rows: dict[Cause, Rows] = field(default_factory=dict)
-    resting: str = ""  # said of a sweep whose poses are all the same
 
     @property
     def all(self) -> Rows:
@@ -72,8 +72,7 @@ class Findings:
 
     def lines(self, what: str = "pose") -> list[str]:
         """A sentence for each cause: the number of poses, and the first of them."""
-        said = [self.resting] if self.resting else []
-        return said + [
+        return [
             f"{len(rows)} of {self.count} poses, from {what} {rows[0]} on: {WORDS[cause]}" for cause, rows in self.rows.items()
         ]
 
@@ -116,7 +115,6 @@ def checked(
         If their lengths are of another unit, or more would be left out than may be.
     """
     found, fault = find(times_s, poses, changes, clock), unit_fault(poses)
-    way = "to use them all the same, give implausible=take"
     if implausible == "take":
         for line in [*([fault] if fault else []), *found.lines(what)]:
             log.warning("%s: taken all the same: %s", place, line)
@@ -124,14 +122,25 @@ def checked(
     kept = without(poses, found.all)
     if len(found.all) > LIMITS.most_share * found.count:
         if fault:
-            raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
+            raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {WAY}")
         expected = f"a motion that a hand makes, but for {100 * LIMITS.most_share:.0f} % at most"
-        raise InputError(f"{place}: poses: expected {expected}, found {'; '.join(found.lines(what))}; {way}")
+        raise InputError(f"{place}: poses: expected {expected}, found {'; '.join(found.lines(what))}; {WAY}")
     if fault := unit_fault(kept):
-        raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
+        raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {WAY}")
     for line in found.lines(what):
-        log.warning("%s: %s%s", place, "" if found.resting == line else "left out ", line)
+        log.warning("%s: left out %s", place, line)
     return kept, found
+
+
+def check_motion(place: str, poses: Array, implausible: Implausible = "refuse") -> None:
+    """Refuse a sweep : (n, 4, 4), NaN where there is no pose, of more than a few that are all the same; or say so only."""
+    known = poses[np.isfinite(poses).all(axis=(1, 2))]
+    if len(known) <= LIMITS.repeats or not (known == known[0]).all():
+        return
+    found = f"all {len(known)} the same to the last digit: no tracking, or a probe at rest?"
+    if implausible == "refuse":
+        raise InputError(f"{place}: poses: expected those of a probe that moves, found {found} {WAY}")
+    log.warning("%s: taken all the same: poses that are %s", place, found.rstrip("?"))
 
 
 def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Array | None = None) -> Findings:
@@ -151,13 +160,13 @@ def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Ar
     left = there[~lost]
     if lost.any():
         rows["identity"] = there[lost]
-    frozen, resting = _frozen(clock[left], poses[left], changes)
+    frozen = _frozen(clock[left], poses[left], changes)
     if len(frozen):
         rows["frozen"], left = left[frozen], np.delete(left, frozen)
     jumped = _jumps(times_s[left], poses[left])
     if len(jumped):
         rows["jump"] = left[jumped]
-    return Findings(len(there), rows, resting)
+    return Findings(len(there), rows)
 
 
 def unit_fault(poses: Array) -> str | None:
@@ -168,8 +177,8 @@ def unit_fault(poses: Array) -> str | None:
     span, farthest = float(np.linalg.norm(np.ptp(places, axis=0))), float(np.abs(places).max())
     if 1e-6 < span < 1 and farthest < 5:
         return f"all within {span:.3g} mm, and {farthest:.3g} mm from the origin: metres?"
-    if span > 5000:
-        return f"a sweep over {span:.4g} mm: micrometres?"
+    if (most := float(np.linalg.norm(np.subtract(*np.percentile(places, [90, 10], axis=0))))) > 5000:  # a few may be wrong
+        return f"a sweep over {most:.4g} mm: micrometres?"
     return None
 
 
@@ -200,16 +209,15 @@ def _lost(poses: Array) -> NDArray[np.bool_]:
     return same
 
 
-def _frozen(times_s: Array, poses: Array, changes: Changes | None) -> tuple[Rows, str]:
-    """Rows of poses that repeat the one before to the last digit, long, while the images change; and a word on one that rests."""
+def _frozen(times_s: Array, poses: Array, changes: Changes | None) -> Rows:
+    """Rows of poses that repeat the one before to the last digit, long, while the images change."""
     same = (poses[1:] == poses[:-1]).all(axis=(1, 2))
     starts = np.concatenate([[0], np.flatnonzero(~same) + 1])
     lengths = np.diff([*starts, len(poses)])
-    if len(poses) > LIMITS.repeats and len(lengths) == 1:
-        return np.empty(0, np.int64), f"all {len(poses)} poses are the same to the last digit: a probe at rest, or no tracking"
-    long = (lengths > LIMITS.repeats) & (lengths > 3 * np.median(lengths))
+    usual_length = np.sort(lengths)[(len(lengths) - 1) // 2]  # of a tracker that is slower than the images
+    long = (lengths > LIMITS.repeats) & (lengths > 3 * usual_length)
     if not long.any() or changes is None:
-        return np.empty(0, np.int64), ""
+        return np.empty(0, np.int64)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[~same]
     moments, change = changes()
     resting = np.zeros(len(moments), bool)
@@ -224,7 +232,7 @@ def _frozen(times_s: Array, poses: Array, changes: Changes | None) -> tuple[Rows
         least = LIMITS.changed_before_jump if jump else LIMITS.changed
         if len(own) >= 3 and np.median(own) > least * usual > 0:
             frozen.append(np.arange(start + 1, end))
-    return np.concatenate([np.empty(0, np.int64), *frozen]), ""
+    return np.concatenate([np.empty(0, np.int64), *frozen])
 
 
 def _during(moments: Array, times_s: Array) -> NDArray[np.bool_]:

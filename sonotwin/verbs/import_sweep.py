@@ -85,6 +85,7 @@ def believed(config: Config, clip: Clip, times: NDArray[np.int64], track: Track)
 
     seconds = 1e-9 * (track.times - track.times[0])
     poses, _ = pose_checks.checked(str(config.poses), seconds, track.poses, config.implausible, changes)
+    pose_checks.check_motion(str(config.poses), poses, config.implausible)
     return replace(track, poses=poses)
 
 

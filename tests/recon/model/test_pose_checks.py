@@ -92,6 +92,19 @@ def test_a_motor_that_pauses_is_at_rest(rng):
     assert not found(poses, change=np.where(steps > 0, 3.0, 1.2))
 
 
+def test_a_sweep_without_any_motion_is_refused(rng, caplog):
+    poses = np.tile(sweep(rng)[7], (COUNT, 1, 1))
+    poses[:10] = np.nan
+    complaint = r"^s: poses: expected those of a probe that moves, found all 50 the same.*implausible=take$"
+    with pytest.raises(InputError, match=complaint):
+        pose_checks.check_motion("s", poses)
+    pose_checks.check_motion("s", poses, "take")
+    assert "s: taken all the same: poses that are all 50 the same to the last digit" in caplog.text
+    pose_checks.check_motion("s", poses[:14])
+    poses[10, 0, 3] += 1e-9
+    pose_checks.check_motion("s", poses)
+
+
 def test_a_slow_tracker_repeats_each_pose(rng):
     """As where the latest pose is stored with each image: ten poses a second, 60 images."""
     poses = np.repeat(sweep(rng), 6, axis=0)
