@@ -51,6 +51,9 @@ class MotionLimits:
     repeats: int = 4  # poses in a row that are the same, at least, before images are compared
     changed: float = 0.7  # times the usual change from image to image of a moving probe
     changed_before_jump: float = 0.3  # the same, where the pose jumps when it goes on
+    small_mm: tuple[float, float] = (2.0, 20.0)  # a sweep's extent that might be in centimetres, as few in mm are; from noise on
+    near_mm: float = 150.0  # the same of its farthest place from the origin
+    slow_mm_s: float = 4.0  # and of its median speed
     least_covered: float = 0.8  # share of the images with a pose, below which it is said
     most_share: float = 1 / 3  # of poses that may be left out
 
@@ -100,6 +103,7 @@ def checked(
     changes: Changes | None = None,
     clock: Array | None = None,
     what: str = "pose",
+    unit: str = "",
 ) -> tuple[Array, Findings]:
     """The poses of a sweep without those that are implausible, and these; all of them where they are to be taken.
 
@@ -108,6 +112,7 @@ def checked(
     place : of the poses, for messages
     what : word for one of them
     times_s, poses, changes, clock : as of `find`
+    unit : field that says in which unit they are, if there is one
 
     Raises
     ------
@@ -115,6 +120,7 @@ def checked(
         If their lengths are of another unit, or more would be left out than may be.
     """
     found, fault = find(times_s, poses, changes, clock), unit_fault(poses)
+    way = f"give {unit}; {WAY}" if unit else WAY
     if implausible == "take":
         for line in [*([fault] if fault else []), *found.lines(what)]:
             log.warning("%s: taken all the same: %s", place, line)
@@ -122,13 +128,13 @@ def checked(
     kept = without(poses, found.all)
     if len(found.all) > LIMITS.most_share * found.count:
         if fault:
-            raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {WAY}")
+            raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
         expected = f"a motion that a hand makes, but for {100 * LIMITS.most_share:.0f} % at most"
         raise InputError(f"{place}: poses: expected {expected}, found {'; '.join(found.lines(what))}; {WAY}")
     if fault := unit_fault(kept):
-        raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {WAY}")
-    for line in found.lines(what):
-        log.warning("%s: left out %s", place, line)
+        raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
+    for line in [f"left out {line}" for line in found.lines(what)] + unit_doubts(times_s, kept, unit):
+        log.warning("%s: %s", place, line)
     return kept, found
 
 
@@ -180,6 +186,24 @@ def unit_fault(poses: Array) -> str | None:
     if (most := float(np.linalg.norm(np.subtract(*np.percentile(places, [90, 10], axis=0))))) > 5000:  # a few may be wrong
         return f"a sweep over {most:.4g} mm: micrometres?"
     return None
+
+
+def unit_doubts(times_s: Array, poses: Array, unit: str = "") -> list[str]:
+    """What is said of a sweep that may well be one in mm, but is small, near and slow as those in centimetres are; else none."""
+    found = np.isfinite(poses).all(axis=(1, 2))
+    places, times = poses[found, :3, 3], times_s[found]
+    if len(places) <= LIMITS.repeats:
+        return []
+    span, farthest = float(np.linalg.norm(np.ptp(places, axis=0))), float(np.linalg.norm(places, axis=1).max())
+    if not LIMITS.small_mm[0] < span < LIMITS.small_mm[1] or farthest > LIMITS.near_mm:
+        return []
+    told = f"all poses lie within {span:.3g} mm, and up to {farthest:.3g} mm from the origin"
+    if (seconds := _seconds(times)) is not None:
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.maximum(np.diff(seconds), _shortest(seconds))
+        if (speed := float(np.median(steps))) > LIMITS.slow_mm_s:
+            return []
+        told += f", at {speed:.2g} mm/s"
+    return [f"{told}: is it in mm, not in centimetres?" + (f" Else give {unit}" if unit else "")]
 
 
 def image_changes(images: Iterable[NDArray]) -> Array:

@@ -122,6 +122,25 @@ def test_another_unit_is_named(factor, unit, rng):
     assert pose_checks.checked("s", TIMES, poses, "take")[0] is poses
 
 
+def test_a_sweep_that_may_be_in_centimetres_is_named(rng, caplog):
+    """3 mm/s over 9 mm, 65 mm from the tracker; the same in mm, or as fast as hands are, is as usual."""
+    poses = sweep(rng)
+    pose_checks.checked("s", TIMES, poses)
+    small = poses.copy()
+    small[:, :3, 3] *= 0.1
+    pose_checks.checked("s", TIMES / 5, small)
+    assert not caplog.text
+    pose_checks.checked("s", TIMES, small, unit="length_unit")
+    assert "s: all poses lie within 7.8 mm, and up to 65.5 mm from the origin, at " in caplog.text
+    assert "mm/s: is it in mm, not in centimetres? Else give length_unit" in caplog.text
+    caplog.clear()
+    pose_checks.checked("s", np.full(COUNT, np.nan), small)
+    assert "up to 65.5 mm from the origin: is it in mm" in caplog.text
+    small[:, :3, 3] *= 0.01
+    with pytest.raises(InputError, match=r"metres\? give length_unit; to use them all the same, give implausible=take"):
+        pose_checks.checked("s", TIMES, small, unit="length_unit")
+
+
 def test_what_is_left_out_is_counted_and_beyond_a_share_refused(rng, caplog):
     poses = sweep(rng)
     poses[5:20] = np.eye(4)
