@@ -51,7 +51,8 @@ class KeptSteps:
                 atomic.check_listed(self.folder, name, BY)
                 atomic.remove_leftovers(self.folder / name)
             atomic.begin_filled(self.folder, BY)
-            self.record = _read(self.folder / RECORD)
+            record = self.folder / RECORD
+            self.record = json_text.read(record) if record.is_file() else {}  # as it was written, by the check above
             self._write()
             yield
             for name in [name for name in self.record if name not in self.done]:
@@ -121,15 +122,6 @@ class KeptSteps:
     def _write(self) -> None:
         with atomic.listed_file(self.folder, RECORD, BY) as temporary:
             temporary.write_text(json.dumps(self.record, indent=2, sort_keys=True) + "\n", encoding="utf-8")
-
-
-def _read(path: Path) -> dict[str, str]:
-    """A record; an empty one where none is there, or a damaged one, which costs work and no more."""
-    try:
-        content = json_text.read(path) if path.is_file() else {}
-        return {name: str(digest) for name, digest in content.items()}
-    except (InputError, AttributeError):
-        return {}
 
 
 def digest_of(content: object) -> str:

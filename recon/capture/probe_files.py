@@ -29,7 +29,7 @@ from recon.geometry import rigid
 from recon.model import lengths
 from recon.model.calibration import Uncertainty
 from recon.model.lengths import UNIT_KEY
-from recon.model.probe import SCANNER_SPEED, SPEEDS, ProbeCalibration
+from recon.model.probe import SCANNER_SPEED, ProbeCalibration, speed_fault
 
 log = logging.getLogger(__name__)
 
@@ -209,13 +209,14 @@ def _in_mm(path: Path, read: ProbeCalibration, unit: float) -> ProbeCalibration:
 
 def _speed(path: Path, values: Values) -> float:
     value = values.get("speed_m_s", SCANNER_SPEED)
-    return _within_speeds(path, float(value) if isinstance(value, int | float) else None)
+    if not isinstance(value, int | float):
+        raise InputError(f"{path}: speed_m_s: expected a number, of m/s, found {brief(value)}")
+    return _within_speeds(path, float(value))
 
 
-def _within_speeds(path: Path, value: float | None) -> float:
-    if value is None or not SPEEDS[0] <= value <= SPEEDS[1]:
-        found = "something else" if value is None else f"{value:g}"
-        raise InputError(f"{path}: speed_m_s: expected a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s, found {found}")
+def _within_speeds(path: Path, value: float) -> float:
+    if fault := speed_fault(value):
+        raise InputError(f"{path}: speed_m_s: {fault}")
     return value
 
 

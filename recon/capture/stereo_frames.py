@@ -109,14 +109,14 @@ def _partners(
     Cameras that run freely drift against each other, so that the nearest frame may be nearer to another; single frames that one
     of them lost leave the other's without a partner.
     """
-    tables = _without_a_last_one(tables)
     times = [table[1] for table in tables]
     periods = [float(np.median(np.diff(each))) for each in times if len(each) > 1]
     period = min(periods) if periods else ALONE_NS
     first, second = _matched(times[0], times[1], NEAR * period)
     for one, other, paired in ((0, 1, first), (1, 0, second)):
         alone = np.setdiff1d(np.arange(len(times[one])), paired)
-        if not len(alone):
+        ended = alone.tolist() == [len(times[one]) - 1] and times[one][-1] > times[other][-1]  # between both cameras
+        if not len(alone) or ended:
             continue
         k = int(alone[0])
         away = abs(int(times[other][_nearest(times[one][[k]], times[other])[0]]) - int(times[one][k])) * 1e-6
@@ -162,15 +162,6 @@ def _matched(first: NDArray[np.int64], second: NDArray[np.int64], most_ns: float
         rows.append((i, j))
     found = np.array(rows[::-1], np.int64).reshape(-1, 2)
     return found[:, 0], found[:, 1]
-
-
-def _without_a_last_one(
-    tables: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]],
-) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """The tables, less a frame at the end that one camera has more than the other: a recording that was cut off there."""
-    counts = [len(frames) for frames, _ in tables]
-    most = min(counts) if max(counts) - min(counts) == 1 and min(counts) > 0 else max(counts)
-    return [(frames[:most], times[:most]) for frames, times in tables]
 
 
 def _nearest(wanted: NDArray[np.int64], times: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -139,6 +139,7 @@ def _believed(
         return taken, pose_checks.image_changes(read_image(path, size, bits=8) for path in paths)
 
     poses, found = pose_checks.checked(str(listed), seconds, track.poses, implausible, changes)
+    pose_checks.check_motion(str(listed), poses, implausible)
     return replace(track, poses=poses), len(found.all)
 
 

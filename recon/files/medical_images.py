@@ -1,8 +1,8 @@
 """Headers of MetaImage (.mha, .mhd) and NRRD (.nrrd, .nhdr) files with fields of one's own, and their pixels a block at a time.
 
-Both are text, name and value a line, followed by the pixels or by the name of the file that has them. What the fields mean is for
-`recon.freehand.sequences` and `recon.files.volumes`; here they are found, and the pixels are unpacked without ever being in
-memory at once.
+Both are text, name and value a line, followed by the pixels or by the name of the file that has them. PLUS's .mkv files are
+taken as if they had such a header. What the fields mean is for `recon.freehand.sequences` and `recon.files.volumes`; here they
+are found, and the pixels are unpacked without ever being in memory at once.
 """
 
 import math
@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError, brief, short
+from recon.files import matroska, video_file
+from recon.files.matroska import Frame
 from recon.files.regular import check_there, opened
 
 META_TYPES = {
@@ -37,7 +39,8 @@ NRRD_TYPES = {  # those of sequences, each with many names
     "double": "f8",
 }
 NO_PIXELS = ("MET_OTHER", "MET_NONE", "")  # types, in either format, of PLUS's files without images
-MATROSKA = b"\x1a\x45\xdf\xa3"  # the beginning of an .mkv file
+UNCOMPRESSED, GREY = "V_UNCOMPRESSED", "Y800"  # of images in a Matroska file
+MOST_PX = 1 << 26  # of a video's images
 MOST_WHOLE = 1 << 40  # of any number of a header
 MOST_HEADER = 1 << 28  # bytes; a sequence of five hours has half as many
 LONGEST_LINE = 1 << 20  # bytes; a file of another kind may have no line breaks at all
@@ -57,6 +60,8 @@ class ImageFile:
     data_path: Path
     data_offset: int  # bytes before the pixels
     channels: int = 1  # numbers a pixel, where they have no axis of their own
+    frames: tuple[Frame, ...] = ()  # of a Matroska file
+    coded: bool = False  # as a video, of which OpenCV makes the images
 
     @property
     def data_bytes(self) -> int:
@@ -74,7 +79,7 @@ def fault(path: Path, field: str, expected: object, found: object) -> InputError
 
 
 def read_header(path: Path) -> ImageFile:
-    """Read the header of a MetaImage or NRRD file, told apart by how it begins.
+    """Read the header of a MetaImage, NRRD or Matroska file, told apart by how it begins.
 
     Raises
     ------
@@ -84,11 +89,10 @@ def read_header(path: Path) -> ImageFile:
     """
     path = Path(path)
     with opened(path) as stream:
-        start = stream.read(len(MATROSKA))
+        start = stream.read(len(matroska.START))
         stream.seek(0)
-        if start == MATROSKA:
-            advice = "PLUS's EditSequenceFile writes it as .igs.mha; its images alone are a clip for import-sweep"
-            raise InputError(f"{path}: expected a MetaImage or NRRD file, found a Matroska video (.mkv): {advice}")
+        if start == matroska.START:
+            return _matroska(path)
         file = _nrrd(path, stream) if start == b"NRRD" else _metaimage(path, stream)
     _check_length(file)
     return file
@@ -250,7 +254,62 @@ def check_beside(header: Path, data: Path) -> None:
         raise fault(header, "data file", "LOCAL or the name of a file in the header's folder", repr(str(data)))
 
 
+def _matroska(path: Path) -> ImageFile:
+    """A sequence as PLUS writes it with the suffix .mkv: texts belong to the frame of the same time."""
+    file = matroska.read(path)
+    videos = [number for number in file.of_kind(matroska.VIDEO) if file.frames.get(number)]
+    if len(videos) != 1:
+        raise fault(path, "tracks", "one of images", len(videos))
+    track, frames = file.tracks[videos[0]], tuple(file.frames[videos[0]])
+    width, height = track.number(matroska.WIDTH), track.number(matroska.HEIGHT)
+    coded = track.text(matroska.CODEC) != UNCOMPRESSED
+    if coded:
+        frames = tuple(sorted(frames))  # as they are shown, which may not be the order in which they are decoded
+    channels = 1 if track.text(matroska.COLOUR) == GREY and not coded else 3
+    wrong = [frame.length for frame in frames if frame.length != width * height * channels]
+    if not 0 < width * height <= MOST_PX or (wrong and not coded):
+        raise fault(path, "frames", f"{width} x {height} pixels of {channels} bytes", f"{(wrong or [0])[0]} bytes")
+    fields = {"Kinds": "domain domain list", "TrackName": track.text(matroska.NAME)}
+    of_time: dict[int, list[int]] = {}
+    for number, frame in enumerate(frames):
+        of_time.setdefault(frame.time_ns, []).append(number)
+        fields[f"Seq_Frame{number:04d}_Timestamp"] = repr(frame.time_ns * 1e-9)
+    with opened(path) as stream:
+        for text in file.of_kind(*matroska.TEXTS):
+            name, used = file.tracks[text].text(matroska.NAME), dict[int, int]()
+            for frame in file.frames.get(text, []):
+                k = used[frame.time_ns] = used.get(frame.time_ns, -1) + 1  # frames of one time take texts in their order
+                numbers = of_time.get(frame.time_ns, [])
+                if k < len(numbers) and frame.length <= matroska.MOST_TEXT:
+                    stream.seek(frame.offset)
+                    value = stream.read(frame.length).split(b"\0")[0].decode("utf-8", "surrogateescape")
+                    fields[f"Seq_Frame{numbers[k]:04d}_{name}"] = value.strip()
+    return ImageFile(path, fields, (width, height, len(frames)), np.dtype("u1"), False, path, 0, channels, frames, coded)
+
+
+def _decoded(file: ImageFile) -> Iterator[bytes]:
+    """Images of a Matroska file : (h, w, 3), red first, one by one."""
+    video, shape = video_file.opened(file.path), (file.size[1], file.size[0], 3)
+    try:
+        for number in range(len(file.frames)):
+            found, image = video.read()
+            if not found or image.shape != shape:
+                raise file.fault("frames", f"{len(file.frames)} images of {shape[1]} x {shape[0]} that OpenCV can decode", number)
+            yield image[..., ::-1].tobytes()
+    finally:
+        video.release()
+
+
 def _pieces(file: ImageFile) -> Iterator[bytes]:
+    if file.coded:
+        yield from _decoded(file)
+        return
+    if file.frames:
+        with opened(file.path) as stream:
+            for frame in file.frames:
+                stream.seek(frame.offset)
+                yield stream.read(frame.length)
+        return
     unpacker = zlib.decompressobj(wbits=47) if file.packed else None  # 47: a zlib or a gzip stream
     with opened(file.data_path) as stream:
         stream.seek(file.data_offset)

@@ -21,7 +21,7 @@ from recon.model.fan import Fan
 
 Array = NDArray[np.float64]
 
-COMPOUNDING: dict[str, Compounding] = {"MEAN": "mean", "MAXIMUM": "maximum", "LATEST": "latest"}
+COMPOUNDING: dict[str, Compounding] = {"MEAN": "mean", "MAXIMUM": "maximum", "LATEST": "latest", "IMPORTANCE_MASK": "weighted"}
 INTERPOLATION: dict[str, Interpolation] = {"NEAREST_NEIGHBOR": "nearest", "LINEAR": "linear"}
 ARITHMETIC: dict[str, Arithmetic] = {"FULL": "plus_full", "PARTIAL": "plus_partial", "NONE": "plus_none"}
 EARLIER = {"WEIGHTED_AVERAGE": "MEAN", "MAXIMUM": "MAXIMUM"}
@@ -118,7 +118,8 @@ def _volume(path: Path, element: Element) -> VolumeSettings:
     arithmetic = ARITHMETIC[_choice(path, element, "Optimization", "FULL", ARITHMETIC)]
     x, y, z = spacing.tolist()
     holes, clip = _sticks(path, element), _clip(path, element)
-    return VolumeSettings((x, y, z), "aligned", compounding, interpolation, clip, *holes, arithmetic=arithmetic)
+    weights = path.parent / _text(path, element, "ImportanceMaskFilename") if compounding == "weighted" else None
+    return VolumeSettings((x, y, z), "aligned", compounding, interpolation, clip, *holes, None, arithmetic, weights)
 
 
 def _earlier_compounding(path: Path, element: Element) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from recon.capture import probe_files
+from recon.capture.images import read_image
 from recon.capture.sweep_part import SweepCapture
 from recon.errors import InputError
 from recon.files.metrics import Metrics
@@ -124,15 +125,30 @@ class VolumeSettings:
     hole_sticks: int = 1  # the shortest ones that count
     fan: Fan | None = None  # within the clip
     arithmetic: Arithmetic = "floating"  # or that of the PLUS toolkit
+    weights: Path | None = None  # image of the pixels' weights, of the weighted compounding
 
     def part(self, shape: tuple[int, int]) -> tuple[Clip | None, Mask | None]:
         """Rectangle and pixels, of images (h, w), that are used; without a clip the rectangle about the fan."""
+        weights = self.weights_of(shape)
+        counted = None if weights is None else weights > 0
         if self.fan is None:
-            return self.clip, None
+            return self.clip, counted
         mask = self.fan.mask(shape, 0 if self.arithmetic == "plus_none" else 1)
         if not mask.any():
             raise InputError(f"fan: expected a part of an image of {shape[1]}x{shape[0]}, found {self.fan}")
-        return self.clip or Clip(*fan.box(mask)), mask
+        return self.clip or Clip(*fan.box(mask)), mask if counted is None else mask & counted
+
+    def weights_of(self, shape: tuple[int, int]) -> NDArray[np.uint8] | None:
+        """Weights of the pixels of images (h, w), if they have any; InputError without a file of theirs, or of another size."""
+        if (self.weights is None) == (self.compounding == "weighted"):
+            found = f"{self.weights or 'none'} with compounding={self.compounding}"
+            raise InputError(f"weights: expected an image with compounding=weighted, and only then, found {found}")
+        if self.weights is None:
+            return None
+        weights = read_image(self.weights, shape[::-1], 8)
+        if not weights.any():
+            raise InputError(f"{self.weights}: expected weights above 0, found none")
+        return weights
 
 
 @dataclass(frozen=True)
@@ -356,6 +372,7 @@ def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES)
         None if mask is None else repeat(mask),
         most_bytes=most_bytes,
         arithmetic=settings.arithmetic,
+        weights=settings.weights_of(scans.shape),
     )
     if settings.hole_voxels == 0:
         return pasted, pasted

@@ -1,8 +1,10 @@
 """Transforms of a sequence that can be believed, and those of a tracker's own file, put at the times of the images."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +14,10 @@ from recon.errors import InputError
 from recon.freehand import sequences
 from recon.freehand.sequences import TRANSFORM, Frames
 from recon.model import pose_checks, tracks
-from recon.model.pose_checks import Implausible
+from recon.model.pose_checks import LIMITS, Implausible
 from recon.model.tracks import Track
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -69,7 +73,7 @@ def believed(
     Raises
     ------
     InputError
-        If too many are implausible, or of another unit; see `recon.model.pose_checks`.
+        If too many are implausible, of another unit, or all the same; see `recon.model.pose_checks`.
     """
     valid, numbers, left_out = dict(frames.valid), np.arange(len(frames.times_s), dtype=float), np.empty(0, np.int64)
 
@@ -77,7 +81,8 @@ def believed(
     def changes() -> tuple[Array, Array]:
         return numbers, pose_checks.image_changes(sequences.stream_images(path))
 
-    for name in leading(frames, to, of, fixed):
+    names = leading(frames, to, of, fixed)
+    for name in names:
         if not _moves(frames.transforms[name], valid[name]):
             continue
         poses = np.where(valid[name][:, None, None], frames.transforms[name], np.nan)
@@ -85,7 +90,21 @@ def believed(
         kept, found = pose_checks.checked(place, frames.times_s, poses, implausible, images, numbers, "frame")
         valid[name] = np.isfinite(kept).all(axis=(1, 2))
         left_out = np.union1d(left_out, found.all)
-    return replace(frames, valid=valid), len(left_out)
+    result = replace(frames, valid=valid)
+    if names:
+        pose_checks.check_motion(f"{path}: {', '.join(names)}", sequences.poses(result, to, of, fixed), implausible)
+        _warn_of_untracked(path, result, names)
+    return result, len(left_out)
+
+
+def _warn_of_untracked(path: Path, frames: Frames, names: list[str]) -> None:
+    """Name a tool that is always at the same place, while one farther along the chain, in the same tracker's frame, moves."""
+    moves = {name: _moves(frames.transforms[name], frames.valid[name]) for name in names}
+    for name, later in combinations(names, 2):
+        count, (tool, tracker) = int(frames.valid[name].sum()), TRANSFORM.findall(name)[0]
+        if not moves[name] and moves[later] and later.endswith(f"To{tracker}") and count > LIMITS.repeats:
+            told = f"the same to the last digit in all {count} frames while {later} moves: was {tool} tracked?"
+            log.warning("%s: %s: %s", path, name, told)
 
 
 def leading(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = None) -> list[str]:

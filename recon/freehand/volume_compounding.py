@@ -18,17 +18,17 @@ from recon.compiled import njit
 from recon.errors import InputError
 from recon.files.volumes import Volume
 from recon.freehand import plus_arithmetic
-from recon.freehand.plus_arithmetic import Arithmetic
+from recon.freehand.plus_arithmetic import MAXIMUM, MEAN, WEIGHTED, Arithmetic, Slice
 from recon.geometry import rigid
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Compounding = Literal["mean", "maximum", "latest"]
+Compounding = Literal["mean", "maximum", "latest", "weighted"]
 Interpolation = Literal["nearest", "linear"]
 Length = Annotated[int, Field(gt=0)]
 Rectangle = tuple[int, int, Length, Length]  # u, v, width, height of a clip, px; of a setting
 
-RULES = {"mean": 0, "maximum": 1, "latest": 2}
+RULES = {"mean": MEAN, "maximum": MAXIMUM, "latest": 2, "weighted": WEIGHTED}
 LEAST_WEIGHT = 0.125  # of a voxel that a pixel is the maximum or the latest of: that of all eight where it lies in their middle
 BYTES_PER_VOXEL = 10  # sum and weight in float32; the grey value, and whether it is filled
 MOST_BYTES = 4 << 30
@@ -160,6 +160,7 @@ def reconstruct(
     masks: Iterable[Mask | None] | None = None,
     most_bytes: int = MOST_BYTES,
     arithmetic: Arithmetic = "floating",
+    weights: NDArray[np.uint8] | None = None,
 ) -> Reconstruction:
     """Put B-scans into a volume.
 
@@ -172,7 +173,7 @@ def reconstruct(
     grid : Grid
         Pixels outside are left out.
     compounding
-        Rule for the pixels in a voxel: their mean, the greatest, or the latest.
+        Rule for the pixels in a voxel: their mean, the greatest, the latest, or their mean by `weights`.
     interpolation
         A pixel counts for the nearest voxel or, by its distance, for the eight around it.
     masks : n times (h, w) bool, optional
@@ -181,6 +182,8 @@ def reconstruct(
         Largest memory of the volume, 10 bytes a voxel.
     arithmetic
         Other than floating: that of the PLUS toolkit, see `recon.freehand.plus_arithmetic`.
+    weights : (h, w) uint8, optional
+        Of the pixels of each image, for the weighted compounding; those of weight 0 don't count.
 
     Raises
     ------
@@ -192,6 +195,11 @@ def reconstruct(
     world_from_pixel = arguments.places_of_pixels("world_from_pixel", world_from_pixel)
     if compounding not in RULES or interpolation not in ("nearest", "linear"):
         raise ValueError(f"no compounding {compounding!r} or interpolation {interpolation!r}")
+    arguments.of_kind("weights", weights, np.ndarray, type(None))
+    if (weights is None) != (compounding != "weighted"):
+        found = f"{'none' if weights is None else 'some'} with {compounding}"
+        raise InputError(f"weights: expected with the weighted compounding, and only then, found {found}")
+    own = np.empty((0, 0), np.uint8) if weights is None else np.ascontiguousarray(weights)
     shape = grid.size[::-1]
     if np.prod(grid.size, dtype=float) * BYTES_PER_VOXEL > most_bytes:
         needed = np.prod(grid.size, dtype=float) * BYTES_PER_VOXEL / 2**30
@@ -214,16 +222,21 @@ def reconstruct(
                 found = f"{image.shape} of {image.dtype}, mask {taken.shape}"
                 raise InputError(f"image {count - 1}: expected height x width of uint8 and a mask like it, found {found}")
             bounds = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
-            plain, rule, linear = np.ascontiguousarray(image), RULES[compounding], interpolation == "linear"
+            if weights is not None:
+                if own.shape != image.shape or own.dtype != np.uint8:
+                    raise InputError(f"weights: expected {image.shape} of uint8 as the image, found {own.shape} of {own.dtype}")
+                taken = taken & (own > 0)
+            rule, linear = RULES[compounding], interpolation == "linear"
+            plain = Slice(np.ascontiguousarray(image), np.ascontiguousarray(taken), own, bounds)
             if sums is not None:
-                (_paste_linear if linear else _paste_nearest)(plain, taken, bounds, matrix, sums, rule)
+                (_paste_linear if linear else _paste_nearest)(plain, matrix, sums, rule)
             else:
                 levels, fixed = plus_arithmetic.Levels(voxels, weight), arithmetic == "plus_full"
-                plus_arithmetic.paste(plain, taken, bounds, matrix, levels, rule, linear, fixed)
+                plus_arithmetic.paste(plain, matrix, levels, rule, linear, fixed)
     if count < len(world_from_pixel):
         raise InputError(f"images: expected as many as poses, {len(world_from_pixel)}, found {count}")
     if sums is not None:
-        _finish(sums, compounding == "mean", voxels)
+        _finish(sums, compounding in ("mean", "weighted"), voxels)
     filled = (weight if sums is None else sums.weight) > 0
     return Reconstruction(Volume(voxels, grid.origin, grid.spacing, grid.directions), filled)
 
@@ -247,37 +260,39 @@ class Sums(NamedTuple):
 
 
 @njit
-def _paste_nearest(image, mask, bounds, voxel_from_pixel, sums: Sums, rule):
+def _paste_nearest(image: Slice, voxel_from_pixel, sums: Sums, rule):
     m = voxel_from_pixel
-    left, right, top, bottom = bounds
+    left, right, top, bottom = image.bounds
     nz, ny, nx = sums.value.shape
     for v in range(top, bottom + 1):
         for u in range(left, right + 1):
-            if not mask[v, u]:
+            if not image.mask[v, u]:
                 continue
+            part = np.float32(image.weight[v, u]) if rule == WEIGHTED else np.float32(1.0)
             i = int(np.floor(m[0, 0] * u + m[0, 1] * v + m[0, 3] + 0.5))
             j = int(np.floor(m[1, 0] * u + m[1, 1] * v + m[1, 3] + 0.5))
             k = int(np.floor(m[2, 0] * u + m[2, 1] * v + m[2, 3] + 0.5))
             if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
-                _compound(sums, k, j, i, image[v, u], np.float32(1.0), rule)
+                _compound(sums, k, j, i, image.grey[v, u], part, rule)
 
 
 @njit
-def _paste_linear(image, mask, bounds, voxel_from_pixel, sums: Sums, rule):
+def _paste_linear(image: Slice, voxel_from_pixel, sums: Sums, rule):
     m = voxel_from_pixel
-    left, right, top, bottom = bounds
+    left, right, top, bottom = image.bounds
     for v in range(top, bottom + 1):
         for u in range(left, right + 1):
-            if not mask[v, u]:
+            if not image.mask[v, u]:
                 continue
+            part = np.float32(image.weight[v, u]) if rule == WEIGHTED else np.float32(1.0)
             x = m[0, 0] * u + m[0, 1] * v + m[0, 3]
             y = m[1, 0] * u + m[1, 1] * v + m[1, 3]
             z = m[2, 0] * u + m[2, 1] * v + m[2, 3]
-            _share_out(sums, x, y, z, image[v, u], rule)
+            _share_out(sums, x, y, z, image.grey[v, u], part, rule)
 
 
 @njit(inline="always")
-def _share_out(sums: Sums, x, y, z, grey, rule):
+def _share_out(sums: Sums, x, y, z, grey, part, rule):
     """Share a pixel out to the eight voxels around it, by its distance from each."""
     nz, ny, nx = sums.value.shape
     i0, j0, k0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
@@ -285,17 +300,17 @@ def _share_out(sums: Sums, x, y, z, grey, rule):
         for j in range(max(j0, 0), min(j0 + 2, ny)):
             for i in range(max(i0, 0), min(i0 + 2, nx)):
                 share = np.float32((1 - abs(x - i)) * (1 - abs(y - j)) * (1 - abs(z - k)))
-                if share >= LEAST_WEIGHT or (rule == 0 and share > 0):
-                    _compound(sums, k, j, i, grey, share, rule)
+                if share >= LEAST_WEIGHT or (rule in (MEAN, WEIGHTED) and share > 0):
+                    _compound(sums, k, j, i, grey, part * share, rule)
 
 
 @njit(inline="always")
 def _compound(sums: Sums, k, j, i, grey, share, rule):
     value, weight = sums.value, sums.weight
-    if rule == 0:
+    if rule in (MEAN, WEIGHTED):
         value[k, j, i] += share * grey
         weight[k, j, i] += share
-    elif rule == 1:
+    elif rule == MAXIMUM:
         value[k, j, i] = max(value[k, j, i], np.float32(grey))
         weight[k, j, i] = 1
     else:

@@ -34,6 +34,8 @@ class Usual:
 BOARD_STEP = Usual(0.5, 1000.0)  # from point to point of a calibration board
 DEVICES_APART = Usual(2.0, 20_000.0)  # from camera to camera or projector
 BRACKET = Usual(1.0, 2000.0)  # from a probe's target to its image's corner
+TARGET_STEP = Usual(5.0, 1000.0)  # from circle to circle of a probe's target
+TARGET_CIRCLE = Usual(2.5, 500.0)  # outer diameter of its circles
 PIXEL = Usual(0.002, 5.0)  # of a B-scan
 B_SCAN = Usual(2.0, 600.0)  # width and depth of a B-scan, or of a whole screen
 MOST_COSINE = 0.17  # between the axes of a B-scan's image, which calibrations by point pairs leave 3 degrees off at times

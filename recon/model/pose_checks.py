@@ -26,6 +26,7 @@ Changes = Callable[
 
 STEP_PX = 4  # of the pixels that are compared from image to image
 LOST = -3.697314e28  # of a coordinate, which NDI's trackers write where a tool isn't seen
+WAY = "to use them all the same, give implausible=take"
 WORDS: dict[Cause, str] = {
     "identity": "the identity, as of a tool that is not seen",
     "frozen": "the same to the last digit as the one before while the images change, as of a tracker that stood still",
@@ -50,6 +51,9 @@ class MotionLimits:
     repeats: int = 4  # poses in a row that are the same, at least, before images are compared
     changed: float = 0.7  # times the usual change from image to image of a moving probe
     changed_before_jump: float = 0.3  # the same, where the pose jumps when it goes on
+    small_mm: tuple[float, float] = (2.0, 20.0)  # a sweep's extent that might be in centimetres, as few in mm are; from noise on
+    near_mm: float = 150.0  # the same of its farthest place from the origin
+    slow_mm_s: float = 4.0  # and of its median speed
     least_covered: float = 0.8  # share of the images with a pose, below which it is said
     most_share: float = 1 / 3  # of poses that may be left out
 
@@ -63,7 +67,6 @@ class Findings:
 
     count: int = 0  # of the poses that there were
     rows: dict[Cause, Rows] = field(default_factory=dict)
-    resting: str = ""  # said of a sweep whose poses are all the same
 
     @property
     def all(self) -> Rows:
@@ -72,8 +75,7 @@ class Findings:
 
     def lines(self, what: str = "pose") -> list[str]:
         """A sentence for each cause: the number of poses, and the first of them."""
-        said = [self.resting] if self.resting else []
-        return said + [
+        return [
             f"{len(rows)} of {self.count} poses, from {what} {rows[0]} on: {WORDS[cause]}" for cause, rows in self.rows.items()
         ]
 
@@ -101,6 +103,7 @@ def checked(
     changes: Changes | None = None,
     clock: Array | None = None,
     what: str = "pose",
+    unit: str = "",
 ) -> tuple[Array, Findings]:
     """The poses of a sweep without those that are implausible, and these; all of them where they are to be taken.
 
@@ -109,6 +112,7 @@ def checked(
     place : of the poses, for messages
     what : word for one of them
     times_s, poses, changes, clock : as of `find`
+    unit : field that says in which unit they are, if there is one
 
     Raises
     ------
@@ -116,7 +120,7 @@ def checked(
         If their lengths are of another unit, or more would be left out than may be.
     """
     found, fault = find(times_s, poses, changes, clock), unit_fault(poses)
-    way = "to use them all the same, give implausible=take"
+    way = f"give {unit}; {WAY}" if unit else WAY
     if implausible == "take":
         for line in [*([fault] if fault else []), *found.lines(what)]:
             log.warning("%s: taken all the same: %s", place, line)
@@ -126,12 +130,23 @@ def checked(
         if fault:
             raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
         expected = f"a motion that a hand makes, but for {100 * LIMITS.most_share:.0f} % at most"
-        raise InputError(f"{place}: poses: expected {expected}, found {'; '.join(found.lines(what))}; {way}")
+        raise InputError(f"{place}: poses: expected {expected}, found {'; '.join(found.lines(what))}; {WAY}")
     if fault := unit_fault(kept):
         raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
-    for line in found.lines(what):
-        log.warning("%s: %s%s", place, "" if found.resting == line else "left out ", line)
+    for line in [f"left out {line}" for line in found.lines(what)] + unit_doubts(times_s, kept, unit):
+        log.warning("%s: %s", place, line)
     return kept, found
+
+
+def check_motion(place: str, poses: Array, implausible: Implausible = "refuse") -> None:
+    """Refuse a sweep : (n, 4, 4), NaN where there is no pose, of more than a few that are all the same; or say so only."""
+    known = poses[np.isfinite(poses).all(axis=(1, 2))]
+    if len(known) <= LIMITS.repeats or not (known == known[0]).all():
+        return
+    found = f"all {len(known)} the same to the last digit: no tracking, or a probe at rest?"
+    if implausible == "refuse":
+        raise InputError(f"{place}: poses: expected those of a probe that moves, found {found} {WAY}")
+    log.warning("%s: taken all the same: poses that are %s", place, found.rstrip("?"))
 
 
 def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Array | None = None) -> Findings:
@@ -151,13 +166,13 @@ def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Ar
     left = there[~lost]
     if lost.any():
         rows["identity"] = there[lost]
-    frozen, resting = _frozen(clock[left], poses[left], changes)
+    frozen = _frozen(clock[left], poses[left], changes)
     if len(frozen):
         rows["frozen"], left = left[frozen], np.delete(left, frozen)
     jumped = _jumps(times_s[left], poses[left])
     if len(jumped):
         rows["jump"] = left[jumped]
-    return Findings(len(there), rows, resting)
+    return Findings(len(there), rows)
 
 
 def unit_fault(poses: Array) -> str | None:
@@ -168,9 +183,27 @@ def unit_fault(poses: Array) -> str | None:
     span, farthest = float(np.linalg.norm(np.ptp(places, axis=0))), float(np.abs(places).max())
     if 1e-6 < span < 1 and farthest < 5:
         return f"all within {span:.3g} mm, and {farthest:.3g} mm from the origin: metres?"
-    if span > 5000:
-        return f"a sweep over {span:.4g} mm: micrometres?"
+    if (most := float(np.linalg.norm(np.subtract(*np.percentile(places, [90, 10], axis=0))))) > 5000:  # a few may be wrong
+        return f"a sweep over {most:.4g} mm: micrometres?"
     return None
+
+
+def unit_doubts(times_s: Array, poses: Array, unit: str = "") -> list[str]:
+    """What is said of a sweep that may well be one in mm, but is small, near and slow as those in centimetres are; else none."""
+    found = np.isfinite(poses).all(axis=(1, 2))
+    places, times = poses[found, :3, 3], times_s[found]
+    if len(places) <= LIMITS.repeats:
+        return []
+    span, farthest = float(np.linalg.norm(np.ptp(places, axis=0))), float(np.linalg.norm(places, axis=1).max())
+    if not LIMITS.small_mm[0] < span < LIMITS.small_mm[1] or farthest > LIMITS.near_mm:
+        return []
+    told = f"all poses lie within {span:.3g} mm, and up to {farthest:.3g} mm from the origin"
+    if (seconds := _seconds(times)) is not None:
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.maximum(np.diff(seconds), _shortest(seconds))
+        if (speed := float(np.median(steps))) > LIMITS.slow_mm_s:
+            return []
+        told += f", at {speed:.2g} mm/s"
+    return [f"{told}: is it in mm, not in centimetres?" + (f" Else give {unit}" if unit else "")]
 
 
 def image_changes(images: Iterable[NDArray]) -> Array:
@@ -200,16 +233,15 @@ def _lost(poses: Array) -> NDArray[np.bool_]:
     return same
 
 
-def _frozen(times_s: Array, poses: Array, changes: Changes | None) -> tuple[Rows, str]:
-    """Rows of poses that repeat the one before to the last digit, long, while the images change; and a word on one that rests."""
+def _frozen(times_s: Array, poses: Array, changes: Changes | None) -> Rows:
+    """Rows of poses that repeat the one before to the last digit, long, while the images change."""
     same = (poses[1:] == poses[:-1]).all(axis=(1, 2))
     starts = np.concatenate([[0], np.flatnonzero(~same) + 1])
     lengths = np.diff([*starts, len(poses)])
-    if len(poses) > LIMITS.repeats and len(lengths) == 1:
-        return np.empty(0, np.int64), f"all {len(poses)} poses are the same to the last digit: a probe at rest, or no tracking"
-    long = (lengths > LIMITS.repeats) & (lengths > 3 * np.median(lengths))
+    usual_length = np.sort(lengths)[(len(lengths) - 1) // 2]  # of a tracker that is slower than the images
+    long = (lengths > LIMITS.repeats) & (lengths > 3 * usual_length)
     if not long.any() or changes is None:
-        return np.empty(0, np.int64), ""
+        return np.empty(0, np.int64)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[~same]
     moments, change = changes()
     resting = np.zeros(len(moments), bool)
@@ -224,7 +256,7 @@ def _frozen(times_s: Array, poses: Array, changes: Changes | None) -> tuple[Rows
         least = LIMITS.changed_before_jump if jump else LIMITS.changed
         if len(own) >= 3 and np.median(own) > least * usual > 0:
             frozen.append(np.arange(start + 1, end))
-    return np.concatenate([np.empty(0, np.int64), *frozen]), ""
+    return np.concatenate([np.empty(0, np.int64), *frozen])
 
 
 def _during(moments: Array, times_s: Array) -> NDArray[np.bool_]:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from recon import arguments
 from recon.geometry import rigid
@@ -14,7 +14,25 @@ from recon.model.calibration import Uncertainty
 Array = NDArray[np.float64]
 
 SPEEDS = (300.0, 5000.0)  # m/s, of anything that is scanned
-Speed = Annotated[float, Field(ge=SPEEDS[0], le=SPEEDS[1], allow_inf_nan=False)]  # m/s; of a setting
+SPEED_UNITS = {1e3: "km/s", 1e-2: "cm/s", 1e-3: "mm/s"}  # m/s of each
+
+
+def speed_fault(value: float) -> str | None:
+    """The fault of a speed of sound that nothing has which is scanned, with the unit in which it would be one; None of others."""
+    least, most = SPEEDS
+    if least <= value <= most:
+        return None
+    unit = next((name for factor, name in SPEED_UNITS.items() if least <= value * factor <= most), None)
+    return f"expected a speed of sound of {least:g} to {most:g} m/s, found {value:g}" + (f": {unit}?" if unit else "")
+
+
+def _speed(value: float) -> float:
+    if fault := speed_fault(value):
+        raise ValueError(fault)
+    return value
+
+
+Speed = Annotated[float, AfterValidator(_speed)]  # m/s; of a setting
 SpeedSigma = Annotated[float, Field(ge=0, le=500)]  # m/s; of a setting
 SCANNER_SPEED = 1540.0  # m/s, a mean of soft tissues, which scanners assume
 

@@ -5,13 +5,14 @@ World is the frame of camera 1. Every field has a unit; nonsense is refused with
 
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from recon.geometry import rigid
 from recon.geometry.camera import DISTORTION_LENGTHS, Camera
+from recon.model.lengths import TARGET_CIRCLE, TARGET_STEP
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -157,6 +158,15 @@ class Target(Part):
     curvature_per_m: Vector = (0.0, 0.0, 0.0)  # of a bowed board: d2z/dx2, d2z/dxdy, d2z/dy2
     tolerance_mm: Annotated[float, Field(ge=0, le=5)] = 0.1  # of each circle's place along each axis, one standard deviation
     covariance_mm2: tuple[Vector, Vector, Vector] | None = None  # of c1, c2_aside, c2 as measured; instead of the tolerance
+    unusual: bool = False  # lengths that no usual target has, such as circles of less than 2.5 mm, are meant
+
+    @model_validator(mode="after")
+    def _usual_lengths(self) -> Self:
+        for name, usual in (("c1_mm", TARGET_STEP), ("c2_mm", TARGET_STEP), ("outer_diameter_mm", TARGET_CIRCLE)):
+            fault = usual.fault(getattr(self, name))
+            if fault and not self.unusual:
+                raise ValueError(f"{name}: expected {usual}, found {fault} If it is right, give unusual=true with it")
+        return self
 
     @field_validator("inner_diameter_mm")
     @classmethod

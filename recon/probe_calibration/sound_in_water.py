@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
-from recon.model.probe import SCANNER_SPEED, SPEEDS, ProbeCalibration
+from recon.model.probe import SCANNER_SPEED, ProbeCalibration, speed_fault
 
 Array = NDArray[np.float64]
 
@@ -118,8 +118,8 @@ def for_tissue(calibration: ProbeCalibration, speed: float | None, sigma: float 
 
 def _check(**speeds: float) -> None:
     for name, value in speeds.items():
-        if not SPEEDS[0] <= value <= SPEEDS[1]:
-            raise InputError(f"{name}: expected a speed of sound of {SPEEDS[0]:g} to {SPEEDS[1]:g} m/s, found {value:g}")
+        if fault := speed_fault(value):
+            raise InputError(f"{name}: {fault}")
 
 
 def _jacobian(names: tuple[str, ...], depth: Array, sy: float, ratio: float, face_row: float) -> tuple[Array, Array]:

@@ -4,9 +4,8 @@ Measured are the ellipses of all rims, centres and shapes; predicted are those o
 held by their covariance, so that the target's has their errors in it: its scale is that of the cameras' baseline.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -24,7 +23,7 @@ from recon.model import circle_layout
 from recon.model.calibration import Uncertainty
 from recon.model.rig import Target
 from recon.target_calibration import target_poses
-from recon.target_calibration.target_poses import Fault, Seen
+from recon.target_calibration.target_poses import Collected, Seen
 from recon.tracking.tracker import Tracking
 
 Array = NDArray[np.float64]
@@ -59,6 +58,8 @@ class Adjusted:
     centre_rms_px: float
     shape_rms_px: float
     used: NDArray[np.bool_]  # (n,) of the pairs
+    pairs: tuple[Seen, ...]
+    collected: Collected = field(default_factory=Collected)  # of the film that the pairs are from, by `calibrate`
 
 
 class _Devices(NamedTuple):
@@ -111,10 +112,10 @@ def calibrate(
     Parameters
     ----------
     tracked : n results of a tracker's steps
-        Taken one by one; those in which all six rims are whole and evenly lit count, of poses that differ.
+        Taken one by one; those in which all six rims are whole count, of poses that differ, in even light if these are enough.
     cameras : the tracker's
     design : where to start; its inner diameter and board stay.
-    optics : of the cameras' calibration; None where it isn't known, or exact.
+    optics : of the cameras as they are now, `Tracker.optics_in_use`; None of exact ones.
     name : str
         Of the film, for messages.
 
@@ -126,14 +127,10 @@ def calibrate(
     arguments.of_kind("design", design, Target)
     arguments.of_kind("optics", optics, Uncertainty, type(None))
     arguments.of_kind("tracked", tracked, Iterable)
-    seen, faults = list[Seen](), Counter[Fault]()
-    for found in tracked:
-        arguments.of_kind("tracked", found, Tracking, way="sonotwin.Tracker.step gives them")
-        pair = target_poses.whole(found, cameras)
-        seen.append(pair) if isinstance(pair, Seen) else faults.update([pair])
-    pairs = target_poses.spread(target_poses.distinct(seen), most_poses)
-    target_poses.check(pairs, name, faults, least_tilt_deg, least_range_mm)
-    return adjust(pairs, design, optics)
+    collected = target_poses.collect(tracked, cameras)
+    pairs = target_poses.spread(target_poses.evenly_lit(collected.seen), most_poses)
+    target_poses.check(pairs, name, collected, least_tilt_deg, least_range_mm)
+    return replace(adjust(pairs, design, optics), collected=collected)
 
 
 def adjust(pairs: Sequence[Seen], design: Target, optics: Uncertainty | None) -> Adjusted:
@@ -160,7 +157,8 @@ def adjust(pairs: Sequence[Seen], design: Target, optics: Uncertainty | None) ->
     covariance[3, 3] += (RIM_BIAS * design.outer_diameter_mm) ** 2
     residuals = _residuals(pairs, devices, unknowns)[used]
     centres, shapes = (float(np.sqrt(np.mean(part**2))) for part in (residuals[:, :CENTRES], residuals[:, CENTRES:]))
-    return Adjusted(_measured_target(unknowns.target, covariance, design), covariance, noise, centres, shapes, used)
+    target = _measured_target(unknowns.target, covariance, design)
+    return Adjusted(target, covariance, noise, centres, shapes, used, tuple(pairs))
 
 
 def _measured_target(values: Array, covariance: Array, design: Target) -> Target:

@@ -1,6 +1,6 @@
 """Figures of a measured target, and the lines that report them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -9,12 +9,12 @@ from recon.model import circle_layout
 from recon.model.rig import Target
 from recon.target_calibration import target_poses
 from recon.target_calibration.target_bundle import NAMES, Adjusted
-from recon.target_calibration.target_poses import Seen
+from recon.tracking import track_figures
 
 
-def measure(adjusted: Adjusted, pairs: Sequence[Seen], design: Target) -> Metrics:
+def measure(adjusted: Adjusted, design: Target) -> Metrics:
     """Figures, each named with its unit."""
-    target, sigma = adjusted.target, np.sqrt(np.diag(adjusted.covariance))
+    pairs, target, sigma = adjusted.pairs, adjusted.target, np.sqrt(np.diag(adjusted.covariance))
     values = [*circle_layout.lengths(target).tolist(), target.outer_diameter_mm, *target.curvature_per_m]
     nominal = [*circle_layout.lengths(design).tolist(), design.outer_diameter_mm]
     across, high = target.board_mm
@@ -32,6 +32,16 @@ def measure(adjusted: Adjusted, pairs: Sequence[Seen], design: Target) -> Metric
         "bow_across_mm": 1e-3 * target.curvature_per_m[0] * across**2 / 8,
         "bow_along_mm": 1e-3 * target.curvature_per_m[2] * high**2 / 8,
     }
+
+
+def found(adjusted: Adjusted) -> Iterator[str]:
+    """Lines: pairs of the film, and a second target, if there is one."""
+    pairs, collected = adjusted.pairs, adjusted.collected
+    uneven = sum(not pair.even for pair in pairs)
+    dim = f", {uneven} of them in uneven light: less exact" if uneven else ""
+    count = f"{len(collected.seen)} of {len(collected.apart_mm)}"
+    yield f"found       {count} pairs whole, {len(pairs)} poses that differ{dim}"
+    yield from track_figures.second_target(collected.apart_mm)
 
 
 def describe(figures: Metrics) -> Iterator[str]:

@@ -1,12 +1,14 @@
 """Pairs of frames from which the target is measured: both cameras see all three circles whole, in poses that differ."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import arguments
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
@@ -27,6 +29,33 @@ class Seen:
     views: tuple[Sighting, Sighting]
     world_from_target: Array  # (4, 4) mm, as the tracker found it
     even: bool = True  # whether the light is even on all rims; else their centres are less certain, as their covariances have it
+
+
+@dataclass(frozen=True)
+class Collected:
+    """The pairs of a film that may measure the target, and why the others don't."""
+
+    seen: tuple[Seen, ...] = ()
+    faults: Mapping[Fault, int] = field(default_factory=dict)  # numbers of the others
+    apart_mm: tuple[float | None, ...] = ()  # of each pair, as of `Tracking`
+
+    @property
+    def told(self) -> str:
+        """Numbers of pairs by their fault, and a second target, to be added to a message."""
+        faults = "".join(f", {count} pairs {fault}" for fault, count in self.faults.items())
+        two = any(one is not None and np.isfinite(one) for one in self.apart_mm)
+        return faults + (", and a second target of this design: cover it" if two else "")
+
+
+def collect(tracked: Iterable[Tracking], cameras: tuple[Camera, Camera]) -> Collected:
+    """Pairs of a film, taken one by one, in which all six circles are whole, and numbers of the others."""
+    seen, faults, apart = list[Seen](), Counter[Fault](), list[float | None]()
+    for found in tracked:
+        arguments.of_kind("tracked", found, Tracking, way="sonotwin.Tracker.step gives them")
+        pair = whole(found, cameras)
+        seen.append(pair) if isinstance(pair, Seen) else faults.update([pair])
+        apart.append(found.apart_mm)
+    return Collected(tuple(seen), faults, tuple(apart))
 
 
 def whole(found: Tracking, cameras: tuple[Camera, Camera]) -> Seen | Fault:
@@ -85,17 +114,12 @@ def range_mm(pairs: Sequence[Seen]) -> float:
     return float(np.ptp(depths))
 
 
-def counted(faults: Mapping[Fault, int]) -> str:
-    """Numbers of pairs by their fault, to be added to a message."""
-    return "".join(f", {count} pairs {fault}" for fault, count in faults.items())
-
-
-def check(pairs: Sequence[Seen], name: str, faults: Mapping[Fault, int], least_tilt_deg: float, least_range_mm: float) -> None:
+def check(pairs: Sequence[Seen], name: str, collected: Collected, least_tilt_deg: float, least_range_mm: float) -> None:
     """Refuse pairs that don't show the target from enough sides.
 
     Parameters
     ----------
-    faults : numbers of the film's other pairs, but for those in much the same pose
+    collected : what the film shows, of which the pairs are those in poses that differ
 
     Raises
     ------
@@ -104,7 +128,7 @@ def check(pairs: Sequence[Seen], name: str, faults: Mapping[Fault, int], least_t
     """
     if len(pairs) < LEAST:
         expected = f"{LEAST} poses in which both cameras see all three circles whole"
-        raise InputError(f"{name}: expected {expected}, found {len(pairs)}{counted(faults)}")
+        raise InputError(f"{name}: expected {expected}, found {len(pairs)}{collected.told}")
     missing = []
     if (tilt := tilt_deg(pairs)) < least_tilt_deg:
         missing.append(f"tilts that differ by {least_tilt_deg:g} deg (standard deviation; to all sides), found {tilt:.1f}")

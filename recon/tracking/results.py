@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -42,8 +42,7 @@ class Step:
     reason: str | None  # None where the target was found
     blur_px: tuple[float, float]  # the longest of each view
     seconds: float  # that it took
-    others: int | None = None  # number of further targets; None of a pair not searched for them
-    apart_mm: float = np.nan  # distance of the nearest of these
+    apart_mm: float | None = None  # as of Tracking
 
     @property
     def found(self) -> bool:
@@ -67,11 +66,8 @@ def kept(found: Tracking, time_ns: int) -> Step:
     blurs = float(np.fmax.reduce(first.blur_px)), float(np.fmax.reduce(second.blur_px))
     seconds = sum(found.seconds.values())
     covariances = pose.covariance, pose.shared
-    step = Step(time_ns, pose.world_from_target, *covariances, pose.triangle, found.how, pose.reason, blurs, seconds)
-    if found.others is None:
-        return step
-    ways = [float(np.linalg.norm(other[:3, 3] - pose.world_from_target[:3, 3])) for other in found.others]
-    return replace(step, others=len(ways), apart_mm=min(ways, default=np.nan))
+    place = pose.world_from_target
+    return Step(time_ns, place, *covariances, pose.triangle, found.how, pose.reason, blurs, seconds, found.apart_mm)
 
 
 def track_of(steps: Sequence[Step]) -> Track:

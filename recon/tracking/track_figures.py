@@ -1,5 +1,6 @@
 """Figures of a tracked film, and the lines that report them."""
 
+import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -46,7 +47,7 @@ def measure(steps: Sequence[Step]) -> Metrics:
     return {
         "frames": len(steps),
         "frames_found": len(found),
-        "frames_with_a_second_target": sum(bool(step.others) for step in steps),
+        "frames_with_a_second_target": sum(math.isfinite(step.apart_mm or math.inf) for step in steps),
         **{f"frames_{way}": sum(step.how == way for step in found) for way in WAYS},
         "sigma_median_mm": float(typical[0]),
         "sigma_median_deg": float(typical[1]),
@@ -97,7 +98,7 @@ def causes(steps: Sequence[Step], target: Target) -> Iterator[str]:
             f"warning     cameras exchanged? In {crossed} of {len(steps)} pairs the views show the target as each other's: "
             "exchange the frames of cam1 and cam2, or their names in the calibration"
         )
-    yield from _second_target(steps)
+    yield from second_target([step.apart_mm for step in steps])
     known = [step.triangle for step in steps if step.triangle is not None]
     if len(known) < FEW:
         return
@@ -120,15 +121,15 @@ def causes(steps: Sequence[Step], target: Target) -> Iterator[str]:
         yield f"target      off its design within the tolerance, {found}: {MEASURE}, and poses get more exact"
 
 
-def _second_target(steps: Sequence[Step]) -> Iterator[str]:
-    """A line on further targets of the design, if there are any."""
-    searched = [step for step in steps if step.others is not None]
-    two = [step for step in searched if step.others]
+def second_target(apart_mm: Sequence[float | None]) -> Iterator[str]:
+    """A line on further targets of the design, if there are any, by the distance of each pair's as of `Tracking.apart_mm`."""
+    searched = [one for one in apart_mm if one is not None]
+    two = [one for one in searched if math.isfinite(one)]
     if two:
-        first = next(k for k, step in enumerate(steps) if step.others)
+        first = next(k for k, one in enumerate(apart_mm) if one is not None and math.isfinite(one))
         yield (
             f"warning     a second target of this design in {len(two)} of {len(searched)} pairs searched for one, first in pair "
-            f"{first}, {two[0].apart_mm:.0f} mm from the one that is followed: the surer one at first, after a loss "
+            f"{first}, {two[0]:.0f} mm from the one that is followed: the surer one at first, after a loss "
             "the nearer to the last pose; cover the other one"
         )
 

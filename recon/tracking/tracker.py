@@ -65,6 +65,14 @@ class Tracking:
         """Whether there is a pose."""
         return self.pose.found
 
+    @property
+    def apart_mm(self) -> float | None:
+        """Distance of the nearest further target; infinite without one, None of a pair that wasn't searched for them."""
+        if self.others is None:
+            return None
+        own = self.pose.world_from_target[:3, 3]
+        return min((float(np.linalg.norm(other[:3, 3] - own)) for other in self.others), default=np.inf)
+
 
 @dataclass
 class Tracker:

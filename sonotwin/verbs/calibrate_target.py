@@ -12,7 +12,7 @@ tracking the film.
 Both films are of one seed: those of another show another print, of which this one's measures are wrong.
 """
 
-from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -24,8 +24,7 @@ from recon.capture import stereo_frames, target_files
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
 from recon.target_calibration import target_bundle, target_figures, target_poses
-from recon.target_calibration.target_poses import Fault, Seen
-from recon.tracking.tracker import Tracker
+from recon.tracking.tracker import Tracker, Tracking
 from sonotwin.tracker_fields import TrackerFields, make_tracker
 
 TARGET = "target.yaml"  # by which the folder of a target is known
@@ -57,15 +56,19 @@ def run(config: Config) -> None:
     film = stereo_frames.read_film(config.capture, config.calibration, config.sweep)
     design = config.rig.target
     tracker = make_tracker(config, design, film.cameras, film.optics, film.bits)
-    seen, faults = collect(film, tracker, console)
-    pairs = target_poses.spread(target_poses.evenly_lit(seen), config.most_poses)
-    uneven = sum(not pair.even for pair in pairs)
-    dim = f", {uneven} of them in uneven light: less exact" if uneven else ""
-    console.print(f"found       {len(seen)} of {len(film.times)} pairs whole, {len(pairs)} poses that differ{dim}", markup=False)
-    target_poses.check(pairs, film.name, faults, config.least_tilt_deg, config.least_range_mm)
-    with console.status("adjusting"):
-        adjusted = target_bundle.adjust(pairs, design, tracker.optics_in_use)
-    figures = target_figures.measure(adjusted, pairs, design)
+    adjusted = target_bundle.calibrate(
+        tracked(film, tracker, console),
+        film.cameras,
+        design,
+        tracker.optics_in_use,
+        config.most_poses,
+        config.least_tilt_deg,
+        config.least_range_mm,
+        film.name,
+    )
+    for line in target_figures.found(adjusted):
+        console.print(line, markup=False)
+    figures = target_figures.measure(adjusted, design)
     for line in target_figures.describe(figures):
         console.print(line, markup=False)
     if film.optics is None:
@@ -76,12 +79,9 @@ def run(config: Config) -> None:
     console.print(f"wrote       {config.out}/{{{TARGET},{metrics.FILE}}}", markup=False)
 
 
-def collect(film: Film, tracker: Tracker, console: Console) -> tuple[list[Seen], Counter[Fault]]:
-    """Pairs of a film in which all six circles are whole, and numbers of the others by their fault."""
-    seen, faults = list[Seen](), Counter[Fault]()
+def tracked(film: Film, tracker: Tracker, console: Console) -> Iterator[Tracking]:
+    """The tracker's result of each pair of a film, with a bar of progress."""
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         pairs = progress.track(film.pairs(), total=len(film.times), description="tracking")
         for time, pair in zip(film.times.tolist(), pairs, strict=True):
-            found = target_poses.whole(tracker.step(*pair, time * 1e-9), film.cameras)
-            seen.append(found) if isinstance(found, Seen) else faults.update([found])
-    return seen, faults
+            yield tracker.step(*pair, time * 1e-9)

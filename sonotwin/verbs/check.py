@@ -34,9 +34,10 @@ from recon.rig_check.optics_equations import PROJECTOR, Matches
 from recon.rig_check.verdicts import Optics, Verdict
 from recon.structured_light import decode
 from recon.target_calibration import target_poses
+from recon.tracking import track_figures
 from recon.tracking.pose_fit import Sighting
 from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
-from sonotwin.verbs.calibrate_target import collect
+from sonotwin.verbs.calibrate_target import tracked
 
 CHECK, PAGE = "check.json", "check.html"  # the first is that by which the folder of a check is known
 SEARCH_PX = 5.0  # of the cameras' principal points: the tracker is to find the target by cameras that have moved, too
@@ -175,17 +176,17 @@ def filmed(
     film = stereo_frames.read_film(config.capture, config.calibration, name)
     wide = config.model_copy(update={"drift_px": SEARCH_PX})
     tracker = make_tracker(wide, target, film.cameras, film.optics, film.bits)
-    seen, faults = collect(film, tracker, console)
-    poses = target_poses.spread(target_poses.evenly_lit(seen, LEAST_POSES), config.most_poses)
+    collected = target_poses.collect(tracked(film, tracker, console), film.cameras)
+    poses = target_poses.spread(target_poses.evenly_lit(collected.seen, LEAST_POSES), config.most_poses)
     if len(poses) < LEAST_POSES:
-        found = (
-            f"{len(poses)} in {len(film.times)} pairs{target_poses.counted(faults)}: move it about, clean, uncovered and well lit"
-        )
+        found = f"{len(poses)} in {len(film.times)} pairs{collected.told}: move it about, clean, uncovered and well lit"
         raise InputError(f"{film.name}: expected {LEAST_POSES} poses in which both cameras see all circles whole, found {found}")
     tilt, reach = target_poses.tilt_deg(poses), target_poses.range_mm(poses)
     console.print(
         f"film        {len(poses)} poses, tilts of {tilt:.0f} deg (1 sigma), over {reach:.0f} mm of depth", markup=False
     )
+    for line in track_figures.second_target(collected.apart_mm):
+        console.print(line, markup=False)
     return [one.views for one in poses]
 
 

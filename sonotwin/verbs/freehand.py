@@ -57,6 +57,7 @@ class Config(ScansFields):
     hole_voxels: Annotated[int, Field(ge=0, le=1000)] | None = None
     hole_sticks: Annotated[int, Field(ge=1, le=len(hole_filling.STICKS))] | None = None
     arithmetic: Arithmetic | None = None
+    weights: Path | None = None
     most_gib: Annotated[float, Field(gt=0, le=1024)] = volume_compounding.MOST_BYTES / 2**30
 
     @property
@@ -79,7 +80,8 @@ def run(config: Config) -> None:
     console = Console(soft_wrap=True, highlight=False)
     plus = None if config.config is None else plus_config.read_config(config.config)
     settings = settings_of(config, plus)
-    inputs = [path for path in (config.capture, config.probe, config.sequence, config.tracker, config.config) if path is not None]
+    given = (config.capture, config.probe, config.sequence, config.tracker, config.config, settings.weights)
+    inputs = [path for path in given if path is not None]
     atomic.check_folder(config.out, "freehand", inputs=inputs)
     sweep, scans = read(config, plus)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
@@ -124,6 +126,8 @@ def settings_of(config: Config, plus: PlusConfig | None) -> VolumeSettings:
     """The given settings of the volume; those of the PLUS configuration where none are given, and the usual ones else."""
     usual = VolumeSettings() if plus is None or plus.volume is None else plus.volume
     settings = replace(usual, **config.given)
+    if settings.compounding != "weighted" and config.weights is None:
+        settings = replace(settings, weights=None)  # of the configuration, whose compounding isn't taken
     return replace(settings, fan=None) if config.fan == "none" else settings
 
 
@@ -160,7 +164,7 @@ def describe(filled: Reconstruction, figures: Metrics, settings: VolumeSettings,
     how = f"{settings.extent}, {settings.compounding}, {settings.interpolation}"
     how += "" if config.config is None else f" by {config.config}"
     how += f" but for {', '.join(config.given)}" if config.config is not None and config.given else ""
-    if settings.arithmetic != "floating" and settings.compounding == "mean":
+    if settings.arithmetic != "floating" and settings.compounding in ("mean", "weighted"):
         how += f", rounded at each pixel as in PLUS, darker by some levels than by arithmetic=floating ({settings.arithmetic})"
     yield f"paste       {size} voxels of {spacing} mm, {how}: {100 * figures['pasted_fraction']:.1f} % seen"
     level = metrics.shown(figures["mean_level"], ".0f")

@@ -84,7 +84,9 @@ def believed(config: Config, clip: Clip, times: NDArray[np.int64], track: Track)
         return 1e-9 * (times - track.times[0]), pose_checks.image_changes(clip.stream())
 
     seconds = 1e-9 * (track.times - track.times[0])
-    poses, _ = pose_checks.checked(str(config.poses), seconds, track.poses, config.implausible, changes)
+    place, unit = str(config.poses), "columns.length_unit"
+    poses, _ = pose_checks.checked(place, seconds, track.poses, config.implausible, changes, unit=unit)
+    pose_checks.check_motion(place, poses, config.implausible)
     return replace(track, poses=poses)
 
 

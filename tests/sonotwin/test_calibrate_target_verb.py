@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sonotwin
 from recon.capture import target_files
+from recon.geometry import rigid
 from recon.model import circle_layout
 from recon.tracking import networks
 from sonotwin.cli import main
@@ -65,6 +67,41 @@ def test_the_target_is_measured_and_poses_are_exact_with_it(drawn, poses, told, 
         figures = json.loads((tmp_path / name / "metrics.json").read_text())
         errors[name] = figures["sigma_median_deg"]
     assert errors["measured"] < 0.7 * errors["designed"]
+
+
+def test_the_interface_gives_the_verbs_figures(drawn, told, rig, tmp_path):
+    assert main(["calibrate-target", f"capture={drawn}", "most_poses=8", f"out={tmp_path / 'out'}"]) == 0
+    film = sonotwin.read_film(drawn)
+    tracker = sonotwin.Tracker(film.cameras, rig.target, told, film.bits, film.optics)
+    pairs = zip(film.times.tolist(), film.pairs(), strict=True)
+    tracked = (tracker.step(*pair, 1e-9 * time) for time, pair in pairs)
+    found = sonotwin.calibrate_target(tracked, film.cameras, rig.target, tracker.optics_in_use, most_poses=8)
+    figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    sigmas = np.sqrt(np.diag(found.covariance))
+    for name, sigma in zip(target_files.LENGTHS_AND_DIAMETER, sigmas, strict=False):
+        assert figures[name] == pytest.approx(getattr(found.target, name), rel=1e-9)
+        assert figures[f"sigma_{name}"] == pytest.approx(sigma, rel=1e-9)
+    assert figures["pairs_used"] == found.used.sum() == len(found.pairs) == 8 and len(found.collected.seen) == COUNT
+
+
+@pytest.mark.parametrize("verb", ["calibrate-target", "check"])
+def test_a_second_target_of_the_design_is_named(verb, drawn, rig, poses, told, tmp_path, capsys):
+    """In the first pairs both cameras see another one 110 mm beside that which the network finds first."""
+    actual, rng = rig.target.model_copy(update=ACTUAL), np.random.default_rng(4)
+    cameras, away = films.optics(rig).cameras.values(), rigid.transform(np.eye(3), [110.0, 5, 10])
+    pairs = list(sonotwin.read_film(drawn).pairs())
+    for k, pose in enumerate(poses[:2]):
+        one, other = ([drawings.frame(camera, [at], actual, 65.0) for camera in cameras] for at in (pose, away @ pose))
+        both = [np.where(np.abs(b - b[0, 0]) > 0.5, b, a) for a, b in zip(one, other, strict=True)]
+        pairs[k] = tuple(drawings.read_out(view - drawings.BLACK_DN, rng) for view in both)
+    told.names = (0, 1, 2, 0, 1, 2)
+    beside = films.centres(rig, away @ poses[0])
+    told.places = [np.vstack(each) for each in zip(told.places, beside, strict=True)]
+    capture, out = tmp_path / "two", tmp_path / "out"
+    captures.write_film(capture, pairs, films.stamps(COUNT), films.optics(rig), films.devices(rig), "two")
+    assert main([verb, f"capture={capture}", f"out={out}"]) in (0, 1)
+    said = capsys.readouterr().out
+    assert "warning     a second target of this design in 1 of 1 pairs searched for one, first in pair 1, 111 mm" in said
 
 
 def test_a_film_in_uneven_light_will_do_if_there_is_no_other(rig, poses, told, tmp_path, capsys):

@@ -126,6 +126,21 @@ def test_stills_with_a_row_each_in_a_plain_table(folder, capsys):
     assert main(["freehand", *given]) == 0
 
 
+def test_poses_of_another_unit_or_at_rest_are_named(folder, capsys, caplog):
+    """In metres and without any tracking they are refused; in centimetres they may be right, which the user is asked."""
+    table = folder / "poses.csv"
+    header, *rows = (line.split(",") for line in table.read_text().splitlines())
+    for factor, moving, complaint in (
+        (1e-3, 1, "metres? give columns.length_unit; to use them all the same, give implausible=take"),
+        (1, 0, "found all 60 the same to the last digit: no tracking, or a probe at rest? to use them all the same"),
+        (0.1, 1, "and up to 65.1 mm from the origin, at 1 mm/s: is it in mm, not in centimetres? Else give columns.length_unit"),
+    ):
+        lines = [[t, x, str(moving * factor * float(y)), str(factor * float(z)), *q] for t, x, y, z, *q in rows]
+        table.write_text("\n".join(map(",".join, [header, *lines])) + "\n")
+        status = imported(folder, f"clip={folder / 'scan.dcm'}", "starts_s=100")
+        assert (status, complaint in capsys.readouterr().err + caplog.text) == (0 if factor == 0.1 else 2, True)
+
+
 def test_poses_that_cover_a_part_of_the_clip_are_counted(folder, capsys):
     assert imported(folder, f"clip={folder / 'scan.dcm'}", "starts_s=101.5") == 0
     said = capsys.readouterr().out

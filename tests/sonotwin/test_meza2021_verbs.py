@@ -138,6 +138,7 @@ def theirs(tmp_path) -> Path:
             cv2.imwrite(str(folder / "USdata" / name / f"im{k + 1}{suffix}"), cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     loose = np.tile(np.eye(4), (12, 1, 1))
     loose[:, :3, :3] = np.array([[1, 0.015, 0], [0, 1.01, 0], [0, 0, 0.995]])
+    loose[:, 0, 3] = np.arange(12)
     np.save(folder / "USdata" / "target_pose.npy", loose)
     np.save(folder / "USdata" / "cross_point.npy", np.full((12, 2), 7.0))
     np.savez(folder / "US_params.npz", sx=0.12, sy=-0.11, T_I_T=probe().target_from_image)

@@ -97,6 +97,18 @@ def test_frames_that_one_camera_lost_are_left_out(caplog):
     assert "cam1/timestamps.csv: left out 3 frames without a partner; of the first, the nearest 33.3 ms away" in caplog.text
 
 
+def test_the_last_pair_of_cameras_of_which_one_lost_an_earlier_frame_is_kept(caplog):
+    """One frame fewer isn't a recording that was cut off at its end, if that frame is the first, or one in between."""
+    stamps = films.stamps(40)
+    for lost in (0, 17):
+        rows = [k for k in range(40) if k != lost]
+        assert partners(stamps, stamps[rows]) == [rows, list(range(39))]
+        assert partners(stamps[rows], stamps) == [list(range(39)), rows]
+    assert caplog.text.count("left out 1 frames without a partner") == 4
+    caplog.clear()
+    assert partners(stamps, stamps[:-1]) == partners(stamps[:-1], stamps) == [list(range(39))] * 2 and not caplog.text
+
+
 def complaint(folder: Path) -> str:
     with pytest.raises(InputError) as caught:
         list(stereo_frames.read_film(folder).pairs())

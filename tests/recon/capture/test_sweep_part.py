@@ -271,3 +271,7 @@ def test_poses_that_no_hand_makes_are_left_out(tmp_path, caplog):
     assert "track.csv: left out 11 of 60 poses, from pose 21 on: the same to the last digit" in caplog.text
     assert np.nanmax(np.abs(sweep.poses()[:, 0, 3] - 20 * (seconds[::2] + 0.004))) < 1e-6
     assert sweep_part.read_sweep(tmp_path / "capture", implausible="take").track.found.all()
+    captures.write_sweep(tmp_path / "rest", shown, stamps[::2], Track(stamps, np.tile(poses[3], (60, 1, 1))), SIZE)
+    with pytest.raises(InputError, match=r"track.csv: poses: expected those of a probe that moves, found all 60 the same"):
+        sweep_part.read_sweep(tmp_path / "rest")
+    assert sweep_part.read_sweep(tmp_path / "rest", implausible="take").track.found.all()

@@ -39,7 +39,7 @@ def optics(*names: str) -> Calibration:
 
 
 def track() -> Track:
-    return Track(25_000_000 * np.arange(12), np.tile(np.eye(4), (12, 1, 1)))
+    return Track(25_000_000 * np.arange(12), np.array([rigid.transform(np.eye(3), [k, 0, 650]) for k in range(12)]))
 
 
 def probe() -> ProbeCalibration:

@@ -10,6 +10,7 @@ from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGLo
 
 from recon.clips import clip_reader, dicom_clip, image_region, video_clip
 from recon.errors import InputError
+from recon.files import video_file
 from tests.recon.clips import made_clips
 from tests.recon.clips.made_clips import BOX, SCREEN
 
@@ -213,14 +214,14 @@ def test_a_video_gives_its_frames_and_times(tmp_path):
 def test_a_video_names_no_files_far_away_whatever_else_is_asked_for(given, used, tmp_path, monkeypatch):
     """And the environment, which other processes inherit, stays as it was."""
     if given is None:
-        monkeypatch.delenv(video_clip.OPTIONS, raising=False)
+        monkeypatch.delenv(video_file.OPTIONS, raising=False)
     else:
-        monkeypatch.setenv(video_clip.OPTIONS, given)
+        monkeypatch.setenv(video_file.OPTIONS, given)
     made_clips.write_video(tmp_path / "screen.avi", made_clips.screens(made_clips.scans(2)))
     seen, plain = [], cv2.VideoCapture
 
     def opened(*arguments):
-        seen.append(os.environ.get(video_clip.OPTIONS))
+        seen.append(os.environ.get(video_file.OPTIONS))
         return plain(*arguments)
 
     monkeypatch.setattr(cv2, "VideoCapture", opened)

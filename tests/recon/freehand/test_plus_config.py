@@ -2,6 +2,7 @@
 
 import re
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from recon.freehand.volume_compounding import Clip
 from recon.geometry import rigid
 from recon.model.fan import Fan
 from recon.model.probe import ProbeCalibration
+from sonotwin.cli import main
 
 CONFIG = """<PlusConfiguration version="2.1">
   <CoordinateDefinitions>
@@ -80,7 +82,8 @@ def test_a_configuration_without_a_reconstruction_gives_its_transforms(tmp_path)
         ("0 0 0 1", "0 0 0 2", "ImageToProbe: expected an invertible matrix with the last row 0 0 0 1"),
         ("0.5 0.6 0.7", "0.5 0 0.7", "OutputSpacing: expected 3 lengths above 0, found '0.5 0 0.7'"),
         ("10 20", "10", "ClipRectangleSize: expected 2 whole numbers of at least 0, found '10'"),
-        ('"MEAN"', '"MEDIAN"', "CompoundingMode: expected one of MEAN, MAXIMUM, LATEST, found MEDIAN"),
+        ('"MEAN"', '"MEDIAN"', "CompoundingMode: expected one of MEAN, MAXIMUM, LATEST, IMPORTANCE_MASK, found MEDIAN"),
+        ('"MEAN"', '"IMPORTANCE_MASK"', "VolumeReconstruction.ImportanceMaskFilename: expected a value, found none"),
         ('"FULL"', '"MORE"', "Optimization: expected one of FULL, PARTIAL, NONE, found MORE"),
         ('"STICK"', '"GAUSSIAN"', "HoleFilling: expected one element of type STICK, found GAUSSIAN"),
         ('"9"', '"nine"', "StickLengthLimit: expected a whole number of at least 1, found 'nine'"),
@@ -131,6 +134,40 @@ def test_what_lies_beside_a_fan_is_no_part_of_the_volume(rng, tmp_path):
     v, u = np.nonzero(inside)
     assert np.allclose(pasted.volume.origin, [u.min() / 2, v.min() / 2, 0])
     assert pasted.filled.sum() == 5 * inside.sum()
+
+
+def test_an_importance_mask_weights_the_pixels(rng, tmp_path, capsys):
+    """The left half of each B-scan by 3 against 1, the last columns not at all; the mask's file beside the configuration."""
+    probe = ProbeCalibration(np.eye(4), np.array([0.5, 0.5]))
+    poses = np.array([rigid.from_rotation_vector([0, 0, 0], [10.0 * k, 0, 0]) for k in range(2)])  # by half a B-scan
+    images = np.stack([np.full((20, 40), level, np.uint8) for level in (50, 90)])
+    sequences.write_sequence(path := tmp_path / "s.igs.nrrd", sequences.sequence_of(images, poses, probe, np.arange(2) / 20))
+    attributes = 'OutputSpacing="0.5 0.5 0.5" CompoundingMode="Importance_Mask" ImportanceMaskFilename="mask.png"'
+    (tmp_path / "c.xml").write_text(f"<VolumeReconstruction {attributes}/>")
+    weights = np.repeat([[180] * 20 + [60] * 15 + [0] * 5], 20, axis=0).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "mask.png"), weights)
+    pasted, _ = plus_config.reconstruct_sequence(path, plus_config.read_config(tmp_path / "c.xml"))
+    levels = pasted.volume.voxels[0]
+    assert (
+        (levels[:, :20] == 50).all()
+        and (levels[:, 20:35] == (60 * 50 + 180 * 90) // 240).all()
+        and (levels[:, 35:55] == 90).all()
+    )
+    assert not pasted.filled[0, :, 55:].any()
+
+    line = ["freehand", f"sequence={path}", "implausible=take", f"out={tmp_path / 'out'}"]
+    assert main([*line, f"config={tmp_path / 'c.xml'}"]) == 0
+    assert np.array_equal(volumes.read_volume(tmp_path / "out" / "volume.nrrd").voxels[0], levels)
+    assert main([*line, f"config={tmp_path / 'c.xml'}", "compounding=latest"]) == 0
+    capsys.readouterr()
+    cv2.imwrite(str(tmp_path / "mask.png"), weights[:10])
+    for given, complaint in (
+        ([f"config={tmp_path / 'c.xml'}"], "mask.png: expected 40x20 8-bit, found 40x10 8-bit"),
+        (["compounding=weighted"], "weights: expected an image with compounding=weighted, and only then, found none"),
+        ([f"weights={tmp_path / 'mask.png'}"], "mask.png with compounding=mean"),
+    ):
+        assert main([*line, *given]) == 2
+        assert complaint in (said := capsys.readouterr().err) and said.count("\n") == 1
 
 
 def test_the_real_sweep_becomes_the_volume_of_plus(real):

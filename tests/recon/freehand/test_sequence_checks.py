@@ -67,6 +67,45 @@ def test_a_volume_is_made_of_what_can_be_believed(fault, left_out, frames, tmp_p
     assert np.flatnonzero(np.isnan(sweep.poses()[:, 0, 0])).tolist() == left_out
 
 
+@pytest.mark.parametrize(
+    ("others", "complaint"),
+    [
+        ([], "ProbeToTracker: poses: expected those of a probe that moves, found all 30 the same to the last digit: no tracking"),
+        ([7], "found 21 of 30 poses, from frame 9 on: the same to the last digit as the one before while the images change"),
+        ([0, 12], "found 26 of 30 poses, from frame 2 on: the same to the last digit as the one before while the images change"),
+        ([29], "found 28 of 30 poses, from frame 1 on: the same to the last digit as the one before while the images change"),
+    ],
+)
+def test_a_sequence_without_tracking_is_named(others, complaint, frames, tmp_path, capsys, caplog):
+    """The matrix of frame 3 in all frames but a few, of which one is far off and the rest are as they were."""
+    path, out = tmp_path / "s.igs.mha", tmp_path / "out"
+    poses = np.tile(frames.transforms["ProbeToTracker"][3], (COUNT, 1, 1))
+    poses[others] = frames.transforms["ProbeToTracker"][others]
+    if others == [7]:
+        poses[7, 0, 3] += 5000
+    sequences.write_sequence(path, with_poses(frames, poses))
+    given = ["freehand", f"sequence={path}", "reference=Tracker", f"out={out}"]
+    assert main(given) == 2
+    said = capsys.readouterr().err
+    assert complaint in said and said.endswith("give implausible=take\n") and said.count("\n") == 1 and not out.exists()
+    with pytest.raises(InputError, match="the same to the last digit"):
+        sequence_sweep.read_sequence_sweep(path, NAMES)
+    assert main([*given, "implausible=take"]) == 0 and "taken all the same" in caplog.text
+
+
+def test_a_probe_that_stands_still_before_a_reference_that_moves_is_named(frames, tmp_path, caplog):
+    """A reference at rest is usual, and ImageToProbe always is; of neither anything is said."""
+    path = tmp_path / "s.igs.mha"
+    moving, resting = frames.transforms["ProbeToTracker"], np.tile(frames.transforms["ProbeToTracker"][3], (COUNT, 1, 1))
+    valid = frames.valid | {"ReferenceToTracker": np.ones(COUNT, bool)}
+    for probe, reference in ((moving, resting), (resting, moving)):
+        transforms = frames.transforms | {"ProbeToTracker": probe, "ReferenceToTracker": reference}
+        sequences.write_sequence(path, replace(frames, transforms=transforms, valid=valid))
+        assert not caplog.text
+        sequence_checks.believed(path, sequences.read_tracking(path), "Reference", "Image")
+    assert "ProbeToTracker: the same to the last digit in all 30 frames while ReferenceToTracker moves: was Probe" in caplog.text
+
+
 def test_a_reference_that_is_lost_counts_as_well(frames, tmp_path):
     reference = np.array([rigid.from_rotation_vector([0.2, 0, 0], [0.01 * (k % 3), 20, 900]) for k in range(COUNT)])
     reference[5] = np.eye(4)

@@ -2,6 +2,7 @@
 
 import tracemalloc
 
+import cv2
 import nrrd
 import numpy as np
 import pytest
@@ -294,9 +295,71 @@ def test_floating_point_levels_are_rounded(tmp_path, greatest, scale, element, n
         sequences.read_sequence(plus_file(tmp_path, PLUS_2D.replace("MET_UCHAR", element), levels.tobytes()))
 
 
-def test_a_matroska_file_is_named(tmp_path):
+def element(name: int, content: bytes, open_ended: bool = False) -> bytes:
+    """An element of a Matroska file, with its size in eight bytes or left open."""
+    size = (1 << 56) - 1 if open_ended else len(content)
+    return name.to_bytes((name.bit_length() + 7) // 8, "big") + (size | 1 << 56).to_bytes(8, "big") + content
+
+
+def matroska_of(frames: Frames, colour: str, open_ended: bool = False) -> bytes:
+    """A sequence as PLUS writes it: images as they are, a track of texts for each field, times in ms from the first on."""
+    texts = {
+        f"{name}Transform": [" ".join(map(repr, m.ravel().tolist())) for m in each] for name, each in frames.transforms.items()
+    }
+    texts |= {f"{name}TransformStatus": ["OK" if ok else "INVALID" for ok in frames.valid[name]] for name in frames.transforms}
+    _, height, width = frames.images.shape
+    video = element(0xE0, element(0xB0, bytes([width])) + element(0xBA, bytes([height])) + element(0x2EB524, colour.encode()))
+    entries = element(0xAE, element(0xD7, b"\1") + element(0x83, b"\1") + element(0x86, b"V_UNCOMPRESSED") + video)
+    for number, name in enumerate(texts, start=2):
+        text = element(0xD7, bytes([number])) + element(0x83, b"\x11") + element(0x86, b"S_TEXT/UTF8")
+        entries += element(0xAE, text + element(0x536E, name.encode()))
+    clusters = b""
+    for k, image in enumerate(frames.images):
+        pixels = image.tobytes() if colour == "Y800" else np.repeat(image[..., None], 3, axis=2).tobytes()
+        blocks = element(0xA3, b"\x81" + bytes(2) + b"\x80" + pixels)
+        for number, each in enumerate(texts.values(), start=2):
+            blocks += element(0xA0, element(0xA1, bytes([0x80 | number, 0, 0, 0]) + each[k].encode() + b"\0"))
+        clusters += element(0x1F43B675, element(0xE7, (50 * k).to_bytes(2, "big")) + blocks, open_ended)
+    segment = element(0x1549A966, element(0x2AD7B1, (10**6).to_bytes(3, "big"))) + element(0x1654AE6B, entries) + clusters
+    return element(0x1A45DFA3, element(0x4282, b"matroska")) + element(0x18538067, segment, open_ended)
+
+
+@pytest.mark.parametrize("colour", ["Y800", "RV24"])
+@pytest.mark.parametrize("open_ended", [False, True])
+def test_a_matroska_file_of_plus_is_read(colour, open_ended, rng, tmp_path):
+    """Images to the last bit, transforms by the times of their frames; of a video without them, that none lead anywhere."""
+    poses = np.array([rigid.from_rotation_vector([0.1 * k, 0.2, 0], [k, 2, 650]) for k in range(5)])
+    valid = {"ProbeToTracker": np.array([True, True, False, True, True])}
+    given = Frames(0.05 * np.arange(5), {"ProbeToTracker": poses}, valid, rng.integers(0, 256, (5, 6, 8), np.uint8))
+    path = tmp_path / "s.mkv"
+    data = matroska_of(given, colour, open_ended)
+    path.write_bytes(data)
+    read = sequences.read_sequence(path)
+    assert np.array_equal(read.images, given.images) and read.times_s == pytest.approx(given.times_s)
+    assert np.array_equal(read.transforms["ProbeToTracker"], poses)
+    assert read.valid["ProbeToTracker"].tolist() == [True, True, False, True, True] and read.valid["Image"].all()
+    for cut in (60, len(data) - 1, *([] if open_ended else [data.rindex(b"\x1f\x43\xb6\x75")])):
+        path.write_bytes(data[:cut])
+        with pytest.raises(InputError, match=r"s\.mkv: expected a whole Matroska file, found it damaged or cut short at byte"):
+            sequences.read_sequence(path)
+
+
+def test_a_video_in_a_matroska_file_has_images_and_no_poses(tmp_path):
+    path = tmp_path / "s.mkv"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 20, (64, 48))
+    for k in range(6):
+        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
+    writer.release()
+    read = sequences.read_sequence(path)
+    assert read.times_s == pytest.approx(np.arange(6) / 20, abs=2e-3) and not read.transforms
+    assert np.abs(read.images[:, 20, 30].astype(int) - 20 * np.arange(6)).max() <= 2
+    with pytest.raises(InputError, match="transforms: expected some in each frame, such as ProbeToTracker"):
+        sequences.poses(read, "Reference", "Image")
+
+
+def test_bytes_of_another_kind_are_named(tmp_path):
     (tmp_path / "s.mkv").write_bytes(b"\x1a\x45\xdf\xa3" + bytes(200))
-    with pytest.raises(InputError, match=r"s\.mkv: expected a MetaImage or NRRD file, found a Matroska video .* EditSeq"):
+    with pytest.raises(InputError, match=r"s\.mkv: expected a whole Matroska file, found it damaged or cut short at byte 4"):
         sequences.read_sequence(tmp_path / "s.mkv")
     (tmp_path / "s.mha").write_bytes(bytes(range(128, 200)) * 2)
     with pytest.raises(InputError, match=r"s\.mha: expected lines of a MetaImage header, 'name = value', found no text$"):

@@ -107,10 +107,11 @@ def test_the_mean_of_plus_is_too_dark(arithmetic, rng):
 
 
 @pytest.mark.parametrize("arithmetic", ["plus_full", "plus_partial"])
-@pytest.mark.parametrize("compounding", ["mean", "maximum", "latest"])
+@pytest.mark.parametrize("compounding", ["mean", "maximum", "latest", "weighted"])
 def test_shares_of_pixels_are_whole_levels_in_plus(arithmetic, compounding, rng):
     """Slow and readable: places and shares in steps of 2^-14 or without, weights of 1/256, levels rounded at each share."""
     matrices, images = fan(rng, 2), rng.integers(0, 256, (2, *SHAPE), np.uint8)
+    own = rng.integers(0, 256, SHAPE, np.uint8) * (rng.random(SHAPE) < 0.9) if compounding == "weighted" else None
     grid = volume_compounding.principal_grid(volume_compounding.corners(matrices, SHAPE), [0.8, 0.9, 0.7])
     step = 2.0**-14 if arithmetic == "plus_full" else 0.0
     levels, weights = np.zeros(grid.size[::-1], int), np.zeros(grid.size[::-1], int)
@@ -120,7 +121,7 @@ def test_shares_of_pixels_are_whole_levels_in_plus(arithmetic, compounding, rng)
         for v, u in np.ndindex(SHAPE):
             place = (placed @ [u, v, 0, 1])[:3]
             first = np.floor(place + 2.0**-17).astype(int)  # PLUS's tolerance
-            if (first < 0).any() or (first + (place != first) >= grid.size).any():
+            if (first < 0).any() or (first + (place != first) >= grid.size).any() or (own is not None and own[v, u] == 0):
                 continue
             for corner in np.ndindex(2, 2, 2):
                 wx, wy, wz = np.where(corner, place - first, 1 - place + first)
@@ -133,14 +134,43 @@ def test_shares_of_pixels_are_whole_levels_in_plus(arithmetic, compounding, rng)
                     total = share + known
                     mean = (share * image[v, u] + known * before) / total
                     levels[at] = np.floor((np.rint(mean / step) * step if step else mean + 2.0**-17) + 0.5)
+                elif own is not None:
+                    part = int(own[v, u])
+                    total = part * share / 256 + known
+                    parts = np.array([int(image[v, u]) * part * share / 256, known]) / total
+                    new, old = np.rint(parts / step) * step if step else parts
+                    levels[at] = np.floor(new + old * before + 0.5 + (0 if step else 2.0**-17))
                 elif share >= 0.125 and (compounding == "latest" or image[v, u] > before):
                     levels[at] = image[v, u]
                 else:
                     continue
                 weights[at] = np.floor(total * 256 + 0.5 + 2.0**-17)
-    found = volume_compounding.reconstruct(images, matrices, grid, compounding, "linear", arithmetic=arithmetic)
+    found = volume_compounding.reconstruct(images, matrices, grid, compounding, "linear", arithmetic=arithmetic, weights=own)
     assert np.array_equal(found.filled, weights > 0) and found.filled.sum() > 50
     assert (found.volume.voxels == levels).all()
+
+
+@pytest.mark.parametrize("interpolation", ["nearest", "linear"])
+def test_pixels_count_by_their_weights(interpolation, rng):
+    """Two images a voxel apart of which each is constant: the weighted mean, and none of what has no weight."""
+    grid = Grid((6, 5, 1), np.zeros(3), np.ones(3), np.eye(3))
+    images = np.stack([np.full((5, 6), level, np.uint8) for level in (40, 200)])
+    weights = rng.integers(1, 256, (5, 6), np.uint8)
+    weights[:, 4:] = 0
+    moved = np.eye(4) + np.eye(4, k=3)  # by a voxel along x
+    found = volume_compounding.reconstruct(images, np.stack([np.eye(4), moved]), grid, "weighted", interpolation, weights=weights)
+    assert not found.filled[0, :, 5].any() and found.filled[0, :, :5].all()
+    first, second = weights[:, 1:4].astype(float), weights[:, :3].astype(float)
+    expected = (40 * first + 200 * second) / (first + second)
+    assert np.abs(found.volume.voxels[0, :, 1:4] - expected).max() <= 0.5
+    whole = volume_compounding.reconstruct(
+        images, np.stack([np.eye(4), moved]), grid, "weighted", interpolation, arithmetic="plus_none", weights=weights
+    )
+    down = np.floor(expected) if interpolation == "nearest" else np.floor(expected + 0.5)
+    assert np.array_equal(whole.volume.voxels[0, :, 1:4], down) and np.array_equal(whole.filled, found.filled)
+    for given, compounding in ((None, "weighted"), (weights, "mean"), (weights[:4], "weighted"), (1.0 * weights, "weighted")):
+        with pytest.raises(InputError, match="weights: expected"):
+            volume_compounding.reconstruct(images, np.stack([np.eye(4), moved]), grid, compounding, weights=given)
 
 
 def test_points_of_a_segmented_ball_lie_on_it(rng):

@@ -10,7 +10,9 @@ from recon.freehand import sequences
 from recon.freehand.sequences import Frames
 from recon.geometry import rigid
 from recon.model.boards import Board
-from recon.model.probe import ProbeCalibration
+from recon.model.probe import ProbeCalibration, Speed
+from recon.model.rig import Target
+from recon.probe_calibration import sound_in_water
 from sonotwin.cli import main
 
 STEPS = {"asymmetric_circles": "spacing_mm", "symmetric_circles": "spacing_mm", "chessboard": "square_mm", "charuco": "square_mm"}
@@ -31,6 +33,34 @@ def test_a_board_in_metres_is_refused_unless_it_is_meant(kind):
         assert f"{STEPS[kind]}: expected 0.5 to 1000 mm, found {unit}" in said and "unusual=true" in said
         assert board(kind, factor, unusual=True).points().shape[1] == 3
     assert board(kind, 0.1) and board(kind, 20)  # 1.5 and 300 mm
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "metres"), (0.1, "centimetres"), (1e3, "micrometres")])
+def test_a_target_in_another_unit_is_refused_unless_it_is_meant(factor, unit, rig):
+    """Of the design's 25 and 40 mm between circles of 18 mm; half and five times as large are targets as well."""
+    design = rig.target.model_dump()
+    sizes = {name: design[name] for name in ("c1_mm", "c2_mm", "outer_diameter_mm", "inner_diameter_mm")}
+    with pytest.raises(ValidationError) as fault:
+        Target.model_validate(design | {name: factor * size for name, size in sizes.items()})
+    assert f"c1_mm: expected 5 to 1000 mm, found {25 * factor:.4g} mm: {unit}? If it is right, give unusual=true" in str(
+        fault.value
+    )
+    assert Target.model_validate(design | {name: factor * size for name, size in sizes.items()} | {"unusual": True})
+    for usual in (0.5, 5):
+        Target.model_validate(design | {name: usual * size for name, size in sizes.items()})
+
+
+@pytest.mark.parametrize(
+    ("value", "unit"), [(1.54, ": km/s?"), (154_000, ": cm/s?"), (1.54e6, ": mm/s?"), (50, ""), (np.nan, "")]
+)
+def test_a_speed_of_sound_in_another_unit_is_named(value, unit, tmp_path):
+    complaint = f"expected a speed of sound of 300 to 5000 m/s, found {value:g}{unit}"
+    with pytest.raises(ValidationError) as fault:
+        TypeAdapter(Speed).validate_python(value)
+    assert one_line(fault.value) == complaint
+    with pytest.raises(InputError) as said:
+        sound_in_water.for_tissue(ProbeCalibration(TURN, np.array([0.1, 0.1])), value)
+    assert str(said.value) == f"speed: {complaint}"
 
 
 def pair(path, unit_mm, **more):

@@ -92,6 +92,19 @@ def test_a_motor_that_pauses_is_at_rest(rng):
     assert not found(poses, change=np.where(steps > 0, 3.0, 1.2))
 
 
+def test_a_sweep_without_any_motion_is_refused(rng, caplog):
+    poses = np.tile(sweep(rng)[7], (COUNT, 1, 1))
+    poses[:10] = np.nan
+    complaint = r"^s: poses: expected those of a probe that moves, found all 50 the same.*implausible=take$"
+    with pytest.raises(InputError, match=complaint):
+        pose_checks.check_motion("s", poses)
+    pose_checks.check_motion("s", poses, "take")
+    assert "s: taken all the same: poses that are all 50 the same to the last digit" in caplog.text
+    pose_checks.check_motion("s", poses[:14])
+    poses[10, 0, 3] += 1e-9
+    pose_checks.check_motion("s", poses)
+
+
 def test_a_slow_tracker_repeats_each_pose(rng):
     """As where the latest pose is stored with each image: ten poses a second, 60 images."""
     poses = np.repeat(sweep(rng), 6, axis=0)
@@ -107,6 +120,25 @@ def test_another_unit_is_named(factor, unit, rng):
     assert unit in str(fault.value) or "farther off" in str(fault.value)
     assert str(fault.value).endswith("implausible=take")
     assert pose_checks.checked("s", TIMES, poses, "take")[0] is poses
+
+
+def test_a_sweep_that_may_be_in_centimetres_is_named(rng, caplog):
+    """3 mm/s over 9 mm, 65 mm from the tracker; the same in mm, or as fast as hands are, is as usual."""
+    poses = sweep(rng)
+    pose_checks.checked("s", TIMES, poses)
+    small = poses.copy()
+    small[:, :3, 3] *= 0.1
+    pose_checks.checked("s", TIMES / 5, small)
+    assert not caplog.text
+    pose_checks.checked("s", TIMES, small, unit="length_unit")
+    assert "s: all poses lie within 7.8 mm, and up to 65.5 mm from the origin, at " in caplog.text
+    assert "mm/s: is it in mm, not in centimetres? Else give length_unit" in caplog.text
+    caplog.clear()
+    pose_checks.checked("s", np.full(COUNT, np.nan), small)
+    assert "up to 65.5 mm from the origin: is it in mm" in caplog.text
+    small[:, :3, 3] *= 0.01
+    with pytest.raises(InputError, match=r"metres\? give length_unit; to use them all the same, give implausible=take"):
+        pose_checks.checked("s", TIMES, small, unit="length_unit")
 
 
 def test_what_is_left_out_is_counted_and_beyond_a_share_refused(rng, caplog):

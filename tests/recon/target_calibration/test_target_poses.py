@@ -69,15 +69,18 @@ def test_spreads_are_those_of_the_poses(cameras, rig):
 def test_what_is_missing_is_named(cameras, rig, rng):
     pairs = target_pairs.many(cameras, rig.target, 10, rng)
     with pytest.raises(InputError, match=r"film: expected 8 poses in which both cameras see .* found 3, 9 pairs without a pose"):
-        target_poses.check(pairs[:3], "film", {"without a pose": 9}, 5, 20)
+        target_poses.check(pairs[:3], "film", target_poses.Collected(faults={"without a pose": 9}), 5, 20)
+    two = target_poses.Collected(faults={"without a pose": 9}, apart_mm=(None, np.inf, 70.0))
+    with pytest.raises(InputError, match=r"9 pairs without a pose, and a second target of this design: cover it$"):
+        target_poses.check(pairs[:3], "film", two, 5, 20)
     flat = [at(pairs[0], 3.0 * k) for k in range(10)]
     with pytest.raises(
         InputError, match=r"expected tilts that differ by 5 deg .* found .*: turn .* set least_tilt_deg"
     ) as caught:
-        target_poses.check(flat, "film", {}, 5, 20)
+        target_poses.check(flat, "film", target_poses.Collected(), 5, 20)
     assert "distances over 20 mm, found 0" in str(caught.value)
-    target_poses.check(flat, "film", {}, 0, 0)
-    target_poses.check(pairs, "film", {}, 5, 20)
+    target_poses.check(flat, "film", target_poses.Collected(), 0, 0)
+    target_poses.check(pairs, "film", target_poses.Collected(), 5, 20)
 
 
 def test_pairs_that_are_not_whole_are_not_taken(cameras):
