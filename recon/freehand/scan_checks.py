@@ -21,7 +21,9 @@ class SweepLimits:
     side: int = 24  # blocks along each side of a B-scan, whose mean levels are compared; speckle averages out
     alike: float = 0.6  # difference of the most similar two over that of any two, at most: else there is nothing to compare
     apart: float = 0.85  # difference of neighbours in space over that of any two, at least, where the order is another
-    repeats: int = 3  # B-scans in a row that are the same to the last digit
+    repeats: int = 5  # B-scans in a row that are the same to the last digit
+    longer: float = 3.0  # times the median of such rows: a grabber that is faster than the scanner has many short ones
+    flat: float = 2.0  # grey levels, standard deviation of an image that shows nothing
     wide: int = 128  # px, of the B-scans in which shifts are measured
     clear: float = 0.15  # phase correlation's peak in the median, at least
     within: float = 0.6  # shift within the plane by the poses over the whole step, at least, of transforms that are wrong
@@ -66,10 +68,10 @@ def faults(images: Iterable[NDArray[np.uint8]], world_from_pixel: Array) -> Iter
                 f"the poses shift B-scans within their own planes by {by_poses:.2g} mm from one to the next, and the images show "
                 f"{shown:.2g} mm: a transform the other way round, axes exchanged, or another probe's calibration?"
             )
-    same = np.array([np.array_equal(one, other) for one, other in pairwise(small)])
-    run = max((len(part) for part in "".join("x" if one else " " for one in same).split()), default=0) + 1
-    if run >= LIMITS.repeats:
-        yield f"{run} B-scans in a row are the same to the last digit while the probe moves: a frozen image?"
+    fresh = [one.std() <= LIMITS.flat or not np.array_equal(one, other) for one, other in pairwise(small)]
+    runs = np.diff([0, *(np.flatnonzero(fresh) + 1), len(small)])
+    if (run := runs.max()) >= LIMITS.repeats and run > LIMITS.longer * np.median(runs):
+        yield f"{run} B-scans in a row are the same to the last digit while the probe moves: a frozen image, or no contact?"
     if _upside_down(np.array(rows)):
         yield "the lowest rows are as bright and as steady as the ringing at a probe's face is: upside down?"
 
