@@ -137,7 +137,10 @@ def write_surface(folder: Path, config: Config) -> str:
     mask = np.ones(surface.images.shape[1:], bool)
     if config.surface is not None:
         shape = (*mask.shape, 3)
-        mask = np.isfinite(npz.read(config.surface / POINTS, {"points": npz.Form("f", shape)})["points"]).all(axis=-1)
+        path = config.surface / POINTS
+        mask = np.isfinite(npz.read(path, {"points": npz.Form("f", shape)})["points"]).all(axis=-1)
+        if not mask.any():
+            raise InputError(f"{path}: points: expected the point of some pixels, found none: no surface was found there?")
     meza2021.write(folder, surface, mask)
     return f"surface     {len(surface.images)} images, {100 * mask.mean():.1f} % of the pixels in the mask"
 
