@@ -85,7 +85,7 @@ def run(config: Config) -> None:
     with watch.stage("triangulate"):
         raw = triangulate(found, config.implausible)
         ray_checks.check(found, raw, camera, projector, shots.name, config.implausible)
-    with watch.stage("compare"):
+    with watch.stage("second_view"):  # the demo has a step of the name "compare"
         for line in compared(config, shots, found, raw):
             print(line)
     with watch.stage("clean"):
