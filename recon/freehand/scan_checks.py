@@ -45,12 +45,11 @@ def faults(images: Iterable[NDArray[np.uint8]], world_from_pixel: Array) -> Iter
     world_from_pixel : (n, 4, 4) mm
         NaN where there is no pose.
     """
-    small, rows, places = [], [], []
+    small, places = [], []
     for image, pose in zip(images, world_from_pixel[: LIMITS.most], strict=False):
         if np.isfinite(pose).all():
             size = LIMITS.wide, max(round(LIMITS.wide * image.shape[0] / image.shape[1]), LIMITS.side)
             small.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-            rows.append(image.mean(axis=1))
             places.append(pose @ np.diag([image.shape[1] / size[0], image.shape[0] / size[1], 1, 1]))
     if len(small) < LIMITS.least:
         return
@@ -72,7 +71,7 @@ def faults(images: Iterable[NDArray[np.uint8]], world_from_pixel: Array) -> Iter
     runs = np.diff([0, *(np.flatnonzero(fresh) + 1), len(small)])
     if (run := runs.max()) >= LIMITS.repeats and run > LIMITS.longer * np.median(runs):
         yield f"{run} B-scans in a row are the same to the last digit while the probe moves: a frozen image, or no contact?"
-    if _upside_down(np.array(rows)):
+    if _upside_down(np.mean(small, axis=2)):
         yield "the lowest rows are as bright and as steady as the ringing at a probe's face is: upside down?"
 
 

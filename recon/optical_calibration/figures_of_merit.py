@@ -96,12 +96,9 @@ def measure(result: Result, truth: Calibration | None = None) -> Metrics:
 def describe_board(result: Result, figures: Metrics) -> str:
     """The board's departure from its design, in words."""
     if not result.released:
-        exact = (
-            ""
-            if result.tolerances.sigmas.any()
-            else ", and exact: no sigma holds its print's errors, unless shape.in_plane_mm does"
-        )
-        return f"taken as designed{exact}"
+        if result.tolerances.sigmas.any():
+            return "taken as designed"
+        return "taken as designed, and exact: no sigma holds its print's errors, unless shape.in_plane_mm does"
     in_plane, out_of_plane = (shown(figures[f"board_{name}_mm"], ".4f", " mm") for name in ("in_plane", "out_of_plane"))
     return f"differs from its design by {in_plane} in its plane and {out_of_plane} out of it (RMS), which is corrected"
 

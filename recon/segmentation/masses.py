@@ -204,15 +204,15 @@ def rough(power: EchoPower) -> list[Mass]:
         if volume < LEAST_MM3 or core > SEED or touches or cut:
             continue
         whole[part] |= inside
-        candidates.append((part, inside, core))
+        candidates.append((part, inside, volume, core))
     shadowed = _name_cut_bodies(dark, whole, ratio, seen, power)
     result = []
-    for part, inside, core in candidates:
+    for part, inside, volume, core in candidates:
         height, thick = np.ptp(np.nonzero(inside)[1]) * spacing[1], _thickness(inside, spacing)
         if height > STREAK * thick:
             log.warning(SHADOW, *_middle(inside, part, power), height, thick)
         elif shadowed[part][inside].mean() > BEHIND:
-            log.warning(HIDDEN, inside.sum() * float(np.prod(spacing)), *_middle(inside, part, power))
+            log.warning(HIDDEN, volume, *_middle(inside, part, power))
         else:
             field = np.where(_widened(inside, GROW_MM, spacing), ratio[part], 1.0)
             result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))

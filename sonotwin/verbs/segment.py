@@ -99,7 +99,7 @@ def run(config: Config) -> None:
     inputs = [path for path in sources if path is not None]
     atomic.check_folder(config.out, "segment", inputs=inputs)
     skin = None if config.surface is None else containment.read_skin(config.surface)
-    scans = read(config)
+    scans = freehand_scans.in_memory(read(config))  # what follows reads them some times more
     freehand_scans.check_size(scans, str(config.capture or config.sequence), None, config.implausible)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
