@@ -1,18 +1,23 @@
 """The exception for a user's mistake, reported in one line."""
 
+import logging
 import re
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+log = logging.getLogger(__name__)
+
+Implausible = Literal["refuse", "take"]  # a setting: what to do about lengths, poses and points that no rig and no hand makes
 Model = TypeVar("Model", bound=BaseModel)
 OWN_WORDS = {  # of kinds of pydantic's
     "int_parsing_size": "a whole number of fewer digits",
     "path_type": "a path",
     "tuple_type": "a list",
 }
+WAY = "to use them all the same, give implausible=take"
 LONGEST = 60  # letters, of a found value in a message
 MOST_LETTERS = 1000  # of a text that are looked at
 MOST_BITS = 256  # of a number that is shown
@@ -63,6 +68,14 @@ def validated(model: type[Model], content: object, place: object) -> Model:
         return model.model_validate(content)
     except ValidationError as error:
         raise InputError(f"{place}: {one_line(error)}") from None
+
+
+def doubt(place: str, seen: str, implausible: Implausible) -> None:
+    """Refuse implausible data by what was seen of them, in a line that ends with the way past it; or warn of them."""
+    if implausible == "take":
+        log.warning("%s: taken all the same: %s", place, seen)
+    else:
+        raise InputError(f"{place}: {seen}{'' if seen.endswith('?') else ';'} {WAY}")
 
 
 def did_you_mean(word: str, known: Sequence[str], before: str = "") -> str:

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from recon.capture import manifest, probe_files, sweep_tables
 from recon.capture.images import Size, frame_file, read_image
 from recon.capture.manifest import MANIFEST, SCANNER, STAMPS, Purpose, image_name
-from recon.errors import InputError
+from recon.errors import Implausible, InputError
 from recon.files.regular import check_there
 from recon.model import pose_checks, tracks
-from recon.model.pose_checks import Implausible
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 

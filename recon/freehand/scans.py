@@ -14,7 +14,7 @@ from pydantic import model_validator
 from recon.capture import probe_files
 from recon.capture.images import read_image
 from recon.capture.sweep_part import SweepCapture
-from recon.errors import InputError
+from recon.errors import Implausible, InputError, doubt
 from recon.files.metrics import Metrics
 from recon.files.volumes import Volume
 from recon.freehand import (
@@ -34,7 +34,6 @@ from recon.freehand.volume_compounding import MOST_BYTES, Clip, Compounding, Int
 from recon.geometry import rigid
 from recon.model import fan, lengths, pose_checks, tracks
 from recon.model.fan import Fan
-from recon.model.pose_checks import Implausible
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration, Speed, SpeedSigma
 from recon.model.rig import NotNegative
 from recon.model.tracks import LagSeconds
@@ -341,9 +340,7 @@ def check_size(scans: Scans, place: str, clip: Clip | None, implausible: Implaus
         If they are, and not to be taken.
     """
     for fault in size_faults(scans, clip):
-        if implausible == "refuse":
-            raise InputError(f"{place}: B-scans: expected {fault}; to use them all the same, give implausible=take")
-        log.warning("%s: B-scans: taken all the same, though expected were %s", place, fault)
+        doubt(place, f"B-scans: expected {fault}", implausible)
 
 
 def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES) -> tuple[Reconstruction, Reconstruction]:

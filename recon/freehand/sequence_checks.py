@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import InputError
+from recon.errors import Implausible, InputError
 from recon.freehand import sequences
 from recon.freehand.sequences import TRANSFORM, Frames
 from recon.model import pose_checks, tracks
-from recon.model.pose_checks import LIMITS, Implausible
+from recon.model.pose_checks import LIMITS
 from recon.model.tracks import Track
 
 log = logging.getLogger(__name__)

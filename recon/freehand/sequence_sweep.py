@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from recon.capture.images import Size
-from recon.errors import InputError
+from recon.errors import Implausible, InputError
 from recon.freehand import sequence_checks, sequences
 from recon.freehand.sequences import MOST_SECONDS, FrameName, FrameNames
 from recon.geometry import rigid
 from recon.model import tracks
-from recon.model.pose_checks import Implausible
 from recon.model.rig import Part
 from recon.model.tracks import MAX_GAP_S, Track
 

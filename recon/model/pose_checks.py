@@ -12,21 +12,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import InputError
+from recon.errors import WAY, Implausible, InputError, doubt
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Cause = Literal["identity", "frozen", "jump"]
-Implausible = Literal["refuse", "take"]  # a setting: what to do about lengths and poses that no scanner and no hand makes
 Changes = Callable[
     [], tuple[Array, Array]
 ]  # moments : (m,) of images, and change of each since the one before : (m,), grey levels
 
 STEP_PX = 4  # of the pixels that are compared from image to image
 LOST = -3.697314e28  # of a coordinate, which NDI's trackers write where a tool isn't seen
-WAY = "to use them all the same, give implausible=take"
 WORDS: dict[Cause, str] = {
     "identity": "the identity, as of a tool that is not seen",
     "frozen": "the same to the last digit as the one before while the images change, as of a tracker that stood still",
@@ -144,9 +142,7 @@ def check_motion(place: str, poses: Array, implausible: Implausible = "refuse") 
     if len(known) <= LIMITS.repeats or not (known == known[0]).all():
         return
     found = f"all {len(known)} the same to the last digit: no tracking, or a probe at rest?"
-    if implausible == "refuse":
-        raise InputError(f"{place}: poses: expected those of a probe that moves, found {found} {WAY}")
-    log.warning("%s: taken all the same: poses that are %s", place, found.rstrip("?"))
+    doubt(place, f"poses: expected those of a probe that moves, found {found}", implausible)
 
 
 def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Array | None = None) -> Findings:

@@ -5,20 +5,16 @@ the projector's image. Where both columns and rows are known, `triangulate` itse
 down of columns alone pass all that; a second camera shows them, as it sees other columns where the points would lie.
 """
 
-import logging
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import InputError
+from recon.errors import Implausible, doubt
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.pose_checks import Implausible
 from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.triangulate import PointMap
-
-log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -62,7 +58,8 @@ def check(
     InputError
         If more points than `limits` allow are lit from behind, lie behind a device, or outside of the projector's image.
     """
-    _say(fault(found, raw, camera, projector, limits or RayLimits()), name, implausible)
+    if seen := fault(found, raw, camera, projector, limits or RayLimits()):
+        doubt(name, seen, implausible)
 
 
 def check_beside(
@@ -113,20 +110,11 @@ def check_beside(
     if apart.size < limits.fewest:
         return np.nan
     share = float(np.mean(apart > limits.apart_px))
-    said = (
-        f"{100 * share:.0f} % of the points lie where {beside.name or 'the other camera'} sees the projector's image more than "
-        f"{limits.apart_px:g} px off: are the images of either camera upside down, or of another scene, or did one of them move?"
-    )
-    _say(said if share > limits.apart else None, name, implausible)
+    if share > limits.apart:
+        where = f"where {beside.name or 'the other camera'} sees the projector's image more than {limits.apart_px:g} px off"
+        cause = "are the images of either camera upside down, or of another scene, or did one of them move?"
+        doubt(name, f"{100 * share:.0f} % of the points lie {where}: {cause}", implausible)
     return 1 - share
-
-
-def _say(seen: str | None, name: str, implausible: Implausible) -> None:
-    """Refuse what was seen, or warn of it."""
-    if seen is not None and implausible != "take":
-        raise InputError(f"{name}: {seen} To use them all the same, give implausible=take")
-    elif seen is not None:
-        log.warning("%s: taken all the same: %s", name, seen)
 
 
 def fault(found: ProjectorMap, raw: PointMap, camera: Camera, projector: Camera, limits: RayLimits) -> str | None:

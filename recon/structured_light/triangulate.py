@@ -4,7 +4,6 @@ A camera pixel's ray is `centre + t * direction`. The projector sees the point a
 solved for so that this is the decoded coordinate: one axis determines it, two do in the least-squares sense.
 """
 
-import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,13 +11,10 @@ from numpy.typing import NDArray
 
 from recon import arguments
 from recon.compiled import njit
-from recon.errors import InputError
+from recon.errors import Implausible, InputError, doubt
 from recon.geometry.camera import Camera, distort_side_by_side
-from recon.model.pose_checks import Implausible
 from recon.structured_light.decode import ProjectorMap
 from recon.threads import in_threads
-
-log = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
 
@@ -135,13 +131,8 @@ def _check_rows(found: ProjectorMap, points: Float32, projector: Camera, implaus
     typical = float(np.nanmedian(np.linalg.norm(missed, axis=1)))
     if typical > MISSED_PX:
         cause = "another camera's calibration or images, images mirrored or turned, or devices that moved since"
-        said = f"{typical:.3g} px in the median: {cause}?"
-        if implausible != "take":
-            raise InputError(
-                f"triangulate: camera: expected columns and rows that agree to {MISSED_PX:g} projector px, found {said} To use "
-                "them all the same, give implausible=take"
-            )
-        log.warning("triangulate: camera: taken all the same: columns and rows that contradict each other by %s", said)
+        expected = f"columns and rows that agree to {MISSED_PX:g} projector px"
+        doubt("triangulate: camera", f"expected {expected}, found {typical:.3g} px in the median: {cause}?", implausible)
 
 
 def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:

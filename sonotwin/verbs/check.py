@@ -21,10 +21,9 @@ from rich.console import Console
 
 from recon.capture import calibration_files, lag_files, manifest, probe_files, stereo_frames, surface_part, sweep_part
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
-from recon.errors import InputError
+from recon.errors import Implausible, InputError
 from recon.files import atomic
 from recon.model.calibration import Calibration, in_use
-from recon.model.pose_checks import Implausible
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import NotNegative, Positive, Target
 from recon.probe_calibration import sound_in_water

@@ -38,10 +38,9 @@ from recon.capture.images import read_image
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
 from recon.capture.stereo_frames import Film
 from recon.capture.sweep_part import SweepCapture
-from recon.errors import InputError
+from recon.errors import Implausible, InputError
 from recon.files import atomic, npz
 from recon.freehand import scans as freehand_scans
-from recon.model.pose_checks import Implausible
 from recon.model.probe import Speed
 from recon.model.rig import Part
 from recon.model.tracks import LagSeconds

@@ -20,7 +20,7 @@ from rich.console import Console
 
 from recon.capture import calibration_files, sweep_part
 from recon.capture.images import read_grey
-from recon.errors import InputError
+from recon.errors import Implausible, InputError
 from recon.files import atomic, layers, metrics
 from recon.files.volumes import read_volume
 from recon.freehand import scans as freehand_scans
@@ -28,7 +28,6 @@ from recon.fusion import fused_scene, scene_page, skin, slicer_folder
 from recon.fusion.fused_scene import FusedScene
 from recon.fusion.skin import Parted
 from recon.model.calibration import Calibration
-from recon.model.pose_checks import Implausible
 from recon.model.probe import Speed
 from recon.model.rig import Part, Rig
 from recon.model.tracks import LagSeconds

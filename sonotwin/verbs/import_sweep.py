@@ -26,11 +26,10 @@ from recon.capture.writer import new_capture
 from recon.clips import clip_reader, image_region, pose_tables
 from recon.clips.clip import Box, Clip
 from recon.clips.pose_tables import MOST_SECONDS, Columns
-from recon.errors import InputError
+from recon.errors import Implausible, InputError
 from recon.files import atomic
 from recon.freehand import volume_compounding
 from recon.model import pose_checks, tracks
-from recon.model.pose_checks import Implausible
 from recon.model.rig import Part
 from recon.model.tracks import Track
 

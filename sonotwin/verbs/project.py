@@ -29,7 +29,7 @@ from rich.console import Console
 
 from recon.capture import calibration_files, sweep_part
 from recon.devices.interfaces import Projector
-from recon.errors import InputError
+from recon.errors import Implausible, InputError
 from recon.files import atomic, layers, metrics
 from recon.files.metrics import Metrics
 from recon.freehand import scans as freehand_scans
@@ -37,7 +37,6 @@ from recon.fusion import fused_scene, probe_shape
 from recon.fusion import skin as skin_parts
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.pose_checks import Implausible
 from recon.model.rig import NotNegative, Part, Rig, Vector
 from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, mass_files

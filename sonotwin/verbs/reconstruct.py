@@ -26,10 +26,9 @@ from rich.console import Console
 
 from recon.capture import calibration_files, manifest, probe_files, target_files
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPart, is_sweep, sweep_part
-from recon.errors import InputError
+from recon.errors import Implausible, InputError
 from recon.files import atomic, metrics
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE
-from recon.model.pose_checks import Implausible
 from recon.model.probe import Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig
 from recon.model.tracks import LagSeconds

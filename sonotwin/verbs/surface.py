@@ -21,10 +21,9 @@ import numpy as np
 
 from recon.capture import surface_part
 from recon.capture.surface_part import SurfaceCapture
-from recon.errors import InputError
+from recon.errors import Implausible, InputError
 from recon.files import atomic, meshes, metrics
 from recon.files.metrics import shown
-from recon.model.pose_checks import Implausible
 from recon.model.rig import Part
 from recon.structured_light import decode, ray_checks, surface_figures, surface_mesh
 from recon.structured_light.decode import ProjectorMap

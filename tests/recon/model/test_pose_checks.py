@@ -99,7 +99,7 @@ def test_a_sweep_without_any_motion_is_refused(rng, caplog):
     with pytest.raises(InputError, match=complaint):
         pose_checks.check_motion("s", poses)
     pose_checks.check_motion("s", poses, "take")
-    assert "s: taken all the same: poses that are all 50 the same to the last digit" in caplog.text
+    assert "s: taken all the same: poses: expected those of a probe that moves, found all 50 the same" in caplog.text
     pose_checks.check_motion("s", poses[:14])
     poses[10, 0, 3] += 1e-9
     pose_checks.check_motion("s", poses)
