@@ -37,23 +37,23 @@ class Fuzzed:
     faults: list[str] = field(default_factory=list)  # last lines of what was raised or said
 
 
-def run(place: Path, seconds: float, only: Sequence[str] = (), workers: int = 2) -> list[Fuzzed]:
-    """Fuzz readers for some seconds each."""
+def run(place: Path, seconds: float, only: Sequence[str] = (), workers: int = 2, inputs: int | None = None) -> list[Fuzzed]:
+    """Fuzz readers for some seconds each, or until each had a number of inputs."""
     names = [name for name in NAMES if not only or name in only]
     with ThreadPoolExecutor(workers) as pool:
-        found = list(pool.map(lambda name: _kept(place, name, seconds), names))
+        found = list(pool.map(lambda name: _kept(place, name, seconds, inputs), names))
     for name in names:
         _row_file(place, name).unlink()
     return found
 
 
-def _kept(place: Path, name: str, seconds: float) -> Fuzzed:
+def _kept(place: Path, name: str, seconds: float, inputs: int | None) -> Fuzzed:
     """What came of a reader before a run was killed; else fuzz it."""
     from recon.files import atomic  # not on top: a process that fuzzes instruments what it imports
 
     file = _row_file(place, name)
     if not file.exists():
-        found = fuzz(place, name, seconds)
+        found = fuzz(place, name, seconds, inputs)
         with atomic.new_file(file) as temporary:
             temporary.write_text(json.dumps(asdict(found)), encoding="utf-8")
     return Fuzzed(**json.loads(file.read_text(encoding="utf-8")))
@@ -63,15 +63,18 @@ def _row_file(place: Path, name: str) -> Path:
     return place.parent / "fuzzing" / f"{name}.json"
 
 
-def fuzz(place: Path, name: str, seconds: float) -> Fuzzed:
+def fuzz(place: Path, name: str, seconds: float, inputs: int | None = None) -> Fuzzed:
     """Fuzz one reader; what breaks it is kept in the folder `fuzzing` beside the sources."""
     found, kept = Fuzzed(name), place.parent / "fuzzing" / name
     kept.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     with TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         while (left := seconds - (time.perf_counter() - start)) > 1 and len(found.faults) < MOST_FAULTS:
+            if inputs is not None and found.inputs >= inputs:
+                break
             spell = min(int(left), SPELL_S)
             limits = [f"-max_total_time={spell}", f"-rss_limit_mb={MOST_MB}", f"-timeout={LONGEST_S}"]
+            limits += [] if inputs is None else [f"-runs={inputs}"]
             settings = [*limits, f"-artifact_prefix={kept}/", "-print_final_stats=1"]
             line = [sys.executable, "-m", "campaign.fuzzing", name, str(place), folder, *settings]
             done = subprocess.run(line, capture_output=True, check=False, cwd=Path(__file__).resolve().parents[1])
