@@ -13,6 +13,7 @@ Those in OpenCV's storage, npz and MATLAB's files may state the unit of their tr
 metres. Without it they are in mm, and devices that would stand apart as none do are refused.
 """
 
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -33,6 +34,8 @@ from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
 from recon.model import lengths
 from recon.model.calibration import WORLD, Calibration, Uncertainty
 from recon.model.lengths import UNIT_KEY
+
+log = logging.getLogger(__name__)
 
 SCHEMA = "sonotwin-optics/1"
 SLMASTER_KEYS = ("M1", "D1", "M4", "D4", "Rlp", "Tlp", "S")
@@ -97,8 +100,12 @@ def _in_mm(path: Path, read: Calibration, stated: object) -> Calibration:
         If they do, or the unit is none.
     """
     if stated is None:
-        for name, fault in _unusual(read).items():
-            raise InputError(f"{path}: {name}: expected {lengths.DEVICES_APART} from {WORLD}, found {fault} {lengths.SAID}")
+        for name, camera in read.cameras.items():
+            apart = lengths.shift(camera.camera_from_world[:3, 3])
+            if fault := lengths.DEVICES_APART.fault(apart):
+                raise InputError(f"{path}: {name}: expected {lengths.DEVICES_APART} from {WORLD}, found {fault} {lengths.SAID}")
+            if doubt := lengths.DEVICES_APART.doubt(apart):
+                log.warning("%s: %s: its distance from %s is %s %s", path, name, WORLD, doubt, lengths.SAID)
         return read
     unit = lengths.unit_of(path, stated)
     if unit == 1:
@@ -112,15 +119,6 @@ def _in_mm(path: Path, read: Calibration, stated: object) -> Calibration:
         for name, camera in read.cameras.items()
     }
     return Calibration(scaled)
-
-
-def _unusual(calibration: Calibration) -> dict[str, str]:
-    """Devices at unusual distances, and these."""
-    faults = {
-        name: lengths.shift_fault(lengths.DEVICES_APART, camera.camera_from_world[:3, 3])
-        for name, camera in calibration.cameras.items()
-    }
-    return {name: fault for name, fault in faults.items() if fault}
 
 
 def of_capture(folder: Path, given: Path | None = None) -> Calibration | None:
@@ -158,7 +156,8 @@ def write(path: Path, calibration: Calibration) -> None:
     """Write sonotwin's own format, whole or not at all. The suffix should be `.yaml`."""
     storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     storage.write("schema", SCHEMA)
-    if _unusual(calibration):
+    apart = [lengths.shift(camera.camera_from_world[:3, 3]) for camera in calibration.cameras.values()]
+    if any(map(lengths.DEVICES_APART.is_unusual, apart)):
         storage.write(UNIT_KEY, 1.0)
     for name, camera in calibration.cameras.items():
         storage.startWriteStruct(name, cv2.FileNode_MAP)

@@ -116,7 +116,7 @@ def write(path: Path, calibration: ProbeCalibration) -> None:
     storage.write("scale", np.asarray(calibration.scale, float).reshape(1, 2))
     storage.write("speed_m_s", float(calibration.speed_m_s))
     storage.write("face_row", float(calibration.face_row))
-    if _unusual(calibration):
+    if _states_unit(calibration):
         storage.write(UNIT_KEY, 1.0)
     if calibration.uncertainty is not None:
         opencv_storage.write_covariance(storage, calibration.uncertainty.names, calibration.uncertainty.covariance)
@@ -128,7 +128,7 @@ def write_authors(path: Path, calibration: ProbeCalibration) -> None:
     sx, sy = calibration.scale
     with atomic.new_file(path) as temporary, temporary.open("wb") as file:
         beside = {"face_row": calibration.face_row} if calibration.face_row else {}
-        beside |= {UNIT_KEY: 1.0} if _unusual(calibration) else {}
+        beside |= {UNIT_KEY: 1.0} if _states_unit(calibration) else {}
         np.savez(file, sx=sx, sy=sy, T_I_T=calibration.target_from_image, speed_m_s=calibration.speed_m_s, **beside)
 
 
@@ -188,7 +188,14 @@ def _checked(path: Path, name: str, read: ProbeCalibration, stated: object) -> P
         return _in_mm(path, read, lengths.unit_of(path, stated))
     if found := _unusual(read, name):
         raise InputError(f"{path}: {found} {lengths.SAID}")
+    if doubt := lengths.BRACKET.doubt(lengths.shift(read.target_from_image[:3, 3])):
+        log.warning("%s: %s: the image's corner lies from the target by %s %s", path, name, doubt, lengths.SAID)
     return read
+
+
+def _states_unit(probe: ProbeCalibration) -> bool:
+    """Whether a file had better state its unit."""
+    return _unusual(probe) is not None or lengths.BRACKET.is_unusual(lengths.shift(probe.target_from_image[:3, 3]))
 
 
 def _unusual(probe: ProbeCalibration, name: str = "target_from_image") -> str | None:
@@ -196,7 +203,7 @@ def _unusual(probe: ProbeCalibration, name: str = "target_from_image") -> str | 
     for axis, size in zip(("sx", "sy"), np.ravel(probe.scale).tolist(), strict=True):
         if found := lengths.PIXEL.fault(size):
             return f"{axis}: expected {lengths.PIXEL} a pixel, found {found}"
-    found = lengths.shift_fault(lengths.BRACKET, probe.target_from_image[:3, 3])
+    found = lengths.BRACKET.fault(lengths.shift(probe.target_from_image[:3, 3]))
     return found and f"{name}: expected {lengths.BRACKET} from the target to the image's corner, found {found}"
 
 

@@ -19,6 +19,7 @@ class Usual:
 
     least: float
     most: float
+    common: tuple[float, float] | None = None  # beyond these, one in another unit is as likely
 
     def fault(self, length_mm: float) -> str | None:
         """A length outside, with the unit in which it would lie well within; None for any other. Zero is none."""
@@ -27,13 +28,24 @@ class Usual:
         unit = next((name for factor, name in UNITS.items() if self.least <= length_mm * factor <= self.most), None)
         return f"{length_mm:.4g} mm" + (f": {unit}?" if unit else "")
 
+    def doubt(self, length_mm: float) -> str | None:
+        """A length that there may be, with the units in which it would be a common one; None for any other."""
+        if self.common is None or not 0 < length_mm < np.inf or self.common[0] <= length_mm <= self.common[1]:
+            return None
+        units = [name for factor, name in UNITS.items() if self.common[0] <= length_mm * factor <= self.common[1]]
+        return f"{length_mm:.4g} mm: is it in mm, not in {' or '.join(units)}?" if units else None
+
+    def is_unusual(self, length_mm: float) -> bool:
+        """Whether a file had better state its unit."""
+        return self.fault(length_mm) is not None or self.doubt(length_mm) is not None
+
     def __str__(self) -> str:
         return f"{self.least:g} to {self.most:g} mm"
 
 
 BOARD_STEP = Usual(0.5, 1000.0)  # from point to point of a calibration board
-DEVICES_APART = Usual(2.0, 20_000.0)  # from camera to camera or projector
-BRACKET = Usual(1.0, 2000.0)  # from a probe's target to its image's corner
+DEVICES_APART = Usual(2.0, 20_000.0, (30.0, 3000.0))  # from camera to camera or projector
+BRACKET = Usual(1.0, 2000.0, (25.0, 600.0))  # from a probe's target to its image's corner
 TARGET_STEP = Usual(5.0, 1000.0)  # from circle to circle of a probe's target
 TARGET_CIRCLE = Usual(2.5, 500.0)  # outer diameter of its circles
 PIXEL = Usual(0.002, 5.0)  # of a B-scan
@@ -41,10 +53,10 @@ B_SCAN = Usual(2.0, 600.0)  # width and depth of a B-scan, or of a whole screen
 MOST_COSINE = 0.17  # between the axes of a B-scan's image, which calibrations by point pairs leave 3 degrees off at times
 
 
-def shift_fault(usual: Usual, translation: ArrayLike) -> str | None:
-    """The fault of a translation : (3,) mm that is longer or shorter than usual; one of nearly zero is none."""
+def shift(translation: ArrayLike) -> float:
+    """Length of a translation : (3,); 0 of one that is nearly zero."""
     length = float(np.linalg.norm(np.ravel(translation)))
-    return None if length < 1e-9 else usual.fault(length)
+    return length if length >= 1e-9 else 0.0
 
 
 def unit_of(path: Path, stated: object) -> float:

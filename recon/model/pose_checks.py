@@ -49,7 +49,7 @@ class MotionLimits:
     repeats: int = 4  # poses in a row that are the same, at least, before images are compared
     changed: float = 0.7  # times the usual change from image to image of a moving probe
     changed_before_jump: float = 0.3  # the same, where the pose jumps when it goes on
-    small_mm: tuple[float, float] = (2.0, 20.0)  # a sweep's extent that might be in centimetres, as few in mm are; from noise on
+    small_mm: tuple[float, float] = (1.0, 20.0)  # a sweep's extent that might be in centimetres or inches, as few in mm are
     near_mm: float = 150.0  # the same of its farthest place from the origin
     slow_mm_s: float = 4.0  # and of its median speed
     least_covered: float = 0.8  # share of the images with a pose, below which it is said
@@ -185,7 +185,7 @@ def unit_fault(poses: Array) -> str | None:
 
 
 def unit_doubts(times_s: Array, poses: Array, unit: str = "") -> list[str]:
-    """What is said of a sweep that may well be one in mm, but is small, near and slow as those in centimetres are; else none."""
+    """Say that a sweep may be in another unit: one that is small, near and slow, as those in centimetres or inches are."""
     found = np.isfinite(poses).all(axis=(1, 2))
     places, times = poses[found, :3, 3], times_s[found]
     if len(places) <= LIMITS.repeats:
@@ -199,7 +199,7 @@ def unit_doubts(times_s: Array, poses: Array, unit: str = "") -> list[str]:
         if (speed := float(np.median(steps))) > LIMITS.slow_mm_s:
             return []
         told += f", at {speed:.2g} mm/s"
-    return [f"{told}: is it in mm, not in centimetres?" + (f" Else give {unit}" if unit else "")]
+    return [f"{told}: is it in mm, not in centimetres or inches?" + (f" Else give {unit}" if unit else "")]
 
 
 def image_changes(images: Iterable[NDArray]) -> Array:

@@ -10,7 +10,9 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
 from recon.geometry.lens_domain import is_one_to_one
+from recon.model import lengths
 from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
+from recon.model.calibration import WORLD
 from recon.optical_calibration.adjustment import Adjustment
 from recon.optical_calibration.bundle import Array, Estimate
 from recon.optical_calibration.observations import PROJECTOR, Observations
@@ -143,6 +145,8 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
                 f"none {_where(seen, part)}, where distortion is a guess"
             )
         spread = uncertainty.sigma(f"{device}.fx") / camera.matrix[0, 0] if uncertainty else 0.0
+        if doubt := lengths.DEVICES_APART.doubt(lengths.shift(camera.camera_from_world[:3, 3])):
+            found.append(f"{device}: its distance from {WORLD} comes out as {doubt} The board's lengths set it")
         if stretched := stretch(device, camera, spread):
             found.append(stretched)
         if uncertainty and (sigma := uncertainty.sigma(f"{device}.fx") / camera.matrix[0, 0]) > UNSURE_FOCAL:

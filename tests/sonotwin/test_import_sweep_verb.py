@@ -133,7 +133,7 @@ def test_poses_of_another_unit_or_at_rest_are_named(folder, capsys, caplog):
     for factor, moving, complaint in (
         (1e-3, 1, "metres? give columns.length_unit; to use them all the same, give implausible=take"),
         (1, 0, "found all 60 the same to the last digit: no tracking, or a probe at rest? to use them all the same"),
-        (0.1, 1, "and up to 65.1 mm from the origin, at 1 mm/s: is it in mm, not in centimetres? Else give columns.length_unit"),
+        (0.1, 1, "up to 65.1 mm from the origin, at 1 mm/s: is it in mm, not in centimetres or inches? Else give columns"),
     ):
         lines = [[t, x, str(moving * factor * float(y)), str(factor * float(z)), *q] for t, x, y, z, *q in rows]
         table.write_text("\n".join(map(",".join, [header, *lines])) + "\n")

@@ -81,6 +81,16 @@ def test_a_calibration_in_metres_is_refused_or_read_as_such(tmp_path):
         calibration_files.read(pair(tmp_path / "pair.npz", 1000, mm_per_unit=0.0), sizes)
 
 
+def test_a_calibration_that_may_be_in_centimetres_is_doubted_unless_stated(tmp_path, caplog):
+    sizes = {"cam1": (640, 480), "cam2": (640, 480)}
+    calibration_files.read(pair(tmp_path / "pair.npz", 1), sizes)
+    calibration_files.read(pair(tmp_path / "pair.npz", 10, mm_per_unit=10.0), sizes)
+    calibration_files.read(pair(tmp_path / "pair.npz", 10, mm_per_unit=1.0), sizes)
+    assert not caplog.text
+    calibration_files.read(pair(tmp_path / "pair.npz", 10), sizes)
+    assert "cam2: its distance from cam1 is 16.12 mm: is it in mm, not in centimetres or inches? give mm_per_unit" in caplog.text
+
+
 @pytest.mark.parametrize(("scale", "shift", "complaint"), [
     ([0.12e-3, 0.12e-3], [30, -50, 90], "sx: expected 0.002 to 5 mm a pixel, found 0.00012 mm: metres?"),
     ([0.12, 0.12], [0.03, -0.05, 0.09], "target_from_image: expected 1 to 2000 mm from the target to the"),
@@ -96,6 +106,18 @@ def test_a_probe_in_metres_is_refused_unless_it_is_stated(scale, shift, complain
     assert complaint in str(fault.value) and "metres?" in str(fault.value)
     path.write_text(path.read_text() + "mm_per_unit: 1000\n")
     assert probe_files.read(path).scale == pytest.approx(1000 * np.array(scale))
+
+
+def test_a_bracket_that_may_be_in_centimetres_is_doubted_unless_stated(tmp_path, caplog):
+    path = tmp_path / "probe.yaml"
+    probe_files.write(path, ProbeCalibration(rigid.transform(TURN[:3, :3], [30, -50, 90]), np.full(2, 0.12)))
+    probe_files.read(path)
+    probe_files.write(path, ProbeCalibration(rigid.transform(TURN[:3, :3], [3, -5, 9]), np.full(2, 0.12)))
+    probe_files.read(path)
+    assert not caplog.text, "what is written says that it is in mm"
+    path.write_text("".join(line for line in path.read_text().splitlines(keepends=True) if "mm_per_unit" not in line))
+    probe_files.read(path)
+    assert "corner lies from the target by 10.72 mm: is it in mm, not in centimetres or inches? give mm_per_unit" in caplog.text
 
 
 PLUS = """<PlusConfiguration><CoordinateDefinitions>

@@ -132,7 +132,12 @@ def test_a_sweep_that_may_be_in_centimetres_is_named(rng, caplog):
     assert not caplog.text
     pose_checks.checked("s", TIMES, small, unit="length_unit")
     assert "s: all poses lie within 7.8 mm, and up to 65.5 mm from the origin, at " in caplog.text
-    assert "mm/s: is it in mm, not in centimetres? Else give length_unit" in caplog.text
+    assert "mm/s: is it in mm, not in centimetres or inches? Else give length_unit" in caplog.text
+    caplog.clear()
+    inches = poses.copy()
+    inches[:, :3, 3] /= 25.4
+    pose_checks.checked("s", TIMES, inches)
+    assert "s: all poses lie within 3.07 mm" in caplog.text
     caplog.clear()
     pose_checks.checked("s", np.full(COUNT, np.nan), small)
     assert "up to 65.5 mm from the origin: is it in mm" in caplog.text
