@@ -99,6 +99,9 @@ def _in_mm(path: Path, read: Calibration, stated: object) -> Calibration:
     InputError
         If they do, or the unit is none.
     """
+    placed = [name for name, camera in read.cameras.items() if not np.allclose(camera.camera_from_world, np.eye(4), atol=1e-9)]
+    if WORLD in placed and (first := [name for name in read.cameras if name not in placed]):
+        log.warning("%s: expected %s where the world begins, found %s there: are their names exchanged?", path, WORLD, first[0])
     if stated is None:
         for name, camera in read.cameras.items():
             apart = lengths.shift(camera.camera_from_world[:3, 3])

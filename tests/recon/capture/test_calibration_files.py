@@ -104,6 +104,18 @@ def test_the_covariance_comes_back(optics, tmp_path):
     assert storage.getNode("covariance").mat().shape == (6, 6)
 
 
+def test_cameras_whose_names_are_exchanged_are_named(optics, tmp_path, caplog):
+    """The world is camera 1's frame: no other camera stands where it begins."""
+    calibration_files.write(tmp_path / "optics.yaml", optics)
+    calibration_files.read(tmp_path / "optics.yaml")
+    assert not caplog.text
+    cameras = dict(optics.cameras)
+    cameras["cam1"], cameras["cam2"] = cameras["cam2"], cameras["cam1"]
+    calibration_files.write(tmp_path / "exchanged.yaml", Calibration(cameras))
+    calibration_files.read(tmp_path / "exchanged.yaml")
+    assert "expected cam1 where the world begins, found cam2 there: are their names exchanged?" in caplog.text
+
+
 def test_a_file_from_before_covariances_has_none(optics, tmp_path):
     calibration_files.write(tmp_path / "optics.yaml", optics)
     assert "covariance" not in (tmp_path / "optics.yaml").read_text()
