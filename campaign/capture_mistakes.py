@@ -65,7 +65,7 @@ def reordered(images: str, how: str) -> Change:
         elif how == "late":
             order = np.roll(order, 1)
         elif how == "frozen":
-            order[b:] = b
+            order[a:] = a
         kept = [path.read_bytes() for path in paths]
         for path, k in zip(paths, order.tolist(), strict=True):
             write(path, kept[k])

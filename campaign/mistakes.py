@@ -1,7 +1,7 @@
 """Plausible mistakes, drawn over the verbs: refused, warned of, harmless, or wrong without a word.
 
-A result is wrong if its figures lie more than three of its own predicted standard deviations (RMS over all of a kind) from those
-without the mistake. What is lost (a pixel, a frame) isn't wrong; what is claimed is.
+A result is wrong if its figures of any name lie more than three of its own predicted standard deviations from those without the
+mistake, in RMS or more than 2 % of them. What is claimed counts; what is lost (a pixel, a frame) doesn't, unless it is all.
 """
 
 import contextlib

@@ -17,8 +17,8 @@ def test_every_mistake_is_drawn_once_before_any_is_again():
         assert sorted(mistake.what for _, mistake in turns) == sorted(mistake.what for mistake in task.mistakes)
 
 
-def figures(value: float, sigma: float = 0.1) -> mistake_figures.Figures:
-    return {"length": (np.array([value, np.nan]), np.array([sigma, sigma]))}
+def figures(value: float, sigma: float = 0.1, name: str = "length") -> mistake_figures.Figures:
+    return {name: (np.array([value, np.nan]), np.array([sigma, sigma]))}
 
 
 @pytest.mark.parametrize(
@@ -31,8 +31,18 @@ def figures(value: float, sigma: float = 0.1) -> mistake_figures.Figures:
         (Run(0, "warning     few poses, 12", figures(5.2)), "harmless"),
         (Run(0, "all is well", figures(5.4)), "silently wrong"),
         (Run(0, "all is well", figures(5.4, 0.2)), "harmless"),
+        (Run(0, "all is well", figures(5.0) | figures(1.0, name="another")), "silently wrong"),
+        (Run(0, "all is well", {}), "silently wrong"),
     ],
 )
 def test_outcomes(made, kind):
     """Beside a right run that warns of few poses and finds 5.0; a value that isn't claimed doesn't count."""
     assert mistakes.judged(made, Run(0, "warning     few poses, 11", figures(5.0)), MISTAKE)[0] == kind
+
+
+def test_a_few_wrong_points_among_many_and_one_mass_of_several_count():
+    right = {"points": (np.zeros(100), np.full(100, 0.1)), "mass0": (np.ones(1), np.ones(1)), "masses": (np.ones(1), np.ones(1))}
+    some = np.zeros(100)
+    some[:8] = 1.0
+    for made, far in (({"points": (some, np.full(100, 0.1))}, 10), ({"mass0": (np.full(1, 9.0), np.ones(1))}, 8), ({}, 0)):
+        assert mistake_figures.distance(right | made, right) == pytest.approx(far)
