@@ -20,7 +20,9 @@ class SweepLimits:
     least: int = 8
     side: int = 24  # blocks along each side of a B-scan, whose mean levels are compared; speckle averages out
     alike: float = 0.6  # difference of the most similar two over that of any two, at most: else there is nothing to compare
-    apart: float = 0.85  # difference of neighbours in space over that of any two, at least, where the order is another
+    by_chance: float = 0.01  # share of random orders in which neighbours in space are as much alike, at least, of another order
+    orders: int = 400  # random ones
+    apart_mm: float = 1.0  # of B-scans of which shifts are measured, so that noise of the poses is none
     repeats: int = 5  # B-scans in a row that are the same to the last digit
     longer: float = 3.0  # times the median of such rows: a grabber that is faster than the scanner has many short ones
     flat: float = 2.0  # grey levels, standard deviation of an image that shows nothing
@@ -64,15 +66,25 @@ def faults(images: Iterable[NDArray[np.uint8]], world_from_pixel: Array) -> Iter
         by_poses, shown, step = _shifts(small, places, centre)
         if by_poses > LIMITS.within * step and shown < LIMITS.shown * by_poses:
             yield (
-                f"the poses shift B-scans within their own planes by {by_poses:.2g} mm from one to the next, and the images show "
+                f"the poses shift B-scans {step:.2g} mm apart by {by_poses:.2g} mm within their own planes, and the images show "
                 f"{shown:.2g} mm: a transform the other way round, axes exchanged, or another probe's calibration?"
             )
-    fresh = [one.std() <= LIMITS.flat or not np.array_equal(one, other) for one, other in pairwise(small)]
-    runs = np.diff([0, *(np.flatnonzero(fresh) + 1), len(small)])
-    if (run := runs.max()) >= LIMITS.repeats and run > LIMITS.longer * np.median(runs):
-        yield f"{run} B-scans in a row are the same to the last digit while the probe moves: a frozen image, or no contact?"
+    if line := frozen(small, places):
+        yield line
     if _upside_down(np.mean(small, axis=2)):
         yield "the lowest rows are as bright and as steady as the ringing at a probe's face is: upside down?"
+
+
+def frozen(images: Iterable[NDArray[np.uint8]], poses: Iterable[Array]) -> str | None:
+    """Say that B-scans are the same to the last digit where their poses : (4, 4) differ; None as a rule, and of flat images."""
+    fresh = [
+        one.std() <= LIMITS.flat or not np.array_equal(one, other) or np.array_equal(pose, after, equal_nan=True)
+        for (one, pose), (other, after) in pairwise(zip(images, poses, strict=True))
+    ]
+    runs = np.diff([0, *(np.flatnonzero(fresh) + 1), len(fresh) + 1])
+    if (run := runs.max()) < LIMITS.repeats or run <= LIMITS.longer * np.median(runs):
+        return None
+    return f"{run} B-scans in a row are the same to the last digit while the probe moves: a frozen image, or no contact?"
 
 
 def _disordered(blocks: NDArray[np.float32], centres: Array) -> bool:
@@ -81,13 +93,16 @@ def _disordered(blocks: NDArray[np.float32], centres: Array) -> bool:
     differences = np.sqrt(np.maximum(squares[:, None] + squares - 2 * blocks @ blocks.T, 0))
     usual = float(np.median(differences[~np.eye(len(blocks), dtype=bool)]))
     nearest = KDTree(centres).query(centres, k=2)[1][:, 1]
-    neighbours = float(np.median(differences[np.arange(len(blocks)), nearest]))
+    neighbours = np.median(differences[np.arange(len(blocks)), nearest])
+    rng = np.random.default_rng(0)
+    orders = (rng.permutation(len(blocks)) for _ in range(LIMITS.orders))
+    by_chance = np.mean([np.median(differences[order, order[nearest]]) <= neighbours for order in orders])
     np.fill_diagonal(differences, np.inf)
-    return float(np.median(differences.min(axis=1))) < LIMITS.alike * usual and neighbours > LIMITS.apart * usual
+    return bool(np.median(differences.min(axis=1)) < LIMITS.alike * usual and by_chance > LIMITS.by_chance)
 
 
 def _shifts(small: list[NDArray[np.uint8]], places: list[Array], centre: Array) -> tuple[float, float, float]:
-    """Medians, mm: shift within the plane from one B-scan to the next by poses, and in the images; step. Without, zeros.
+    """Medians over B-scans that are apart, mm: shift within the plane by poses and in the images, and distance; else zeros.
 
     Parameters
     ----------
@@ -98,8 +113,11 @@ def _shifts(small: list[NDArray[np.uint8]], places: list[Array], centre: Array) 
     """
     mean = np.mean(small, axis=0, dtype=np.float32)  # what is alike in all is the scanner's, and never shifts
     window = cv2.createHanningWindow(mean.shape[::-1], cv2.CV_32F)
-    found = []
-    for (before, here), (after, there) in pairwise(zip(small, places, strict=True)):
+    centres, found = np.array(places)[:, :3] @ centre, []
+    strides = range(1, len(small) // 4)
+    apart = (s for s in strides if np.median(np.linalg.norm(centres[s:] - centres[:-s], axis=1)) >= LIMITS.apart_mm)
+    stride = next(apart, len(small) // 4)
+    for before, here, after, there in zip(small, places, small[stride:], places[stride:], strict=False):
         pixel_mm = np.linalg.norm(here[:3, :2], axis=0)
         moved = (np.linalg.inv(here) @ there @ centre - centre)[:2] * pixel_mm
         seen, peak = cv2.phaseCorrelate(before - mean, after - mean, window)

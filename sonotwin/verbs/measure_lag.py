@@ -10,6 +10,7 @@ Takes seconds.
     sonotwin freehand capture=outputs/sweep/capture lag_s=0.0503 out=outputs/volume
 """
 
+import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
@@ -27,7 +28,7 @@ from recon.clips import fan_region, image_region
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
-from recon.freehand import sequence_sweep
+from recon.freehand import scan_checks, sequence_sweep
 from recon.freehand.sequence_sweep import SequenceFields, SequenceSweep
 from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Rectangle
@@ -35,6 +36,8 @@ from recon.model.fan import Fan, Sector
 from recon.model.rig import Finite
 from recon.probe_calibration import latency
 from recon.probe_calibration.latency import Lag
+
+log = logging.getLogger(__name__)
 
 LAG = lag_files.FILE  # by which the folder of a lag is known
 DEPTHS = "depths.csv"
@@ -105,6 +108,8 @@ def run(config: Config) -> None:
         found = latency.estimate(sweep.times, depths, sweep.track, config.search_s)
     except InputError as error:
         raise InputError(f"{sweep.name}: {error}") from None
+    if line := scan_checks.frozen(sweep.images(), sweep.poses(found.seconds)):
+        log.warning("%s: %s", sweep.name, line)
     figures = latency.measure(depths, found) | {"seconds_find": round(seconds, 3)}
     for line in describe(figures):
         console.print(line, markup=False)

@@ -33,6 +33,19 @@ def test_a_sweep_is_no_fault_and_images_in_another_order_are(rng):
     assert "another order" in line
 
 
+def test_a_few_images_in_another_order_are_told_and_noisy_poses_are_not(rng):
+    """Ten of 2 mm apart, by an order of which none is in its place; and poses with more noise than steps."""
+    images, places = sweep(rng, smooth=6.0)
+    few = images[::4], places[::4]
+    assert told(*few) == []
+    (line,) = told(few[0][[5, 2, 9, 0, 7, 3, 8, 1, 6, 4]], few[1])
+    assert "another order" in line
+    along = places.copy()
+    along[:, 2, 3] *= 0.4
+    along[:, :3, 3] += rng.normal(0, 0.3, (COUNT, 3))
+    assert told(images, along) == []
+
+
 @pytest.mark.parametrize("smooth", [0.0, 30.0])
 def test_images_of_which_no_two_resemble_each_other_have_no_order(smooth, rng):
     """Speckle alone, anew in each image; and a medium that is the same all along, as a tube is."""
@@ -48,7 +61,7 @@ def test_poses_that_shift_the_images_otherwise_than_they_show_are_told(rng):
     along = places.copy()
     along[:, 0, 3], along[:, 2, 3] = along[:, 2, 3], 0
     (line,) = told(images, along)
-    assert "by 0.5 mm from one to the next" in line
+    assert "the poses shift B-scans 1 mm apart by 1 mm within their own planes" in line
     wide = ndimage.gaussian_filter(rng.standard_normal((96, 80 + 5 * COUNT)), 3.0)
     wide = np.clip(110 + 30 * wide / wide.std(), 0, 255).astype(np.uint8)
     assert told(np.stack([wide[:, 5 * k : 5 * k + 80] for k in range(COUNT)]), along) == []
@@ -61,6 +74,9 @@ def test_frozen_images_are_told(rng):
     images[20:] = images[20]
     (line,) = told(images, places)
     assert line.startswith("20 B-scans in a row are the same")
+    resting = places.copy()
+    resting[20:] = places[20]
+    assert told(images, resting) == []
     images[20:] = 0
     assert told(images, places) == []
 
