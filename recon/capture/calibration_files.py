@@ -91,6 +91,18 @@ def _of_storage(path: Path, values: Values, sizes: Mapping[str, tuple[int, int]]
     raise InputError(f"{path}: expected {DIALECTS}, found {found}")
 
 
+def _warn_of_mistakes(path: Path, read: Calibration) -> None:
+    """Warn where names are likely exchanged, or distortion left out."""
+    placed = [name for name, camera in read.cameras.items() if not np.allclose(camera.camera_from_world, np.eye(4), atol=1e-9)]
+    if WORLD in placed and (first := [name for name in read.cameras if name not in placed]):
+        log.warning("%s: expected %s where the world begins, found %s there: are their names exchanged?", path, WORLD, first[0])
+    matrices = [camera.matrix for camera in read.cameras.values()]
+    rectified = all(np.array_equal(matrix, matrices[0]) for matrix in matrices)  # or one device alone
+    estimated = read.uncertainty is None or any(name.endswith(".k1") for name in read.uncertainty.names)
+    if estimated and not rectified and not any(camera.distortion.any() for camera in read.cameras.values()):
+        log.warning("%s: no lens has any distortion: was it left out, or are the images free of it?", path)
+
+
 def _in_mm(path: Path, read: Calibration, stated: object) -> Calibration:
     """The calibration in mm, by the unit that its file states; without one, the usual distances between devices tell another.
 
@@ -99,9 +111,7 @@ def _in_mm(path: Path, read: Calibration, stated: object) -> Calibration:
     InputError
         If they do, or the unit is none.
     """
-    placed = [name for name, camera in read.cameras.items() if not np.allclose(camera.camera_from_world, np.eye(4), atol=1e-9)]
-    if WORLD in placed and (first := [name for name in read.cameras if name not in placed]):
-        log.warning("%s: expected %s where the world begins, found %s there: are their names exchanged?", path, WORLD, first[0])
+    _warn_of_mistakes(path, read)
     if stated is None:
         for name, camera in read.cameras.items():
             apart = lengths.shift(camera.camera_from_world[:3, 3])

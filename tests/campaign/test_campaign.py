@@ -2,9 +2,22 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from campaign import bad_inputs, foreign, full_disk, fuzzing, kills, mistaken_tasks, mistakes, soak, sources, two_writers
+from campaign import (
+    bad_inputs,
+    foreign,
+    full_disk,
+    fuzzing,
+    kills,
+    mistake_figures,
+    mistaken_tasks,
+    mistakes,
+    soak,
+    sources,
+    two_writers,
+)
 from campaign.sources import COMMANDS
 
 NAMES = {"ball", "scan", "skin", "volume"}
@@ -45,6 +58,8 @@ def test_mistakes_are_made_and_judged(place, tmp_path):
     first = mistakes.run(place, 4, workers=1, kept=kept, tasks=tasks)
     assert [one.row for one in mistakes.run(place, 4, workers=1, kept=kept, tasks=tasks)] == [one.row for one in first]
     assert all(one.outcome != "traceback" for one in first), first
+    one, other = (mistakes._commands(place, mistaken_tasks.FREEHAND, None, np.random.default_rng(0)).figures for _ in range(2))
+    assert mistake_figures.distance(one, other) == 0
     assert mistakes.table(first)[2].startswith("| freehand | 4 |")
 
 

@@ -1,5 +1,7 @@
 """Calibration files of every dialect come back as they were, and bad ones are refused in one line."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -114,6 +116,16 @@ def test_cameras_whose_names_are_exchanged_are_named(optics, tmp_path, caplog):
     calibration_files.write(tmp_path / "exchanged.yaml", Calibration(cameras))
     calibration_files.read(tmp_path / "exchanged.yaml")
     assert "expected cam1 where the world begins, found cam2 there: are their names exchanged?" in caplog.text
+
+
+def test_lenses_that_were_left_out_are_named(optics, tmp_path, caplog):
+    """Of a rectified pair, both of one matrix, there are none."""
+    straight = {name: replace(camera, distortion=np.zeros(5)) for name, camera in optics.cameras.items()}
+    pair = {name: replace(straight[name], matrix=straight["cam1"].matrix) for name in ("cam1", "cam2")}
+    for cameras, said in ((pair, 0), (straight, 1)):
+        calibration_files.write(tmp_path / "optics.yaml", Calibration(cameras))
+        calibration_files.read(tmp_path / "optics.yaml")
+        assert caplog.text.count("no lens has any distortion: was it left out") == said
 
 
 def test_a_file_from_before_covariances_has_none(optics, tmp_path):
