@@ -25,7 +25,7 @@ class Fringes(Part):
 
     kind: Literal["fringes"] = "fringes"
     axis: Axis = "columns"
-    pitch: float = Field(gt=1)  # projector px a period
+    pitch: float = Field(gt=2)  # projector px a period; finer ones no raster shows
     steps: int = Field(ge=3, le=1000)  # phase shifts
     first: Annotated[int, Field(ge=-1000, le=1000)] = 0  # of the first shift: shift_k = 2 pi (first + k) / steps, k < steps
     backwards: bool | None = None  # whether that shift is negative; left out of files if it isn't, so that 0.1.0 reads them

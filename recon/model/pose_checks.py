@@ -51,7 +51,7 @@ class MotionLimits:
     changed_before_jump: float = 0.3  # the same, where the pose jumps when it goes on
     small_mm: tuple[float, float] = (1.0, 20.0)  # a sweep's extent that might be in centimetres or inches, as few in mm are
     near_mm: float = 150.0  # the same of its farthest place from the origin
-    slow_mm_s: float = 4.0  # and of its median speed
+    slow_mm_s: float = 6.0  # and of its median speed
     least_covered: float = 0.8  # share of the images with a pose, below which it is said
     most_share: float = 1 / 3  # of poses that may be left out
 
