@@ -11,6 +11,8 @@ TWIN := .venv/.twin
 LIVE := outputs/live
 # Each worker takes one half of the tests, so that few make the same fixtures; who is done helps the other.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
+# Compiled sources are kept, whatever the shell says: else each command that a test starts, and each worker, compiles all anew.
+export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo live test lint slow docs accuracy benchmark campaign paper clean
