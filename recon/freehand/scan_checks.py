@@ -23,7 +23,7 @@ class SweepLimits:
     by_chance: float = 0.01  # share of random orders in which neighbours in space are as much alike, at least, of another order
     orders: int = 400  # random ones
     apart_mm: float = 1.0  # of B-scans of which shifts are measured, so that noise of the poses is none
-    repeats: int = 5  # B-scans in a row that are the same to the last digit
+    repeats: int = 4  # B-scans in a row that are the same to the last digit
     longer: float = 3.0  # times the median of such rows: a grabber that is faster than the scanner has many short ones
     flat: float = 2.0  # grey levels, standard deviation of an image that shows nothing
     wide: int = 128  # px, of the B-scans in which shifts are measured
