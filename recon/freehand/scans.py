@@ -247,16 +247,16 @@ def of_sequence(
     if reference.upper() == sequences.RAS:
         expected = f"{sequences.LPS}, which files of volumes and surfaces are declared to be in; 3D Slicer turns them to RAS"
         raise InputError(f"{path}: reference: expected {expected}, found {reference}")
-    frames, left_out = sequence_checks.believed(path, frames, reference, image if probe is None else target, fixed, implausible)
+    start = image if probe is None else target
     try:
-        if probe is None:
-            world_from_pixel = sequences.poses(frames, reference, image, fixed)
-        else:
-            world_from_pixel = sequences.poses(frames, reference, target, fixed) @ sequences.target_from_pixel(probe)
+        sequences.chain(frames, reference, start, fixed)
     except InputError as error:
         asked = probe is None and not fixed and frames.transforms
         hint = "; no calibration of the probe among them? give probe=... or config=..." if asked else ""
         raise InputError(f"{path}: {error}{hint}") from None
+    frames, left_out = sequence_checks.believed(path, frames, reference, start, fixed, implausible)
+    world_from_start = sequences.poses(frames, reference, start, fixed)
+    world_from_pixel = world_from_start if probe is None else world_from_start @ sequences.target_from_pixel(probe)
     placed = sequence_sweep.lagged(str(path), frames.times_s, world_from_pixel, lag_s)
     calibrated, face_row = (SCANNER_SPEED, 0.0) if probe is None else (probe.speed_m_s, probe.face_row)
     speed = tissue_m_s or calibrated

@@ -81,7 +81,11 @@ def believed(
     def changes() -> tuple[Array, Array]:
         return numbers, pose_checks.image_changes(sequences.stream_images(path))
 
-    names = leading(frames, to, of, fixed)
+    try:
+        chain = sequences.chain(frames, to, of, fixed)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    names = [name for name in chain if name in frames.transforms and name not in (fixed or {})]
     for name in names:
         if not _moves(frames.transforms[name], valid[name]):
             continue
@@ -105,20 +109,6 @@ def _warn_of_untracked(path: Path, frames: Frames, names: list[str]) -> None:
         if not moves[name] and moves[later] and later.endswith(f"To{tracker}") and count > LIMITS.repeats:
             told = f"the same to the last digit in all {count} frames while {later} moves: was {tool} tracked?"
             log.warning("%s: %s: %s", path, name, told)
-
-
-def leading(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = None) -> list[str]:
-    """Names of the file's transforms along the chain from a frame of reference to another that `sequences.poses` takes."""
-    names = [*(fixed or {}), *(name for name in frames.transforms if name not in (fixed or {}))]
-    ends = {name: match.groups() for name in names if (match := TRANSFORM.fullmatch(name))}
-    chains: dict[str, list[str]] = {of: []}
-    for here in (waiting := [of]):
-        for name, (source, destination) in ends.items():
-            for start, there in ((source, destination), (destination, source)):
-                if start == here and there not in chains:
-                    chains[there] = [*chains[here], name]
-                    waiting.append(there)
-    return [name for name in chains.get(to, ()) if name not in (fixed or {})]
 
 
 def _moves(matrices: Array, valid: NDArray[np.bool_]) -> bool:

@@ -107,10 +107,7 @@ def read_sequence_sweep(
     """
     frames, (height, width) = sequence_checks.read_tracking(path, tracker), sequences.image_shape(path)
     frames, _ = sequence_checks.believed(path, frames, names.reference, names.target, None, implausible)
-    try:
-        poses = sequences.poses(frames, names.reference, names.target)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    poses = sequences.poses(frames, names.reference, names.target)
     numbers = np.flatnonzero(frames.valid["Image"])
     return SequenceSweep(str(path), (width, height), numbers, frames.times_s, poses, lambda: sequences.stream_images(path))
 

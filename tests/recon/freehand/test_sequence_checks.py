@@ -118,6 +118,21 @@ def test_a_reference_that_is_lost_counts_as_well(frames, tmp_path):
     assert sequence_checks.believed(path, sequences.read_tracking(path), "Tracker", "Image")[1] == 0, "it isn't on the way"
 
 
+@pytest.mark.parametrize("reference", ["LPS", "Ras", "Tracker"])
+def test_poses_by_way_of_ras_are_checked_too(reference, frames, tmp_path):
+    """3D Slicer's frame, and half a turn from it the results'; neither hides lost poses, nor that there was no tracking."""
+    path = tmp_path / "s.igs.mha"
+    ras = {"TrackerToRas": np.tile(sequences.RAS_FROM_LPS, (COUNT, 1, 1))}
+    for poses, left_out in ((spoiled(frames, "identity"), 3), (spoiled(frames, "far"), 1), (frames, 0)):
+        valid = frames.valid | {"TrackerToRas": np.ones(COUNT, bool)}
+        sequences.write_sequence(path, replace(poses, transforms=poses.transforms | ras, valid=valid))
+        assert sequence_checks.believed(path, sequences.read_tracking(path), reference, "Image")[1] == left_out
+    still = np.tile(frames.transforms["ProbeToTracker"][3], (COUNT, 1, 1))
+    sequences.write_sequence(path, replace(frames, transforms=frames.transforms | ras | {"ProbeToTracker": still}, valid=valid))
+    with pytest.raises(InputError, match=r"ProbeToTracker.*: poses: expected those of a probe that moves, found all 30 the same"):
+        sequence_checks.believed(path, sequences.read_tracking(path), reference, "Image")
+
+
 def test_the_mark_of_a_tool_that_is_not_seen_is_no_pose(frames, tmp_path):
     path = tmp_path / "s.igs.mha"
     sequences.write_sequence(path, frames)
