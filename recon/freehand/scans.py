@@ -242,19 +242,13 @@ def of_sequence(
         If the file is damaged, no transforms lead from the images to the reference frame, or that is RAS, which results aren't
         written in.
     """
-    frames, shape = sequence_checks.read_tracking(path, tracker), sequences.image_shape(path)
     image, target, reference = names or FrameNames()
     if reference.upper() == sequences.RAS:
         expected = f"{sequences.LPS}, which files of volumes and surfaces are declared to be in; 3D Slicer turns them to RAS"
         raise InputError(f"{path}: reference: expected {expected}, found {reference}")
-    start = image if probe is None else target
-    try:
-        sequences.chain(frames, reference, start, fixed)
-    except InputError as error:
-        asked = probe is None and not fixed and frames.transforms
-        hint = "; no calibration of the probe among them? give probe=... or config=..." if asked else ""
-        raise InputError(f"{path}: {error}{hint}") from None
-    frames, left_out = sequence_checks.believed(path, frames, reference, start, fixed, implausible)
+    shape, start = sequences.image_shape(path), image if probe is None else target
+    hint = "" if probe or fixed else "; no calibration of the probe among them? give probe=... or config=..."
+    frames, left_out = sequence_checks.read_tracking(path, reference, start, fixed, tracker, implausible, hint)
     world_from_start = sequences.poses(frames, reference, start, fixed)
     world_from_pixel = world_from_start if probe is None else world_from_start @ sequences.target_from_pixel(probe)
     placed = sequence_sweep.lagged(str(path), frames.times_s, world_from_pixel, lag_s)

@@ -105,8 +105,8 @@ def read_sequence_sweep(
         If the file is damaged, holds no images, or no transforms that lead from the target to the reference frame; or too many
         poses are implausible.
     """
-    frames, (height, width) = sequence_checks.read_tracking(path, tracker), sequences.image_shape(path)
-    frames, _ = sequence_checks.believed(path, frames, names.reference, names.target, None, implausible)
+    height, width = sequences.image_shape(path)
+    frames, _ = sequence_checks.read_tracking(path, names.reference, names.target, None, tracker, implausible)
     poses = sequences.poses(frames, names.reference, names.target)
     numbers = np.flatnonzero(frames.valid["Image"])
     return SequenceSweep(str(path), (width, height), numbers, frames.times_s, poses, lambda: sequences.stream_images(path))

@@ -8,7 +8,7 @@ the images have a place of their own: by the transform `TToPhysical`, where T is
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -146,7 +146,7 @@ def poses(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = 
         If no chain of transforms leads from one to the other.
     """
     result = np.broadcast_to(np.eye(4), (len(frames.times_s), 4, 4))
-    for name in chain(frames, to, of, fixed):
+    for name in chain(frames.transforms, to, of, fixed):
         if fixed and name in fixed:
             forth = fixed[name]
         else:
@@ -156,15 +156,15 @@ def poses(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = 
     return result
 
 
-def chain(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = None) -> list[str]:
-    """Names of the transforms that lead from frame `of` to frame `to`, as of `poses`; the half turn's, RASToLPS, among them.
+def chain(transforms: Collection[str], to: str, of: str, fixed: Collection[str] | None = None) -> list[str]:
+    """Names of those transforms that lead from frame `of` to frame `to`, as of `poses`; RASToLPS for the half turn among them.
 
     Raises
     ------
     InputError
         If none lead there.
     """
-    names = list(dict.fromkeys([*(fixed or {}), *frames.transforms]))
+    names = list(dict.fromkeys([*(fixed or ()), *transforms]))
     ends = {name: match.groups() for name in names if (match := TRANSFORM.fullmatch(name))}
     turns = {frame for pair in ends.values() for frame in pair if frame.upper() == RAS}
     ends |= {name: (frame, LPS) for frame in sorted(turns) if (name := f"{frame}To{LPS}") not in ends}
@@ -174,7 +174,7 @@ def chain(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = 
             if here in pair and (there := pair[pair[0] == here]) not in chains:
                 chains[there] = [*chains[here], name]
                 waiting.append(there)
-    if to not in chains and not frames.transforms:
+    if to not in chains and not transforms:
         expected = "some in each frame, such as ProbeToTracker, of the tracker"
         raise InputError(f"transforms: expected {expected}, found none: without poses nothing says where an image was taken")
     if to not in chains:

@@ -67,7 +67,7 @@ class Findings:
     rows: dict[Cause, Rows] = field(default_factory=dict)
 
     @property
-    def all(self) -> Rows:
+    def rows_left_out(self) -> Rows:
         """All rows : (m,), increasing."""
         return np.unique(np.concatenate([np.empty(0, np.int64), *self.rows.values()]))
 
@@ -93,7 +93,7 @@ def is_lost(values: Array) -> bool:
     return bool(np.isclose(values, LOST, rtol=1e-3, atol=0).any())
 
 
-def checked(
+def without_implausible(
     place: str,
     times_s: Array,
     poses: Array,
@@ -115,34 +115,36 @@ def checked(
     Raises
     ------
     InputError
-        If their lengths are of another unit, or more would be left out than may be.
+        If more would be left out than may be.
     """
-    found, fault = find(times_s, poses, changes, clock), unit_fault(poses)
-    way = f"give {unit}; {WAY}" if unit else WAY
+    found = find(times_s, poses, changes, clock)
     if implausible == "take":
-        for line in [*([fault] if fault else []), *found.lines(what)]:
+        for line in found.lines(what):
             log.warning("%s: taken all the same: %s", place, line)
         return poses, Findings(found.count)
-    kept = without(poses, found.all)
-    if len(found.all) > LIMITS.most_share * found.count:
-        if fault:
-            raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
+    if len(found.rows_left_out) > LIMITS.most_share * found.count:
+        if "jump" in found.rows and (fault := unit_fault(poses, unit)):
+            raise InputError(f"{place}: poses: expected a sweep in mm, found {fault}; {WAY}")
         expected = f"a motion that a hand makes, but for {100 * LIMITS.most_share:.0f} % at most"
         raise InputError(f"{place}: poses: expected {expected}, found {'; '.join(found.lines(what))}; {WAY}")
-    if fault := unit_fault(kept):
-        raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
-    for line in [f"left out {line}" for line in found.lines(what)] + unit_doubts(times_s, kept, unit):
-        log.warning("%s: %s", place, line)
-    return kept, found
+    for line in found.lines(what):
+        log.warning("%s: left out %s", place, line)
+    return without(poses, found.rows_left_out), found
 
 
-def check_motion(place: str, poses: Array, implausible: Implausible = "refuse") -> None:
-    """Refuse a sweep : (n, 4, 4), NaN where there is no pose, of more than a few that are all the same; or say so only."""
+def check_motion(place: str, times_s: Array, poses: Array, implausible: Implausible = "refuse", unit: str = "") -> None:
+    """Refuse a sweep : (n, 4, 4), NaN where there is no pose, of more than a few that are all the same or of another unit.
+
+    Where they are to be taken it is said only, as it is of a sweep that may be of another unit; `unit` as above.
+    """
     known = poses[np.isfinite(poses).all(axis=(1, 2))]
-    if len(known) <= LIMITS.repeats or not (known == known[0]).all():
-        return
-    found = f"all {len(known)} the same to the last digit: no tracking, or a probe at rest?"
-    doubt(place, f"poses: expected those of a probe that moves, found {found}", implausible)
+    if len(known) > LIMITS.repeats and (known == known[0]).all():
+        found = f"all {len(known)} the same to the last digit: no tracking, or a probe at rest?"
+        doubt(place, f"poses: expected those of a probe that moves, found {found}", implausible)
+    if fault := unit_fault(poses, unit):
+        doubt(place, f"poses: expected a sweep in mm, found {fault}", implausible)
+    elif implausible == "refuse" and (told := unit_doubt(times_s, poses, unit)):
+        log.warning("%s: %s", place, told)
 
 
 def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Array | None = None) -> Findings:
@@ -171,35 +173,37 @@ def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Ar
     return Findings(len(there), rows)
 
 
-def unit_fault(poses: Array) -> str | None:
+def unit_fault(poses: Array, unit: str = "") -> str | None:
     """The fault of poses : (n, 4, 4) whose shifts seem to be in another unit than mm, with the likely one; None as a rule."""
     places = poses[np.isfinite(poses).all(axis=(1, 2)), :3, 3]
     if len(places) < 3:
         return None
     span, farthest = float(np.linalg.norm(np.ptp(places, axis=0))), float(np.abs(places).max())
     if 1e-6 < span < 1 and farthest < 5:
-        return f"all within {span:.3g} mm, and {farthest:.3g} mm from the origin: metres?"
+        way = f"give {unit}" if unit else "multiply the translations by 1000"
+        return f"all within {span:.3g} mm, and {farthest:.3g} mm from the origin: metres? {way}"
     if (most := float(np.linalg.norm(np.subtract(*np.percentile(places, [90, 10], axis=0))))) > 5000:  # a few may be wrong
-        return f"a sweep over {most:.4g} mm: micrometres?"
+        way = f"give {unit}" if unit else "divide the translations by 1000"
+        return f"a sweep over {most:.4g} mm: micrometres? {way}"
     return None
 
 
-def unit_doubts(times_s: Array, poses: Array, unit: str = "") -> list[str]:
+def unit_doubt(times_s: Array, poses: Array, unit: str = "") -> str | None:
     """Say that a sweep may be in another unit: one that is small, near and slow, as those in centimetres or inches are."""
     found = np.isfinite(poses).all(axis=(1, 2))
     places, times = poses[found, :3, 3], times_s[found]
     if len(places) <= LIMITS.repeats:
-        return []
+        return None
     span, farthest = float(np.linalg.norm(np.ptp(places, axis=0))), float(np.linalg.norm(places, axis=1).max())
     if not LIMITS.small_mm[0] < span < LIMITS.small_mm[1] or farthest > LIMITS.near_mm:
-        return []
+        return None
     told = f"all poses lie within {span:.3g} mm, and up to {farthest:.3g} mm from the origin"
     if (seconds := _seconds(times)) is not None:
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.maximum(np.diff(seconds), _shortest(seconds))
         if (speed := float(np.median(steps))) > LIMITS.slow_mm_s:
-            return []
+            return None
         told += f", at {speed:.2g} mm/s"
-    return [f"{told}: is it in mm, not in centimetres or inches?" + (f" Else give {unit}" if unit else "")]
+    return f"{told}: is it in mm, not in centimetres or inches?" + (f" Else give {unit}" if unit else "")
 
 
 def image_changes(images: Iterable[NDArray]) -> Array:

@@ -84,8 +84,8 @@ def believed(config: Config, clip: Clip, times: NDArray[np.int64], track: Track)
 
     seconds = 1e-9 * (track.times - track.times[0])
     place, unit = str(config.poses), "columns.length_unit"
-    poses, _ = pose_checks.checked(place, seconds, track.poses, config.implausible, changes, unit=unit)
-    pose_checks.check_motion(place, poses, config.implausible)
+    poses, _ = pose_checks.without_implausible(place, seconds, track.poses, config.implausible, changes, unit=unit)
+    pose_checks.check_motion(place, seconds, poses, config.implausible, unit)
     return replace(track, poses=poses)
 
 

@@ -29,6 +29,12 @@ def found(poses, times=TIMES, change=None) -> dict:
     return {cause: rows.tolist() for cause, rows in pose_checks.find(times, poses, changes).rows.items()}
 
 
+def judged(poses, times=TIMES, implausible="refuse", unit=""):
+    kept, findings = pose_checks.without_implausible("s", times, poses, implausible, unit=unit)
+    pose_checks.check_motion("s", times, kept, implausible, unit)
+    return kept, findings
+
+
 @pytest.mark.parametrize("speed_mm_s", [5, 100, 500, 2000])
 @pytest.mark.parametrize("rate_hz", [1, 5, 20, 200, 1000])
 def test_what_hands_do_is_no_fault(speed_mm_s, rate_hz, rng):
@@ -97,12 +103,12 @@ def test_a_sweep_without_any_motion_is_refused(rng, caplog):
     poses[:10] = np.nan
     complaint = r"^s: poses: expected those of a probe that moves, found all 50 the same.*implausible=take$"
     with pytest.raises(InputError, match=complaint):
-        pose_checks.check_motion("s", poses)
-    pose_checks.check_motion("s", poses, "take")
+        pose_checks.check_motion("s", TIMES, poses)
+    pose_checks.check_motion("s", TIMES, poses, "take")
     assert "s: taken all the same: poses: expected those of a probe that moves, found all 50 the same" in caplog.text
-    pose_checks.check_motion("s", poses[:14])
+    pose_checks.check_motion("s", TIMES[:14], poses[:14])
     poses[10, 0, 3] += 1e-9
-    pose_checks.check_motion("s", poses)
+    pose_checks.check_motion("s", TIMES, poses)
 
 
 def test_a_slow_tracker_repeats_each_pose(rng):
@@ -111,51 +117,53 @@ def test_a_slow_tracker_repeats_each_pose(rng):
     assert not found(poses, np.arange(len(poses)) / 60, np.full(len(poses), 3.0))
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "metres?"), (1e3, "micrometres?")])
+@pytest.mark.parametrize(
+    ("factor", "unit"),
+    [(1e-3, "metres? multiply the translations by 1000"), (1e3, "micrometres? divide the translations by 1000")],
+)
 def test_another_unit_is_named(factor, unit, rng):
     poses = sweep(rng)
     poses[:, :3, 3] *= factor
-    with pytest.raises(InputError, match="poses: expected") as fault:
-        pose_checks.checked("s", TIMES, poses)
-    assert unit in str(fault.value) or "farther off" in str(fault.value)
-    assert str(fault.value).endswith("implausible=take")
-    assert pose_checks.checked("s", TIMES, poses, "take")[0] is poses
+    with pytest.raises(InputError, match=r"poses: expected a sweep in mm") as fault:
+        judged(poses)
+    assert str(fault.value).endswith(f"{unit}; to use them all the same, give implausible=take")
+    assert judged(poses, implausible="take")[0] is poses
 
 
 def test_a_sweep_that_may_be_in_centimetres_is_named(rng, caplog):
     """3 mm/s over 9 mm, 65 mm from the tracker; the same in mm, or as fast as hands are, is as usual."""
     poses = sweep(rng)
-    pose_checks.checked("s", TIMES, poses)
+    judged(poses)
     small = poses.copy()
     small[:, :3, 3] *= 0.1
-    pose_checks.checked("s", TIMES / 5, small)
+    judged(small, TIMES / 5)
     assert not caplog.text
-    pose_checks.checked("s", TIMES, small, unit="length_unit")
+    judged(small, unit="length_unit")
     assert "s: all poses lie within 7.8 mm, and up to 65.5 mm from the origin, at " in caplog.text
     assert "mm/s: is it in mm, not in centimetres or inches? Else give length_unit" in caplog.text
     caplog.clear()
     inches = poses.copy()
     inches[:, :3, 3] /= 25.4
-    pose_checks.checked("s", TIMES, inches)
+    judged(inches)
     assert "s: all poses lie within 3.07 mm" in caplog.text
     caplog.clear()
-    pose_checks.checked("s", np.full(COUNT, np.nan), small)
+    judged(small, np.full(COUNT, np.nan))
     assert "up to 65.5 mm from the origin: is it in mm" in caplog.text
     small[:, :3, 3] *= 0.01
     with pytest.raises(InputError, match=r"metres\? give length_unit; to use them all the same, give implausible=take"):
-        pose_checks.checked("s", TIMES, small, unit="length_unit")
+        judged(small, unit="length_unit")
 
 
 def test_what_is_left_out_is_counted_and_beyond_a_share_refused(rng, caplog):
     poses = sweep(rng)
     poses[5:20] = np.eye(4)
     with caplog.at_level(logging.WARNING):
-        kept, findings = pose_checks.checked("s", TIMES, poses)
+        kept, findings = judged(poses)
     assert "s: left out 15 of 60 poses, from pose 5 on: the identity" in caplog.text
-    assert np.isnan(kept[5:20]).all() and np.isfinite(kept[20:]).all() and len(findings.all) == 15
+    assert np.isnan(kept[5:20]).all() and np.isfinite(kept[20:]).all() and len(findings.rows_left_out) == 15
     poses[20:30] = np.eye(4)
     with pytest.raises(InputError, match=r"found 25 of 60 poses, from pose 5 on: the identity.* give implausible=take"):
-        pose_checks.checked("s", TIMES, poses)
+        judged(poses)
 
 
 def test_stills_have_the_pose_of_their_moment(rng):
