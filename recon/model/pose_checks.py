@@ -45,7 +45,11 @@ class MotionLimits:
     usual: float = 12.0  # times the median over the sweep, which tells a noisy tracker from a jump
     near: float = 5.0  # times the median step, within which a pose that is the identity lies on the way
     away_mm: float = 1000.0  # from the sweep's middle
+    burst_s: float = 5e-3  # between stamps, below which they may come in bursts
+    together: int = 12  # such steps that are timed together: bursts may have 14, and one step in 15 may be a gap
+    gap: float = 5.0  # times the period, over which a motion isn't followed
     untimed_mm: float = 100.0  # of a step, where no times tell its speed
+    alone: int = 10  # poses that make a sweep of their own there
     repeats: int = 4  # poses in a row that are the same, at least, before images are compared
     changed: float = 0.7  # times the usual change from image to image of a moving probe
     changed_before_jump: float = 0.3  # the same, where the pose jumps when it goes on
@@ -283,12 +287,18 @@ def _seconds(times_s: Array) -> Array | None:
 
 
 def _shortest(seconds: Array) -> float:
-    """The least time between two poses that is believed: half of most periods, as stamps may come in bursts."""
-    return 0.5 * float(np.percentile(np.diff(seconds), 90))
+    """The least time between two poses that is believed: their period, and half more of stamps that may come in bursts."""
+    if (period := float(np.percentile(np.diff(seconds), 40))) > LIMITS.burst_s:
+        return period
+    steps = min(LIMITS.together, len(seconds) - 1)
+    return 1.5 * float(np.percentile(seconds[steps:] - seconds[:-steps], 20)) / steps
 
 
 def _joined(times_s: Array, poses: Array) -> Rows:
-    """Rows of the longest piece of the motion, and of those that can be reached from it."""
+    """Rows of the longest piece of the motion, and of those that can be reached from it.
+
+    Where no times tell how long a hand had, a long piece from which the motion doesn't come back is another sweep.
+    """
     seconds, places = _seconds(times_s), poses[:, :3, 3]
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     turns = _turns(poses[:-1, :3, :3], poses[1:, :3, :3])
@@ -304,19 +314,32 @@ def _joined(times_s: Array, poses: Array) -> Rows:
         return near & ((turn_rad <= LIMITS.least_rad) | (turn_rad <= LIMITS.turn_rad_s * duration))
 
     rows = np.arange(len(poses))
-    ends = np.flatnonzero(~fits(steps, turns, rows[:-1], rows[1:]))
+    apart = ~fits(steps, turns, rows[:-1], rows[1:])
+    if seconds is not None:
+        apart |= np.diff(seconds) > LIMITS.gap * shortest
+    ends = np.flatnonzero(apart)
     pieces = np.split(rows, ends + 1)
     longest = max(range(len(pieces)), key=lambda k: len(pieces[k]))
-    kept = [pieces[longest]]
+
+    kept = []
     for others, last, first in ((pieces[longest + 1 :], -1, 0), (pieces[:longest][::-1], 0, -1)):
-        at = pieces[longest][[last]]
-        for piece in others:
-            to = piece[[first]]
-            step = np.linalg.norm(places[to] - places[at], axis=1)
-            if fits(step, _turns(poses[at, :3, :3], poses[to, :3, :3]), at, to)[0]:
-                kept.append(piece)
-                at = piece[[last]]
-    return np.sort(np.concatenate(kept))
+
+        def reached(before: Rows, after: Rows, last: int = last, first: int = first) -> bool:
+            a, b = before[[last]], after[[first]]
+            step = np.linalg.norm(places[b] - places[a], axis=1)
+            return bool(fits(step, _turns(poses[a, :3, :3], poses[b, :3, :3]), a, b)[0])
+
+        way = [pieces[longest]]
+        for number, piece in enumerate(others):
+            here = reached(way[-1], piece)
+            if not here and len(way) > 1 and len(way[-1]) < len(piece) and reached(way[-2], piece):
+                way, here = way[:-1], True  # what was reached over a gap was wrong
+            if not here and seconds is None and len(piece) >= LIMITS.alone:
+                here = not any(reached(way[-1], later) for later in others[number + 1 :])
+            if here:
+                way.append(piece)
+        kept += way
+    return np.unique(np.concatenate(kept))
 
 
 def _spikes(times_s: Array, places: Array) -> NDArray[np.bool_]:

@@ -42,8 +42,9 @@ def test_what_hands_do_is_no_fault(speed_mm_s, rate_hz, rng):
     poses = sweep(rng, speed_mm_s, rate_hz, 0.2, 200)
     times = np.arange(200) / rate_hz
     assert not found(poses, times, np.full(200, 3.0))
-    bursts = np.floor(times * rate_hz / 3) * 3 / rate_hz + 1e-4 * np.arange(200)  # stamps of packets of three
-    assert not found(poses, bursts)
+    for packet in (3, 10):  # whose stamps are those of their arrival
+        bursts = np.floor(times * rate_hz / packet) * packet / rate_hz + 1e-4 * np.arange(200)
+        assert not found(poses, bursts)
 
 
 def test_poses_relative_to_the_first_begin_with_the_identity(rng):
@@ -65,6 +66,37 @@ def test_jumps_are_found_with_times_and_without(rows, off_mm, times, rng):
     poses = sweep(rng)
     poses[rows, 0, 3] += off_mm
     assert found(poses, times) == {"jump": rows}
+
+
+@pytest.mark.parametrize(("every", "gap_s"), [(12, 1.0), (9, 1.0), (9, 0.5), (8, 10.0), (5, 1.0), (3, 1.0)])
+@pytest.mark.parametrize("off_mm", [80.0, 500.0])
+def test_gaps_hide_no_jump(every, gap_s, off_mm, rng):
+    """Of a tool that is often hidden: a pose that has others within a period of it is judged by them, not by the gaps."""
+    times = TIMES + np.cumsum(np.where(np.arange(COUNT) % every == 0, gap_s, 0))
+    poses = sweep(rng)
+    assert not found(poses, times)
+    row = COUNT // 2 // every * every + every // 2
+    poses[row, 0, 3] += off_mm
+    assert found(poses, times) == {"jump": [row]}
+
+
+def test_a_jump_next_to_a_gap_costs_no_other_pose(rng):
+    poses, row = sweep(rng), 32
+    poses[row, 0, 3] += 300
+    assert found(poses, TIMES + np.cumsum(np.where(np.arange(COUNT) % 8 == 0, 10, 0))) == {"jump": [row]}
+
+
+def test_two_sweeps_without_times_are_both_kept(rng):
+    """60 poses, and 50 beside them; three that come back are a jump, and so are as many far off at the end."""
+    there = sweep(rng, count=110)
+    there[60:, :3, 3] = sweep(rng, count=50)[:, :3, 3] + [0, 150, 0]
+    assert not found(there, np.full(110, np.nan)) and not found(there[::-1], np.full(110, np.nan))
+    there[20:23, 2, 3] += 400
+    there[108:, 2, 3] += 400
+    assert found(there, np.full(110, np.nan)) == {"jump": [20, 21, 22, 108, 109]}
+    there = sweep(rng, count=110)
+    there[50:65, 2, 3] += 400
+    assert found(there, np.full(110, np.nan)) == {"jump": list(range(50, 65))}
 
 
 def test_a_single_pose_a_little_aside_is_a_jump(rng):
