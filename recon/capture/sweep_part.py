@@ -134,10 +134,10 @@ def _believed(
     """The track without poses that no hand makes, and their number."""
     seconds, taken = ((each - track.times[0]) * 1e-9 for each in (track.times, times))
 
-    def changes() -> tuple[Array, Array]:
-        return taken, pose_checks.image_changes(read_image(path, size, bits=8) for path in paths)
+    def images() -> tuple[Array, NDArray[np.float32]]:
+        return taken, pose_checks.small_images(read_image(path, size, bits=8) for path in paths)
 
-    poses, found = pose_checks.without_implausible(str(listed), seconds, track.poses, implausible, changes)
+    poses, found = pose_checks.without_implausible(str(listed), seconds, track.poses, implausible, images)
     pose_checks.check_motion(str(listed), seconds, poses, implausible)
     return replace(track, poses=poses), len(found.rows_left_out)
 

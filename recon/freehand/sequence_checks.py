@@ -14,7 +14,7 @@ from recon.errors import Implausible, InputError
 from recon.freehand import sequences
 from recon.freehand.sequences import TRANSFORM, Frames
 from recon.model import pose_checks, tracks
-from recon.model.pose_checks import LIMITS, Changes
+from recon.model.pose_checks import LIMITS, Images
 from recon.model.tracks import Track
 
 log = logging.getLogger(__name__)
@@ -56,11 +56,11 @@ def read_tracking(
     times_s, numbers = frames.times_s, np.arange(len(frames.times_s), dtype=float)
 
     @cache
-    def changes() -> Array:
-        return pose_checks.image_changes(sequences.stream_images(path))
+    def small() -> NDArray[np.float32]:
+        return pose_checks.small_images(sequences.stream_images(path))
 
     def without_implausible(file: Path, of_file: Frames, names: list[str], clock: Array, moments: Array) -> tuple[Frames, int]:
-        images = (lambda: (moments, changes())) if "Image" in frames.valid else None
+        images = (lambda: (moments, small())) if "Image" in frames.valid else None
         return _without_implausible(file, of_file, names, implausible, clock, images)
 
     own = [name for name in names if name in frames.transforms]
@@ -98,7 +98,7 @@ def _check_times(file: Path, times_s: Array) -> None:
 
 
 def _without_implausible(
-    path: Path, frames: Frames, names: list[str], implausible: Implausible, clock: Array, changes: Changes | None
+    path: Path, frames: Frames, names: list[str], implausible: Implausible, clock: Array, images: Images | None
 ) -> tuple[Frames, int]:
     """The frames without poses of some transforms that no hand makes; number of those frames."""
     valid, left_out = dict(frames.valid), np.empty(0, np.int64)
@@ -106,7 +106,7 @@ def _without_implausible(
         if _moves(frames.transforms[name], valid[name]):
             poses = np.where(valid[name][:, None, None], frames.transforms[name], np.nan)
             place = f"{path}: {name}"
-            kept, found = pose_checks.without_implausible(place, frames.times_s, poses, implausible, changes, clock, "frame")
+            kept, found = pose_checks.without_implausible(place, frames.times_s, poses, implausible, images, clock, "frame")
             valid[name] = np.isfinite(kept).all(axis=(1, 2))
             left_out = np.union1d(left_out, found.rows_left_out)
     return replace(frames, valid=valid), len(left_out)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,15 +20,13 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Cause = Literal["identity", "frozen", "jump"]
-Changes = Callable[
-    [], tuple[Array, Array]
-]  # moments : (m,) of images, and change of each since the one before : (m,), grey levels
+Images = Callable[[], tuple[Array, NDArray[np.float32]]]  # moments : (m,) of images, and these as of `small_images` : (m, h, w)
 
-STEP_PX = 4  # of the pixels that are compared from image to image
+BLOCK_PX, MOST_BLOCKS = 8, 4096  # that images are averaged in before they are compared
 LOST = -3.697314e28  # of a coordinate, which NDI's trackers write where a tool isn't seen
 WORDS: dict[Cause, str] = {
     "identity": "the identity, as of a tool that is not seen",
-    "frozen": "the same to the last digit as the one before while the images change, as of a tracker that stood still",
+    "frozen": "the same to the last digit as the one before while the images change, as of a tracker that stopped",
     "jump": "farther off its neighbours than a hand moves",
 }
 
@@ -51,8 +50,9 @@ class MotionLimits:
     untimed_mm: float = 100.0  # of a step, where no times tell its speed
     alone: int = 10  # poses that make a sweep of their own there
     repeats: int = 4  # poses in a row that are the same, at least, before images are compared
-    changed: float = 0.7  # times the usual change from image to image of a moving probe
+    changed: float = 0.7  # times the usual change between images, as far apart, of a moving probe
     changed_before_jump: float = 0.3  # the same, where the pose jumps when it goes on
+    grows: float = 1.2  # times the mean square between neighbours, by which images farther apart tell motion from noise
     small_mm: tuple[float, float] = (1.0, 20.0)  # a sweep's extent that might be in centimetres or inches, as few in mm are
     near_mm: float = 150.0  # the same of its farthest place from the origin
     slow_mm_s: float = 4.0  # and of its median speed
@@ -102,7 +102,7 @@ def without_implausible(
     times_s: Array,
     poses: Array,
     implausible: Implausible = "refuse",
-    changes: Changes | None = None,
+    images: Images | None = None,
     clock: Array | None = None,
     what: str = "pose",
     unit: str = "",
@@ -113,7 +113,7 @@ def without_implausible(
     ----------
     place : of the poses, for messages
     what : word for one of them
-    times_s, poses, changes, clock : as of `find`
+    times_s, poses, images, clock : as of `find`
     unit : field that says in which unit they are, if there is one
 
     Raises
@@ -121,7 +121,7 @@ def without_implausible(
     InputError
         If more would be left out than may be.
     """
-    found = find(times_s, poses, changes, clock)
+    found = find(times_s, poses, images, clock)
     if implausible == "take":
         for line in found.lines(what):
             log.warning("%s: taken all the same: %s", place, line)
@@ -151,14 +151,14 @@ def check_motion(place: str, times_s: Array, poses: Array, implausible: Implausi
         log.warning("%s: %s", place, told)
 
 
-def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Array | None = None) -> Findings:
+def find(times_s: Array, poses: Array, images: Images | None = None, clock: Array | None = None) -> Findings:
     """Implausible poses of a sweep.
 
     Parameters
     ----------
     times_s : (n,) s, NaN where a pose has none; any order
     poses : (n, 4, 4) mm, rigid or nearly so, or times a scale; NaN where there is none
-    changes : of the images; looked at only where poses repeat
+    images : looked at only where poses repeat
     clock : (n,) of the poses, by which the images' moments count; the times without it
     """
     clock = times_s if clock is None else clock
@@ -168,7 +168,7 @@ def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Ar
     left = there[~lost]
     if lost.any():
         rows["identity"] = there[lost]
-    frozen = _frozen(clock[left], poses[left], changes)
+    frozen = _frozen(clock[left], poses[left], images)
     if len(frozen):
         rows["frozen"], left = left[frozen], np.delete(left, frozen)
     jumped = _jumps(times_s[left], poses[left])
@@ -210,13 +210,13 @@ def unit_doubt(times_s: Array, poses: Array, unit: str = "") -> str | None:
     return f"{told}: is it in mm, not in centimetres or inches?" + (f" Else give {unit}" if unit else "")
 
 
-def image_changes(images: Iterable[NDArray]) -> Array:
-    """Mean change : (n,) of each image's grey levels since the one before; NaN of the first."""
-    before, found = None, []
+def small_images(images: Iterable[NDArray]) -> NDArray[np.float32]:
+    """Mean grey levels : (n, h, w) of the images' blocks, in which noise counts little beside what is seen."""
+    found = []
     for image in images:
-        now = image[::STEP_PX, ::STEP_PX].astype(np.float32)
-        found.append(np.nan if before is None else float(np.abs(now - before).mean()))
-        before = now
+        block = max(BLOCK_PX, int(np.ceil(np.sqrt(image.size / MOST_BLOCKS))))
+        size = [max(1, pixels // block) for pixels in image.shape[::-1]]
+        found.append(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
     return np.array(found)
 
 
@@ -237,35 +237,55 @@ def _lost(poses: Array) -> NDArray[np.bool_]:
     return same
 
 
-def _frozen(times_s: Array, poses: Array, changes: Changes | None) -> Rows:
-    """Rows of poses that repeat the one before to the last digit, long, while the images change."""
+def _frozen(times_s: Array, poses: Array, images: Images | None) -> Rows:
+    """Rows of poses that repeat the one before to the last digit, long, while the images change as they do elsewhere.
+
+    Images some way apart are compared: those of a probe at rest differ by noise alone, however slow its motion was.
+    """
     same = (poses[1:] == poses[:-1]).all(axis=(1, 2))
     starts = np.concatenate([[0], np.flatnonzero(~same) + 1])
     lengths = np.diff([*starts, len(poses)])
     usual_length = np.sort(lengths)[(len(lengths) - 1) // 2]  # of a tracker that is slower than the images
     long = (lengths > LIMITS.repeats) & (lengths > 3 * usual_length)
-    if not long.any() or changes is None:
+    if not long.any() or images is None:
         return np.empty(0, np.int64)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[~same]
-    moments, change = changes()
-    resting = np.zeros(len(moments), bool)
-    for start, length in zip(starts[long], lengths[long], strict=True):
-        resting |= _during(moments, times_s[start : start + length])
-    usual = np.median(change[~resting & np.isfinite(change)]) if (~resting & np.isfinite(change)).any() else np.nan
+    moments, small = images()
+    later = np.arange(len(moments)) > 0
+    within = [
+        later & (moments > times_s[start]) & (moments <= times_s[start + length - 1])
+        for start, length in zip(starts[long], lengths[long], strict=True)
+    ]
+    moving = later & ~np.any(within, axis=0)
     frozen = []
-    for start, length in zip(starts[long], lengths[long], strict=True):
-        own = change[_during(moments, times_s[start : start + length]) & np.isfinite(change)]
+    for start, length, own in zip(starts[long], lengths[long], within, strict=True):
+        apart = (min(_longest(own), _longest(moving)) + 1) // 2
+        if own.sum() < 3 or apart == 0:
+            continue
         end = start + length
         jump = np.linalg.norm(poses[end, :3, 3] - poses[start, :3, 3]) > 3 * np.median(steps) if end < len(poses) else False
         least = LIMITS.changed_before_jump if jump else LIMITS.changed
-        if len(own) >= 3 and np.median(own) > least * usual > 0:
+        (far, near), (usual, usual_near) = ([_change(small, among, k) for k in (apart, 1)] for among in (own, moving))
+        if usual > LIMITS.grows * usual_near:  # else neighbours differ as others do, far more than by noise
+            changed = far > LIMITS.changed_before_jump**2 * usual
+            changed &= (far - near) * usual_near > least**2 * (usual - usual_near) * near
+        else:
+            changed = far > least**2 * usual
+        if changed:
             frozen.append(np.arange(start + 1, end))
     return np.concatenate([np.empty(0, np.int64), *frozen])
 
 
-def _during(moments: Array, times_s: Array) -> NDArray[np.bool_]:
-    """Images that were taken within a run of poses, and the one before too."""
-    return (moments > times_s[0]) & (moments <= times_s[-1])
+def _longest(marked: NDArray[np.bool_]) -> int:
+    """Length of the longest run of marked ones."""
+    bounds = np.flatnonzero(np.diff([False, *marked, False]))
+    return int(np.diff(bounds)[::2].max(initial=0))
+
+
+def _change(images: NDArray[np.float32], marked: NDArray[np.bool_], apart: int) -> float:
+    """Median mean square of the difference of images : (n, h, w) some way apart, all on the way but the first one marked."""
+    ends = np.flatnonzero(np.convolve(marked, np.ones(apart), "valid") == apart) + apart - 1
+    return float(np.median([np.square(images[k] - images[k - apart]).mean() for k in ends]))
 
 
 def _jumps(times_s: Array, poses: Array) -> Rows:

@@ -24,9 +24,18 @@ def sweep(rng, speed_mm_s=30.0, rate_hz=RATE_HZ, noise_mm=0.05, count=COUNT):
     return poses
 
 
-def found(poses, times=TIMES, change=None) -> dict:
-    changes = None if change is None else lambda: (times, change)
-    return {cause: rows.tolist() for cause, rows in pose_checks.find(times, poses, changes).rows.items()}
+def b_scans(rng, along_mm, noise=5.0):
+    """Images at places along a sweep through tissue whose structures are 1 mm thick and 8 px wide, with noise in each pixel."""
+    tissue = 110 + 30 * rng.standard_normal((int(np.max(along_mm)) + 2, 12, 16))
+    whole = np.floor(along_mm).astype(int)
+    share = (along_mm - whole)[:, None, None]
+    images = np.kron((1 - share) * tissue[whole] + share * tissue[whole + 1], np.ones((1, 8, 8)))
+    return np.clip(images + noise * rng.standard_normal(images.shape), 0, 255).astype(np.uint8)
+
+
+def found(poses, times=TIMES, images=None) -> dict:
+    looked_at = None if images is None else lambda: (times, pose_checks.small_images(images))
+    return {cause: rows.tolist() for cause, rows in pose_checks.find(times, poses, looked_at).rows.items()}
 
 
 def judged(poses, times=TIMES, implausible="refuse", unit=""):
@@ -41,7 +50,7 @@ def test_what_hands_do_is_no_fault(speed_mm_s, rate_hz, rng):
     """From a slow sweep to one faster than any that makes images, by trackers of any rate and 0.2 mm of noise."""
     poses = sweep(rng, speed_mm_s, rate_hz, 0.2, 200)
     times = np.arange(200) / rate_hz
-    assert not found(poses, times, np.full(200, 3.0))
+    assert not found(poses, times)
     for packet in (3, 10):  # whose stamps are those of their arrival
         bursts = np.floor(times * rate_hz / packet) * packet / rate_hz + 1e-4 * np.arange(200)
         assert not found(poses, bursts)
@@ -112,22 +121,23 @@ def test_a_target_seen_from_its_other_side_turns_at_once(rng):
     assert found(poses) == {"jump": [50, 51, 52, 53, 54]}
 
 
-@pytest.mark.parametrize(("end", "jumps"), [(30, True), (COUNT, False)])
-def test_a_tracker_that_froze_while_images_change(end, jumps, rng):
-    """Where the pose jumps afterwards a third of the usual change tells it; at the end nearly all of it must be there."""
+@pytest.mark.parametrize("step_mm", [0.1, 1.5])
+@pytest.mark.parametrize("end", [30, COUNT])
+def test_a_tracker_that_froze_while_images_change(end, step_mm, rng):
+    """With neighbours that differ by little more than noise, and by all that they could; and whether it goes on or not."""
     poses = sweep(rng)
     poses[20:end] = poses[20]
-    assert found(poses, change=np.full(COUNT, 3.0)) == {"frozen": list(range(21, end))}
-    still = np.where((np.arange(COUNT) > 20) & (np.arange(COUNT) < end), 1.5, 3.0)
-    assert found(poses, change=still) == ({"frozen": list(range(21, end))} if jumps else {})
+    assert found(poses, images=b_scans(rng, step_mm * np.arange(COUNT))) == {"frozen": list(range(21, end))}
 
 
-def test_a_motor_that_pauses_is_at_rest(rng):
-    """Poses of an encoder repeat to the last digit; images then differ by noise, some third of what motion makes."""
-    steps = np.concatenate([np.full(20, 1.5), np.zeros(15), np.full(COUNT - 35, 1.5)])
+@pytest.mark.parametrize(("step_mm", "noise"), [(0.1, 5.0), (0.05, 10.0), (1.5, 10.0), (0.1, 0.0)])
+@pytest.mark.parametrize("rest", [10, 30])
+def test_a_motor_that_pauses_is_at_rest(step_mm, noise, rest, rng):
+    """Poses of an encoder repeat to the last digit; images then differ by noise, as much as neighbours of a slow motion do."""
+    steps = np.concatenate([np.full(20, step_mm), np.zeros(rest), np.full(COUNT - 20 - rest, step_mm)])
     poses = np.tile(rigid.transform(np.eye(3), [0, 0, 650]), (COUNT, 1, 1))
     poses[:, 0, 3] = np.cumsum(steps)
-    assert not found(poses, change=np.where(steps > 0, 3.0, 1.2))
+    assert not found(poses, images=b_scans(rng, np.cumsum(steps), noise))
 
 
 def test_a_sweep_without_any_motion_is_refused(rng, caplog):
@@ -146,7 +156,7 @@ def test_a_sweep_without_any_motion_is_refused(rng, caplog):
 def test_a_slow_tracker_repeats_each_pose(rng):
     """As where the latest pose is stored with each image: ten poses a second, 60 images."""
     poses = np.repeat(sweep(rng), 6, axis=0)
-    assert not found(poses, np.arange(len(poses)) / 60, np.full(len(poses), 3.0))
+    assert not found(poses, np.arange(len(poses)) / 60, b_scans(rng, 0.5 * np.arange(len(poses))))
 
 
 @pytest.mark.parametrize(
