@@ -138,7 +138,8 @@ def lagged(name: str, times_s: Array, poses: Array, lag_s: float) -> Array:
     result = np.full(poses.shape, np.nan)
     result[known] = tracks.poses_at(motion, _nanoseconds(name, times_s[known]), lag_s) @ start
     if len(moving.times) * 2 < known.sum():
-        found = f"{len(moving.times)} different ones in {known.sum()} frames, from {times_s[known][0]:.15g} s on"
+        times = "1 different time" if len(moving.times) == 1 else f"{len(moving.times)} different times"
+        found = f"only {times} in {known.sum()} frames, from {times_s[known][0]:.15g} s on"
         raise InputError(f"{name}: Timestamp: expected one of each frame's own, by which poses are interpolated, found {found}")
     if not np.isfinite(result).any():
         found = "none: is the lag right, or the frame rate too low?"

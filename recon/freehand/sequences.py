@@ -293,10 +293,11 @@ def _matrices(file: ImageFile, key: str, texts: list[str], words: list[str]) -> 
             continue
         name = _key(index, key)
         matrix = medical_images.numbers(file.path, name, text, 16).reshape(4, 4)
-        valid[index] = word.upper() in ("", "OK") and not pose_checks.is_lost(matrix)
+        lost = pose_checks.is_lost(matrix)
+        valid[index] = word.upper() in ("", "OK") and not lost
         if valid[index] and not is_usable(matrix):
             raise file.fault(name, "an invertible matrix with the last row 0 0 0 1", repr(text))
-        matrices[index] = np.eye(4) if pose_checks.is_lost(matrix) else matrix
+        matrices[index] = np.eye(4) if lost else matrix
     return matrices, valid
 
 

@@ -146,7 +146,7 @@ def test_the_mark_of_a_tool_that_is_not_seen_is_no_pose(frames, tmp_path):
 def test_time_stamps_that_are_all_the_same_are_named(frames, tmp_path):
     path = tmp_path / "s.igs.mha"
     sequences.write_sequence(path, replace(frames, times_s=np.full(COUNT, 5.0)))
-    with pytest.raises(InputError, match=r"Timestamp: expected one of each frame's own.*found 1 different ones in 30 frames"):
+    with pytest.raises(InputError, match=r"Timestamp: expected one of each frame.*found only 1 different time in 30 frames"):
         sequence_sweep.read_sequence_sweep(path, NAMES).poses(0.05)
 
 
