@@ -134,12 +134,12 @@ def _believed(
     """The track without poses that no hand makes, and their number."""
     seconds, taken = ((each - track.times[0]) * 1e-9 for each in (track.times, times))
 
-    def changes() -> tuple[Array, Array]:
-        return taken, pose_checks.image_changes(read_image(path, size, bits=8) for path in paths)
+    def images() -> tuple[Array, NDArray[np.float32]]:
+        return taken, pose_checks.small_images(read_image(path, size, bits=8) for path in paths)
 
-    poses, found = pose_checks.checked(str(listed), seconds, track.poses, implausible, changes)
-    pose_checks.check_motion(str(listed), poses, implausible)
-    return replace(track, poses=poses), len(found.all)
+    poses, found = pose_checks.without_implausible(str(listed), seconds, track.poses, implausible, images)
+    pose_checks.check_motion(str(listed), seconds, poses, implausible)
+    return replace(track, poses=poses), len(found.rows_left_out)
 
 
 def _span(times: NDArray[np.int64]) -> str:

@@ -79,6 +79,8 @@ def read(path: Path, columns: Columns, frames: NDArray[np.int64] | None = None) 
     lines, table = _numbers(path, columns.names, columns.time is not None)
     if columns.time is None:
         times = np.empty(0, np.int64) if frames is None else frames
+        while len(table) > len(times) and np.isnan(table[-1]).all():
+            table = table[:-1]  # empty rows below it
         if len(table) != len(times):
             expected = f"a row for each of {len(times)} frames of the clip, where columns.time is null"
             raise InputError(f"{path}: expected {expected}, found {len(table)}")
@@ -153,11 +155,15 @@ def _numbers(path: Path, names: Names, timed: bool) -> tuple[list[int], Array]:
         first = text.partition("\n")[0]
         separator = next((one for one in SEPARATORS if one in first), " ")
         parsed = csv.reader(text.splitlines(), delimiter=separator, skipinitialspace=True)
-        rows = [row for row in enumerate(parsed, start=1) if any(row[1])]
+        rows = [row for row in enumerate(parsed, start=1) if any(row[1]) or (len(row[1]) > 1 and not timed)]
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: expected a table as CSV text, found other or damaged data") from None
+    while rows and not any(rows[0][1]) and not all(name.isdigit() for name in names):
+        del rows[0]  # above a header
     header = [word.strip() for word in rows[0][1]] if rows else []
-    bare = bool(header) and all(_is_number(word) for word in header)
+    words = [word for word in header if word]  # fewer of a pose that wasn't found, and over the rows' own numbers
+    named = 1 < len(words) < len(header) and words == [str(number) for number in range(len(words))]
+    bare = bool(header) and all(_is_number(word) for word in words) and not named
     by_number = {str(number): number - 1 for number in range(1, len(header) + 1)}
     known = by_number if bare else by_number | {name: header.index(name) for name in header}
     missing = [name for name in names if name not in known]

@@ -5,22 +5,18 @@ from numpy.typing import NDArray
 
 from recon.compiled import njit
 from recon.files.volumes import Volume
-from recon.freehand import plus_arithmetic
-from recon.freehand.plus_arithmetic import reach
 from recon.freehand.volume_compounding import Reconstruction
 
 Array = NDArray[np.float64]
 
-STICKS = np.array(  # one of each pair of opposite directions to the 26 neighbours
+STICKS = np.array(  # x, y, z; one of each pair of opposite directions to the 26 neighbours, in PLUS's order of sums
     [
-        (i, j, k)
-        for i in (-1, 0, 1)
-        for j in (-1, 0, 1)
-        for k in (-1, 0, 1)
-        if (k, j, i) > (0, 0, 0)
+        *((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        *((1, 1, 0), (1, 0, 1), (0, 1, 1), (1, -1, 0), (1, 0, -1), (0, 1, -1)),
+        *((1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 1)),
     ],
     np.int64,
-)  # fmt: skip
+)
 MOST_VOXELS = 9  # of a stick, both ends included
 MOSTLY = 90  # percentile of the gaps between B-scans that are to be filled
 
@@ -34,13 +30,13 @@ def fill_holes(
     the mean, weighted by 1/length, over the `sticks` shortest ones and all as short as these. Voxels without a stick of at most
     `most_voxels` stay empty, so the volume does not grow past the scan. Filled voxels keep their values.
 
-    Source: sticks and their limit are those of the PLUS toolkit's hole filling, which weights the two ends slightly otherwise and
-    rounds down; with `as_plus` both are done as there.
+    Source: sticks and their limit are those of the PLUS toolkit's hole filling (vtkIGSIOFillHolesInVolume), which weights the two
+    ends slightly otherwise and rounds down; with `as_plus` both are done as there.
     """
     volume = reconstruction.volume
     voxels, filled = volume.voxels.copy(), reconstruction.filled.copy()
     if as_plus:
-        plus_arithmetic.fill(volume.voxels, reconstruction.filled, most_voxels, sticks, voxels, filled)
+        _fill_as_plus(volume.voxels, reconstruction.filled, most_voxels, sticks, voxels, filled)
         return Reconstruction(Volume(voxels, volume.origin, volume.spacing, volume.directions), filled)
     lengths = np.linalg.norm(STICKS * volume.spacing, axis=1)
     _fill(volume.voxels, reconstruction.filled, lengths, most_voxels, sticks, voxels, filled)
@@ -93,10 +89,10 @@ def _measure(before, known, voxel, step_mm, most_voxels, length, grey):
     for s in range(len(step_mm)):
         di, dj, dk = STICKS[s]
         length[s] = np.inf
-        forth = reach(known, k, j, i, dk, dj, di, most_voxels - 2)
+        forth = _reach(known, k, j, i, dk, dj, di, most_voxels - 2)
         if forth == 0:
             continue
-        back = reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth)
+        back = _reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth)
         if back > 0:
             ahead = before[k + forth * dk, j + forth * dj, i + forth * di]
             behind = before[k - back * dk, j - back * dj, i - back * di]
@@ -120,3 +116,57 @@ def _mean_of_shortest(length, grey, sticks):
                 length[s] = np.inf
                 used += 1
     return total / weights if used > 0 else -1.0
+
+
+@njit
+def _fill_as_plus(before, known, most_voxels, sticks, voxels, filled):
+    """The same as the PLUS toolkit does it: for whole levels, rounded down, and with other weights.
+
+    A stick is longer by one than its ends are apart, and each end counts by one step more than the other's distance; spacings
+    don't count.
+    """
+    nz, ny, nx = before.shape
+    weight, grey = np.empty(len(STICKS)), np.empty(len(STICKS))
+    for k in range(nz):
+        for j in range(ny):
+            for i in range(nx):
+                if known[k, j, i]:
+                    continue
+                for s in range(len(STICKS)):
+                    di, dj, dk = STICKS[s]
+                    weight[s] = 0.0
+                    forth = _reach(known, k, j, i, dk, dj, di, most_voxels - 1)
+                    back = _reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth) if forth else 0
+                    if back:
+                        ahead = before[k + forth * dk, j + forth * dj, i + forth * di]
+                        behind = before[k - back * dk, j - back * dj, i - back * di]
+                        length = np.float64(forth + back + 1)
+                        part = (back + 1) / length
+                        grey[s] = np.floor((1.0 - part) * behind + part * ahead)
+                        weight[s] = 1.0 / (length * np.sqrt(np.float64(di * di + dj * dj + dk * dk)))
+                total, weights, used = 0.0, 0.0, 0
+                while used < sticks and weight.max() > 0:
+                    most = weight.max()
+                    for s in range(len(STICKS)):
+                        if weight[s] == most:
+                            total += grey[s] * weight[s]
+                            weights += weight[s]
+                            weight[s] = 0.0
+                            used += 1
+                voxels[k, j, i] = 0  # though a share below 1/512 may have left a level there
+                if used:
+                    voxels[k, j, i] = np.uint8(total / weights)
+                    filled[k, j, i] = True
+
+
+@njit
+def _reach(filled, k, j, i, dk, dj, di, most):
+    """Steps to the next filled voxel, 0 if there is none within `most`."""
+    nz, ny, nx = filled.shape
+    for step in range(1, most + 1):
+        k, j, i = k + dk, j + dj, i + di
+        if not (0 <= k < nz and 0 <= j < ny and 0 <= i < nx):
+            return 0
+        if filled[k, j, i]:
+            return step
+    return 0

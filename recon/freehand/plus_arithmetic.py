@@ -8,8 +8,8 @@ eight voxels don't all lie in the volume is left out. From the 256th pixel of a 
 Of pixels with weights of their own (`IMPORTANCE_MASK`) those of weight 0 never count. So it is in PLUS with linear shares; with
 the nearest voxel and an optimization it loses its place in the image at the first of them, which isn't followed.
 
-Source: the arithmetic was followed in the source text of PLUS (vtkIGSIOPasteSliceIntoVolume, vtkIGSIOFillHolesInVolume), and its
-volumes are reproduced; this is written anew.
+Source: the arithmetic was followed in the source text of PLUS (vtkIGSIOPasteSliceIntoVolume), and its volumes are reproduced;
+this is written anew.
 """
 
 from typing import Literal, NamedTuple
@@ -26,17 +26,8 @@ ONE = 1 << DIGITS
 WHOLE = 256  # weight of a pixel
 FULL, MOST = 65535 - WHOLE, 65535  # weight from which on a voxel changes slowly, and the greatest
 NEARLY = 7.62939453125e-06  # 2^-17; a place in floating point that is as near below a whole number counts for it
-LEAST_SHARE = 0.125  # of a voxel that a pixel is the maximum or the latest of
-MEAN, MAXIMUM, WEIGHTED = 0, 1, 3  # rules; LATEST else
-
-STICKS = np.array(  # x, y, z; of those as short as each other, sums are made in this order
-    [
-        *((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-        *((1, 1, 0), (1, 0, 1), (0, 1, 1), (1, -1, 0), (1, 0, -1), (0, 1, -1)),
-        *((1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 1)),
-    ],
-    np.int64,
-)
+LEAST_SHARE = 0.125  # of a voxel that a pixel is the maximum or the latest of: that of all eight where it lies in their middle
+MEAN, MAXIMUM, LATEST, WEIGHTED = range(4)  # rules
 
 
 class Levels(NamedTuple):
@@ -192,57 +183,3 @@ def _share_floating(levels: Levels, x, y, z, grey, part, rule):
                 else:
                     continue
                 levels.weight[k + dk, j + dj, i + di] = min(np.int64(np.floor(total * WHOLE + 0.5 + NEARLY)), MOST)
-
-
-@njit
-def fill(before, known, most_voxels, sticks, voxels, filled):
-    """Fill holes by sticks : as `recon.freehand.hole_filling.fill_holes`, but for whole levels, rounded down, and other weights.
-
-    A stick is longer by one than its ends are apart, and each end counts by one step more than the other's distance; spacings
-    don't count.
-    """
-    nz, ny, nx = before.shape
-    weight, grey = np.empty(len(STICKS)), np.empty(len(STICKS))
-    for k in range(nz):
-        for j in range(ny):
-            for i in range(nx):
-                if known[k, j, i]:
-                    continue
-                for s in range(len(STICKS)):
-                    di, dj, dk = STICKS[s]
-                    weight[s] = 0.0
-                    forth = reach(known, k, j, i, dk, dj, di, most_voxels - 1)
-                    back = reach(known, k, j, i, -dk, -dj, -di, most_voxels - 1 - forth) if forth else 0
-                    if back:
-                        ahead = before[k + forth * dk, j + forth * dj, i + forth * di]
-                        behind = before[k - back * dk, j - back * dj, i - back * di]
-                        length = np.float64(forth + back + 1)
-                        part = (back + 1) / length
-                        grey[s] = np.floor((1.0 - part) * behind + part * ahead)
-                        weight[s] = 1.0 / (length * np.sqrt(np.float64(di * di + dj * dj + dk * dk)))
-                total, weights, used = 0.0, 0.0, 0
-                while used < sticks and weight.max() > 0:
-                    most = weight.max()
-                    for s in range(len(STICKS)):
-                        if weight[s] == most:
-                            total += grey[s] * weight[s]
-                            weights += weight[s]
-                            weight[s] = 0.0
-                            used += 1
-                voxels[k, j, i] = 0  # though a share below 1/512 may have left a level there
-                if used:
-                    voxels[k, j, i] = np.uint8(total / weights)
-                    filled[k, j, i] = True
-
-
-@njit
-def reach(filled, k, j, i, dk, dj, di, most):
-    """Steps to the next filled voxel, 0 if there is none within `most`."""
-    nz, ny, nx = filled.shape
-    for step in range(1, most + 1):
-        k, j, i = k + dk, j + dj, i + di
-        if not (0 <= k < nz and 0 <= j < ny and 0 <= i < nx):
-            return 0
-        if filled[k, j, i]:
-            return step
-    return 0

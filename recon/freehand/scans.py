@@ -126,16 +126,21 @@ class VolumeSettings:
     arithmetic: Arithmetic = "floating"  # or that of the PLUS toolkit
     weights: Path | None = None  # image of the pixels' weights, of the weighted compounding
 
-    def part(self, shape: tuple[int, int]) -> tuple[Clip | None, Mask | None]:
-        """Rectangle and pixels, of images (h, w), that are used; without a clip the rectangle about the fan."""
+    def box(self, shape: tuple[int, int]) -> Clip | None:
+        """Rectangle, of images (h, w), that is used; without a clip the one about the fan."""
+        return self.clip or (None if self.fan is None else Clip(*fan.box(self._fan_mask(shape))))
+
+    def part(self, shape: tuple[int, int]) -> tuple[Clip | None, Mask | None, NDArray[np.uint8] | None]:
+        """Rectangle and pixels, of images (h, w), that are used, and their weights."""
         weights = self.weights_of(shape)
-        counted = None if weights is None else weights > 0
-        if self.fan is None:
-            return self.clip, counted
-        mask = self.fan.mask(shape, 0 if self.arithmetic == "plus_none" else 1)
+        masks = [*([] if weights is None else [weights > 0]), *([] if self.fan is None else [self._fan_mask(shape)])]
+        return self.box(shape), np.logical_and.reduce(masks) if masks else None, weights
+
+    def _fan_mask(self, shape: tuple[int, int]) -> Mask:
+        mask = self.fan.mask(shape, 0 if self.arithmetic == "plus_none" else 1) if self.fan else np.ones(shape, bool)
         if not mask.any():
             raise InputError(f"fan: expected a part of an image of {shape[1]}x{shape[0]}, found {self.fan}")
-        return self.clip or Clip(*fan.box(mask)), mask if counted is None else mask & counted
+        return mask
 
     def weights_of(self, shape: tuple[int, int]) -> NDArray[np.uint8] | None:
         """Weights of the pixels of images (h, w), if they have any; InputError without a file of theirs, or of another size."""
@@ -242,21 +247,15 @@ def of_sequence(
         If the file is damaged, no transforms lead from the images to the reference frame, or that is RAS, which results aren't
         written in.
     """
-    frames, shape = sequence_checks.read_tracking(path, tracker), sequences.image_shape(path)
     image, target, reference = names or FrameNames()
     if reference.upper() == sequences.RAS:
         expected = f"{sequences.LPS}, which files of volumes and surfaces are declared to be in; 3D Slicer turns them to RAS"
         raise InputError(f"{path}: reference: expected {expected}, found {reference}")
-    frames, left_out = sequence_checks.believed(path, frames, reference, image if probe is None else target, fixed, implausible)
-    try:
-        if probe is None:
-            world_from_pixel = sequences.poses(frames, reference, image, fixed)
-        else:
-            world_from_pixel = sequences.poses(frames, reference, target, fixed) @ sequences.target_from_pixel(probe)
-    except InputError as error:
-        asked = probe is None and not fixed and frames.transforms
-        hint = "; no calibration of the probe among them? give probe=... or config=..." if asked else ""
-        raise InputError(f"{path}: {error}{hint}") from None
+    shape, start = sequences.image_shape(path), image if probe is None else target
+    hint = "" if probe or fixed else "; no calibration of the probe among them? give probe=... or config=..."
+    frames, left_out = sequence_checks.read_tracking(path, reference, start, fixed, tracker, implausible, hint)
+    world_from_start = sequences.poses(frames, reference, start, fixed)
+    world_from_pixel = world_from_start if probe is None else world_from_start @ sequences.target_from_pixel(probe)
     placed = sequence_sweep.lagged(str(path), frames.times_s, world_from_pixel, lag_s)
     calibrated, face_row = (SCANNER_SPEED, 0.0) if probe is None else (probe.speed_m_s, probe.face_row)
     speed = tissue_m_s or calibrated
@@ -356,7 +355,7 @@ def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES)
     InputError
         If no B-scan has a pose, or as `recon.freehand.volume_compounding.reconstruct`.
     """
-    clip, mask = settings.part(scans.shape)
+    clip, mask, weights = settings.part(scans.shape)
     around = volume_compounding.corners(scans.world_from_pixel, scans.shape, clip)
     grid_along = volume_compounding.aligned_grid if settings.extent == "aligned" else volume_compounding.principal_grid
     pasted = volume_compounding.reconstruct(
@@ -369,7 +368,7 @@ def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES)
         None if mask is None else repeat(mask),
         most_bytes=most_bytes,
         arithmetic=settings.arithmetic,
-        weights=settings.weights_of(scans.shape),
+        weights=weights,
     )
     if settings.hole_voxels == 0:
         return pasted, pasted
@@ -382,7 +381,7 @@ def sigma_volume(scans: Scans, volume: Volume, settings: VolumeSettings) -> Volu
         return None
     forms = place_uncertainty.forms(scans.world_from_pixel, scans.probe, scans.errors)
     return place_uncertainty.sigma_volume(
-        forms, scans.world_from_pixel, scans.shape, grid_of(volume), *settings.part(scans.shape)
+        forms, scans.world_from_pixel, scans.shape, grid_of(volume), *settings.part(scans.shape)[:2]
     )
 
 

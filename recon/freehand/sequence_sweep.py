@@ -105,12 +105,9 @@ def read_sequence_sweep(
         If the file is damaged, holds no images, or no transforms that lead from the target to the reference frame; or too many
         poses are implausible.
     """
-    frames, (height, width) = sequence_checks.read_tracking(path, tracker), sequences.image_shape(path)
-    frames, _ = sequence_checks.believed(path, frames, names.reference, names.target, None, implausible)
-    try:
-        poses = sequences.poses(frames, names.reference, names.target)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    height, width = sequences.image_shape(path)
+    frames, _ = sequence_checks.read_tracking(path, names.reference, names.target, None, tracker, implausible)
+    poses = sequences.poses(frames, names.reference, names.target)
     numbers = np.flatnonzero(frames.valid["Image"])
     return SequenceSweep(str(path), (width, height), numbers, frames.times_s, poses, lambda: sequences.stream_images(path))
 
@@ -141,7 +138,8 @@ def lagged(name: str, times_s: Array, poses: Array, lag_s: float) -> Array:
     result = np.full(poses.shape, np.nan)
     result[known] = tracks.poses_at(motion, _nanoseconds(name, times_s[known]), lag_s) @ start
     if len(moving.times) * 2 < known.sum():
-        found = f"{len(moving.times)} different ones in {known.sum()} frames, from {times_s[known][0]:.15g} s on"
+        times = "1 different time" if len(moving.times) == 1 else f"{len(moving.times)} different times"
+        found = f"only {times} in {known.sum()} frames, from {times_s[known][0]:.15g} s on"
         raise InputError(f"{name}: Timestamp: expected one of each frame's own, by which poses are interpolated, found {found}")
     if not np.isfinite(result).any():
         found = "none: is the lag right, or the frame rate too low?"

@@ -8,8 +8,7 @@ the images have a place of their own: by the transform `TToPhysical`, where T is
 """
 
 import re
-from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -146,32 +145,42 @@ def poses(frames: Frames, to: str, of: str, fixed: Mapping[str, Array] | None = 
     InputError
         If no chain of transforms leads from one to the other.
     """
-    count = len(frames.times_s)
-    steps: dict[str, dict[str, Array]] = {}
-    for name in [*(fixed or {}), *(name for name in frames.transforms if name not in (fixed or {}))]:
-        if match := TRANSFORM.fullmatch(name):
-            source, destination = match.groups()
-            forth = np.broadcast_to((fixed or {})[name], (count, 4, 4)) if fixed and name in fixed else _usable(frames, name)
-            steps.setdefault(source, {}).setdefault(destination, forth)
-            steps.setdefault(destination, {}).setdefault(source, np.linalg.inv(forth))
-    for name in [name for name in steps if name.upper() == RAS]:
-        steps[name].setdefault(LPS, np.broadcast_to(RAS_FROM_LPS, (count, 4, 4)))
-        steps.setdefault(LPS, {}).setdefault(name, np.broadcast_to(RAS_FROM_LPS, (count, 4, 4)))
-    reached, waiting = {of: np.broadcast_to(np.eye(4), (count, 4, 4))}, deque([of])
-    while waiting and to not in reached:
-        here = waiting.popleft()
-        for there, there_from_here in steps.get(here, {}).items():
-            if there not in reached:
-                reached[there] = there_from_here @ reached[here]
+    result = np.broadcast_to(np.eye(4), (len(frames.times_s), 4, 4))
+    for name in chain(frames.transforms, to, of, fixed):
+        if fixed and name in fixed:
+            forth = fixed[name]
+        else:
+            forth = _usable(frames, name) if name in frames.transforms else RAS_FROM_LPS
+        source, destination = TRANSFORM.findall(name)[0]
+        result, of = (forth @ result, destination) if source == of else (np.linalg.inv(forth) @ result, source)
+    return result
+
+
+def chain(transforms: Collection[str], to: str, of: str, fixed: Collection[str] | None = None) -> list[str]:
+    """Names of those transforms that lead from frame `of` to frame `to`, as of `poses`; RASToLPS for the half turn among them.
+
+    Raises
+    ------
+    InputError
+        If none lead there.
+    """
+    names = list(dict.fromkeys([*(fixed or ()), *transforms]))
+    ends = {name: match.groups() for name in names if (match := TRANSFORM.fullmatch(name))}
+    turns = {frame for pair in ends.values() for frame in pair if frame.upper() == RAS}
+    ends |= {name: (frame, LPS) for frame in sorted(turns) if (name := f"{frame}To{LPS}") not in ends}
+    chains: dict[str, list[str]] = {of: []}
+    for here in (waiting := [of]):
+        for name, pair in ends.items():
+            if here in pair and (there := pair[pair[0] == here]) not in chains:
+                chains[there] = [*chains[here], name]
                 waiting.append(there)
-    if to not in reached and not frames.transforms:
+    if to not in chains and not transforms:
         expected = "some in each frame, such as ProbeToTracker, of the tracker"
         raise InputError(f"transforms: expected {expected}, found none: without poses nothing says where an image was taken")
-    if to not in reached:
-        known = ", ".join(dict.fromkeys([*(fixed or {}), *frames.transforms])) or "none"
-        ends = f", which lead from there to {', '.join(list(reached)[1:])}" if len(reached) > 1 else ""
-        raise InputError(f"transforms: expected some that lead from {of} to {to}, found {known}{ends}")
-    return reached[to]
+    if to not in chains:
+        leads = f", which lead from there to {', '.join(list(chains)[1:])}" if len(chains) > 1 else ""
+        raise InputError(f"transforms: expected some that lead from {of} to {to}, found {', '.join(names) or 'none'}{leads}")
+    return chains[to]
 
 
 def lies_elsewhere(frames: Frames, reference: str) -> bool:
@@ -284,10 +293,11 @@ def _matrices(file: ImageFile, key: str, texts: list[str], words: list[str]) -> 
             continue
         name = _key(index, key)
         matrix = medical_images.numbers(file.path, name, text, 16).reshape(4, 4)
-        valid[index] = word.upper() in ("", "OK") and not pose_checks.is_lost(matrix)
+        lost = pose_checks.is_lost(matrix)
+        valid[index] = word.upper() in ("", "OK") and not lost
         if valid[index] and not is_usable(matrix):
             raise file.fault(name, "an invertible matrix with the last row 0 0 0 1", repr(text))
-        matrices[index] = np.eye(4) if pose_checks.is_lost(matrix) else matrix
+        matrices[index] = np.eye(4) if lost else matrix
     return matrices, valid
 
 

@@ -7,7 +7,7 @@ Frames pass one by one; in memory are the volume and one image. `world_from_pixe
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import repeat
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,10 +15,10 @@ from pydantic import Field
 
 from recon import arguments
 from recon.compiled import njit
-from recon.errors import InputError
+from recon.errors import InputError, brief
 from recon.files.volumes import Volume
 from recon.freehand import plus_arithmetic
-from recon.freehand.plus_arithmetic import MAXIMUM, MEAN, WEIGHTED, Arithmetic, Slice
+from recon.freehand.plus_arithmetic import LATEST, LEAST_SHARE, MAXIMUM, MEAN, WEIGHTED, Arithmetic, Slice
 from recon.geometry import rigid
 
 Array = NDArray[np.float64]
@@ -28,8 +28,7 @@ Interpolation = Literal["nearest", "linear"]
 Length = Annotated[int, Field(gt=0)]
 Rectangle = tuple[int, int, Length, Length]  # u, v, width, height of a clip, px; of a setting
 
-RULES = {"mean": MEAN, "maximum": MAXIMUM, "latest": 2, "weighted": WEIGHTED}
-LEAST_WEIGHT = 0.125  # of a voxel that a pixel is the maximum or the latest of: that of all eight where it lies in their middle
+RULES = {"mean": MEAN, "maximum": MAXIMUM, "latest": LATEST, "weighted": WEIGHTED}
 BYTES_PER_VOXEL = 10  # sum and weight in float32; the grey value, and whether it is filled
 MOST_BYTES = 4 << 30
 
@@ -195,6 +194,8 @@ def reconstruct(
     world_from_pixel = arguments.places_of_pixels("world_from_pixel", world_from_pixel)
     if compounding not in RULES or interpolation not in ("nearest", "linear"):
         raise ValueError(f"no compounding {compounding!r} or interpolation {interpolation!r}")
+    if arithmetic not in get_args(Arithmetic):
+        raise InputError(f"arithmetic: expected one of {', '.join(get_args(Arithmetic))}, found {brief(arithmetic)}")
     arguments.of_kind("weights", weights, np.ndarray, type(None))
     if (weights is None) != (compounding != "weighted"):
         found = f"{'none' if weights is None else 'some'} with {compounding}"
@@ -300,7 +301,7 @@ def _share_out(sums: Sums, x, y, z, grey, part, rule):
         for j in range(max(j0, 0), min(j0 + 2, ny)):
             for i in range(max(i0, 0), min(i0 + 2, nx)):
                 share = np.float32((1 - abs(x - i)) * (1 - abs(y - j)) * (1 - abs(z - k)))
-                if share >= LEAST_WEIGHT or (rule in (MEAN, WEIGHTED) and share > 0):
+                if share >= LEAST_SHARE or (rule in (MEAN, WEIGHTED) and share > 0):
                     _compound(sums, k, j, i, grey, part * share, rule)
 
 

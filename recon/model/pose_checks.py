@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,15 +20,13 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Cause = Literal["identity", "frozen", "jump"]
-Changes = Callable[
-    [], tuple[Array, Array]
-]  # moments : (m,) of images, and change of each since the one before : (m,), grey levels
+Images = Callable[[], tuple[Array, NDArray[np.float32]]]  # moments : (m,) of images, and these as of `small_images` : (m, h, w)
 
-STEP_PX = 4  # of the pixels that are compared from image to image
+BLOCK_PX, MOST_BLOCKS = 8, 4096  # that images are averaged in before they are compared
 LOST = -3.697314e28  # of a coordinate, which NDI's trackers write where a tool isn't seen
 WORDS: dict[Cause, str] = {
     "identity": "the identity, as of a tool that is not seen",
-    "frozen": "the same to the last digit as the one before while the images change, as of a tracker that stood still",
+    "frozen": "the same to the last digit as the one before while the images change, as of a tracker that stopped",
     "jump": "farther off its neighbours than a hand moves",
 }
 
@@ -45,10 +44,15 @@ class MotionLimits:
     usual: float = 12.0  # times the median over the sweep, which tells a noisy tracker from a jump
     near: float = 5.0  # times the median step, within which a pose that is the identity lies on the way
     away_mm: float = 1000.0  # from the sweep's middle
+    burst_s: float = 5e-3  # between stamps, below which they may come in bursts
+    together: int = 12  # such steps that are timed together: bursts may have 14, and one step in 15 may be a gap
+    gap: float = 5.0  # times the period, over which a motion isn't followed
     untimed_mm: float = 100.0  # of a step, where no times tell its speed
+    alone: int = 10  # poses that make a sweep of their own there
     repeats: int = 4  # poses in a row that are the same, at least, before images are compared
-    changed: float = 0.7  # times the usual change from image to image of a moving probe
+    changed: float = 0.7  # times the usual change between images, as far apart, of a moving probe
     changed_before_jump: float = 0.3  # the same, where the pose jumps when it goes on
+    grows: float = 1.2  # times the mean square between neighbours, by which images farther apart tell motion from noise
     small_mm: tuple[float, float] = (1.0, 20.0)  # a sweep's extent that might be in centimetres or inches, as few in mm are
     near_mm: float = 150.0  # the same of its farthest place from the origin
     slow_mm_s: float = 6.0  # and of its median speed
@@ -67,7 +71,7 @@ class Findings:
     rows: dict[Cause, Rows] = field(default_factory=dict)
 
     @property
-    def all(self) -> Rows:
+    def rows_left_out(self) -> Rows:
         """All rows : (m,), increasing."""
         return np.unique(np.concatenate([np.empty(0, np.int64), *self.rows.values()]))
 
@@ -93,12 +97,12 @@ def is_lost(values: Array) -> bool:
     return bool(np.isclose(values, LOST, rtol=1e-3, atol=0).any())
 
 
-def checked(
+def without_implausible(
     place: str,
     times_s: Array,
     poses: Array,
     implausible: Implausible = "refuse",
-    changes: Changes | None = None,
+    images: Images | None = None,
     clock: Array | None = None,
     what: str = "pose",
     unit: str = "",
@@ -109,50 +113,52 @@ def checked(
     ----------
     place : of the poses, for messages
     what : word for one of them
-    times_s, poses, changes, clock : as of `find`
+    times_s, poses, images, clock : as of `find`
     unit : field that says in which unit they are, if there is one
 
     Raises
     ------
     InputError
-        If their lengths are of another unit, or more would be left out than may be.
+        If more would be left out than may be.
     """
-    found, fault = find(times_s, poses, changes, clock), unit_fault(poses)
-    way = f"give {unit}; {WAY}" if unit else WAY
+    found = find(times_s, poses, images, clock)
     if implausible == "take":
-        for line in [*([fault] if fault else []), *found.lines(what)]:
+        for line in found.lines(what):
             log.warning("%s: taken all the same: %s", place, line)
         return poses, Findings(found.count)
-    kept = without(poses, found.all)
-    if len(found.all) > LIMITS.most_share * found.count:
-        if fault:
-            raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
+    if len(found.rows_left_out) > LIMITS.most_share * found.count:
+        if "jump" in found.rows and (fault := unit_fault(poses, unit)):
+            raise InputError(f"{place}: poses: expected a sweep in mm, found {fault}; {WAY}")
         expected = f"a motion that a hand makes, but for {100 * LIMITS.most_share:.0f} % at most"
         raise InputError(f"{place}: poses: expected {expected}, found {'; '.join(found.lines(what))}; {WAY}")
-    if fault := unit_fault(kept):
-        raise InputError(f"{place}: poses: expected a sweep in mm, found {fault} {way}")
-    for line in [f"left out {line}" for line in found.lines(what)] + unit_doubts(times_s, kept, unit):
-        log.warning("%s: %s", place, line)
-    return kept, found
+    for line in found.lines(what):
+        log.warning("%s: left out %s", place, line)
+    return without(poses, found.rows_left_out), found
 
 
-def check_motion(place: str, poses: Array, implausible: Implausible = "refuse") -> None:
-    """Refuse a sweep : (n, 4, 4), NaN where there is no pose, of more than a few that are all the same; or say so only."""
+def check_motion(place: str, times_s: Array, poses: Array, implausible: Implausible = "refuse", unit: str = "") -> None:
+    """Refuse a sweep : (n, 4, 4), NaN where there is no pose, of more than a few that are all the same or of another unit.
+
+    Where they are to be taken it is said only, as it is of a sweep that may be of another unit; `unit` as above.
+    """
     known = poses[np.isfinite(poses).all(axis=(1, 2))]
-    if len(known) <= LIMITS.repeats or not (known == known[0]).all():
-        return
-    found = f"all {len(known)} the same to the last digit: no tracking, or a probe at rest?"
-    doubt(place, f"poses: expected those of a probe that moves, found {found}", implausible)
+    if len(known) > LIMITS.repeats and (known == known[0]).all():
+        found = f"all {len(known)} the same to the last digit: no tracking, or a probe at rest?"
+        doubt(place, f"poses: expected those of a probe that moves, found {found}", implausible)
+    if fault := unit_fault(poses, unit):
+        doubt(place, f"poses: expected a sweep in mm, found {fault}", implausible)
+    elif implausible == "refuse" and (told := unit_doubt(times_s, poses, unit)):
+        log.warning("%s: %s", place, told)
 
 
-def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Array | None = None) -> Findings:
+def find(times_s: Array, poses: Array, images: Images | None = None, clock: Array | None = None) -> Findings:
     """Implausible poses of a sweep.
 
     Parameters
     ----------
     times_s : (n,) s, NaN where a pose has none; any order
     poses : (n, 4, 4) mm, rigid or nearly so, or times a scale; NaN where there is none
-    changes : of the images; looked at only where poses repeat
+    images : looked at only where poses repeat
     clock : (n,) of the poses, by which the images' moments count; the times without it
     """
     clock = times_s if clock is None else clock
@@ -162,7 +168,7 @@ def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Ar
     left = there[~lost]
     if lost.any():
         rows["identity"] = there[lost]
-    frozen = _frozen(clock[left], poses[left], changes)
+    frozen = _frozen(clock[left], poses[left], images)
     if len(frozen):
         rows["frozen"], left = left[frozen], np.delete(left, frozen)
     jumped = _jumps(times_s[left], poses[left])
@@ -171,44 +177,46 @@ def find(times_s: Array, poses: Array, changes: Changes | None = None, clock: Ar
     return Findings(len(there), rows)
 
 
-def unit_fault(poses: Array) -> str | None:
+def unit_fault(poses: Array, unit: str = "") -> str | None:
     """The fault of poses : (n, 4, 4) whose shifts seem to be in another unit than mm, with the likely one; None as a rule."""
     places = poses[np.isfinite(poses).all(axis=(1, 2)), :3, 3]
     if len(places) < 3:
         return None
     span, farthest = float(np.linalg.norm(np.ptp(places, axis=0))), float(np.abs(places).max())
     if 1e-6 < span < 1 and farthest < 5:
-        return f"all within {span:.3g} mm, and {farthest:.3g} mm from the origin: metres?"
+        way = f"give {unit}" if unit else "multiply the translations by 1000"
+        return f"all within {span:.3g} mm, and {farthest:.3g} mm from the origin: metres? {way}"
     if (most := float(np.linalg.norm(np.subtract(*np.percentile(places, [90, 10], axis=0))))) > 5000:  # a few may be wrong
-        return f"a sweep over {most:.4g} mm: micrometres?"
+        way = f"give {unit}" if unit else "divide the translations by 1000"
+        return f"a sweep over {most:.4g} mm: micrometres? {way}"
     return None
 
 
-def unit_doubts(times_s: Array, poses: Array, unit: str = "") -> list[str]:
+def unit_doubt(times_s: Array, poses: Array, unit: str = "") -> str | None:
     """Say that a sweep may be in another unit: one that is small, near and slow, as those in centimetres or inches are."""
     found = np.isfinite(poses).all(axis=(1, 2))
     places, times = poses[found, :3, 3], times_s[found]
     if len(places) <= LIMITS.repeats:
-        return []
+        return None
     span, farthest = float(np.linalg.norm(np.ptp(places, axis=0))), float(np.linalg.norm(places, axis=1).max())
     if not LIMITS.small_mm[0] < span < LIMITS.small_mm[1] or farthest > LIMITS.near_mm:
-        return []
+        return None
     told = f"all poses lie within {span:.3g} mm, and up to {farthest:.3g} mm from the origin"
     if (seconds := _seconds(times)) is not None:
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.maximum(np.diff(seconds), _shortest(seconds))
         if (speed := float(np.median(steps))) > LIMITS.slow_mm_s:
-            return []
+            return None
         told += f", at {speed:.2g} mm/s"
-    return [f"{told}: is it in mm, not in centimetres or inches?" + (f" Else give {unit}" if unit else "")]
+    return f"{told}: is it in mm, not in centimetres or inches?" + (f" Else give {unit}" if unit else "")
 
 
-def image_changes(images: Iterable[NDArray]) -> Array:
-    """Mean change : (n,) of each image's grey levels since the one before; NaN of the first."""
-    before, found = None, []
+def small_images(images: Iterable[NDArray]) -> NDArray[np.float32]:
+    """Mean grey levels : (n, h, w) of the images' blocks, in which noise counts little beside what is seen."""
+    found = []
     for image in images:
-        now = image[::STEP_PX, ::STEP_PX].astype(np.float32)
-        found.append(np.nan if before is None else float(np.abs(now - before).mean()))
-        before = now
+        block = max(BLOCK_PX, int(np.ceil(np.sqrt(image.size / MOST_BLOCKS))))
+        size = [max(1, pixels // block) for pixels in image.shape[::-1]]
+        found.append(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
     return np.array(found)
 
 
@@ -229,35 +237,55 @@ def _lost(poses: Array) -> NDArray[np.bool_]:
     return same
 
 
-def _frozen(times_s: Array, poses: Array, changes: Changes | None) -> Rows:
-    """Rows of poses that repeat the one before to the last digit, long, while the images change."""
+def _frozen(times_s: Array, poses: Array, images: Images | None) -> Rows:
+    """Rows of poses that repeat the one before to the last digit, long, while the images change as they do elsewhere.
+
+    Images some way apart are compared: those of a probe at rest differ by noise alone, however slow its motion was.
+    """
     same = (poses[1:] == poses[:-1]).all(axis=(1, 2))
     starts = np.concatenate([[0], np.flatnonzero(~same) + 1])
     lengths = np.diff([*starts, len(poses)])
     usual_length = np.sort(lengths)[(len(lengths) - 1) // 2]  # of a tracker that is slower than the images
     long = (lengths > LIMITS.repeats) & (lengths > 3 * usual_length)
-    if not long.any() or changes is None:
+    if not long.any() or images is None:
         return np.empty(0, np.int64)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[~same]
-    moments, change = changes()
-    resting = np.zeros(len(moments), bool)
-    for start, length in zip(starts[long], lengths[long], strict=True):
-        resting |= _during(moments, times_s[start : start + length])
-    usual = np.median(change[~resting & np.isfinite(change)]) if (~resting & np.isfinite(change)).any() else np.nan
+    moments, small = images()
+    later = np.arange(len(moments)) > 0
+    within = [
+        later & (moments > times_s[start]) & (moments <= times_s[start + length - 1])
+        for start, length in zip(starts[long], lengths[long], strict=True)
+    ]
+    moving = later & ~np.any(within, axis=0)
     frozen = []
-    for start, length in zip(starts[long], lengths[long], strict=True):
-        own = change[_during(moments, times_s[start : start + length]) & np.isfinite(change)]
+    for start, length, own in zip(starts[long], lengths[long], within, strict=True):
+        apart = (min(_longest(own), _longest(moving)) + 1) // 2
+        if own.sum() < 3 or apart == 0:
+            continue
         end = start + length
         jump = np.linalg.norm(poses[end, :3, 3] - poses[start, :3, 3]) > 3 * np.median(steps) if end < len(poses) else False
         least = LIMITS.changed_before_jump if jump else LIMITS.changed
-        if len(own) >= 3 and np.median(own) > least * usual > 0:
+        (far, near), (usual, usual_near) = ([_change(small, among, k) for k in (apart, 1)] for among in (own, moving))
+        if usual > LIMITS.grows * usual_near:  # else neighbours differ as others do, far more than by noise
+            changed = far > LIMITS.changed_before_jump**2 * usual
+            changed &= (far - near) * usual_near > least**2 * (usual - usual_near) * near
+        else:
+            changed = far > least**2 * usual
+        if changed:
             frozen.append(np.arange(start + 1, end))
     return np.concatenate([np.empty(0, np.int64), *frozen])
 
 
-def _during(moments: Array, times_s: Array) -> NDArray[np.bool_]:
-    """Images that were taken within a run of poses, and the one before too."""
-    return (moments > times_s[0]) & (moments <= times_s[-1])
+def _longest(marked: NDArray[np.bool_]) -> int:
+    """Length of the longest run of marked ones."""
+    bounds = np.flatnonzero(np.diff([False, *marked, False]))
+    return int(np.diff(bounds)[::2].max(initial=0))
+
+
+def _change(images: NDArray[np.float32], marked: NDArray[np.bool_], apart: int) -> float:
+    """Median mean square of the difference of images : (n, h, w) some way apart, all on the way but the first one marked."""
+    ends = np.flatnonzero(np.convolve(marked, np.ones(apart), "valid") == apart) + apart - 1
+    return float(np.median([np.square(images[k] - images[k - apart]).mean() for k in ends]))
 
 
 def _jumps(times_s: Array, poses: Array) -> Rows:
@@ -279,12 +307,18 @@ def _seconds(times_s: Array) -> Array | None:
 
 
 def _shortest(seconds: Array) -> float:
-    """The least time between two poses that is believed: half of most periods, as stamps may come in bursts."""
-    return 0.5 * float(np.percentile(np.diff(seconds), 90))
+    """The least time between two poses that is believed: their period, and half more of stamps that may come in bursts."""
+    if (period := float(np.percentile(np.diff(seconds), 40))) > LIMITS.burst_s:
+        return period
+    steps = min(LIMITS.together, len(seconds) - 1)
+    return 1.5 * float(np.percentile(seconds[steps:] - seconds[:-steps], 20)) / steps
 
 
 def _joined(times_s: Array, poses: Array) -> Rows:
-    """Rows of the longest piece of the motion, and of those that can be reached from it."""
+    """Rows of the longest piece of the motion, and of those that can be reached from it.
+
+    Where no times tell how long a hand had, a long piece from which the motion doesn't come back is another sweep.
+    """
     seconds, places = _seconds(times_s), poses[:, :3, 3]
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     turns = _turns(poses[:-1, :3, :3], poses[1:, :3, :3])
@@ -300,19 +334,32 @@ def _joined(times_s: Array, poses: Array) -> Rows:
         return near & ((turn_rad <= LIMITS.least_rad) | (turn_rad <= LIMITS.turn_rad_s * duration))
 
     rows = np.arange(len(poses))
-    ends = np.flatnonzero(~fits(steps, turns, rows[:-1], rows[1:]))
+    apart = ~fits(steps, turns, rows[:-1], rows[1:])
+    if seconds is not None:
+        apart |= np.diff(seconds) > LIMITS.gap * shortest
+    ends = np.flatnonzero(apart)
     pieces = np.split(rows, ends + 1)
     longest = max(range(len(pieces)), key=lambda k: len(pieces[k]))
-    kept = [pieces[longest]]
+
+    kept = []
     for others, last, first in ((pieces[longest + 1 :], -1, 0), (pieces[:longest][::-1], 0, -1)):
-        at = pieces[longest][[last]]
-        for piece in others:
-            to = piece[[first]]
-            step = np.linalg.norm(places[to] - places[at], axis=1)
-            if fits(step, _turns(poses[at, :3, :3], poses[to, :3, :3]), at, to)[0]:
-                kept.append(piece)
-                at = piece[[last]]
-    return np.sort(np.concatenate(kept))
+
+        def reached(before: Rows, after: Rows, last: int = last, first: int = first) -> bool:
+            a, b = before[[last]], after[[first]]
+            step = np.linalg.norm(places[b] - places[a], axis=1)
+            return bool(fits(step, _turns(poses[a, :3, :3], poses[b, :3, :3]), a, b)[0])
+
+        way = [pieces[longest]]
+        for number, piece in enumerate(others):
+            here = reached(way[-1], piece)
+            if not here and len(way) > 1 and len(way[-1]) < len(piece) and reached(way[-2], piece):
+                way, here = way[:-1], True  # what was reached over a gap was wrong
+            if not here and seconds is None and len(piece) >= LIMITS.alone:
+                here = not any(reached(way[-1], later) for later in others[number + 1 :])
+            if here:
+                way.append(piece)
+        kept += way
+    return np.unique(np.concatenate(kept))
 
 
 def _spikes(times_s: Array, places: Array) -> NDArray[np.bool_]:

@@ -114,8 +114,8 @@ def _spot(level: NDArray[np.float32], look: Appearance) -> Crossing:
     chosen, rivals = _first_arrival(peaks, contrasts, look.rival_db)
     if len(rivals):
         places = ", ".join(f"({u}, {v})" for u, v in (peaks[chosen], peaks[rivals[0]]))
-        kind = "two candidates" if len(rivals) == 1 else f"{SEVERAL}: {len(rivals) + 1} spots, such as at"
-        return _none(f"{kind}{':' if len(rivals) == 1 else ''} {places}", float(contrasts[chosen]))
+        several = f"{SEVERAL}: {len(rivals) + 1} spots, such as at {places}"
+        return _none(f"two candidates: {places}" if len(rivals) == 1 else several, float(contrasts[chosen]))
     return _fitted(level, smooth, peaks[chosen], float(contrasts[chosen]), grey, look)
 
 

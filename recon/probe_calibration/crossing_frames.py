@@ -20,9 +20,7 @@ FIELDS = {  # of an appearance, by the reason of a rejection that another scanne
     "no echo stands out": "min_contrast_db",
     "two candidates": "rival_db",
 }
-ONE_CROSSING = (
-    "Of phantoms only two crossed wires are read: take such ones, or give pairs=... of one point's pixels found elsewhere"
-)
+ONE_CROSSING = "only two crossed wires can be found: use such a phantom, or give pairs=FILE with one point's pixels"
 
 
 @dataclass(frozen=True)
@@ -93,6 +91,6 @@ def refuse_few(frames: CrossingFrames) -> None:
         reason = next((each.reason for each in frames.crossings if (each.reason or "").startswith(kind)), kind)
         way = f"; another scanner? give appearance.{FIELDS[kind]}" if kind in FIELDS else ""
         if kind == cross_wire.SEVERAL:
-            way = f"; N-wires, or other things in the water? {ONE_CROSSING}"
+            way = f"; N-wires? {ONE_CROSSING}; reverberations? give appearance.rival_db"
         expected = f"{MIN_FRAMES} frames or more with a pose and the crossing"
         raise InputError(f"{frames.name}: expected {expected}, found {len(frames.usable)} (most often: {reason}{way})")

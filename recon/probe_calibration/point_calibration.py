@@ -191,8 +191,7 @@ def calibrate(
         used = sightings.of(inliers)
         probe_checks.information(estimate.target_from_image, estimate.scale, information, used, size, max_sigma_mm)
     except InputError as error:
-        text = f"{error}; {_farthest(estimate, sightings, numbers)}"
-        raise InputError(text if moved is None else f"{text}; {moved.described}") from None
+        raise InputError(str(error) if moved is None else f"{error}; {moved.described}") from None
     covariance = whole[: len(NAMES), : len(NAMES)].copy()
     covariance[np.ix_(SHIFT, SHIFT)] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)

@@ -139,7 +139,8 @@ def information(
     }
     named = min(weak, key=lambda name: weak[name])
     found = f"{worst:.2g} mm along {_axis(open_)}: {named}" if weak[named] < 1 else f"{worst:.2g} mm: too few or too noisy frames"
-    raise InputError(f"motion: expected pixels to be placed to {most_mm:g} mm (1 sigma; max_sigma_mm), found {found}")
+    expected = f"pixels to be placed to {most_mm:g} mm (1 sigma)"
+    raise InputError(f"motion: expected {expected}, found {found}; allow more by max_sigma_mm=")
 
 
 def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -> None:

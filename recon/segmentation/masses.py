@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import cv2
@@ -27,35 +28,46 @@ Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 SPACING_MM = (0.5, 0.25, 0.5)  # along the array, the beam and across; a border square to the beam is a line of its pulse
-SMOOTH_MM = 0.6  # standard deviation; speckle cells are smaller
-AROUND_MM = 6.0  # standard deviation over which tissue's level is taken
-DARK = 0.35  # of tissue's power around: 4.6 dB below it
-SEED = 0.12  # of tissue's power, above that of a mass's core: 9 dB
-RISE = 4.0  # of power from the darkest on: behind is no longer the mass but its shadow
-GROW_MM = 1.0  # from a rough body, within which its border is searched; the shadow behind begins there too
-EDGE_MM = 0.5  # of what was scanned: bodies nearer to it are none
-OPEN_MM = 1.5  # radius: thinner parts are shadows of borders
 BESIDE_MM = 0.25  # half of the widest voxel
 BLUR_REACH = 4  # standard deviations to which a blur reaches
-LEAST_MM3 = 50.0
 TOP_MM = 3.0  # ringing at the face, left out
 ROUGHLY = 1  # refinement of the surface, as exact as clearing needs it
 REFINEMENTS = (2, 3)  # after each clearing
 SAMPLED = 40  # images for the level of tissue
 LEAST_GREY = 5.0  # of 255, of tissue
-CORE = 0.6  # of a mass's extent: its darkest part
-MOSTLY = 0.6  # share of what lies before a cut body that shows tissue: elsewhere the probe doesn't touch
-SAME = 0.5  # share of a cut body that is whole by itself
-LEAST_CUT_MM3 = 15.0  # of what is seen of a cut body
-DARKEST = 0.1  # share of a cut body that is as dark as a mass's core: of a small piece most lies within the blur of its border
-LEAST_CUT_MM = 2.5  # of it down the beam; speckle has no holes as deep
-STREAK = 2.5  # height of a body down the beam over its thickness, above which it is the shadow of a border
-CUT = "a dark body is cut by %s, and is left out: %.0f mm3 of it at %.0f, %.0f, %.0f mm, %.0f x %.0f x %.0f mm; scan on there"
-FLOOR = "the dark behind the tissue, %.0f mm3 about %.0f, %.0f, %.0f mm, holds no mass, or one that isn't told from it"
-BEHIND = 0.5  # share of a body within the shadow of one that is cut, which can't be cleared
-HIDDEN = "a dark body of %.0f mm3 at %.0f, %.0f, %.0f mm is left out: it lies behind one that is cut, and may be its shadow"
-SHADOW = "a dark streak at %.0f, %.0f, %.0f mm, %.0f mm down the beam and %.0f mm thick, is left out as the shadow of a border"
-LEAST_SEEN = 0.3  # of the core, by sound that came through other masses
+
+
+@dataclass(frozen=True)
+class MassLimits:
+    """When dark voxels count as a mass. Powers are shares of the tissue's around."""
+
+    smooth_mm: float = 0.6  # standard deviation; speckle cells are smaller
+    around_mm: float = 6.0  # standard deviation over which tissue's level is taken
+    dark: float = 0.35  # 4.6 dB below tissue
+    seed: float = 0.12  # above the power of a mass's core: 9 dB
+    rise: float = 4.0  # of power from the darkest on: behind is no longer the mass but its shadow
+    grow_mm: float = 1.0  # from a rough body, within which its border is searched; the shadow behind begins there too
+    edge_mm: float = 0.5  # of what was scanned: bodies nearer to it are none
+    open_mm: float = 1.5  # radius: thinner parts are shadows of borders
+    least_mm3: float = 50.0
+    streak: float = 2.5  # height of a body down the beam over its thickness, above which it may be the shadow of a border
+    core: float = 0.6  # of a mass's extent: its darkest part
+    least_seen: float = 0.3  # of the core, by sound that came through other masses
+
+
+@dataclass(frozen=True)
+class CutBodyLimits:
+    """When dark voxels at a side or an end of the scan are named as a body that it cuts."""
+
+    least_mm3: float = 15.0  # of what is seen of it
+    least_mm: float = 2.5  # of it down the beam; speckle has no holes as deep
+    darkest: float = 0.1  # share that is as dark as a mass's core: of a small piece most lies within the blur of its border
+    same: float = 0.5  # share of it that is whole by itself
+    mostly: float = 0.6  # share of what lies before it that shows tissue: elsewhere the probe doesn't touch
+    behind: float = 0.5  # share of another body within its shadow, which can't be cleared
+
+
+LIMITS, CUT = MassLimits(), CutBodyLimits()
 
 
 def from_scans(
@@ -142,11 +154,11 @@ def tissue_grey(images: Iterable[NDArray], shape: tuple[int, int], world_from_pi
 
 def is_dark(mass: Mass, power: EchoPower) -> bool:
     """Whether a mass is still dark after the shadows of others have been taken away."""
-    places = mass.centre + CORE * (mass.mesh.vertices - mass.centre)
+    places = mass.centre + LIMITS.core * (mass.mesh.vertices - mass.centre)
     voxel = np.rint(rigid.apply(np.linalg.inv(power.volume.world_from_voxel), places)).astype(int)
     i, j, k = np.clip(voxel, 0, np.array(power.weight.shape[::-1]) - 1).T
     seen = power.weight[k, j, i] > 0
-    return bool(seen.mean() > LEAST_SEEN and np.median(power.volume.voxels[k, j, i][seen]) < DARK)
+    return bool(seen.mean() > LIMITS.least_seen and np.median(power.volume.voxels[k, j, i][seen]) < LIMITS.dark)
 
 
 def shown(masses: Sequence[Mass], world_from_pixel: Array, shape: tuple[int, int], sound: Sound) -> Iterator[Mask]:
@@ -174,34 +186,34 @@ def refined(masses: Sequence[Mass], power: EchoPower, times: int) -> list[Mass]:
 def rough(power: EchoPower) -> list[Mass]:
     """Dark bodies with tissue all around, without the shadows that hang on to them.
 
-    Warnings are logged of bodies that the scan's side or end cuts, of those behind them, and of streaks down the beam, which are
-    shadows of borders.
+    Warnings are logged of bodies that the scan's side or end cuts, of those behind them, and of streaks down the beam, which may
+    be shadows of borders.
     """
     spacing = power.volume.spacing[::-1]
-    smooth = _smoothed(power.volume.voxels, power.weight, SMOOTH_MM / spacing)
+    smooth = _smoothed(power.volume.voxels, power.weight, LIMITS.smooth_mm / spacing)
     seen = np.isfinite(smooth)
     tissue = np.minimum(power.volume.voxels, 2.0)
     bright = seen.copy()
     for _ in range(3):
-        level = _smoothed(tissue, power.weight * bright, AROUND_MM / spacing)
-        bright = seen & (smooth > DARK * np.nan_to_num(level, nan=np.inf))
+        level = _smoothed(tissue, power.weight * bright, LIMITS.around_mm / spacing)
+        bright = seen & (smooth > LIMITS.dark * np.nan_to_num(level, nan=np.inf))
     ratio = np.where(seen, smooth / level, 1.0)
-    dark = seen & (ratio < DARK)
+    dark = seen & (ratio < LIMITS.dark)
     dark &= ~_risen(np.where(dark, ratio, np.inf))
-    body = _opened(dark, OPEN_MM, spacing)
+    body = _opened(dark, LIMITS.open_mm, spacing)
     unknown = ~seen
     labels, count = ndimage.label(body)
     parts = ndimage.find_objects(labels)
-    margin, edge = (np.ceil(one / spacing).astype(int) for one in (2 * GROW_MM, EDGE_MM))
+    margin, edge = (np.ceil(one / spacing).astype(int) for one in (2 * LIMITS.grow_mm, LIMITS.edge_mm))
     whole, candidates = np.zeros(dark.shape, bool), []
     for number in range(1, count + 1):
         part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(parts[number - 1], margin, strict=True))
         inside = labels[part] == number
         volume = inside.sum() * float(np.prod(spacing))
-        touches = (_widened(inside, EDGE_MM, spacing) & unknown[part]).any()
+        touches = (_widened(inside, LIMITS.edge_mm, spacing) & unknown[part]).any()
         cut = any(s.start < m or s.stop > n - m for s, m, n in zip(parts[number - 1], edge, dark.shape, strict=True))
         core = np.median(ratio[part][inside])
-        if volume < LEAST_MM3 or core > SEED or touches or cut:
+        if volume < LIMITS.least_mm3 or core > LIMITS.seed or touches or cut:
             continue
         whole[part] |= inside
         candidates.append((part, inside, volume, core))
@@ -209,12 +221,15 @@ def rough(power: EchoPower) -> list[Mass]:
     result = []
     for part, inside, volume, core in candidates:
         height, thick = np.ptp(np.nonzero(inside)[1]) * spacing[1], _thickness(inside, spacing)
-        if height > STREAK * thick:
-            log.warning(SHADOW, *_middle(inside, part, power), height, thick)
-        elif shadowed[part][inside].mean() > BEHIND:
-            log.warning(HIDDEN, volume, *_middle(inside, part, power))
+        if height > LIMITS.streak * thick:
+            told = "a dark streak at %.0f, %.0f, %.0f mm, %.0f mm down the beam and %.0f mm thick, is left out: "
+            told += "a shadow of a border, or a body longer down the beam than %g times its thickness"
+            log.warning(told, *_middle(inside, part, power), height, thick, LIMITS.streak)
+        elif shadowed[part][inside].mean() > CUT.behind:
+            told = "a dark body of %.0f mm3 at %.0f, %.0f, %.0f mm is left out: it lies behind one that is cut, maybe its shadow"
+            log.warning(told, volume, *_middle(inside, part, power))
         else:
-            field = np.where(_widened(inside, GROW_MM, spacing), ratio[part], 1.0)
+            field = np.where(_widened(inside, LIMITS.grow_mm, spacing), ratio[part], 1.0)
             result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))
     return result
 
@@ -226,14 +241,14 @@ def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, power:
     hardly a side.
     """
     spacing = power.volume.spacing[::-1]
-    pad = int(np.ceil(2 * OPEN_MM / spacing.min()))
+    pad = int(np.ceil(2 * LIMITS.open_mm / spacing.min()))
     whole, known = np.pad(whole, pad), np.pad(seen, pad)
     ratio = np.pad(ratio, pad, constant_values=1.0)
     dark = np.pad(dark, pad)
-    bright = known & (ratio > DARK)
+    bright = known & (ratio > LIMITS.dark)
     last = ~np.logical_or.accumulate(bright[:, ::-1], axis=1)[:, ::-1]  # nothing behind is bright
-    labels, _ = ndimage.label(dark & _opened(dark | ~known, OPEN_MM, spacing))
-    margin = np.ceil(4 * EDGE_MM / spacing).astype(int)
+    labels, _ = ndimage.label(dark & _opened(dark | ~known, LIMITS.open_mm, spacing))
+    margin = np.ceil(4 * LIMITS.edge_mm / spacing).astype(int)
     shadowed = np.zeros(dark.shape, bool)
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
         part = tuple(slice(s.start - m, s.stop + m) for s, m in zip(box, margin, strict=True))
@@ -241,31 +256,37 @@ def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, power:
         volume = inside.sum() * float(np.prod(spacing))
         extents = [(s.stop - s.start) * step for s, step in zip(box, spacing, strict=True)][::-1]
         across, height, along = extents
-        small = volume < LEAST_CUT_MM3 or height < LEAST_CUT_MM or height > STREAK * max(across, along)
-        if small or np.quantile(ratio[part][inside], DARKEST) > SEED or whole[part][inside].mean() > SAME:
+        small = volume < CUT.least_mm3 or height < CUT.least_mm or height > LIMITS.streak * max(across, along)
+        if small or np.quantile(ratio[part][inside], CUT.darkest) > LIMITS.seed or whole[part][inside].mean() > CUT.same:
             continue
-        shell, behind = _widened(inside, 2 * EDGE_MM, spacing) & ~inside, np.logical_or.accumulate(inside, axis=1)
+        shell, behind = _widened(inside, 2 * LIMITS.edge_mm, spacing) & ~inside, np.logical_or.accumulate(inside, axis=1)
         before = np.logical_or.accumulate(inside[:, ::-1], axis=1)[:, ::-1] & ~behind
         beside, before = shell & ~behind & ~before, shell & before
-        sides = {"the images' side": _open(shell & ~here, 2), "the sweep's end": _open(shell & ~here, 0)}
-        if not any(sides.values()) or (before & bright[part]).sum() < MOSTLY * before.sum():
+        sides = {
+            ("the images' side", "scan on there"): _fullest(shell & ~here, 2),
+            ("the sweep's end", "scan on there"): _fullest(shell & ~here, 0),
+            ("the images' lower end", "set a greater depth"): _fullest(shell & ~here, 1),
+        }
+        if not any(sides.values()) or (before & bright[part]).sum() < CUT.mostly * before.sum():
             continue
-        ends = (inside & last[part]).any(axis=1).sum() > (1 - MOSTLY) * inside.any(axis=1).sum()
+        ends = (inside & last[part]).any(axis=1).sum() > (1 - CUT.mostly) * inside.any(axis=1).sum()
         middle = tuple(slice(s.start - pad, s.stop - pad) for s in part)
-        if ends and (beside & ~here).sum() > (1 - MOSTLY) * beside.sum():
-            log.info(FLOOR, volume, *_middle(inside, middle, power))
+        if ends and (beside & ~here).sum() > (1 - CUT.mostly) * beside.sum():
+            told = "the dark behind the tissue, %.0f mm3 about %.0f, %.0f, %.0f mm, holds no mass, or one that isn't told from it"
+            log.info(told, volume, *_middle(inside, middle, power))
             continue
-        log.warning(CUT, max(sides, key=lambda name: sides[name]), volume, *_middle(inside, middle, power), *extents)
-        near = _widened(inside, 2 * GROW_MM, spacing)
+        border, way = max(sides, key=lambda name: sides[name])
+        told = "a dark body is cut by %s, and is left out: %.0f mm3 of it at %.0f, %.0f, %.0f mm, %.0f x %.0f x %.0f mm; %s"
+        log.warning(told, border, volume, *_middle(inside, middle, power), *extents, way)
+        near = _widened(inside, 2 * LIMITS.grow_mm, spacing)
         below = np.pad(near, ((0, 0), (0, dark.shape[1] - part[1].start - near.shape[1]), (0, 0)))
         shadowed[part[0], part[1].start :, part[2]] |= np.logical_or.accumulate(below, axis=1)
     return shadowed[pad:-pad, pad:-pad, pad:-pad]
 
 
-def _open(unseen: Mask, axis: int) -> int:
-    """Number of unseen voxels in a body's shell at its outermost layers along an axis."""
-    filled = unseen.sum(axis=tuple(one for one in range(3) if one != axis))
-    return int(filled.max()) if filled.any() else 0
+def _fullest(unseen: Mask, axis: int) -> int:
+    """Greatest number of unseen voxels of a body's shell in one layer along an axis: what cuts it lies square to the greatest."""
+    return int(unseen.sum(axis=tuple(one for one in range(3) if one != axis)).max(initial=0))
 
 
 def _thickness(inside: Mask, spacing: Array) -> float:
@@ -273,25 +294,21 @@ def _thickness(inside: Mask, spacing: Array) -> float:
     return 2 * float(np.max(np.asarray(ndimage.distance_transform_edt(np.pad(inside, 1), spacing))))
 
 
-def _centre(inside: Mask, part: tuple[slice, ...]) -> Array:
-    """Voxel : (3,) x, y, z in the middle of a body in a part of a volume."""
-    return np.array([np.mean(axis) + s.start for axis, s in zip(np.nonzero(inside), part, strict=True)][::-1])
-
-
 def _middle(inside: Mask, part: tuple[slice, ...], power: EchoPower) -> Array:
-    """The same place in the world : (3,) mm."""
-    return rigid.apply(power.volume.world_from_voxel, _centre(inside, part))
+    """Middle : (3,) mm, in the world, of a body in a part of a volume."""
+    voxel = np.array([np.mean(axis) + s.start for axis, s in zip(np.nonzero(inside), part, strict=True)][::-1])
+    return rigid.apply(power.volume.world_from_voxel, voxel)
 
 
 def _risen(ratio: NDArray) -> Mask:
-    """Voxels behind a rise of power by `RISE`, in each run of finite values down the beam (axis 1)."""
+    """Voxels behind a rise of power by `LIMITS.rise`, in each run of finite values down the beam (axis 1)."""
     lowest, risen = np.full(ratio[:, 0].shape, np.inf), np.zeros(ratio[:, 0].shape, bool)
     result = np.zeros(ratio.shape, bool)
     for row in range(ratio.shape[1]):
         here = ratio[:, row]
         run = np.isfinite(here)
         lowest = np.where(run, np.minimum(lowest, here), np.inf)
-        risen = run & (risen | (here > RISE * lowest))
+        risen = run & (risen | (here > LIMITS.rise * lowest))
         result[:, row] = risen
     return result
 

@@ -88,7 +88,7 @@ def run(config: Config) -> None:
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
     for line in config.assumptions(scans.speed_m_s):
         console.print(f"assumed     {line}", markup=False)
-    clip = settings.part(scans.shape)[0]
+    clip = settings.box(scans.shape)
     for line in freehand_scans.cautions(scans if clip is None else freehand_scans.cut(scans, clip)):
         console.print(f"warning     {line}", markup=False)
     if (config.fan == "find" or settings.fan) and scans.speed_m_s != scans.calibrated_m_s:
@@ -101,7 +101,7 @@ def run(config: Config) -> None:
     elif plus is not None and config.fan is None and settings.fan is not None:
         console.print(f"fan         of {config.config}, {settings.fan}; all of each B-scan by fan=none", markup=False)
 
-    freehand_scans.check_size(scans, str(config.capture or config.sequence), settings.part(scans.shape)[0], config.implausible)
+    freehand_scans.check_size(scans, str(config.capture or config.sequence), settings.box(scans.shape), config.implausible)
     start = perf_counter()
     with console.status("putting B-scans into the volume"):
         pasted, filled = freehand_scans.volume(scans, settings, int(config.most_gib * 2**30))
@@ -148,7 +148,7 @@ def read(config: Config, plus: PlusConfig | None) -> tuple[SweepCapture | None, 
 
 def advice(scans: Scans, settings: VolumeSettings) -> Iterator[str]:
     """A line on voxels so fine that gaps between B-scans stay empty; none as a rule."""
-    left, right, top, bottom = (settings.part(scans.shape)[0] or Clip(0, 0, *scans.shape[::-1])).bounds(scans.shape)
+    left, right, top, bottom = (settings.box(scans.shape) or Clip(0, 0, *scans.shape[::-1])).bounds(scans.shape)
     corners = np.array([[u, v] for u in (left, right) for v in (top, bottom)], float)
     needed = hole_filling.spacing_that_fills(scans.world_from_pixel, corners, settings.hole_voxels)
     if needed > ROOM * np.max(settings.spacing_mm):

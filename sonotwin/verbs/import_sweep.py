@@ -79,13 +79,13 @@ def run(config: Config) -> None:
 def believed(config: Config, clip: Clip, times: NDArray[np.int64], track: Track) -> Track:
     """The poses without those that no hand makes; InputError if these are many, see `recon.model.pose_checks`."""
 
-    def changes() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return 1e-9 * (times - track.times[0]), pose_checks.image_changes(clip.stream())
+    def images() -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        return 1e-9 * (times - track.times[0]), pose_checks.small_images(clip.stream())
 
     seconds = 1e-9 * (track.times - track.times[0])
     place, unit = str(config.poses), "columns.length_unit"
-    poses, _ = pose_checks.checked(place, seconds, track.poses, config.implausible, changes, unit=unit)
-    pose_checks.check_motion(place, poses, config.implausible)
+    poses, _ = pose_checks.without_implausible(place, seconds, track.poses, config.implausible, images, unit=unit)
+    pose_checks.check_motion(place, seconds, poses, config.implausible, unit)
     return replace(track, poses=poses)
 
 

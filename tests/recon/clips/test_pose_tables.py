@@ -147,6 +147,24 @@ def test_tables_without_times_have_a_row_a_frame(tmp_path):
         pose_tables.read(tmp_path / "t.txt", columns, times[:2])
 
 
+@pytest.mark.parametrize("lost", [0, 3, 5])
+@pytest.mark.parametrize("timed", [True, False])
+def test_an_empty_row_is_a_pose_that_was_not_found_and_no_header(timed, lost, tmp_path):
+    """The first row too; a table's own numbers of columns, over numbers of rows, are a header still."""
+    path, times = tmp_path / "t.csv", np.rint(1e9 * SECONDS).astype(int)
+    columns = NUMBERED if timed else NUMBERED.model_copy(update={"time": None})
+    rows = [",".join(f"{value:.12g}" for value in row) for row in ROWS]
+    rows[lost] = f"{SECONDS[lost]:g}" * timed + 7 * ","
+    for below in ("", "" if timed else 2 * f"\n{7 * ','}"):
+        path.write_text("\n".join(rows) + below)
+        read = pose_tables.read(path, columns, None if timed else times)
+        assert np.flatnonzero(~read.found).tolist() == [lost]
+        assert np.allclose(read.poses[read.found], np.delete(POSES, lost, axis=0), atol=1e-8)
+    path.write_text("\n".join([",0,1,2,3,4,5,6", *(f"{k},{row.partition(',')[2]}" for k, row in enumerate(rows))]))
+    by_name = Columns(time=None, translation=("0", "1", "2"), quaternion=("3", "4", "5", "6"))
+    assert np.flatnonzero(~pose_tables.read(path, by_name, times).found).tolist() == [lost]
+
+
 def test_rows_that_repeat_a_time_are_left_out_with_a_count(tmp_path, caplog):
     """The first of them counts, or the first with a pose; where most repeat, the clock stood still."""
     lost = ROWS[1].copy()

@@ -250,6 +250,8 @@ def test_what_cannot_be_reconstructed(sweep):
     grid = volume_compounding.aligned_grid(around, 0.5)
     with pytest.raises(InputError, match=r"volume: expected at most 4.0 GiB, found .* GiB for .* voxels; take a larger spacing"):
         volume_compounding.reconstruct(images, matrices, volume_compounding.aligned_grid(around, 0.001))
+    with pytest.raises(InputError, match=r"arithmetic: expected one of floating, plus_full, .*, found 'plus'"):
+        volume_compounding.reconstruct(images, matrices, grid, arithmetic="plus")
     with pytest.raises(InputError, match="images: expected as many as poses, 12, found 11"):
         volume_compounding.reconstruct(images[1:], matrices, grid)
     with pytest.raises(InputError, match="images: expected as many as poses, 11, found more"):

@@ -33,7 +33,7 @@ def test_n_wires_are_named_with_the_way_past():
             image += 200 * np.exp(-(((u - column) / 5) ** 2 + ((v - row) / 2.5) ** 2) / 2)
     images = [np.clip(image, 0, 255).astype(np.uint8)] * 8
     frames = crossing_frames.look("nwires", images, (240, 200), np.arange(8), np.tile(np.eye(4), (8, 1, 1)))
-    with pytest.raises(InputError, match=r"several candidates: . spots.* N-wires.* two crossed wires are read.* pairs=") as said:
+    with pytest.raises(InputError, match=r"several candidates: . spots.* two crossed wires .* pairs=FILE.*rival_db\)$") as said:
         crossing_frames.refuse_few(frames)
     assert "another scanner" not in str(said.value)
 
