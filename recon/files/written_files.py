@@ -250,7 +250,7 @@ def take_away(left: Path, place: Path) -> None:
         try:
             if os.path.lexists(other) and (_same(path, other) or path.is_dir()):
                 _remove(path)
-            elif is_unchanged(path, listed):
+            elif is_unchanged(path, listed) and (name not in others or os.path.lexists(other)):
                 path.unlink()
             elif place.is_dir() and not os.path.lexists(other):
                 _make_folders(left, place, name)

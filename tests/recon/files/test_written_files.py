@@ -119,17 +119,38 @@ def test_what_comes_while_a_result_is_replaced_is_moved_over(tmp_path, monkeypat
     assert sorted(os.listdir(tmp_path)) == ["out"]
 
 
-def test_files_without_second_names_are_moved_over(tmp_path, monkeypatch):
-    """Where the file system has no links, or lets nobody link to files of others."""
-    make(tmp_path / "out")
-    write(tmp_path / "out" / "thesis.txt")
+def without_links(monkeypatch):
+    """A file system that has no links, or lets nobody link to files of others."""
 
     def refuse(*_, **__):
         raise OSError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "link", refuse)
+
+
+def test_files_without_second_names_are_moved_over(tmp_path, monkeypatch):
+    make(tmp_path / "out")
+    write(tmp_path / "out" / "thesis.txt")
+    without_links(monkeypatch)
     make(tmp_path / "out", "second")
     assert (tmp_path / "out" / "thesis.txt").read_text() == "years of work" and sorted(os.listdir(tmp_path)) == ["out"]
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_of_two_writers_without_links_both_keep_their_files(tmp_path, monkeypatch, copied):
+    """Also where the second laid copies of the first's files into the new folder."""
+    make(tmp_path / "out", manifest="of the first")
+    before = everything(tmp_path / "out")
+    without_links(monkeypatch)
+    with atomic.new_folder(tmp_path / "out", "sweep", ("manifest",)) as folder:
+        if copied:
+            atomic.link_tree(tmp_path / "out", folder, leave_out={"manifest"})
+        write(folder / "manifest", "of both")
+        write(folder / "sweep" / "0000.png")
+    after = everything(tmp_path / "out")
+    assert after.keys() == before.keys() | {"sweep/", "sweep/0000.png"} and sorted(os.listdir(tmp_path)) == ["out"]
+    assert {name for name in before if before[name] != after[name]} == {"manifest"}
+    assert {one.by for each in (written_files.read_list(tmp_path / "out") or {}).values() for one in each} >= {"segment", "sweep"}
 
 
 @pytest.mark.parametrize(
