@@ -33,6 +33,7 @@ from recon.model.patterns import Patterns
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 
+POSE = "write_pose"  # who writes the poses of a board, one by one
 AMENDED = (manifest.MANIFEST, manifest.OPTICS)  # where a part is added: what they hold stays in them
 
 
@@ -276,7 +277,7 @@ def write_pose(folder: Path, name: str, lit: Mapping[str, Images], fringes: Mapp
     """
     record = describe_pose(name, list(lit), {camera: len(stack) for camera, stack in fringes.items()})
     place = Path("board", name)
-    with atomic.new_folder(folder / place, "write_pose") as temporary:
+    with atomic.new_folder(folder / place, POSE) as temporary:
         for camera, stack in fringes.items():
             write_images([temporary / Path(path).relative_to(place) for path in record.fringes[camera]], stack)
         for camera, image in lit.items():

@@ -136,13 +136,20 @@ def list_again(folder: Path, name: str, by: str) -> None:
 
 
 def check_listed(folder: Path, name: str, by: str) -> None:
-    """Check that a file in a folder that is filled where it stands can be written; InputError if another's is there."""
+    """Check that a file in a folder that is filled where it stands can be written.
+
+    Raises
+    ------
+    InputError
+        If one is there that `by` didn't write, or that was changed since.
+    """
     path = folder / name
     if not os.path.lexists(path):
         return
-    files = written_files.read_list(folder) or {}
-    if not (name in files and written_files.is_unchanged(path, files[name])):
-        found = "found it changed since" if name in files else "found another file"
+    listed = (written_files.read_list(folder) or {}).get(name, ())
+    writer = listed[0].by if listed else None
+    if writer != by or not written_files.is_unchanged(path, listed):
+        found = {None: "found another file", by: "found it changed since"}.get(writer, f"found that of {writer}")
         raise InputError(f"{path}: expected nothing or a file as {by} wrote it, {found}; {written_files.ELSEWHERE}")
 
 

@@ -262,13 +262,13 @@ def take_away(left: Path, place: Path) -> None:
     _remove_empty(left, set())
 
 
-def discard(folder: Path) -> None:
-    """Remove the files that sonotwin wrote into a folder and those below, by their lists; what others put there stays."""
+def discard(folder: Path, *by: str) -> None:
+    """Remove the files that some writers wrote into a folder and those below, by their lists; what others put there stays."""
     empty = {name for name in entries(folder) if (folder / name).is_dir()}
     for path in sorted(folder.rglob(LIST), reverse=True):
         listed, files = path.parent, _readable_list(path.parent)
         for name in entries(listed) & files.keys():
-            if is_unchanged(listed / name, files[name]):
+            if files[name][0].by in by and is_unchanged(listed / name, files[name]):
                 (listed / name).unlink()
         if all((listed / name).is_dir() and not (listed / name).is_symlink() for name in entries(listed)):
             path.unlink()

@@ -43,6 +43,11 @@ def linked(path: Path, target: Path) -> None:
     path.symlink_to(target)
 
 
+def entered(out: Path, name: str, by: str) -> None:
+    with atomic.listed_file(out, name, by) as file:
+        write(file)
+
+
 KEPT = {
     "beside": lambda out: write(out / "thesis.txt"),
     "hidden": lambda out: write(out / ".notes"),
@@ -159,8 +164,9 @@ def test_of_two_writers_without_links_both_keep_their_files(tmp_path, monkeypatc
         (lambda out: write(out / "log.txt", "frist"), "log.txt: .*changed since"),
         (lambda out: write(out / "other.txt"), "other.txt: .*another file"),
         (lambda out: linked(out / "other.txt", out.parent / "thesis.txt"), "other.txt: .*another file"),
+        (lambda out: entered(out, "other.txt", "demo"), "other.txt: .*that of demo"),
     ],
-    ids=["changed", "another", "a link"],
+    ids=["changed", "another", "a link", "another writer's"],
 )
 def test_a_folder_that_is_filled_keeps_what_others_put_there(tmp_path, lay, expected):
     """One that grows may be appended to; killed before the first file, or between list and file, the next run goes on."""
@@ -190,14 +196,16 @@ def test_a_folder_that_is_filled_keeps_what_others_put_there(tmp_path, lay, expe
 
 
 def test_only_listed_files_are_discarded(tmp_path):
-    """Of a list from a stranger too, which names files elsewhere."""
+    """Of a list from a stranger too, which names files elsewhere; results of another writer stay."""
     make(tmp_path / "out")
+    make(tmp_path / "out" / "its", by="evaluate")
     make(tmp_path / "out" / "pose")
     write(tmp_path / "out" / "pose" / "thesis.txt")
     write(tmp_path / "victim.txt")
     made = written_files.written(tmp_path / "victim.txt", "segment")
     written_files.write_list(tmp_path / "out" / LIST, {"../victim.txt": (made,), str(tmp_path / "victim.txt"): (made,)})
-    written_files.discard(tmp_path / "out")
+    written_files.discard(tmp_path / "out", "segment")
     assert {name for name in everything(tmp_path) if not name.endswith("/")} == {
-        "victim.txt", "out/pose/thesis.txt", "out/metrics.json", "out/slicer/mass0.ply"
+        "victim.txt", "out/pose/thesis.txt", "out/metrics.json", "out/slicer/mass0.ply", "out/its/metrics.json",
+        "out/its/slicer/mass0.ply",
     }  # fmt: skip
