@@ -281,7 +281,7 @@ def open_recording(folder: Path, name: str = "") -> Iterator[Recording]:
     """
     folder = Path(os.path.realpath(folder))
     _check_capture(folder)
-    atomic.check_folder(folder, RECORD, amends=(manifest.MANIFEST,))
+    atomic.check_folder(folder, RECORD, adds=written_files.Addition((manifest.MANIFEST,)))
     folder.mkdir(parents=True, exist_ok=True)
     with atomic.alone(folder):
         path = folder / manifest.MANIFEST

@@ -28,13 +28,14 @@ from recon.capture.manifest import (
 )
 from recon.errors import InputError
 from recon.files import atomic
+from recon.files.written_files import Addition
 from recon.model.calibration import Calibration
 from recon.model.patterns import Patterns
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 
 POSE = "write_pose"  # who writes the poses of a board, one by one
-AMENDED = (manifest.MANIFEST, manifest.OPTICS)  # where a part is added: what they hold stays in them
+SHARED = (manifest.MANIFEST, manifest.OPTICS)  # where a part is added: what they hold stays in them
 
 
 class CaptureWriter:
@@ -213,7 +214,7 @@ def new_capture(folder: Path, name: str = "", add: PartName | None = None, by: s
     InputError
         If the place is taken by something that `by` didn't write, or that isn't as it was written; or can't be written to.
     """
-    with atomic.new_folder(folder, by, () if add is None else AMENDED) as temporary:
+    with atomic.new_folder(folder, by, None if add is None else Addition(SHARED, add)) as temporary:
         capture = CaptureWriter(temporary, name)
         if add is not None and Path(folder, manifest.MANIFEST).is_file():
             capture.keep(Path(folder), add)

@@ -8,7 +8,7 @@ import pytest
 
 from recon.errors import InputError
 from recon.files import atomic, written_files
-from recon.files.written_files import LIST
+from recon.files.written_files import LIST, Addition
 
 
 def make(out: Path, text: str = "first", by: str = "segment", **more: str) -> None:
@@ -17,6 +17,7 @@ def make(out: Path, text: str = "first", by: str = "segment", **more: str) -> No
         (folder / "slicer").mkdir()
         for name in ("metrics.json", "slicer/mass0.ply"):
             (folder / name).write_text(text)
+        (folder / "overlays").mkdir()
         for name, content in more.items():
             (folder / name).write_text(content)
 
@@ -90,6 +91,7 @@ REFUSED = {
     "a file changed by hand": (lambda out: (make(out), write(out / "metrics.json", "frist")), "metrics.json: .*changed since"),
     "a file moved away and linked": (lambda out: moved(out, "metrics.json"), "metrics.json: .*changed since"),
     "a folder moved away and linked": (lambda out: moved(out, "slicer"), "slicer: expected a folder"),
+    "an empty folder replaced by a link": (lambda out: moved(out, "overlays"), "overlays: .*found another file"),
     "a file where a new one is written": (lambda out: (make(out), write(out / "extra")), "extra: .*found another"),
     "a folder where a file is written": (lambda out: (make(out), write(out / "extra" / "a.txt")), "a.txt: .*found something"),
     "a damaged list": (lambda out: (make(out), write(out / LIST, "{}")), "damaged"),
@@ -147,7 +149,7 @@ def test_of_two_writers_without_links_both_keep_their_files(tmp_path, monkeypatc
     make(tmp_path / "out", manifest="of the first")
     before = everything(tmp_path / "out")
     without_links(monkeypatch)
-    with atomic.new_folder(tmp_path / "out", "sweep", ("manifest",)) as folder:
+    with atomic.new_folder(tmp_path / "out", "sweep", Addition(("manifest",), "sweep")) as folder:
         if copied:
             atomic.link_tree(tmp_path / "out", folder, leave_out={"manifest"})
         write(folder / "manifest", "of both")
@@ -156,6 +158,42 @@ def test_of_two_writers_without_links_both_keep_their_files(tmp_path, monkeypatc
     assert after.keys() == before.keys() | {"sweep/", "sweep/0000.png"} and sorted(os.listdir(tmp_path)) == ["out"]
     assert {name for name in before if before[name] != after[name]} == {"manifest"}
     assert {one.by for each in (written_files.read_list(tmp_path / "out") or {}).values() for one in each} >= {"segment", "sweep"}
+
+
+def add(out: Path, by: str = "twin") -> None:
+    with atomic.new_folder(out, by, Addition(("manifest",), "sweep")) as folder:
+        write(folder / "manifest", by)
+        write(folder / "sweep" / "0000.png", "first")
+
+
+PARTS = {
+    "new": (lambda out: None, None),
+    "notes beside": (lambda out: (add(out), write(out / "sweep" / "notes.txt")), None),
+    "own": (add, None),
+    "a result within": (lambda out: make(out / "sweep" / "take01", by="record"), None),
+    "changed": (lambda out: (add(out), write(out / "sweep" / "0000.png", "new")), "0000.png: .*changed since"),
+    "another's": (lambda out: add(out, "record"), "0000.png: .*found that of record"),
+    "of nobody": (lambda out: write(out / "sweep" / "0000.png"), "0000.png: .*found another file"),
+    "changed elsewhere": (lambda out: write(out / "metrics.json", "by hand"), None),
+}
+
+
+@pytest.mark.parametrize("place", PARTS)
+def test_a_part_that_may_not_be_replaced_is_refused_before_the_work(tmp_path, place):
+    """What passes the check can be added in the end; the other parts stay as they are."""
+    lay, expected = PARTS[place]
+    make(tmp_path / "out", manifest="of the first")
+    lay(tmp_path / "out")
+    before = everything(tmp_path)
+    if expected is None:
+        atomic.check_folder(tmp_path / "out", "twin", adds=Addition(("manifest",), "sweep"))
+        add(tmp_path / "out")
+        changed = {name for name, digest in before.items() if everything(tmp_path)[name] != digest}
+        assert changed <= {"out/manifest"}
+        return
+    with pytest.raises(InputError, match=expected):
+        atomic.check_folder(tmp_path / "out", "twin", adds=Addition(("manifest",), "sweep"))
+    assert everything(tmp_path) == before
 
 
 @pytest.mark.parametrize(
