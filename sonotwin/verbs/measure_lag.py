@@ -36,7 +36,7 @@ from recon.model.rig import Finite
 from recon.probe_calibration import latency
 from recon.probe_calibration.latency import Lag
 
-LAG = lag_files.FILE  # by which the folder of a lag is known
+LAG = lag_files.FILE
 DEPTHS = "depths.csv"
 MOSTLY = 0.5  # share of images with a bottom; with less, it is looked for in a part of a screen
 HEADER = ("frame", "time_ns", "depth_px", "residual_px", "used")

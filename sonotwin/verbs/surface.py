@@ -30,7 +30,7 @@ from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.triangulate import PointMap, Triangulator
 from sonotwin import choices
 
-POINTS = "points.npz"  # by which the folder of a surface is known
+POINTS = "points.npz"
 
 
 class Config(Part):
