@@ -25,8 +25,6 @@ from recon.files.written_files import LIST, UNPLACED, Addition
 
 log = logging.getLogger(__name__)
 
-_being_written = set[Path]()  # temporary files of this process
-
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
@@ -35,19 +33,17 @@ def new_file(path: Path) -> Iterator[Path]:
     Where `path` is a link, the file that it leads to is written; where it is such a temporary path, that itself.
     """
     path = Path(os.path.realpath(path))
-    if path in _being_written:
+    if re.search(rf"^\..*\.{os.getpid()}\.new(\.|$)", path.name):  # as `_beside` names it
         yield path
         return
     if not path.parent.is_dir():  # the lock's file would make it
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
     temporary = _beside(path, "new")
     with named_in_errors(path), alone(path):
-        _being_written.add(temporary)
         try:
             yield temporary
             os.replace(temporary, path)
         finally:
-            _being_written.discard(temporary)
             temporary.unlink(missing_ok=True)
 
 

@@ -40,10 +40,10 @@ class Written:
 
 @dataclass(frozen=True)
 class Addition:
-    """A part of a folder into which several write, that is added to it or written anew."""
+    """A part that is added, or written anew, to a folder into which several write: one that has the first of the shared files."""
 
-    shared: tuple[str, ...]  # files that are replaced whoever wrote them, as what they hold is taken over; the first is in each
-    part: str | None = None  # its folder
+    shared: tuple[str, ...]  # files that are replaced whoever wrote them, as the new ones take over what they hold
+    part: str | None = None  # the part's folder
 
 
 Files = dict[str, tuple[Written, ...]]  # by path within the folder; two of a file that is being replaced where it stands
