@@ -232,14 +232,16 @@ def complete(new: Path, old: Path, by: str, shared: Collection[str] = ()) -> Non
         if _is_folder(here) and (name not in there or _is_folder(earlier)):
             continue
         listed = before.get(name, ()) if name in there else ()
-        own = bool(listed) and listed[0].by == by and is_unchanged(earlier, listed)
+        unchanged = bool(listed) and is_unchanged(earlier, listed)
+        own = unchanged and listed[0].by == by
         if name in there and _same(here, earlier):
             files |= {name: listed} if listed else {}
         elif name in shared and earlier.is_file() and not own:
             files[name] = written(here, by), written(earlier, REPLACED)
         elif name in there and not own and _alike(here, earlier):
-            here.unlink()
-            _carry(old, new, name)
+            if not unchanged:  # what is listed may be a copy, where there are no links
+                here.unlink()
+                _carry(old, new, name)
             files |= {name: listed} if listed else {}
         else:
             if name in there:
