@@ -42,7 +42,7 @@ def described(value: object) -> str:
 def numbers(name: str, value: Any, shape: Shape | None = None, finite: bool = True, what: str = "") -> NDArray:
     """An array of numbers of a shape, or of any, as it is; refused are other kinds, other shapes and, where they may not be, NaN.
 
-    what : of them, in words, for messages
+    what : a noun for messages, such as `grey images`
     """
     try:
         array = np.asarray(value)
@@ -66,7 +66,7 @@ def grey_levels(name: str, value: Any, shape: Shape, bits: Any) -> NDArray:
     most = 2.0 ** whole(f"{name}: bits", bits, 1, 16) - 1
     count = f"{shape[0]} " if len(shape) == 3 and isinstance(shape[0], int) else ""
     images = numbers(name, value, shape, what=f"{count}grey images" if len(shape) == 3 else "a grey image")
-    if images.size and images.dtype != np.uint8:
+    if images.size:
         low, high = float(images.min()), float(images.max())
         if low < 0 or high > most:
             raise InputError(f"{name}: expected grey levels from 0 to {most:.0f}, as of bits={bits}, found {low:g} to {high:g}")

@@ -35,7 +35,7 @@ def read_patterns(source: str | Path = "paper_surface") -> Patterns:
 def file_of(group: str, source: str | Path) -> Path:
     """The file itself where there is one, else the choice of that name; raises InputError if there is neither."""
     known, given = config.folder() / group / f"{source}.yaml", Path(source)
-    if given.exists() or len(given.parts) != 1 or given.suffix:
+    if given.is_file() or len(given.parts) != 1 or given.suffix:
         return given
     if not known.is_file():
         names = sorted(choice.stem for choice in known.parent.glob("*.yaml"))

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from recon.errors import InputError, did_you_mean, one_line, short
+from recon.errors import InputError, brief, did_you_mean, one_line, short
 from recon.files import yaml_text
 
 OF_ONE_VERB = {"devices/virtual": "record"}  # choices of a group that only this verb takes
@@ -87,7 +87,7 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
         for override in quoted:
             _check_choice(verb, override)
         if files:
-            quoted.append(f"hydra.searchpath=[file://{own}]")
+            quoted.append(f"hydra.searchpath=['{_escape(f'file://{own}')}']")
         try:
             composed = hydra_compose(name, quoted)
             for override in plain:
@@ -119,7 +119,14 @@ def _own_choice(verb: str, override: str) -> tuple[str, Path] | None:
     path = Path(value.strip("'\""))
     if key.partition("@")[0] not in groups(verb) or path.suffix not in (".yaml", ".yml") or not path.is_file():
         return None
-    yaml_text.read(path)  # which refuses what is no YAML, in one line
+    content = yaml_text.read(path)  # which refuses what is no YAML, in one line
+    if not isinstance(content, dict | None):
+        raise InputError(f"{path}: expected a map of fields, found {brief(content)}")
+    defaults = (content or {}).get("defaults", [])
+    entries = defaults if isinstance(defaults, list) else [None]
+    choices = [name for one in entries for name in (one.values() if isinstance(one, dict) and len(one) == 1 else [one])]
+    if not all(isinstance(name, str) for name in choices):
+        raise InputError(f"{path}: defaults: expected a list of choices, found {brief(defaults)}")
     return key, path
 
 

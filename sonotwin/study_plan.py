@@ -1,14 +1,14 @@
 """A study's plan: what conf/study says, what is given beside it, and the settings of each trial."""
 
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
-from recon.errors import InputError, did_you_mean, one_line, validated
+from recon.errors import InputError, one_line, validated
 from recon.files import yaml_text
 from recon.model.rig import Part
+from sonotwin import choices
 from sonotwin.config import folder
 from twin.studies import experiments, factors, study_runs
 from twin.studies.beside_paper import Figure
@@ -52,14 +52,7 @@ def read_study(name: object) -> Study | None:
     """
     if name == SWEEP:
         return None
-    name = str(name)
-    known = folder() / "study" / f"{name}.yaml"
-    path = known if known.is_file() else Path(name)
-    if path.suffix not in (".yaml", ".yml"):
-        names = sorted(each.stem for each in known.parent.glob("*.yaml"))
-        raise InputError(
-            f"name: expected {SWEEP}, one of {', '.join(names)}, or a YAML file, found {name}{did_you_mean(name, names)}"
-        )
+    path = choices.file_of("study", str(name))
     return validated(Study, yaml_text.read(path), path)
 
 

@@ -268,7 +268,7 @@ def missing_poses(session: Session, settings: Settings) -> list[int]:
     atomic.check_folder(unfinished, TWIN)
     kept = unfinished / SETTINGS
     if not kept.is_file() or read_json(kept) != session.settings:
-        written_files.discard(unfinished)
+        written_files.discard(unfinished, TWIN, writer.POSE)
         with atomic.new_folder(unfinished, TWIN) as folder:
             write_json(folder / SETTINGS, session.settings)
     places = [unfinished / "capture" / "board" / pose_name(k) for k in range(settings.poses.count)]
@@ -294,7 +294,7 @@ def finish(session: Session, settings: Settings, exposures: Mapping[CameraName, 
         truth.write_arrays("board.npz", board_truth(settings, placed))
         atomic.link_tree(session.out / UNFINISHED / "capture", capture.folder, leave_out={MANIFEST})
         capture.add_board(part, devices)
-    written_files.discard(session.out / UNFINISHED)
+    written_files.discard(session.out / UNFINISHED, TWIN, writer.POSE)
 
 
 def board_truth(settings: Settings, placed: rigid.Array) -> dict[str, np.ndarray]:

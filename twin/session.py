@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from recon.capture import calibration_files
 from recon.capture.manifest import MANIFEST, OPTICS, SWEEP, PartName, Purpose, is_sweep, read_manifest
-from recon.capture.writer import AMENDED, CaptureWriter, check_kept
+from recon.capture.writer import SHARED, CaptureWriter, check_kept
 from recon.errors import InputError
 from recon.files import atomic, json_text, npz
+from recon.files.written_files import Addition
 from recon.geometry.camera import Camera
 from recon.model.calibration import Calibration
 from scenes.scene_types import Scene
@@ -102,6 +103,11 @@ class Session:
         """The part's truth."""
         return TruthFolder(self.out / TRUTH, self.part)
 
+    @property
+    def _adds(self) -> Addition | None:
+        """The part as one of a capture that may have others."""
+        return Addition(SHARED, self.part) if self.add else None
+
     def check(self) -> None:
         """Check, before any long work, that capture and truth can be written; puts back what a process that was killed set aside.
 
@@ -112,7 +118,7 @@ class Session:
             one, parts that can't stay where they are, or parts rendered with another rig.
         """
         atomic.check_folder(self.truth.folder, TWIN)
-        atomic.check_folder(self.capture, TWIN, amends=AMENDED if self.add else ())
+        atomic.check_folder(self.capture, TWIN, adds=self._adds)
         atomic.restore((self.truth.folder, self.capture))
         self._check_parts()
 
@@ -156,7 +162,7 @@ class Session:
         scene : as of `describe`
         """
         places = {self.truth.folder: TWIN, self.capture: TWIN}
-        with atomic.new_folders(places, {self.capture: AMENDED} if self.add else {}) as (folder, capture):
+        with atomic.new_folders(places, {self.capture: self._adds} if self._adds else {}) as (folder, capture):
             self._check_parts()
             writer, truth = CaptureWriter(capture, str(scene["name"])), TruthFolder(folder, self.part)
             kept = writer.keep(self.capture, self.part) if self.add and (self.capture / MANIFEST).is_file() else ()

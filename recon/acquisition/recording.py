@@ -119,7 +119,7 @@ class Recording:
         before = self._manifest.board
         poses = before.poses if before else ()
         name = self.next_pose
-        written_files.discard(self.folder / BOARD / name)  # of a pose that was never entered
+        written_files.discard(self.folder / BOARD / name, writer.POSE)  # of a pose that was never entered
         pose = writer.write_pose(self.folder, name, lit, fringes)
         self._enter(BOARD, BoardPart(board=board, patterns=patterns, poses=(*poses, pose)), devices)
         return name
@@ -198,7 +198,7 @@ class Recording:
             atomic.remove_listed(self.folder, (manifest.OPTICS, manifest.PROBE), RECORD)
         (self.folder / manifest.MANIFEST).unlink()
         if not written_files.entries(self.folder) - {str(Path(manifest.OPTICS).parent)}:
-            written_files.discard(self.folder)
+            written_files.discard(self.folder, RECORD)
         for empty in (self.folder / Path(manifest.OPTICS).parent, self.folder):
             with suppress(OSError):  # of a sweep of which a frame was written, but not entered
                 empty.rmdir()
@@ -208,7 +208,7 @@ class Recording:
         named = {path for paths in (self._manifest.surface.images.values() if self._manifest.surface else ()) for path in paths}
         for entry in _entries(self.folder / SURFACE):
             if re.fullmatch(r"take\d+", entry.name) and not any(path.startswith(f"{SURFACE}/{entry.name}/") for path in named):
-                written_files.discard(entry)
+                written_files.discard(entry, RECORD)
 
     def _tidy(self) -> None:
         """Mend what a process that was killed has left."""
@@ -281,7 +281,7 @@ def open_recording(folder: Path, name: str = "") -> Iterator[Recording]:
     """
     folder = Path(os.path.realpath(folder))
     _check_capture(folder)
-    atomic.check_folder(folder, RECORD, amends=(manifest.MANIFEST,))
+    atomic.check_folder(folder, RECORD, adds=written_files.Addition((manifest.MANIFEST,)))
     folder.mkdir(parents=True, exist_ok=True)
     with atomic.alone(folder):
         path = folder / manifest.MANIFEST

@@ -68,7 +68,7 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
         arrays = _decimal(matlab.read(path, forms, OLD_KEYS))
         return _in_mm(path, _stereo_pair(path, arrays, sizes or {}), arrays.get(UNIT_KEY))
     if (stored := camera_dialects.read(path)) is not None:
-        return _of_stored(path, stored)
+        return _of_metres(path, _of_stored(path, stored))
     values = opencv_storage.read(path, "a calibration file")
     if values is None:
         arrays = _decimal(npz.read(path, forms))
@@ -132,6 +132,16 @@ def _in_mm(path: Path, read: Calibration, stated: object) -> Calibration:
         for name, camera in read.cameras.items()
     }
     return Calibration(scaled)
+
+
+def _of_metres(path: Path, read: Calibration) -> Calibration:
+    """The calibration of a dialect that is in metres; InputError if mm were taken for them."""
+    most = lengths.DEVICES_APART.most / camera_dialects.MM
+    for name, camera in read.cameras.items():
+        if (apart := lengths.shift(camera.camera_from_world[:3, 3]) / camera_dialects.MM) > most:
+            expected = f"{path}: {name}: expected it within {most:g} m of {WORLD}"
+            raise InputError(f"{expected}, found {apart:.4g} m: are its translations in mm? Divide them by 1000")
+    return read
 
 
 def of_capture(folder: Path, given: Path | None = None) -> Calibration | None:

@@ -3,7 +3,7 @@
 Where they differ from ours, which are pixels, mm, and OpenCV's distortion coefficients in OpenCV's order:
 
 - Kalibr: `cam0`, `cam1`, ... of one YAML file; `T_cn_cnm1` (4x4) takes points of the camera before to this one, in m. Of its
-  models `pinhole` with `radtan` (k1 k2 p1 p2) or `none`. The topic of the images names the device where it has one of our names.
+  models `pinhole` with `radtan` (k1 k2 p1 p2) or `none`. The topic of the images names the device where it has one of our words.
 - ROS: a YAML file a camera; `plumb_bob` (5 coefficients) or `rational_polynomial` (8). The pose of a pair follows from both
   rectifications: camera i's points turned by its R, and the second's then moved by P[:, 3] over the focal length, in m.
 - mrcal: a file a camera, a Python dictionary; `extrinsics` or `rt_cam_ref` are axis times angle and a shift, from any reference,
@@ -28,7 +28,6 @@ from recon.geometry.camera import Array
 from recon.model.calibration import WORLD
 
 MM = 1000.0  # in a m
-FARTHEST_M = 20.0  # between two devices of a rig: mm that are taken for m are more
 OF_FILES = (".cameramodel", ".yaml", ".yml")  # of one camera each
 DEVICES = {
     "cam1": "cam1",
@@ -37,6 +36,7 @@ DEVICES = {
     "right": "cam2",
     "projector": "projector",
 }  # by words in files and topics
+FROM_0 = {"cam0": "cam1", "cam1": "cam2", "projector": "projector"}  # where one is cam0
 MRCAL = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}  # coefficients by the model's name
 ROS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,4})?"
@@ -129,21 +129,22 @@ def _several(folder: Path, texts: Mapping[Path, str]) -> dict[str, Stored]:
                 f"{folder}: projection_matrix: expected those of a pair calibrated together, the second's with a shift in its "
                 "last column, found none: which of both is where isn't in these files"
             )
-        _check_metres(folder, "projection_matrix", shift)
         pose = rigid.transform(other.rotation.T @ one.rotation, other.rotation.T @ np.append(shift, 0) * MM)
         found[name] = other.stored._replace(camera_from_world=pose)
     return _in_world(found)
 
 
 def _devices(place: Path, words: Sequence[str]) -> list[str]:
-    """Our names of devices by words that others have for them; else the cameras in their order."""
-    known = [DEVICES.get(word.lower(), "") for word in words]
-    if all(known) and len(set(known)) == len(known):
-        return known
-    if len(words) > 2:
-        named = ", ".join(dict.fromkeys(DEVICES.values()))
-        raise InputError(f"{place}: expected devices named {named}, or no more than two cameras, found {brief(list(words))}")
-    return ["cam1", "cam2"][: len(words)]
+    """Our names of devices by the first word that tells in each file's name or topic; the cameras in their order if none does."""
+    pieces = [re.findall(r"[^\W_]+", word.lower()) for word in words]
+    names = FROM_0 if any("cam0" in each for each in pieces) else DEVICES
+    known = [next((names[piece] for piece in each if piece in names), "") for each in pieces]
+    if not any(known) and len(words) <= 2:
+        return ["cam1", "cam2"][: len(words)]
+    if not all(known) or len(set(known)) < len(known):
+        expected = f"names with {', '.join(DEVICES)}, each device once, or two cameras with none of these"
+        raise InputError(f"{place}: expected {expected}, found {brief(list(words))}; rename them")
+    return known
 
 
 def _in_world(found: Mapping[str, Stored]) -> dict[str, Stored]:
@@ -181,10 +182,9 @@ def _kalibr(path: Path, content: Any) -> dict[str, Stored]:
             motion = [_numbers(path, f"{key}.T_cn_cnm1", row, 4) for row in rows] if isinstance(rows, list) else []
             if len(motion) != 4:
                 raise InputError(f"{path}: {key}.T_cn_cnm1: expected 4 rows of 4 numbers, found {brief(rows)}")
-            _check_metres(path, f"{key}.T_cn_cnm1", np.array(motion)[:3, 3])
             pose = np.array(motion) * np.array([[1, 1, 1, MM]] * 3 + [[1, 1, 1, 1]]) @ pose
         size = _size(path, f"{key}.resolution", entry.get("resolution"))
-        topics.append(next((part for part in str(entry.get("rostopic", "")).split("/") if part), key))
+        topics.append(str(entry.get("rostopic") or ""))
         stored.append(Stored(size, pinhole(fx, fy, cx, cy), k if lens == "radtan" else np.zeros(0), pose))
     return _in_world(dict(zip(_devices(path, topics), stored, strict=True)))
 
@@ -232,7 +232,6 @@ def _mrcal(path: Path, text: str) -> Stored:
     fx, fy, cx, cy, *k = _listed(path, plain, "intrinsics", 4 + MRCAL[model])
     width, height = _listed(path, plain, "imagersize", 2)
     motion = _listed(path, plain, "rt_cam_ref|extrinsics", 6)
-    _check_metres(path, "extrinsics", motion[3:])
     pose = rigid.from_rotation_vector(motion[:3], motion[3:] * MM)
     return Stored(_size(path, "imagersize", [width, height]), pinhole(fx, fy, cx, cy), np.array(k, float), pose)
 
@@ -273,12 +272,6 @@ def _size(path: Path, name: str, value: Any) -> tuple[int, int]:
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> Array:
     """A matrix : (3, 3) px without skew."""
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-
-
-def _check_metres(path: Path, name: str, shift: Array) -> None:
-    if np.abs(shift).max() > FARTHEST_M:
-        expected = f"{path}: {name}: expected a shift of up to {FARTHEST_M:g} m"
-        raise InputError(f"{expected}, found {np.abs(shift).max():g}: is it in mm? Divide it by 1000")
 
 
 def slstudio(path: Path, values: opencv_storage.Values, sizes: Mapping[str, tuple[int, int]]) -> dict[str, Stored]:

@@ -32,7 +32,7 @@ PROJECTOR_SIZE = (1280, 800)  # px; their files don't store it
 PARAMETERS = "cam1_proj_params.npz"
 STEREO_PARAMETERS = "cam1_cam2_params.npz"
 STEREO_XML = "StereoParams.xml"  # the same, as OpenCV FileStorage
-MARKER = "sonotwin-export.json"  # by which a folder of ours is known
+MARKER = "sonotwin-export.json"
 
 
 def patterns(projector_size: Size = PROJECTOR_SIZE, lit: bool = True) -> Patterns:
@@ -88,15 +88,13 @@ def read_images(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[ND
 class Mark(Part):
     """Content of `MARKER`."""
 
-    layout: Literal["meza2021", "kalibr", "ros", "mrcal", "slstudio"] = "meza2021"
+    layout: Literal["meza2021"] = "meza2021"
     speed_m_s: Speed | None = None
 
 
 @contextmanager
-def new_folder(folder: Path, layout: str = "meza2021") -> Iterator[Path]:
-    """Give a folder to be filled in their layout, or in one for calibrations alone; it replaces such a one of ours alone.
-
-    It appears whole or not at all.
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Give a folder to be filled in their layout, which appears whole or not at all, and replaces such a one of ours alone.
 
     Raises
     ------
@@ -104,14 +102,13 @@ def new_folder(folder: Path, layout: str = "meza2021") -> Iterator[Path]:
         If the place is taken by something else, a folder of theirs included, or can't be written to.
     """
     with atomic.new_folder(folder, "export") as temporary:
-        mark(temporary, layout=layout)
+        mark(temporary)
         yield temporary
 
 
-def mark(folder: Path, speed_m_s: float | None = None, layout: str = "meza2021") -> None:
+def mark(folder: Path, speed_m_s: float | None = None) -> None:
     """Write what makes a folder one of ours, with the speed of sound that its `US_params.npz` is right for."""
-    content = Mark.model_validate({"layout": layout, "speed_m_s": speed_m_s})
-    (folder / MARKER).write_text(content.model_dump_json(exclude_none=True) + "\n", encoding="utf-8")
+    (folder / MARKER).write_text(Mark(speed_m_s=speed_m_s).model_dump_json(exclude_none=True) + "\n", encoding="utf-8")
 
 
 def speed_of(folder: Path) -> float | None:

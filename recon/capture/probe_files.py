@@ -7,7 +7,8 @@
   beside these, which their programs leave alone; for theirs a caller gives the speed, or 1540 m/s is taken, with a warning. A
   rotation that is off by up to 2 % is taken as the nearest one, and a negative scale as the same map with that axis turned round.
 - a matrix of 4 x 4 numbers from pixels to mm, as text, or as `ImageToProbe` in a configuration of the PLUS toolkit: its first two
-  columns are as long as mm/px. Axes that aren't square, by up to some degrees, are taken as such, with a warning.
+  columns are as long as mm/px; for its speed of sound holds the same. Axes that aren't square, by up to some degrees, are taken
+  as such, with a warning.
 
 Any but the last may state the unit of its lengths by a number `mm_per_unit`; without it lengths that no bracket has are refused.
 """
@@ -38,6 +39,7 @@ Array = NDArray[np.float64]
 SCHEMA = "sonotwin-probe/1"
 PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
 AUTHORS = "US_params.npz"
+AS_NPZ = f"give it as {AUTHORS} with sx, sy, T_I_T and"  # a plain matrix, for what there is no place in it
 MOST_ROWS = 1e5  # of a scanner's image
 PLUS_ENDS = ("Image", "Probe")
 SEPARATORS = bytes.maketrans(b",;[]()", b"      ")
@@ -58,7 +60,7 @@ def read(path: Path, speed_m_s: float | None = None) -> ProbeCalibration:
     path = Path(path)
     matrix = _plain_matrix(path)
     if matrix is not None:
-        return _of_matrix(path, *matrix, SCANNER_SPEED if speed_m_s is None else speed_m_s)
+        return _of_matrix(path, *matrix, speed_m_s)
     values = opencv_storage.read(path, "a probe's calibration")
     return _authors(path, speed_m_s) if values is None else _own(path, values)
 
@@ -87,7 +89,7 @@ def _plain_matrix(path: Path) -> tuple[str, Array] | None:
     return name, values.reshape(4, 4)
 
 
-def _of_matrix(path: Path, name: str, matrix: Array, speed_m_s: float) -> ProbeCalibration:
+def _of_matrix(path: Path, name: str, matrix: Array, speed_m_s: float | None) -> ProbeCalibration:
     """The calibration by a matrix from pixels to mm."""
     scale = np.linalg.norm(matrix[:3, :2], axis=0)
     if not np.isfinite(matrix).all() or np.abs(matrix[3] - [0, 0, 0, 1]).max() > rigid.EXACT or scale.min() == 0:
@@ -105,7 +107,10 @@ def _of_matrix(path: Path, name: str, matrix: Array, speed_m_s: float) -> ProbeC
         log.warning(
             "%s: %s: axes are %.1f degrees off a right angle, and are taken as square; `config` keeps them", path, name, off
         )
-    return _checked(path, name, ProbeCalibration(pose, scale, None, speed_m_s, 0.0), None)
+    if speed_m_s is None:
+        speed_m_s = _scanners_speed(path, f"{AS_NPZ} speed_m_s")
+    way = f"multiply its first three rows by the mm of its unit or, if it is right, {AS_NPZ} {UNIT_KEY}=1"
+    return _checked(path, name, ProbeCalibration(pose, scale, None, speed_m_s, 0.0), None, way)
 
 
 def write(path: Path, calibration: ProbeCalibration) -> None:
@@ -156,12 +161,17 @@ def _authors(path: Path, speed_m_s: float | None) -> ProbeCalibration:
     if "speed_m_s" in values:
         speed_m_s = _within_speeds(path, float(values["speed_m_s"].item()))
     elif speed_m_s is None:
-        speed_m_s = SCANNER_SPEED
-        way = "if it was made in water, import it with speed_m_s=..., or add speed_m_s to it"
-        log.warning("%s: names no speed of sound, and is taken as right where it makes %g m/s; %s", path, speed_m_s, way)
+        speed_m_s = _scanners_speed(path, "import it with speed_m_s=..., or add speed_m_s to it")
     face_row = float(values["face_row"].item()) if "face_row" in values else 0.0
     read = ProbeCalibration(pose, scale, None, speed_m_s, face_row)
     return _checked(path, "T_I_T", read, values.get(UNIT_KEY))
+
+
+def _scanners_speed(path: Path, way: str) -> float:
+    """The speed of sound, m/s, that scanners assume, for a file that names none; with a warning."""
+    text = "%s: names no speed of sound, and is taken as right where it makes %g m/s; if it was made in water, %s"
+    log.warning(text, path, SCANNER_SPEED, way)
+    return SCANNER_SPEED
 
 
 def _own(path: Path, values: Values) -> ProbeCalibration:
@@ -176,7 +186,7 @@ def _own(path: Path, values: Values) -> ProbeCalibration:
     return _checked(path, "target_from_image", read, values.get(UNIT_KEY))
 
 
-def _checked(path: Path, name: str, read: ProbeCalibration, stated: object) -> ProbeCalibration:
+def _checked(path: Path, name: str, read: ProbeCalibration, stated: object, way: str = lengths.SAID) -> ProbeCalibration:
     scale = read.scale
     if found := rigid.fault(read.target_from_image):
         raise InputError(f"{path}: {name}: expected {rigid.RIGID}, in mm, found {found}")
@@ -187,9 +197,9 @@ def _checked(path: Path, name: str, read: ProbeCalibration, stated: object) -> P
     if stated is not None:
         return _in_mm(path, read, lengths.unit_of(path, stated))
     if found := _unusual(read, name):
-        raise InputError(f"{path}: {found} {lengths.SAID}")
+        raise InputError(f"{path}: {found} {way}")
     if doubt := lengths.BRACKET.doubt(lengths.shift(read.target_from_image[:3, 3])):
-        log.warning("%s: %s: the image's corner lies from the target by %s %s", path, name, doubt, lengths.SAID)
+        log.warning("%s: %s: the image's corner lies from the target by %s %s", path, name, doubt, way)
     return read
 
 

@@ -120,42 +120,43 @@ def _partners(
             continue
         k = int(alone[0])
         away = abs(int(times[other][_nearest(times[one][[k]], times[other])[0]]) - int(times[one][k])) * 1e-6
-        wanted = f"a frame of its own within {NEAR * period * 1e-6:.1f} ms of {CAMERAS[one]}'s frame {tables[one][0][k]}"
-        counts = " and ".join(f"{len(each)} frames of {name}" for each, name in zip(times, CAMERAS, strict=True))
-        found = f"the nearest {away:.1f} ms away ({len(alone)} such, in {counts})"
         if len(alone) > MOST_ALONE * len(times[one]):
+            wanted = f"a frame of its own within {NEAR * period * 1e-6:.1f} ms of {CAMERAS[one]}'s frame {tables[one][0][k]}"
+            counts = " and ".join(f"{len(each)} frames of {name}" for each, name in zip(times, CAMERAS, strict=True))
+            found = f"the nearest {away:.1f} ms away ({len(alone)} such, in {counts})"
             raise InputError(
                 f"{places[other] / STAMPS}: expected {wanted}, found {found}; leave frames without a partner out of both tables"
             )
-        log.warning("%s: left out %d frames without a partner; of the first, %s", places[one] / STAMPS, len(alone), found)
-    apart = np.abs(times[0][first] - times[1][second])
-    if np.median(apart) > max(APART * period, APART_NS):
-        how = "as of cameras that run freely"
-        text = f"pairs are mostly {np.median(apart) * 1e-6:.1f} ms apart, up to {apart.max() * 1e-6:.1f} ms, {how}"
-        log.warning(
-            "%s: %s: a target that moves is seen at two places; with sweep_triggers by hardware both take it at once",
-            places[0].parent,
-            text,
-        )
+        text = "%s: left out %d of %d frames, without a partner in %s; the first is frame %d, %.1f ms from the nearest"
+        log.warning(text, places[one] / STAMPS, len(alone), len(times[one]), CAMERAS[other], tables[one][0][k], away)
+    apart = float(np.median(np.abs(times[0][first] - times[1][second])))
+    if apart > max(APART * period, APART_NS):
+        way = "a moving target is seen at two places. Trigger both cameras by hardware: sweep_triggers"
+        log.warning("%s: pairs are %.1f ms apart (median); %s", places[0].parent, apart * 1e-6, way)
     return first, second
 
 
 def _matched(first: NDArray[np.int64], second: NDArray[np.int64], most_ns: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of rows, both rising, less than `most_ns` apart, of which the sum of what is left of that is the greatest."""
+    """Pairs of rows, both rising, less than `most_ns` apart, of which the sum of what is left of twice that is the greatest.
+
+    Twice, so that one more pair always counts more than another's distance, but not more than those of a whole film.
+    """
     low = np.searchsorted(second, first - most_ns, "right").tolist()
     high = np.searchsorted(second, first + most_ns, "left").tolist()
     pairs: list[tuple[int, int, int]] = []  # row of each table, and the pair before
     best = [(0.0, -1)]  # sum and last pair, by the number of the second table's rows that may be used
     for i, (start, end) in enumerate(zip(low, high, strict=True)):
         best += [best[-1]] * (end + 1 - len(best))
-        before = best[start : end + 1]
-        for j in range(start, end):
-            score, last = before[j - start]
-            score += most_ns - abs(int(second[j]) - int(first[i]))
-            if score > best[j + 1][0]:
-                pairs.append((i, j, last))
-                for used in range(j + 1, len(best)):
-                    best[used] = max(best[used], (score, len(pairs) - 1))
+        gains = (2 * most_ns - np.abs(second[start:end] - first[i])).tolist()
+        before = greatest = best[start]
+        for j, gain in enumerate(gains, start):
+            here = best[j + 1]
+            if here[0] > greatest[0]:
+                greatest = here
+            if before[0] + gain > greatest[0]:
+                greatest = before[0] + gain, len(pairs)
+                pairs.append((i, j, before[1]))
+            before, best[j + 1] = here, greatest
     rows, last = [], best[-1][1]
     while last >= 0:
         i, j, last = pairs[last]

@@ -28,12 +28,14 @@ from recon.capture.manifest import (
 )
 from recon.errors import InputError
 from recon.files import atomic
+from recon.files.written_files import Addition
 from recon.model.calibration import Calibration
 from recon.model.patterns import Patterns
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 
-AMENDED = (manifest.MANIFEST, manifest.OPTICS)  # where a part is added: what they hold stays in them
+POSE = "write_pose"  # who writes the poses of a board, one by one
+SHARED = (manifest.MANIFEST, manifest.OPTICS)  # where a part is added: what they hold stays in them
 
 
 class CaptureWriter:
@@ -212,7 +214,7 @@ def new_capture(folder: Path, name: str = "", add: PartName | None = None, by: s
     InputError
         If the place is taken by something that `by` didn't write, or that isn't as it was written; or can't be written to.
     """
-    with atomic.new_folder(folder, by, () if add is None else AMENDED) as temporary:
+    with atomic.new_folder(folder, by, None if add is None else Addition(SHARED, add)) as temporary:
         capture = CaptureWriter(temporary, name)
         if add is not None and Path(folder, manifest.MANIFEST).is_file():
             capture.keep(Path(folder), add)
@@ -276,7 +278,7 @@ def write_pose(folder: Path, name: str, lit: Mapping[str, Images], fringes: Mapp
     """
     record = describe_pose(name, list(lit), {camera: len(stack) for camera, stack in fringes.items()})
     place = Path("board", name)
-    with atomic.new_folder(folder / place, "write_pose") as temporary:
+    with atomic.new_folder(folder / place, POSE) as temporary:
         for camera, stack in fringes.items():
             write_images([temporary / Path(path).relative_to(place) for path in record.fringes[camera]], stack)
         for camera, image in lit.items():

@@ -21,11 +21,9 @@ from filelock import Timeout
 from recon import file_locks, interrupts
 from recon.errors import InputError
 from recon.files import renaming, written_files
-from recon.files.written_files import LIST, UNPLACED
+from recon.files.written_files import LIST, UNPLACED, Addition
 
 log = logging.getLogger(__name__)
-
-_being_written = set[Path]()  # temporary files of this process
 
 
 @contextmanager
@@ -35,50 +33,46 @@ def new_file(path: Path) -> Iterator[Path]:
     Where `path` is a link, the file that it leads to is written; where it is such a temporary path, that itself.
     """
     path = Path(os.path.realpath(path))
-    if path in _being_written:
+    if re.search(rf"^\..*\.{os.getpid()}\.new(\.|$)", path.name):  # as `_beside` names it
         yield path
         return
     if not path.parent.is_dir():  # the lock's file would make it
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
     temporary = _beside(path, "new")
     with named_in_errors(path), alone(path):
-        _being_written.add(temporary)
         try:
             yield temporary
             os.replace(temporary, path)
         finally:
-            _being_written.discard(temporary)
             temporary.unlink(missing_ok=True)
 
 
 @contextmanager
-def new_folder(path: Path, by: str, amends: Collection[str] = ()) -> Iterator[Path]:
+def new_folder(path: Path, by: str, adds: Addition | None = None) -> Iterator[Path]:
     """Give a temporary folder to fill; on success it takes the place of `path`, on failure it goes away.
 
     Of a folder that is already there, the files that `by` wrote are replaced if `check_folder` allows it; all else stays in it.
     """
-    with new_folders({path: by}, {path: amends} if amends else {}) as (folder,):
+    with new_folders({path: by}, {path: adds} if adds else {}) as (folder,):
         yield folder
 
 
 @contextmanager
-def new_folders(
-    places: Mapping[Path, str], amends: Mapping[Path, Collection[str]] = MappingProxyType({})
-) -> Iterator[tuple[Path, ...]]:
+def new_folders(places: Mapping[Path, str], adds: Mapping[Path, Addition] = MappingProxyType({})) -> Iterator[tuple[Path, ...]]:
     """Give temporary folders to fill, one a place; on success all take their places, on failure all old folders stay.
 
     The last folder is exchanged with the old one at once, so that at every moment an old or a new one can be read. The others are
     set aside before and put in place after it, so that none stands beside another age of the last. Where a path is a link, the
     folder that it leads to is replaced. Waits until no other process writes one of them; what stands there then doesn't change
-    before the end. What is there and isn't replaced, by `written_files`, is in the new folder, too.
+    before the end. Files that aren't replaced stay, see `written_files`.
 
     Parameters
     ----------
     places : path -> who writes it, as of `check_folder`
-    amends : path -> files there that are replaced whoever wrote them, as of `check_folder`
+    adds : path -> part that is added there
     """
     by = {Path(os.path.realpath(path)): name for path, name in places.items()}
-    amended = {Path(os.path.realpath(path)): names for path, names in amends.items()}
+    additions = {Path(os.path.realpath(path)): part for path, part in adds.items()}
     paths = list(by)
     with ExitStack() as locks:
         for path in sorted(paths):
@@ -88,13 +82,13 @@ def new_folders(
             locks.enter_context(alone(path))
         _put_back(paths)
         for path in paths:
-            check_folder(path, by[path], amends=amended.get(path, ()))
+            check_folder(path, by[path], adds=additions.get(path))
         with named_in_errors(paths[-1]), _exchanged(paths) as temporaries:
             yield temporaries
             for folder, path in zip(temporaries, paths, strict=True):
-                written_files.complete(folder, path, by[path], amended.get(path, ()))
+                written_files.complete(folder, path, by[path], additions[path].shared if path in additions else ())
     for path in paths:
-        if path not in amended and (others := written_files.foreign(path)):
+        if path not in additions and (others := written_files.foreign(path)):
             log.warning("%s: kept %s, which this run didn't write", path, ", ".join(others[:3]) + " ..." * (len(others) > 3))
 
 
@@ -136,14 +130,17 @@ def list_again(folder: Path, name: str, by: str) -> None:
 
 
 def check_listed(folder: Path, name: str, by: str) -> None:
-    """Check that a file in a folder that is filled where it stands can be written; InputError if another's is there."""
+    """Check that a file in a folder that is filled where it stands can be written.
+
+    Raises
+    ------
+    InputError
+        If one is there that `by` didn't write, or that was changed since.
+    """
     path = folder / name
     if not os.path.lexists(path):
         return
-    files = written_files.read_list(folder) or {}
-    if not (name in files and written_files.is_unchanged(path, files[name])):
-        found = "found it changed since" if name in files else "found another file"
-        raise InputError(f"{path}: expected nothing or a file as {by} wrote it, {found}; {written_files.ELSEWHERE}")
+    written_files.check_own(path, (written_files.read_list(folder) or {}).get(name, ()), by)
 
 
 def remove_listed(folder: Path, names: Iterable[str], by: str) -> None:
@@ -280,10 +277,10 @@ def _remove(path: Path) -> None:
         shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
     for entry in _leftovers(path, "whole|old"):
         if entry.is_dir():
-            written_files.take_away(entry, path)
+            written_files.remove_replaced(entry, path)
 
 
-def check_folder(path: Path, by: str, inputs: Iterable[Path] = (), amends: Collection[str] = ()) -> None:
+def check_folder(path: Path, by: str, inputs: Iterable[Path] = (), adds: Addition | None = None) -> None:
     """Check, before any long work, that a folder can be written at `path`, and that nothing is lost by it.
 
     Parameters
@@ -292,8 +289,8 @@ def check_folder(path: Path, by: str, inputs: Iterable[Path] = (), amends: Colle
         Who writes it: a verb, or a function. Only files that it wrote itself may be replaced.
     inputs : iterable of paths
         Sources of the folder's content.
-    amends : collection of str
-        Files that are replaced whoever wrote them, as the new ones take over what they hold.
+    adds : Addition
+        The part that is written into a folder which others may have written, too.
 
     Raises
     ------
@@ -301,7 +298,7 @@ def check_folder(path: Path, by: str, inputs: Iterable[Path] = (), amends: Colle
         If something else is there: a file, a folder of another's, or one with a file that was changed since; if `path` is one of
         the inputs or has one in it; or if the place can't be written to.
     """
-    path = _checked(path, by, inputs, amends)
+    path = _checked(path, by, inputs, adds)
     _check_writable(path, path.parent)
 
 
@@ -311,7 +308,7 @@ def check_filled_folder(path: Path, by: str, inputs: Iterable[Path] = ()) -> Non
     _check_writable(path, path)
 
 
-def _checked(path: Path, by: str, inputs: Iterable[Path], amends: Collection[str] = ()) -> Path:
+def _checked(path: Path, by: str, inputs: Iterable[Path], adds: Addition | None = None) -> Path:
     """The place itself behind links, where nothing is lost by writing there; InputError otherwise, as of `check_folder`."""
     named, path = path, Path(os.path.realpath(path))
     if path.is_symlink():
@@ -321,7 +318,7 @@ def _checked(path: Path, by: str, inputs: Iterable[Path], amends: Collection[str
             raise InputError(f"{path}: expected a folder apart from what is read, found it to hold {source}")
     _check_no_file(path)
     if path.is_dir():
-        written_files.replaceable(path, by, amends)
+        written_files.check_replaceable(path, by, adds)
     return path
 
 

@@ -23,7 +23,7 @@ def opened(path: Path) -> cv2.VideoCapture:
 
 @contextmanager
 def _environment(wanted: dict[str, str]) -> Iterator[None]:
-    """Variables of the environment, as they were afterwards."""
+    """Set environment variables, and restore them at the end."""
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
     try:

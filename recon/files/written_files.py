@@ -11,7 +11,7 @@ import os
 import shutil
 import stat
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -36,6 +36,14 @@ class Written:
     size: int  # bytes
     sha256: str
     grows: bool = False  # whether more may have been appended since
+
+
+@dataclass(frozen=True)
+class Addition:
+    """A part that is added, or written anew, to a folder into which several write: one that has the first of the shared files."""
+
+    shared: tuple[str, ...]  # files that are replaced whoever wrote them, as the new ones take over what they hold
+    part: str | None = None  # the part's folder
 
 
 Files = dict[str, tuple[Written, ...]]  # by path within the folder; two of a file that is being replaced where it stands
@@ -91,6 +99,15 @@ def is_unchanged(path: Path, files: tuple[Written, ...]) -> bool:
     return bool(alike) and _sha256(path) in {one.sha256 for one in alike}
 
 
+def check_own(path: Path, listed: tuple[Written, ...], by: str) -> None:
+    """Check that `by` wrote a file, as it stands there; InputError else."""
+    writer = listed[0].by if listed else None
+    if writer == by and is_unchanged(path, listed):
+        return
+    found = {None: "another file", by: "it changed since"}.get(writer, f"that of {writer}")
+    raise InputError(f"{path}: expected nothing or a file as {by} wrote it, found {found}; {ELSEWHERE}")
+
+
 def _beginning(path: Path, size: int) -> bytes:
     with path.open("rb") as file:
         return file.read(size)
@@ -134,42 +151,49 @@ def _raised(error: OSError) -> None:
 
 
 def _is_mark(folder: Path, name: str) -> bool:
-    """Whether a name in a folder is that of its list, half of it, or a mark of a process at work there."""
+    """Whether a name in a folder is that of its list, of a temporary file of it, or of a mark of a process at work there."""
     return name in (LIST, UNPLACED, f".{folder.name}.occupied") or name.startswith(f".{LIST.removesuffix('json')}")
 
 
-def replaceable(folder: Path, by: str, amends: Collection[str] = ()) -> Files:
-    """The list of a folder into which `by` may write: a new or empty one, or one that it has written before.
-
-    Parameters
-    ----------
-    amends : files that are replaced whoever wrote them, as what they hold is taken over; a folder that has the first may be of
-        others
+def check_replaceable(folder: Path, by: str, adds: Addition | None = None) -> None:
+    """Check that `by` may write into a folder: a new or empty one, one that it has written before, or one to which it adds.
 
     Raises
     ------
     InputError
-        If the folder is of others, or a file that would be replaced isn't as it was written, or can't stay where it is.
+        If the folder, or the part, is of others, or a file that would be replaced isn't as it was written, or can't stay where it
+        is.
     """
     files, top = read_list(folder), sorted(name for name in os.listdir(folder) if not _is_mark(folder, name))
     if not top:
-        return {}
-    amended = bool(amends) and (folder / next(iter(amends))).is_file()
-    if not amended:
-        _check_owner(folder, by, files, top[0])
+        return
     there = entries(folder)
-    if not amended:
-        for name in sorted(there & (files or {}).keys()):
-            if _is_by(files, name, by) and not is_unchanged(folder / name, (files or {})[name]):
-                raise InputError(f"{folder / name}: expected it as {by} wrote it, found it changed since; {ELSEWHERE}")
-    for name in sorted(files or ()):
+    if adds is None or not (folder / adds.shared[0]).is_file():
+        _check_owner(folder, by, files, top[0])
+        files = files or {}
+        replaced = [name for name in there & files.keys() if files[name][0].by == by]
+    else:
+        files = files or {}
+        replaced = _of_part(folder, there, files, adds.part)
+    for name in sorted(replaced):
+        check_own(folder / name, files.get(name, ()), by)
+    for name in sorted(files):
         if blocking := next((parent for parent in _above(name) if parent in there), None):
             raise InputError(f"{folder / blocking}: expected a folder that {by} wrote, found something else; {ELSEWHERE}")
     device = folder.stat().st_dev
-    for name in sorted(there - (files or {}).keys()):
+    for name in sorted(there - files.keys()):
         if os.path.lexists(folder / name) and (folder / name).lstat().st_dev != device:
             raise InputError(f"{folder / name}: expected it on the disk of {folder}, found another disk; give another place")
-    return files or {}
+
+
+def _of_part(folder: Path, there: Collection[str], files: Files, part: str | None) -> list[str]:
+    """Files of a part: those that are listed or, if none is, all that are of no other list."""
+    inside = [name for name in there if part is not None and PurePosixPath(name).is_relative_to(part)]
+    return [name for name in inside if name in files] or [
+        name
+        for name in inside
+        if not _is_folder(folder / name) and not any((folder / above / LIST).is_file() for above in _above(name))
+    ]
 
 
 def _check_owner(folder: Path, by: str, files: Files | None, first: str) -> None:
@@ -184,8 +208,12 @@ def _check_owner(folder: Path, by: str, files: Files | None, first: str) -> None
         raise InputError(f"{folder}: {expected}, found one of {found}; give another place, or move this folder away")
 
 
-def complete(new: Path, old: Path, by: str, amends: Collection[str] = ()) -> None:
+def complete(new: Path, old: Path, by: str, shared: Collection[str] = ()) -> None:
     """List the files of a new folder, and let it hold all of the old one's that it doesn't replace, as links to the same files.
+
+    Parameters
+    ----------
+    shared : as of `Addition`
 
     Raises
     ------
@@ -201,24 +229,27 @@ def complete(new: Path, old: Path, by: str, amends: Collection[str] = ()) -> Non
         here, earlier = new / name, old / name
         if blocking := next((parent for parent in _above(name) if parent in there), None):
             raise InputError(f"{old / blocking}: expected a folder for {name}, found something else; {ELSEWHERE}")
-        if here.is_dir() and not here.is_symlink() and (name not in there or earlier.is_dir()):
+        if _is_folder(here) and (name not in there or _is_folder(earlier)):
             continue
+        listed = before.get(name, ()) if name in there else ()
+        unchanged = bool(listed) and is_unchanged(earlier, listed)
+        own = unchanged and listed[0].by == by
         if name in there and _same(here, earlier):
-            files |= {name: before[name]} if name in before else {}
-        elif name not in there or _goes(old, before, name, by):
-            files[name] = (written(here, by),)
-        elif name in amends and earlier.is_file():
+            files |= {name: listed} if listed else {}
+        elif name in shared and earlier.is_file() and not own:
             files[name] = written(here, by), written(earlier, REPLACED)
-        elif _alike(here, earlier):
-            here.unlink()
-            _carry(old, new, name)
-            files |= {name: before[name]} if name in before else {}
+        elif name in there and not own and _alike(here, earlier):
+            if not unchanged:  # what is listed may be a copy, where there are no links
+                here.unlink()
+                _carry(old, new, name)
+            files |= {name: listed} if listed else {}
         else:
-            raise InputError(f"{earlier}: expected nothing or a file as {by} wrote it, found another; {ELSEWHERE}")
+            if name in there:
+                check_own(earlier, listed, by)
+            files[name] = (written(here, by),)
     for name in sorted(there - made):
-        if name in before and _is_by(before, name, by):
-            if not is_unchanged(old / name, before[name]):
-                raise InputError(f"{old / name}: expected it as {by} wrote it, found it changed since; {ELSEWHERE}")
+        if name in before and before[name][0].by == by:
+            check_own(old / name, before[name], by)
             continue
         if any(parent in made for parent in _above(name)) or (not (old / name).is_dir() and (new / name).is_dir()):
             raise InputError(f"{old / name}: expected a place for what {by} writes there, found something of others; {ELSEWHERE}")
@@ -238,7 +269,7 @@ def foreign(folder: Path) -> list[str]:
     return sorted({name.partition("/")[0] for name in entries(folder) - (read_list(folder) or {}).keys()})
 
 
-def take_away(left: Path, place: Path) -> None:
+def remove_replaced(left: Path, place: Path) -> None:
     """Remove a folder that was replaced: the files that sonotwin wrote, and links to files of the new one; move all else over.
 
     What can't be moved stays, and is named.
@@ -248,9 +279,9 @@ def take_away(left: Path, place: Path) -> None:
         path, other = left / name, place / name
         listed = (*files.get(name, ()), *others.get(name, ()))
         try:
-            if os.path.lexists(other) and (_same(path, other) or path.is_dir()):
+            if os.path.lexists(other) and (_same(path, other) or _is_folder(path)):
                 _remove(path)
-            elif is_unchanged(path, listed):
+            elif is_unchanged(path, listed) and (name not in others or os.path.lexists(other)):
                 path.unlink()
             elif place.is_dir() and not os.path.lexists(other):
                 _make_folders(left, place, name)
@@ -262,15 +293,15 @@ def take_away(left: Path, place: Path) -> None:
     _remove_empty(left, set())
 
 
-def discard(folder: Path) -> None:
-    """Remove the files that sonotwin wrote into a folder and those below, by their lists; what others put there stays."""
+def discard(folder: Path, *by: str) -> None:
+    """Remove the files that some writers wrote into a folder and those below, by their lists; what others put there stays."""
     empty = {name for name in entries(folder) if (folder / name).is_dir()}
     for path in sorted(folder.rglob(LIST), reverse=True):
         listed, files = path.parent, _readable_list(path.parent)
         for name in entries(listed) & files.keys():
-            if is_unchanged(listed / name, files[name]):
+            if files[name][0].by in by and is_unchanged(listed / name, files[name]):
                 (listed / name).unlink()
-        if all((listed / name).is_dir() and not (listed / name).is_symlink() for name in entries(listed)):
+        if all(_is_folder(listed / name) for name in entries(listed)):
             path.unlink()
     _remove_empty(folder, empty)
 
@@ -285,7 +316,7 @@ def _readable_list(folder: Path) -> Files:
 
 def _remove_empty(folder: Path, kept: Collection[str]) -> None:
     """Remove the folders below and the folder itself, as far as they hold nothing but a list, apart from some."""
-    if not entries(folder) - {str(name) for name in entries(folder) if (folder / name).is_dir()}:
+    if all(_is_folder(folder / name) for name in entries(folder)):
         for name in (LIST, UNPLACED):
             (folder / name).unlink(missing_ok=True)
     for place, _, _ in os.walk(folder, topdown=False):
@@ -295,15 +326,11 @@ def _remove_empty(folder: Path, kept: Collection[str]) -> None:
 
 
 def _remove(path: Path) -> None:
-    path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
+    path.rmdir() if _is_folder(path) else path.unlink()
 
 
-def _goes(old: Path, before: Files, name: str, by: str) -> bool:
-    return name in before and _is_by(before, name, by) and is_unchanged(old / name, before[name])
-
-
-def _is_by(files: Mapping[str, tuple[Written, ...]] | None, name: str, by: str) -> bool:
-    return (files or {})[name][0].by == by
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
 
 
 def _above(name: str) -> Iterator[str]:
@@ -323,9 +350,9 @@ def _alike(one: Path, other: Path) -> bool:
 
 
 def _carry(old: Path, new: Path, name: str) -> None:
-    """Let a new folder hold an entry of the old one too; one that can't have two names is moved later, by `take_away`."""
+    """Let a new folder hold an entry of the old one too; one that can't have two names is moved later, by `remove_replaced`."""
     _make_folders(old, new, name)
-    if (old / name).is_dir() and not (old / name).is_symlink():
+    if _is_folder(old / name):
         (new / name).mkdir(exist_ok=True)
         shutil.copystat(old / name, new / name)
         return

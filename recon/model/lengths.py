@@ -10,12 +10,12 @@ from recon.errors import InputError, brief
 
 UNITS = {1e3: "metres", 10.0: "centimetres", 25.4: "inches", 1e-3: "micrometres"}  # mm of each
 UNIT_KEY = "mm_per_unit"  # of a file: 1 says that its lengths are in mm, however small; 1000 that they are in metres
-SAID = f"give {UNIT_KEY} in the file, 1000 for metres, or 1 if it is right"
+SAID = f"give {UNIT_KEY} in the file: 1 if it is right, 10 for centimetres, 25.4 for inches, 1000 for metres"
 
 
 @dataclass(frozen=True)
 class Usual:
-    """Lengths of a kind of thing, mm: between the two bounds are all that there are, and a wide margin."""
+    """Bounds that hold every real length, mm, with a wide margin. A length of 0 is never a fault."""
 
     least: float
     most: float

@@ -39,7 +39,7 @@ from recon.optical_calibration.sightings import Cause, Failure, light
 from recon.pattern_trials import likely_patterns
 from recon.structured_light import surface_figures
 
-PAGE = "calibration.html"  # by which the folder of a calibration is known
+PAGE = "calibration.html"
 OPTICS = "optics.yaml"
 MANY, MOST_LISTED = 4, 40  # poses that are dropped alike, which are one line; and of these that it lists
 CONTENTS = {

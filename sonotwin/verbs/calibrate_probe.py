@@ -41,7 +41,7 @@ from recon.probe_calibration.crossing_frames import CrossingFrames
 from recon.probe_calibration.tank_calibration import Result, Settings
 
 PROBE = "probe.yaml"
-FRAMES = "frames.csv"  # by which the folder of a probe's calibration is known
+FRAMES = "frames.csv"
 OF_THE_SCALE, OF_THE_SIZE = "rig.probe.scale_mm_per_px", "rig.probe.image_size"
 
 

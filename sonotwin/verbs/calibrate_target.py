@@ -27,7 +27,7 @@ from recon.target_calibration import target_bundle, target_figures, target_poses
 from recon.tracking.tracker import Tracker, Tracking
 from sonotwin.tracker_fields import TrackerFields, make_tracker
 
-TARGET = "target.yaml"  # by which the folder of a target is known
+TARGET = "target.yaml"
 NO_COVARIANCE = "the cameras' calibration has no covariance: its errors are not in these uncertainties"
 
 

@@ -38,7 +38,7 @@ from recon.tracking.pose_fit import Sighting
 from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
 from sonotwin.verbs.calibrate_target import tracked
 
-CHECK, PAGE = "check.json", "check.html"  # the first is that by which the folder of a check is known
+CHECK, PAGE = "check.json", "check.html"
 SEARCH_PX = 5.0  # of the cameras' principal points: the tracker is to find the target by cameras that have moved, too
 UNKNOWN_LAG_S = 1.0  # standard deviation of a lag that wasn't measured
 LEAST_POSES = 3

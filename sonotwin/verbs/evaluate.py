@@ -15,7 +15,7 @@ from recon.reports import figures
 from sonotwin.verbs.surface import POINTS
 from twin.evaluation import surface_errors
 
-ERROR_MAP = "error_map.png"  # by which the folder of an evaluation is known
+ERROR_MAP = "error_map.png"
 
 
 class Config(Part):

@@ -110,15 +110,19 @@ def export_cameras(config: Config, console: Console) -> None:
     Raises
     ------
     InputError
-        If there is none, or one that the layout can't say.
+        If there is none, or one that the layout can't say; or if fields are given that aren't for it.
     """
+    for name in ("surface", "sweep", "probe", "lag_s", "tissue_m_s", "masses"):
+        if (value := getattr(config, name)) != Config.model_fields[name].default:
+            expected = f"none with layout={config.layout}, which is for the calibration of cameras alone"
+            raise InputError(f"export: {name}: expected {expected}, found {value}")
     if config.capture is not None:
         optics = calibration_files.of_capture(config.capture, config.calibration)
     else:
         optics = None if config.calibration is None else calibration_files.read(config.calibration)
     if optics is None:
         raise InputError(f"export: calibration: expected one of cameras for layout={config.layout}, found none")
-    with meza2021.new_folder(config.out, config.layout) as folder:
+    with atomic.new_folder(config.out, "export") as folder:
         names = camera_exports.WRITERS[config.layout](folder, optics)
     devices = camera_exports.taken(config.layout, optics)
     console.print(f"optics      {', '.join(devices)}: {', '.join(names)}", markup=False)

@@ -39,7 +39,7 @@ from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction, Rectangle
 from recon.model.fan import Fan, Sector
 
-VOLUME = "volume.nrrd"  # by which the folder of a volume is known
+VOLUME = "volume.nrrd"
 ROOM = 1.1  # by which gaps may be wider than sticks reach, before it is said
 SIGMA, SEQUENCE = "sigma.nrrd", "sequence.igs.mha"
 

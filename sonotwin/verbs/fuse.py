@@ -34,7 +34,7 @@ from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, mass_files
 from sonotwin.verbs import freehand
 
-SCENE, PAGE, SLICER = "scene.glb", "scene.html", "slicer"  # the first is what the folder of a scene is known by
+SCENE, PAGE, SLICER = "scene.glb", "scene.html", "slicer"
 
 
 class Config(Part):

@@ -39,7 +39,7 @@ from recon.probe_calibration.latency import Lag
 
 log = logging.getLogger(__name__)
 
-LAG = lag_files.FILE  # by which the folder of a lag is known
+LAG = lag_files.FILE
 DEPTHS = "depths.csv"
 MOSTLY = 0.5  # share of images with a bottom; with less, it is looked for in a part of a screen
 HEADER = ("frame", "time_ns", "depth_px", "residual_px", "used")

@@ -29,7 +29,7 @@ from recon.files import atomic
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 
-SHEET = "timing_sheet.csv"  # by which the folder is known
+SHEET = "timing_sheet.csv"
 SEQUENCE = "patterns.yaml"
 LIT = "lit.png"
 CAMERA = "cam1"

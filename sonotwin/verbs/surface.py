@@ -30,7 +30,7 @@ from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.triangulate import PointMap, Triangulator
 from sonotwin import choices
 
-POINTS = "points.npz"  # by which the folder of a surface is known
+POINTS = "points.npz"
 
 
 class Config(Part):
@@ -121,6 +121,7 @@ def compared(config: Config, shots: SurfaceCapture, found: ProjectorMap, raw: Po
         return
     for name in surface_part.cameras_beside(config.capture, config.camera):
         if name not in shots.calibration.cameras:
+            yield f"compare     {name} isn't compared: it has no calibration"
             continue
         try:
             its = surface_part.read_surface(config.capture, name, config.calibration)

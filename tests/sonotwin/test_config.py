@@ -1,5 +1,6 @@
 """From YAML and overrides to a validated configuration, and the one line for each way to get it wrong."""
 
+import tempfile
 from pathlib import Path
 from typing import Literal
 
@@ -123,14 +124,27 @@ def test_a_path_without_a_file_is_said_so(path, tmp_path):
 
 
 def test_a_choice_may_be_a_file_of_ones_own(tmp_path_factory, tmp_path):
-    """From anywhere, as after an installation, with fields of it changed on top; what is no YAML is refused in one line."""
+    """From anywhere, as after an installation, with fields of it changed on top; all else is refused in one line."""
     path = tmp_path_factory.mktemp("own") / "mine.yaml"
     path.write_text("gamma: 1.5\n")
     assert load(f"rig={path}").rig.gamma == 1.5 and load(f"rig={path}", "rig.gamma=1.8").rig.gamma == 1.8
     assert sorted(each.name for each in (tmp_path / "rig").iterdir()) == ["narrow.yaml", "wide.yaml"], "nothing is copied there"
-    path.write_text("a: [")
-    with pytest.raises(InputError, match=rf"^{path}: expected YAML, found"):
-        load(f"rig={path}")
+    for text, found in (
+        ("a: [", "expected YAML, found"),
+        ("5", "expected a map of fields, found 5"),
+        ("defaults: 5", "defaults: expected a list of choices, found 5"),
+        ("defaults: [rig: 5]", "defaults: expected a list of choices, found"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=rf"^{path}: {found}"):
+            load(f"rig={path}")
+
+
+def test_a_choice_of_ones_own_is_found_whatever_the_temporary_folders_name(tmp_path_factory, monkeypatch):
+    place = tmp_path_factory.mktemp("a, b's [c]")
+    (place / "mine.yaml").write_text("gamma: 1.5\n")
+    monkeypatch.setattr(tempfile, "tempdir", str(place))
+    assert load(f"rig={place / 'mine.yaml'}").rig.gamma == 1.5
 
 
 def test_brackets_and_quotes_are_balanced():

@@ -149,6 +149,7 @@ TAKEN = {  # of a kind that is right
         ({"images": lambda images: images / 255}, "expected grey levels from 0 to 255, found 0.* to 0.*: shares of white"),
         ({"images": lambda images: np.where(images > 50, np.nan, images)}, "expected finite 18 grey images"),
         ({"images": lambda images: np.uint16(images) * 16}, "from 0 to 255, as of bits=8"),
+        ({"bits": 4}, "from 0 to 15, as of bits=4"),
         ({"bits": 12}, "expected 16-bit numbers, as of bits=12"),
         ({"bits": "8"}, "bits: expected a whole number from 1 to 16, found '8'"),
     ],

@@ -116,7 +116,8 @@ def test_a_changed_record_is_refused_and_a_lost_one_costs_work_alone(tmp_path, v
     done(tmp_path)
     (tmp_path / RECORD).write_text(content)
     with pytest.raises(
-        InputError, match=r"reconstruct\.json: expected it as reconstruct wrote it, found it changed since; move it"
+        InputError,
+        match=r"reconstruct\.json: expected nothing or a file as reconstruct wrote it, found it changed since",
     ):
         done(tmp_path)
     (tmp_path / RECORD).unlink()

@@ -202,10 +202,13 @@ def test_a_calibration_goes_out_for_other_programs_and_comes_back(capture, tmp_p
     out = tmp_path / "out"
     assert main(["export", "layout=ros", f"capture={capture}", f"out={out}"]) == 0
     assert "left out    projector: the layout has no place for it" in capsys.readouterr().out
-    assert sorted(path.name for path in out.glob("[!.]*")) == ["cam1.yaml", "cam2.yaml", "sonotwin-export.json"]
+    assert sorted(path.name for path in out.glob("[!.]*")) == ["cam1.yaml", "cam2.yaml"]
     found = calibration_files.read(out).cameras
     assert found["cam2"].camera_from_world == pytest.approx(optics().cameras["cam2"].camera_from_world)
     assert main(["export", "layout=kalibr", f"calibration={out}", f"out={tmp_path / 'chain'}"]) == 0
+    assert contents(tmp_path / "chain").keys() == {"camchain.yaml", ".sonotwin.json"}
+    assert main(["export", "layout=kalibr", f"calibration={out}", "lag_s=0.05", f"out={tmp_path / 'none'}"]) == 2
+    assert "export: lag_s: expected none with layout=kalibr, which is for the calibration" in capsys.readouterr().err
     assert list(calibration_files.read(tmp_path / "chain" / "camchain.yaml").cameras) == ["cam1", "cam2"]
     assert main(["export", "layout=slstudio", f"calibration={out}", f"out={tmp_path / 'none'}"]) == 2
     assert "layout: expected cam1 and projector for SLStudio, found cam1, cam2" in capsys.readouterr().err

@@ -165,6 +165,10 @@ def test_a_second_camera_shows_images_upside_down(optics, tmp_path, capsys, capl
     assert main(["surface", *fields]) == 0 and said in capsys.readouterr().out
     (tmp_path / "capture" / "surface" / "cam2" / "0003.png").write_bytes(b"")
     assert main(["surface", *fields]) == 0 and "cam2 isn't compared: " in capsys.readouterr().out
+    pair = {name: camera for name, camera in optics.cameras.items() if name != "cam2"}
+    calibration_files.write(tmp_path / "pair.yaml", Calibration(pair))
+    assert main(["surface", *fields, f"calibration={tmp_path / 'pair.yaml'}"]) == 0
+    assert "cam2 isn't compared: it has no calibration" in capsys.readouterr().out
 
 
 def test_results_are_replaced_but_other_folders_are_not(shots, tmp_path, capsys):

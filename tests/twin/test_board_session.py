@@ -155,7 +155,7 @@ def test_changed_settings_of_an_unfinished_run_are_named(settings, tmp_path):
     board_session.missing_poses(session, settings)
     (tmp_path / "unfinished" / "settings.json").write_text("{", encoding="utf-8")
     with pytest.raises(
-        InputError, match=r"unfinished/settings\.json: expected it as the twin wrote it, found it changed"
+        InputError, match=r"unfinished/settings\.json: expected nothing or a file as the twin wrote it, found it changed"
     ) as refusal:
         board_session.missing_poses(session, settings)
     assert "\n" not in str(refusal.value)

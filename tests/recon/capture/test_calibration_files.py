@@ -274,8 +274,8 @@ def test_files_as_kalibr_and_mrcal_write_them(tmp_path):
     assert found["cam2"].camera_from_world[:3, 3] == pytest.approx([-110, 0.5, -0.2]) and found["cam1"].distortion[3] == 1e-5
     folder = tmp_path / "models"
     folder.mkdir()
-    (folder / "camera-0.cameramodel").write_text(MRCAL)
-    (folder / "camera-1.cameramodel").write_text(MRCAL.replace("0.1, 0., 0, -.25", "0.1, 0., 0, -.5"))
+    (folder / "camera-0.cameramodel").write_text(MRCAL.replace("-.25", "30.25"))  # of a reference that lies far away
+    (folder / "camera-1.cameramodel").write_text(MRCAL.replace("-.25", "30."))
     both = calibration_files.read(folder).cameras
     assert list(both) == ["cam1", "cam2"] and both["cam1"].size == (3840, 2160)
     assert np.array_equal(both["cam1"].camera_from_world, np.eye(4))
@@ -283,17 +283,45 @@ def test_files_as_kalibr_and_mrcal_write_them(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ("left", "right", ("cam1", "cam2")),
+        ("stereo/right", "stereo/left", ("cam2", "cam1")),
+        ("Camera_right", "camera_left", ("cam2", "cam1")),
+        ("cam0", "cam1", ("cam1", "cam2")),
+        ("cam1", "cam0", ("cam2", "cam1")),
+        ("cam1", "projector", ("cam1", "projector")),
+        ("a", "b", ("cam1", "cam2")),
+        ("left", "camera", None),
+        ("camera", "projector", None),
+        ("cam1", "proj", None),
+        ("right", "cam0", None),
+        ("cam2", "cam3", None),
+        ("left", "cam1", None),
+    ],
+)
+def test_devices_are_told_by_words_or_not_at_all(tmp_path, first, second, expected):
+    """A pair of which one word alone tells isn't taken in another order."""
+    (tmp_path / "camchain.yaml").write_text(KALIBR.replace("/cam0/", "/%s/").replace("/cam1/", "/%s/") % (first, second))
+    if expected is None:
+        with pytest.raises(InputError, match=r"expected names with cam1, left, cam2, .*; rename them"):
+            calibration_files.read(tmp_path / "camchain.yaml")
+        return
+    cameras = calibration_files.read(tmp_path / "camchain.yaml").cameras
+    assert {name: camera.matrix[0, 0] for name, camera in cameras.items()} == dict(zip(expected, (461.6, 458.6), strict=True))
+
+
+@pytest.mark.parametrize(
     ("text", "old", "new", "complaint"),
     [
         (KALIBR, "distortion_model: radtan", "distortion_model: equidistant", "cam0: .*none, found .*'equidistant'"),
-        (KALIBR, "-0.11]", "-110.0]", r"T_cn_cnm1: expected a shift of up to 20 m, found 110: is it in mm\?"),
+        (KALIBR, "-0.11]", "-110.0]", r"cam2: expected it within 20 m of cam1, found 110 m: are its translations in mm\?"),
         (KALIBR, "[752, 480]", "[752]", r"cam0.resolution: expected 2 numbers, found \[752\]"),
         (KALIBR, "461.6, ", "", "cam0.intrinsics: expected 4 numbers"),
         (KALIBR, "T_cn_cnm1", "T_cam_imu", "cam1.T_cn_cnm1: expected 4 rows of 4 numbers, found None"),
         (KALIBR, "[1.0, 0.0, 0.0, -0.11]", "[0.9, 0.0, 0.0, -0.11]", "cam2.camera_from_world: expected a rigid transform"),
         (MRCAL, "OPENCV4", "SPLINED_STEREOGRAPHIC_order=3", "lensmodel: expected one of .*mrcal-convert-lensmodel"),
         (MRCAL, "2.1, -1.1,", "2.1,", "intrinsics: expected 8 numbers"),
-        (MRCAL, "-.25", "-250.0", "extrinsics: expected a shift of up to 20 m, found 250"),
         (MRCAL, "'imagersize'", "'imagesize'", "imagersize: expected a list of numbers once, found none"),
         (MRCAL, "-.25", "__import__('os')", "extrinsics: expected a list of numbers once, found something else"),
     ],

@@ -6,6 +6,7 @@ import pytest
 
 from recon.capture import probe_files
 from recon.errors import InputError
+from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
 
@@ -114,3 +115,19 @@ def test_a_file_of_the_authors_is_told_its_speed_or_warned_of(tmp_path, caplog):
     assert probe_files.read(path).speed_m_s == 1540.0
     (said,) = caplog.messages
     assert "names no speed of sound" in said and "import it with speed_m_s=..." in said
+
+
+def test_a_plain_matrix_is_told_a_way_that_it_has(tmp_path, caplog):
+    """It has no place for a speed or a unit: both go into the authors' file, which then reads alike."""
+    path, authors = tmp_path / "matrix.txt", tmp_path / probe_files.AUTHORS
+    placed = rigid.transform(np.eye(3), [0.1, 0.2, 0.3])
+    np.savetxt(path, placed @ np.diag([0.12, 0.12, 0.12, 1]))
+    with pytest.raises(InputError, match=rf"if it is right, give it as {authors.name} with sx, sy, T_I_T and mm_per_unit=1$"):
+        probe_files.read(path)
+    np.savez(authors, sx=0.12, sy=0.12, T_I_T=placed, mm_per_unit=1)
+    assert probe_files.read(authors, 1488.0).target_from_image == pytest.approx(placed)
+    caplog.clear()
+    np.savetxt(path, rigid.transform(np.eye(3), [0, 90, 0]) @ np.diag([0.12, 0.12, 0.12, 1]))
+    assert probe_files.read(path, 1488.0).speed_m_s == 1488.0 and not caplog.messages
+    assert probe_files.read(path).speed_m_s == 1540.0
+    assert [f"made in water, give it as {authors.name}" in text for text in caplog.messages] == [True]

@@ -8,7 +8,7 @@ import pytest
 
 from recon.errors import InputError
 from recon.files import atomic, written_files
-from recon.files.written_files import LIST
+from recon.files.written_files import LIST, Addition
 
 
 def make(out: Path, text: str = "first", by: str = "segment", **more: str) -> None:
@@ -17,6 +17,7 @@ def make(out: Path, text: str = "first", by: str = "segment", **more: str) -> No
         (folder / "slicer").mkdir()
         for name in ("metrics.json", "slicer/mass0.ply"):
             (folder / name).write_text(text)
+        (folder / "overlays").mkdir()
         for name, content in more.items():
             (folder / name).write_text(content)
 
@@ -41,6 +42,11 @@ def write(path: Path, text: str = "years of work") -> None:
 def linked(path: Path, target: Path) -> None:
     target.mkdir() if not target.suffix else write(target)
     path.symlink_to(target)
+
+
+def entered(out: Path, name: str, by: str) -> None:
+    with atomic.listed_file(out, name, by) as file:
+        write(file)
 
 
 KEPT = {
@@ -85,6 +91,7 @@ REFUSED = {
     "a file changed by hand": (lambda out: (make(out), write(out / "metrics.json", "frist")), "metrics.json: .*changed since"),
     "a file moved away and linked": (lambda out: moved(out, "metrics.json"), "metrics.json: .*changed since"),
     "a folder moved away and linked": (lambda out: moved(out, "slicer"), "slicer: expected a folder"),
+    "an empty folder replaced by a link": (lambda out: moved(out, "overlays"), "overlays: .*found another file"),
     "a file where a new one is written": (lambda out: (make(out), write(out / "extra")), "extra: .*found another"),
     "a folder where a file is written": (lambda out: (make(out), write(out / "extra" / "a.txt")), "a.txt: .*found something"),
     "a damaged list": (lambda out: (make(out), write(out / LIST, "{}")), "damaged"),
@@ -119,17 +126,74 @@ def test_what_comes_while_a_result_is_replaced_is_moved_over(tmp_path, monkeypat
     assert sorted(os.listdir(tmp_path)) == ["out"]
 
 
-def test_files_without_second_names_are_moved_over(tmp_path, monkeypatch):
-    """Where the file system has no links, or lets nobody link to files of others."""
-    make(tmp_path / "out")
-    write(tmp_path / "out" / "thesis.txt")
+def without_links(monkeypatch):
+    """A file system that has no links, or lets nobody link to files of others."""
 
     def refuse(*_, **__):
         raise OSError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "link", refuse)
+
+
+def test_files_without_second_names_are_moved_over(tmp_path, monkeypatch):
+    make(tmp_path / "out")
+    write(tmp_path / "out" / "thesis.txt")
+    without_links(monkeypatch)
     make(tmp_path / "out", "second")
     assert (tmp_path / "out" / "thesis.txt").read_text() == "years of work" and sorted(os.listdir(tmp_path)) == ["out"]
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_of_two_writers_without_links_both_keep_their_files(tmp_path, monkeypatch, copied):
+    """Also where the second laid copies of the first's files into the new folder."""
+    make(tmp_path / "out", manifest="of the first")
+    before = everything(tmp_path / "out")
+    without_links(monkeypatch)
+    with atomic.new_folder(tmp_path / "out", "sweep", Addition(("manifest",), "sweep")) as folder:
+        if copied:
+            atomic.link_tree(tmp_path / "out", folder, leave_out={"manifest"})
+        write(folder / "manifest", "of both")
+        write(folder / "sweep" / "0000.png")
+    after = everything(tmp_path / "out")
+    assert after.keys() == before.keys() | {"sweep/", "sweep/0000.png"} and sorted(os.listdir(tmp_path)) == ["out"]
+    assert {name for name in before if before[name] != after[name]} == {"manifest"}
+    assert {one.by for each in (written_files.read_list(tmp_path / "out") or {}).values() for one in each} >= {"segment", "sweep"}
+
+
+def add(out: Path, by: str = "twin") -> None:
+    with atomic.new_folder(out, by, Addition(("manifest",), "sweep")) as folder:
+        write(folder / "manifest", by)
+        write(folder / "sweep" / "0000.png", "first")
+
+
+PARTS = {
+    "new": (lambda out: None, None),
+    "notes beside": (lambda out: (add(out), write(out / "sweep" / "notes.txt")), None),
+    "own": (add, None),
+    "a result within": (lambda out: make(out / "sweep" / "take01", by="record"), None),
+    "changed": (lambda out: (add(out), write(out / "sweep" / "0000.png", "new")), "0000.png: .*changed since"),
+    "another's": (lambda out: add(out, "record"), "0000.png: .*found that of record"),
+    "of nobody": (lambda out: write(out / "sweep" / "0000.png"), "0000.png: .*found another file"),
+    "changed elsewhere": (lambda out: write(out / "metrics.json", "by hand"), None),
+}
+
+
+@pytest.mark.parametrize("place", PARTS)
+def test_a_part_that_may_not_be_replaced_is_refused_before_the_work(tmp_path, place):
+    """What passes the check can be added in the end; the other parts stay as they are."""
+    lay, expected = PARTS[place]
+    make(tmp_path / "out", manifest="of the first")
+    lay(tmp_path / "out")
+    before = everything(tmp_path)
+    if expected is None:
+        atomic.check_folder(tmp_path / "out", "twin", adds=Addition(("manifest",), "sweep"))
+        add(tmp_path / "out")
+        changed = {name for name, digest in before.items() if everything(tmp_path)[name] != digest}
+        assert changed <= {"out/manifest"}
+        return
+    with pytest.raises(InputError, match=expected):
+        atomic.check_folder(tmp_path / "out", "twin", adds=Addition(("manifest",), "sweep"))
+    assert everything(tmp_path) == before
 
 
 @pytest.mark.parametrize(
@@ -138,8 +202,9 @@ def test_files_without_second_names_are_moved_over(tmp_path, monkeypatch):
         (lambda out: write(out / "log.txt", "frist"), "log.txt: .*changed since"),
         (lambda out: write(out / "other.txt"), "other.txt: .*another file"),
         (lambda out: linked(out / "other.txt", out.parent / "thesis.txt"), "other.txt: .*another file"),
+        (lambda out: entered(out, "other.txt", "demo"), "other.txt: .*that of demo"),
     ],
-    ids=["changed", "another", "a link"],
+    ids=["changed", "another", "a link", "another writer's"],
 )
 def test_a_folder_that_is_filled_keeps_what_others_put_there(tmp_path, lay, expected):
     """One that grows may be appended to; killed before the first file, or between list and file, the next run goes on."""
@@ -169,14 +234,16 @@ def test_a_folder_that_is_filled_keeps_what_others_put_there(tmp_path, lay, expe
 
 
 def test_only_listed_files_are_discarded(tmp_path):
-    """Of a list from a stranger too, which names files elsewhere."""
+    """Of a list from a stranger too, which names files elsewhere; results of another writer stay."""
     make(tmp_path / "out")
+    make(tmp_path / "out" / "its", by="evaluate")
     make(tmp_path / "out" / "pose")
     write(tmp_path / "out" / "pose" / "thesis.txt")
     write(tmp_path / "victim.txt")
     made = written_files.written(tmp_path / "victim.txt", "segment")
     written_files.write_list(tmp_path / "out" / LIST, {"../victim.txt": (made,), str(tmp_path / "victim.txt"): (made,)})
-    written_files.discard(tmp_path / "out")
+    written_files.discard(tmp_path / "out", "segment")
     assert {name for name in everything(tmp_path) if not name.endswith("/")} == {
-        "victim.txt", "out/pose/thesis.txt", "out/metrics.json", "out/slicer/mass0.ply"
+        "victim.txt", "out/pose/thesis.txt", "out/metrics.json", "out/slicer/mass0.ply", "out/its/metrics.json",
+        "out/its/slicer/mass0.ply",
     }  # fmt: skip

@@ -134,7 +134,7 @@ def test_a_matrix_from_pixels_to_mm_is_a_probes_calibration(form, tmp_path, capl
 
     def read(matrix):
         path.write_text(form.format("\n".join(" ".join(f"{value:.9g}" for value in row) for row in matrix)))
-        return probe_files.read(path)
+        return probe_files.read(path, 1540.0)
 
     found = read(matrix)
     np.testing.assert_allclose(found.target_from_image, TURN, atol=1e-6)
