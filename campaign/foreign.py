@@ -130,7 +130,7 @@ def run(place: Path, workers: int, only: Sequence[str] = (), kept: Path | None =
             pass
     cases = [] if kept is None or not kept.exists() else [_of_line(line) for line in kept.read_text().splitlines()]
     left = [command for command in chosen if command.verb not in {case.writer for case in cases}]
-    with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=1) as pool:
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
         attacks = [pool.submit(_attack, place, results, command) for command in left]
         for attack in as_completed(attacks):
             found = attack.result()

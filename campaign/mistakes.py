@@ -82,7 +82,7 @@ def run(place: Path, count: int, workers: int, kept: Path | None = None, tasks: 
     found = {} if kept is None or not kept.exists() else {one.number: one for one in _read(kept)}
     left = [number for number in range(count) if number not in found]
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=100) as pool:
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
         for outcome in pool.map(partial(make, place, names), left):
             found[outcome.number] = outcome
             if kept is not None:
