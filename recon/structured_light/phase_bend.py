@@ -41,6 +41,7 @@ ALONG = 8  # samples a period along the fringes, or where they are as wide as th
 WINDOW = 0.5  # periods, standard deviation of a Gaussian
 PERIODS = 2.5  # across a window's reach: an image of fewer shows no whole one
 WHOLE = 0.7  # of a window that must be known
+CUT_OFF = 0.005  # of a window that may be saturated
 SHARED = 9  # windows that show the same, with one standard deviation from one to the next
 FEWEST = 30  # windows
 FINEST = 0.75  # of a whole turn from pixel to pixel: faster phasors are aliased
@@ -165,11 +166,12 @@ def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Hid
     strides = [int(np.clip(2 * np.pi / max(turn, speed / 4) / (ALONG * steps), 1, longest)) for turn in turns]
     strides = [stride if 2 * turn < speed else 1 for stride, turn in zip(strides, turns, strict=True)]
     thin = np.s_[strides[0] // 2 :: strides[0], strides[1] // 2 :: strides[1]]
-    seen, known, width = fringe.phase[thin], valid[thin], WINDOW * period / np.array(strides)
+    seen, known, saturated = fringe.phase[thin], valid[thin], fringe.saturated[thin]
+    width = WINDOW * period / np.array(strides)
     twice = 2 * steps * speed < FINEST * 2 * np.pi
     c, e, limit = 0.0, 0.0, STRONGEST[steps]
     for _ in range(ROUNDS):
-        windows = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, width, steps)
+        windows = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, saturated, width, steps)
         if windows.shape[1] < FEWEST:
             return "few"
         once, second = np.median(windows.real, axis=1)
@@ -220,8 +222,11 @@ def straight(seen: Image, bend: Array, steps: int) -> Array:
     return seen + np.interp((seen + np.pi) % turn, turn * np.arange(TABLE + 1) / TABLE, np.append(bend[:, 0], bend[0, 0]))
 
 
-def _windows(phase: Array, known: Mask, width: Array, steps: int) -> NDArray[np.complex128]:
-    """Means of `exp(i N phase)` and `exp(2 i N phase)` over the windows in which enough is known : (2, w)."""
+def _windows(phase: Array, known: Mask, saturated: Mask, width: Array, steps: int) -> NDArray[np.complex128]:
+    """Means of `exp(i N phase)` and `exp(2 i N phase)` over the windows in which enough is known : (2, w).
+
+    Peaks that saturate are missing N times a period, as the harmonic is that is looked for.
+    """
     down, across = np.maximum(np.rint(width), 1).astype(int)
 
     def means(image: NDArray) -> Image:
@@ -231,6 +236,6 @@ def _windows(phase: Array, known: Mask, width: Array, steps: int) -> NDArray[np.
         return blurred[down // 2 :: down, across // 2 :: across]
 
     share = means(known)
-    whole = share > WHOLE
+    whole = (share > WHOLE) & (means(saturated) < CUT_OFF)
     angles = [k * steps * phase for k in (1, 2)]
     return np.array([(means(known * np.cos(a)) + 1j * means(known * np.sin(a)))[whole] / share[whole] for a in angles])

@@ -21,7 +21,7 @@ ADVICE = {
     Status.OUTSIDE: "out of the projector's image: check that the patterns are those projected",
 }
 HIDDEN: dict[Hidden, str] = {
-    "few": "which too few periods are seen to show",
+    "few": "which too few periods are seen to show, saturated ones apart",
     "fine": "which periods of so few camera pixels don't show",
 }
 BENT_PX = 0.05  # projector px by which phases may be bent before it is said
