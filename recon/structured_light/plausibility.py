@@ -18,12 +18,14 @@ CHECK_SAMPLES = 10_000  # pixels of a check
 LIT_SHARE = 0.002  # share of the image that must carry fringes
 SATURATED_SHARE = 0.5  # share of the lit image that may be saturated
 HARMONIC_SHARE = 0.08  # of the modulation, in the high harmonics: beyond, it is no N-step sequence
-AROUND = 0.25  # of the RMS phasor: a larger mean is of phases that are not seen all around
-EACH_WAY = 0.02  # share of the phasors in each eighth of the circle, where phases are seen all around
-FLAT = 0.05  # share of short phasors, of a quarter of the RMS, where an ellipse is nearly a line: 0.1 of one
-SLIM = 0.25  # of the power, in the mean square of the phasors: 1 of a doubled step, 0.03 of a shift off by 5 % of a step
+EACH_WAY = 0.01  # share of the pixels in each eighth of the circle, where phases are seen all around
+SLIM = (
+    0.1  # of the contrast's square, in its second harmonic around the circle: 1 of a line, 0.03 of a shift off by 5 % of a step
+)
+BLACK = 0.01  # of the samples: the rest is brighter than black
 SPARSE_STEPS = 7  # at most, of which neighbours differ by a third of the swing; more have harmonics that show errors
-ALIKE = 0.15  # of the swing: a median difference of two images that noise makes; share of the pixels of either phase
+ALIKE = 0.15  # of the swing: a median difference of two images that noise makes; share of the pixels of either phase; of the
+# largest difference of neighbours, the RMS of two that are one: over all phases it is 0.8
 STRONG = 0.15  # of full scale: the swing of fringes that show whether black is clipped
 CLIPPED = 0.12  # share of black samples in these; of dark fringes that just reach black, and of rounding, it is 0.07
 BENT = 0.02  # of a pitch, by which light bends phases, before it is suspected
@@ -60,32 +62,35 @@ def check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, 
         raise InputError(f"{place} are saturated in {share:.0f} % of the lit pixels, expected under half: shorten the exposure")
     useful = (swing > 2 * least) & (samples.max(axis=0) < full)
     if useful.any():
-        _check_steps(samples[:, useful], part, full, place, start)
+        _check_steps(samples[:, useful], beside[:, useful], part, full, place, start)
         _check_order(samples[:, useful], beside[:, useful], part, full, place, start)
 
 
-def _check_steps(samples: Image, part: Fringes, full: float, place: str, start: int) -> None:
-    """Refuse a step that was taken twice, is late or far off: phasors lie on a line or a slim ellipse, not around a circle.
+def _check_steps(samples: Image, beside: Image, part: Fringes, full: float, place: str, start: int) -> None:
+    """Refuse a step that was taken twice, is late or far off: contrasts lie on a line or a slim ellipse, not around a circle.
 
-    Three steps leave no residual by which an error shows, but phases all around show it. Of a wave so wide that few phases are
-    seen, two images that are one: a pixel of theirs is of one of two phases.
+    Three steps leave no residual by which an error shows, but phases all around show it, in contrasts over eighths of the circle
+    that weigh the same: a bright object on something dark is no ellipse. Of a wave so wide that few phases are seen, two images
+    that are one: a pixel is of one of two phases, and a difference is noise, which products with the pixels beside don't show.
     """
     if part.steps > SPARSE_STEPS or samples.shape[1] < FEW:
         return
-    swing = np.median(np.ptp(samples, axis=0))
+    level, c, s = pseudo_inverse(part.shifts) @ samples
+    swing = np.ptp(samples, axis=0)
+    level = np.maximum(level - np.quantile(samples, BLACK), swing / 2)
     pairs = list(itertools.combinations(range(part.steps), 2))
-    differences = [float(np.median(np.abs(samples[a] - samples[b]))) for a, b in pairs]
+    differences = [float(np.median(np.abs(samples[a] - samples[b]) / swing)) for a, b in pairs]
     a, b = pairs[int(np.argmin(differences))]
-    others = [samples[k] - samples[a] for k in range(part.steps) if k not in (a, b)]
-    both = max(min(np.mean(other > swing / 4), np.mean(other < -swing / 4)) for other in others)
-    doubled = min(differences) < ALIKE * swing and both > ALIKE
-    _, c, s = pseudo_inverse(part.shifts) @ samples
-    phasor = c + 1j * s
-    power = float(np.mean(np.abs(phasor) ** 2))
-    sectors = np.bincount(((np.angle(phasor) + np.pi) * (4 / np.pi)).astype(int) % 8, minlength=8) / phasor.size
-    flat = np.mean(np.abs(phasor) < np.sqrt(power) / 4)
-    around = abs(np.mean(phasor)) < AROUND * np.sqrt(power) and (sectors.min() > EACH_WAY or flat > FLAT)
-    if doubled or (around and abs(np.mean(phasor**2)) > SLIM * power):
+    others = [(samples[k] - samples[a]) / swing for k in range(part.steps) if k not in (a, b)]
+    both = max(min(np.mean(other > 1 / 4), np.mean(other < -1 / 4)) for other in others)
+    square = np.mean((samples[a] - samples[b]) * (beside[a] - beside[b]) / level**2) / np.mean((swing / level) ** 2)
+    doubled = min(differences) < ALIKE and square < (ALIKE * np.sin(np.pi / part.steps)) ** 2 and both > ALIKE
+    contrast = (c + 1j * s) / level
+    sector = ((np.angle(contrast) + np.pi) * (4 / np.pi)).astype(int) % 8
+    number = np.bincount(sector, minlength=8)
+    power = np.bincount(sector, np.abs(contrast) ** 2, 8) / np.maximum(number, 1)
+    slim = abs(power @ np.exp(0.5j * np.pi * np.arange(8))) > SLIM * power.sum()
+    if doubled or (slim and number.min() > EACH_WAY * number.sum()):
         cause = f"images {start + a} and {start + b} show the same" if doubled else "the steps are uneven"
         share = _clipped(samples, full)
         black = f" {said_of_black(share)}? Or" if share > CLIPPED else ""
