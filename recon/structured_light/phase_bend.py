@@ -61,14 +61,9 @@ class Bend:
     table: Array  # (TABLE, 2) of true less seen phase, rad, and the slope of true by seen, over the phase seen, one bend long
     steps: int
     pitch: float  # projector px
-    sigma: float  # rad, what may be left, a standard deviation over all phases; 0 where it isn't known
+    sigma: float  # rad, what may be left, a standard deviation over all phases
     gamma: float  # exponent of a law of light that bends as much; of blurred fringes it is nearer to 1 than the projector's
     undone: bool = True  # False of more than can be undone
-
-    @property
-    def straight(self) -> bool:
-        """Whether nothing was undone."""
-        return not self.table[:, 0].any()
 
     @property
     def most_px(self) -> float:

@@ -85,10 +85,9 @@ def bent(linearity: Linearity) -> Iterator[str]:
         if bend.most_px > BENT_PX:
             law = f", it goes with level^{bend.gamma:.1f} or so" if bend.steps == FEWEST_STEPS else ""
             law += f" ({said_of_black(linearity.clipped)}?)" if linearity.clipped > CLIPPED else ""
-            left = f"to {bend.left_px:.3f} px" if bend.sigma else "by what other fringes show"
             yield (
                 f"linearity   light isn't linear{law}: {bend.steps} steps of {bend.pitch:g} px were bent by up to "
-                f"{bend.most_px:.2f} px, which is undone {left}; {LINEAR_LIGHT}"
+                f"{bend.most_px:.2f} px, which is undone to {bend.left_px:.3f} px; {LINEAR_LIGHT}"
             )
     for part, why in linearity.unknown:
         yield (
