@@ -213,7 +213,7 @@ def _from_fringes(shots: _Shots, axis: Axis) -> _AxisMap:
     linearity = Linearity(bends, unknown, clipped)
     plausibility.check_bends(bends, clipped, f"{shots.name}: fringes of {axis}")
     part, fringe = min(sets, key=lambda pair: pair[0].pitch)
-    light = plausibility.suspected(bends, bool(unknown), clipped)
+    light = plausibility.suspected(bends, unknown, clipped)
     orders, unreachable, counts = _orders(shots, axis, sets, status == Status.OK, light)
     scale = Scale(float(part.zero(length)), part.pitch, length)
     x, sigma = _coordinates(fringe, orders, unreachable, status, scale)

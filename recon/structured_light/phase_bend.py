@@ -25,14 +25,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.compiled import kernel
+from recon.model.patterns import Fringes
 from recon.structured_light.phase import Fringe
 from recon.threads import in_threads
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Waveform = Literal["sine", "binary"]
 Hidden = Literal["few", "fine"]  # why fringes don't show their bend: too few whole periods, or periods of too few pixels
 
+DEFOCUS = "defocus the projector more, or take sine fringes"
 LINEAR_LIGHT = "set projector and camera to linear, project patterns of linearise_gamma, or take 5 steps or more"
 
 MOST_STEPS = 4  # from five on a gamma bends the phase by less than a hundredth of a radian
@@ -62,8 +65,9 @@ class Bend:
     steps: int
     pitch: float  # projector px
     sigma: float  # rad, what may be left, a standard deviation over all phases
-    gamma: float  # exponent of a law of light that bends as much; of blurred fringes it is nearer to 1 than the projector's
+    gamma: float | None  # of a law of light that bends as much; of blurred fringes nearer to 1 than the projector's; None of none
     undone: bool = True  # False of more than can be undone
+    waveform: Waveform = "sine"  # of binary fringes it is their own harmonics that bend
 
     @property
     def most_px(self) -> float:
@@ -125,21 +129,23 @@ def by_gamma(steps: int, gamma: float) -> Array:
     return table(steps, phase + bend, phase)
 
 
-def gamma_of(steps: int, c: float) -> float:
-    """The gamma whose harmonic N - 1 is c of the fundamental: of four steps, the one from 1.5 up."""
+def gamma_of(steps: int, c: float) -> float | None:
+    """The gamma whose harmonic N - 1 is c of the fundamental: of four steps, the one from 1.5 up; None if there is none."""
     if steps == 3:
         return (1 + 2 * c) / (1 - c)
     gammas = np.geomspace(1.45, 5, 400)
-    return float(np.interp(c, (gammas - 1) * (gammas - 2) / ((gammas + 2) * (gammas + 3)), gammas))
+    harmonics = (gammas - 1) * (gammas - 2) / ((gammas + 2) * (gammas + 3))
+    return float(np.interp(c, harmonics, gammas)) if c >= harmonics[0] else None
 
 
-def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Hidden:
+def measure(fringe: Fringe, part: Fringes, valid: Mask) -> Bend | Hidden:
     """Measure the bend of a set of fringes on windows of whole periods.
 
     Parameters
     ----------
     fringe : Fringe
-    steps, pitch : of its sequence; projector px
+    part : Fringes
+        Their sequence.
     valid : (h, w) bool
         Pixels that count.
 
@@ -148,6 +154,7 @@ def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Hid
     Bend, or the reason why there is none to see
         With a table of no bend if none is sure.
     """
+    steps = part.steps
     turns = [_turn(fringe.phase, valid, axis) for axis in (0, 1)]
     speed = float(np.hypot(*turns))
     if steps * speed >= FINEST * 2 * np.pi:
@@ -173,23 +180,25 @@ def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Hid
         c, e = c + 2 * once / steps, e + second / steps if twice else 0.0
         if abs(c) > limit:
             c = float(np.copysign(limit, c))
-            return Bend(by_harmonics(steps, c, 0.0), steps, pitch, np.inf, float(gamma_of(steps, c)), undone=False)
+            return Bend(by_harmonics(steps, c, 0.0), steps, part.pitch, np.inf, gamma_of(steps, c), False, part.waveform)
         if 2 * abs(once) / steps < SETTLED:
             break
-    return _judged(windows, steps, pitch, c, e if twice else 0.0)
+    return _judged(windows, part, c, e if twice else 0.0)
 
 
-def _judged(windows: NDArray[np.complex128], steps: int, pitch: float, c: float, e: float) -> Bend:
+def _judged(windows: NDArray[np.complex128], part: Fringes, c: float, e: float) -> Bend:
     """The bend, or none where it isn't sure, by windows : (2, w).
 
     Shapes and noise scatter their real and imaginary parts alike; real parts scatter more where the bend varies, as with blur.
     """
+    steps = part.steps
     real, imaginary = _scatter(windows.real), _scatter(windows.imag)
     unsure = 1.25 * real * np.sqrt(SHARED / windows.shape[1]) * np.array([2, 1]) / steps  # of c and e, rad
     varies = np.sqrt(np.maximum(real**2 - imaginary**2, 0)) * np.array([2, 1]) / steps
     c, e = (value if abs(value) > SURE * error else 0.0 for value, error in zip((c, e), unsure, strict=True))
     left = float(np.sqrt((unsure**2).sum() + (varies[0] ** 2 if c else 0.0)) / np.sqrt(2))
-    return Bend(by_harmonics(steps, c, e), steps, pitch, left, float(gamma_of(steps, c)) if c else 1.0)
+    gamma = gamma_of(steps, c) if c else 1.0
+    return Bend(by_harmonics(steps, c, e), steps, part.pitch, left, gamma, waveform=part.waveform)
 
 
 def _scatter(values: Array) -> Array:

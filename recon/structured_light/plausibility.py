@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from recon.errors import InputError
 from recon.model.patterns import Fringes, GrayCode
 from recon.structured_light.phase import Fringe, pseudo_inverse, sample_pixels
-from recon.structured_light.phase_bend import LINEAR_LIGHT, Bend
+from recon.structured_light.phase_bend import DEFOCUS, LINEAR_LIGHT, Bend, Hidden
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -92,8 +92,7 @@ def _check_steps(samples: Image, beside: Image, part: Fringes, full: float, plac
     slim = abs(power @ np.exp(0.5j * np.pi * np.arange(8))) > SLIM * power.sum()
     if doubled or (slim and number.min() > EACH_WAY * number.sum()):
         cause = f"images {start + a} and {start + b} show the same" if doubled else "the steps are uneven"
-        share = _clipped(samples, full)
-        black = f" {said_of_black(share)}? Or" if share > CLIPPED else ""
+        black = f" {clip}? Or" if (clip := black_clipped(_clipped(samples, full))) else ""
         raise InputError(
             f"{place} do not follow the {part.steps}-step sequence, {cause}:{black} was one taken twice, or before the projector "
             "had changed, or with another exposure?"
@@ -125,8 +124,8 @@ def _check_order(samples: Image, beside: Image, part: Fringes, full: float, plac
         order[[a, b]] = b, a
         if (left := strange(order)) < best:
             best, suspects = left, f", {start + a} and {start + b} look exchanged"
-    share = 0.0 if suspects else _clipped(samples, full)
-    cause = f"{said_of_black(share)}, or " if share > CLIPPED else ""
+    black = "" if suspects else black_clipped(_clipped(samples, full))
+    cause = f"{black}, or " if black else ""
     raise InputError(f"{place} do not follow the {n}-step sequence{suspects}: {cause}are they in the manifest's order?")
 
 
@@ -140,29 +139,33 @@ def _clipped(samples: Image, full: float) -> float:
     return float(np.mean(samples[:, strong] == 0)) if np.count_nonzero(strong) >= FEW else 0.0
 
 
-def said_of_black(share: float) -> str:
-    """The cause of many black samples, in words."""
+def black_clipped(share: float) -> str:
+    """The cause of many black samples, in words; empty of few."""
+    if share <= CLIPPED:
+        return ""
     causes = "the camera's black level, a background subtracted or a gamma"
     return f"{100 * share:.0f} % of the samples are 0: is black clipped by {causes}"
 
 
-def suspected(bends: Iterable[Bend], unknown: bool, clipped: float) -> str:
+def suspected(bends: Iterable[Bend], unknown: Iterable[tuple[Fringes, Hidden]], clipped: float) -> str:
     """A cause of phases that contradict each other, by what few steps show of their light, in words; empty as a rule."""
-    if clipped > CLIPPED:
-        return said_of_black(clipped)
-    if unknown or any(bend.most_px > BENT * bend.pitch for bend in bends):
-        return "is light too far from linear for so few steps (a gamma)"
-    return ""
+    if black := black_clipped(clipped):
+        return black
+    waveforms = [part.waveform for part, _ in unknown] + [bend.waveform for bend in bends if bend.most_px > BENT * bend.pitch]
+    if "binary" in waveforms:
+        return "are binary fringes too sharp for so few steps"
+    return "is light too far from linear for so few steps (a gamma)" if waveforms else ""
 
 
 def check_bends(bends: Iterable[Bend], clipped: float, place: str) -> None:
     """Refuse phases that are bent by more than can be undone."""
     for bend in bends:
         if not bend.undone:
-            cause = f" {said_of_black(clipped)}? Else" if clipped > CLIPPED else ""
+            law = "" if bend.gamma is None else f" as by light that goes with level^{bend.gamma:.1f} or more"
+            law, way = (" by harmonics of binary fringes", DEFOCUS) if bend.waveform == "binary" else (law, LINEAR_LIGHT)
+            cause = f" {black}? Else" if (black := black_clipped(clipped)) else ""
             raise InputError(
-                f"{place}: {bend.steps} steps of {bend.pitch:g} px are bent as by light that goes with level^{bend.gamma:.1f} or "
-                f"more, by which phases can't be told:{cause} {LINEAR_LIGHT}"
+                f"{place}: {bend.steps} steps of {bend.pitch:g} px are bent{law}, by which phases can't be told:{cause} {way}"
             )
 
 

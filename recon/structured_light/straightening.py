@@ -45,14 +45,15 @@ def straighten(sets: Sequence[Measured], valid: Mask, length: int) -> Straight:
     for number, (part, fringe) in enumerate(sets):
         if part.steps > phase_bend.MOST_STEPS:
             continue
-        bend = phase_bend.measure(fringe, part.steps, part.pitch, valid)
+        bend = phase_bend.measure(fringe, part, valid)
         if not isinstance(bend, Bend):
             hidden[number] = bend
         else:
             bends[number] = bend
             done[number] = (part, bend.straightened(fringe))
-    if hidden and len(sets) > 1 and (common := _common_gamma(list(done.values()), list(hidden), valid, length)):
-        for number in hidden:
+    bendable = [number for number in hidden if sets[number][0].waveform == "sine"]  # by a gamma
+    if bendable and len(sets) > 1 and (common := _common_gamma(list(done.values()), bendable, valid, length)):
+        for number in bendable:
             part, fringe = sets[number]
             best, *others = (phase_bend.by_gamma(part.steps, gamma) for gamma in common)
             left = max(float(np.std(other[:, 0] - best[:, 0])) for other in others) / np.sqrt(3)  # of anything up to there

@@ -103,6 +103,20 @@ def test_peaks_that_saturate_are_no_gamma(rng, steps):
     assert not any("light isn't linear" in line for line in describe_decoding(patterns, found))
 
 
+@pytest.mark.parametrize(("steps", "blur"), [(3, 0.5), (4, 0.5), (4, 1.0)])
+def test_binary_fringes_are_no_gamma(rng, steps, blur):
+    """Third harmonics of a square wave, undone or too strong for that: the way on is more defocus."""
+    parts = (Fringes(pitch=16, steps=steps, waveform="binary", origin=640.5), GrayCode(pitch=16, bits=7, complementary=True))
+    columns = 639.5 + 0.9 * (np.mgrid[:160, :320][1] - 160.0)
+    images = photograph(patterns_of(parts), {"columns": columns}, rng, light=200, blur=blur)
+    try:
+        found = decode(images, patterns_of(parts))
+        said = [line for line in describe_decoding(patterns_of(parts), found) if line.startswith("linearity")]
+    except InputError as reason:
+        said = [str(reason)]
+    assert len(said) == 1 and "binary fringes" in said[0] and said[0].endswith("defocus the projector more, or take sine fringes")
+
+
 def test_clipped_black_is_named(rng):
     """Of 150 DN 30 subtracted: by the line of the bend with three steps; 100: in place of a wrong order with twelve."""
     patterns, images = seen(3, rng)
