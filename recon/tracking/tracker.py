@@ -143,7 +143,7 @@ class Tracker:
 
     def _explained(self, result: Tracking, now: float, limit: float) -> Tracking:
         """A result without a pose, with the reasons that the last poses know: circles that have left a view, or got too small."""
-        if not self._past or not 0 < now - self._past[-1][0] <= limit or "camera" not in str(result.pose.reason).split(":")[0]:
+        if not self._past or not 0 < now - self._past[-1][0] <= limit or result.pose.reason != views.unseen(result.views):
             return result
         pose = self._predicted(now)
         seen = [views.gone(view, self._expected(k, pose), self.cameras[k].size) for k, view in enumerate(result.views)]
