@@ -28,7 +28,7 @@ Measured = tuple[Fringes, Fringe]
 DARKEST = 4.0  # DN of 255: default of the least modulation
 SMALLEST = 8  # px, an image's shorter side: the extent of the stencil of continuity
 WORST_SIGMA = 0.3  # rad of predicted phase noise: beyond, orders can't be decided
-NOISIER = "is the dark noisier than a linear camera's, as of a gamma"  # where noise is assumed
+NOISIER = "are dark pixels noisier than assumed (a camera with a gamma)"  # where noise is assumed
 LIT_SIGMA = 0.25  # rad: fringes that strong come about by noise in one pixel of 3000
 
 

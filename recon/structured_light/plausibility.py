@@ -343,10 +343,11 @@ def check_pitches(trusted: Mask, valid: Mask, sigma: Image, light: str, place: s
     lit = np.count_nonzero(valid)
     lost = lit - np.count_nonzero(trusted & valid)
     clear = valid & (sigma <= np.median(sigma[valid])) if lit else valid
-    contradicting = np.count_nonzero(clear & ~trusted)
+    contradicting, least_noise = np.count_nonzero(clear & ~trusted), np.count_nonzero(clear)
     cause = f"{light}, or " if light else ""
-    if lost > max(CONTRADICTED * lit, FEW) or contradicting > max(UNEXPLAINED * np.count_nonzero(clear), FEW):
+    if (all_over := lost > max(CONTRADICTED * lit, FEW)) or contradicting > max(UNEXPLAINED * least_noise, FEW):
+        share, where = (lost / lit, "") if all_over else (contradicting / least_noise, " with the least noise")
         raise InputError(
-            f"{place} contradict each other in {100 * lost / lit:.0f} % of the pixels: {cause}are they in the manifest's "
+            f"{place} contradict each other in {100 * share:.0f} % of the pixels{where}: {cause}are they in the manifest's "
             "order, each step taken once, and are the pitches those projected?"
         )

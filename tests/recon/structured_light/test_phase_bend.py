@@ -136,4 +136,4 @@ def test_a_code_that_jumps_is_doubted_with_its_noise_where_that_is_assumed(rng):
         images[[steps + 3, steps + 4]] = images[[steps + 4, steps + 3]]
         with pytest.raises(InputError, match="fringe orders jump") as caught:
             decode(images, patterns)
-        assert ("is the dark noisier" in str(caught.value)) == doubted
+        assert ("are dark pixels noisier" in str(caught.value)) == doubted
