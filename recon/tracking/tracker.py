@@ -74,6 +74,11 @@ class Tracking:
         return min((float(np.linalg.norm(other[:3, 3] - own)) for other in self.others), default=np.inf)
 
 
+def is_beside(apart_mm: float | None) -> bool:
+    """Whether there is a further target, by `Tracking.apart_mm`."""
+    return apart_mm is not None and bool(np.isfinite(apart_mm))
+
+
 @dataclass
 class Tracker:
     """Follows a target through pairs of frames. Its state is the last poses; `forget` clears it.
