@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 DEPTH_MM, MIDDLE_MM, BREADTH_MM = 659.5, (2.8, -2.3), 226.7  # of conf/rig/meza2021.yaml, as `_measured` finds them
 NOISE, FOCAL_PX = 0.01743, 3324.5  # of its cameras: `relative_noise`, and the mean focal length
 GRID = (33, 27)  # places over camera 1's image, across and down
-NEAREST_MM, FARTHEST_MM, STEPS = 50.0, 5000.0, 462  # depths that are looked at, each 1 % behind the one before
+NEAREST, FARTHEST, STEPS = 0.1, 10.0, 462  # depths that are looked at, of camera 1's focus, each 1 % behind the one before
 SHARP_PX = 1.0, 1.0, 5.0  # disc of a point out of focus that halves a depth's weight, of cameras and projector
 POWER = 4  # of a depth's weight: the best ones count
 LEVEL = 0.45  # of a camera's range: the brightness at which its noise is compared
@@ -117,7 +117,7 @@ def _measured(rig: Rig) -> tuple[float, tuple[float, float], float]:
     across, down = (np.linspace(0, length - 1, steps) for length, steps in zip(cameras[0].size, GRID, strict=True))
     rays = cameras[0].rays(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
     rays = rays / rays[:, 2:]
-    depths = np.geomspace(NEAREST_MM, FARTHEST_MM, STEPS)
+    depths = rig.cam1.lens.focus_mm * np.geomspace(NEAREST, FARTHEST, STEPS)
     seen = np.ones((STEPS, len(rays)), bool)
     for camera in cameras[1:]:
         pixels = camera.project(depths[:, None, None] * rays)

@@ -26,6 +26,7 @@ LEAST_CORNERS = 6  # of a ChArUco board: enough for a pose
 LEAST_MARKERS = 4  # that a mirrored image must show before it is called so
 LEAST_SPREAD = 0.5  # of a square: smaller singular value of corners that tell a homography, whichever one is left out
 ASTRAY = 0.25  # of a square, RMS of markers about where the board has them
+TAGS_ASTRAY = 1.0  # of a tag, likewise: a wide lens gives 0.3, a wrong number of columns 20 and more
 ALTERNATING = 0.3  # of the usual step from one square to the next: least one of a whole board
 
 FEWEST_PX = 1.5e6  # pixels of a large image in which a chessboard is looked for first; see `reduced_images`
@@ -95,12 +96,10 @@ def find_aprilgrid(image: Array, board: AprilGrid, full: float) -> Detection:
     grey = _eight_bits(image, full)
     tags, numbers = _tags(grey, board.border_cells)
     if len(numbers) < min(LEAST_MARKERS, board.columns * board.rows):
+        cells = 3 - board.border_cells
         others = {
             MIRRORED: (np.ascontiguousarray(grey[:, ::-1]), board.border_cells),
-            f"tags have a border of {3 - board.border_cells} cells: give the board border_cells: {3 - board.border_cells}": (
-                grey,
-                3 - board.border_cells,
-            ),
+            f"tags have a border of {cells} cells: give the board border_cells: {cells}": (grey, cells),
         }
         for reason, (other, border) in others.items():
             if len(_tags(other, border)[1]) > 2 * len(numbers):
@@ -112,7 +111,7 @@ def find_aprilgrid(image: Array, board: AprilGrid, full: float) -> Detection:
     if known.sum() <= len(known) / 2:
         raise BoardNotFound(f"tag {numbers[~known][0]} isn't on a grid of {several} tags: wrong board size")
     at, rough, points = places[numbers[known]].ravel(), tags[known].reshape(-1, 2), board.points()
-    if not _astray(points[at], rough, board.tag_mm) < ASTRAY:
+    if not _astray(points[at], rough, board.tag_mm) < TAGS_ASTRAY:
         turned = board.columns != board.rows and _fits_exchanged(tags[known], numbers[known], board)
         cause = "rows and columns exchanged?" if turned else "wrong columns, rows or spacing_ratio?"
         raise BoardNotFound(f"tags lie otherwise than on a grid of {several} tags: {cause}")
@@ -164,7 +163,7 @@ def _fits_exchanged(tags: Array, numbers: NDArray[np.int64], board: AprilGrid) -
     """Whether tags : (k, 4, 2) px lie as on a grid that has as many columns as this one has rows."""
     other = board.model_copy(update={"columns": board.rows, "rows": board.columns})
     at = other.corners_of_tags()[numbers].ravel()
-    return _astray(other.points()[at], tags.reshape(-1, 2), board.tag_mm) < ASTRAY
+    return _astray(other.points()[at], tags.reshape(-1, 2), board.tag_mm) < TAGS_ASTRAY
 
 
 def _eight_bits(image: Array, full: float) -> NDArray[np.uint8]:

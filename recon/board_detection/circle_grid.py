@@ -26,7 +26,7 @@ def find_circles(image: Array, board: Circles, full: float) -> Detection:
     """Find the discs of a board and measure their ellipses; see `recon.board_detection.detect.detect`."""
     image = full - image if board.white else image
     looked = reduced(image)
-    rough = looked.full_ellipses(discs.candidates(looked.image, full)) if looked.times > 1 else discs.candidates(image, full)
+    rough = looked.full_ellipses(discs.candidates(looked.image, full))
     cells, steps = _grid(board)
     try:
         assignment = lattice.assign(rough.centre, cells, steps)

@@ -30,10 +30,13 @@ class Usual:
 
     def doubt(self, length_mm: float) -> str | None:
         """A length that there may be, with the units in which it would be a common one; None for any other."""
+        return f"{length_mm:.4g} mm: is it in mm, not in {units}?" if (units := self.units(length_mm)) else None
+
+    def units(self, length_mm: float) -> str:
+        """The units in which a length that there may be would be a common one, in words; empty for any other."""
         if self.common is None or not 0 < length_mm < np.inf or self.common[0] <= length_mm <= self.common[1]:
-            return None
-        units = [name for factor, name in UNITS.items() if self.common[0] <= length_mm * factor <= self.common[1]]
-        return f"{length_mm:.4g} mm: is it in mm, not in {' or '.join(units)}?" if units else None
+            return ""
+        return " or ".join(name for factor, name in UNITS.items() if self.common[0] <= length_mm * factor <= self.common[1])
 
     def is_unusual(self, length_mm: float) -> bool:
         """Whether a file had better state its unit."""

@@ -98,7 +98,7 @@ def describe_board(result: Result, figures: Metrics) -> str:
     if not result.released:
         if result.tolerances.sigmas.any():
             return "taken as designed"
-        return "taken as designed, and exact: no sigma holds its print's errors, unless shape.in_plane_mm does"
+        return "taken as designed and exact: sigma leaves out the errors of its print; shape.in_plane_mm puts them in"
     in_plane, out_of_plane = (shown(figures[f"board_{name}_mm"], ".4f", " mm") for name in ("in_plane", "out_of_plane"))
     return f"differs from its design by {in_plane} in its plane and {out_of_plane} out of it (RMS), which is corrected"
 

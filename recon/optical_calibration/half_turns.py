@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from recon.geometry import board_shape, rigid
@@ -37,8 +38,8 @@ def half_turn(board: Board) -> Turn | None:
         return None
     points = board.points()
     turned = points.min(axis=0) + points.max(axis=0) - points
-    distances = np.linalg.norm(turned[:, None] - points, axis=-1)
-    return distances.argmin(axis=1) if distances.min(axis=1).max() < NEAR * np.ptp(points) else None
+    distances, numbers = KDTree(points).query(turned)
+    return numbers if distances.max() < NEAR * np.ptp(points) else None
 
 
 def turned(observations: Observations, poses: Sequence[int], turn: Turn, devices: Sequence[int] | None = None) -> Observations:

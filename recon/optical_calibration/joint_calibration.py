@@ -155,7 +155,7 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     turn = half_turns.half_turn(board)
     observations, flipped = (observations, {}) if turn is None else half_turns.agreeing(observations, turn)
     shown = sighted_light(sightings)
-    light = plausibility.suspected(shown.bends, bool(shown.unknown), shown.clipped)
+    light = plausibility.suspected(shown.bends, shown.unknown, shown.clipped)
     first = initial_estimate.estimate(observations, light)
     checks.refuse_parallel(observations, first, name)
     seen = [sighting.radii for sighting in sightings if sighting.pixels]

@@ -145,12 +145,13 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
                 f"none {_where(seen, part)}, where distortion is a guess"
             )
         spread = uncertainty.sigma(f"{device}.fx") / camera.matrix[0, 0] if uncertainty else 0.0
-        if doubt := lengths.DEVICES_APART.doubt(lengths.shift(camera.camera_from_world[:3, 3])):
-            found.append(f"{device}: its distance from {WORLD} comes out as {doubt} The board's lengths set it")
+        apart = lengths.shift(camera.camera_from_world[:3, 3])
+        if units := lengths.DEVICES_APART.units(apart):
+            found.append(f"{device}: is {apart:.4g} mm from {WORLD}: was the board's spacing given in {units}?")
         if stretched := stretch(device, camera, spread):
             found.append(stretched)
-        if uncertainty and (sigma := uncertainty.sigma(f"{device}.fx") / camera.matrix[0, 0]) > UNSURE_FOCAL:
-            found.append(f"{device}: focal length is known to {100 * sigma:.2g} % only: more poses, tilted more")
+        if spread > UNSURE_FOCAL:
+            found.append(f"{device}: focal length is known to {100 * spread:.2g} % only: more poses, tilted more")
     return found
 
 
@@ -160,8 +161,8 @@ def stretch(device: str, camera: Camera, sigma: float) -> str | None:
     if abs(aspect - 1) <= max(STRETCHED, SURE * sigma):
         return None
     return (
-        f"{device}: focal lengths fx / fy are {aspect:.2f}, expected 1: is its image stretched, as a display of another "
-        "resolution than the projector's own, or are its pixels no squares?"
+        f"{device}: focal lengths fx / fy are {aspect:.2f}, expected 1: does the display scale the patterns to another "
+        "resolution, or aren't its pixels square (diamond pixels of a DLP)?"
     )
 
 

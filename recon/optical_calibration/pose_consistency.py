@@ -75,11 +75,7 @@ def consistency(
 ) -> Consistency:
     """Compare the poses of an adjustment, made with the same arguments."""
     assert adjusted.calibration.uncertainty is not None
-    problem = Problem(observations, offsets, free, tolerances, released, adjusted.lenses)
-    ways = bends(observations.points)
-    parts = [_of_pose(problem, adjusted, p, ways) for p in range(len(observations.poses))]
-    whole = inverse(sum(information for information, _, _ in parts) + prior_information(problem, adjusted.estimate))
-    carry = whole[: len(problem.names)]
+    parts, whole, carry = _parts(Problem(observations, offsets, free, tolerances, released, adjusted.lenses), adjusted)
     covariances = np.array([carry @ (part - part @ whole @ part) @ carry.T for part, _, _ in parts])
     scale = 1 / np.sqrt(np.maximum(np.diag(covariances.sum(axis=0)), 1e-300))
     values, vectors = np.linalg.eigh(scale[:, None] * covariances.sum(axis=0) * scale)
@@ -116,10 +112,16 @@ def added(
     """Covariance : (g, g) that causes, found in these and other poses, add to that of an adjustment's devices."""
     if not causes.bend_mm and causes.factor == 1:
         return np.zeros_like(causes.covariance)
-    problem = Problem(observations, offsets, free, tolerances, released, adjusted.lenses)
+    parts, _, carry = _parts(Problem(observations, offsets, free, tolerances, released, adjusted.lenses), adjusted)
+    return _added(parts, carry, causes.bend_mm, causes.factor**2)
+
+
+def _parts(problem: Problem, adjusted: Adjustment) -> tuple[list[tuple[Array, Array, Array]], Array, Array]:
+    """What each pose has for all unknowns, as of `_of_pose`; the covariance of these; and its rows of the parameters."""
+    observations = problem.observations
     parts = [_of_pose(problem, adjusted, p, bends(observations.points)) for p in range(len(observations.poses))]
     whole = inverse(sum(information for information, _, _ in parts) + prior_information(problem, adjusted.estimate))
-    return _added(parts, whole[: len(problem.names)], causes.bend_mm, causes.factor**2)
+    return parts, whole, whole[: len(problem.names)]
 
 
 def _added(parts: Sequence[tuple[Array, Array, Array]], carry: Array, bend: float, factor: float) -> Array:

@@ -28,7 +28,7 @@ Measured = tuple[Fringes, Fringe]
 DARKEST = 4.0  # DN of 255: default of the least modulation
 SMALLEST = 8  # px, an image's shorter side: the extent of the stencil of continuity
 WORST_SIGMA = 0.3  # rad of predicted phase noise: beyond, orders can't be decided
-NOISIER = "is the dark noisier than a linear camera's, as of a gamma"  # where noise is assumed
+NOISIER = "are dark pixels noisier than assumed (a camera with a gamma)"  # where noise is assumed
 LIT_SIGMA = 0.25  # rad: fringes that strong come about by noise in one pixel of 3000
 
 
@@ -213,7 +213,7 @@ def _from_fringes(shots: _Shots, axis: Axis) -> _AxisMap:
     linearity = Linearity(bends, unknown, clipped)
     plausibility.check_bends(bends, clipped, f"{shots.name}: fringes of {axis}")
     part, fringe = min(sets, key=lambda pair: pair[0].pitch)
-    light = plausibility.suspected(bends, bool(unknown), clipped)
+    light = plausibility.suspected(bends, unknown, clipped)
     orders, unreachable, counts = _orders(shots, axis, sets, status == Status.OK, light)
     scale = Scale(float(part.zero(length)), part.pitch, length)
     x, sigma = _coordinates(fringe, orders, unreachable, status, scale)

@@ -25,14 +25,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.compiled import kernel
+from recon.model.patterns import Fringes
 from recon.structured_light.phase import Fringe
 from recon.threads import in_threads
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Waveform = Literal["sine", "binary"]
 Hidden = Literal["few", "fine"]  # why fringes don't show their bend: too few whole periods, or periods of too few pixels
 
+DEFOCUS = "defocus the projector more, or take sine fringes"
 LINEAR_LIGHT = "set projector and camera to linear, project patterns of linearise_gamma, or take 5 steps or more"
 
 MOST_STEPS = 4  # from five on a gamma bends the phase by less than a hundredth of a radian
@@ -41,6 +44,7 @@ ALONG = 8  # samples a period along the fringes, or where they are as wide as th
 WINDOW = 0.5  # periods, standard deviation of a Gaussian
 PERIODS = 2.5  # across a window's reach: an image of fewer shows no whole one
 WHOLE = 0.7  # of a window that must be known
+CUT_OFF = 0.005  # of a window that may be saturated
 SHARED = 9  # windows that show the same, with one standard deviation from one to the next
 FEWEST = 30  # windows
 FINEST = 0.75  # of a whole turn from pixel to pixel: faster phasors are aliased
@@ -60,14 +64,10 @@ class Bend:
     table: Array  # (TABLE, 2) of true less seen phase, rad, and the slope of true by seen, over the phase seen, one bend long
     steps: int
     pitch: float  # projector px
-    sigma: float  # rad, what may be left, a standard deviation over all phases; 0 where it isn't known
-    gamma: float  # exponent of a law of light that bends as much; of blurred fringes it is nearer to 1 than the projector's
+    sigma: float  # rad, what may be left, a standard deviation over all phases
+    gamma: float | None  # of a law of light that bends as much; of blurred fringes nearer to 1 than the projector's; None of none
     undone: bool = True  # False of more than can be undone
-
-    @property
-    def straight(self) -> bool:
-        """Whether nothing was undone."""
-        return not self.table[:, 0].any()
+    waveform: Waveform = "sine"  # of binary fringes it is their own harmonics that bend
 
     @property
     def most_px(self) -> float:
@@ -129,21 +129,23 @@ def by_gamma(steps: int, gamma: float) -> Array:
     return table(steps, phase + bend, phase)
 
 
-def gamma_of(steps: int, c: float) -> float:
-    """The gamma whose harmonic N - 1 is c of the fundamental: of four steps, the one from 1.5 up."""
+def gamma_of(steps: int, c: float) -> float | None:
+    """The gamma whose harmonic N - 1 is c of the fundamental: of four steps, the one from 1.5 up; None if there is none."""
     if steps == 3:
         return (1 + 2 * c) / (1 - c)
     gammas = np.geomspace(1.45, 5, 400)
-    return float(np.interp(c, (gammas - 1) * (gammas - 2) / ((gammas + 2) * (gammas + 3)), gammas))
+    harmonics = (gammas - 1) * (gammas - 2) / ((gammas + 2) * (gammas + 3))
+    return float(np.interp(c, harmonics, gammas)) if c >= harmonics[0] else None
 
 
-def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Hidden:
+def measure(fringe: Fringe, part: Fringes, valid: Mask) -> Bend | Hidden:
     """Measure the bend of a set of fringes on windows of whole periods.
 
     Parameters
     ----------
     fringe : Fringe
-    steps, pitch : of its sequence; projector px
+    part : Fringes
+        Their sequence.
     valid : (h, w) bool
         Pixels that count.
 
@@ -152,6 +154,7 @@ def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Hid
     Bend, or the reason why there is none to see
         With a table of no bend if none is sure.
     """
+    steps = part.steps
     turns = [_turn(fringe.phase, valid, axis) for axis in (0, 1)]
     speed = float(np.hypot(*turns))
     if steps * speed >= FINEST * 2 * np.pi:
@@ -165,34 +168,37 @@ def measure(fringe: Fringe, steps: int, pitch: float, valid: Mask) -> Bend | Hid
     strides = [int(np.clip(2 * np.pi / max(turn, speed / 4) / (ALONG * steps), 1, longest)) for turn in turns]
     strides = [stride if 2 * turn < speed else 1 for stride, turn in zip(strides, turns, strict=True)]
     thin = np.s_[strides[0] // 2 :: strides[0], strides[1] // 2 :: strides[1]]
-    seen, known, width = fringe.phase[thin], valid[thin], WINDOW * period / np.array(strides)
+    seen, known, saturated = fringe.phase[thin], valid[thin], fringe.saturated[thin]
+    width = WINDOW * period / np.array(strides)
     twice = 2 * steps * speed < FINEST * 2 * np.pi
     c, e, limit = 0.0, 0.0, STRONGEST[steps]
     for _ in range(ROUNDS):
-        windows = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, width, steps)
+        windows = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, saturated, width, steps)
         if windows.shape[1] < FEWEST:
             return "few"
         once, second = np.median(windows.real, axis=1)
         c, e = c + 2 * once / steps, e + second / steps if twice else 0.0
         if abs(c) > limit:
             c = float(np.copysign(limit, c))
-            return Bend(by_harmonics(steps, c, 0.0), steps, pitch, np.inf, float(gamma_of(steps, c)), undone=False)
+            return Bend(by_harmonics(steps, c, 0.0), steps, part.pitch, np.inf, gamma_of(steps, c), False, part.waveform)
         if 2 * abs(once) / steps < SETTLED:
             break
-    return _judged(windows, steps, pitch, c, e if twice else 0.0)
+    return _judged(windows, part, c, e if twice else 0.0)
 
 
-def _judged(windows: NDArray[np.complex128], steps: int, pitch: float, c: float, e: float) -> Bend:
+def _judged(windows: NDArray[np.complex128], part: Fringes, c: float, e: float) -> Bend:
     """The bend, or none where it isn't sure, by windows : (2, w).
 
     Shapes and noise scatter their real and imaginary parts alike; real parts scatter more where the bend varies, as with blur.
     """
+    steps = part.steps
     real, imaginary = _scatter(windows.real), _scatter(windows.imag)
     unsure = 1.25 * real * np.sqrt(SHARED / windows.shape[1]) * np.array([2, 1]) / steps  # of c and e, rad
     varies = np.sqrt(np.maximum(real**2 - imaginary**2, 0)) * np.array([2, 1]) / steps
     c, e = (value if abs(value) > SURE * error else 0.0 for value, error in zip((c, e), unsure, strict=True))
     left = float(np.sqrt((unsure**2).sum() + (varies[0] ** 2 if c else 0.0)) / np.sqrt(2))
-    return Bend(by_harmonics(steps, c, e), steps, pitch, left, float(gamma_of(steps, c)) if c else 1.0)
+    gamma = gamma_of(steps, c) if c else 1.0
+    return Bend(by_harmonics(steps, c, e), steps, part.pitch, left, gamma, waveform=part.waveform)
 
 
 def _scatter(values: Array) -> Array:
@@ -220,8 +226,11 @@ def straight(seen: Image, bend: Array, steps: int) -> Array:
     return seen + np.interp((seen + np.pi) % turn, turn * np.arange(TABLE + 1) / TABLE, np.append(bend[:, 0], bend[0, 0]))
 
 
-def _windows(phase: Array, known: Mask, width: Array, steps: int) -> NDArray[np.complex128]:
-    """Means of `exp(i N phase)` and `exp(2 i N phase)` over the windows in which enough is known : (2, w)."""
+def _windows(phase: Array, known: Mask, saturated: Mask, width: Array, steps: int) -> NDArray[np.complex128]:
+    """Means of `exp(i N phase)` and `exp(2 i N phase)` over the windows in which enough is known : (2, w).
+
+    Peaks that saturate are missing N times a period, as the harmonic is that is looked for.
+    """
     down, across = np.maximum(np.rint(width), 1).astype(int)
 
     def means(image: NDArray) -> Image:
@@ -231,6 +240,6 @@ def _windows(phase: Array, known: Mask, width: Array, steps: int) -> NDArray[np.
         return blurred[down // 2 :: down, across // 2 :: across]
 
     share = means(known)
-    whole = share > WHOLE
+    whole = (share > WHOLE) & (means(saturated) < CUT_OFF)
     angles = [k * steps * phase for k in (1, 2)]
     return np.array([(means(known * np.cos(a)) + 1j * means(known * np.sin(a)))[whole] / share[whole] for a in angles])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from recon.errors import InputError
 from recon.model.patterns import Fringes, GrayCode
 from recon.structured_light.phase import Fringe, pseudo_inverse, sample_pixels
-from recon.structured_light.phase_bend import LINEAR_LIGHT, Bend
+from recon.structured_light.phase_bend import DEFOCUS, LINEAR_LIGHT, Bend, Hidden
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -18,12 +18,14 @@ CHECK_SAMPLES = 10_000  # pixels of a check
 LIT_SHARE = 0.002  # share of the image that must carry fringes
 SATURATED_SHARE = 0.5  # share of the lit image that may be saturated
 HARMONIC_SHARE = 0.08  # of the modulation, in the high harmonics: beyond, it is no N-step sequence
-AROUND = 0.25  # of the RMS phasor: a larger mean is of phases that are not seen all around
-EACH_WAY = 0.02  # share of the phasors in each eighth of the circle, where phases are seen all around
-FLAT = 0.05  # share of short phasors, of a quarter of the RMS, where an ellipse is nearly a line: 0.1 of one
-SLIM = 0.25  # of the power, in the mean square of the phasors: 1 of a doubled step, 0.03 of a shift off by 5 % of a step
+EACH_WAY = 0.01  # share of the pixels in each eighth of the circle, where phases are seen all around
+SLIM = (
+    0.1  # of the contrast's square, in its second harmonic around the circle: 1 of a line, 0.03 of a shift off by 5 % of a step
+)
+BLACK = 0.01  # of the samples: the rest is brighter than black
 SPARSE_STEPS = 7  # at most, of which neighbours differ by a third of the swing; more have harmonics that show errors
-ALIKE = 0.15  # of the swing: a median difference of two images that noise makes; share of the pixels of either phase
+ALIKE = 0.15  # of the swing: a median difference of two images that noise makes; share of the pixels of either phase; of the
+# largest difference of neighbours, the RMS of two that are one: over all phases it is 0.8
 STRONG = 0.15  # of full scale: the swing of fringes that show whether black is clipped
 CLIPPED = 0.12  # share of black samples in these; of dark fringes that just reach black, and of rounding, it is 0.07
 BENT = 0.02  # of a pitch, by which light bends phases, before it is suspected
@@ -60,35 +62,37 @@ def check_fringes(images: NDArray, part: Fringes, fringe: Fringe, least: float, 
         raise InputError(f"{place} are saturated in {share:.0f} % of the lit pixels, expected under half: shorten the exposure")
     useful = (swing > 2 * least) & (samples.max(axis=0) < full)
     if useful.any():
-        _check_steps(samples[:, useful], part, full, place, start)
+        _check_steps(samples[:, useful], beside[:, useful], part, full, place, start)
         _check_order(samples[:, useful], beside[:, useful], part, full, place, start)
 
 
-def _check_steps(samples: Image, part: Fringes, full: float, place: str, start: int) -> None:
-    """Refuse a step that was taken twice, is late or far off: phasors lie on a line or a slim ellipse, not around a circle.
+def _check_steps(samples: Image, beside: Image, part: Fringes, full: float, place: str, start: int) -> None:
+    """Refuse a step that was taken twice, is late or far off: contrasts lie on a line or a slim ellipse, not around a circle.
 
-    Three steps leave no residual by which an error shows, but phases all around show it. Of a wave so wide that few phases are
-    seen, two images that are one: a pixel of theirs is of one of two phases.
+    Three steps leave no residual by which an error shows, but phases all around show it, in contrasts over eighths of the circle
+    that weigh the same: a bright object on something dark is no ellipse. Of a wave so wide that few phases are seen, two images
+    that are one: a pixel is of one of two phases, and a difference is noise, which products with the pixels beside don't show.
     """
     if part.steps > SPARSE_STEPS or samples.shape[1] < FEW:
         return
-    swing = np.median(np.ptp(samples, axis=0))
+    level, c, s = pseudo_inverse(part.shifts) @ samples
+    swing = np.ptp(samples, axis=0)
+    level = np.maximum(level - np.quantile(samples, BLACK), swing / 2)
     pairs = list(itertools.combinations(range(part.steps), 2))
-    differences = [float(np.median(np.abs(samples[a] - samples[b]))) for a, b in pairs]
+    differences = [float(np.median(np.abs(samples[a] - samples[b]) / swing)) for a, b in pairs]
     a, b = pairs[int(np.argmin(differences))]
-    others = [samples[k] - samples[a] for k in range(part.steps) if k not in (a, b)]
-    both = max(min(np.mean(other > swing / 4), np.mean(other < -swing / 4)) for other in others)
-    doubled = min(differences) < ALIKE * swing and both > ALIKE
-    _, c, s = pseudo_inverse(part.shifts) @ samples
-    phasor = c + 1j * s
-    power = float(np.mean(np.abs(phasor) ** 2))
-    sectors = np.bincount(((np.angle(phasor) + np.pi) * (4 / np.pi)).astype(int) % 8, minlength=8) / phasor.size
-    flat = np.mean(np.abs(phasor) < np.sqrt(power) / 4)
-    around = abs(np.mean(phasor)) < AROUND * np.sqrt(power) and (sectors.min() > EACH_WAY or flat > FLAT)
-    if doubled or (around and abs(np.mean(phasor**2)) > SLIM * power):
+    others = [(samples[k] - samples[a]) / swing for k in range(part.steps) if k not in (a, b)]
+    both = max(min(np.mean(other > 1 / 4), np.mean(other < -1 / 4)) for other in others)
+    square = np.mean((samples[a] - samples[b]) * (beside[a] - beside[b]) / level**2) / np.mean((swing / level) ** 2)
+    doubled = min(differences) < ALIKE and square < (ALIKE * np.sin(np.pi / part.steps)) ** 2 and both > ALIKE
+    contrast = (c + 1j * s) / level
+    sector = ((np.angle(contrast) + np.pi) * (4 / np.pi)).astype(int) % 8
+    number = np.bincount(sector, minlength=8)
+    power = np.bincount(sector, np.abs(contrast) ** 2, 8) / np.maximum(number, 1)
+    slim = abs(power @ np.exp(0.5j * np.pi * np.arange(8))) > SLIM * power.sum()
+    if doubled or (slim and number.min() > EACH_WAY * number.sum()):
         cause = f"images {start + a} and {start + b} show the same" if doubled else "the steps are uneven"
-        share = _clipped(samples, full)
-        black = f" {said_of_black(share)}? Or" if share > CLIPPED else ""
+        black = f" {clip}? Or" if (clip := black_clipped(_clipped(samples, full))) else ""
         raise InputError(
             f"{place} do not follow the {part.steps}-step sequence, {cause}:{black} was one taken twice, or before the projector "
             "had changed, or with another exposure?"
@@ -120,8 +124,8 @@ def _check_order(samples: Image, beside: Image, part: Fringes, full: float, plac
         order[[a, b]] = b, a
         if (left := strange(order)) < best:
             best, suspects = left, f", {start + a} and {start + b} look exchanged"
-    share = 0.0 if suspects else _clipped(samples, full)
-    cause = f"{said_of_black(share)}, or " if share > CLIPPED else ""
+    black = "" if suspects else black_clipped(_clipped(samples, full))
+    cause = f"{black}, or " if black else ""
     raise InputError(f"{place} do not follow the {n}-step sequence{suspects}: {cause}are they in the manifest's order?")
 
 
@@ -135,29 +139,33 @@ def _clipped(samples: Image, full: float) -> float:
     return float(np.mean(samples[:, strong] == 0)) if np.count_nonzero(strong) >= FEW else 0.0
 
 
-def said_of_black(share: float) -> str:
-    """The cause of many black samples, in words."""
+def black_clipped(share: float) -> str:
+    """The cause of many black samples, in words; empty of few."""
+    if share <= CLIPPED:
+        return ""
     causes = "the camera's black level, a background subtracted or a gamma"
     return f"{100 * share:.0f} % of the samples are 0: is black clipped by {causes}"
 
 
-def suspected(bends: Iterable[Bend], unknown: bool, clipped: float) -> str:
+def suspected(bends: Iterable[Bend], unknown: Iterable[tuple[Fringes, Hidden]], clipped: float) -> str:
     """A cause of phases that contradict each other, by what few steps show of their light, in words; empty as a rule."""
-    if clipped > CLIPPED:
-        return said_of_black(clipped)
-    if unknown or any(bend.most_px > BENT * bend.pitch for bend in bends):
-        return "is light too far from linear for so few steps (a gamma)"
-    return ""
+    if black := black_clipped(clipped):
+        return black
+    waveforms = [part.waveform for part, _ in unknown] + [bend.waveform for bend in bends if bend.most_px > BENT * bend.pitch]
+    if "binary" in waveforms:
+        return "are binary fringes too sharp for so few steps"
+    return "is light too far from linear for so few steps (a gamma)" if waveforms else ""
 
 
 def check_bends(bends: Iterable[Bend], clipped: float, place: str) -> None:
     """Refuse phases that are bent by more than can be undone."""
     for bend in bends:
         if not bend.undone:
-            cause = f" {said_of_black(clipped)}? Else" if clipped > CLIPPED else ""
+            law = "" if bend.gamma is None else f" as by light that goes with level^{bend.gamma:.1f} or more"
+            law, way = (" by harmonics of binary fringes", DEFOCUS) if bend.waveform == "binary" else (law, LINEAR_LIGHT)
+            cause = f" {black}? Else" if (black := black_clipped(clipped)) else ""
             raise InputError(
-                f"{place}: {bend.steps} steps of {bend.pitch:g} px are bent as by light that goes with level^{bend.gamma:.1f} or "
-                f"more, by which phases can't be told:{cause} {LINEAR_LIGHT}"
+                f"{place}: {bend.steps} steps of {bend.pitch:g} px are bent{law}, by which phases can't be told:{cause} {way}"
             )
 
 
@@ -335,10 +343,11 @@ def check_pitches(trusted: Mask, valid: Mask, sigma: Image, light: str, place: s
     lit = np.count_nonzero(valid)
     lost = lit - np.count_nonzero(trusted & valid)
     clear = valid & (sigma <= np.median(sigma[valid])) if lit else valid
-    contradicting = np.count_nonzero(clear & ~trusted)
+    contradicting, least_noise = np.count_nonzero(clear & ~trusted), np.count_nonzero(clear)
     cause = f"{light}, or " if light else ""
-    if lost > max(CONTRADICTED * lit, FEW) or contradicting > max(UNEXPLAINED * np.count_nonzero(clear), FEW):
+    if (all_over := lost > max(CONTRADICTED * lit, FEW)) or contradicting > max(UNEXPLAINED * least_noise, FEW):
+        share, where = (lost / lit, "") if all_over else (contradicting / least_noise, " with the least noise")
         raise InputError(
-            f"{place} contradict each other in {100 * lost / lit:.0f} % of the pixels: {cause}are they in the manifest's "
+            f"{place} contradict each other in {100 * share:.0f} % of the pixels{where}: {cause}are they in the manifest's "
             "order, each step taken once, and are the pitches those projected?"
         )

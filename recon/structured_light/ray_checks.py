@@ -34,6 +34,9 @@ class RayLimits:
     fewest: int = 200  # points that decide
 
 
+LIMITS = RayLimits()
+
+
 def check(
     found: ProjectorMap,
     raw: PointMap,
@@ -41,7 +44,7 @@ def check(
     projector: Camera,
     name: str,
     implausible: Implausible = "refuse",
-    limits: RayLimits | None = None,
+    limits: RayLimits = LIMITS,
 ) -> None:
     """Refuse a map whose rays make no scene that camera and projector both see, or warn of it where it is to be taken.
 
@@ -58,7 +61,7 @@ def check(
     InputError
         If more points than `limits` allow are lit from behind, lie behind a device, or outside of the projector's image.
     """
-    if seen := fault(found, raw, camera, projector, limits or RayLimits()):
+    if seen := _fault(found, raw, camera, projector, limits):
         doubt(name, seen, implausible)
 
 
@@ -69,9 +72,11 @@ def check_beside(
     beside: Camera,
     name: str,
     implausible: Implausible = "refuse",
-    limits: RayLimits | None = None,
+    limits: RayLimits = LIMITS,
 ) -> float:
     """Refuse a map whose points lie where a second camera sees other columns, or rows, or warn of it where it is to be taken.
+
+    Of points that turn their backs to the second camera it sees what hides them.
 
     Parameters
     ----------
@@ -91,14 +96,13 @@ def check_beside(
     InputError
         If more points than `limits` allow contradict each other.
     """
-    limits = limits or RayLimits()
-    thin = np.s_[:: limits.every, :: limits.every]
     first, second = (m.rows if found.columns is None or other.columns is None else m.columns for m in (found, other))
     if first is None or second is None:
         return np.nan
-    points, expected = raw.points[thin].reshape(-1, 3).astype(float), first[thin].ravel()
-    known = np.isfinite(points[:, 0]) & np.isfinite(expected)
-    points, expected = points[known], expected[known]
+    points, normals = _normals(raw, limits)
+    expected = first[:: limits.every, :: limits.every][: points.shape[0], : points.shape[1]]
+    facing = (np.sum(normals * (beside.centre - points), axis=-1) > 0) & np.isfinite(expected)
+    points, expected = points[facing], expected[facing]
     with np.errstate(all="ignore"):
         pixels = beside.project(points)
     height, width = second.shape
@@ -117,13 +121,13 @@ def check_beside(
     return 1 - share
 
 
-def fault(found: ProjectorMap, raw: PointMap, camera: Camera, projector: Camera, limits: RayLimits) -> str | None:
+def _fault(found: ProjectorMap, raw: PointMap, camera: Camera, projector: Camera, limits: RayLimits) -> str | None:
     """The first thing that no scene shows to both devices, with its likely cause; None as a rule, and of few pixels."""
     axes = [axis for axis in (found.columns, found.rows) if axis is not None]
     decoded, solved = np.isfinite(np.stack(axes)).any(axis=0), np.isfinite(raw.points[..., 0])
     if np.count_nonzero(decoded) < limits.fewest * limits.every**2:
         return None
-    if (share := lit_from_behind(raw, camera, projector, limits)) > limits.behind:
+    if (share := _lit_from_behind(raw, camera, projector, limits)) > limits.behind:
         return (
             f"the projector would light the back of what the camera sees in {100 * share:.0f} % of the points: are the "
             "camera's images mirrored or turned by 180 degrees, the patterns projected mirrored, or is it another calibration?"
@@ -149,13 +153,18 @@ def fault(found: ProjectorMap, raw: PointMap, camera: Camera, projector: Camera,
     return None
 
 
-def lit_from_behind(raw: PointMap, camera: Camera, projector: Camera, limits: RayLimits) -> float:
+def _lit_from_behind(raw: PointMap, camera: Camera, projector: Camera, limits: RayLimits) -> float:
     """Share of the points whose surface faces one device and turns its back to the other; 0 of too few."""
+    points, normals = _normals(raw, limits)
+    facing = [np.sum(normals * (device.centre - points), axis=-1) for device in (camera, projector)]
+    known = np.isfinite(facing[0])
+    return float(np.mean((facing[0] * facing[1])[known] < 0)) if np.count_nonzero(known) >= limits.fewest else 0.0
+
+
+def _normals(raw: PointMap, limits: RayLimits) -> tuple[Array, Array]:
+    """Every so many points, and normals that face the camera, of any length : (h, w, 3) each; NaN where unknown."""
     points, reach = raw.points, limits.reach
     corner = points[: -reach : limits.every, : -reach : limits.every].astype(float)
     across = points[: -reach : limits.every, reach :: limits.every][: len(corner), : corner.shape[1]] - corner
     down = points[reach :: limits.every, : -reach : limits.every][: len(corner), : corner.shape[1]] - corner
-    normal = np.cross(across, down)
-    facing = [np.sum(normal * (device.centre - corner), axis=-1) for device in (camera, projector)]
-    known = np.isfinite(facing[0])
-    return float(np.mean((facing[0] * facing[1])[known] < 0)) if np.count_nonzero(known) >= limits.fewest else 0.0
+    return corner, np.cross(down, across)

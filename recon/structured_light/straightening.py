@@ -45,24 +45,30 @@ def straighten(sets: Sequence[Measured], valid: Mask, length: int) -> Straight:
     for number, (part, fringe) in enumerate(sets):
         if part.steps > phase_bend.MOST_STEPS:
             continue
-        bend = phase_bend.measure(fringe, part.steps, part.pitch, valid)
+        bend = phase_bend.measure(fringe, part, valid)
         if not isinstance(bend, Bend):
             hidden[number] = bend
         else:
             bends[number] = bend
             done[number] = (part, bend.straightened(fringe))
-    if hidden and len(sets) > 1 and (gamma := _common_gamma(list(done.values()), list(hidden), valid, length)):
-        for number in hidden:
+    bendable = [number for number in hidden if sets[number][0].waveform == "sine"]  # by a gamma
+    if bendable and len(sets) > 1 and (common := _common_gamma(list(done.values()), bendable, valid, length)):
+        for number in bendable:
             part, fringe = sets[number]
-            bends[number] = Bend(phase_bend.by_gamma(part.steps, gamma), part.steps, part.pitch, 0.0, gamma)
+            best, *others = (phase_bend.by_gamma(part.steps, gamma) for gamma in common)
+            left = max(float(np.std(other[:, 0] - best[:, 0])) for other in others) / np.sqrt(3)  # of anything up to there
+            bends[number] = Bend(best, part.steps, part.pitch, float(left), common[0])
             done[number] = (part, bends[number].straightened(fringe))
     return Straight(
         list(done.values()), tuple(bends.values()), tuple((sets[k][0], why) for k, why in hidden.items() if k not in bends)
     )
 
 
-def _common_gamma(sets: Sequence[Measured], hidden: Sequence[int], valid: Mask, length: int) -> float | None:
-    """The gamma by which sets that hide their bend, by their numbers, agree best with all others; None if noise hides it."""
+def _common_gamma(sets: Sequence[Measured], hidden: Sequence[int], valid: Mask, length: int) -> tuple[float, float, float] | None:
+    """The gamma by which sets that hide their bend, by their numbers, agree best with all others; None if noise hides it.
+
+    With the least and the largest that agree as well.
+    """
     every = max(1, int(np.sqrt(valid.size / SAMPLES)))
     thin = np.s_[every // 2 :: every, every // 2 :: every]
     use = valid[thin]
@@ -84,11 +90,13 @@ def _common_gamma(sets: Sequence[Measured], hidden: Sequence[int], valid: Mask, 
         return None
     k = int(np.argmax(found))
     near = np.geomspace(GAMMAS[max(k - 1, 0)], GAMMAS[min(k + 1, len(GAMMAS) - 1)], FINER)
-    better = [agreement(gamma) for gamma in near]
-    best = max(better)
+    tried, agreements = np.array([1.0, *GAMMAS, *near]), np.array([usual, *found, *map(agreement, near)])
+    best = agreements.max()
     if best < LEAST:
         return None
-    return float(near[int(np.argmax(better))]) if best > usual + AGREES else 1.0
+    as_well = tried[agreements > best - AGREES]
+    gamma = tried[agreements.argmax()] if best > usual + AGREES else 1.0
+    return float(gamma), float(as_well.min()), float(as_well.max())
 
 
 def _agreement(sets: Sequence[Measured], length: int) -> float:

@@ -9,8 +9,8 @@ from recon.files.metrics import Metrics
 from recon.geometry.camera import Camera
 from recon.model.patterns import Patterns
 from recon.structured_light.decode import Linearity, ProjectorMap, Status
-from recon.structured_light.phase_bend import LINEAR_LIGHT, Hidden
-from recon.structured_light.plausibility import CLIPPED, said_of_black
+from recon.structured_light.phase_bend import DEFOCUS, LINEAR_LIGHT, Hidden
+from recon.structured_light.plausibility import black_clipped
 from recon.structured_light.triangulate import PointMap
 
 ADVICE = {
@@ -21,7 +21,7 @@ ADVICE = {
     Status.OUTSIDE: "out of the projector's image: check that the patterns are those projected",
 }
 HIDDEN: dict[Hidden, str] = {
-    "few": "which too few periods are seen to show",
+    "few": "which too few periods are seen to show, saturated ones apart",
     "fine": "which periods of so few camera pixels don't show",
 }
 BENT_PX = 0.05  # projector px by which phases may be bent before it is said
@@ -81,19 +81,22 @@ def describe_decoding(patterns: Patterns, found: ProjectorMap) -> Iterator[str]:
 
 def bent(linearity: Linearity) -> Iterator[str]:
     """Warnings of phases that light bends which isn't linear: of those that were straightened, and those that don't show it."""
+    black = f" ({clip}?)" if (clip := black_clipped(linearity.clipped)) else ""
     for bend in linearity.bends:
         if bend.most_px > BENT_PX:
-            law = f", it goes with level^{bend.gamma:.1f} or so" if bend.steps == FEWEST_STEPS else ""
-            law += f" ({said_of_black(linearity.clipped)}?)" if linearity.clipped > CLIPPED else ""
-            left = f"to {bend.left_px:.3f} px" if bend.sigma else "by what other fringes show"
+            law = f", it goes with level^{bend.gamma:.1f} or so" if bend.steps == FEWEST_STEPS and bend.gamma else ""
+            cause, way = f"light isn't linear{law}{black}", LINEAR_LIGHT
+            if bend.waveform == "binary":
+                cause, way = "binary fringes are no sines yet", DEFOCUS
             yield (
-                f"linearity   light isn't linear{law}: {bend.steps} steps of {bend.pitch:g} px were bent by up to "
-                f"{bend.most_px:.2f} px, which is undone {left}; {LINEAR_LIGHT}"
+                f"linearity   {cause}: {bend.steps} steps of {bend.pitch:g} px were bent by up to "
+                f"{bend.most_px:.2f} px, which is undone to {bend.left_px:.3f} px; {way}"
             )
     for part, why in linearity.unknown:
+        cause, way = ("harmonics of binary fringes", DEFOCUS) if part.waveform == "binary" else ("a gamma", LINEAR_LIGHT)
         yield (
-            f"linearity   {part.steps} steps of {part.pitch:g} px would be bent by a gamma, {HIDDEN[why]}; it isn't in "
-            f"sigma: {LINEAR_LIGHT}"
+            f"linearity   {part.steps} steps of {part.pitch:g} px would be bent by {cause}, {HIDDEN[why]}; it isn't in "
+            f"sigma: {way}"
         )
 
 

@@ -108,9 +108,8 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera, 
 
 def _check_devices(found: ProjectorMap, camera: Camera, projector: Camera) -> None:
     """Refuse a map of another camera's images, or of patterns of another size than the projector's."""
-    if not all(hasattr(found, name) for name in ("columns", "rows", "sigma_columns", "sigma_rows")):
-        raise InputError(f"triangulate: projector_map: expected what decode makes of images, found {arguments.described(found)}")
-    taken_by, size = getattr(found, "camera", ""), getattr(found, "projector_size", None)
+    arguments.of_kind("triangulate: projector_map", found, ProjectorMap, way="sonotwin.decode makes one of images")
+    taken_by, size = found.camera, found.projector_size
     if taken_by and camera.name and taken_by != camera.name:
         raise InputError(f"triangulate: camera: expected {taken_by}, which took the images, found {camera.name}")
     if size is not None and size != projector.size:

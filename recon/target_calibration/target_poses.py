@@ -13,7 +13,7 @@ from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.tracking.pose_fit import Sighting
-from recon.tracking.tracker import Tracking
+from recon.tracking.tracker import Tracking, is_beside
 
 Array = NDArray[np.float64]
 
@@ -43,8 +43,7 @@ class Collected:
     def told(self) -> str:
         """Numbers of pairs by their fault, and a second target, to be added to a message."""
         faults = "".join(f", {count} pairs {fault}" for fault, count in self.faults.items())
-        two = any(one is not None and np.isfinite(one) for one in self.apart_mm)
-        return faults + (", and a second target of this design: cover it" if two else "")
+        return faults + (", and a second target of this design: cover it" if any(map(is_beside, self.apart_mm)) else "")
 
 
 def collect(tracked: Iterable[Tracking], cameras: tuple[Camera, Camera]) -> Collected:

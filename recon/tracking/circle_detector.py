@@ -58,9 +58,6 @@ class Window(NamedTuple):
 
     def back(self, points: Array) -> Array:
         """Places : (n, 2) px of the frame, of those in the window at the size of FRAME."""
-        return points if self.scale == 1 and not (self.left or self.top) else self._back(points)
-
-    def _back(self, points: Array) -> Array:
         return (points + 0.5) / self.scale - 0.5 + [self.left, self.top]
 
 

@@ -68,15 +68,12 @@ def patches(image: NDArray, points: Array, step: float = 1) -> Patches:
 
 def _magnified(image: NDArray, corners: Array, step: float) -> NDArray[np.float32]:
     """Patches of which several pixels lie within one of the image, between which light is interpolated."""
-    most = np.array(image.shape[::-1]) - 1
-    places = corners[:, :, None] + (step - 1) / 2 + step * np.arange(PATCH)
-    lower = np.floor(places)
-    share = (places - lower).astype(np.float32)
-    near, far = (np.clip(lower + k, 0, most[:, None]).astype(np.int64) for k in (0, 1))
-    made = np.zeros((len(corners), PATCH, PATCH), np.float32)
-    for columns, across in ((near[:, 0], 1 - share[:, 0]), (far[:, 0], share[:, 0])):
-        for rows, down in ((near[:, 1], 1 - share[:, 1]), (far[:, 1], share[:, 1])):
-            made += down[:, :, None] * across[:, None, :] * image[rows[:, :, None], columns[:, None, :]]
+    along = (step - 1) / 2 + step * np.arange(PATCH)
+    source = image.astype(np.float32)
+    made = np.empty((len(corners), PATCH, PATCH), np.float32)
+    for number, corner in enumerate(corners):
+        columns, rows = np.meshgrid(*np.float32(corner[:, None] + along))
+        cv2.remap(source, columns, rows, cv2.INTER_LINEAR, dst=made[number], borderMode=cv2.BORDER_REPLICATE)
     return made / np.float32(255)
 
 

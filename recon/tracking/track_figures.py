@@ -1,6 +1,5 @@
 """Figures of a tracked film, and the lines that report them."""
 
-import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -14,7 +13,7 @@ from recon.model import circle_layout
 from recon.model.circle_layout import LENGTHS
 from recon.model.rig import Target
 from recon.tracking.results import Step
-from recon.tracking.tracker import EXCHANGED
+from recon.tracking.tracker import EXCHANGED, is_beside
 
 Array = NDArray[np.float64]
 
@@ -47,7 +46,7 @@ def measure(steps: Sequence[Step]) -> Metrics:
     return {
         "frames": len(steps),
         "frames_found": len(found),
-        "frames_with_a_second_target": sum(math.isfinite(step.apart_mm or math.inf) for step in steps),
+        "frames_with_a_second_target": sum(is_beside(step.apart_mm) for step in steps),
         **{f"frames_{way}": sum(step.how == way for step in found) for way in WAYS},
         "sigma_median_mm": float(typical[0]),
         "sigma_median_deg": float(typical[1]),
@@ -123,13 +122,12 @@ def causes(steps: Sequence[Step], target: Target) -> Iterator[str]:
 
 def second_target(apart_mm: Sequence[float | None]) -> Iterator[str]:
     """A line on further targets of the design, if there are any, by the distance of each pair's as of `Tracking.apart_mm`."""
-    searched = [one for one in apart_mm if one is not None]
-    two = [one for one in searched if math.isfinite(one)]
+    searched = sum(one is not None for one in apart_mm)
+    two = [k for k, one in enumerate(apart_mm) if is_beside(one)]
     if two:
-        first = next(k for k, one in enumerate(apart_mm) if one is not None and math.isfinite(one))
         yield (
-            f"warning     a second target of this design in {len(two)} of {len(searched)} pairs searched for one, first in pair "
-            f"{first}, {two[0]:.0f} mm from the one that is followed: the surer one at first, after a loss "
+            f"warning     a second target of this design in {len(two)} of {searched} pairs searched for one, first in pair "
+            f"{two[0]}, {apart_mm[two[0]]:.0f} mm from the one that is followed: the surer one at first, after a loss "
             "the nearer to the last pose; cover the other one"
         )
 

@@ -74,6 +74,11 @@ class Tracking:
         return min((float(np.linalg.norm(other[:3, 3] - own)) for other in self.others), default=np.inf)
 
 
+def is_beside(apart_mm: float | None) -> bool:
+    """Whether there is a further target, by `Tracking.apart_mm`."""
+    return apart_mm is not None and bool(np.isfinite(apart_mm))
+
+
 @dataclass
 class Tracker:
     """Follows a target through pairs of frames. Its state is the last poses; `forget` clears it.
@@ -143,7 +148,7 @@ class Tracker:
 
     def _explained(self, result: Tracking, now: float, limit: float) -> Tracking:
         """A result without a pose, with the reasons that the last poses know: circles that have left a view, or got too small."""
-        if not self._past or not 0 < now - self._past[-1][0] <= limit or "camera" not in str(result.pose.reason).split(":")[0]:
+        if not self._past or not 0 < now - self._past[-1][0] <= limit or result.pose.reason != views.unseen(result.views):
             return result
         pose = self._predicted(now)
         seen = [views.gone(view, self._expected(k, pose), self.cameras[k].size) for k, view in enumerate(result.views)]

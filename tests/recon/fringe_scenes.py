@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.model.patterns import Patterns
+from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.phase import Noise
 
 NOISE = Noise(0.5, 0.033)  # DN^2, DN
@@ -43,6 +44,19 @@ def photograph(
         image = image + rng.normal(size=image.shape) * np.sqrt(np.maximum(noise.read_variance - 1 / 12 + noise.gain * image, 0))
         images.append(np.clip(np.rint(image), 0, 255).astype(np.uint8))
     return np.stack(images)
+
+
+def projector_map(
+    columns: NDArray | None = None,
+    rows: NDArray | None = None,
+    sigma_columns: NDArray | None = None,
+    sigma_rows: NDArray | None = None,
+) -> ProjectorMap:
+    """A map of these coordinates, (h, w) each, all of them decoded."""
+    shape = next(image.shape for image in (columns, rows) if image is not None)
+    nothing, status = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
+    shown = (nothing, nothing, nothing, status, status == 0)
+    return ProjectorMap(columns, rows, sigma_columns, sigma_rows, *shown, NOISE, {})
 
 
 def breast(shape: tuple[int, int] = (1024, 1280), middle: float = 639.5) -> NDArray[np.float64]:

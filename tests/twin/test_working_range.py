@@ -54,6 +54,12 @@ def test_a_rig_of_another_size_works_at_other_depths(factor):
     assert found.poses(Poses(depth_mm=(300, 400))).depth_mm == (300, 400)
 
 
+@pytest.mark.parametrize(("factor", "margin"), [(0.06, 0.01), (12.0, 0.15)])
+def test_depths_are_those_of_rigs_of_any_size(factor, margin):
+    """Centimetres or metres away, no depth is a fixed one; far lenses are sharp all over, so that where all views meet counts."""
+    assert working_range(shrunk(choices.read_rig(), factor)).scale == pytest.approx(factor, rel=margin)
+
+
 def test_noisier_cameras_make_detectors_noisier():
     rig = choices.read_rig()
     sensor = rig.cam1.sensor.model_copy(update={"saturation_e": rig.cam1.sensor.saturation_e / 4})

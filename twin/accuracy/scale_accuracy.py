@@ -44,21 +44,21 @@ class Scaled:
 
 def measurements(setup: Setup) -> list[Measurement]:
     """Row a: the scale of calibrations with drawn boards."""
-    return [partial(rows, setup.rig)]
+    return [partial(down, setup.rig)]
 
 
-def rows(rig: Rig) -> list[Row]:
+def down(rig: Rig) -> list[Row]:
     """The scale's errors over what is stated of them, and beside those of boards taken as designed."""
-    found = [each(rig, seed) for seed in BOARDS]
-    told = [one for one in found if one is not None]
-    error, sigma, designed = np.array([(one.error, one.sigma, one.designed) for one in told]).T
+    found = [calibrated(rig, seed) for seed in BOARDS]
+    accepted = [one for one in found if one is not None]
+    error, sigma, designed = np.array([(one.error, one.sigma, one.designed) for one in accepted]).T
     what = f"{len(found)} boards"
     return [
-        Row("a", f"{what}: refused", len(found) - len(told), None, None, ""),
+        Row("a", f"{what}: refused", len(found) - len(accepted), None, None, ""),
         Row(
             "a", f"{what}: scale within 3 stated sigma, at least", float(np.mean(abs(error) <= 3 * sigma)), 0.99, 0.997, "", True
         ),
-        Row("a", f"{what}: worse than as designed by more than a stated sigma", worse(told), 0, 0, ""),
+        Row("a", f"{what}: worse than as designed by more than a stated sigma", worse(accepted), 0, 0, ""),
         Row("a", f"{what}: error of the scale, largest", 100 * float(abs(error).max()), None, None, "%"),
         Row("a", f"{what}, taken as designed: error of the scale, largest", 100 * float(abs(designed).max()), None, None, "%"),
     ]
@@ -69,7 +69,7 @@ def worse(found: list[Scaled]) -> int:
     return sum(abs(one.error) > abs(one.designed) + one.sigma for one in found)
 
 
-def each(rig: Rig, seed: int) -> Scaled | None:
+def calibrated(rig: Rig, seed: int) -> Scaled | None:
     """One board, its poses and their noise, calibrated by default and with the board as designed; None if it is refused."""
     rng = np.random.default_rng([seed, 9])
     board, seen = _drawn(rig, rng)

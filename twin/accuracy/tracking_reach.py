@@ -17,7 +17,7 @@ from recon.model.rig import CameraDevice, Lens, Optics, Pose, Rig, Target
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
 from twin.accuracy import tracking_frames
-from twin.accuracy.pose_accuracy import pose_errors
+from twin.accuracy.pose_accuracy import cameras_of, pose_errors
 from twin.accuracy.table_rows import Row, Setup
 from twin.shooting import FilmQuality
 from twin.tracking.mesh_bank import build_bank
@@ -40,7 +40,7 @@ WHITE_DN = (60.0, 150.0)
 BLUR_PX = 0.5  # of the lens in focus
 MARGIN_PX = 4.0  # of the board from the images' borders
 TRIES = 1000
-WRONG_MM = 0.01  # error of a place over its distance beyond which a pose is wrong, whatever is predicted
+WRONG_SHARE = 0.01  # error of a place over its distance beyond which a pose is wrong, whatever is predicted
 WHOLLY = 0.98  # of each disc that is seen
 
 
@@ -76,7 +76,7 @@ def tracked(setup: Setup, networks: Networks, seed: int, count: int, most_px: fl
         result = Tracker(cameras, setup.rig.target, networks).step(*given.views)
         distance = float(np.linalg.norm(take.motion.world_from_target[:3, 3]))
         errors = pose_errors(take, result.pose.world_from_target) if result.found else None
-        wrong = errors is not None and errors[0] > WRONG_MM * distance
+        wrong = errors is not None and errors[0] > WRONG_SHARE * distance
         disc = min(disc_px(camera, take.motion.world_from_target, setup.rig.target) for camera in cameras)
         yield Reached(take.k, cameras[0].size, disc, distance, result.how, result.pose.reason, wrong)
 
@@ -170,9 +170,3 @@ def disc_px(camera: Camera, pose: Array, target: Target) -> float:
     """Diameter of a circle at right angles at the distance of the farthest one, px."""
     depths = rigid.apply(camera.camera_from_world @ pose, circle_centres(target))[:, 2]
     return float(camera.matrix[0, 0] * target.outer_diameter_mm / depths.max())
-
-
-def cameras_of(take: Take) -> tuple[Camera, Camera]:
-    """Both calibrated cameras."""
-    first, second = (device.optics.camera() for device in take.cameras)
-    return first, second

@@ -122,6 +122,14 @@ def test_another_layout_is_named_with_the_field_that_takes_it(board, given, hint
         detect(image, board.model_copy(update=given))
 
 
+def test_tags_under_a_wide_lens_are_on_their_grid(rng):
+    """Of a lens with k1 of -0.35, 10 x 7 tags lie 0.26 tags off any map without distortion."""
+    board = AprilGrid(columns=10, rows=7, tag_mm=50)
+    camera = Camera((752, 480), np.array([[458, 0, 367], [0, 457, 248], [0, 0, 1.0]]), np.array([-0.35, 0.12, 0, 0, 0]))
+    found = detect(noisy(view(board, camera, pose(board, 400, (0, 0), 0.0)), rng), board)
+    assert np.isfinite(found.pixels[:, 0]).mean() > 0.8
+
+
 @pytest.mark.parametrize("board", [ASYMMETRIC, CHESSBOARD, APRILGRID], ids=lambda b: b.kind)
 def test_large_images_are_looked_at_reduced_and_measured_whole(board, clean, rng, monkeypatch):
     """So a photograph without a board costs no more than a small one; points are as well measured as without."""

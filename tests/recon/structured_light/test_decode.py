@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from recon.errors import InputError
 from recon.model.patterns import CentreLine, Fringes, Patterns
+from recon.structured_light import plausibility
 from recon.structured_light.decode import Status, decode
-from recon.structured_light.phase import Noise
+from recon.structured_light.phase import Noise, wrapped_phase
 from tests.recon.fringe_scenes import NOISE, breast, photograph
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -320,3 +321,23 @@ def test_a_step_taken_twice_is_refused(rng, steps, share):
         wrong = images.copy()
         wrong[late] = np.uint8(share * images[late - 1] + (1 - share) * images[late])
         refused(wrong, patterns, "taken twice|contradict each other in .* taken once")
+
+
+@pytest.mark.parametrize("steps", [3, 4, 6, 7])
+@pytest.mark.parametrize("objects", [[(0.35, 0.5)], [(0.2, 0.3), (0.7, 0.8)]], ids=["one", "opposite phases"])
+def test_bright_objects_on_something_dark_are_no_uneven_steps(rng, steps, objects):
+    """A coarse cue as wide as the view, of albedo 0.15 and 0.8: most light is of few phases. A step taken twice still shows."""
+    parts = (Fringes(pitch=16, steps=8), Fringes(pitch=114, steps=steps), Fringes(pitch=912, steps=steps))
+    patterns = Patterns(projector_size=(912, 480), unwrap="heterodyne", parts=parts)
+    columns = np.broadcast_to(20 + 870 * np.arange(320) / 320, (240, 320))
+    light = np.full(columns.shape, 33.0)
+    for left, right in objects:
+        light[50:200][:, (columns[0] > left * 912) & (columns[0] < right * 912)] = 176
+    images = photograph(patterns, {"columns": columns}, rng, light=light, ambient=3)
+    for part, place in patterns.slices():
+        fringe = wrapped_phase(images[place], part.shifts, noise=NOISE, saturation=255.0)
+        plausibility.check_fringes(images[place], part, fringe, 4.0, 255.0, "images", place.start)
+        twice = images[place].copy()
+        twice[2] = twice[1]
+        with pytest.raises(InputError, match=f"do not follow the {part.steps}-step sequence"):
+            plausibility.check_fringes(twice, part, fringe, 4.0, 255.0, "images", place.start)

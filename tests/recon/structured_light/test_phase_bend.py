@@ -7,7 +7,7 @@ from recon.errors import InputError
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns
 from recon.structured_light.decode import Status, decode
 from recon.structured_light.surface_figures import describe_decoding
-from tests.recon.fringe_scenes import photograph
+from tests.recon.fringe_scenes import NOISE, photograph
 
 CODE = GrayCode(pitch=18, bits=7, complementary=True)
 PARTS = {
@@ -74,6 +74,49 @@ def test_a_gamma_beyond_what_can_be_undone_is_refused(rng):
         decode(images, patterns)
 
 
+@pytest.mark.parametrize("gamma", [1.1, 1.8])
+def test_a_gamma_that_a_small_object_hides_is_counted(rng, gamma):
+    """An object of 40 x 40 px shows too few periods: by the gammas that agree as well, errors aren't beyond sigma."""
+    parts = (Fringes(pitch=24, steps=3), Fringes(pitch=216, steps=3), Fringes(pitch=912, steps=3))
+    patterns = Patterns(projector_size=(912, 480), unwrap="heterodyne", parts=parts)
+    columns = 300 + 0.8 * np.mgrid[:120, :200][1]
+    light = np.zeros(columns.shape)
+    light[40:80, 80:120] = 200
+    images = photograph(patterns, {"columns": columns}, rng, light=light, ambient=3, gamma=gamma)
+    found = decode(images, patterns, noise=NOISE)
+    ok = found.status == Status.OK
+    z = (found.columns - columns)[ok] / found.sigma_columns[ok]
+    assert ok.sum() > 1000 and 0.4 < z.std() < 1.1
+    assert all(bend.sigma > 0.005 for bend in found.linearity.bends)
+
+
+@pytest.mark.parametrize("steps", [3, 4])
+def test_peaks_that_saturate_are_no_gamma(rng, steps):
+    """White level 2 DN beyond full scale, linear light: pixels at the peaks, N times a period, are missing, the rest is good."""
+    patterns = patterns_of((Fringes(pitch=18, steps=steps), CODE))
+    columns = 639.5 + 0.9 * (np.mgrid[:160, :480][1] - 240.0) + 3 * np.sin(np.mgrid[:160, :480][0] / 20)
+    images = photograph(patterns, {"columns": columns}, rng, light=249, ambient=8)
+    found = decode(images, patterns)
+    ok = found.status == Status.OK
+    assert 0.05 < np.mean(found.status == Status.SATURATED) < 0.3
+    assert (found.columns - columns)[ok].std() < 0.05  # 0.03; 0.3 where peaks are taken for a gamma
+    assert not any("light isn't linear" in line for line in describe_decoding(patterns, found))
+
+
+@pytest.mark.parametrize(("steps", "blur"), [(3, 0.5), (4, 0.5), (4, 1.0)])
+def test_binary_fringes_are_no_gamma(rng, steps, blur):
+    """Third harmonics of a square wave, undone or too strong for that: the way on is more defocus."""
+    parts = (Fringes(pitch=16, steps=steps, waveform="binary", origin=640.5), GrayCode(pitch=16, bits=7, complementary=True))
+    columns = 639.5 + 0.9 * (np.mgrid[:160, :320][1] - 160.0)
+    images = photograph(patterns_of(parts), {"columns": columns}, rng, light=200, blur=blur)
+    try:
+        found = decode(images, patterns_of(parts))
+        said = [line for line in describe_decoding(patterns_of(parts), found) if line.startswith("linearity")]
+    except InputError as reason:
+        said = [str(reason)]
+    assert len(said) == 1 and "binary fringes" in said[0] and said[0].endswith("defocus the projector more, or take sine fringes")
+
+
 def test_clipped_black_is_named(rng):
     """Of 150 DN 30 subtracted: by the line of the bend with three steps; 100: in place of a wrong order with twelve."""
     patterns, images = seen(3, rng)
@@ -93,4 +136,4 @@ def test_a_code_that_jumps_is_doubted_with_its_noise_where_that_is_assumed(rng):
         images[[steps + 3, steps + 4]] = images[[steps + 4, steps + 3]]
         with pytest.raises(InputError, match="fringe orders jump") as caught:
             decode(images, patterns)
-        assert ("is the dark noisier" in str(caught.value)) == doubted
+        assert ("are dark pixels noisier" in str(caught.value)) == doubted

@@ -12,7 +12,7 @@ from recon.geometry.camera import Camera
 from recon.structured_light import ray_checks
 from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.phase import Noise
-from recon.structured_light.triangulate import triangulate
+from recon.structured_light.triangulate import PointMap, triangulate
 
 SIZE = (160, 120)
 CAMERA = Camera(SIZE, np.array([[400.0, 0, 80], [0, 400, 60], [0, 0, 1]]), np.zeros(5))
@@ -97,3 +97,28 @@ def test_another_calibration_makes_none_unless_it_is_to_be_taken(rng, caplog, of
     ray_checks.check(found, raw, CAMERA, other, "shots", implausible="take")
     (said,) = caplog.messages
     assert "taken all the same" in said and re.search(match, said)
+
+
+def test_what_an_object_hides_from_a_second_camera_contradicts_nothing():
+    """A sphere lit from the front, two cameras 45 degrees to either side: half of what one sees faces away from the other."""
+
+    def at(degrees):
+        place = 500 * np.array([np.sin(np.deg2rad(degrees)), 0, -np.cos(np.deg2rad(degrees))])
+        axes = rigid.from_rotation_vector([0, np.deg2rad(degrees), 0], np.zeros(3))[:3, :3]
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = axes, -axes @ place
+        return Camera((320, 320), np.array([[1500.0, 0, 159.5], [0, 1500, 159.5], [0, 0, 1]]), np.zeros(5), pose)
+
+    def shot(camera, light):
+        rays = camera.pixel_rays().astype(float)
+        nearest = rays @ camera.centre
+        with np.errstate(invalid="ignore"):
+            points = camera.centre - (nearest + np.sqrt(nearest**2 - (500**2 - 40**2)))[..., None] * rays
+        points[np.sum((light.centre - points) * points, axis=-1) < 0] = np.nan
+        columns = light.project(points.reshape(-1, 3))[:, 0].reshape(points.shape[:2])
+        return decoded(np.float32(columns)), PointMap(np.float32(points), np.zeros(points.shape[:2], np.float32))
+
+    (found, raw), (other, _) = (shot(at(degrees), at(0)) for degrees in (-45, 45))
+    assert ray_checks.check_beside(found, raw, other, at(45), "shots") > 0.95
+    with pytest.raises(InputError, match="did one of them move"):
+        ray_checks.check_beside(found, raw, replace(other, columns=other.columns + 20), at(45), "shots")

@@ -12,6 +12,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.structured_light import surface_mesh
 from recon.structured_light.triangulate import PointMap, triangulate
+from tests.recon.fringe_scenes import projector_map
 
 PITCH = 12.0  # projector px
 WALL = 690.0  # mm
@@ -19,16 +20,6 @@ MIDDLE, AXES = np.array([0.0, 0.0, WALL]), np.array([85.0, 65.0, 55.0])  # of th
 CAMERA = Camera((640, 512), np.array([[1660.0, 0, 309], [0, 1665, 261], [0, 0, 1]]), np.zeros(5))
 PROJECTOR_POSE = rigid.from_rotation_vector(np.deg2rad([5.214, -12.430, -2.472]), [148.861, -68.650, 14.818])
 PROJECTOR = Camera((1280, 800), np.array([[1921.0, 0, 614], [0, 1927, 772], [0, 0, 1]]), np.zeros(5), PROJECTOR_POSE)
-
-
-@dataclass(frozen=True)
-class Columns:
-    """A decoded map of columns."""
-
-    columns: np.ndarray
-    sigma_columns: np.ndarray
-    rows: None = None
-    sigma_rows: None = None
 
 
 @dataclass(frozen=True)
@@ -88,7 +79,9 @@ def scene() -> Scene:
     columns = PITCH * (turns + np.round(truth.columns / PITCH - turns))
     dark = modulation < 4
     columns[dark] = sigma[dark] = np.nan
-    return Scene(triangulate(Columns(columns, PITCH / (2 * np.pi) * sigma), CAMERA, PROJECTOR), modulation, truth)
+    return Scene(
+        triangulate(projector_map(columns, sigma_columns=PITCH / (2 * np.pi) * sigma), CAMERA, PROJECTOR), modulation, truth
+    )
 
 
 def off(points: PointMap, truth: View) -> np.ndarray:

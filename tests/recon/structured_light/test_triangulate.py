@@ -1,25 +1,14 @@
 """Triangulation against points that were put there: synthetic projector maps of a known surface through strong lenses."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.structured_light.triangulate import PointMap, Triangulator, triangulate
+from tests.recon.fringe_scenes import projector_map
 
 SIZE = (160, 128)
-
-
-@dataclass(frozen=True)
-class Map:
-    """What triangulation reads of a decoded map."""
-
-    columns: np.ndarray | None = None
-    sigma_columns: np.ndarray | None = None
-    rows: np.ndarray | None = None
-    sigma_rows: np.ndarray | None = None
 
 
 def matrix(focal, centre):
@@ -59,7 +48,7 @@ def test_points_come_back(devices, axes):
     camera, projector = devices
     points = surface_points(camera)
     sigma = sigmas(points.shape[:2], **dict.fromkeys(axes.split(), 0.02))
-    result = triangulate(Map(**coordinates(points, projector, axes), **sigma), camera, projector)
+    result = triangulate(projector_map(**coordinates(points, projector, axes), **sigma), camera, projector)
     assert np.abs(result.points - points).max() < 1e-4
 
 
@@ -71,7 +60,9 @@ def test_predicted_sigma_is_the_scatter_along_the_ray(devices):
     sigma = {"sigma_columns": np.full(points.shape[:2], 0.05), "sigma_rows": np.full(points.shape[:2], 0.02)}
     for axes in (("columns",), ("rows",), ("columns", "rows")):
         noisy = {axis: truth[axis] + rng.normal(0, sigma[f"sigma_{axis}"]) for axis in axes}
-        result = triangulate(Map(**noisy, **{f"sigma_{axis}": sigma[f"sigma_{axis}"] for axis in axes}), camera, projector)
+        result = triangulate(
+            projector_map(**noisy, **{f"sigma_{axis}": sigma[f"sigma_{axis}"] for axis in axes}), camera, projector
+        )
         along = ((result.points - points) * camera.rays(camera.pixel_grid())).sum(axis=-1)
         z = along / result.sigma
         assert abs(z.std() - 1) < 5 / np.sqrt(2 * z.size) and abs(z.mean()) < 5 / np.sqrt(z.size)
@@ -83,7 +74,7 @@ def test_the_better_axis_counts_more(devices):
     points, rng = surface_points(camera), np.random.default_rng(2)
     truth, shape = coordinates(points, projector, "columns rows"), points.shape[:2]
     both = truth | {"rows": truth["rows"] + rng.normal(0, 2, shape)}
-    result = triangulate(Map(**both, **sigmas(shape, columns=0.01, rows=10.0)), camera, projector)
+    result = triangulate(projector_map(**both, **sigmas(shape, columns=0.01, rows=10.0)), camera, projector)
     assert np.abs(result.points - points).max() < 0.02
 
 
@@ -94,7 +85,7 @@ def test_a_pixel_with_one_axis_uses_that_one(devices):
     truth["columns"][:, ::2] = np.nan
     truth["rows"][::2, 1::2] = np.nan
     truth["columns"][0, 1], truth["rows"][0, 1] = np.nan, np.nan
-    result = triangulate(Map(**truth, **sigmas(shape, columns=0.02, rows=0.02)), camera, projector)
+    result = triangulate(projector_map(**truth, **sigmas(shape, columns=0.02, rows=0.02)), camera, projector)
     assert np.isnan(result.points[0, 1]).all() and np.isnan(result.sigma[0, 1])
     known = np.isfinite(result.sigma)
     assert known.sum() == known.size - 1 and np.abs(result.points - points)[known].max() < 1e-4
@@ -108,7 +99,7 @@ def test_what_lies_behind_a_device_is_left_out(devices):
         projector.project(far)[..., 0]
         + np.sign(projector.project(far)[..., 0] - projector.project(surface_points(camera))[..., 0]) * 40
     )
-    result = triangulate(Map(columns=beyond, sigma_columns=np.full(beyond.shape, 0.02)), camera, projector)
+    result = triangulate(projector_map(columns=beyond, sigma_columns=np.full(beyond.shape, 0.02)), camera, projector)
     assert np.isnan(result.points).all() and np.isnan(result.sigma).all()
 
 
@@ -117,7 +108,7 @@ def test_one_triangulator_serves_many_maps(devices):
     points = surface_points(camera)
     one = Triangulator(camera, projector)
     for offset in (0.0, 1.0):
-        given = Map(
+        given = projector_map(
             columns=coordinates(points, projector, "columns")["columns"] + offset, sigma_columns=np.full(points.shape[:2], 0.02)
         )
         fresh: PointMap = triangulate(given, camera, projector)
@@ -126,12 +117,12 @@ def test_one_triangulator_serves_many_maps(devices):
 
 def test_a_map_of_another_size_is_refused(devices):
     with pytest.raises(ValueError, match=r"columns: expected an image of shape \(128, 160\), found \(20, 10\)"):
-        triangulate(Map(columns=np.zeros((20, 10)), sigma_columns=np.ones((20, 10))), *devices)
+        triangulate(projector_map(columns=np.zeros((20, 10)), sigma_columns=np.ones((20, 10))), *devices)
 
 
 def test_a_sigma_of_another_size_is_refused(devices):
     with pytest.raises(ValueError, match=r"sigma_rows: expected an image of shape \(128, 160\), found \(128, 10\)"):
-        triangulate(Map(rows=np.zeros((128, 160)), sigma_rows=np.ones((128, 10))), *devices)
+        triangulate(projector_map(rows=np.zeros((128, 160)), sigma_rows=np.ones((128, 10))), *devices)
 
 
 @pytest.mark.parametrize("axis", ["columns", "rows"])
@@ -139,7 +130,9 @@ def test_a_camera_of_one_row_needs_one_axis_only(devices, axis):
     camera, projector = devices
     line = Camera((SIZE[0], 1), camera.matrix, camera.distortion, camera.camera_from_world)
     points = surface_points(line)
-    result = triangulate(Map(**coordinates(points, projector, axis), **sigmas((1, SIZE[0]), **{axis: 0.02})), line, projector)
+    result = triangulate(
+        projector_map(**coordinates(points, projector, axis), **sigmas((1, SIZE[0]), **{axis: 0.02})), line, projector
+    )
     assert np.abs(result.points - points).max() < 1e-4 and np.isfinite(result.sigma).all()
 
 
@@ -147,5 +140,5 @@ def test_a_camera_of_one_row_needs_one_axis_only(devices, axis):
 def test_an_axis_without_sigma_gives_points_and_no_sigma(devices, axes):
     camera, projector = devices
     points = surface_points(camera)
-    result = triangulate(Map(**coordinates(points, projector, axes)), camera, projector)
+    result = triangulate(projector_map(**coordinates(points, projector, axes)), camera, projector)
     assert np.abs(result.points - points).max() < 1e-4 and np.isnan(result.sigma).all()

@@ -204,6 +204,10 @@ def test_swapped_cameras_are_not_found(cameras, rig, pair):
     found = Tracker(cameras, rig.target, Told(places[::-1])).step(pair[1], pair[0])
     assert not found.found and found.pose.reason == tracking.EXCHANGED
     assert not any(view.found for view in found.views)
+    tracker, aside = Tracker(cameras, rig.target, Told(places[::-1])), FACING.copy()
+    aside[0, 3] -= 120
+    tracker.remember(aside, 0)
+    assert tracker.step(pair[1], pair[0]).pose.reason == tracking.EXCHANGED, "a last pose beyond the view explains nothing here"
 
 
 @pytest.mark.parametrize(
