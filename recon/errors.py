@@ -70,7 +70,7 @@ def validated(model: type[Model], content: object, place: object) -> Model:
         raise InputError(f"{place}: {one_line(error)}") from None
 
 
-def doubt(place: str, seen: str, implausible: Implausible) -> None:
+def refuse_or_warn(place: str, seen: str, implausible: Implausible) -> None:
     """Refuse implausible data by what was seen of them, in a line that ends with the way past it; or warn of them."""
     if implausible == "take":
         log.warning("%s: taken all the same: %s", place, seen)

@@ -14,7 +14,7 @@ from pydantic import model_validator
 from recon.capture import probe_files
 from recon.capture.images import read_image
 from recon.capture.sweep_part import SweepCapture
-from recon.errors import Implausible, InputError, doubt
+from recon.errors import Implausible, InputError, refuse_or_warn
 from recon.files.metrics import Metrics
 from recon.files.volumes import Volume
 from recon.freehand import (
@@ -339,7 +339,7 @@ def check_size(scans: Scans, place: str, clip: Clip | None, implausible: Implaus
         If they are, and not to be taken.
     """
     for fault in size_faults(scans, clip):
-        doubt(place, f"B-scans: expected {fault}", implausible)
+        refuse_or_warn(place, f"B-scans: expected {fault}", implausible)
 
 
 def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES) -> tuple[Reconstruction, Reconstruction]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import WAY, Implausible, InputError, doubt
+from recon.errors import WAY, Implausible, InputError, refuse_or_warn
 
 log = logging.getLogger(__name__)
 
@@ -144,9 +144,9 @@ def check_motion(place: str, times_s: Array, poses: Array, implausible: Implausi
     known = poses[np.isfinite(poses).all(axis=(1, 2))]
     if len(known) > LIMITS.repeats and (known == known[0]).all():
         found = f"all {len(known)} the same to the last digit: no tracking, or a probe at rest?"
-        doubt(place, f"poses: expected those of a probe that moves, found {found}", implausible)
+        refuse_or_warn(place, f"poses: expected those of a probe that moves, found {found}", implausible)
     if fault := unit_fault(poses, unit):
-        doubt(place, f"poses: expected a sweep in mm, found {fault}", implausible)
+        refuse_or_warn(place, f"poses: expected a sweep in mm, found {fault}", implausible)
     elif implausible == "refuse" and (told := unit_doubt(times_s, poses, unit)):
         log.warning("%s: %s", place, told)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import Implausible, doubt
+from recon.errors import Implausible, refuse_or_warn
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.structured_light.decode import ProjectorMap
@@ -62,7 +62,7 @@ def check(
         If more points than `limits` allow are lit from behind, lie behind a device, or outside of the projector's image.
     """
     if seen := _fault(found, raw, camera, projector, limits):
-        doubt(name, seen, implausible)
+        refuse_or_warn(name, seen, implausible)
 
 
 def check_beside(
@@ -117,7 +117,7 @@ def check_beside(
     if share > limits.apart:
         where = f"where {beside.name or 'the other camera'} sees the projector's image more than {limits.apart_px:g} px off"
         cause = "are the images of either camera upside down, or of another scene, or did one of them move?"
-        doubt(name, f"{100 * share:.0f} % of the points lie {where}: {cause}", implausible)
+        refuse_or_warn(name, f"{100 * share:.0f} % of the points lie {where}: {cause}", implausible)
     return 1 - share
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon import arguments
 from recon.compiled import njit
-from recon.errors import Implausible, InputError, doubt
+from recon.errors import Implausible, InputError, refuse_or_warn
 from recon.geometry.camera import Camera, distort_side_by_side
 from recon.structured_light.decode import ProjectorMap
 from recon.threads import in_threads
@@ -131,7 +131,7 @@ def _check_rows(found: ProjectorMap, points: Float32, projector: Camera, implaus
     if typical > MISSED_PX:
         cause = "another camera's calibration or images, images mirrored or turned, or devices that moved since"
         expected = f"columns and rows that agree to {MISSED_PX:g} projector px"
-        doubt("triangulate: camera", f"expected {expected}, found {typical:.3g} px in the median: {cause}?", implausible)
+        refuse_or_warn("triangulate: camera", f"expected {expected}, found {typical:.3g} px in the median: {cause}?", implausible)
 
 
 def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:
