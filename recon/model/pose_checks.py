@@ -56,6 +56,7 @@ class MotionLimits:
     small_mm: tuple[float, float] = (1.0, 20.0)  # a sweep's extent that might be in centimetres or inches, as few in mm are
     near_mm: float = 150.0  # the same of its farthest place from the origin
     slow_mm_s: float = 6.0  # and of its median speed
+    swing: float = 2.5  # way of the places over that of the inverses'; of right sweeps 1.03 at most, of far trackers 0.15
     least_covered: float = 0.8  # share of the images with a pose, below which it is said
     most_share: float = 1 / 3  # of poses that may be left out
 
@@ -149,6 +150,8 @@ def check_motion(place: str, times_s: Array, poses: Array, implausible: Implausi
         refuse_or_warn(place, f"poses: expected a sweep in mm, found {fault}", implausible)
     elif implausible == "refuse" and (told := unit_doubt(times_s, poses, unit)):
         log.warning("%s: %s", place, told)
+    if told := direction_doubt(poses):
+        log.warning("%s: %s", place, told)
 
 
 def find(times_s: Array, poses: Array, images: Images | None = None, clock: Array | None = None) -> Findings:
@@ -208,6 +211,21 @@ def unit_doubt(times_s: Array, poses: Array, unit: str = "") -> str | None:
             return None
         told += f", at {speed:.2g} mm/s"
     return f"{told}: is it in mm, not in centimetres or inches?" + (f" Else give {unit}" if unit else "")
+
+
+def direction_doubt(poses: Array) -> str | None:
+    """Say that poses : (n, 4, 4) may be the other way round.
+
+    A probe that is far from the world's origin turns about itself: its place hardly moves by that. The origin's place in the
+    probe's frame swings, as far as it is away.
+    """
+    known = poses[np.isfinite(poses).all(axis=(1, 2))]
+    if len(known) <= LIMITS.repeats:
+        return None
+    given, other = (np.linalg.norm(np.diff(each[:, :3, 3], axis=0), axis=1).sum() for each in (known, np.linalg.inv(known)))
+    if given < LIMITS.swing * other or other < LIMITS.small_mm[0]:
+        return None
+    return f"poses whose places go {given:.3g} mm, and those of their inverses {other:.3g} mm: the other way round?"
 
 
 def small_images(images: Iterable[NDArray]) -> NDArray[np.float32]:

@@ -196,6 +196,19 @@ def test_a_sweep_that_may_be_in_centimetres_is_named(rng, caplog):
         judged(small, unit="length_unit")
 
 
+def test_poses_that_are_the_other_way_round_are_named(rng, caplog):
+    """Of a hand that trembles by half a degree, 0.6 m from the tracker; one that doesn't turn shows nothing."""
+    poses = sweep(rng)
+    for turns, told in ((0.0, False), (0.01, True)):
+        tremble = np.array([rigid.from_rotation_vector(turn, [0, 0, 600]) for turn in rng.normal(0, turns, (COUNT, 3))])
+        turned = tremble @ poses[0]
+        turned[:, :3, 3] = poses[:, :3, 3] + [0, 0, 600]
+        pose_checks.check_motion("s", TIMES, turned)
+        assert not caplog.text
+        pose_checks.check_motion("s", TIMES, np.linalg.inv(turned))
+        assert ("the other way round?" in caplog.text) == told
+
+
 def test_what_is_left_out_is_counted_and_beyond_a_share_refused(rng, caplog):
     poses = sweep(rng)
     poses[5:20] = np.eye(4)
