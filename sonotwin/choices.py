@@ -32,13 +32,13 @@ def read_patterns(source: str | Path = "paper_surface") -> Patterns:
     return surface_part.read_patterns(file_of("patterns", source))
 
 
-def file_of(group: str, source: str | Path) -> Path:
-    """The file itself where there is one, else the choice of that name; raises InputError if there is neither."""
+def file_of(group: str, source: str | Path, field: str = "") -> Path:
+    """The file itself where there is one, else the choice of that name; InputError if there is neither, with the field's name."""
     known, given = config.folder() / group / f"{source}.yaml", Path(source)
     if given.is_file() or len(given.parts) != 1 or given.suffix:
         return given
     if not known.is_file():
         names = sorted(choice.stem for choice in known.parent.glob("*.yaml"))
-        expected = f"{group}: expected one of {', '.join(names)}, or a YAML file"
+        expected = f"{field or group}: expected one of {', '.join(names)}, or a YAML file"
         raise InputError(f"{expected}, found {short(str(source))}{did_you_mean(str(source), names)}")
     return known

@@ -52,7 +52,7 @@ def read_study(name: object) -> Study | None:
     """
     if name == SWEEP:
         return None
-    path = choices.file_of("study", str(name))
+    path = choices.file_of("study", str(name), "name")
     return validated(Study, yaml_text.read(path), path)
 
 

@@ -10,12 +10,13 @@ import subprocess
 import sys
 from html import unescape
 from time import sleep
+from types import SimpleNamespace
 
 import pyarrow.parquet as pq
 import pytest
 
 from recon.errors import InputError
-from sonotwin import study_plan, study_steps
+from sonotwin import choices, study_plan, study_steps
 from sonotwin.cli import main
 from sonotwin.config import folder, load
 from sonotwin.verbs.study import Config
@@ -117,7 +118,7 @@ def test_the_columns_of_surfaces_are_explained():
 def test_a_studys_name_may_be_a_number(tmp_path, monkeypatch):
     (tmp_path / "study").mkdir()
     (tmp_path / "study" / "7.yaml").write_text("title: Seventh\nof: surface\nover: {}\n")
-    monkeypatch.setattr(study_plan, "folder", lambda: tmp_path)
+    monkeypatch.setattr(choices, "config", SimpleNamespace(folder=lambda: tmp_path))
     config = load("study", ["name=7", "out=x"], Config)
     assert (config.name, config.title) == ("7", "Seventh")
 
@@ -141,8 +142,8 @@ SWEEP = "over={noise.speed_mm_s: [5, 10]}"
             [*SURFACE, "over={shooting.gain: [1, 2]}", "patterns=gray_alone"],
             "settings.patterns: expected fringes along columns, which closed forms are of, found none",
         ),
-        (["name=exposur"], "study: expected one of better_rig, "),
-        (["name=7"], "study: expected one of better_rig, "),
+        (["name=exposur"], "name: expected one of better_rig, "),
+        (["name=7"], "name: expected one of better_rig, "),
         (["name=sweep", SWEEP], "of: needs a value with name=sweep; give of=..."),
         (["name=sweep", "of=chain"], "over: needs a value with name=sweep; give over=..."),
         (["name=sweep", "of=chains", SWEEP], "of: expected one of surface, calibration, tracking, laboratory, chain,"),
