@@ -102,8 +102,10 @@ class ScansFields(SequenceFields):
     def _lag_assumed(self) -> bool:
         return self.capture is not None and self.lag_s is None
 
-    def assumptions(self, speed_m_s: float) -> Iterator[str]:
+    def assumptions(self, speed_m_s: float, poses_exact: bool = False) -> Iterator[str]:
         """Lines on what was assumed, as it wasn't given."""
+        if poses_exact:
+            yield "poses without errors, as they have no covariance: standard deviations of places leave out the tracking's"
         if self._lag_assumed:
             yield f"no lag of the B-scans, to {1e3 * self.unsure.lag_s:g} ms (1 sigma); measure-lag finds it, give lag_s"
         if self.tissue_m_s is None:
@@ -173,6 +175,11 @@ class Scans:
     def placed(self) -> int:
         """Number of B-scans with a pose."""
         return int(np.isfinite(self.world_from_pixel).all(axis=(1, 2)).sum())
+
+    @property
+    def poses_exact(self) -> bool:
+        """Whether poses count as without errors, as their track has no covariance."""
+        return self.errors is not None and not self.errors.known
 
 
 def probe_of(sweep: SweepCapture, capture: Path, given: Path | None) -> ProbeCalibration:
@@ -312,18 +319,28 @@ def cautions(scans: Scans) -> Iterator[str]:
     yield from scan_checks.faults(scans.stream(), scans.world_from_pixel)
 
 
+def pixel_sides(scans: Scans) -> Array:
+    """Width and height : (2,) mm of a pixel, in the median; NaN without a pose."""
+    placed = scans.world_from_pixel[np.isfinite(scans.world_from_pixel).all(axis=(1, 2))]
+    return np.median(np.linalg.norm(placed[:, :3, :2], axis=1), axis=0) if len(placed) else np.full(2, np.nan)
+
+
+def sides(scans: Scans, clip: Clip | None = None) -> list[float]:
+    """Width and height of the B-scans, or of their part within a clip, mm."""
+    left, right, top, bottom = (clip or Clip(0, 0, scans.shape[1], scans.shape[0])).bounds(scans.shape)
+    return (pixel_sides(scans) * [right - left + 1, bottom - top + 1]).tolist()
+
+
 def size_faults(scans: Scans, clip: Clip | None = None) -> list[str]:
     """Faults of the size of the B-scans, or of their part within a clip, and of their axes; none as a rule."""
     placed = scans.world_from_pixel[np.isfinite(scans.world_from_pixel).all(axis=(1, 2))]
     if not len(placed):
         return []
-    left, right, top, bottom = (clip or Clip(0, 0, scans.shape[1], scans.shape[0])).bounds(scans.shape)
-    pixel_mm = np.median(np.linalg.norm(placed[:, :3, :2], axis=1), axis=0)
-    sides = pixel_mm * [right - left + 1, bottom - top + 1]
     faults = []
-    wrong = [fault for side in sides.tolist() if (fault := lengths.B_SCAN.fault(side))]
+    wrong = [fault for side in sides(scans, clip) if (fault := lengths.B_SCAN.fault(side))]
     if wrong:
-        cause = ", pixels of 1 mm: the identity in place of the probe's calibration?" if np.abs(pixel_mm - 1).max() < 1e-6 else ""
+        same = np.abs(pixel_sides(scans) - 1).max() < 1e-6
+        cause = ", pixels of 1 mm: the identity in place of the probe's calibration?" if same else ""
         faults.append(f"sides of {lengths.B_SCAN}, found {wrong[0]}{cause}")
     if found := lengths.axes_fault(placed[0]):
         faults.append(f"square axes, found {found}")
@@ -340,6 +357,8 @@ def check_size(scans: Scans, place: str, clip: Clip | None, implausible: Implaus
     """
     for fault in size_faults(scans, clip):
         refuse_or_warn(place, f"B-scans: expected {fault}", implausible)
+    if doubt := next(filter(None, map(lengths.B_SCAN.doubt, sides(scans, clip))), None):
+        log.warning("%s: a side of the B-scans is %s", place, doubt)
 
 
 def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES) -> tuple[Reconstruction, Reconstruction]:

@@ -52,7 +52,7 @@ BRACKET = Usual(1.0, 2000.0, (25.0, 600.0))  # from a probe's target to its imag
 TARGET_STEP = Usual(5.0, 1000.0)  # from circle to circle of a probe's target
 TARGET_CIRCLE = Usual(2.5, 500.0)  # outer diameter of its circles
 PIXEL = Usual(0.002, 5.0)  # of a B-scan
-B_SCAN = Usual(2.0, 600.0)  # width and depth of a B-scan, or of a whole screen
+B_SCAN = Usual(2.0, 600.0, (15.0, 400.0))  # width and depth of a B-scan, or of a whole screen
 MOST_COSINE = 0.17  # between the axes of a B-scan's image, which calibrations by point pairs leave 3 degrees off at times
 
 

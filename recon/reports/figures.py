@@ -71,7 +71,7 @@ def webp(picture: Colours) -> str:
     return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
-def error_map_png(error: Map, interior: Mask, half_range: float = 0.1) -> bytes:
+def error_map_png(error: Map, interior: Mask, half_range: float) -> bytes:
     """Map of signed errors : (h, w) mm with its colour bar, as a PNG file for itself; edges are left out."""
     figure = Figure(figsize=(8, 5.4), dpi=160, layout="constrained")
     axes = figure.add_subplot()

@@ -329,7 +329,8 @@ def _check_residuals(residual: Image, place: str) -> None:
         off = abs(float(np.angle(np.mean(np.exp(2j * np.pi * residual))))) / (2 * np.pi)
         raise InputError(
             f"{place}: the code lies {off:.2f} period off the fringes in the mean, and over a quarter period in "
-            f"{100 * (above + below) / residual.size:.0f} % of the pixels: are the images in the manifest's order?"
+            f"{100 * (above + below) / residual.size:.0f} % of the pixels: are the images in the manifest's "
+            "order, and are the fringes' origin and the code's start those projected?"
         )
 
 

@@ -46,6 +46,7 @@ LOOK_S, LOOK_FRAMES = 1.0, 30.0  # after which a second target is looked for aga
 OTHERS = 4  # triples that are looked at then
 APART_DISCS = 1.0  # least distance of two targets, in circles' diameters
 NO_NETWORKS = "no networks to find it by"
+SPARSE = 16  # rows, of which one is compared to know two cameras' images for the same one
 TRIALS = 10  # triples of both views that are looked at
 ALL_LEVELS = 16  # frames without the target, after which it is looked for at any size again
 
@@ -228,6 +229,8 @@ class Tracker:
                 found = f"{frame.shape[1]}x{frame.shape[0]}"
                 raise InputError(f"camera {number}: expected an image of {camera.size[0]}x{camera.size[1]}, found {found}")
             frames.append(frame)
+        if np.array_equal(frames[0][::SPARSE], frames[1][::SPARSE]) and frames[0].std() > 0:
+            raise InputError("both cameras show the same image to the last digit: is one camera's folder given for both?")
         return frames[0], frames[1]
 
     def _predicted(self, now: float) -> Array:

@@ -8,12 +8,15 @@ error_map.png into the folder `out`, by default evaluation/ in the surface's fol
 
 from pathlib import Path
 
+import numpy as np
+
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown
 from recon.model.rig import Part
 from recon.reports import figures
 from sonotwin.verbs.surface import POINTS
 from twin.evaluation import surface_errors
+from twin.reports import error_report
 
 ERROR_MAP = "error_map.png"
 
@@ -41,8 +44,9 @@ def run(config: Config) -> None:
     points, sigma = surface_errors.read_points(config.surface / POINTS)
     comparison = surface_errors.compare(points, sigma, truth)
     found = surface_errors.measure(points, comparison, truth)
+    half_range = error_report.half_range(np.where(comparison.interior, comparison.error, np.nan), error_report.ERROR_MM)
     with atomic.new_folder(out, "evaluate") as folder:
-        (folder / ERROR_MAP).write_bytes(figures.error_map_png(comparison.error, comparison.interior))
+        (folder / ERROR_MAP).write_bytes(figures.error_map_png(comparison.error, comparison.interior, half_range))
         metrics.write(folder / metrics.FILE, found)
     print(f"evaluate    {describe(found)}")
     print(f"wrote       {out}/{{{metrics.FILE},{ERROR_MAP}}}")

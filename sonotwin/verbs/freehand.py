@@ -86,7 +86,7 @@ def run(config: Config) -> None:
     sweep, scans = read(config, plus)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
-    for line in config.assumptions(scans.speed_m_s):
+    for line in config.assumptions(scans.speed_m_s, scans.poses_exact):
         console.print(f"assumed     {line}", markup=False)
     clip = settings.box(scans.shape)
     for line in freehand_scans.cautions(scans if clip is None else freehand_scans.cut(scans, clip)):

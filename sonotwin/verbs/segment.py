@@ -103,7 +103,7 @@ def run(config: Config) -> None:
     freehand_scans.check_size(scans, str(config.capture or config.sequence), None, config.implausible)
     console.print(f"read        {freehand_scans.summary(scans)}", markup=False)
     console.print(f"depth       {freehand_scans.depths(scans)}", markup=False)
-    for line in config.assumptions(scans.speed_m_s):
+    for line in config.assumptions(scans.speed_m_s, scans.poses_exact):
         console.print(f"assumed     {line}", markup=False)
     for line in freehand_scans.cautions(scans):
         console.print(f"warning     {line}", markup=False)

@@ -31,6 +31,7 @@ from recon.structured_light.triangulate import PointMap, Triangulator
 from sonotwin import choices
 
 POINTS = "points.npz"
+MOSTLY = 0.8  # share of the triangulated points, beyond which those that are removed make a warning
 
 
 class Config(Part):
@@ -98,6 +99,11 @@ def run(config: Config) -> None:
     figures = surface_figures.measure(found, raw, cleaned) | predicted
     points, sigma = f"{figures['points']:,}".replace(",", " "), shown(figures["predicted_rms_mm"], ".3f", " mm")
     print(f"triangulate {points} points, predicted sigma {sigma}, {figures['removed_px']} px removed as unsure")
+    if figures["removed_px"] > MOSTLY * (figures["points"] + figures["removed_px"]):
+        print(
+            "warning     most of the points are unsure: does the calibration take points from camera 1 to the projector, and not "
+            "back, are the patterns those projected, or is the scene very dark?"
+        )
 
     with atomic.new_folder(config.out, "surface") as folder:
         with watch.stage("write"):

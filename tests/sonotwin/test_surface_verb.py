@@ -110,6 +110,18 @@ def test_a_capture_becomes_a_surface(shots, tmp_path, capsys):
         assert {"modulation", "status"} <= set(points)
 
 
+def test_a_surface_that_loses_most_of_its_points_is_warned_of(optics, tmp_path, capsys):
+    patterns = SEQUENCES["gray"]
+    devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
+    writer.write_surface(tmp_path / "capture", {"cam1": photograph(patterns, optics)}, patterns, optics, devices)
+    given = ["surface", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'surface'}"]
+    assert main(given) == 0 and "warning" not in capsys.readouterr().out
+    with np.load(tmp_path / "surface" / "points.npz") as found:
+        steps = found["sigma"] / (found["points"][..., 2] / 830)
+    assert main([*given, f"limits.max_sigma={np.nanquantile(steps, 0.1):.6f}", "limits.min_island_px=1"]) == 0
+    assert "warning     most of the points are unsure: does the calibration take points" in capsys.readouterr().out
+
+
 def test_a_bare_folder_gives_the_same(shots, optics, tmp_path):
     folder, _, patterns = shots
     (tmp_path / "sequence.yaml").write_text(patterns.model_dump_json())

@@ -47,6 +47,7 @@ def test_what_is_assumed_is_said_and_counts():
     assert fields.unsure == (0.1, 50.0) and fields.lag == 0
     said = list(fields.assumptions(1540.0))
     assert said[0].startswith("no lag of the B-scans, to 100 ms") and said[1].startswith("sound of 1540 m/s in what was scanned")
+    assert next(fields.assumptions(1540.0, poses_exact=True)).startswith("poses without errors, as they have no covariance")
     known = scans.ScansFields(capture=Path("c"), lag_s=0.05, tissue_m_s=1450.0)
     assert known.unsure == (0.0, 25.0) and not list(known.assumptions(1450.0))
     assert scans.ScansFields(capture=Path("c"), lag_sigma_s=0.02, tissue_sigma_m_s=3.0).unsure == (0.02, 3.0)

@@ -6,7 +6,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from recon.capture import calibration_files, probe_files
 from recon.errors import InputError, one_line
-from recon.freehand import sequences
+from recon.freehand import scans, sequences
 from recon.freehand.sequences import Frames
 from recon.geometry import rigid
 from recon.model.boards import Board
@@ -151,6 +151,15 @@ def test_a_matrix_from_pixels_to_mm_is_a_probes_calibration(form, tmp_path, capl
     ):
         with pytest.raises(InputError, match=complaint):
             read(wrong)
+
+
+def test_b_scans_that_may_be_in_centimetres_are_doubted(tmp_path, caplog):
+    """Of 66 x 49 mm none is; of 6.6 x 4.9 mm some probes' are."""
+    for pixel_mm, told in ((0.08, False), (0.008, True)):
+        matrices = np.tile(np.diag([pixel_mm, pixel_mm, 1, 1]), (4, 1, 1))
+        placed = scans.Scans((616, 820), matrices, lambda: iter(()), 1540.0, 1540.0)
+        scans.check_size(placed, "s", None, "refuse")
+        assert ("s: a side of the B-scans is 6.56 mm: is it in mm, not in centimetres or inches?" in caplog.text) == told
 
 
 @pytest.mark.parametrize(("image_to_probe", "complaint"), [

@@ -199,6 +199,11 @@ def test_one_camera_alone_is_said_so(tracker, pair):
     assert other.pose.reason.startswith("only camera 2 sees the target")
 
 
+def test_one_cameras_images_for_both_are_named(tracker, pair):
+    found = tracker.step(pair[0], pair[0])
+    assert not found.found and "both cameras show the same image" in found.pose.reason
+
+
 def test_swapped_cameras_are_not_found(cameras, rig, pair):
     places = [centres(camera, FACING, rig.target) for camera in cameras]
     found = Tracker(cameras, rig.target, Told(places[::-1])).step(pair[1], pair[0])
