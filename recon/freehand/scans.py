@@ -107,10 +107,10 @@ class ScansFields(SequenceFields):
         if poses_exact:
             yield "poses without errors, as they have no covariance: standard deviations of places leave out the tracking's"
         if self._lag_assumed:
-            yield f"no lag of the B-scans, to {1e3 * self.unsure.lag_s:g} ms (1 sigma); measure-lag finds it, give lag_s"
+            yield f"no lag of the B-scans, ± {1e3 * self.unsure.lag_s:g} ms (1 sigma); measure-lag finds it, give lag_s"
         if self.tissue_m_s is None:
             sigma = f"{self.unsure.tissue_m_s:g} m/s (1 sigma)"
-            yield f"sound of {speed_m_s:.0f} m/s in what was scanned, as calibrated, to {sigma}; give tissue_m_s"
+            yield f"sound of {speed_m_s:.0f} m/s in what was scanned, as calibrated, ± {sigma}; give tissue_m_s"
 
 
 @dataclass(frozen=True)
@@ -307,7 +307,7 @@ def depths(scans: Scans) -> str:
     """One line: the speed of sound for which the depths hold."""
     calibrated, speed = scans.calibrated_m_s, scans.speed_m_s
     how = "as calibrated" if speed == calibrated else f"converted from {calibrated:.0f} m/s, for which the probe is calibrated"
-    return f"right where sound makes {speed:.0f} m/s, {how}"
+    return f"right for sound of {speed:.0f} m/s, {how}"
 
 
 def cautions(scans: Scans) -> Iterator[str]:

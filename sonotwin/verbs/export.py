@@ -164,7 +164,7 @@ def write_sweep(folder: Path, config: Config, held: Manifest) -> list[str]:
         converted = sound_in_water.for_tissue(probe, config.tissue_m_s)
         probe_files.write_authors(folder / probe_files.AUTHORS, converted)
         meza2021.mark(folder, converted.speed_m_s)
-        lines.append(f"probe       {probe_files.AUTHORS}, right where sound makes {converted.speed_m_s:.0f} m/s")
+        lines.append(f"probe       {probe_files.AUTHORS}, right for sound of {converted.speed_m_s:.0f} m/s")
     if config.masses is not None and probe is not None:
         scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
         meshes = [mass.mesh for mass in mass_files.read_masses(config.masses).values()]

@@ -77,7 +77,7 @@ def run(config: Config) -> None:
             calibration, known = probe
             capture.add_probe(calibration)
             speed = f"{calibration.speed_m_s:g} m/s{known}"
-            lines.append(f"probe       {probe_files.AUTHORS}, taken as right where sound makes {speed}")
+            lines.append(f"probe       {probe_files.AUTHORS}, taken as right for sound of {speed}")
     for line in lines:
         console.print(line, markup=False)
     console.print(f"wrote       {config.out}", markup=False)

@@ -38,7 +38,7 @@ def test_images_are_read_anew_where_there_is_none():
 def test_what_is_said_of_them():
     few = recorded([])
     assert scans.summary(few) == "3 B-scans, 5x4, 2 with a pose"
-    assert scans.depths(few) == "right where sound makes 1540 m/s, converted from 1488 m/s, for which the probe is calibrated"
+    assert scans.depths(few) == "right for sound of 1540 m/s, converted from 1488 m/s, for which the probe is calibrated"
 
 
 def test_what_is_assumed_is_said_and_counts():
@@ -46,7 +46,7 @@ def test_what_is_assumed_is_said_and_counts():
     fields = scans.ScansFields(capture=Path("c"))
     assert fields.unsure == (0.1, 50.0) and fields.lag == 0
     said = list(fields.assumptions(1540.0))
-    assert said[0].startswith("no lag of the B-scans, to 100 ms") and said[1].startswith("sound of 1540 m/s in what was scanned")
+    assert said[0].startswith("no lag of the B-scans, ± 100 ms") and said[1].startswith("sound of 1540 m/s in what was scanned")
     assert next(fields.assumptions(1540.0, poses_exact=True)).startswith("poses without errors, as they have no covariance")
     known = scans.ScansFields(capture=Path("c"), lag_s=0.05, tissue_m_s=1450.0)
     assert known.unsure == (0.0, 25.0) and not list(known.assumptions(1450.0))
