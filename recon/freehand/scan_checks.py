@@ -57,13 +57,14 @@ def faults(images: Iterable[NDArray[np.uint8]], world_from_pixel: Array) -> Iter
         return
     blocks = np.array([cv2.resize(one, (LIMITS.side,) * 2, interpolation=cv2.INTER_AREA).astype(np.float32) for one in small])
     centre = np.array([small[0].shape[1] / 2, small[0].shape[0] / 2, 0, 1])
-    if _disordered(blocks.reshape(len(blocks), -1), np.array(places)[:, :3] @ centre):
+    centres = np.array(places)[:, :3] @ centre
+    if _disordered(blocks.reshape(len(blocks), -1), centres):
         yield (
             "B-scans that were taken near each other look no more alike than any two: images in another order, or poses of "
             "another sweep?"
         )
     else:
-        by_poses, shown, step = _shifts(small, places, centre)
+        by_poses, shown, step = _shifts(small, places, centre, centres)
         if by_poses > LIMITS.within * step and shown < LIMITS.shown * by_poses:
             yield (
                 f"the poses shift B-scans {step:.2g} mm apart by {by_poses:.2g} mm within their own planes, and the images show "
@@ -78,7 +79,7 @@ def faults(images: Iterable[NDArray[np.uint8]], world_from_pixel: Array) -> Iter
 def frozen(images: Iterable[NDArray[np.uint8]], poses: Iterable[Array]) -> str | None:
     """Say that B-scans are the same to the last digit where their poses : (4, 4) differ; None as a rule, and of flat images."""
     fresh = [
-        one.std() <= LIMITS.flat or not np.array_equal(one, other) or np.array_equal(pose, after, equal_nan=True)
+        not np.array_equal(one, other) or one.std() <= LIMITS.flat or np.array_equal(pose, after, equal_nan=True)
         for (one, pose), (other, after) in pairwise(zip(images, poses, strict=True))
     ]
     runs = np.diff([0, *(np.flatnonzero(fresh) + 1), len(fresh) + 1])
@@ -91,17 +92,18 @@ def _disordered(blocks: NDArray[np.float32], centres: Array) -> bool:
     """Whether B-scans that resemble each other exist, but not where they are neighbours by their centres : (n, 3) mm."""
     squares = (blocks**2).sum(axis=1)
     differences = np.sqrt(np.maximum(squares[:, None] + squares - 2 * blocks @ blocks.T, 0))
-    usual = float(np.median(differences[~np.eye(len(blocks), dtype=bool)]))
+    others = differences[~np.eye(len(blocks), dtype=bool)].reshape(len(blocks), -1)
+    if not np.median(others.min(axis=1)) < LIMITS.alike * np.median(others):
+        return False
     nearest = KDTree(centres).query(centres, k=2)[1][:, 1]
     neighbours = np.median(differences[np.arange(len(blocks)), nearest])
     rng = np.random.default_rng(0)
     orders = (rng.permutation(len(blocks)) for _ in range(LIMITS.orders))
     by_chance = np.mean([np.median(differences[order, order[nearest]]) <= neighbours for order in orders])
-    np.fill_diagonal(differences, np.inf)
-    return bool(np.median(differences.min(axis=1)) < LIMITS.alike * usual and by_chance > LIMITS.by_chance)
+    return bool(by_chance > LIMITS.by_chance)
 
 
-def _shifts(small: list[NDArray[np.uint8]], places: list[Array], centre: Array) -> tuple[float, float, float]:
+def _shifts(small: list[NDArray[np.uint8]], places: list[Array], centre: Array, centres: Array) -> tuple[float, float, float]:
     """Medians over B-scans that are apart, mm: shift within the plane by poses and in the images, and distance; else zeros.
 
     Parameters
@@ -109,11 +111,11 @@ def _shifts(small: list[NDArray[np.uint8]], places: list[Array], centre: Array) 
     small : (h, w) each
     places : (4, 4) each
         world_from_pixel of them.
-    centre : (4,) px
+    centre, centres : (4,) px, (n, 3) mm
     """
     mean = np.mean(small, axis=0, dtype=np.float32)  # what is alike in all is the scanner's, and never shifts
     window = cv2.createHanningWindow(mean.shape[::-1], cv2.CV_32F)
-    centres, found = np.array(places)[:, :3] @ centre, []
+    found = []
     strides = range(1, len(small) // 4)
     apart = (s for s in strides if np.median(np.linalg.norm(centres[s:] - centres[:-s], axis=1)) >= LIMITS.apart_mm)
     stride = next(apart, len(small) // 4)

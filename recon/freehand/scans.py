@@ -130,18 +130,18 @@ class VolumeSettings:
 
     def box(self, shape: tuple[int, int]) -> Clip | None:
         """Rectangle, of images (h, w), that is used; without a clip the one about the fan."""
-        return self.clip or (None if self.fan is None else Clip(*fan.box(self._fan_mask(shape))))
+        return self.clip or (None if self.fan is None else Clip(*fan.box(self._mask(self.fan, shape))))
 
     def part(self, shape: tuple[int, int]) -> tuple[Clip | None, Mask | None, NDArray[np.uint8] | None]:
         """Rectangle and pixels, of images (h, w), that are used, and their weights."""
         weights = self.weights_of(shape)
-        masks = [*([] if weights is None else [weights > 0]), *([] if self.fan is None else [self._fan_mask(shape)])]
+        masks = [*([] if weights is None else [weights > 0]), *([] if self.fan is None else [self._mask(self.fan, shape)])]
         return self.box(shape), np.logical_and.reduce(masks) if masks else None, weights
 
-    def _fan_mask(self, shape: tuple[int, int]) -> Mask:
-        mask = self.fan.mask(shape, 0 if self.arithmetic == "plus_none" else 1) if self.fan else np.ones(shape, bool)
+    def _mask(self, of: Fan, shape: tuple[int, int]) -> Mask:
+        mask = of.mask(shape, 0 if self.arithmetic == "plus_none" else 1)
         if not mask.any():
-            raise InputError(f"fan: expected a part of an image of {shape[1]}x{shape[0]}, found {self.fan}")
+            raise InputError(f"fan: expected a part of an image of {shape[1]}x{shape[0]}, found {of}")
         return mask
 
     def weights_of(self, shape: tuple[int, int]) -> NDArray[np.uint8] | None:

@@ -19,9 +19,7 @@ LIT_SHARE = 0.002  # share of the image that must carry fringes
 SATURATED_SHARE = 0.5  # share of the lit image that may be saturated
 HARMONIC_SHARE = 0.08  # of the modulation, in the high harmonics: beyond, it is no N-step sequence
 EACH_WAY = 0.01  # share of the pixels in each eighth of the circle, where phases are seen all around
-SLIM = (
-    0.1  # of the contrast's square, in its second harmonic around the circle: 1 of a line, 0.03 of a shift off by 5 % of a step
-)
+SLIM = 0.1  # of the contrast's square, in its second harmonic around: 1 of a line, 0.03 of a shift off by 5 % of a step
 BLACK = 0.01  # of the samples: the rest is brighter than black
 SPARSE_STEPS = 7  # at most, of which neighbours differ by a third of the swing; more have harmonics that show errors
 ALIKE = 0.15  # of the swing: a median difference of two images that noise makes; share of the pixels of either phase; of the
