@@ -1,8 +1,8 @@
 """A frame of a film, rendered where it matters: one ray in many pixels at large, more about the target, most at its rims.
 
-Three layers lie on each other: cells of 4 px all over, cells of 2 px about the target's board, and every pixel of the circles as
-far out as a fit of their rims looks; the last with more rays at the rims, where a pixel's share of ink is the noise. Rays between
-are interpolated.
+Three layers lie on each other: cells of 4 px all over, cells of 2 px about the target's board, and every pixel of the board's
+edges and of the circles as far out as a fit of their rims looks; the last with more rays at the rims, where a pixel's share of
+ink is the noise. Rays between are interpolated.
 
 How much of the unshadowed light arrives is smooth but for sharp shadows, and it is what few shadow rays know badly: on plain
 paper it would scatter by a tenth. So it is averaged over neighbours; what the surface reflects is not, and keeps its edges.
@@ -42,7 +42,6 @@ class Cells:
     extent: tuple[int, int]  # width, height, px
     cell: int  # px
     samples: int
-    number: int  # tells the sets of sample points of an image's layers apart
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -58,7 +57,7 @@ class Cells:
         v, u = np.broadcast_arrays(v[:, None], u)
         row, column = np.indices(u.shape)
         first = ((row % TILE) * TILE + column % TILE) * self.samples
-        return lanes_of(take, camera, u, v, self.samples, np.full(u.size, self.number << 24), first)
+        return lanes_of(take, camera, u, v, self.samples, np.zeros(u.size), first)  # one set for all, or layers would differ
 
     def lay(self, image: Image, light: Light) -> None:
         """Interpolate the lanes' radiance into the rectangle of an image : (h, w)."""
@@ -74,12 +73,11 @@ class Pixels:
     u: NDArray[np.int64]  # (n,)
     v: NDArray[np.int64]
     samples: NDArray[np.int64]
-    circle: NDArray[np.int64]  # the one that is nearest
-    number: int
+    circle: NDArray[np.int64]  # the one that is nearest, or NO_CIRCLE
 
     def lanes(self, take: int, camera: int) -> Lanes:
         """Lanes in the same order."""
-        lanes = lanes_of(take, camera, self.u, self.v, 1, self.number << 24 | np.arange(self.u.size))
+        lanes = lanes_of(take, camera, self.u, self.v, 1, 1 + np.arange(self.u.size))
         return Lanes(**lanes.__dict__ | {"samples": np.uint32(self.samples), "circle": np.uint32(self.circle)})
 
     def lay(self, image: Image, light: Light) -> None:
@@ -120,12 +118,14 @@ def film_picture(
 ) -> FilmPicture:
     """Layers for a take's frame by one camera, which exposes later by a share of the exposure."""
     size = device.optics.size
-    whole = Cells((0, 0), size, CELL_PX, quality.view, 0)
+    whole = Cells((0, 0), size, CELL_PX, quality.view)
     near = about_target(take, device, late, target) if take.present else None
     if near is None:
         return FilmPicture(size, [whole])
-    first, extent = near
-    return FilmPicture(size, [whole, Cells(first, extent, NEAR_CELL_PX, quality.view, 1), circles(truth, size, target, quality)])
+    corners = device.optics.camera().project(rigid.apply(take.motion.later(late).world_from_target, board_corners(target)))
+    return FilmPicture(
+        size, [whole, Cells(*near, NEAR_CELL_PX, quality.view), sharp_pixels(truth, corners, size, target, quality)]
+    )
 
 
 def about_target(take: Take, device: CameraDevice, late: float, target: Target) -> tuple[tuple[int, int], tuple[int, int]] | None:
@@ -139,10 +139,17 @@ def about_target(take: Take, device: CameraDevice, late: float, target: Target) 
     return (tuple(low.astype(int).tolist()), tuple(extent.astype(int).tolist())) if extent.min() >= 2 else None
 
 
-def circles(truth: ViewTruth, size: tuple[int, int], target: Target, quality: FilmQuality) -> Pixels:
-    """Pixels of the circles, as far out as a fit of their rims looks, with more rays at outer and inner rims."""
+def sharp_pixels(truth: ViewTruth, corners: Array, size: tuple[int, int], target: Target, quality: FilmQuality) -> Pixels:
+    """Pixels of the board's edges, between its corners : (4, 2) px, and of the circles, as far out as a fit of their rims looks,
+    with more rays at outer and inner rims.
+    """
     ratio = target.inner_diameter_mm / target.outer_diameter_mm
-    found: list[Array] = []
+    edges = np.zeros(size[::-1], np.uint8)
+    width = 2 * RIM_PX + float(truth.blur_px.max())
+    cv2.polylines(edges, [np.rint(corners).astype(np.int32)], isClosed=True, color=1, thickness=round(width))
+    v, u = edges.nonzero()
+    same = np.ones(u.size)
+    found = [np.column_stack([u, v, same * quality.disc, same * NO_CIRCLE, same * np.inf])]
     for number, (row, path) in enumerate(zip(truth.ellipses, truth.blur_px, strict=True)):
         reach = row[2] * (1 + BEYOND) + path
         low = np.clip(np.floor(row[:2] - reach), 0, size).astype(int)
@@ -157,7 +164,7 @@ def circles(truth: ViewTruth, size: tuple[int, int], target: Target, quality: Fi
     table = table[np.argsort(table[:, 4], kind="stable")]  # of pixels that two circles share, those of the nearer
     _, kept = np.unique(table[:, 1] * size[0] + table[:, 0], return_index=True)
     u, v, rays, number = table[kept, :4].astype(np.int64).T
-    return Pixels(u, v, rays, number, 2)
+    return Pixels(u, v, rays, number)
 
 
 def most_rays(quality: FilmQuality) -> int:

@@ -77,7 +77,6 @@ def render(
     most_samples: int,
     seed: int,
     grid: BitGrid | None = None,
-    shadows: int = SHADOWS,
 ) -> Light:
     """Trace the lanes' rays.
 
@@ -87,14 +86,12 @@ def render(
         Points of the largest set, a power of two.
     grid : BitGrid or None
         Print on the target's face instead of the circles.
-    shadows : int
-        Shadow rays a ray, a power of two.
     """
     first, step, end = _shares(lanes)
     take, camera = dr.gather(mi.UInt32, mi.UInt32(lanes.take), first), dr.gather(mi.UInt32, mi.UInt32(lanes.camera), first)
     rows = Rows.of(take_columns(takes, rig, bank.body_at, bank.scene_at), take)
     cameras = Rows.of(camera_columns(takes), take * 2 + camera)
-    path = _Path(bank, rig.target, rows, cameras, grid, shadows)
+    path = _Path(bank, rig.target, rows, cameras, grid)
     key = dr.gather(mi.UInt32, mi.UInt32([one.k for one in takes]), take) * 4 + camera
     seeds = mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed), 4)[0]
     u, v, sets, circles = mi.Float(lanes.u), mi.Float(lanes.v), mi.UInt32(lanes.set), mi.UInt32(lanes.circle)
@@ -147,8 +144,8 @@ class _Source(NamedTuple):
 class _Path:
     """Rays through the same takes, one after another; fetches constant parameters once."""
 
-    def __init__(self, bank: Bank, target: Target, rows: Rows, cameras: Rows, grid: BitGrid | None, shadows: int) -> None:
-        self.bank, self.target, self.rows, self.grid, self.shadows = bank, target, rows, grid, shadows
+    def __init__(self, bank: Bank, target: Target, rows: Rows, cameras: Rows, grid: BitGrid | None) -> None:
+        self.bank, self.target, self.rows, self.grid = bank, target, rows, grid
         self.world_from_camera = Turn.of(cameras, "world_from_camera")
         self.fx, self.fy, self.cx, self.cy = cameras.all("pinhole")
         self.k1, self.k2, self.p1, self.p2, self.k3 = cameras.all("distortion")
@@ -273,23 +270,23 @@ class _Path:
         return 1 + dr.dot(self.gradient, direction)
 
     def _reflected(self, place, normal, view, surface, time, points: PairedPoints) -> tuple[mi.Float, mi.Float]:
-        """Radiance towards the viewer: of all sources without shadows, if one of them is seen, and in any case; mean of the
-        shadow rays.
+        """Radiance towards the viewer: of all sources without shadows, if one of them is seen, mean of the shadow rays; and in
+        any case, the lamps' by their middles, which is what a ball that shines evenly gives a matte surface.
         """
-        radiance, plain = mi.Float(0), mi.Float(0)
-        for light in points.split(self.shadows):
-            around, sources = self._sources(place, normal, view, surface, light)
+        radiance = mi.Float(0)
+        for light in points.split(SHADOWS):
+            ball = mi.Vector3f(mi.warp.square_to_uniform_sphere(light.square()))
+            around, sources = self._sources(place, normal, view, surface, ball)
             total = around + sum(source.value for source in sources)
             way, weight = self._towards_one(around, sources, light.square().x * total, normal, light.square())
             blocked = self._blocked(place + normal * LIFT_MM, way, time, total > 0)
             radiance += dr.select(blocked, 0, total * weight)
-            plain += total
-        return radiance / self.shadows, plain / self.shadows
+        around, sources = self._sources(place, normal, view, surface, mi.Vector3f(0))
+        return radiance / SHADOWS, around + sum(source.value for source in sources)
 
-    def _sources(self, place, normal, view, surface, points: PairedPoints) -> tuple[mi.Float, list["_Source"]]:
-        """Unshadowed radiance from the surroundings' light, a point of each lamp, and the projector."""
+    def _sources(self, place, normal, view, surface, ball: mi.Vector3f) -> tuple[mi.Float, list["_Source"]]:
+        """Unshadowed radiance from the surroundings' light, the lamps' points at `ball`, in radii, and the projector."""
         around = surface[0] * self.ambient * self._share_from(2 / 3 * normal)  # mean of all directions by their cosines
-        ball = mi.Vector3f(mi.warp.square_to_uniform_sphere(points.square()))
         sources = []
         for k in range(LAMPS):
             px, py, pz, radius, intensity = self.lamps[5 * k : 5 * k + 5]

@@ -94,7 +94,7 @@ def render_film(bank: Bank, rig: Rig, takes: Sequence[Take], quality: FilmQualit
     ]
     pictures = [film_picture(shot.take, shot.device, shot.late, rig.target, shot.truth, quality) for shot in shots]
     blocks = [picture.lanes(k // 2, shot.camera) for k, (picture, shot) in enumerate(zip(pictures, shots, strict=True))]
-    light = render(bank, rig, takes, joined(blocks), most_rays(quality), seed, shadows=1)
+    light = render(bank, rig, takes, joined(blocks), most_rays(quality), seed)
     starts = np.cumsum([0, *(len(block.u) for block in blocks)])
     parts = [light.part(slice(a, b)) for a, b in pairwise(starts)]
 

@@ -9,10 +9,10 @@ from twin.tracking.film_pictures import (
     Cells,
     FilmPicture,
     Pixels,
-    circles,
     evened,
     over_a_tile,
     over_pixels,
+    sharp_pixels,
     visible_shares,
 )
 from twin.tracking.moving_transport import NO_CIRCLE, Light
@@ -32,12 +32,13 @@ def truth_of(rows, blur=0.0):
     return ViewTruth(None, rows[:, :2], rows, np.ones(3, bool), np.full(3, blur))
 
 
+CORNERS = np.array([[20.0, 20], [300, 20], [300, 240], [20, 240]])
 ROWS = [[80.0, 90.0, 20.0, 17.0, 0.4], [150.0, 90.0, 20.0, 18.0, 0.2], [400.0, 90.0, 20.0, 18.0, 0.0]]
 
 
 def test_what_is_linear_is_interpolated_exactly():
     """Lanes are in the middles of their cells; a window may begin anywhere."""
-    whole, near = Cells((0, 0), SIZE, 4, 1, 0), Cells((33, 21), (61, 50), 2, 1, 1)
+    whole, near = Cells((0, 0), SIZE, 4, 1), Cells((33, 21), (61, 50), 2, 1)
     picture = FilmPicture(SIZE, [whole, near])
     lanes = picture.lanes(0, 0)
     image = picture.radiance(light_of(3.0 + 0.02 * lanes.u + 0.01 * lanes.v))
@@ -48,27 +49,32 @@ def test_what_is_linear_is_interpolated_exactly():
 
 
 def test_a_tile_deals_out_each_point_of_its_set_once():
-    lanes = Cells((0, 0), (64, 64), 4, 2, 0).lanes(0, 0)
+    lanes = Cells((0, 0), (64, 64), 4, 2).lanes(0, 0)
     assert len(set(lanes.set.tolist())) == 1
     first = lanes.first.reshape(16, 16)[:4, :4]
     assert sorted(first.ravel().tolist()) == list(range(0, 32, 2))
 
 
-def test_the_pixels_of_the_circles_reach_as_far_as_a_fit_looks(rig):
-    """Every pixel within BEYOND radii of an ellipse, none twice, each with the nearest circle; the third is outside."""
-    made = circles(truth_of(ROWS), SIZE, rig.target, FilmQuality())
+def test_sharp_pixels_reach_as_far_as_a_fit_looks(rig):
+    """Every pixel within BEYOND radii of an ellipse and beside an edge, none twice, each with the nearest circle, if any; the
+    third is outside.
+    """
+    made = sharp_pixels(truth_of(ROWS), CORNERS, SIZE, rig.target, FilmQuality())
     assert len(np.unique(made.v * SIZE[0] + made.u)) == len(made.u)
     v, u = np.mgrid[: SIZE[1], : SIZE[0]]
     near = (np.hypot(u - 80, v - 90) < 17 * (1 + BEYOND) - 1) | (np.hypot(u - 150, v - 90) < 18 * (1 + BEYOND) - 1)
     held = np.zeros(near.shape, bool)
     held[made.v, made.u] = True
-    assert held[near].all() and set(made.circle.tolist()) == {0, 1}
+    assert held[near].all() and set(made.circle.tolist()) == {0, 1, NO_CIRCLE}
+    assert held[17:24, 20:300].all() and held[20:240, 297:304].all() and not held[30:50, 200:290].any()
     rim = np.abs(np.hypot(made.u - 80.0, made.v - 90.0) - 18.5) < 1
     assert (made.samples[rim] == FilmQuality().rim).all() and (made.samples == FilmQuality().disc).sum() > 500
 
 
 def test_a_blurred_circle_has_wider_rims(rig):
-    still, blurred = (circles(truth_of(ROWS, blur), SIZE, rig.target, FilmQuality()).samples for blur in (0.0, 10.0))
+    still, blurred = (
+        sharp_pixels(truth_of(ROWS, blur), CORNERS, SIZE, rig.target, FilmQuality()).samples for blur in (0.0, 10.0)
+    )
     assert np.count_nonzero(blurred == FilmQuality().rim) > 1.5 * np.count_nonzero(still == FilmQuality().rim)
 
 
@@ -92,8 +98,8 @@ def test_a_repeated_pattern_of_shadow_rays_leaves_no_noise():
 
 def test_shares_are_those_of_the_area(rig):
     """Whatever the number of rays: a circle of which the left half is covered."""
-    made = circles(truth_of(ROWS), SIZE, rig.target, FilmQuality())
-    lanes = Pixels(made.u, made.v, made.samples, made.circle, 2).lanes(0, 0)
+    made = sharp_pixels(truth_of(ROWS), CORNERS, SIZE, rig.target, FilmQuality())
+    lanes = Pixels(made.u, made.v, made.samples, made.circle).lanes(0, 0)
     inside = (np.hypot(lanes.u - 80, lanes.v - 90) < 17) | (np.hypot(lanes.u - 150, lanes.v - 90) < 17)
     disc = np.where(inside, lanes.samples, 0).astype(np.float32)
     seen = np.where((lanes.circle == 0) & (lanes.u < 80), 0, disc)

@@ -14,7 +14,9 @@ from recon.model.circle_layout import circle_centres
 from scenes.handheld.surroundings import surroundings
 from tests.twin.tracking.takes import facing, plain_take, ranges, rig
 from twin.optics.sampling import sobol_pair
+from twin.shooting import FilmQuality
 from twin.tracking import mesh_bank as bank_module
+from twin.tracking.film_pictures import TILE, film_picture, most_rays
 from twin.tracking.mesh_bank import build_bank
 from twin.tracking.moving_transport import NO_CIRCLE, Lanes, _Path, render
 from twin.tracking.rendered_views import white_radiance
@@ -152,6 +154,30 @@ def lit_by(take, *names: str):
     gradient = np.array([0.5, -0.5, 0.5])
     lighting = replace(take.lighting, lamps=lamps, projector=projector, ambient=0.4 * ("around" in names), gradient=gradient)
     return replace(take, lighting=lighting)
+
+
+def test_paper_under_a_large_lamp_has_no_lattice_in_a_film(bank):
+    """Nothing stands before the face, so brightness varies over paper as smoothly as the lamp's light."""
+    take, truth = unhidden(bank)
+    pose = take.motion.world_from_target
+    lamps = np.zeros((4, 5))
+    lamps[:, 3] = 1
+    lamps[0] = [*(pose[:3, 3] + pose[:3, :3] @ [100, 200, 700]), 80, 700.0**2]
+    take = replace(take, lighting=replace(take.lighting, lamps=lamps, ambient=0.1))
+    quality = FilmQuality(view=MOST // TILE**2)
+    picture = film_picture(take, take.cameras[0], 0.0, RIG.target, truth, quality)
+    image = picture.radiance(render(bank, RIG, [take], picture.lanes(0, 0), most_rays(quality), 1))
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    a, b = (truth.centres[k] - truth.centres[0] for k in (1, 2))
+    along, across = np.linalg.solve(np.column_stack([a, b]), (np.stack([u, v], -1) - truth.centres[0])[..., None])[..., 0].T
+    on_face = ((along > 0) & (along < 1) & (across > 0) & (across < 1)).T
+    for row in truth.ellipses:
+        on_face &= np.hypot(u - row[0], v - row[1]) > row[2] + 5
+    x, y = (u - truth.centres[0, 0])[on_face] / 200, (v - truth.centres[0, 1])[on_face] / 200
+    terms = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    paper = image[on_face]
+    smooth = terms @ np.linalg.lstsq(terms, paper)[0]
+    assert (paper / smooth).std() < 0.005
 
 
 def test_light_of_several_sources_adds_up_in_their_shadows(bank):
