@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 
 from campaign import full_disk, sources
 from campaign.sources import Command
+from recon.capture.manifest import MANIFEST
 from recon.files import written_files
 from recon.files.written_files import LIST
 
@@ -112,6 +113,7 @@ INSTEAD: dict[str, Lay] = {
     "a file in its place": write,
     "a folder of theses": lambda out: [write(out / f"{number}.txt") for number in range(3)],
 }
+SHARED = {("render", "a result of demo")}  # by whose own words its capture may be rendered anew, by hand
 OF_A_FILE = ("one of ours, changed by hand", "one of ours, moved and linked", "a file in its place")  # where `out` is a file
 
 
@@ -185,17 +187,27 @@ def _case(place: Path, command: Command, content: str, copied: Path | None, lay:
         out = folder / command.out
         if copied is not None:
             shutil.copytree(copied, out, symlinks=True) if copied.is_dir() else shutil.copyfile(copied, out)
-        own = content in IN_A_RESULT
+        own = content in IN_A_RESULT or (command.verb, content) in SHARED
         if lay is not None:
             lay(out)
         for beside in (f"{command.out}.notes", f".{command.out}.notes", f".{command.out}.old.txt"):
             write(folder / beside)
         before = digests(folder)
         kept = {path: digest for path, digest in before.items() if not (own and path in _replaceable(folder, out))}
+        told = {path: (folder / path).read_bytes() for path in kept if path.endswith(f"/{MANIFEST}")}
         anew = full_disk.anew(command.verb) if own else ()
         status, said = _do(command, (*command.line, *anew), folder)
         after = digests(folder)
-    return Case(command.verb, content, status, said, tuple(path for path, one in kept.items() if after.get(path) != one))
+        merged = {path for path, old in told.items() if path in after and _takes_over((folder / path).read_bytes(), old)}
+    lost = tuple(path for path, one in kept.items() if after.get(path) != one and path not in merged)
+    return Case(command.verb, content, status, said, lost)
+
+
+def _takes_over(new: bytes, old: bytes) -> bool:
+    """Whether a capture's manifest has all that the old one said, the surface apart, of which a new take is the last."""
+    new_parts, old_parts = json.loads(new), json.loads(old)
+    devices = new_parts.pop("devices").items() >= old_parts.pop("devices").items()
+    return devices and all(new_parts.get(name) == old_parts[name] for name in old_parts if name != "surface")
 
 
 def _replaceable(folder: Path, out: Path) -> set[str]:

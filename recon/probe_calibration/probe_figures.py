@@ -21,6 +21,7 @@ FIVE_POINTS = ("centre", "top_left", "top_right", "bottom_left", "bottom_right")
 LAST = 3  # frames, too few to find a sudden movement by
 SPEEDS_APART = 0.03  # relative; water 15 degrees colder, or a depth setting of 50 mm for one of 48
 SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reported
+FREEZING_F = 32.0  # degrees Fahrenheit
 
 
 def measure(frames: CrossingFrames, result: Result, design: Probe, settings: Settings) -> Metrics:
@@ -141,13 +142,22 @@ def _describe_sound(figures: Metrics, settings: Settings) -> Iterator[str]:
         yield f"depth       {same}; temperature_c=... converts it"
         return
     if abs(speed / in_water - 1) > SPEEDS_APART:
-        yield "warning     not the tank's speed: another depth setting than of rig.probe.scale_mm_per_px, or poses not in mm?"
+        yield f"warning     not the tank's speed: {_other_speed(speed, settings.temperature_c)}"
     deep = float(sound_in_water.shown_too_deep(SHOWN_DEPTH_MM, in_water, assumed))
     shown = f"{abs(deep):.2f} mm too {'deep' if deep > 0 else 'shallow'} at {SHOWN_DEPTH_MM:g} mm"
     by = "" if settings.temperature_c is None else f"{settings.temperature_c:g} °C, "
     yield f"water       {by}{in_water:.1f} m/s: assuming {assumed:g}, the scanner shows echoes {shown}"
     scales = f"sy {figures['sy_measured_mm_per_px']:.5f} to {figures['sy_mm_per_px']:.5f} mm/px"
     yield f"depth       converted from this water to {settings.wanted_speed:g} m/s: {scales}"
+
+
+def _other_speed(speed: float, temperature_c: float | None) -> str:
+    """Why a tank's speed of sound, m/s, isn't that of its stated temperature."""
+    if temperature_c is not None and temperature_c > FREEZING_F:
+        celsius = (temperature_c - FREEZING_F) / 1.8
+        if abs(speed / float(sound_in_water.speed_of_sound(celsius)) - 1) <= SPEEDS_APART:
+            return f"is temperature_c={temperature_c:g} in degrees Fahrenheit? It would be {celsius:.0f} °C"
+    return "another depth setting than of rig.probe.scale_mm_per_px, or poses not in mm?"
 
 
 def rows(frames: CrossingFrames, found: Adjustment) -> Iterator[Sequence[object]]:

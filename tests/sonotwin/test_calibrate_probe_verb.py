@@ -189,6 +189,16 @@ def test_another_scanners_scale_makes_no_speed_of_sound(rig, rng, tmp_path, caps
     assert probe_files.read(tmp_path / "out" / "probe.yaml").speed_m_s == pytest.approx(1488.4, rel=0.01)
 
 
+def test_degrees_fahrenheit_are_named(rig, rng, tmp_path):
+    fields = [
+        f"pairs={pairs_of(probe_motions.true_probe(rig), bscans.SIZE, rng, tmp_path / 'pairs.csv')}",
+        f"out={tmp_path / 'out'}",
+    ]
+    fahrenheit = sweep_sets.WATER_C * 1.8 + 32
+    assert any("degrees Fahrenheit" in line for line in calibrate(*fields, f"temperature_c={fahrenheit}"))
+    assert not any("Fahrenheit" in line for line in calibrate(*fields, f"temperature_c={sweep_sets.WATER_C}"))
+
+
 def test_a_scale_of_the_rig_is_none_of_wider_images(rig, rng, tmp_path, capsys):
     """Twice as many mm a pixel both ways, of the same size in px: another scanner's, so the temperature is asked for."""
     wider = replace(probe_motions.true_probe(rig), scale=2 * np.array(rig.probe.scale_mm_per_px))
