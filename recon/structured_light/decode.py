@@ -283,8 +283,8 @@ def _orders(shots: _Shots, axis: Axis, sets: list[Measured], valid: Mask, light:
     nowhere = np.zeros(valid.shape, bool)
     part, fringe = min(sets, key=lambda pair: pair[0].pitch)
     if patterns.unwrap == "heterodyne":
-        orders = multi_frequency.fringe_order(sets, length)
-        plausibility.check_pitches(orders.trusted, valid, fringe.sigma, light, f"{name}: fringes of {axis}")
+        orders, clear = multi_frequency.fringe_order(sets, length)
+        plausibility.check_pitches(orders.trusted, valid & clear, fringe.sigma, light, f"{name}: fringes of {axis}")
         return orders, nowhere, {}
     guide, place = next((p, at) for p, at in patterns.slices() if isinstance(p, GrayCode | CentreLine) and p.axis == axis)
     if isinstance(guide, CentreLine):

@@ -24,6 +24,7 @@ PLANNED_SIGMA = 0.02  # rad of phase noise, if the sequence's own isn't known: t
 FRINGES = 0.3  # rad: pixels of more phase noise show none
 
 Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def _widest(start: Step, candidates: list[Step], goal: Step, noise: NDArray[np.f
     return reach[-1]
 
 
-def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> Orders:
+def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> tuple[Orders, Mask]:
     """Fringe order k of the finest pitch, so that `x = origin + pitch * (phase / 2 pi + k)`.
 
     Each rung of the ladder gives a coordinate that the next one refines. A pixel is not trusted where a phase ends further
@@ -133,6 +134,11 @@ def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> Orders:
     ----------
     sets : (fringes, decoded fringes) of one axis, any order
     length : projector px of the axis
+
+    Returns
+    -------
+    orders : of all pixels
+    clear : (h, w) bool, where noise leaves MARGIN sigmas to every decision: what isn't trusted there contradicts itself
 
     Raises
     ------
@@ -145,26 +151,30 @@ def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> Orders:
     pitches = [fringes.pitch for fringes, _ in sets]
     phases = np.stack([fringe.phase for _, fringe in sets])
     sigmas = np.stack([fringe.sigma for _, fringe in sets])
-    path = ladder(pitches, length, _typical(sigmas))
+    path = ladder(pitches, length, _least(sigmas))
     # A combined phase is zero where its own sum is; shift every set so that all are zero at the middle of the axis.
     middle = (length - 1) / 2
     lead = np.array([2 * np.pi * (middle - fringes.zero(length)) / fringes.pitch for fringes, _ in sets])
     rungs = Rungs(np.array([step.pitch for step in path]), np.array([step.weights for step in path], float), lead)
     span = Span(middle, float(sets[0][0].zero(length)), length / 2)
     orders = Orders(np.zeros(phases.shape[1:], np.int32), np.zeros(phases.shape[1:], np.bool_))
-    in_threads(_climb, phases.shape[1], phases, sigmas, rungs, span, orders)
-    return orders
+    clear = np.zeros(phases.shape[1:], np.bool_)
+    in_threads(_climb, phases.shape[1], phases, sigmas, rungs, span, orders, clear)
+    return orders, clear
 
 
-def _typical(sigmas: Image) -> NDArray[np.float64] | None:
-    """Phase noise of the better half of the pixels that show fringes : (sets,) rad; None if there are none."""
+def _least(sigmas: Image) -> NDArray[np.float64] | None:
+    """Phase noise that a twentieth of the pixels that show fringes have at most : (sets,) rad; None if there are none.
+
+    A small bright object on a dark table is measured though the table can't be.
+    """
     seen = sigmas.reshape(len(sigmas), -1)
     seen = seen[:, (seen < FRINGES).all(axis=0)]
-    return np.quantile(seen, 0.25, axis=1).astype(float) if seen.size else None
+    return np.quantile(seen, 0.05, axis=1).astype(float) if seen.size else None
 
 
 @kernel
-def _climb(first, end, phases, sigmas, rungs: Rungs, span: Span, orders: Orders):
+def _climb(first, end, phases, sigmas, rungs: Rungs, span: Span, orders: Orders, clear):
     """Orders of rows `first` to `end`, not included; at the ends of the axis by both ways of unwrapping the coarsest wave."""
     pitch, weights = rungs.pitch, rungs.weights
     n, _, width = phases.shape
@@ -172,19 +182,24 @@ def _climb(first, end, phases, sigmas, rungs: Rungs, span: Span, orders: Orders)
         for u in range(width):
             start = _cycles(phases, rungs, 0, v, u)
             start -= np.floor(start + 0.5)
-            x, sure = _ascend(phases, sigmas, rungs, v, u, start)
+            x, sure, may_be, noise = _ascend(phases, sigmas, rungs, v, u, start)
             variance = 0.0
             for i in range(n):
                 variance += (weights[0, i] * sigmas[i, v, u]) ** 2
             if 0.5 - abs(start) < SIGMAS * np.sqrt(variance) / (2 * np.pi):
-                # The ends of the coarsest wave are one phase: of both only that which leads onto the axis can be right.
-                other, too = _ascend(phases, sigmas, rungs, v, u, start - np.sign(start))
+                # The ends of the coarsest wave are one phase: of both only that which leads onto the axis can be right. The one
+                # counts that is sure, and only if noise can't explain what the finer waves have against the other.
+                other, too, other_may_be, _ = _ascend(phases, sigmas, rungs, v, u, start - np.sign(start))
                 reach = span.half + SIGMAS * pitch[-1] / (2 * np.pi) * sigmas[0, v, u]
-                inside, as_well = sure and abs(x) <= reach, too and abs(other) <= reach
-                sure = inside != as_well
-                x = other if as_well and not inside else x
+                may_be = may_be and (abs(x) <= reach or not sure)
+                other_may_be = other_may_be and (abs(other) <= reach or not too)
+                if other_may_be and not may_be:
+                    x, sure = other, too
+                elif other_may_be or not may_be:
+                    sure = False
             orders.order[v, u] = np.floor((span.middle + x - span.origin) / pitch[-1] - phases[0, v, u] / (2 * np.pi) + 0.5)
             orders.trusted[v, u] = sure
+            clear[v, u] = noise <= 0.5 / MARGIN
 
 
 @njit(inline="always")
@@ -198,9 +213,11 @@ def _cycles(phases, rungs: Rungs, r, v, u):
 
 @njit(inline="always")
 def _ascend(phases, sigmas, rungs: Rungs, v, u, start):
-    """Projector px from the middle by the finest rung, and whether every rung could be decided."""
+    """Projector px from the middle by the finest rung, whether every rung could be decided, whether all agree within their
+    noise, and the worst's noise in cycles.
+    """
     pitch, weights = rungs.pitch, rungs.weights
-    x, sure = pitch[0] * start, True
+    x, sure, agree, worst = pitch[0] * start, True, True, 0.0
     for r in range(1, pitch.size):
         cycles = _cycles(phases, rungs, r, v, u)
         whole = x / pitch[r] - cycles
@@ -208,9 +225,11 @@ def _ascend(phases, sigmas, rungs: Rungs, v, u, start):
         variance = 0.0
         for i in range(phases.shape[0]):
             variance += ((pitch[r - 1] / pitch[r] * weights[r - 1, i] - weights[r, i]) * sigmas[i, v, u]) ** 2
-        residual, doubt = abs(whole - nearest), SIGMAS * np.sqrt(variance) / (2 * np.pi)
+        noise = np.sqrt(variance) / (2 * np.pi)
+        residual, doubt, worst = abs(whole - nearest), SIGMAS * noise, max(worst, noise)
         # A wrong order comes from an error of over half a cycle, and leaves the rest to a whole one.
         if residual > min(SLACK + doubt, 1 - SLACK - doubt):
             sure = False
+        agree = agree and residual <= SLACK + doubt
         x = pitch[r] * (cycles + nearest)
-    return x, sure
+    return x, sure, agree, worst

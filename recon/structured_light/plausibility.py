@@ -332,20 +332,21 @@ def _check_residuals(residual: Image, place: str) -> None:
         )
 
 
-def check_pitches(trusted: Mask, valid: Mask, sigma: Image, light: str, place: str) -> None:
+def check_pitches(trusted: Mask, clear: Mask, sigma: Image, light: str, place: str) -> None:
     """Refuse sets of fringes whose phases contradict each other nearly everywhere, or in many pixels in which noise is small.
 
-    trusted, valid : (h, w) bool
+    trusted : (h, w) bool
+    clear : (h, w) bool, where noise leaves the orders to be decided
     sigma : (h, w) rad, of the finest phase
     light : what is suspected of it, in words; empty as a rule
     """
-    lit = np.count_nonzero(valid)
-    lost = lit - np.count_nonzero(trusted & valid)
-    clear = valid & (sigma <= np.median(sigma[valid])) if lit else valid
-    contradicting, least_noise = np.count_nonzero(clear & ~trusted), np.count_nonzero(clear)
+    count = np.count_nonzero(clear)
+    lost = count - np.count_nonzero(trusted & clear)
+    clearest = clear & (sigma <= np.median(sigma[clear])) if count else clear
+    contradicting, least_noise = np.count_nonzero(clearest & ~trusted), np.count_nonzero(clearest)
     cause = f"{light}, or " if light else ""
-    if (all_over := lost > max(CONTRADICTED * lit, FEW)) or contradicting > max(UNEXPLAINED * least_noise, FEW):
-        share, where = (lost / lit, "") if all_over else (contradicting / least_noise, " with the least noise")
+    if (all_over := lost > max(CONTRADICTED * count, FEW)) or contradicting > max(UNEXPLAINED * least_noise, FEW):
+        share, where = (lost / count, "") if all_over else (contradicting / least_noise, " with the least noise")
         raise InputError(
             f"{place} contradict each other in {100 * share:.0f} % of the pixels{where}: {cause}are they in the manifest's "
             "order, each step taken once, and are the pitches those projected?"

@@ -106,7 +106,7 @@ def _agreement(sets: Sequence[Measured], length: int) -> float:
     """
     sets = sorted(sets, key=lambda pair: pair[0].pitch)
     finest, fringe = sets[0]
-    order = multi_frequency.fringe_order(sets, length).order
+    order = multi_frequency.fringe_order(sets, length)[0].order
     x = finest.zero(length) + finest.pitch * (fringe.phase.astype(float) / (2 * np.pi) + order)
     shares = []
     for (finer, _), (part, its) in pairwise(sets):

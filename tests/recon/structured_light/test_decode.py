@@ -265,6 +265,22 @@ def test_swapped_sets_of_fringes_are_refused(rng):
     refused(images[[*range(8), *range(14, 20), *range(8, 14)]], patterns, "fringes of columns contradict each other")
 
 
+@pytest.mark.parametrize("dark", [2.0, 6.0, 12.0])
+def test_a_small_bright_object_is_measured_on_a_table_too_dark_to_decide(rng, dark):
+    """What noise leaves open is no contradiction, and no pixel is placed at the other end of the axis. Exchanged sets are one."""
+    parts = tuple(Fringes(pitch=pitch, steps=5) for pitch in (20, 140, 1200))
+    patterns = Patterns(projector_size=(1200, 800), unwrap="heterodyne", parts=parts)
+    columns = np.broadcast_to(20 + 1100 * np.arange(320) / 320, (240, 320))
+    light = np.full(columns.shape, dark)
+    light[80:160, 120:216] = 150
+    images = photograph(patterns, {"columns": columns}, rng, light=light)
+    found = decode(images, patterns, noise=NOISE, min_modulation_dn=0.5)
+    ok = found.status == Status.OK
+    assert ok[80:160, 120:216].mean() > 0.98 and np.abs(found.columns - columns)[ok].max() < 8
+    with pytest.raises(InputError, match="contradict each other"):
+        decode(images[[*range(5), *range(10, 15), *range(5, 10)]], patterns, noise=NOISE, min_modulation_dn=0.5)
+
+
 @pytest.mark.parametrize("name", ["paper_surface", "gray_surface"])
 def test_sizes_that_are_no_multiple_of_the_cells(rng, name):
     patterns = load(name)

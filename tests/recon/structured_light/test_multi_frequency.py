@@ -21,7 +21,7 @@ def decoded(pitches, x, sigma, rng, origins=None):
     origins = origins or [None] * len(pitches)
     sets = [Fringes(pitch=p, steps=8, origin=o) for p, o in zip(pitches, origins, strict=True)]
     pairs = [(fringes, measured(fringes, x, sigma, rng)) for fringes in sets]
-    found = fringe_order(pairs, 1280)
+    found = fringe_order(pairs, 1280)[0]
     fringes, fringe = min(pairs, key=lambda pair: pair[0].pitch)
     return fringes.zero(1280) + fringes.pitch * (fringe.phase / (2 * np.pi) + found.order), found.trusted
 
@@ -59,7 +59,7 @@ def test_contradicting_phases_are_refused(rng):
     """
     fringes = [Fringes(pitch=pitch, steps=8) for pitch in (12, 126, 1332)]
     sets = [(f, measured(f, rng.uniform(0, 1279, (50, 60)), 0.01, rng)) for f in fringes]
-    trusted = fringe_order(sets, 1280).trusted
+    trusted = fringe_order(sets, 1280)[0].trusted
     assert trusted.mean() == pytest.approx((2 * (0.1 + 5 * 0.105 / (2 * np.pi))) ** 2, abs=0.035)  # 5 standard errors
 
 
