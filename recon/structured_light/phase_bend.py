@@ -17,6 +17,7 @@ The noise of the phase is magnified where it is stretched, and what may be left 
 Sources: Guo, He and Chen 2004 (histogram of the phase); Liu and others 2010 (harmonics of a gamma).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -53,6 +54,8 @@ UNAMBIGUOUS = 1.5  # rad, as far as one of the former turns over several pixels
 ROUNDS = 8
 SETTLED = 2e-4  # rad
 STRONGEST = {3: 0.44, 4: 0.3}  # c by steps: three at 0.5 have a phase that stands still; no more can be undone
+STEEPEST = 0.9  # 2 N e likewise: at 1 the phase stands still
+FURTHER = (3, 4)  # harmonics of the bend that aren't undone: they tell what is left, as of binary fringes
 SURE = 4.0  # standard errors, from which on a bend is undone
 NORMAL = 1.4826  # standard deviation of normal values over their median distance
 
@@ -173,21 +176,23 @@ def measure(fringe: Fringe, part: Fringes, valid: Mask) -> Bend | Hidden:
     twice = 2 * steps * speed < FINEST * 2 * np.pi
     c, e, limit = 0.0, 0.0, STRONGEST[steps]
     for _ in range(ROUNDS):
-        windows = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, saturated, width, steps)
+        windows = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, saturated, width, (steps, 2 * steps))
         if windows.shape[1] < FEWEST:
             return "few"
         once, second = np.median(windows.real, axis=1)
         c, e = c + 2 * once / steps, e + second / steps if twice else 0.0
-        if abs(c) > limit:
-            c = float(np.copysign(limit, c))
+        if abs(c) > limit or 2 * steps * abs(e) > STEEPEST:
+            c = float(np.clip(c, -limit, limit))
             return Bend(by_harmonics(steps, c, 0.0), steps, part.pitch, np.inf, gamma_of(steps, c), False, part.waveform)
         if 2 * abs(once) / steps < SETTLED:
             break
-    return _judged(windows, part, c, e if twice else 0.0)
+    shown = [k * steps for k in FURTHER if k * steps * speed < FINEST * 2 * np.pi]
+    rest = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, saturated, width, shown)
+    return _judged(windows, rest, part, c, e if twice else 0.0)
 
 
-def _judged(windows: NDArray[np.complex128], part: Fringes, c: float, e: float) -> Bend:
-    """The bend, or none where it isn't sure, by windows : (2, w).
+def _judged(windows: NDArray[np.complex128], rest: NDArray[np.complex128], part: Fringes, c: float, e: float) -> Bend:
+    """The bend, or none where it isn't sure, by windows : (2, w) and those of further harmonics : (k, w).
 
     Shapes and noise scatter their real and imaginary parts alike; real parts scatter more where the bend varies, as with blur.
     """
@@ -196,7 +201,10 @@ def _judged(windows: NDArray[np.complex128], part: Fringes, c: float, e: float) 
     unsure = 1.25 * real * np.sqrt(SHARED / windows.shape[1]) * np.array([2, 1]) / steps  # of c and e, rad
     varies = np.sqrt(np.maximum(real**2 - imaginary**2, 0)) * np.array([2, 1]) / steps
     c, e = (value if abs(value) > SURE * error else 0.0 for value, error in zip((c, e), unsure, strict=True))
-    left = float(np.sqrt((unsure**2).sum() + (varies[0] ** 2 if c else 0.0)) / np.sqrt(2))
+    further = np.median(rest.real, axis=1)
+    further = further[np.abs(further) > SURE * 1.25 * _scatter(rest.real) * np.sqrt(SHARED / windows.shape[1])]
+    more = 2 / steps * further / FURTHER[0]
+    left = float(np.sqrt((unsure**2).sum() + (more**2).sum() + (varies[0] ** 2 if c else 0.0)) / np.sqrt(2))
     gamma = gamma_of(steps, c) if c else 1.0
     return Bend(by_harmonics(steps, c, e), steps, part.pitch, left, gamma, waveform=part.waveform)
 
@@ -226,8 +234,8 @@ def straight(seen: Image, bend: Array, steps: int) -> Array:
     return seen + np.interp((seen + np.pi) % turn, turn * np.arange(TABLE + 1) / TABLE, np.append(bend[:, 0], bend[0, 0]))
 
 
-def _windows(phase: Array, known: Mask, saturated: Mask, width: Array, steps: int) -> NDArray[np.complex128]:
-    """Means of `exp(i N phase)` and `exp(2 i N phase)` over the windows in which enough is known : (2, w).
+def _windows(phase: Array, known: Mask, saturated: Mask, width: Array, multiples: Sequence[int]) -> NDArray[np.complex128]:
+    """Means of `exp(i m phase)` for multiples m over the windows in which enough is known : (m, w).
 
     Peaks that saturate are missing N times a period, as the harmonic is that is looked for.
     """
@@ -241,5 +249,6 @@ def _windows(phase: Array, known: Mask, saturated: Mask, width: Array, steps: in
 
     share = means(known)
     whole = (share > WHOLE) & (means(saturated) < CUT_OFF)
-    angles = [k * steps * phase for k in (1, 2)]
-    return np.array([(means(known * np.cos(a)) + 1j * means(known * np.sin(a)))[whole] / share[whole] for a in angles])
+    angles = [multiple * phase for multiple in multiples]
+    found = [(means(known * np.cos(a)) + 1j * means(known * np.sin(a)))[whole] / share[whole] for a in angles]
+    return np.array(found).reshape(len(multiples), np.count_nonzero(whole))

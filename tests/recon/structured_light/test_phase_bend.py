@@ -117,6 +117,24 @@ def test_binary_fringes_are_no_gamma(rng, steps, blur):
     assert len(said) == 1 and "binary fringes" in said[0] and said[0].endswith("defocus the projector more, or take sine fringes")
 
 
+@pytest.mark.parametrize(("steps", "pitch", "blur"), [(3, 24, 0.5), (3, 60, 2), (3, 60, 8), (4, 60, 4), (4, 60, 8)])
+def test_what_is_left_of_binary_fringes_is_counted(rng, steps, pitch, blur):
+    """Harmonics that two terms don't undo: refused where the phase stands still, else in sigma and in the line."""
+    bits = int(np.ceil(np.log2(1280 / pitch)))
+    parts = (Fringes(pitch=pitch, steps=steps, waveform="binary"), GrayCode(pitch=pitch, bits=bits, complementary=True))
+    u, v = np.arange(640) / 640, np.arange(200)[:, None] / 360
+    columns = 20 + 400 * u + 30 * np.sin(3 * u + 2 * v) + 10 * v
+    images = photograph(patterns_of(parts), {"columns": columns}, rng, light=180, blur=blur)
+    if blur < pitch / 20:
+        with pytest.raises(InputError, match="bent by harmonics of binary fringes, by which phases can't be told"):
+            decode(images, patterns_of(parts), noise=NOISE)
+        return
+    found = decode(images, patterns_of(parts), noise=NOISE)
+    off = (found.columns - columns)[found.status == Status.OK]
+    off = off[np.abs(off) < 3] - np.median(off)
+    assert np.std(off) < 1.4 * np.sqrt(np.nanmean(found.sigma_columns**2))
+
+
 def test_clipped_black_is_named(rng):
     """Of 150 DN 30 subtracted: by the line of the bend with three steps; 100: in place of a wrong order with twelve."""
     patterns, images = seen(3, rng)
