@@ -226,8 +226,11 @@ LAG = Task(
     ("bottom", "wires"),
     lambda folder: figures_of.lag(folder / "new"),
     (
-        *pose_mistakes.of_poses(f"{BOTTOM}/track.csv"),
-        *(one for one in pose_mistakes.of_stamps(f"{BOTTOM}/us/timestamps.csv") if one.kind != "late"),  # which it measures
+        *(  # lateness is what it measures
+            one
+            for one in (*pose_mistakes.of_poses(f"{BOTTOM}/track.csv"), *pose_mistakes.of_stamps(f"{BOTTOM}/us/timestamps.csv"))
+            if one.kind != "late"
+        ),
         *_images(f"{BOTTOM}/us", "B-scans", tuple(how for how in SCANNED if how != "late")),
         Mistake("device", "B-scans of another sweep", r"bottom|found", taken_from("wires/capture/sweep/us", f"{BOTTOM}/us")),
         Mistake("units", "lags sought in ms", r"search|lag", given("search_s=[-300,600]")),

@@ -56,6 +56,7 @@ class Unsure(NamedTuple):
 
 
 ASSUMED = Unsure(0.1, 50.0)  # of a lag that is taken as none: scanners show images 0 to 200 ms late; and of any tissue's sound
+SOFT_M_S = (900.0, 1800.0)  # of soft tissues, water, silicone and gels
 KNOWN_TISSUE_M_S = 25.0  # m/s, standard deviation of the speed of sound in tissue that is known by its kind
 
 
@@ -316,6 +317,9 @@ def cautions(scans: Scans) -> Iterator[str]:
         yield line
     if scans.elsewhere:
         yield "3D Slicer shows the sequence where its transforms to RAS put it, and these results elsewhere: give reference=LPS"
+    if not SOFT_M_S[0] <= scans.speed_m_s <= SOFT_M_S[1]:
+        found = f"sound of {scans.speed_m_s:g} m/s in all that was scanned"
+        yield f"{found}: of bone or gas? Soft tissues, water and silicone have {SOFT_M_S[0]:g} to {SOFT_M_S[1]:g} m/s"
     yield from scan_checks.faults(scans.stream(), scans.world_from_pixel)
 
 

@@ -148,6 +148,10 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
         apart = lengths.shift(camera.camera_from_world[:3, 3])
         if units := lengths.DEVICES_APART.units(apart):
             found.append(f"{device}: is {apart:.4g} mm from {WORLD}: was the board's spacing given in {units}?")
+        if device != PROJECTOR and (np.diag(camera.camera_from_world)[:2] < 0).all():
+            found.append(
+                f"{device}: stands upside down beside {WORLD}: is it mounted so, or are its images turned by 180 degrees?"
+            )
         if stretched := stretch(device, camera, spread):
             found.append(stretched)
         if spread > UNSURE_FOCAL:

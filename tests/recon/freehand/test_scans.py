@@ -1,5 +1,6 @@
 """B-scans in space: are they read no more often than need be, and no more kept than there is room for?"""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,12 @@ def test_what_is_said_of_them():
     few = recorded([])
     assert scans.summary(few) == "3 B-scans, 5x4, 2 with a pose"
     assert scans.depths(few) == "right for sound of 1540 m/s, converted from 1488 m/s, for which the probe is calibrated"
+
+
+def test_the_speed_of_sound_of_bone_is_doubted():
+    few = recorded([])
+    said = ["".join(scans.cautions(replace(few, speed_m_s=speed))) for speed in (1000.0, 1540.0, 3500.0)]
+    assert ["of bone or gas?" in each for each in said] == [False, False, True]
 
 
 def test_what_is_assumed_is_said_and_counts():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from recon.geometry import rigid
 from recon.geometry.board_shape import Tolerances
 from recon.geometry.camera_jacobian import MATRIX
 from recon.geometry.lens_domain import is_one_to_one
@@ -231,6 +232,19 @@ def test_a_lens_that_points_leave_open_has_neither_pole_nor_fold(rig, rng, model
     most = largest(found.cameras["cam1"], MATRIX + MODELS[model])
     assert (found.uncertainty.covariance.diagonal() ** 0.5 <= 1.001 * most).all()
     assert (np.abs(normalised_errors(found, {"cam1": camera})) < 5).all()
+
+
+def test_a_camera_upside_down_is_doubted(rig, rng):
+    """Images of camera 2 turned by 180 degrees calibrate as well as upright ones."""
+    upright = {name: devices(rig)[name] for name in ("cam1", "cam2")}
+    poses = random_poses(devices(rig), 12, rng)
+    over = rigid.from_rotation_vector([0, 0, np.pi], np.zeros(3)) @ upright["cam2"].camera_from_world
+    for second, doubted in ((upright["cam2"], False), (replace(upright["cam2"], camera_from_world=over), True)):
+        cameras = {"cam1": upright["cam1"], "cam2": second}
+        seen = observe(cameras, poses, rng)
+        free = free_parameters(["cam1", "cam2"], dict.fromkeys(cameras, MODELS["brown"]))
+        found = adjust(seen, Estimate(cameras, poses, BOARD.points()), free)
+        assert any("cam2: stands upside down" in line for line in optical_checks.warnings(seen, found)) == doubted
 
 
 def test_where_the_sightings_ask_for_a_fold_the_lens_is_not_forced(rig, rng):
