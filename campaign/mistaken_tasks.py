@@ -305,11 +305,11 @@ def _swept(scan: str) -> tuple[Mistake, ...]:
 
 FREEHAND = Task(
     "freehand",
-    (("freehand", "capture=scan/capture", "lag_s=0.05", "out=new"),),
-    ("scan",),
+    (("freehand", "capture=raster/capture", "lag_s=0.05", "out=new"),),
+    ("raster",),
     lambda folder: figures_of.volume(folder / "new"),
     (
-        *_swept("scan"),
+        *_swept("raster"),
         Mistake("units", "voxels in metres", r"spacing", given("spacing_mm=0.0005")),
         Mistake("units", "voxels of 50 mm", r"spacing|voxel", given("spacing_mm=50")),
         Mistake("field", "another clip", r"clip", given("clip=[400,10,100,100]")),
@@ -317,11 +317,11 @@ FREEHAND = Task(
 )
 SEGMENT = Task(
     "segment",
-    (("segment", "capture=lumps/capture", "lag_s=0.05", "tissue_m_s=1450", "overlays=0", "out=new"),),
-    ("lumps",),
+    (("segment", "capture=raster/capture", "lag_s=0.05", "tissue_m_s=1450", "overlays=0", "out=new"),),
+    ("raster",),
     lambda folder: figures_of.masses(folder / "new"),
     (
-        *_swept("lumps"),
+        *_swept("raster"),
         Mistake("field", "another dynamic range", r"dynamic|range", given("dynamic_range_db=40")),
         Mistake("field", "no speed of sound", r"tissue_m_s|speed|sound", given("tissue_m_s=null")),
         Mistake("late", "no lag", r"lag", given("lag_s=0")),
@@ -348,11 +348,11 @@ def _cell(column: str, how: Callable[[float], float]) -> made.Change:
     """A column of the foreign table of poses."""
 
     def change(folder: Path, rng: made.Rng) -> Line:
-        header, *rows = [line.split(",") for line in (folder / "poses.csv").read_text(encoding="utf-8").splitlines()]
+        header, *rows = [line.split(",") for line in (folder / "raster.csv").read_text(encoding="utf-8").splitlines()]
         k = header.index(column)
         for row in rows:
             row[k] = f"{how(float(row[k])):.9g}"
-        made.write(folder / "poses.csv", "\n".join(",".join(row) for row in (header, *rows)) + "\n")
+        made.write(folder / "raster.csv", "\n".join(",".join(row) for row in (header, *rows)) + "\n")
         return ()
 
     return change
@@ -367,11 +367,11 @@ CLIP = r"unit|column|clock|second|quaternion|speed|starts|metres"
 IMPORT_SWEEP = Task(
     "import-sweep",
     (
-        ("import-sweep", "clip=scan.dcm", "poses=poses.csv", "starts_s=100", "columns.time=t", "columns.translation=[x,y,z]",
+        ("import-sweep", "clip=raster.dcm", "poses=raster.csv", "starts_s=100", "columns.time=t", "columns.translation=[x,y,z]",
          "columns.quaternion=[qx,qy,qz,qw]", "out=imported"),
         ("freehand", "capture=imported", "probe=probe/probe.yaml", "out=new"),
     ),
-    ("scan.dcm", "poses.csv", "probe"),
+    ("raster.dcm", "raster.csv", "probe"),
     lambda folder: figures_of.volume(folder / "new"),
     (
         *(Mistake("units", f"positions in {name}", CLIP, _all_of("xyz", lambda x, f=f: x * f)) for name, f in made.UNITS.items()),

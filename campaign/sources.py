@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from campaign import commands
-from recon.capture import probe_files, surface_part
+from recon.capture import probe_files, surface_part, sweep_part
 from recon.devices.openigtlink import igtl_messages
 from recon.files import atomic
 from recon.geometry import rigid
@@ -25,7 +25,7 @@ MADE = (  # command lines in the order in which they are run
     ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "path.count=12", "out=wires"),
     ("sweep", "scene=tank", "ultrasound=water", "path=bob", "path.seconds=2", "out=bottom"),
     ("sweep", *STROKE, "out=scan"),
-    ("sweep", "path.start_mm=[26,-34]", "path.end_mm=[26,34]", "path.speed_mm_s=30", "out=lumps"),
+    ("sweep", "path=raster", "out=raster"),
     ("sweep", *STROKE, "filmed=true", "clocks.camera_hz=20", "out=filmed"),
     ("film", "frames=24", "path.turn_deg=20", "white_dn=120", "seed=1", "out=film"),
     ("dataset", "samples=4", "shard=2", "out=data"),
@@ -192,10 +192,22 @@ def _write_others(folder: Path) -> None:
     rows = [f"{time:.6f},0,{10 * (time - 99):.6f},650,0,0,0,1" for time in 99.0 + np.arange(60) / 20]
     (folder / "poses.csv").write_text("\n".join(["t,x,y,z,qx,qy,qz,qw", *rows]) + "\n", encoding="utf-8")
     (folder / "pairs.csv").write_text(_pairs(folder), encoding="utf-8")
+    _write_exported(folder)
     (folder / "plus.xml").write_text(PLUS, encoding="utf-8")
     _write_what_is_projected(folder)
     _write_small_ones(folder)
     (folder / "study.yaml").write_text("title: Rays\nof: tracking\nover:\n  film.rays: [16]\nseeds: 1\n", encoding="utf-8")
+
+
+def _write_exported(folder: Path) -> None:
+    """The raster as another scanner's clip and another tracker's table."""
+    sweep = sweep_part.read_sweep(folder / "raster/capture")
+    made_clips.write_dicom(folder / "raster.dcm", np.array(list(sweep.images())), region=False, FrameTime=50.0)
+    poses = sweep.track.poses[sweep.track.found]
+    seconds = 100 + (sweep.track.times[sweep.track.found] - sweep.times[0]) * 1e-9
+    table = np.column_stack([seconds, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+    rows = [",".join(f"{number:.9g}" for number in row) for row in table.tolist()]
+    (folder / "raster.csv").write_text("\n".join(["t,x,y,z,qx,qy,qz,qw", *rows]) + "\n", encoding="utf-8")
 
 
 def _write_what_is_projected(folder: Path) -> None:
