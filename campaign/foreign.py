@@ -113,7 +113,7 @@ INSTEAD: dict[str, Lay] = {
     "a file in its place": write,
     "a folder of theses": lambda out: [write(out / f"{number}.txt") for number in range(3)],
 }
-SHARED = {("render", "a result of demo")}  # by whose own words its capture may be rendered anew, by hand
+SHARED = {("render", "a result of demo")}  # demo's report has the command that renders its capture anew
 OF_A_FILE = ("one of ours, changed by hand", "one of ours, moved and linked", "a file in its place")  # where `out` is a file
 
 
@@ -198,16 +198,20 @@ def _case(place: Path, command: Command, content: str, copied: Path | None, lay:
         anew = full_disk.anew(command.verb) if own else ()
         status, said = _do(command, (*command.line, *anew), folder)
         after = digests(folder)
-        merged = {path for path, old in told.items() if path in after and _takes_over((folder / path).read_bytes(), old)}
-    lost = tuple(path for path, one in kept.items() if after.get(path) != one and path not in merged)
+        changed = [path for path, digest in kept.items() if after.get(path) != digest]
+        lost = tuple(path for path in changed if not (path in told and path in after and _takes_over(folder / path, told[path])))
     return Case(command.verb, content, status, said, lost)
 
 
-def _takes_over(new: bytes, old: bytes) -> bool:
+def _takes_over(path: Path, old: bytes) -> bool:
     """Whether a capture's manifest has all that the old one said, the surface apart, of which a new take is the last."""
-    new_parts, old_parts = json.loads(new), json.loads(old)
-    devices = new_parts.pop("devices").items() >= old_parts.pop("devices").items()
-    return devices and all(new_parts.get(name) == old_parts[name] for name in old_parts if name != "surface")
+    try:
+        now, before = json.loads(path.read_bytes()), json.loads(old)
+        devices = now["devices"].items() >= before["devices"].items()
+    except (ValueError, KeyError, AttributeError):
+        return False
+    same = all(now.get(name) == before[name] for name in before.keys() - {"devices", "surface"})
+    return devices and same and before.keys() <= now.keys()
 
 
 def _replaceable(folder: Path, out: Path) -> set[str]:

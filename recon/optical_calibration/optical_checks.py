@@ -26,6 +26,7 @@ COVERED = 0.5  # least share of the image within the points' hull
 FAR_OFF = 0.15  # of the image's side, from it to the nearest point
 DIAMETER_REFUSED, DIAMETER_DOUBTED = 0.04, 0.015  # relative error of the discs' size; ink spreads by up to 1 %
 NOISY = 3.0  # times the predicted noise
+UPSIDE_DOWN = -0.5  # cosine of a roll against the first camera
 UNSURE_FOCAL = 2e-3  # relative standard deviation of a focal length; 0.2 % is 1.4 mm at 700 mm
 
 
@@ -148,7 +149,7 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
         apart = lengths.shift(camera.camera_from_world[:3, 3])
         if units := lengths.DEVICES_APART.units(apart):
             found.append(f"{device}: is {apart:.4g} mm from {WORLD}: was the board's spacing given in {units}?")
-        if device != PROJECTOR and (np.diag(camera.camera_from_world)[:2] < 0).all():
+        if device != PROJECTOR and (np.diag(camera.camera_from_world)[:2] < UPSIDE_DOWN).all():
             found.append(
                 f"{device}: stands upside down beside {WORLD}: is it mounted so, or are its images turned by 180 degrees?"
             )

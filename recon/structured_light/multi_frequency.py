@@ -21,6 +21,7 @@ SLACK = 0.1  # cycle from the nearest whole order, besides noise: beyond, the ph
 SIGMAS = 5.0  # of noise, margin of the decision on a pixel
 MARGIN = 4.0  # sigmas to the tipping point, least margin of a typical pixel: with 4, the decision fails for 3 % of them
 PLANNED_SIGMA = 0.02  # rad of phase noise, if the sequence's own isn't known: three steps, noise 1/40 of modulation
+BETTER = 13.8  # 2 ln 1000, of squared sigmas by which one end of the axis must fit better than the other
 FRINGES = 0.3  # rad: pixels of more phase noise show none
 
 Image = NDArray[np.float32]
@@ -128,7 +129,8 @@ def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> tuple[O
     """Fringe order k of the finest pitch, so that `x = origin + pitch * (phase / 2 pi + k)`.
 
     Each rung of the ladder gives a coordinate that the next one refines. A pixel is not trusted where a phase ends further
-    than 0.1 cycle and five predicted sigmas from a whole order, or within reach of an equal error from the next order.
+    than 0.1 cycle and five predicted sigmas from a whole order, or within reach of an equal error from the next order; nor
+    where it may as well lie at the other end of the axis.
 
     Parameters
     ----------
@@ -138,7 +140,8 @@ def fringe_order(sets: Sequence[tuple[Fringes, Fringe]], length: int) -> tuple[O
     Returns
     -------
     orders : of all pixels
-    clear : (h, w) bool, where noise leaves MARGIN sigmas to every decision: what isn't trusted there contradicts itself
+    clear : (h, w) bool, where noise leaves MARGIN sigmas to every rung, and the end of the axis is known: what isn't trusted
+        there contradicts itself
 
     Raises
     ------
@@ -182,24 +185,26 @@ def _climb(first, end, phases, sigmas, rungs: Rungs, span: Span, orders: Orders,
         for u in range(width):
             start = _cycles(phases, rungs, 0, v, u)
             start -= np.floor(start + 0.5)
-            x, sure, may_be, noise = _ascend(phases, sigmas, rungs, v, u, start)
+            x, sure, misfit, noise = _ascend(phases, sigmas, rungs, v, u, start)
+            decided = noise <= 0.5 / MARGIN
             variance = 0.0
             for i in range(n):
                 variance += (weights[0, i] * sigmas[i, v, u]) ** 2
             if 0.5 - abs(start) < SIGMAS * np.sqrt(variance) / (2 * np.pi):
-                # The ends of the coarsest wave are one phase: of both only that which leads onto the axis can be right. The one
-                # counts that is sure, and only if noise can't explain what the finer waves have against the other.
-                other, too, other_may_be, _ = _ascend(phases, sigmas, rungs, v, u, start - np.sign(start))
+                # The ends of the coarsest wave are one phase: only that which leads onto the axis can be right, or else that
+                # which the finer waves fit much better. What isn't sure may have been led off the axis by noise.
+                other, too, its_misfit, _ = _ascend(phases, sigmas, rungs, v, u, start - np.sign(start))
                 reach = span.half + SIGMAS * pitch[-1] / (2 * np.pi) * sigmas[0, v, u]
-                may_be = may_be and (abs(x) <= reach or not sure)
-                other_may_be = other_may_be and (abs(other) <= reach or not too)
-                if other_may_be and not may_be:
+                possible, other_possible = abs(x) <= reach or not sure, abs(other) <= reach or not too
+                if other_possible and (not possible or its_misfit < misfit):
                     x, sure = other, too
-                elif other_may_be or not may_be:
+                if possible and other_possible and abs(its_misfit - misfit) < BETTER:
+                    sure = decided = False
+                elif not possible and not other_possible:
                     sure = False
             orders.order[v, u] = np.floor((span.middle + x - span.origin) / pitch[-1] - phases[0, v, u] / (2 * np.pi) + 0.5)
             orders.trusted[v, u] = sure
-            clear[v, u] = noise <= 0.5 / MARGIN
+            clear[v, u] = decided
 
 
 @njit(inline="always")
@@ -213,11 +218,11 @@ def _cycles(phases, rungs: Rungs, r, v, u):
 
 @njit(inline="always")
 def _ascend(phases, sigmas, rungs: Rungs, v, u, start):
-    """Projector px from the middle by the finest rung, whether every rung could be decided, whether all agree within their
-    noise, and the worst's noise in cycles.
+    """Projector px from the middle by the finest rung, whether every rung could be decided, the sum of the squares of what is
+    left of them over its variance, and the worst's noise in cycles.
     """
     pitch, weights = rungs.pitch, rungs.weights
-    x, sure, agree, worst = pitch[0] * start, True, True, 0.0
+    x, sure, misfit, worst = pitch[0] * start, True, 0.0, 0.0
     for r in range(1, pitch.size):
         cycles = _cycles(phases, rungs, r, v, u)
         whole = x / pitch[r] - cycles
@@ -230,6 +235,6 @@ def _ascend(phases, sigmas, rungs: Rungs, v, u, start):
         # A wrong order comes from an error of over half a cycle, and leaves the rest to a whole one.
         if residual > min(SLACK + doubt, 1 - SLACK - doubt):
             sure = False
-        agree = agree and residual <= SLACK + doubt
+        misfit += residual**2 / max(variance / (2 * np.pi) ** 2, 1e-12)
         x = pitch[r] * (cycles + nearest)
-    return x, sure, agree, worst
+    return x, sure, misfit, worst

@@ -55,7 +55,7 @@ ROUNDS = 8
 SETTLED = 2e-4  # rad
 STRONGEST = {3: 0.44, 4: 0.3}  # c by steps: three at 0.5 have a phase that stands still; no more can be undone
 STEEPEST = 0.9  # 2 N e likewise: at 1 the phase stands still
-FURTHER = (3, 4)  # harmonics of the bend that aren't undone: they tell what is left, as of binary fringes
+FURTHER = (3, 4)  # multiples of the bend that aren't undone: they tell what is left, as of binary fringes
 SURE = 4.0  # standard errors, from which on a bend is undone
 NORMAL = 1.4826  # standard deviation of normal values over their median distance
 
@@ -118,10 +118,11 @@ def table(steps: int, seen: Array, true: Array) -> Array:
 
 
 def by_harmonics(steps: int, c: float, e: float) -> Array:
-    """The table of harmonic N - 1 of c of the fundamental, with a rest of `e sin(2 N phase)`."""
-    phase = 2 * np.pi / steps * np.arange(4 * TABLE) / (4 * TABLE)
+    """The table of harmonic N - 1 of c of the fundamental, after a rest by which phases are less by `e sin(2 N phase)`."""
+    phase = np.linspace(0, 2 * np.pi / steps, 4 * TABLE + 1)
     seen = phase + np.angle(1 + c * np.exp(-1j * steps * phase))
-    return table(steps, seen, phase + e * np.sin(2 * steps * phase))
+    true = np.interp(phase, phase - e * np.sin(2 * steps * phase), phase)
+    return table(steps, seen[:-1], true[:-1])
 
 
 def by_gamma(steps: int, gamma: float) -> Array:
@@ -174,6 +175,8 @@ def measure(fringe: Fringe, part: Fringes, valid: Mask) -> Bend | Hidden:
     seen, known, saturated = fringe.phase[thin], valid[thin], fringe.saturated[thin]
     width = WINDOW * period / np.array(strides)
     twice = 2 * steps * speed < FINEST * 2 * np.pi
+    if part.waveform == "binary" and steps == 3 and not twice:  # whose bend has even multiples alone
+        return "fine"
     c, e, limit = 0.0, 0.0, STRONGEST[steps]
     for _ in range(ROUNDS):
         windows = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, saturated, width, (steps, 2 * steps))
@@ -182,17 +185,19 @@ def measure(fringe: Fringe, part: Fringes, valid: Mask) -> Bend | Hidden:
         once, second = np.median(windows.real, axis=1)
         c, e = c + 2 * once / steps, e + second / steps if twice else 0.0
         if abs(c) > limit or 2 * steps * abs(e) > STEEPEST:
+            gamma = gamma_of(steps, float(np.copysign(limit, c))) if abs(c) > limit else None
             c = float(np.clip(c, -limit, limit))
-            return Bend(by_harmonics(steps, c, 0.0), steps, part.pitch, np.inf, gamma_of(steps, c), False, part.waveform)
+            return Bend(by_harmonics(steps, c, 0.0), steps, part.pitch, np.inf, gamma, False, part.waveform)
         if 2 * abs(once) / steps < SETTLED:
             break
-    shown = [k * steps for k in FURTHER if k * steps * speed < FINEST * 2 * np.pi]
-    rest = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, saturated, width, shown)
-    return _judged(windows, rest, part, c, e if twice else 0.0)
+    multiples = [k * steps for k in FURTHER if k * steps * speed < FINEST * 2 * np.pi]
+    rest = _windows(straight(seen, by_harmonics(steps, c, e), steps), known, saturated, width, multiples)
+    further = rest / (np.array(multiples) / 2)[:, None]  # amplitudes, rad
+    return _judged(windows, further, part, c, e if twice else 0.0)
 
 
-def _judged(windows: NDArray[np.complex128], rest: NDArray[np.complex128], part: Fringes, c: float, e: float) -> Bend:
-    """The bend, or none where it isn't sure, by windows : (2, w) and those of further harmonics : (k, w).
+def _judged(windows: NDArray[np.complex128], further: NDArray[np.complex128], part: Fringes, c: float, e: float) -> Bend:
+    """The bend, or none where it isn't sure, by windows : (2, w), and what is left by its further multiples : (k, w) rad.
 
     Shapes and noise scatter their real and imaginary parts alike; real parts scatter more where the bend varies, as with blur.
     """
@@ -201,10 +206,10 @@ def _judged(windows: NDArray[np.complex128], rest: NDArray[np.complex128], part:
     unsure = 1.25 * real * np.sqrt(SHARED / windows.shape[1]) * np.array([2, 1]) / steps  # of c and e, rad
     varies = np.sqrt(np.maximum(real**2 - imaginary**2, 0)) * np.array([2, 1]) / steps
     c, e = (value if abs(value) > SURE * error else 0.0 for value, error in zip((c, e), unsure, strict=True))
-    further = np.median(rest.real, axis=1)
-    further = further[np.abs(further) > SURE * 1.25 * _scatter(rest.real) * np.sqrt(SHARED / windows.shape[1])]
-    more = 2 / steps * further / FURTHER[0]
-    left = float(np.sqrt((unsure**2).sum() + (more**2).sum() + (varies[0] ** 2 if c else 0.0)) / np.sqrt(2))
+    more = np.median(further.real, axis=1)
+    more = more[np.abs(more) > SURE * 1.25 * _scatter(further.real) * np.sqrt(SHARED / windows.shape[1])]
+    counted = [*unsure, *more, varies[0] if c else 0.0]
+    left = float(np.linalg.norm(counted) / np.sqrt(2))
     gamma = gamma_of(steps, c) if c else 1.0
     return Bend(by_harmonics(steps, c, e), steps, part.pitch, left, gamma, waveform=part.waveform)
 

@@ -159,7 +159,9 @@ def check_bends(bends: Iterable[Bend], clipped: float, place: str) -> None:
     """Refuse phases that are bent by more than can be undone."""
     for bend in bends:
         if not bend.undone:
-            law = "" if bend.gamma is None else f" as by light that goes with level^{bend.gamma:.1f} or more"
+            law = " as by no gamma (binary fringes?)"
+            if bend.gamma is not None:
+                law = f" as by light that goes with level^{bend.gamma:.1f} or more"
             law, way = (" by harmonics of binary fringes", DEFOCUS) if bend.waveform == "binary" else (law, LINEAR_LIGHT)
             cause = f" {black}? Else" if (black := black_clipped(clipped)) else ""
             raise InputError(
@@ -346,8 +348,15 @@ def check_pitches(trusted: Mask, clear: Mask, sigma: Image, light: str, place: s
     contradicting, least_noise = np.count_nonzero(clearest & ~trusted), np.count_nonzero(clearest)
     cause = f"{light}, or " if light else ""
     if (all_over := lost > max(CONTRADICTED * count, FEW)) or contradicting > max(UNEXPLAINED * least_noise, FEW):
-        share, where = (lost / count, "") if all_over else (contradicting / least_noise, " with the least noise")
+        share, which = (
+            (lost / count, "that noise leaves to be decided")
+            if all_over
+            else (
+                contradicting / least_noise,
+                "with the least noise",
+            )
+        )
         raise InputError(
-            f"{place} contradict each other in {100 * share:.0f} % of the pixels{where}: {cause}are they in the manifest's "
+            f"{place} contradict each other in {100 * share:.0f} % of the pixels {which}: {cause}are they in the manifest's "
             "order, each step taken once, and are the pitches those projected?"
         )

@@ -145,11 +145,10 @@ def sharp_pixels(truth: ViewTruth, corners: Array, size: tuple[int, int], target
     """
     ratio = target.inner_diameter_mm / target.outer_diameter_mm
     edges = np.zeros(size[::-1], np.uint8)
-    width = 2 * RIM_PX + float(truth.blur_px.max())
-    cv2.polylines(edges, [np.rint(corners).astype(np.int32)], isClosed=True, color=1, thickness=round(width))
+    width = round(2 * RIM_PX + float(truth.blur_px.max()))  # over which they move
+    cv2.polylines(edges, [np.rint(corners).astype(np.int32)], isClosed=True, color=1, thickness=width)
     v, u = edges.nonzero()
-    same = np.ones(u.size)
-    found = [np.column_stack([u, v, same * quality.disc, same * NO_CIRCLE, same * np.inf])]
+    found = [np.column_stack([u, v, *(np.full(u.size, value) for value in (quality.disc, NO_CIRCLE, np.inf))])]
     for number, (row, path) in enumerate(zip(truth.ellipses, truth.blur_px, strict=True)):
         reach = row[2] * (1 + BEYOND) + path
         low = np.clip(np.floor(row[:2] - reach), 0, size).astype(int)

@@ -271,7 +271,8 @@ class _Path:
 
     def _reflected(self, place, normal, view, surface, time, points: PairedPoints) -> tuple[mi.Float, mi.Float]:
         """Radiance towards the viewer: of all sources without shadows, if one of them is seen, mean of the shadow rays; and in
-        any case, the lamps' by their middles, which is what a ball that shines evenly gives a matte surface.
+        any case, the lamps' by their middles, which is what a ball that shines evenly gives a matte surface; of gloss on what is
+        curved it is sharper.
         """
         radiance = mi.Float(0)
         for light in points.split(SHADOWS):

@@ -281,6 +281,17 @@ def test_a_small_bright_object_is_measured_on_a_table_too_dark_to_decide(rng, da
         decode(images[[*range(5), *range(10, 15), *range(5, 10)]], patterns, noise=NOISE, min_modulation_dn=0.5)
 
 
+@pytest.mark.parametrize(("light", "least"), [(14.0, 0.3), (18.0, 0.9), (30.0, 0.99)])
+def test_a_wall_near_an_end_of_the_axis_is_measured(rng, light, least):
+    """The other end fits the coarsest wave as well; where noise leaves that open, a pixel is unsure, and none is placed there."""
+    parts = tuple(Fringes(pitch=pitch, steps=5) for pitch in (20, 140, 1200))
+    patterns = Patterns(projector_size=(1200, 800), unwrap="heterodyne", parts=parts)
+    columns = np.broadcast_to(1100 + 90 * np.arange(320) / 320, (160, 320))
+    found = decode(photograph(patterns, {"columns": columns}, rng, light=light), patterns, noise=NOISE, min_modulation_dn=2.0)
+    ok = found.status == Status.OK
+    assert ok.mean() > least and np.mean(np.abs(found.columns - columns)[ok] > 8) < 2e-4
+
+
 @pytest.mark.parametrize("name", ["paper_surface", "gray_surface"])
 def test_sizes_that_are_no_multiple_of_the_cells(rng, name):
     patterns = load(name)

@@ -117,22 +117,36 @@ def test_binary_fringes_are_no_gamma(rng, steps, blur):
     assert len(said) == 1 and "binary fringes" in said[0] and said[0].endswith("defocus the projector more, or take sine fringes")
 
 
-@pytest.mark.parametrize(("steps", "pitch", "blur"), [(3, 24, 0.5), (3, 60, 2), (3, 60, 8), (4, 60, 4), (4, 60, 8)])
-def test_what_is_left_of_binary_fringes_is_counted(rng, steps, pitch, blur):
-    """Harmonics that two terms don't undo: refused where the phase stands still, else in sigma and in the line."""
+@pytest.mark.parametrize(
+    ("steps", "pitch", "blur", "period_px"),
+    [(3, 24, 0.5, 40), (3, 60, 2, 90), (3, 24, 1, 40), (3, 24, 1, 14), (3, 60, 8, 90), (4, 60, 4, 90), (4, 60, 8, 90)],
+)
+def test_what_is_left_of_binary_fringes_is_counted(rng, steps, pitch, blur, period_px):
+    """Harmonics that two terms don't undo: refused where the phase stands still, else in sigma, not too small nor too large."""
     bits = int(np.ceil(np.log2(1280 / pitch)))
     parts = (Fringes(pitch=pitch, steps=steps, waveform="binary"), GrayCode(pitch=pitch, bits=bits, complementary=True))
-    u, v = np.arange(640) / 640, np.arange(200)[:, None] / 360
-    columns = 20 + 400 * u + 30 * np.sin(3 * u + 2 * v) + 10 * v
+    u, v = np.arange(640), np.arange(200)[:, None]
+    columns = 20 + u * pitch / period_px + 10 * np.sin(u / 300 + v / 200) + 0.03 * v
     images = photograph(patterns_of(parts), {"columns": columns}, rng, light=180, blur=blur)
-    if blur < pitch / 20:
+    if blur < pitch / 25:
         with pytest.raises(InputError, match="bent by harmonics of binary fringes, by which phases can't be told"):
             decode(images, patterns_of(parts), noise=NOISE)
         return
     found = decode(images, patterns_of(parts), noise=NOISE)
     off = (found.columns - columns)[found.status == Status.OK]
     off = off[np.abs(off) < 3] - np.median(off)
-    assert np.std(off) < 1.4 * np.sqrt(np.nanmean(found.sigma_columns**2))
+    assert 0.6 < np.std(off) / np.sqrt(np.nanmean(found.sigma_columns**2)) < 1.4
+
+
+def test_binary_fringes_of_few_pixels_are_said_to_hide_their_bend(rng):
+    parts = (Fringes(pitch=24, steps=3, waveform="binary"), GrayCode(pitch=24, bits=6, complementary=True))
+    columns = np.broadcast_to(30 + 3.0 * np.arange(400), (200, 400))
+    found = decode(
+        photograph(patterns_of(parts), {"columns": columns}, rng, light=180, blur=0.7), patterns_of(parts), noise=NOISE
+    )
+    assert any(
+        "which periods of so few camera pixels don't show" in line for line in describe_decoding(patterns_of(parts), found)
+    )
 
 
 def test_clipped_black_is_named(rng):

@@ -53,6 +53,10 @@ def test_a_tile_deals_out_each_point_of_its_set_once():
     assert len(set(lanes.set.tolist())) == 1
     first = lanes.first.reshape(16, 16)[:4, :4]
     assert sorted(first.ravel().tolist()) == list(range(0, 32, 2))
+    finer = Cells((8, 8), (32, 32), 2, 2).lanes(0, 0)
+    assert set(finer.set.tolist()) == set(lanes.set.tolist()), (
+        "another set would be off by another error, in a step at the border"
+    )
 
 
 def test_sharp_pixels_reach_as_far_as_a_fit_looks(rig):
