@@ -38,10 +38,10 @@ def test_values_are_those_of_the_standard_library(tmp_path):
     ],
 )
 def test_odd_values_are_refused_at_once(text, complaint):
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(InputError) as refusal:
         json_text.parsed(PLACE, text)
-    assert str(refusal.value).startswith(f"file.json: {complaint}") and time.perf_counter() - start < 1
+    assert str(refusal.value).startswith(f"file.json: {complaint}") and time.process_time() - start < 1
 
 
 def test_a_large_file_is_refused_before_it_is_read(tmp_path):
