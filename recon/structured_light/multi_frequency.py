@@ -220,6 +220,8 @@ def _cycles(phases, rungs: Rungs, r, v, u):
 def _ascend(phases, sigmas, rungs: Rungs, v, u, start):
     """Projector px from the middle by the finest rung, whether every rung could be decided, the sum of the squares of what is
     left of them over its variance, and the worst's noise in cycles.
+
+    To the variance of noise belongs a slack for what bends phases, of which SLACK is three standard deviations.
     """
     pitch, weights = rungs.pitch, rungs.weights
     x, sure, misfit, worst = pitch[0] * start, True, 0.0, 0.0
@@ -235,6 +237,6 @@ def _ascend(phases, sigmas, rungs: Rungs, v, u, start):
         # A wrong order comes from an error of over half a cycle, and leaves the rest to a whole one.
         if residual > min(SLACK + doubt, 1 - SLACK - doubt):
             sure = False
-        misfit += residual**2 / max(variance / (2 * np.pi) ** 2, 1e-12)
+        misfit += residual**2 / (noise**2 + (SLACK / 3) ** 2)
         x = pitch[r] * (cycles + nearest)
     return x, sure, misfit, worst
