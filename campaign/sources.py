@@ -165,7 +165,7 @@ def make(folder: Path, names: Collection[str] | None = None) -> None:
             outcome = commands.run(line, folder, LONGEST_S)
             if outcome.status:
                 raise RuntimeError(f"sonotwin {' '.join(line)}: {outcome.said}")
-    if names is None and not (folder / "study.yaml").exists():
+    if names is None and not all((folder / name).exists() for name in ("raster.csv", "study.yaml")):
         _write_others(folder)
 
 
