@@ -5,10 +5,11 @@ edges and of the circles as far out as a fit of their rims looks; the last with 
 ink is the noise. Rays between are interpolated.
 
 How much of the unshadowed light arrives is smooth but for sharp shadows, and it is what few shadow rays know badly: on plain
-paper it would scatter by a tenth. So it is averaged over neighbours; what the surface reflects is not, and keeps its edges.
+paper it would scatter by a tenth. So it is averaged over the cells about each, and the pixels take that of the cells beneath;
+what the surface reflects is not averaged, and keeps its edges.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -31,7 +32,6 @@ AROUND_PX = 24  # beyond the target's board
 BEYOND = 0.42  # radii beyond a circle's rim: a fit of the rim reaches to 0.37
 RIM_PX = 4.0  # on either side of a rim, and half of the motion's blur
 TILE = 4  # cells along each axis, among which the points of one set are dealt out: alike in all tiles, which leaves no noise
-SPREAD_PX = 4.0  # standard deviation over which the share of light that arrives is averaged between pixels
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,13 @@ class Cells:
         first = ((row % TILE) * TILE + column % TILE) * self.samples
         return lanes_of(take, camera, u, v, self.samples, np.zeros(u.size), first)  # one set for all, or layers would differ
 
-    def lay(self, image: Image, light: Light) -> None:
-        """Interpolate the lanes' radiance into the rectangle of an image : (h, w)."""
-        settled = evened(light.radiance.reshape(self.shape), light.plain.reshape(self.shape), over_a_tile)
+    def lay(self, image: Image, arrived: Image, light: Light) -> None:
+        """Interpolate the lanes' radiance, and what arrives of the unshadowed light, into the rectangle of images : (h, w)."""
+        plain = light.plain.reshape(self.shape)
+        share = arriving(light.radiance.reshape(self.shape), plain)
         (u, v), (width, height) = self.first, self.extent
-        image[v : v + height, u : u + width] = cv2.resize(settled, self.extent, interpolation=cv2.INTER_LINEAR)
+        for laid, cells in ((image, plain * share), (arrived, share)):
+            laid[v : v + height, u : u + width] = cv2.resize(cells, self.extent, interpolation=cv2.INTER_LINEAR)
 
 
 @dataclass(frozen=True)
@@ -80,15 +82,9 @@ class Pixels:
         lanes = lanes_of(take, camera, self.u, self.v, 1, 1 + np.arange(self.u.size))
         return Lanes(**lanes.__dict__ | {"samples": np.uint32(self.samples), "circle": np.uint32(self.circle)})
 
-    def lay(self, image: Image, light: Light) -> None:
-        """Put the lanes' radiance into the image : (h, w)."""
-        if not len(self.u):
-            return
-        low_u, low_v = self.u.min(), self.v.min()
-        at = self.v - low_v, self.u - low_u
-        radiance, plain = np.zeros((2, at[0].max() + 1, at[1].max() + 1), np.float32)
-        radiance[at], plain[at] = light.radiance, light.plain
-        image[self.v, self.u] = evened(radiance, plain, over_pixels)[at]
+    def lay(self, image: Image, arrived: Image, light: Light) -> None:
+        """Put the lanes' radiance into the image : (h, w), of the light that arrives : (h, w) by the layer beneath."""
+        image[self.v, self.u] = light.plain * arrived[self.v, self.u]
 
 
 @dataclass(frozen=True)
@@ -104,11 +100,11 @@ class FilmPicture:
 
     def radiance(self, light: Light) -> Image:
         """The image : (h, w), from the light of `lanes`."""
-        image = np.zeros(self.size[::-1], np.float32)
+        image, arrived = np.zeros((2, *self.size[::-1]), np.float32)
         first = 0
         for layer in self.layers:
             count = len(layer.u) if isinstance(layer, Pixels) else layer.shape[0] * layer.shape[1]
-            layer.lay(image, light.part(slice(first, first + count)))
+            layer.lay(image, arrived, light.part(slice(first, first + count)))
             first += count
         return image
 
@@ -177,10 +173,9 @@ def visible_shares(lanes: Lanes, light: Light) -> Array:
     return seen / np.maximum(disc, 1)
 
 
-def evened(radiance: Image, plain: Image, average: Callable[[Image], Image]) -> Image:
-    """Radiance : (h, w), whose share of the unshadowed radiance is averaged over neighbours; zero where that is zero."""
-    arrived, unshadowed = average(radiance), average(plain)
-    return np.where(plain > 0, plain * arrived / np.maximum(unshadowed, np.float32(1e-20)), np.float32(0))
+def arriving(radiance: Image, plain: Image) -> Image:
+    """Share : (h, w) of the unshadowed radiance that arrives, averaged over the cells about each."""
+    return over_a_tile(radiance) / np.maximum(over_a_tile(plain), np.float32(1e-20))
 
 
 def over_a_tile(image: Image) -> Image:
@@ -188,11 +183,6 @@ def over_a_tile(image: Image) -> Image:
     box = np.full(TILE, 1 / TILE)
     kernel = np.float32(np.convolve(box, box))
     return cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
-
-
-def over_pixels(image: Image) -> Image:
-    """Mean of pixels about each."""
-    return cv2.GaussianBlur(image, (0, 0), SPREAD_PX, borderType=cv2.BORDER_REPLICATE)
 
 
 def _radii(ellipse: Array, u: NDArray, v: NDArray) -> Array:

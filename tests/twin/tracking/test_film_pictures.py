@@ -9,9 +9,7 @@ from twin.tracking.film_pictures import (
     Cells,
     FilmPicture,
     Pixels,
-    evened,
-    over_a_tile,
-    over_pixels,
+    arriving,
     sharp_pixels,
     visible_shares,
 )
@@ -82,22 +80,29 @@ def test_a_blurred_circle_has_wider_rims(rig):
     assert np.count_nonzero(blurred == FilmQuality().rim) > 1.5 * np.count_nonzero(still == FilmQuality().rim)
 
 
-@pytest.mark.parametrize("average", [over_a_tile, over_pixels])
-def test_evening_keeps_what_is_even_and_sharp_print(rng, average):
-    """Light of which three quarters arrive, here and there: the mean stays, noise goes, and the print's edge stays sharp."""
+def test_what_arrives_is_averaged_and_sharp_print_is_not(rng):
+    """Light of which three quarters arrive, here and there: the mean stays, noise goes, and the print's edge doesn't show."""
     plain = np.where(np.arange(80) < 40, 1.0, 0.05).astype(np.float32)[None].repeat(80, axis=0)
     arrived = (rng.random((80, 80)) < 0.75).astype(np.float32)
-    result = evened(plain * arrived, plain, average) / plain
-    inside = result[12:-12, 12:-12]
+    inside = arriving(plain * arrived, plain)[12:-12, 12:-12]
     assert inside.mean() == pytest.approx(0.75, abs=0.03)
     assert inside.std() < 0.25 * arrived.std()
-    assert evened(np.zeros_like(plain), np.zeros_like(plain), average).max() == 0
+    assert arriving(np.zeros_like(plain), np.zeros_like(plain)).max() == 0
 
 
 def test_a_repeated_pattern_of_shadow_rays_leaves_no_noise():
     """One in four points is blocked, in each tile the same: everywhere exactly three quarters arrive."""
     arrived = np.tile(np.repeat([[0, 1, 1, 1]], 4, axis=0), (12, 12)).astype(np.float32)
-    assert evened(arrived, np.ones_like(arrived), over_a_tile)[4:-4, 4:-4] == pytest.approx(0.75, abs=1e-6)
+    assert arriving(arrived, np.ones_like(arrived))[4:-4, 4:-4] == pytest.approx(0.75, abs=1e-6)
+
+
+def test_pixels_take_the_light_of_the_cells_beneath(rig, rng):
+    """Half of the light arrives by the cells, whatever the pixels' own shadow rays say: no circle stands in a paler disc."""
+    sharp = sharp_pixels(truth_of(ROWS), CORNERS, SIZE, rig.target, FilmQuality())
+    picture = FilmPicture(SIZE, [Cells((0, 0), SIZE, 4, 1), sharp])
+    cells = SIZE[0] * SIZE[1] // 16
+    radiance = np.r_[np.full(cells, 0.5), rng.random(len(sharp.u))]
+    assert picture.radiance(light_of(radiance, np.ones_like(radiance))) == pytest.approx(0.5, abs=1e-6)
 
 
 def test_shares_are_those_of_the_area(rig):
