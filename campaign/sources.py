@@ -189,8 +189,9 @@ def _write_others(folder: Path) -> None:
     shown = made_clips.screens(made_clips.scans(24))
     made_clips.write_dicom(folder / "scan.dcm", shown, FrameTime=50.0)
     made_clips.write_video(folder / "screen.avi", shown, 20.0)
-    rows = [f"{time:.6f},0,{10 * (time - 99):.6f},650,0,0,0,1" for time in 99.0 + np.arange(60) / 20]
-    (folder / "poses.csv").write_text("\n".join(["t,x,y,z,qx,qy,qz,qw", *rows]) + "\n", encoding="utf-8")
+    _write_poses(
+        folder / "poses.csv", [[time, 0, 10 * (time - 99), 650, 0, 0, 0, 1] for time in (99.0 + np.arange(60) / 20).tolist()]
+    )
     (folder / "pairs.csv").write_text(_pairs(folder), encoding="utf-8")
     _write_exported(folder)
     (folder / "plus.xml").write_text(PLUS, encoding="utf-8")
@@ -206,8 +207,13 @@ def _write_exported(folder: Path) -> None:
     poses = sweep.track.poses[sweep.track.found]
     seconds = 100 + (sweep.track.times[sweep.track.found] - sweep.times[0]) * 1e-9
     table = np.column_stack([seconds, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
-    rows = [",".join(f"{number:.9g}" for number in row) for row in table.tolist()]
-    (folder / "raster.csv").write_text("\n".join(["t,x,y,z,qx,qy,qz,qw", *rows]) + "\n", encoding="utf-8")
+    _write_poses(folder / "raster.csv", table.tolist())
+
+
+def _write_poses(path: Path, table: Sequence[Sequence[float]]) -> None:
+    """A table of another tracker's: times in s, places in mm, quaternions."""
+    rows = [",".join(f"{number:.9g}" for number in row) for row in table]
+    path.write_text("\n".join(["t,x,y,z,qx,qy,qz,qw", *rows]) + "\n", encoding="utf-8")
 
 
 def _write_what_is_projected(folder: Path) -> None:

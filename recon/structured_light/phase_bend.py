@@ -185,8 +185,8 @@ def measure(fringe: Fringe, part: Fringes, valid: Mask) -> Bend | Hidden:
         once, second = np.median(windows.real, axis=1)
         c, e = c + 2 * once / steps, e + second / steps if twice else 0.0
         if abs(c) > limit or 2 * steps * abs(e) > STEEPEST:
-            gamma = gamma_of(steps, float(np.copysign(limit, c))) if abs(c) > limit else None
-            c = float(np.clip(c, -limit, limit))
+            of_a_gamma, c = abs(c) > limit, float(np.clip(c, -limit, limit))
+            gamma = gamma_of(steps, c) if of_a_gamma else None
             return Bend(by_harmonics(steps, c, 0.0), steps, part.pitch, np.inf, gamma, False, part.waveform)
         if 2 * abs(once) / steps < SETTLED:
             break

@@ -348,14 +348,8 @@ def check_pitches(trusted: Mask, clear: Mask, sigma: Image, light: str, place: s
     contradicting, least_noise = np.count_nonzero(clearest & ~trusted), np.count_nonzero(clearest)
     cause = f"{light}, or " if light else ""
     if (all_over := lost > max(CONTRADICTED * count, FEW)) or contradicting > max(UNEXPLAINED * least_noise, FEW):
-        share, which = (
-            (lost / count, "that noise leaves to be decided")
-            if all_over
-            else (
-                contradicting / least_noise,
-                "with the least noise",
-            )
-        )
+        share = lost / count if all_over else contradicting / least_noise
+        which = "that noise leaves to be decided" if all_over else "with the least noise"
         raise InputError(
             f"{place} contradict each other in {100 * share:.0f} % of the pixels {which}: {cause}are they in the manifest's "
             "order, each step taken once, and are the pitches those projected?"
