@@ -25,6 +25,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 
 from recon import arguments
 from recon.errors import InputError
@@ -377,19 +378,31 @@ def _without_outliers(start: _Estimate, sightings: Sightings, noise: Noise) -> t
         weights = np.maximum(1 - squared / (2 * GATE * scale), 0) ** 2
         estimate = _levenberg_marquardt(estimate, sightings, noise, weights)
     inliers = np.zeros(len(sightings.pixels), bool)
-    factor = np.sqrt(scale)
+    factor, gate = np.sqrt(scale), GATE
     for _ in range(20):
-        squared = _squared(estimate, sightings, noise)
-        inside = squared <= GATE * factor**2
-        if inside.sum() < MIN_FRAMES:
-            break
-        if (inside == inliers).all():
+        inside = _squared_as_predicted(estimate, sightings, noise, inliers) <= gate * factor**2
+        if inside.sum() < MIN_FRAMES or (inside == inliers).all():
             break
         inliers = inside
         estimate = _levenberg_marquardt(estimate, sightings.of(inliers), noise, np.ones(inliers.sum()))
         freedom = 3 * inliers.sum() - 11 - (sightings.beside is not None)
         factor = np.sqrt(max(_squared(estimate, sightings.of(inliers), noise).sum() / freedom, 1e-12))
+        gate = 3 * stats.f.isf(stats.chi2.sf(GATE, 3), 3, freedom)  # GATE of a level that is itself measured by these frames
     return estimate, inliers, float(factor)
+
+
+def _squared_as_predicted(estimate: _Estimate, sightings: Sightings, noise: Noise, used: Mask) -> Array:
+    """Squared normalised residuals : (n,), of frames that weren't used by the uncertainty of the estimate too.
+
+    Without it, six frames that twelve unknowns fit well would make outliers of all others, good ones too.
+    """
+    slopes, residuals = _whitened(estimate, sightings, noise)
+    covariance = np.broadcast_to(np.eye(3), (len(slopes), 3, 3)).copy()
+    if used.any():
+        matrix, _, _ = _normal_equations(estimate, sightings.of(used), noise, np.ones(used.sum()))
+        others = slopes[~used]
+        covariance[~used] += others @ np.linalg.pinv(matrix, hermitian=True) @ np.swapaxes(others, 1, 2)
+    return np.einsum("ni,ni->n", residuals, np.linalg.solve(covariance, residuals[..., None])[..., 0])
 
 
 def _farthest(estimate: _Estimate, sightings: Sightings, numbers: NDArray[np.int64] | None) -> str:
