@@ -9,7 +9,7 @@ from time import perf_counter
 
 from recon.files import metrics
 from recon.files.metrics import Metrics
-from sonotwin.demo_config import CALIBRATION
+from sonotwin.demonstration import RESULT
 from twin.accuracy.table_rows import Measurement, Row
 
 
@@ -39,4 +39,4 @@ def demonstration(out: Path, environment: dict[str, str]) -> tuple[float, Metric
     start = perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=os.environ | environment)
     seconds = perf_counter() - start
-    return seconds, metrics.read(out / metrics.FILE) | metrics.read(out / CALIBRATION / metrics.FILE)
+    return seconds, metrics.read(out / metrics.FILE) | metrics.read(out / RESULT / "optics" / metrics.FILE)

@@ -7,8 +7,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LightSource
 
-from sonotwin.verbs.demo import compared
-from twin.evaluation import surface_errors
+from sonotwin.rendered_session import BOTTOM, SCAN
+from twin.evaluation import session_errors, surface_errors, sweep_errors
 from twin.evaluation.sweep_errors import nearest_frame
 from twin.reports import sweep_pictures, sweep_report
 
@@ -21,7 +21,7 @@ SMOOTHED_PX = 2.0  # for the shading alone: bare noise of 0.02 mm would show
 def outside() -> None:
     """Four panels: the scene, its fringes, the reconstructed surface, its errors."""
     images = [cv2.imread(str(DEMO / "capture/surface/cam1" / f"{k:04d}.png"), cv2.IMREAD_GRAYSCALE) for k in range(9)]
-    points, sigma = surface_errors.read_points(DEMO / "surface/points.npz")
+    points, sigma = surface_errors.read_points(DEMO / "result/surface/points.npz")
     error = surface_errors.compare(points, sigma, surface_errors.read_truth(DEMO / "truth")).error
     known = np.isfinite(points[..., 2])
     weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), SMOOTHED_PX)
@@ -47,11 +47,12 @@ def outside() -> None:
 
 def inside() -> None:
     """The measured skin with the tumours found under it, and a B-scan through each beside what it should show."""
-    findings, truth = compared(DEMO)
-    story = sweep_report.read({name: DEMO / name for name in ("sweep", "bottom", "probe", "lag", "volume")}, findings, truth)
+    truth = sweep_errors.read_truth(DEMO / "truth", SCAN)
+    findings = session_errors.findings(DEMO / "result", truth, SCAN)
+    story = sweep_report.read(DEMO / "result", SCAN, BOTTOM, findings, truth)
     figure = plt.figure(figsize=(16, 3.4), layout="constrained")
     axes = figure.add_subplot(1, 4, 1, projection="3d", computed_zorder=False)
-    skin = surface_errors.read_points(DEMO / "surface/points.npz")[0][::8, ::8]
+    skin = surface_errors.read_points(DEMO / "result/surface/points.npz")[0][::8, ::8]
     breast = np.where((skin[..., 2] < TABLE_MM)[..., None], skin, np.nan)
     axes.plot_wireframe(*shown(breast), rcount=60, ccount=60, color="0.6", linewidth=0.3)
     for finding in findings:

@@ -44,6 +44,18 @@ def groups(verb: str) -> dict[str, list[str]]:
     return {name: [one for one in given if OF_ONE_VERB.get(f"{name}/{one}", verb) == verb] for name, given in found.items()}
 
 
+def defaults(verb: str) -> dict[str, Any]:
+    """The fields of a verb as they are without overrides; `???` where one needs a value."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from omegaconf import OmegaConf
+
+    with initialize_config_dir(str(folder()), version_base=None):
+        found = OmegaConf.to_container(hydra_compose(verb), resolve=True)
+    assert isinstance(found, dict)
+    return {str(key): value for key, value in found.items()}
+
+
 def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
     """Compose a verb's configuration and validate it.
 

@@ -18,11 +18,14 @@ from recon.files import metrics
 from recon.files.code_digest import code_digest
 from recon.files.metrics import Metrics, shown
 from recon.probe_calibration import repeatability
-from sonotwin import config, session_steps
+from recon.probe_calibration.sound_in_water import speed_of_sound
+from sonotwin import config, rendered_session
 from sonotwin.choices import read_rig
-from sonotwin.session_steps import BOTTOM, SCAN, TUBE, WIRES
+from sonotwin.rendered_session import BOTTOM, SCAN, TUBE, WATER_C, WATER_SIGMA_M_S, WIRES, Settings, choice
+from sonotwin.verbs import calibrate_optics, calibrate_probe, reconstruct
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation import session_errors
+from twin.ultrasound.timed_sweep import Clocks
 
 Array = NDArray[np.float64]
 
@@ -39,6 +42,7 @@ LENGTHS = {  # of the cylinders: figure, what it is the error of, its bar and th
 }
 MARK = "_true_extent_mm"  # of a tumour's figures, one a tumour
 PACKAGES = ("recon", "scenes", "twin", "sonotwin")
+TISSUE_M_S = 1450.0  # of the phantom's silicone
 
 
 def measurements(setup: Setup) -> list[Measurement]:
@@ -75,24 +79,43 @@ def session(work: Path, conditions: str, seed: int) -> tuple[bool, Metrics]:
 
     Returns whether all steps were done, and the figures.
     """
-    given, known = [f"conditions={conditions}", f"seed={seed}"], [f"board_scale={BOARD_SCALE[conditions]:g}"]
-    for verb, fields in session_steps.rendering(work / "session", given, POSES):
-        session_steps.do(verb, fields)
+    chosen = settings(conditions, seed)
+    for part in rendered_session.parts(chosen, work / "session"):
+        part.run()
     truth = (work / "session" / "truth").rename(work / "truth")
-    status = session_steps.do(*session_steps.reconstruction(work / "session", work / "result", known))
+    by = reconstruction(chosen, BOARD_SCALE[conditions], work / "session", work / "result")
+    status = reconstruct.run(by)
     figures = session_errors.measure(work / "result", work / "session" / "capture", truth)
     if status:
         return False, figures
-    status, of_cylinders = cylinders(work / "cylinders", work / "result", given, known)
+    status, of_cylinders = cylinders(work / "cylinders", chosen, by)
     return status == 0, figures | of_cylinders
 
 
-def cylinders(work: Path, calibrated: Path, given: Sequence[str], known: Sequence[str]) -> tuple[int, Metrics]:
+def settings(conditions: str, seed: int) -> Settings:
+    """A session's settings: as many poses as in Meza et al. 2021, and the cameras' usual rate over the scene."""
+    usual = rendered_session.usual(
+        conditions=choice("conditions", conditions), poses=choice("poses", POSES), bottom_s=6.0, seed=seed
+    )
+    return usual.model_copy(update={"clocks": usual.clocks.model_copy(update={"camera_hz": Clocks().camera_hz})})
+
+
+def reconstruction(chosen: Settings, board_scale: float, session: Path, out: Path) -> reconstruct.Config:
+    """Settings by which a session is reconstructed."""
+    known = {"board_scale": board_scale, "temperature_c": WATER_C, "tissue_m_s": TISSUE_M_S}
+    return reconstruct.Config.model_validate({"rig": chosen.rig, "capture": session / "capture", "out": out, **known})
+
+
+def cylinders(work: Path, chosen: Settings, by: reconstruct.Config) -> tuple[int, Metrics]:
     """The paper's cylinders by the calibrations of a session; returns the exit status of `reconstruct`, and the figures."""
-    for verb, fields in session_steps.rendering_cylinders(work / "session", given):
-        session_steps.do(verb, fields)
+    for part in rendered_session.cylinders(chosen, work / "session"):
+        part.run()
     truth = (work / "session" / "truth").rename(work / "truth")
-    status = session_steps.do(*session_steps.reconstruction_of_cylinders(work / "session", calibrated, work / "result", known))
+    optics, probe = by.out / "optics" / calibrate_optics.OPTICS, by.out / "probe" / calibrate_probe.PROBE
+    known = {"calibration": optics, "probe": probe, **reconstruct.measured_lag(by.out / "latency").fields}
+    known |= {"tissue_m_s": speed_of_sound(WATER_C), "tissue_sigma_m_s": WATER_SIGMA_M_S, "board_scale": by.board_scale}
+    own = {"rig": chosen.rig, "capture": work / "session" / "capture", "find": "tube", "out": work / "result"}
+    status = reconstruct.run(reconstruct.Config.model_validate(own | known))
     return status, {} if status else session_errors.cylinders(work / "result", truth, TUBE)
 
 

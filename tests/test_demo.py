@@ -4,7 +4,6 @@ import html
 import json
 import re
 import shlex
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +12,13 @@ import pytest
 from recon.errors import InputError
 from recon.files import atomic
 from recon.tracking import networks
-from sonotwin import pipeline
+from sonotwin import demonstration, pipeline, rendered_session
 from sonotwin.cli import main
-from sonotwin.config import compose, load
-from sonotwin.demo_steps import VerbStep, verb_steps
-from sonotwin.latency_fields import Latency
+from sonotwin.config import load
+from sonotwin.demonstration import Config
 from sonotwin.pipeline import Step
-from sonotwin.verbs import sweep
-from sonotwin.verbs.demo import Config, commands, followed, looked_inside
+from sonotwin.verbs import evaluate, film, reconstruct, render, sweep, track
+from sonotwin.verbs.demo import followed, looked_inside
 
 SMALL = (  # cameras at half their size: fringes of ten pixels a period
     "rig.cam1.optics.size=[640,512]",
@@ -42,7 +40,7 @@ COARSE = [  # B-scans of half the lines and two thirds of the rows
     for field in ("image_size=[161,272]", "scale_mm_per_px=[0.2458,0.18375]")
 ]
 SWEPT = (*COARSE, "path.strokes=1", "path.speed_mm_s=30", "wires=20", "bottom_s=2.5")  # over the largest tumour alone
-MADE = ("report.html", "surface.ply", "surface.glb", "metrics.json", "calibration/calibration.html", "truth/scene.json")
+MADE = ("report.html", "surface.ply", "surface.glb", "metrics.json", "result/optics/calibration.html", "truth/board.npz")
 
 
 def figures(folder):
@@ -60,18 +58,16 @@ def test_a_small_demonstration_runs_through(tmp_path, capsys):
     assert metrics["point_error_rms_mm"] < 2.5 * metrics["point_sigma_mm"]
     # Behind the breast's steep side, where light that spreads leaves little of the fringes, the table isn't reached at this size.
     assert metrics["coverage"] > 0.7 and metrics["gross_error_fraction"] < 0.01
-    steps = ("board", "calibrate", "render", "surface", "evaluate", "report", "demo")
+    steps = ("board", "render", "reconstruct", "evaluate", "report", "demo")
     assert all(f"seconds_{name}" in metrics for name in steps)
     assert max(metrics[f"reprojection_rms_{name}_px"] for name in ("cam1", "cam2", "projector")) < 0.05
     printed = capsys.readouterr().out.splitlines()
     wrote = [re.fullmatch(r"wrote +(.*)/\{(.*)\}", line) for line in printed if line.startswith("wrote")]
-    assert len(wrote) == 5
+    assert len(wrote) == 6  # two renders, three steps of the reconstruction, and the evaluation
     assert all((Path(folder) / name).exists() for folder, names in (line.groups() for line in wrote) for name in names.split(","))
-    assert (out / "surface.ply").read_bytes() == (out / "surface" / "surface.ply").read_bytes()
+    assert (out / "surface.ply").read_bytes() == (out / "result" / "surface" / "surface.ply").read_bytes()
     report = html.unescape((out / "report.html").read_text(encoding="utf-8"))
-    assert f"sonotwin render conditions=lifelike '{SMALL[0]}' '{SMALL[1]}'" in report, (
-        "the settings, though this was no command line"
-    )
+    assert f"sonotwin render '{SMALL[0]}' '{SMALL[1]}'" in report and "conditions=lifelike" in report
     last = printed[-5:]
     assert [line.split()[0] for line in last] == ["measured", "accuracy", "calibrated", "coverage", "look"]
     assert str(out / "report.html") in last[-1]
@@ -84,34 +80,22 @@ def test_a_small_demonstration_looks_inside(tmp_path, capsys):
     assert main(["demo", "tracing.samples=4", "scene.edge_mm=1.5", *SWEPT, "poses=none", f"out={out}"]) == 0
     made = (
         "report.html",
-        "probe/probe.yaml",
-        "lag/lag.json",
-        "volume/volume.nrrd",
-        "tumours/mass0.ply",
-        "poses/sweep/poses.csv",
-        "scene/scene.html",
-        "scene/slicer/masses.mrk.json",
-        "sweep/truth/scene.json",
+        "result/probe/probe.yaml",
+        "result/latency/lag.json",
+        "result/volume/scan/volume.nrrd",
+        "result/masses/scan/mass0.ply",
+        "result/poses/scan/poses.csv",
+        "result/scene/scan/scene.html",
+        "result/scene/scan/slicer/masses.mrk.json",
+        "truth/sweep/scan/scene.json",
     )
     assert not [name for name in made if not (out / name).is_file()]
     metrics = figures(out)
     assert (metrics["tumours_true"], metrics["tumours_found"], metrics["tumours_false"]) == (3, 1, 0)
     assert metrics["tumour0_centre_error_mm"] < 1 and metrics["tumour0_dice"] > 0.85 and metrics["tumour0_inside"] == 1
     assert metrics["lag_low_ms"] - 2 < 50 < metrics["lag_high_ms"] + 2
-    assert metrics["sweep_placement_rms_mm"] < 1
-    steps = (
-        "wires",
-        "track_wires",
-        "probe",
-        "bottom",
-        "track_bottom",
-        "lag",
-        "sweep",
-        "track_sweep",
-        "volume",
-        "tumours",
-        "scene",
-    )
+    assert metrics["placement_rms_mm"] < 1
+    steps = ("render", "wires", "bottom", "scan", "reconstruct", "evaluate", "report")
     assert all(f"seconds_{name}" in metrics for name in steps)
     last = capsys.readouterr().out.splitlines()[-8:]
     assert [line.split()[0] for line in last] == [
@@ -131,11 +115,9 @@ def test_a_small_demonstration_looks_inside(tmp_path, capsys):
 
 def test_the_tank_is_seen_by_the_scanner_of_the_sweep():
     """Also by one of another size whose settings are a file, so that no override names it."""
-    config = load("demo", COARSE, Config)
-    steps = {step.name: step for step in verb_steps(Path("outputs/demo"), config, COARSE[:2]) if isinstance(step, VerbStep)}
-    for name in ("wires", "bottom"):
-        verb, *fields = steps[name].words(None)
-        assert load(verb, fields, sweep.Config).ultrasound.image_size == (161, 272)
+    parts = {part.name: part.settings for part in rendered_session.parts(load("demo", COARSE, Config), Path("out"))}
+    for name in ("wires", "bottom", "scan"):
+        assert parts[name].ultrasound.image_size == (161, 272)
 
 
 @pytest.mark.slow
@@ -163,47 +145,48 @@ def silent(_):
     pass
 
 
-def step(name, works=True, makes=(), refines=(), figure=None):
-    def work(folder, figures):
+def step(folder, name, works=True, makes=(), figure=None):
+    def work(figures):
         for made in makes:
-            if "." in made:
-                with atomic.listed_file(folder, made, pipeline.DEMO) as path:
-                    path.write_text(name, encoding="utf-8")
+            with atomic.listed_file(folder, made, pipeline.DEMO) as path:
+                path.write_text(name, encoding="utf-8")
         if not works:
             raise KeyboardInterrupt
         return {figure or name: len(figures)}
 
-    return Step(name, f"do {name}", work, makes, refines)
+    return Step(name, f"do {name}", work, makes)
 
 
 def test_steps_see_the_figures_before_them(tmp_path):
-    told = []
-    metrics = pipeline.play([step("first"), step("second")], tmp_path / "demo", {"seed": 3}, told.append)
+    told, folder = [], tmp_path / "demo"
+    metrics = pipeline.play([step(folder, "first"), step(folder, "second")], folder, {"seed": 3}, told.append)
     assert told == ["1/2 do first", "2/2 do second"]
     assert (metrics["first"], metrics["second"]) == (0, 2)  # its figure, and its seconds
-    assert metrics == figures(tmp_path / "demo")
-    assert json.loads((tmp_path / "demo" / "demo.json").read_text(encoding="utf-8")) == {"seed": 3}
+    assert metrics == figures(folder)
+    assert json.loads((folder / "demo.json").read_text(encoding="utf-8")) == {"seed": 3}
 
 
 def test_a_run_that_was_killed_leaves_nothing_to_the_next(tmp_path):
     """A first run is complete, a second dies halfway, killed ones have left temporary folders and files, a third starts clean."""
-    folder = tmp_path / "demo"
-    report = step("report", makes=("report.html",))
-    pipeline.play([step("render", makes=("truth",)), report], folder, {}, silent)
+    folder, afresh = tmp_path / "demo", {"truth": "the twin"}
+    report = step(folder, "report", makes=("report.html",))
+    pipeline.play([step(folder, "render"), report], folder, {}, silent, afresh)
+    with atomic.new_folder(folder / "truth", "the twin") as truth:
+        (truth / "scene.json").write_text("{}")
     (folder / ".truth.4194305.new").mkdir()
     (folder / ".report.4194305.new.html").write_text("half")
     (folder / ".demo.4194305.new.json").write_text("half")
     with pytest.raises(KeyboardInterrupt):
-        pipeline.play([step("render", works=False, makes=("truth",)), report], folder, {}, silent)
+        pipeline.play([step(folder, "render", works=False), report], folder, {}, silent, afresh)
     assert sorted(path.name for path in folder.iterdir()) == [".sonotwin.json", "demo.json"]  # no old report beside a new capture
-    pipeline.play([step("render"), report], folder, {}, silent)
+    pipeline.play([step(folder, "render"), report], folder, {}, silent, afresh)
     assert sorted(path.name for path in folder.iterdir()) == [".sonotwin.json", "demo.json", "metrics.json", "report.html"]
 
 
 def test_hidden_files_of_others_stay(tmp_path):
     """What isn't a step's own temporary is nobody's to delete."""
     folder = tmp_path / "demo"
-    report = step("report", makes=("report.html",))
+    report = step(folder, "report", makes=("report.html",))
     pipeline.play([report], folder, {}, silent)
     others = {".git", ".notes.2024.md", ".report.html", ".other.4194305.new"}
     for name in others:
@@ -213,92 +196,72 @@ def test_hidden_files_of_others_stay(tmp_path):
 
 
 def test_a_figure_has_one_meaning(tmp_path):
-    """A step that contradicts an earlier one is stopped, unless it is there to know better."""
-    first, second = step("first", figure="points"), step("second", figure="points")
+    """A step that contradicts an earlier one is stopped."""
+    first, second = step(tmp_path, "first", figure="points"), step(tmp_path, "second", figure="points")
     with pytest.raises(ValueError, match="second: points: expected 0 as before, found 2"):
         pipeline.play([first, second], tmp_path / "a", {}, silent)
-    better = step("second", figure="points", refines=("points",))
-    assert pipeline.play([first, better], tmp_path / "b", {}, silent)["points"] == 2
 
 
 def test_other_peoples_files_are_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
     with pytest.raises(InputError, match="found other files"):
-        pipeline.play([step("render")], tmp_path, {}, silent)
+        pipeline.play([step(tmp_path, "render")], tmp_path, {}, silent)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_the_report_repeats_the_settings_that_were_given(tmp_path):
-    overrides = ["scene=sphere", "out=elsewhere", "poses=paper"]
-    config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
-    lines = commands(tmp_path / "a b", config, overrides, None)
-    verbs = ["demo", "render", "calibrate-optics", "render", "surface", "evaluate", "film", "track"]  # a sphere hides nothing
-    assert [re.split(r"\s", line)[1] for line in lines] == verbs
-    assert "scene=sphere" in lines[0] and "scene=sphere" in lines[3] and "elsewhere" not in "".join(lines)
-    assert "scene=board" in lines[1] and "poses=paper" in lines[1] and "poses=paper" not in lines[3]
-    assert f"'out={tmp_path / 'a b'}'" in lines[3] and "calibration=" in lines[4]
+MODELS = {"render": render, "sweep": sweep, "reconstruct": reconstruct, "evaluate": evaluate, "film": film, "track": track}
 
 
-def test_without_poses_nothing_is_calibrated(tmp_path):
-    fields = ["poses=none", "path=none", "film_frames=0"]
-    config = Config.model_validate(compose("demo", fields), context={"overrides": []})
-    assert config.poses is None
-    lines = commands(tmp_path, config, [], None)
-    assert [re.split(r"\s", line)[1] for line in lines] == ["demo", "render", "surface", "evaluate"]
-
-
-def test_the_commands_of_the_sweep_are_those_of_the_verbs(tmp_path):
-    """Each has the settings that its verb knows, and passes its verb's own checks."""
-    overrides = ["poses=none", "clocks.lag_s=0.08", "scene.edge_mm=1.5", "tracing.samples=4", f"board={tmp_path}", *COARSE]
-    config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
-    lines = [shlex.split(line)[1:] for line in commands(tmp_path, config, overrides, Latency(0.0503, 0.001))]
-    verbs = [line[0] for line in lines]
-    inside = ["sweep", "track", "calibrate-probe", "sweep", "track", "measure-lag", "sweep", "track"]
-    assert verbs == ["demo", "render", "surface", "evaluate", *inside, "freehand", "segment", "fuse"]
-    for verb, *fields in lines:
-        module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
-        assert load(verb, fields, module.Config), verb
-    assert all("tissue_m_s=1450" in line for line in lines[-3:]), "volume, masses and picture at one speed"
-    assert all("filmed=true" in line for line in lines if line[0] == "sweep"), "poses are found in frames"
-    assert all(f"capture={tmp_path}/poses/sweep" in line and "lag_s=0.0503" in line for line in lines[-3:])
-    assert all("lag_sigma_s=0.001" in line for line in lines[-3:-1])
-    assert "path=raster" in lines[10] and "clocks.lag_s=0.08" in lines[10] and "clocks.camera_hz=16" in lines[10]
+@pytest.mark.parametrize(("overrides", "verbs"), [
+    (["scene=sphere", "poses=paper"], ["render", "render", "reconstruct", "evaluate", "film", "track"]),  # it hides nothing
+    (["poses=none", "path=none", "film_frames=0"], ["render", "reconstruct", "evaluate"]),
+    (["poses=none", "clocks.lag_s=0.08", "scene.edge_mm=1.5", *COARSE], ["render", *3 * ["sweep"], "reconstruct", "evaluate"]),
+    (["scene=two_objects", "poses.count=4", "shooting.gain=2", "seed=3", "path=none", "film_frames=0"],
+     ["render", "render", "reconstruct", "evaluate"]),
+])  # fmt: skip
+def test_the_commands_of_the_report_give_the_settings_of_the_steps(tmp_path, overrides, verbs):
+    """Each line, read as a shell would, is the demonstration's own settings of that step again."""
+    out = tmp_path / "a b"
+    config = load("demo", [*overrides, f"out={out}"], Config)
+    first, *lines = [shlex.split(line)[1:] for line in demonstration.commands(config)]
+    assert load("demo", first[1:], Config) == config
+    assert [line[0] for line in lines] == verbs
+    steps = [part.settings for part in rendered_session.parts(config, out)]
+    steps += [config.reconstruction, config.comparison, *(config.filming or ())]
+    for (verb, *fields), settings in zip(lines, steps, strict=True):
+        assert load(verb, fields, MODELS[verb].Config) == settings
+    assert all("add=true" in line and f"out={out}" in line for line in lines if line[0] in ("render", "sweep")), "one capture"
 
 
 @pytest.mark.parametrize("overrides", [[], ["scene=two_objects", "poses.count=4", "shooting.gain=2", "seed=3"]])
-def test_each_verb_gets_the_demonstrations_settings(overrides, tmp_path):
-    """The demonstration's fields reach each verb, whose own YAML has the same defaults, but for those that a step sets."""
-    config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
+def test_each_part_has_the_demonstrations_settings(overrides, tmp_path):
+    """The demonstration's fields reach each part, but for those that it sets itself; the others are its verb's own defaults."""
+    config = load("demo", overrides, Config)
     own = {
-        "board": {"scene", "patterns", "cameras", "out"},
-        "render": {"poses", "out"},
-        "surface": {"patterns", "out"},
-        "film": {"path", "out"},
-        "wires": {"scene", "path", "ultrasound", "clocks", "out"},
-        "bottom": {"scene", "path", "ultrasound", "out"},
+        "board": {"scene", "patterns", "cameras", "shooting"},
+        "render": {"poses"},
+        "wires": {"scene", "path", "ultrasound", "clocks"},
+        "bottom": {"scene", "path", "ultrasound"},
+        "scan": set[str](),
     }
-    for step in verb_steps(tmp_path, config, overrides):
-        if not isinstance(step, VerbStep):
-            continue
-        verb, *fields = step.words(Latency(0.05, 0.001))
-        model = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}").Config
-        given = load(verb, fields, model)
-        shared = set(model.model_fields) & set(Config.model_fields) - own.get(step.name, {"out"})
-        assert {name: getattr(given, name) for name in shared} == {name: getattr(config, name) for name in shared}, step.name
+    for part in rendered_session.parts(config, tmp_path):
+        model = type(part.settings)
+        shared = set(model.model_fields) & set(Config.model_fields) - {"out"} - own[part.name]
+        assert {name: getattr(part.settings, name) for name in shared} == {name: getattr(config, name) for name in shared}
+        usual = load(part.verb, [f"out={tmp_path}"], model)
+        rest = set(model.model_fields) - set(Config.model_fields) - {"add", "name", "filmed"}
+        assert {name: getattr(part.settings, name) for name in rest} == {name: getattr(usual, name) for name in rest}
 
 
 @pytest.mark.parametrize(("overrides", "inside"), [([], True), (["path=none"], False), (["scene=sphere"], False)])
 def test_only_what_has_tumours_is_looked_into(overrides, inside):
-    config = Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
+    config = load("demo", overrides, Config)
     assert config.looks_inside is inside
 
 
 def test_what_is_left_out_is_said():
     """A sphere hides nothing, and a person might wonder; who asks for no path knows."""
-    sphere, none = (
-        Config.model_validate(compose("demo", overrides), context={"overrides": overrides})
-        for overrides in (["scene=sphere"], ["path=none"])
-    )
+    sphere, none = (load("demo", overrides, Config) for overrides in (["scene=sphere"], ["path=none"]))
     (line,) = looked_inside(sphere, {})
     assert line.startswith("left out") and "sphere" in line
     assert looked_inside(none, {}) == []

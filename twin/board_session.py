@@ -5,6 +5,7 @@ finished set then takes its place as `OUT/capture/` and `OUT/truth/`.
 """
 
 import math
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.capture import writer
-from recon.capture.manifest import MANIFEST, BoardPart, Device
+from recon.capture import calibration_files, writer
+from recon.capture.manifest import MANIFEST, OPTICS, BoardPart, Device, read_manifest
 from recon.files import atomic, written_files
 from recon.geometry import rigid
 from recon.model.patterns import Patterns
@@ -295,6 +296,20 @@ def finish(session: Session, settings: Settings, exposures: Mapping[CameraName, 
         atomic.link_tree(session.out / UNFINISHED / "capture", capture.folder, leave_out={MANIFEST})
         capture.add_board(part, devices)
     written_files.discard(session.out / UNFINISHED, TWIN, writer.POSE)
+
+
+def take_over(kept: Session, session: Session) -> None:
+    """Let a session have the board of another, as links to its files, unless it has it already; raises as `Session.check`."""
+    if is_finished(session):
+        return
+    session.check()
+    read = read_manifest(kept.capture)
+    assert read.board is not None
+    with session.write(kept.truth.scene()) as (capture, truth):
+        truth.write_optics(calibration_files.read(kept.truth.folder / OPTICS))
+        shutil.copyfile(kept.truth.folder / "board.npz", truth.folder / "board.npz")
+        atomic.link_tree(kept.capture / "board", capture.folder / "board")
+        capture.add_board(read.board, read.devices_of("board"))
 
 
 def board_truth(settings: Settings, placed: rigid.Array) -> dict[str, np.ndarray]:

@@ -182,16 +182,25 @@ def devices_that_measure(calibration: Calibration) -> tuple[str, str]:
 
 def working_depths(result: Result) -> tuple[float, ...]:
     """Depths to judge the calibration at, mm: the nearest, middle and farthest at which points of the board were."""
-    depths = np.quantile(board_points(result)[..., 2], DEPTHS)
+    return _depths(board_points(result))
+
+
+def _depths(points: Array) -> tuple[float, ...]:
+    depths = np.quantile(points[..., 2], DEPTHS)
     return tuple(float(depth) for depth in sorted({*np.round(depths)}))
 
 
 def working_volume(result: Result) -> Array:
-    """Points that stand for the working volume : (m, 3) mm: what all devices see at its depths, or else where the board was."""
+    """Points that stand for the working volume : (m, 3) mm, as of `volume_about`."""
+    return volume_about(result.adjustment.calibration, board_points(result).reshape(-1, 3))
+
+
+def volume_about(calibration: Calibration, points: Array) -> Array:
+    """Points that all devices see : (m, 3) mm, at the depths of a board's points : (n, 3) mm; else these themselves."""
     try:
-        return uncertainty.working_volume(result.adjustment.calibration, working_depths(result))
+        return uncertainty.working_volume(calibration, _depths(points))
     except ValueError:
-        return board_points(result).reshape(-1, 3)
+        return points
 
 
 def board_points(result: Result) -> Array:

@@ -15,13 +15,12 @@ fringes are refused, other patterns are tried on three poses.
 
 import re
 import shlex
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import PrivateAttr
 from rich.console import Console
 
 from recon.capture import board_part, calibration_files, manifest, meza2021
@@ -38,6 +37,7 @@ from recon.optical_calibration.observations import PROJECTOR
 from recon.optical_calibration.sightings import Cause, Failure, light
 from recon.pattern_trials import likely_patterns
 from recon.structured_light import surface_figures
+from sonotwin import command_line
 
 PAGE = "calibration.html"
 OPTICS = "optics.yaml"
@@ -60,12 +60,6 @@ class Config(Settings):
     truth: Path | None = None
     devices: tuple[DeviceName, ...] | None = None
     distortion: Literal["auto", ModelName] = "auto"  # as one list of choices, for the message
-    _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
-
-    def model_post_init(self, context: Any) -> None:
-        """Keep the overrides, for the command that the page shows."""
-        if context:
-            self._overrides = context["overrides"]
 
 
 def run(config: Config) -> None:
@@ -182,6 +176,6 @@ def write(config: Config, result: Result, figures: Metrics, truth: Calibration |
         names = [OPTICS, *meza2021.write_parameters(folder, found), metrics.FILE, PAGE]
         metrics.write(folder / metrics.FILE, figures)
         outputs = [(name, CONTENTS[name]) for name in names]
-        command = shlex.join(["sonotwin", "calibrate-optics", *config._overrides])
+        command = shlex.join(["sonotwin", *command_line.words("calibrate-optics", config)])
         calibration_report.write(folder / PAGE, result, figures, outputs, [command], truth)
     return names

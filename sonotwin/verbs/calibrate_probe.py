@@ -16,14 +16,13 @@ target is seen, and bring the crossing near all corners of the image in turn.
     sonotwin calibrate-probe pairs=pairs.csv rig.probe.image_size=[640,480] temperature_c=22.4 out=outputs/probe
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PrivateAttr, model_validator
+from pydantic import model_validator
 from rich.console import Console
 
 from recon.capture import probe_files, sweep_part, sweep_tables
@@ -39,10 +38,10 @@ from recon.model.tracks import LagSeconds
 from recon.probe_calibration import crossing_frames, probe_figures, sound_in_water, tank_calibration
 from recon.probe_calibration.crossing_frames import CrossingFrames
 from recon.probe_calibration.tank_calibration import Result, Settings
+from sonotwin import choices
 
 PROBE = "probe.yaml"
 FRAMES = "frames.csv"
-OF_THE_SCALE, OF_THE_SIZE = "rig.probe.scale_mm_per_px", "rig.probe.image_size"
 
 
 class Config(SequenceFields, Settings):
@@ -56,7 +55,6 @@ class Config(SequenceFields, Settings):
     earlier: Path | None = None
     clip: Rectangle | None = None
     lag_s: LagSeconds = 0.0
-    _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
 
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
@@ -68,18 +66,13 @@ class Config(SequenceFields, Settings):
                 raise ValueError(f"{name}: expected none with pairs, which come without images and times, found {value}")
         return self
 
-    def model_post_init(self, context: Any) -> None:
-        """Keep the overrides, by which a scale that was given differs from the default rig's."""
-        if context:
-            self._overrides = context["overrides"]
-
     @property
     def scanner_sy(self) -> float | None:
         """The scanner's mm/px in depth: as given; NaN where only the size was, so of another scanner; None for the rig's."""
-        given = {each.lstrip("+~").partition("=")[0] for each in self._overrides}
-        if given & {"rig", "rig.probe", OF_THE_SCALE}:
-            return self.rig.probe.scale_mm_per_px[1]
-        return np.nan if OF_THE_SIZE in given else None
+        given, usual = self.rig.probe, choices.read_rig().probe
+        if given.scale_mm_per_px != usual.scale_mm_per_px:
+            return given.scale_mm_per_px[1]
+        return None if given.image_size == usual.image_size else np.nan
 
 
 def run(config: Config) -> None:

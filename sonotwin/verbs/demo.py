@@ -1,9 +1,9 @@
 """Calibrate the rendered rig, measure a phantom outside and inside with it, compare with the truth, and report the whole story.
 
 Reads the same choices from conf/ as `sonotwin render`, `sonotwin sweep` and `sonotwin film`. Writes into the folder `out`:
-report.html and calibration/calibration.html (open them in a browser; they need no network), surface.ply (mm), surface.glb
-(metres, y up), metrics.json; of scenes with tumours volume/, tumours/ and scene/, with poses/ of the probe in the frames of each
-sweep, of others track/, the tracker's poses in a film; the captures and their truth, and the folders of the steps between. Takes
+report.html (open it in a browser; it needs no network), surface.ply (mm), surface.glb (metres, y up), metrics.json; capture/, one
+session with the board, the scene under fringes and, of scenes with tumours, three filmed sweeps, and its truth/; result/, what
+`sonotwin reconstruct` makes of the capture; of other scenes film/ and track/, a moving target and the tracker's poses. Takes
 four to six minutes on two cores, half of that without ultrasound (path=none), and less without the film (film_frames=0); the
 first run ever also compiles, for one or two. The board's images are kept and used again by all demonstrations of the same rig. A
 run that was interrupted is simply started again.
@@ -13,57 +13,17 @@ run that was interrupted is simply started again.
     sonotwin demo scene=sphere patterns=gray_surface out=outputs/sphere
 """
 
-from pathlib import Path
-
 from rich.console import Console
 
-from recon.capture import calibration_files
-from recon.files import atomic
 from recon.files.metrics import Metrics, shown
 from recon.tracking import networks
 from scenes.catalogue import parse_scene
-from sonotwin import latency_fields, pipeline
-from sonotwin.config import load
-from sonotwin.demo_config import CALIBRATION, Config
-from sonotwin.demo_steps import Figures, commands, compared, fusing_fields, poses_of, tracked_film, verb_steps
-from sonotwin.pipeline import Step
-from sonotwin.verbs import calibrate_optics, fuse, surface
+from sonotwin import demonstration, pipeline
+from sonotwin.demonstration import Config
 from twin import board_session
 from twin.evaluation import sweep_errors
 from twin.evaluation.surface_errors import things
-from twin.reports import demo_report, sweep_report
-
-OUTPUTS = (
-    ("report.html", "this page"),
-    ("surface.ply", "the surface: triangles, normals and predicted sigma of each vertex, in mm"),
-    ("surface.glb", "the same for viewers and for the web, in metres"),
-    ("metrics.json", "all figures on this page and some more"),
-    ("calibration/calibration.html", "the calibration that the surface was measured with, and how far it can be trusted"),
-    ("volume/volume.nrrd", "the B-scans of the sweep as a volume in the frame of the surface, in mm"),
-    ("tumours/", "what was found inside: a closed surface each, in mm"),
-    ("probe/probe.yaml", "the calibration of the probe, with its covariance"),
-    ("lag/lag.json", "the lag of the scanner behind the cameras"),
-    ("scene/scene.html", "all of it in one view that one can turn, with the probe and its B-scan along the sweep"),
-    ("scene/scene.glb, scene/slicer/", "the same as layers for any viewer, and a folder for 3D Slicer"),
-    (
-        "poses/",
-        "the probe's poses in each sweep's frames with their covariance, why some weren't found, and pictures",
-    ),
-    ("track/", "the target's poses in the film with their covariance, why some weren't found, and pictures of all frames"),
-    ("capture/", "the images, their manifest and the calibration, as a camera would have left them"),
-    ("truth/", "what the images were rendered from: points, normals, projector coordinates, true calibration"),
-    (
-        "sweep/, wires/, bottom/",
-        "B-scans and frames of the sweep, of crossed wires and of a flat bottom, and their truth",
-    ),
-    ("film/", "frames of the moving target by both cameras, and their truth"),
-    ("surface/points.npz", "the point of every pixel and its predicted sigma"),
-    ("evaluation/error_map.png", "map of the errors"),
-    ("demo.json", "every setting"),
-)
-
-
-FILMED, SWEPT = ("film", "track"), ("volume", "tumours", "probe", "lag", "scene", "poses", "sweep")  # of which only one is made
+from twin.session import CAPTURE, TRUTH, TWIN
 
 
 def run(config: Config) -> None:
@@ -72,7 +32,8 @@ def run(config: Config) -> None:
     Raises
     ------
     InputError
-        If a setting is wrong, the tracker's networks are missing, or `out` or `board` holds something else.
+        If a setting is wrong, the tracker's networks are missing, a step could not be done, or `out` or `board` holds something
+        else.
     """
     console = Console(soft_wrap=True, highlight=False)
     if config.looks_inside or config.film_frames:
@@ -80,42 +41,16 @@ def run(config: Config) -> None:
     parse_scene(config.scene)
     if config.poses is not None:
         board_session.check_place(config.board)
-    steps = [each if isinstance(each, Step) else each.step() for each in verb_steps(config.out, config, config._overrides)]
     found = pipeline.play(
-        [*steps, telling_step(config)],
+        demonstration.steps(config),
         config.out,
         config.model_dump(mode="json"),
         lambda text: console.print(text, style="bold cyan", markup=False),
+        {CAPTURE: TWIN, TRUTH: TWIN},
     )
     console.print()
     for line in summary(config, found):
         console.print(line, markup=False)
-
-
-def telling_step(config: Config) -> Step:
-    """The report of all steps before it."""
-
-    def telling(folder: Path, figures: Figures) -> Figures:
-        estimated = calibration_files.read(folder / CALIBRATION / calibrate_optics.OPTICS) if config.poses else None
-        points = folder / "surface" / surface.POINTS
-        story = demo_report.read(folder / "capture", folder / "truth", points, config.cameras[0], estimated)
-        inside = None
-        if config.looks_inside:
-            findings, truth = compared(folder)
-            places = {name: folder / name for name in ("probe", "lag", "volume")}
-            places |= {name: poses_of(folder, name) for name in ("sweep", "bottom")}
-            inside = sweep_report.read(places, findings, truth)
-        tracked = tracked_film(folder, config.looks_inside) if config.looks_inside or config.film_frames else None
-        fused = fuse.read(load("fuse", fusing_fields(folder, config, config._overrides), fuse.Config)) if inside else None
-        unmade = FILMED if config.looks_inside else SWEPT
-        listed = [(name, text) for name, text in OUTPUTS if name.partition("/")[0] not in unmade]
-        outputs = [(name, text) for name, text in listed if (folder / name.partition(",")[0]).exists() or name == "report.html"]
-        lines = commands(folder, config, config._overrides, latency_fields.measured(folder / "lag") if inside else None)
-        with atomic.listed_file(folder, "report.html", pipeline.DEMO) as page:
-            demo_report.write(page, story, dict(figures), outputs, lines, inside, tracked, fused)
-        return {}
-
-    return Step("report", "write the report", telling, ("report.html",))
 
 
 def summary(config: Config, found: Metrics) -> list[str]:
@@ -163,7 +98,7 @@ def looked_inside(config: Config, found: Metrics) -> list[str]:
         f"probe       from {found['probe_frames_used']} B-scans of crossed wires: {found['probe_rms_mm']:.3f} mm RMS; image "
         f"centre known to {found['probe_sigma_centre_mm']:.3f} mm, by its own prediction",
         f"lag         {found['lag_ms']:.1f} ms, {found['lag_low_ms']:.1f} to {found['lag_high_ms']:.1f} ms (95 %), true "
-        f"{1e3 * config.clocks.lag_s:.1f}; pixels of the sweep off by {found['sweep_placement_rms_mm']:.3f} mm RMS",
+        f"{1e3 * config.clocks.lag_s:.1f}; pixels of the sweep off by {found['placement_rms_mm']:.3f} mm RMS",
         f"tumours     {found['tumours_found']} of {found['tumours_true']} found, {count} inside the surface{off}{false}",
     ]
 

@@ -15,31 +15,30 @@ left out, or if none could be done.
     sonotwin reconstruct capture=session/capture calibration=optics.yaml probe=probe.yaml lag_s=0.05 out=result
 """
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, NamedTuple
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, model_validator
 from rich.console import Console
 
-from recon.capture import calibration_files, manifest, probe_files, target_files
+from recon.capture import calibration_files, lag_files, manifest, probe_files, target_files
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPart, is_sweep, sweep_part
 from recon.errors import Implausible, InputError
 from recon.files import atomic, metrics
+from recon.files.code_digest import code_digest
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE
 from recon.model.probe import Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
+from recon.session import store
+from recon.session.store import Store, files_of
 from recon.tracking import networks
 from recon.tracking.results import POSES
-from sonotwin import kept_steps, latency_fields
-from sonotwin.kept_steps import KeptSteps, files_of
-from sonotwin.latency_fields import Latency
-from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, fuse, measure_lag, segment, surface
+from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, fuse, measure_lag, segment, surface, track
 
 Drift = Annotated[float, Field(ge=0, le=10)]
 NO_OPTICS = "no calibration of the cameras: no board, and none given"
@@ -72,7 +71,6 @@ class Config(Part):
     spread_mm: segment.Spreads = SPREAD_MM
     slice_mm: segment.Slice = SLICE_MM
     overlays: bool = False
-    _overrides: Sequence[str] = PrivateAttr(())  # field=value as they were given
 
     @model_validator(mode="after")
     def _sigma_of_a_lag(self) -> "Config":
@@ -80,20 +78,17 @@ class Config(Part):
             raise ValueError(f"lag_sigma_s: expected with a lag_s that is given, found {self.lag_sigma_s:g} without")
         return self
 
-    def model_post_init(self, context: Any) -> None:
-        """Keep the overrides, of which the rig's are passed on to the steps."""
-        if context:
-            self._overrides = context["overrides"]
+
+class Lag(NamedTuple):
+    """The lag of the scanner's images behind the poses, as fields of the steps that place B-scans."""
+
+    lag_s: float = 0.0
+    sigma_s: float | None = None  # None where the lag is assumed, for want of a measured or a given one
 
     @property
-    def taken(self) -> str:
-        """The setting of what no hand makes and no rig sees, as a field of the steps that read a sweep or fringes."""
-        return f"implausible={self.implausible}"
-
-    @property
-    def rig_fields(self) -> list[str]:
-        """Overrides of the rig."""
-        return [each for each in self._overrides if each.lstrip("+~").partition("=")[0].partition(".")[0] == "rig"]
+    def fields(self) -> dict[str, object]:
+        """The lag and its standard deviation; none of one that is assumed, as each step assumes it too, with its uncertainty."""
+        return {} if self.sigma_s is None else {"lag_s": self.lag_s, "lag_sigma_s": self.sigma_s}
 
 
 @dataclass(frozen=True)
@@ -127,7 +122,8 @@ def run(config: Config) -> int:
     """
     console = Console(soft_wrap=True, highlight=False)
     sources = Sources(config, manifest.read_manifest(config.capture))
-    steps = KeptSteps(config.out, lambda line: console.print(line, style="bold cyan", markup=False))
+    code = code_digest("recon", "sonotwin")
+    steps = Store(config.out, lambda line: console.print(line, style="bold cyan", markup=False), code)
     given = [path for path in (config.calibration, config.target, config.probe, config.networks) if path is not None]
     check(sources)
     with steps.opened([config.capture, *given]):
@@ -139,7 +135,7 @@ def run(config: Config) -> int:
         for name, part in sources.sweeps.items():
             if part.purpose in (None, "volume") and SCANNER in part.images:
                 look_inside(steps, sources, name, tracked[name], probe, lag, skin, optics)
-        with atomic.listed_file(config.out, metrics.FILE, kept_steps.BY) as temporary:
+        with atomic.listed_file(config.out, metrics.FILE, store.BY) as temporary:
             metrics.write(temporary, figures(config.out, steps))
     if not steps.done:
         console.print("nothing     could be done: give what was left out, such as calibration=FILE, probe=FILE", markup=False)
@@ -180,7 +176,7 @@ def check(sources: Sources) -> None:
         sound_in_water.speed_of_sound(config.temperature_c)
 
 
-def calibrated_optics(steps: KeptSteps, sources: Sources) -> Path | None:
+def calibrated_optics(steps: Store, sources: Sources) -> Path | None:
     """The calibration of cameras and projector: the one given, the board's, or the capture's own."""
     config, held = sources.config, sources.held
     own = None if held.calibration is None else config.capture / held.calibration
@@ -191,25 +187,25 @@ def calibrated_optics(steps: KeptSteps, sources: Sources) -> Path | None:
     if held.board.patterns is None and held.surface is not None and own is not None:
         steps.leave_out("optics", f"the board was seen without fringes, and so not by the projector; {own} is used")
         return own
-    fields, files = [f"capture={config.capture}"], (calibrate_optics.OPTICS, calibrate_optics.PAGE)
-    made = steps.do("optics", "cameras and projector, from the board", "calibrate-optics", fields, files, sources.files("board"))
+    fields, files = {"capture": config.capture}, (calibrate_optics.OPTICS, calibrate_optics.PAGE)
+    made = steps.do("optics", "cameras and projector, from the board", calibrate_optics, fields, files, sources.files("board"))
     return None if made is None else made / calibrate_optics.OPTICS
 
 
-def measured_skin(steps: KeptSteps, sources: Sources, optics: Path | None) -> Path | None:
+def measured_skin(steps: Store, sources: Sources, optics: Path | None) -> Path | None:
     """The surface by light."""
     config = sources.config
     if sources.held.surface is None:
         return None
     if optics is None:
         return steps.leave_out("surface", _no(steps, "optics", NO_OPTICS))
-    fields = [f"capture={config.capture}", f"calibration={optics}", f"camera={config.camera}", config.taken]
+    fields = {"capture": config.capture, "calibration": optics, "camera": config.camera, "implausible": config.implausible}
     made_of = sources.files("surface") | _known_by(steps, "optics", optics)
-    made = steps.do("surface", "the surface, from fringes", "surface", fields, (surface.POINTS, SKIN), made_of)
+    made = steps.do("surface", "the surface, from fringes", surface, fields, (surface.POINTS, SKIN), made_of)
     return None if made is None else made / SKIN
 
 
-def tracked_sweep(steps: KeptSteps, sources: Sources, name: str, optics: Path | None) -> Path | None:
+def tracked_sweep(steps: Store, sources: Sources, name: str, optics: Path | None) -> Path | None:
     """A capture in which the sweep has poses: made of the cameras' frames, or the capture itself, where it has a track."""
     config, part, step = sources.config, sources.sweeps[name], _step_of("poses", name)
     filmed = set(CAMERAS) <= part.images.keys()
@@ -219,34 +215,37 @@ def tracked_sweep(steps: KeptSteps, sources: Sources, name: str, optics: Path | 
         return steps.leave_out(step, f"neither frames of {' and '.join(CAMERAS)} nor a track")
     if optics is None:
         return steps.leave_out(step, _no(steps, "optics", NO_OPTICS))
-    given = {"target": config.target, "networks": config.networks}
-    fields = [f"capture={config.capture}", f"sweep={name}", f"calibration={optics}", f"drift_px={config.drift_px:.15g}"]
-    fields.append(f"board_scale={config.board_scale:.15g}")
-    fields += [f"{field}={path}" for field, path in given.items() if path is not None]
-    fields += [f"overlays={str(config.overlays).lower()}", *config.rig_fields]
+    same = {"rig", "drift_px", "board_scale", "target", "networks", "overlays"}
+    fields = {"capture": config.capture, "sweep": name, "calibration": optics, **{key: getattr(config, key) for key in same}}
     weights = config.networks or networks.WEIGHTS
     made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *filter(None, [config.target]))
     files = (POSES, MANIFEST) if SCANNER in part.images else (POSES,)
-    return steps.do(step, "poses of the probe, from frames", "track", fields, files, made_of)
+    return steps.do(step, "poses of the probe, from frames", track, fields, files, made_of)
 
 
-def measured_latency(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None]) -> Latency | None:
+def measured_latency(steps: Store, sources: Sources, tracked: Mapping[str, Path | None]) -> Lag | None:
     """The scanner's latency: the one given, that of the last sweep over a flat bottom, or 0 without one; None if it failed."""
     config, name = sources.config, _last(sources, "latency")
     if config.lag_s is not None:
-        return Latency(config.lag_s, config.lag_sigma_s)
+        return Lag(config.lag_s, config.lag_sigma_s)
     if name is None:
         steps.leave_out("latency", "no sweep over a flat bottom and no lag_s; the B-scans' time stamps are taken as they are")
-        return Latency(0.0, 0.0, assumed=True)
+        return Lag()
     if tracked[name] is None:
         return steps.fail("latency", f"no poses of the sweep {name}")
-    fields = [f"capture={tracked[name]}", f"sweep={name}", config.taken]
+    fields = {"capture": tracked[name], "sweep": name, "implausible": config.implausible}
     does, made_of = "the scanner's lag, from a flat bottom", _scans(steps, sources, name)
-    made = steps.do("latency", does, "measure-lag", fields, (measure_lag.LAG,), made_of)
-    return None if made is None else latency_fields.measured(made)
+    made = steps.do("latency", does, measure_lag, fields, (measure_lag.LAG,), made_of)
+    return None if made is None else measured_lag(made)
 
 
-def calibrated_probe(steps: KeptSteps, sources: Sources, tracked: Mapping[str, Path | None], lag: Latency | None) -> Path | None:
+def measured_lag(folder: Path) -> Lag:
+    """The lag that `sonotwin measure-lag` wrote into a folder; InputError as of `recon.capture.lag_files.read`."""
+    found = lag_files.read(folder / lag_files.FILE)
+    return Lag(found.lag_s, found.sigma_s)
+
+
+def calibrated_probe(steps: Store, sources: Sources, tracked: Mapping[str, Path | None], lag: Lag | None) -> Path | None:
     """The probe's calibration: the one given, that of the last sweep over crossed wires, or without one the capture's."""
     config, name = sources.config, _last(sources, "probe")
     if config.probe is not None:
@@ -255,27 +254,27 @@ def calibrated_probe(steps: KeptSteps, sources: Sources, tracked: Mapping[str, P
         return None if sources.held.probe is None else _own_probe(steps, config, config.capture / sources.held.probe)
     if tracked[name] is None or lag is None:
         return steps.fail("probe", NO_LAG if lag is None else f"no poses of the sweep {name}; give probe=...")
-    fields = [f"capture={tracked[name]}", f"sweep={name}", lag.field, config.taken, *config.rig_fields]
-    fields += [] if config.temperature_c is None else [f"temperature_c={config.temperature_c:.15g}"]
+    fields = {"rig": config.rig, "capture": tracked[name], "sweep": name, "lag_s": lag.lag_s}
+    fields |= {"implausible": config.implausible, "temperature_c": config.temperature_c}
     does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
     files = (calibrate_probe.PROBE, calibrate_probe.FRAMES)
-    made = steps.do("probe", does, "calibrate-probe", fields, files, made_of)
+    made = steps.do("probe", does, calibrate_probe, fields, files, made_of)
     return None if made is None else made / calibrate_probe.PROBE
 
 
-def _own_probe(steps: KeptSteps, config: Config, own: Path) -> Path:
+def _own_probe(steps: Store, config: Config, own: Path) -> Path:
     """The calibration that the capture has, as it has no wires."""
     unused = "" if config.temperature_c is None else "; temperature_c is for wires, and isn't used"
     return steps.take("probe", own, f"the capture's own, as it has no sweep over crossed wires{unused}")
 
 
 def look_inside(
-    steps: KeptSteps,
+    steps: Store,
     sources: Sources,
     name: str,
     capture: Path | None,
     probe: Path | None,
-    lag: Latency | None,
+    lag: Lag | None,
     skin: Path | None,
     optics: Path | None,
 ) -> None:
@@ -288,31 +287,29 @@ def look_inside(
         for kind in wanted:
             steps.leave_out(_step_of(kind, name), reason)
         return None
-    placing = [f"capture={capture}", f"sweep={name}", f"probe={probe}", config.taken]
-    placing += [] if config.tissue_m_s is None else [f"tissue_m_s={config.tissue_m_s:.15g}"]
-    sigma = [] if config.tissue_sigma_m_s is None else [f"tissue_sigma_m_s={config.tissue_sigma_m_s:.15g}"]
-    fields = [*placing, *lag.fields, *sigma]
+    placing = {"capture": capture, "sweep": name, "probe": probe, "tissue_m_s": config.tissue_m_s}
+    placing |= {"implausible": config.implausible}
+    fields = placing | lag.fields | {"tissue_sigma_m_s": config.tissue_sigma_m_s}
     made_of = _scans(steps, sources, name) | _known_by(steps, "probe", probe)
-    spacing = f"spacing_mm={config.spacing_mm:.15g}"
-    voxels = steps.do(volume, "B-scans in a volume", "freehand", [*fields, spacing], (freehand.VOLUME,), made_of)
+    voxels = steps.do(
+        volume, "B-scans in a volume", freehand, fields | {"spacing_mm": config.spacing_mm}, (freehand.VOLUME,), made_of
+    )
     if config.find == "nothing":
         return None
     if skin is not None:
-        fields, made_of = [*fields, f"surface={skin}"], made_of | {"skin": steps.digest("surface")}
-        placing = [*placing, f"surface={skin}"]
+        fields, made_of = fields | {"surface": skin}, made_of | {"skin": steps.digest("surface")}
+        placing |= {"surface": skin}
     does, found = f"{'masses' if config.find == 'masses' else 'a tube'} in the B-scans", _step_of(config.find, name)
-    blur = [f"spread_mm={json.dumps(config.spread_mm)}", f"slice_mm={json.dumps(config.slice_mm)}"]
-    masses = steps.do(found, does, "segment", [*fields, f"kind={config.find}", *blur], (), made_of)
+    sought = {"kind": config.find, "spread_mm": config.spread_mm, "slice_mm": config.slice_mm}
+    masses = steps.do(found, does, segment, fields | sought, (), made_of)
     if config.find == "masses":
-        shown = [*placing, lag.field, *([] if masses is None else [f"masses={masses}"])]
-        shown += [] if optics is None else [f"calibration={optics}"]
-        shown += [*([] if voxels is None else [f"volume={voxels}"]), *config.rig_fields]
+        shown = placing | {"rig": config.rig, "lag_s": lag.lag_s, "masses": masses, "calibration": optics, "volume": voxels}
         made_of |= {"masses": steps.digest(found), "optics": steps.digest("optics"), "volume": steps.digest(volume)}
-        steps.do(_step_of("scene", name), "all of it in one picture", "fuse", shown, (fuse.SCENE,), made_of)
+        steps.do(_step_of("scene", name), "all of it in one picture", fuse, shown, (fuse.SCENE,), made_of)
     return None
 
 
-def figures(out: Path, steps: KeptSteps) -> metrics.Metrics:
+def figures(out: Path, steps: Store) -> metrics.Metrics:
     """Figures of all steps that are done, less those of the clock, by the step's name."""
     found: metrics.Metrics = {}
     for name in steps.done:
@@ -327,7 +324,7 @@ def _step_of(kind: str, sweep: str) -> str:
     return f"{kind}/{sweep}" if sweep else kind
 
 
-def _no(steps: KeptSteps, step: str, reason: str) -> str:
+def _no(steps: Store, step: str, reason: str) -> str:
     """The reason for what is missing: the step that should have made it failed, or there was none."""
     return f"{step} failed" if step in steps.failed else reason
 
@@ -338,11 +335,11 @@ def _last(sources: Sources, purpose: str) -> str | None:
     return fitting[-1] if fitting else None
 
 
-def _scans(steps: KeptSteps, sources: Sources, name: str) -> dict[str, object]:
+def _scans(steps: Store, sources: Sources, name: str) -> dict[str, object]:
     """Inputs of a step that reads a sweep's B-scans and poses."""
     return sources.files(sweep_part(name)) | {"poses": steps.digest(_step_of("poses", name))}
 
 
-def _known_by(steps: KeptSteps, step: str, *files: Path) -> dict[str, object]:
+def _known_by(steps: Store, step: str, *files: Path) -> dict[str, object]:
     """Digest of an earlier step, and of the files that it made or that stand in its place."""
     return {step: [steps.digest(step), files_of(files)]}

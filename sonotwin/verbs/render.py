@@ -83,14 +83,23 @@ class Config(Part):
 def run(config: Config) -> None:
     """Render, and say what was written."""
     console = Console(soft_wrap=True, highlight=False)
-    if config.poses is not None:
-        config = config.model_copy(update={"poses": working_range(config.rig).poses(config.poses)})
-    settings = config.model_dump(mode="json", exclude={"out", "add"})
+    config = in_working_range(config)
     if config.poses is None:
-        render_surface(config, Session(config.out, "surface", settings, config.add), console)
+        render_surface(config, part_of(config), console)
     else:
-        render_board(config, config.poses, Session(config.out, "board", settings, config.add), console)
+        render_board(config, config.poses, part_of(config), console)
     console.print(f"wrote       {config.out}/{{capture,truth}}", markup=False)
+
+
+def in_working_range(config: Config) -> Config:
+    """The same, with a board's depths where the rig works, unless they were given."""
+    return config if config.poses is None else config.model_copy(update={"poses": working_range(config.rig).poses(config.poses)})
+
+
+def part_of(config: Config) -> Session:
+    """The part of a capture that is rendered by some settings."""
+    settings = in_working_range(config).model_dump(mode="json", exclude={"out", "add"})
+    return Session(config.out, "surface" if config.poses is None else "board", settings, config.add)
 
 
 def render_board(config: Config, chosen: BoardPoses, session: Session, console: Console) -> None:

@@ -3,18 +3,11 @@
 import numpy as np
 import pytest
 
-from recon.capture import lag_files
-from recon.capture.lag_files import LagFile
 from recon.errors import InputError
 from scenes.catalogue import build_scene
-from sonotwin import session_accuracy, session_steps
-from sonotwin.config import load
-from sonotwin.verbs import reconstruct, render, sweep
+from sonotwin import rendered_session, session_accuracy
 from twin.accuracy.table_rows import Setup
 from twin.evaluation import session_errors
-
-MODELS = {"render": render.Config, "sweep": sweep.Config, "reconstruct": reconstruct.Config}
-
 
 FILM = {"frames": 100, "visible": 95, "visible_found": 95, "false": 0, "shift_median_mm": 0.02, "turn_median_deg": 0.04}
 SCAN = {
@@ -111,24 +104,13 @@ def test_another_rig_is_refused(rig):
 
 
 @pytest.mark.parametrize("kind", ["ideal", "lifelike"])
-def test_the_verbs_of_a_session_are_valid(tmp_path, kind):
-    """All write into one capture, by one seed and under the same conditions; its sweeps have the names that rows go by."""
-    steps = list(session_steps.rendering(tmp_path, [f"conditions={kind}", "seed=3"]))
-    read = [load(verb, fields, MODELS[verb]) for verb, fields in steps]
-    assert {each.seed for each in read} == {3} and all(each.add for each in read)
-    assert [each.name for each in read[2:]] == ["wires", "bottom", "scan"] and all(each.filmed for each in read[2:])
-    read = [
-        load(verb, fields, MODELS[verb]) for verb, fields in session_steps.rendering_cylinders(tmp_path, [f"conditions={kind}"])
-    ]
-    assert read[1].name == "tube" and read[1].filmed
-    inner, outer = (build_scene(dict(each.scene)).shapes[-1] for each in read)
+def test_the_parts_of_a_session_are_of_one_rig_under_the_same_conditions(tmp_path, kind):
+    """All write into one capture, by one seed; its sweeps have the names that rows go by, and both cylinders are the same."""
+    chosen = session_accuracy.settings(kind, 3)
+    settings = [part.settings for part in rendered_session.parts(chosen, tmp_path)]
+    assert all((each.seed, each.add, each.rig, each.conditions) == (3, True, chosen.rig, chosen.conditions) for each in settings)
+    assert [each.name for each in settings[2:]] == ["wires", "bottom", "scan"] and all(each.filmed for each in settings[2:])
+    by_light, by_sound = (part.settings for part in rendered_session.cylinders(chosen, tmp_path))
+    assert by_sound.name == "tube" and by_sound.filmed
+    outer, inner = (build_scene(dict(each.scene)).shapes[-1] for each in (by_light, by_sound))
     assert np.allclose(inner.point, outer.point) and inner.radius == outer.radius
-    (tmp_path / "latency").mkdir()
-    lag = LagFile(lag_s=0.05, sigma_s=0.001, interval_s=(0.048, 0.052), coverage=0.95)
-    lag_files.write(tmp_path / "latency" / lag_files.FILE, lag)
-    verb, fields = session_steps.reconstruction_of_cylinders(tmp_path, tmp_path, tmp_path / "out", ["board_scale=0"])
-    by_session = load(verb, fields, MODELS[verb])
-    assert (by_session.find, by_session.lag_s, by_session.board_scale) == ("tube", 0.05, 0.0)
-    assert by_session.tissue_m_s == pytest.approx(1488.3, abs=0.2)
-    verb, fields = session_steps.reconstruction(tmp_path, tmp_path / "out")
-    assert load(verb, fields, MODELS[verb]).capture == tmp_path / "capture"

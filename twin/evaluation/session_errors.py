@@ -6,21 +6,25 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from recon.capture import lag_files, manifest, probe_files, sweep_part
-from recon.capture.manifest import CAMERAS, SCANNER, PartName
+from recon.capture import calibration_files, lag_files, manifest, probe_files, sweep_part
+from recon.capture.manifest import CAMERAS, OPTICS, SCANNER, PartName
 from recon.capture.manifest import sweep_part as sweep_path
 from recon.files import metrics
 from recon.files.metrics import Metrics
+from recon.files.npz import Form
 from recon.freehand import place_uncertainty
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans, Unsure
+from recon.geometry import rigid
 from recon.geometry.primitives import Cylinder
 from recon.geometry.surface_tree import signed_distances
+from recon.model.calibration import Calibration
+from recon.optical_calibration import figures_of_merit
 from recon.probe_calibration.repeatability import five_points
 from recon.segmentation import tube_cover
 from scenes.catalogue import build_scene
 from twin.evaluation import sweep_errors, track_errors
-from twin.evaluation.sweep_errors import SweepTruth
+from twin.evaluation.sweep_errors import Finding, SweepTruth
 from twin.session import TruthFolder
 
 Array = NDArray[np.float64]
@@ -65,9 +69,7 @@ def inside(result: Path, truth: Path, name: str) -> Metrics:
     sweep = sweep_part.read_sweep(result / "poses" / name, name)
     scans = freehand_scans.of_sweep(sweep, probe, lag.lag_s, true.transducer.assumed_speed, Unsure(lag.sigma_s))
     shown, apart = scans.world_from_pixel, sweep_errors.placement(scans.world_from_pixel, true)
-    folder = result / "masses" / name
-    found = metrics.read(folder / metrics.FILE)
-    meshes = [trimesh.load_mesh(folder / f"mass{number}.ply", process=False) for number in range(int(found["masses"]))]
+    masses, sigmas = metrics.read(result / "masses" / name / metrics.FILE), place_sigmas(scans)
     figures: Metrics = {
         "lag_error_ms": 1e3 * (lag.lag_s - true.lag_s),
         "lag_covered": float(lag.interval_s[0] <= true.lag_s <= lag.interval_s[1]),
@@ -75,11 +77,35 @@ def inside(result: Path, truth: Path, name: str) -> Metrics:
         "probe_worst_sigma_mm": float(sigma[error.argmax()]),
         **dict(zip(PROBE_ERRORS, apart_by_probe.ravel().tolist(), strict=True)),
         "placement_rms_mm": float(np.sqrt(np.nanmean(apart**2))),
-        "placement_over_sigma": float(np.sqrt(np.nanmean((apart / place_sigmas(scans)) ** 2))),
-        **sweep_errors.measure(sweep_errors.compare(meshes, true.hidden), true, found),
+        "placement_sigma_mm": float(np.sqrt(np.nanmean(sigmas**2))),
+        "placement_over_sigma": float(np.sqrt(np.nanmean((apart / sigmas) ** 2))),
+        **sweep_errors.measure(findings(result, true, name), true, masses),
     }
     skin = result / "surface" / "surface.ply"
     return figures | ({"contact_bias_mm": contact_bias(shown, true, skin)} if skin.is_file() else {})
+
+
+def findings(result: Path, true: SweepTruth, name: str) -> list[Finding]:
+    """The true masses of a sweep, each with its match among those that were found in it; InputError if a file is missing."""
+    folder = result / "masses" / name
+    count = int(metrics.read(folder / metrics.FILE)["masses"])
+    meshes = [trimesh.load_mesh(folder / f"mass{number}.ply", process=False) for number in range(count)]
+    return sweep_errors.compare(meshes, true.hidden)
+
+
+def optics(found: Calibration, truth: Path) -> Metrics:
+    """Errors of a calibration against the true one, over what all devices see at the board's depths.
+
+    Raises
+    ------
+    InputError
+        If the truth of a board is missing or damaged.
+    """
+    forms = {"world_from_board": Form("f", (None, 4, 4)), "points": Form("f", (None, 3))}
+    board = TruthFolder(truth, "board").arrays("board.npz", forms)
+    points = np.concatenate([rigid.apply(pose, board["points"]) for pose in board["world_from_board"]])
+    true = calibration_files.read_for(truth / OPTICS, {name: camera.size for name, camera in found.cameras.items()})
+    return figures_of_merit.errors(found, true, figures_of_merit.volume_about(found, points))
 
 
 def cylinders(result: Path, truth: Path, name: str) -> Metrics:

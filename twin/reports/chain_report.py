@@ -34,10 +34,15 @@ def lines(metrics: Metrics) -> Iterator[Line]:
     found = f"{metrics['track_found']} of {metrics['track_frames']} frames"
     yield "Probe’s places, median", found, _mm(metrics, "track_sigma_median_mm"), _mm(metrics, "track_shift_median_mm")
     late, sigma = (f"{metrics[name]:.1f} ms" for name in ("lag_ms", "lag_sigma_ms"))
-    yield "Scanner’s lag", late, sigma, f"{abs(metrics['lag_ms'] - metrics['lag_true_ms']):.1f} ms"
+    yield "Scanner’s lag", late, sigma, f"{abs(metrics['lag_error_ms']):.1f} ms"
     used = f"from {metrics['probe_frames_used']} B-scans of wires"
-    yield "Probe’s calibration, worst of five pixels", used, _mm(metrics, "probe_worst_sigma_mm"), _mm(metrics, "probe_worst_mm")
-    predicted, off = (_mm(metrics, f"sweep_placement_{name}_mm", ".2f") for name in ("sigma", "rms"))
+    yield (
+        "Probe’s calibration, worst of five pixels",
+        used,
+        _mm(metrics, "probe_worst_sigma_mm"),
+        _mm(metrics, "probe_worst_error_mm"),
+    )
+    predicted, off = (_mm(metrics, f"placement_{name}_mm", ".2f") for name in ("sigma", "rms"))
     yield "Places of the sweep’s pixels, without the speed of sound’s error", "B-scans in space", predicted, off
     yield from of_tumours(metrics)
 

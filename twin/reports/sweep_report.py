@@ -1,7 +1,7 @@
 """Ultrasound's sections of the report: masses inside the measured surface, the probe's calibration and its sweep."""
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,31 +65,31 @@ class Inside:
     speed_m_s: float  # of sound in the tissue, as given to the reconstruction
 
 
-def read(folders: Mapping[str, Path], findings: Sequence[Finding], expected: SweepTruth) -> Inside:
-    """Read the results of the steps.
+def read(result: Path, scan: str, bottom: str, findings: Sequence[Finding], expected: SweepTruth) -> Inside:
+    """Read the results of `sonotwin reconstruct`.
 
     Parameters
     ----------
-    folders : captures of `sweep` and `bottom` with poses, and folders of `probe`, `lag` and `volume`, by these names.
+    scan, bottom : names of the sweep over the scene, and of that over a flat bottom
 
     Raises
     ------
     InputError
         If one of them is missing or damaged.
     """
-    sweep = sweep_part.read_sweep(folders["sweep"])
-    probe = probe_files.read(folders["probe"] / "probe.yaml")
-    lag_s = lag_files.read(folders["lag"] / lag_files.FILE).lag_s
-    rows = _rows(folders["lag"] / "depths.csv")
-    given = float(read_figures(folders["volume"] / FILE)["speed_m_per_s"])
+    sweep = sweep_part.read_sweep(result / "poses" / scan, scan)
+    probe = probe_files.read(result / "probe" / "probe.yaml")
+    lag_s = lag_files.read(result / "latency" / lag_files.FILE).lag_s
+    rows = _rows(result / "latency" / "depths.csv")
+    given = float(read_figures(result / "volume" / scan / FILE)["speed_m_per_s"])
     return Inside(
         sweep,
         sweep.poses(lag_s) @ sequences.target_from_pixel(sound_in_water.for_tissue(probe, given)),
-        volumes.read_volume(folders["volume"] / "volume.nrrd"),
+        volumes.read_volume(result / "volume" / scan / "volume.nrrd"),
         findings,
         expected,
         probe,
-        sweep_part.read_sweep(folders["bottom"]),
+        sweep_part.read_sweep(result / "poses" / bottom, bottom),
         np.array([[float(row[name] or "nan") for name in ("depth_px", "residual_px")] for row in rows]),
         lag_s,
         given,
@@ -329,7 +329,7 @@ def probe_table(metrics: Metrics, story: Inside) -> str:
             interval,
             f"{metrics['lag_ms']:.1f} ms; true {1e3 * story.truth.lag_s:.1f}",
         ),
-        ("A pixel of the sweep in space, RMS", "not measured", "", f"{metrics['sweep_placement_rms_mm']:.3f} mm"),
+        ("A pixel of the sweep in space, RMS", "not measured", "", f"{metrics['placement_rms_mm']:.3f} mm"),
     ]
     caption = (
         "Paper: Meza et al. 2021; its CR2, the mean distance of five calibrations from their mean, stands beside the error "

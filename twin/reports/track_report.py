@@ -35,15 +35,15 @@ class Tracked:
     overlays: tuple[Path, ...]  # (n,)
 
 
-def read(film: Path, track: Path) -> Tracked:
-    """Read what `sonotwin film` and `sonotwin track` left in their folders.
+def read(truth: Path, track: Path, name: str = "") -> Tracked:
+    """Read the truth of filmed frames, of one of several sweeps by its name, and what `sonotwin track` found in them.
 
     Raises
     ------
     InputError
         If something is missing or damaged, or they don't fit together.
     """
-    expected = track_errors.read_truth(film / "truth")
+    expected = track_errors.read_truth(truth, name)
     errors = track_errors.compare(track_errors.read_track(track / results.POSES, expected), expected)
     rows = list(csv.DictReader(read_text(track / results.FRAMES).splitlines()))
     if len(rows) != len(expected.times):

@@ -1,6 +1,6 @@
-"""Steps that are done once: each is a verb that writes a folder, which is kept as long as nothing that it was made of changes.
+"""Steps that are done once: each writes a folder, which is kept as long as nothing changes that it was made of.
 
-A record in the folder of all steps holds a digest of each step's inputs: its verb's settings, files and earlier steps. A step is
+A record in the folder of all steps holds a digest of each step's inputs: code, settings, files and earlier steps. A step is
 taken out of the record before it is done again and entered after its folder has appeared whole, so a run that was stopped
 anywhere goes on where it was.
 """
@@ -10,25 +10,23 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 
-from recon.errors import InputError
+from recon.errors import InputError, validated
 from recon.files import atomic, json_text, metrics
-from sonotwin.config import load
 
 RECORD = "reconstruct.json"
 BY = "reconstruct"  # who writes
-RESULTS = 2  # number of what verbs leave in their folders; another one does all steps anew
 
 
 @dataclass
-class KeptSteps:
+class Store:
     """Steps in one folder. Its state is the record, and the names of the steps of this run."""
 
     folder: Path
     say: Callable[[str], None]
+    code: str  # digest of the code that does the steps
     record: dict[str, str] = field(default_factory=dict)  # name of a step -> digest of its inputs
     done: list[str] = field(default_factory=list)  # steps whose result is there
     failed: list[str] = field(default_factory=list)  # steps that could not be done
@@ -60,7 +58,13 @@ class KeptSteps:
                 self._change(name, None)
 
     def do(
-        self, name: str, does: str, verb: str, fields: Sequence[str], files: Sequence[str], made_of: Mapping[str, object]
+        self,
+        name: str,
+        does: str,
+        verb: ModuleType,
+        fields: Mapping[str, object],
+        files: Sequence[str],
+        made_of: Mapping[str, object],
     ) -> Path | None:
         """Do a step, unless its result of before is there; returns its folder, None if it can't be done.
 
@@ -68,22 +72,21 @@ class KeptSteps:
         ----------
         name : of the step, and of its folder
         does : for people
-        verb, fields : the command line, less `out`
+        verb, fields : module of the verb that does it, with its `Config` and `run`; and its settings, all but `out`
         files : that the step hands on; all must be there for it to be kept
         made_of : inputs beside the settings: digests of files and of earlier steps
         """
-        place = self.folder / name
-        module = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}")
+        place, of = self.folder / name, verb.__name__.rpartition(".")[2]
         try:
-            config = load(verb, [*fields, f"out={place}"], module.Config)
-            digest = digest_of([version("sonotwin"), RESULTS, verb, config.model_dump(mode="json", exclude={"out"}), made_of])
+            settings = validated(verb.Config, {**fields, "out": place}, of.replace("_", "-"))
+            digest = digest_of([self.code, of, settings.model_dump(mode="json", exclude={"out"}), made_of])
             if self.record.get(name) == digest and all((place / file).is_file() for file in (*files, metrics.FILE)):
                 self.say(f"kept        {name}: {does}, as before")
                 self.done.append(name)
                 return place
             self.say(f"{name}: {does}")
             self._change(name, None)
-            module.run(config)
+            verb.run(settings)
         except InputError as error:
             self.fail(name, str(error))
             return None

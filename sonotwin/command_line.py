@@ -1,0 +1,78 @@
+"""Command lines that are printed from settings: the fields of a verb that differ from its defaults, choices of groups by name."""
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
+
+from pydantic import BaseModel, TypeAdapter
+
+from recon.files import yaml_text
+from sonotwin import config
+
+ABSENT = object()
+
+
+def words(verb: str, settings: BaseModel) -> list[str]:
+    """The words after `sonotwin` that give a verb these settings: `load` makes the same of them."""
+    return [verb, *fields(verb, settings)]
+
+
+def fields(verb: str, settings: BaseModel) -> list[str]:
+    """Overrides of a verb's defaults, those of groups first; of a group the choice that is nearest, and what differs from it."""
+    groups, usual, found = config.groups(verb), config.defaults(verb), list[str]()
+    known_fields: dict[str, Any] = type(settings).model_fields
+    types = {name: TypeAdapter(Annotated[field.annotation, field]) for name, field in known_fields.items()}
+    values = settings.model_dump(mode="json")
+    for name in sorted(values, key=lambda name: name not in groups):
+        known = usual.get(name, ABSENT)
+        default = known_fields[name].get_default(call_default_factory=True) if known is ABSENT else known
+        if name not in groups or values[name] == _parsed(types[name], known):
+            found += _differences(name, values[name], _parsed(types[name], default))
+            continue
+        choices = {one: yaml_text.read(config.folder() / name / f"{one}.yaml") for one in groups[name]}
+        parsed = {one: _parsed(types[name], content.get(name, content)) for one, content in choices.items()}  # "none" has a null
+        apart = {one: list(_differences(name, values[name], content)) for one, content in parsed.items()}
+        nearest = min(apart, key=lambda one: (len(" ".join(apart[one])), one))
+        found += [*([] if parsed[nearest] == _parsed(types[name], known) else [f"{name}={nearest}"]), *apart[nearest]]
+    return found
+
+
+def _parsed(kind: TypeAdapter, value: Any) -> Any:
+    """A value of YAML as the settings hold it, in JSON's kinds; as it stands where it is none of its field."""
+    try:
+        return kind.dump_python(kind.validate_python(value), mode="json")
+    except ValueError:
+        return value
+
+
+def _differences(name: str, value: Any, default: Any) -> Iterator[str]:
+    """Overrides, leaf by leaf, that make the value of its default."""
+    if value == default:
+        return
+    if not (isinstance(value, Mapping) and isinstance(default, Mapping)):
+        yield f"{name}={_text(value)}"
+        return
+    for key in value:
+        if key in default:
+            yield from _differences(f"{name}.{key}", value[key], default[key])
+        else:
+            yield f"+{name}.{key}={_text(value[key])}"
+    yield from (f"~{name}.{key}" for key in default if key not in value)
+
+
+def _text(value: Any) -> str:
+    """A value in Hydra's grammar."""
+    match value:
+        case None:
+            return "null"
+        case bool():
+            return str(value).lower()
+        case float():
+            return f"{value:.15g}"
+        case Mapping():
+            return "{" + ",".join(f"{key}:{_text(one)}" for key, one in value.items()) + "}"
+        case list() | tuple():
+            return "[" + ",".join(map(_text, value)) + "]"
+        case "":
+            return '""'
+        case _:
+            return str(value)

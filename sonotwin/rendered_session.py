@@ -1,0 +1,157 @@
+"""A whole session, rendered: the board, the scene by light, and filmed sweeps over crossed wires, a flat bottom and the scene.
+
+All are parts of one capture, which `sonotwin reconstruct` takes as it is. The demonstration, the sessions of accuracy, and tests
+render theirs here.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from recon.files import yaml_text
+from recon.model.rig import Positive
+from scenes.acoustics import MADE_OF
+from sonotwin import choices, config
+from sonotwin.verbs import render, sweep
+from twin.ultrasound.sweep_session import AnyPath
+from twin.ultrasound.timed_sweep import Clocks
+from twin.ultrasound.transducer import Transducer, check_scanner
+
+WATER_C, WATER_SIGMA_M_S = (
+    22.0,
+    1.5,
+)  # of the tank, as `scenes.acoustics` has it; and of water whose temperature is known to half a degree
+WIRES, BOTTOM, SCAN, TUBE = "wires", "bottom", "scan", "tube"  # names of sweeps
+RESTING_HZ = 5.0  # pairs of frames, while the probe is held still for each B-scan of the wires
+BOTTOM_HZ = 20.0  # pairs of frames at most, over the flat bottom
+TUMOURS = "tumour"  # what the things are called that ultrasound looks for
+INNER_MM = (4.0, -2.0, 670.29)  # the inner cylinder's centre, where conf/scene/cylinders.yaml has it
+
+
+class Settings(render.Config):
+    """What a session is rendered from: the fields of `sonotwin render`, of which poses are the board's; and of its sweeps."""
+
+    ultrasound: Transducer
+    path: AnyPath | None
+    clocks: Clocks = Clocks(camera_hz=16.0)
+    wires: Annotated[int, Field(ge=1, le=1000)] = 40
+    bottom_s: Positive = 5.0
+
+    @model_validator(mode="after")
+    def _fits_poses(self) -> "Settings":
+        # in place of render's check of that name: here poses are of the board, rendered by itself, and the scene is another
+        return self
+
+    @model_validator(mode="after")
+    def _one_scanner(self) -> "Settings":
+        check_scanner(self.rig, self.ultrasound)
+        return self
+
+    @property
+    def looks_inside(self) -> bool:
+        """Whether the scene is swept over: a path was given, and there is something to find."""
+        return self.path is not None and TUMOURS in MADE_OF.get(str(self.scene["kind"]), {})
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """A part of a session, to be rendered by `sonotwin render` or `sonotwin sweep`."""
+
+    name: str  # in one word
+    does: str  # for people
+    verb: str
+    settings: render.Config | sweep.Config
+
+    def run(self) -> None:
+        """Render it."""
+        if isinstance(self.settings, sweep.Config):
+            sweep.run(self.settings)
+        else:
+            render.run(self.settings)
+
+
+def parts(chosen: Settings, out: Path) -> Iterator[Rendering]:
+    """All parts of a session, in their order."""
+    if chosen.poses is not None:
+        yield Rendering("board", f"render the calibration board in {chosen.poses.count} poses", "render", board(chosen, out))
+    images = f"render {chosen.patterns.count} images of the scene and its truth"
+    yield Rendering("render", images, "render", skin(chosen, out))
+    if not chosen.looks_inside:
+        return
+    rests, clocks = choice("path", "wire"), chosen.clocks
+    wires = {"scene": choice("scene", "crosswire"), "ultrasound": _in_water(chosen), "path": rests | {"count": chosen.wires}}
+    resting = clocks.model_copy(update={"camera_hz": RESTING_HZ})
+    yield _swept(
+        chosen, out, WIRES, f"render {chosen.wires} B-scans of crossed wires, and frames of both cameras", wires, resting
+    )
+    bob = choice("path", "bob") | {"seconds": chosen.bottom_s}
+    bottom = {"scene": choice("scene", "tank"), "ultrasound": _in_water(chosen), "path": bob}
+    slower = clocks.model_copy(update={"camera_hz": min(clocks.camera_hz, BOTTOM_HZ)})
+    yield _swept(chosen, out, BOTTOM, "render a flat bottom, up and down", bottom, slower)
+    scan = {"scene": chosen.scene, "ultrasound": chosen.ultrasound, "path": chosen.path}
+    yield _swept(chosen, out, SCAN, "render a sweep over the scene: B-scans, frames, and their truth", scan, clocks)
+
+
+def board(chosen: Settings, out: Path, add: bool = True) -> render.Config:
+    """Settings of the calibration board, which has an exposure of its own."""
+    assert chosen.poses is not None
+    shooting = chosen.shooting.model_copy(update={"exposure_s": None})
+    own = {
+        "scene": choice("scene", "board"),
+        "patterns": choices.read_patterns("paper_calibration"),
+        "cameras": ["cam1", "cam2"],
+    }
+    own |= {"poses": chosen.poses, "shooting": shooting, "out": out, "add": add}
+    return render.Config.model_validate(_shared(chosen) | own)
+
+
+def skin(chosen: Settings, out: Path) -> render.Config:
+    """Settings of the scene under fringes."""
+    own = {name: getattr(chosen, name) for name in ("scene", "patterns", "cameras", "shooting")}
+    return render.Config.model_validate(_shared(chosen) | own | {"out": out, "add": True})
+
+
+def cylinders(chosen: Settings, out: Path) -> Iterator[Rendering]:
+    """The paper's cylinders, in another capture of the same rig.
+
+    Light measures the outer one; then that is taken away, and ultrasound measures the inner one, which stays where it is, in
+    water, in 94 B-scans as in Meza et al. 2021.
+    """
+    outer = chosen.model_copy(update={"scene": choice("scene", "cylinders")})
+    yield Rendering("render", "render images of the outer cylinder", "render", skin(outer, out))
+    along = {"start_mm": (-19.35, -2), "end_mm": (27.35, -2), "turn_deg": 90, "standoff_mm": 17}
+    scene = choice("scene", "inner_cylinder") | {"centre_mm": list(INNER_MM)}
+    fields = {"scene": scene, "ultrasound": _in_water(chosen), "path": choice("path", "stroke") | along}
+    clocks = chosen.clocks.model_copy(update={"camera_hz": min(chosen.clocks.camera_hz, BOTTOM_HZ)})
+    yield _swept(chosen, out, TUBE, "render a sweep along the inner cylinder", fields, clocks)
+
+
+def _swept(chosen: Settings, out: Path, name: str, does: str, fields: dict, clocks: Clocks) -> Rendering:
+    shared = {"rig": chosen.rig, "conditions": chosen.conditions, "seed": chosen.seed, "clocks": clocks}
+    settings = sweep.Config.model_validate({**shared, **fields, "filmed": True, "name": name, "out": out, "add": True})
+    return Rendering(name, does, "sweep", settings)
+
+
+def _shared(chosen: Settings) -> dict:
+    return {name: getattr(chosen, name) for name in ("rig", "tracing", "seed", "conditions")}
+
+
+def _in_water(chosen: Settings) -> Transducer:
+    """The scanner as it is set for water, its images as over the scene."""
+    in_water = Transducer.model_validate(choice("ultrasound", "water"))
+    same = {"image_size": chosen.ultrasound.image_size, "scale_mm_per_px": chosen.ultrasound.scale_mm_per_px}
+    return Transducer.model_validate(in_water.model_dump() | same)
+
+
+def usual(**own: object) -> Settings:
+    """The settings of the demonstration's session, but for some."""
+    known = {name: value for name, value in config.defaults("demo").items() if name in Settings.model_fields}
+    return Settings.model_validate(known | own)
+
+
+def choice(group: str, name: str) -> dict:
+    """The fields of a choice of conf/."""
+    return yaml_text.read(choices.file_of(group, name))
