@@ -246,7 +246,7 @@ def test_each_part_has_the_demonstrations_settings(overrides, tmp_path):
     }
     for part in rendered_session.parts(config, tmp_path):
         model = type(part.settings)
-        shared = set(model.model_fields) & set(Config.model_fields) - {"out"} - own[part.name]
+        shared = set(model.model_fields) & set(Config.model_fields) - {"out", "add"} - own[part.name]
         assert {name: getattr(part.settings, name) for name in shared} == {name: getattr(config, name) for name in shared}
         usual = load(part.verb, [f"out={tmp_path}"], model)
         rest = set(model.model_fields) - set(Config.model_fields) - {"add", "name", "filmed"}

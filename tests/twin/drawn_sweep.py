@@ -135,5 +135,5 @@ def figures(story: Inside) -> dict[str, float | int]:
         **measured,
         **{f"probe_{name}": value for name, value in (probe | sound).items()},
         **{f"lag_{name}": value for name, value in lags.items()},
-        "sweep_placement_rms_mm": 0.3,
+        "placement_rms_mm": 0.3,
     }
