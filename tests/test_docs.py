@@ -31,7 +31,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "render": {"capture", "truth"},
     "film": {"capture", "truth"},
     "sweep": {"capture", "truth"},
-    "demo": {"capture", "truth", "surface"},
+    "demo": {"capture", "truth", "result"},
     "surface": {"", "surface.ply"},
     "track": {""},
     "dataset": {""},
