@@ -11,6 +11,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from recon.capture import calibration_files
+from recon.capture.manifest import image_name
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
@@ -18,7 +19,7 @@ from recon.model.probe import Speed
 from sonotwin import command_line, pipeline, rendered_session
 from sonotwin.config import defaults
 from sonotwin.pipeline import Step
-from sonotwin.rendered_session import BOTTOM, SCAN, WATER_C
+from sonotwin.rendered_session import BOTTOM, SCAN, WATER_C, Rendering
 from sonotwin.verbs import calibrate_optics, calibrate_probe, evaluate, film, fuse, reconstruct, render, surface, track
 from twin import board_session
 from twin.evaluation import session_errors, sweep_errors, track_errors
@@ -116,7 +117,7 @@ def steps(config: Config) -> list[Step]:
     """All steps, in order."""
     made = []
     for part in rendered_session.parts(config, config.out):
-        work = partial(render_board, config) if part.name == "board" else part.run
+        work = {"render": partial(render_scene, config, part), "board": partial(render_board, config)}.get(part.name, part.run)
         made.append(Step(part.name, part.does, lambda _, work=work: work()))
     made.append(Step("reconstruct", "reconstruct all of it from the images", lambda _: reconstruct_session(config), MESHES))
     made.append(Step("evaluate", "compare it with the truth", lambda _: compare(config)))
@@ -126,6 +127,12 @@ def steps(config: Config) -> list[Step]:
         made.append(Step("film", frames, lambda _: film.run(filmed)))
         made.append(Step("track", "track the target through them, and compare with the truth", lambda _: track_film(tracking)))
     return [*made, Step("report", "write the report", lambda found: report(config, found), (REPORT,))]
+
+
+def render_scene(config: Config, part: Rendering) -> None:
+    """The scene under fringes; a person sees the first picture before the long steps."""
+    part.run()
+    print(f"look at     {config.out / CAPTURE / 'surface' / config.cameras[0] / image_name(1)}, the first picture of the scene")
 
 
 def render_board(config: Config) -> None:

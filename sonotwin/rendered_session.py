@@ -74,11 +74,11 @@ class Rendering:
 
 
 def parts(chosen: Settings, out: Path) -> Iterator[Rendering]:
-    """All parts of a session, in their order."""
-    if chosen.poses is not None:
-        yield Rendering("board", f"render the calibration board in {chosen.poses.count} poses", "render", board(chosen, out))
+    """All parts of a session, in their order: the scene first, of which there is soon something to see."""
     images = f"render {chosen.patterns.count} images of the scene and its truth"
     yield Rendering("render", images, "render", skin(chosen, out))
+    if chosen.poses is not None:
+        yield Rendering("board", f"render the calibration board in {chosen.poses.count} poses", "render", board(chosen, out))
     if not chosen.looks_inside:
         return
     rests, clocks = choice("path", "wire"), chosen.clocks
