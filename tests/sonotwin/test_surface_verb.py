@@ -20,6 +20,7 @@ from recon.model.calibration import Calibration
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns, Uniform
 from recon.tracking import networks
 from sonotwin.cli import main
+from tests import added
 from tests.recon.tracking import films
 from tests.recon.tracking.stand_ins import Told
 
@@ -347,3 +348,53 @@ def test_the_page_measures(rig, tmp_path, monkeypatch):
     shutil.rmtree("shots")
     images.write_images([tmp_path / "shots" / f"{i}.png" for i in range(sequence.count)], photograph(sequence, optics))
     assert main(["surface", "images=shots", "patterns=sequence.yaml", "calibration=optics.yaml", "out=surface"]) == 0
+
+
+SINGLE_WAVE = '''
+"""One wave over the whole axis: its phase alone is the coordinate."""
+
+import numpy as np
+
+from recon.model.patterns import Fringes, of_kind
+from recon.structured_light.gray_code import Orders
+from recon.structured_light.shots import Ordered, finest
+
+WHOLE_IMAGE = False
+ALONE = ()
+
+
+def check(parts, axis):
+    """Check that a wave covers the axis."""
+    if len(of_kind(parts, Fringes, axis)) != 1:
+        raise ValueError("parts: single_wave unwrapping expects one set of fringes")
+
+
+def orders(shots, axis, sets, valid, light):
+    """The whole turn that brings each phase nearest to the middle of the axis."""
+    part, fringe = finest(sets)
+    length = shots.patterns.length(axis)
+    cycles = ((length - 1) / 2 - part.zero(length)) / part.pitch - fringe.phase / (2 * np.pi)
+    order = np.rint(cycles).astype(np.int32)
+    return Ordered(Orders(order, np.abs(cycles - order) < 0.5 - fringe.sigma), np.zeros(valid.shape, bool), {})
+'''
+
+
+def test_a_fourth_unwrapping_is_one_module(optics, tmp_path, monkeypatch, capsys):
+    """It is found by its name in a sequence's file, checks the parts, and decodes: the plane stands where it is."""
+    sequence = tmp_path / "wave.yaml"
+    text = "projector_size: [640, 400]\nunwrap: single_wave\nparts: [{kind: fringes, pitch: 720, steps: 16}]\n"
+    sequence.write_text(text)
+    with pytest.raises(sonotwin.InputError, match="expected 'centre_line', 'gray' or 'heterodyne', found 'single_wave'"):
+        sonotwin.read_patterns(sequence)
+    added.add(monkeypatch, tmp_path / "ours", "recon.structured_light.fringe_orders", "single_wave", SINGLE_WAVE)
+    patterns = sonotwin.read_patterns(sequence)
+    devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
+    writer.write_surface(tmp_path / "capture", {"cam1": photograph(patterns, optics)}, patterns, optics, devices)
+    assert main(["surface", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}"]) == 0
+    assert "unwrap      single wave" in capsys.readouterr().out
+    fit = primitives.fit_plane(trimesh.load(tmp_path / "out" / "surface.ply", process=False).vertices)
+    assert np.linalg.norm(np.cross(fit.shape.normal, TILT[:3, 2])) < 0.02
+    assert abs((fit.shape.point - TILT[:3, 3]) @ TILT[:3, 2]) < 0.3
+    sequence.write_text(text.replace("parts: [", "parts: [{kind: fringes, pitch: 12, steps: 8}, "))
+    with pytest.raises(sonotwin.InputError, match="single_wave unwrapping expects one set of fringes"):
+        sonotwin.read_patterns(sequence)
