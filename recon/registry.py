@@ -27,13 +27,13 @@ def kinds(package: str) -> dict[str, Any]:
 
 
 def known(package: str, name: Any) -> str:
-    """The name, for a field of pydantic's: where there is no such kind it is refused as one of several literals is."""
-    if name not in (there := names(package)):
-        raise PydanticKnownError("literal_error", {"expected": listed(there)})
+    """The name of a kind that is there, for a field of pydantic's."""
+    return one_of(name, names(package))
+
+
+def one_of(name: Any, there: list[str]) -> str:
+    """The name, if it is one of several; else the refusal of pydantic's literals."""
+    if name not in there:
+        *others, last = map(repr, there)
+        raise PydanticKnownError("literal_error", {"expected": f"{', '.join(others)} or {last}" if others else last})
     return name
-
-
-def listed(there: list[str]) -> str:
-    """Names as pydantic lists literals: 'a', 'b' or 'c'."""
-    *others, last = map(repr, there)
-    return f"{', '.join(others)} or {last}" if others else last

@@ -398,3 +398,64 @@ def test_a_fourth_unwrapping_is_one_module(optics, tmp_path, monkeypatch, capsys
     sequence.write_text(text.replace("parts: [", "parts: [{kind: fringes, pitch: 12, steps: 8}, "))
     with pytest.raises(sonotwin.InputError, match="single_wave unwrapping expects one set of fringes"):
         sonotwin.read_patterns(sequence)
+
+
+ROWS = '''
+"""A text with a row a device: its name, size, focal lengths and centre, coefficients, and its pose, row by row in metres."""
+
+import numpy as np
+
+from recon.capture import camera_dialects
+from recon.capture.camera_dialects import MM, Stored
+
+
+def recognises(content):
+    """Whether the first words are those of the dialect."""
+    return any(text.startswith("rows of devices") for text in content.texts().values())
+
+
+def read(content, sizes):
+    """All devices."""
+    (text,) = content.texts().values()
+    found = {}
+    for line in text.splitlines()[1:]:
+        name, *words = line.split()
+        w, h, fx, fy, cx, cy, *rest = map(float, words)
+        pose = np.vstack([np.reshape(rest[5:], (3, 4)) * [1, 1, 1, MM], [0, 0, 0, 1]])
+        found[name] = Stored((int(w), int(h)), camera_dialects.pinhole(fx, fy, cx, cy), np.array(rest[:5]), pose)
+    return camera_dialects.of_metres(content.path, found)
+
+
+def write(folder, optics):
+    """Write one file."""
+    lines = ["rows of devices"]
+    for name, device in optics.cameras.items():
+        k = device.matrix
+        pose = device.camera_from_world[:3] / [1, 1, 1, MM]
+        numbers = [*device.size, k[0, 0], k[1, 1], k[0, 2], k[1, 2], *device.distortion, *pose.ravel()]
+        lines.append(" ".join([name, *(repr(float(number)) for number in numbers)]))
+    (folder / "rig.rows").write_text(chr(10).join(lines))
+    return ["rig.rows"]
+
+
+def taken(optics):
+    """All."""
+    return list(optics.cameras)
+'''
+
+
+def test_another_dialect_of_calibrations_is_one_module(optics, tmp_path, monkeypatch, capsys):
+    """`export` writes it by its name, `surface` reads it by its content, and the surface is that of the rig's own file."""
+    devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
+    patterns, capture = SEQUENCES["gray"], tmp_path / "capture"
+    writer.write_surface(capture, {"cam1": photograph(patterns, optics)}, patterns, optics, devices)
+    export = ["export", "layout=rows", f"capture={capture}", f"out={tmp_path / 'theirs'}"]
+    assert main(export) == 2
+    assert "expected 'meza2021', 'kalibr', 'mrcal', 'ros' or 'slstudio', found 'rows'" in capsys.readouterr().err
+    added.add(monkeypatch, tmp_path / "ours", calibration_files.DIALECTS, "rows", ROWS)
+    assert main(export) == 0
+    theirs = tmp_path / "theirs" / "rig.rows"
+    for name, given in {"a": [], "b": [f"calibration={theirs}"]}.items():
+        assert main(["surface", f"capture={capture}", f"out={tmp_path / name}", *given]) == 0
+    with np.load(tmp_path / "a" / "points.npz") as own, np.load(tmp_path / "b" / "points.npz") as other:
+        assert np.allclose(own["points"], other["points"], atol=1e-3, equal_nan=True)
