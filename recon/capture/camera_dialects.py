@@ -77,7 +77,10 @@ class Content:
     @cached_property
     def is_packed(self) -> bool:
         """Whether the file holds arrays: npz, or MATLAB's."""
-        return self.is_matlab or (self.path.is_file() and opencv_storage.read(self.path, "a calibration file") is None)
+        if not self.path.is_file():
+            return False
+        with self.path.open("rb") as file:
+            return self.is_matlab or file.read(2) == b"PK"
 
     @cached_property
     def values(self) -> Values:
