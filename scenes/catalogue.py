@@ -1,22 +1,19 @@
 """Find a scene by its kind. A kind is a module of `scenes.kinds`, with a `Config` and a `build`."""
 
 from collections.abc import Mapping
-from importlib import import_module
-from pkgutil import iter_modules
 from types import ModuleType
 from typing import Any
 
 from pydantic import ValidationError
 
-import scenes.kinds
-from recon import arguments
+from recon import arguments, registry
 from recon.errors import InputError, one_line
 from scenes.scene_types import Scene
 
 
 def kinds() -> list[str]:
     """Names of all kinds of scene, in alphabetical order."""
-    return sorted(module.name for module in iter_modules(scenes.kinds.__path__))
+    return registry.names("scenes.kinds")
 
 
 def build_scene(config: Mapping[str, Any]) -> Scene:
@@ -44,7 +41,7 @@ def parse_scene(config: Mapping[str, Any]) -> tuple[ModuleType, Any]:
     kind = config["kind"]
     if kind not in kinds():
         raise InputError(f"scene: kind: expected one of {', '.join(kinds())}, found {kind!r}")
-    module = import_module(f"scenes.kinds.{kind}")
+    module = registry.kind("scenes.kinds", kind)
     try:
         return module, module.Config(**{key: value for key, value in config.items() if key != "kind"})
     except ValidationError as error:

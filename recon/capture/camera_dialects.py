@@ -13,8 +13,11 @@ Where they differ from ours, which are pixels, mm, and OpenCV's distortion coeff
 Sources: the wikis and sources of Kalibr and SLStudio, ROS's sensor_msgs/CameraInfo, mrcal's documentation of its file formats.
 """
 
+import logging
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,10 +25,15 @@ import numpy as np
 
 from recon.capture.images import natural_key
 from recon.errors import InputError, brief
-from recon.files import opencv_storage, regular, yaml_text
+from recon.files import matlab, opencv_storage, regular
+from recon.files.opencv_storage import Values
 from recon.geometry import rigid
-from recon.geometry.camera import Array
-from recon.model.calibration import WORLD
+from recon.geometry.camera import ROTATION, Array, Camera
+from recon.model import lengths
+from recon.model.calibration import WORLD, Calibration
+from recon.model.lengths import UNIT_KEY
+
+log = logging.getLogger(__name__)
 
 MM = 1000.0  # in a m
 OF_FILES = (".cameramodel", ".yaml", ".yml")  # of one camera each
@@ -37,12 +45,65 @@ DEVICES = {
     "projector": "projector",
 }  # by words in files and topics
 FROM_0 = {"cam0": "cam1", "cam1": "cam2", "projector": "projector"}  # where one is cam0
-MRCAL = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}  # coefficients by the model's name
-ROS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}
+FEW_DIGITS = 1.1e-5  # of a rotation's products, in any of the files: five decimals mostly pass
+LARGEST = 1e8  # px, of a focal length; and of any coefficient
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,4})?"
-LISTED = re.compile(rf"\[\s*(?:{NUMBER}\s*(?:,\s*{NUMBER}\s*)*,?\s*)?\]")
-SLSTUDIO = ("Kc", "kc", "Kp", "kp", "Rp", "Tp")
-SLSTUDIO_SIZES = {"cam1": ("frameWidth", "frameHeight"), "projector": ("screenResX", "screenResY")}
+
+
+Sizes = Mapping[str, tuple[int, int]]  # px, of devices' images
+
+
+class Content:
+    """What a file of a calibration holds, or a folder of them, parsed when a dialect first asks for it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._texts = path, dict[Path, str | None]()
+
+    def texts(self, *suffixes: str) -> dict[Path, str]:
+        """Plain texts: that of the file, or those of a folder's files with these suffixes, in natural order; none of OpenCV's."""
+        files = [self.path]
+        if self.path.is_dir():
+            files = sorted((file for file in self.path.iterdir() if file.suffix.lower() in suffixes), key=natural_key)
+        for file in files:
+            if file not in self._texts:
+                self._texts[file] = _text(file)
+        return {file: text for file in files if (text := self._texts[file]) is not None}
+
+    @property
+    def is_matlab(self) -> bool:
+        """Whether the file is one of MATLAB's."""
+        return self.path.is_file() and matlab.is_matlab(self.path)
+
+    @cached_property
+    def is_packed(self) -> bool:
+        """Whether the file holds arrays: npz, or MATLAB's."""
+        if not self.path.is_file():
+            return False
+        with self.path.open("rb") as file:
+            return self.is_matlab or file.read(2) == b"PK"
+
+    @cached_property
+    def values(self) -> Values:
+        """Values of OpenCV's storage; none of what is none."""
+        try:
+            return self.checked_values()
+        except InputError:
+            return {}
+
+    def checked_values(self) -> Values:
+        """The same; InputError if the file is missing, damaged, or no storage."""
+        return {} if self.is_matlab else opencv_storage.read(self.path, "a calibration file") or {}
+
+
+def _text(file: Path) -> str | None:
+    """A file's text, if it may be of a dialect of plain text."""
+    data = regular.read_bytes(file, expected="a calibration file")
+    if data.startswith((b"PK", b"%YAML")) or len(data) > opencv_storage.MOST_BYTES:
+        return None
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return None
 
 
 class Stored(NamedTuple):
@@ -54,87 +115,7 @@ class Stored(NamedTuple):
     camera_from_world: Array  # (4, 4) mm
 
 
-class Rectified(NamedTuple):
-    """A camera of ROS's: its rectification, too."""
-
-    stored: Stored
-    rotation: Array  # (3, 3)
-    projection: Array  # (3, 4), px and px m
-
-
-def read(path: Path) -> dict[str, Stored] | None:
-    """Devices in a file of one of these dialects, SLStudio's left out, or in a folder of files of one camera each.
-
-    None for what is none of these.
-
-    Raises
-    ------
-    InputError
-        If a value is missing or of another kind, a model is none of ours, or devices can't be told.
-    """
-    if path.is_dir():
-        files = sorted((file for file in path.iterdir() if file.suffix.lower() in OF_FILES), key=natural_key)
-        texts = {file: text for file in files if (text := _text(file)) is not None and not _is_kalibr(text)}
-        return _several(path, texts) if texts else None
-    text = _text(path)
-    if text is None:
-        return None
-    if _is_kalibr(text):
-        return _kalibr(path, yaml_text.loaded(path, text))
-    return _in_world({WORLD: _mrcal(path, text) if _is_mrcal(text) else _ros(path, text).stored})
-
-
-def _text(path: Path) -> str | None:
-    """A file's text, if it is of one of these dialects by its first words."""
-    data = regular.read_bytes(path, expected="a calibration file")
-    if data.startswith((b"PK", b"%YAML")) or len(data) > opencv_storage.MOST_BYTES:
-        return None
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return None
-    return text if _is_mrcal(text) or _is_kalibr(text) or re.search(r"^camera_matrix\s*:", text, re.MULTILINE) else None
-
-
-def _is_mrcal(text: str) -> bool:
-    return re.search(r"""^\s*\{?\s*['"]lens_?model['"]\s*:""", text, re.MULTILINE) is not None
-
-
-def _is_kalibr(text: str) -> bool:
-    return re.search(r"^cam\d+\s*:", text, re.MULTILINE) is not None
-
-
-def _several(folder: Path, texts: Mapping[Path, str]) -> dict[str, Stored]:
-    """Devices of a folder's files: of mrcal's by their poses, of ROS's by the rectification of a pair."""
-    names = _devices(folder, [file.stem for file in texts])
-    kinds = {_is_mrcal(text) for text in texts.values()}
-    if len(kinds) > 1:
-        raise InputError(f"{folder}: expected files of mrcal or of ROS, found both; leave one kind")
-    if kinds.pop():
-        return _in_world({name: _mrcal(file, text) for name, (file, text) in zip(names, texts.items(), strict=True)})
-    cameras = {name: _ros(file, text) for name, (file, text) in zip(names, texts.items(), strict=True)}
-    if len(cameras) > 2:
-        raise InputError(
-            f"{folder}: expected files of ROS of one pair, found {len(cameras)}: {', '.join(file.name for file in texts)}"
-        )
-    (first, one), *others = cameras.items()
-    found = {first: one.stored}
-    for name, other in others:
-        focal = np.array([other.projection[0, 0], other.projection[1, 1]])
-        if not (focal > 0).all():
-            raise InputError(f"{folder}: projection_matrix: expected positive focal lengths of {name}, found {focal.tolist()}")
-        shift = (other.projection[:2, 3] - one.projection[:2, 3]) / focal
-        if not shift.any():
-            raise InputError(
-                f"{folder}: projection_matrix: expected those of a pair calibrated together, the second's with a shift in its "
-                "last column, found none: which of both is where isn't in these files"
-            )
-        pose = rigid.transform(other.rotation.T @ one.rotation, other.rotation.T @ np.append(shift, 0) * MM)
-        found[name] = other.stored._replace(camera_from_world=pose)
-    return _in_world(found)
-
-
-def _devices(place: Path, words: Sequence[str]) -> list[str]:
+def devices(place: Path, words: Sequence[str]) -> list[str]:
     """Our names of devices by the first word that tells in each file's name or topic; the cameras in their order if none does."""
     pieces = [re.findall(r"[^\W_]+", word.lower()) for word in words]
     names = FROM_0 if any("cam0" in each for each in pieces) else DEVICES
@@ -147,7 +128,7 @@ def _devices(place: Path, words: Sequence[str]) -> list[str]:
     return known
 
 
-def _in_world(found: Mapping[str, Stored]) -> dict[str, Stored]:
+def in_world(found: Mapping[str, Stored]) -> dict[str, Stored]:
     """The same devices, camera 1 first and its frame the world."""
     if WORLD not in found:
         return dict(found)
@@ -157,96 +138,7 @@ def _in_world(found: Mapping[str, Stored]) -> dict[str, Stored]:
     return moved | {WORLD: moved[WORLD]._replace(camera_from_world=np.eye(4))}
 
 
-def _kalibr(path: Path, content: Any) -> dict[str, Stored]:
-    entries = {
-        key: value for key, value in (content if isinstance(content, dict) else {}).items() if re.fullmatch(r"cam\d+", str(key))
-    }
-    ordered = sorted(entries, key=lambda key: int(key[3:]))
-    if ordered != [f"cam{k}" for k in range(len(ordered))] or not ordered:
-        raise InputError(f"{path}: expected cam0, cam1 and so on, found {', '.join(ordered) or 'none'}")
-    topics, stored, pose = [], [], np.eye(4)
-    for number, key in enumerate(ordered):
-        entry = entries[key]
-        if not isinstance(entry, dict):
-            raise InputError(f"{path}: {key}: expected a camera's fields, found {brief(entry)}")
-        model, lens = entry.get("camera_model"), entry.get("distortion_model")
-        if model != "pinhole" or lens not in ("radtan", "none"):
-            raise InputError(
-                f"{path}: {key}: expected camera_model: pinhole with distortion_model: radtan or none, found {brief(model)} with "
-                f"{brief(lens)}: calibrate with --models pinhole-radtan"
-            )
-        fx, fy, cx, cy = _numbers(path, f"{key}.intrinsics", entry.get("intrinsics"), 4)
-        k = _numbers(path, f"{key}.distortion_coeffs", entry.get("distortion_coeffs"), 4 if lens == "radtan" else None)
-        if number:
-            rows = entry.get("T_cn_cnm1")
-            motion = [_numbers(path, f"{key}.T_cn_cnm1", row, 4) for row in rows] if isinstance(rows, list) else []
-            if len(motion) != 4:
-                raise InputError(f"{path}: {key}.T_cn_cnm1: expected 4 rows of 4 numbers, found {brief(rows)}")
-            pose = np.array(motion) * np.array([[1, 1, 1, MM]] * 3 + [[1, 1, 1, 1]]) @ pose
-        size = _size(path, f"{key}.resolution", entry.get("resolution"))
-        topics.append(str(entry.get("rostopic") or ""))
-        stored.append(Stored(size, pinhole(fx, fy, cx, cy), k if lens == "radtan" else np.zeros(0), pose))
-    return _in_world(dict(zip(_devices(path, topics), stored, strict=True)))
-
-
-def _ros(path: Path, text: str) -> Rectified:
-    content = yaml_text.loaded(path, text)
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: expected a camera's fields, found {brief(content)}")
-    model = content.get("distortion_model")
-    counts = ROS.get(model) if isinstance(model, str) else None
-    if counts is None:
-        raise InputError(f"{path}: distortion_model: expected {' or '.join(ROS)}, found {brief(model)}")
-    size = _size(path, "image_width and image_height", [content.get("image_width"), content.get("image_height")])
-    k = _entries(path, content, "distortion_coefficients")
-    if k.size not in counts:
-        raise InputError(f"{path}: distortion_coefficients: expected {counts[-1]} of {model}, found {k.size}")
-    matrix = _entries(path, content, "camera_matrix", (3, 3))
-    rotation = _entries(path, content, "rectification_matrix", (3, 3)) if "rectification_matrix" in content else np.eye(3)
-    if fault := rigid.fault(rigid.transform(rotation, np.zeros(3))):
-        raise InputError(f"{path}: rectification_matrix: expected a rotation, found {fault}")
-    projection = np.column_stack([matrix, np.zeros(3)])
-    if "projection_matrix" in content:
-        projection = _entries(path, content, "projection_matrix", (3, 4))
-    return Rectified(Stored(size, matrix, k, np.eye(4)), rotation, projection)
-
-
-def _entries(path: Path, content: Mapping[str, Any], name: str, shape: tuple[int, ...] | None = None) -> Array:
-    """A matrix of ROS's, a map of rows, cols and data."""
-    value = content.get(name)
-    data = value.get("data") if isinstance(value, dict) else None
-    numbers = _numbers(path, name, data, None if shape is None else int(np.prod(shape)))
-    return numbers if shape is None else numbers.reshape(shape)
-
-
-def _mrcal(path: Path, text: str) -> Stored:
-    """A file's dictionary isn't evaluated: of its values only these are read."""
-    plain = re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE)
-    found = re.findall(r"""['"]lens_?model['"]\s*:\s*['"]([^'"]*)['"]""", plain)
-    model = found[0].removeprefix("LENSMODEL_") if len(found) == 1 else ""
-    if model not in MRCAL:
-        expected = ", ".join(f"LENSMODEL_{name}" for name in MRCAL)
-        raise InputError(
-            f"{path}: lensmodel: expected one of {expected}, found {brief(', '.join(found))}: mrcal-convert-lensmodel makes one"
-        )
-    fx, fy, cx, cy, *k = _listed(path, plain, "intrinsics", 4 + MRCAL[model])
-    width, height = _listed(path, plain, "imagersize", 2)
-    motion = _listed(path, plain, "rt_cam_ref|extrinsics", 6)
-    pose = rigid.from_rotation_vector(motion[:3], motion[3:] * MM)
-    return Stored(_size(path, "imagersize", [width, height]), pinhole(fx, fy, cx, cy), np.array(k, float), pose)
-
-
-def _listed(path: Path, text: str, key: str, count: int) -> Array:
-    """Numbers : (count,) of a list in a Python dictionary."""
-    name = key.rpartition("|")[2]
-    places = list(re.finditer(rf"""['"](?:{key})['"]\s*:\s*""", text))
-    found = LISTED.match(text, places[0].end()) if len(places) == 1 else None
-    if found is None:
-        raise InputError(f"{path}: {name}: expected a list of numbers once, found {'something else' if places else 'none'}")
-    return _numbers(path, name, [float(number) for number in re.findall(NUMBER, found[0])], count)
-
-
-def _numbers(path: Path, name: str, value: Any, count: int | None = None) -> Array:
+def numbers(path: Path, name: str, value: Any, count: int | None = None) -> Array:
     """A list of numbers : (n,) that are finite, of a length if one is given."""
     listed = value if isinstance(value, list) else [value]
     listed = [float(one) if isinstance(one, str) and re.fullmatch(NUMBER, one) else one for one in listed]  # as of 1e-05 in YAML
@@ -262,11 +154,12 @@ def _numbers(path: Path, name: str, value: Any, count: int | None = None) -> Arr
     return numbers
 
 
-def _size(path: Path, name: str, value: Any) -> tuple[int, int]:
-    numbers = _numbers(path, name, value, 2)
-    if (numbers != np.rint(numbers)).any() or numbers.min() < 1 or numbers.max() > 1e6:
+def image_size(path: Path, name: str, value: Any) -> tuple[int, int]:
+    """Width and height, px, that are a list of two whole numbers."""
+    sides = numbers(path, name, value, 2)
+    if (sides != np.rint(sides)).any() or sides.min() < 1 or sides.max() > 1e6:
         raise InputError(f"{path}: {name}: expected width and height in px, found {brief(value)}")
-    return int(numbers[0]), int(numbers[1])
+    return int(sides[0]), int(sides[1])
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> Array:
@@ -274,25 +167,94 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> Array:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def slstudio(path: Path, values: opencv_storage.Values, sizes: Mapping[str, tuple[int, int]]) -> dict[str, Stored]:
-    """Camera and projector of SLStudio's calibration; sizes, where it has none, are those given.
+def _warn_of_mistakes(path: Path, read: Calibration) -> None:
+    """Warn where names are likely exchanged, or distortion left out."""
+    placed = [name for name, camera in read.cameras.items() if not np.allclose(camera.camera_from_world, np.eye(4), atol=1e-9)]
+    if WORLD in placed and (first := [name for name in read.cameras if name not in placed]):
+        log.warning("%s: expected %s where the world begins, found %s there: are their names exchanged?", path, WORLD, first[0])
+    matrices = [camera.matrix for camera in read.cameras.values()]
+    rectified = all(np.array_equal(matrix, matrices[0]) for matrix in matrices)  # or one device alone
+    estimated = read.uncertainty is None or any(name.endswith(".k1") for name in read.uncertainty.names)
+    if estimated and not rectified and not any(camera.distortion.any() for camera in read.cameras.values()):
+        log.warning("%s: no lens has any distortion: was it left out, or are the images free of it?", path)
+
+
+def of_mm(content: Content, read: Calibration, stated: object = None) -> Calibration:
+    """The calibration in mm, by the unit that its file states; without one, the usual distances between devices tell another.
 
     Raises
     ------
     InputError
-        If a matrix or a size is missing.
+        If they do, or the unit is none.
     """
-    matrices = {key: opencv_storage.matrix(path, key, values.get(key)) for key in SLSTUDIO}
-    if matrices["Rp"].shape != (3, 3) or matrices["Tp"].size != 3:
-        shapes = f"{matrices['Rp'].shape} and {matrices['Tp'].shape}"
-        raise InputError(f"{path}: Rp, Tp: expected a 3x3 rotation and 3 translations in mm, found {shapes}")
-    found: dict[str, Stored] = {}
-    poses = {"cam1": np.eye(4), "projector": rigid.transform(matrices["Rp"], matrices["Tp"])}
-    for (device, keys), (matrix, lens) in zip(SLSTUDIO_SIZES.items(), (("Kc", "kc"), ("Kp", "kp")), strict=True):
-        sides = [side for key in keys if isinstance(side := values.get(key), int) and side > 0]
-        size = (sides[0], sides[1]) if len(sides) == 2 else sizes.get(device)
-        if size is None:
-            named = " and ".join(keys)
-            raise InputError(f"{path}: {named}: expected the image size of {device}, found none, and none was given")
-        found[device] = Stored(size, matrices[matrix], matrices[lens].ravel(), poses[device])
-    return found
+    path, stated = content.path, content.values.get(UNIT_KEY) if stated is None else stated
+    _warn_of_mistakes(path, read)
+    if stated is None:
+        for name, camera in read.cameras.items():
+            apart = lengths.shift(camera.camera_from_world[:3, 3])
+            if fault := lengths.DEVICES_APART.fault(apart):
+                raise InputError(f"{path}: {name}: expected {lengths.DEVICES_APART} from {WORLD}, found {fault} {lengths.SAID}")
+            if doubt := lengths.DEVICES_APART.doubt(apart):
+                log.warning("%s: %s: its distance from %s is %s %s", path, name, WORLD, doubt, lengths.SAID)
+        return read
+    unit = lengths.unit_of(path, stated)
+    if unit == 1:
+        return read
+    if read.uncertainty is not None:
+        raise InputError(f"{path}: {UNIT_KEY}: expected 1 with a covariance, which is in mm, found {unit:g}")
+    scaled = {
+        name: replace(
+            camera, camera_from_world=rigid.transform(camera.camera_from_world[:3, :3], unit * camera.camera_from_world[:3, 3])
+        )
+        for name, camera in read.cameras.items()
+    }
+    return Calibration(scaled)
+
+
+def of_metres(path: Path, stored: Mapping[str, Stored]) -> Calibration:
+    """The calibration of a dialect that is in metres; InputError if mm were taken for them."""
+    read = of_stored(path, stored)
+    most = lengths.DEVICES_APART.most / MM
+    for name, camera in read.cameras.items():
+        if (apart := lengths.shift(camera.camera_from_world[:3, 3]) / MM) > most:
+            expected = f"{path}: {name}: expected it within {most:g} m of {WORLD}"
+            raise InputError(f"{expected}, found {apart:.4g} m: are its translations in mm? Divide them by 1000")
+    return read
+
+
+def of_stored(path: Path, stored: Mapping[str, Stored]) -> Calibration:
+    """Devices as `Calibration` checks them; InputError names what is wrong."""
+    return Calibration({name: camera(path, name, *one) for name, one in stored.items()})
+
+
+def camera(path: Path, name: str, size: tuple[int, int], matrix: Array, distortion: Array, camera_from_world: Array) -> Camera:
+    """A device; InputError if a number is too large, or its pose no rotation and shift."""
+    for part, values in (("matrix", matrix), ("distortion", distortion)):
+        if (np.abs(values) > LARGEST).any():
+            raise InputError(f"{path}: {name}.{part}: expected numbers of up to {LARGEST:g}, found {np.abs(values).max():g}")
+    if rigid.fault(camera_from_world, ROTATION) and not rigid.fault(camera_from_world, FEW_DIGITS):
+        camera_from_world = rigid.nearest(camera_from_world)
+    try:
+        return Camera(size, matrix, distortion, camera_from_world)
+    except ValueError as error:
+        raise InputError(f"{path}: {name}.{error}") from None
+
+
+def motion(path: Path, values: Mapping[str, Array], rotation: str, translation: str) -> Array:
+    """The pose : (4, 4) mm by a rotation and a translation; InputError if their shapes are others."""
+    if values[rotation].shape != (3, 3) or values[translation].size != 3:
+        found = f"{values[rotation].shape} and {values[translation].shape}"
+        raise InputError(f"{path}: {rotation}, {translation}: expected a 3x3 rotation and 3 translations in mm, found {found}")
+    return rigid.transform(values[rotation], values[translation])
+
+
+def size_of(path: Path, name: str, sizes: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
+    """The image size given for a device that the file stores none for; InputError if none was given."""
+    if name not in sizes:
+        raise InputError(f"{path}: expected a file that stores the image size of {name}, found none, and none was given")
+    return sizes[name]
+
+
+def matrices(path: Path, values: Values, keys: tuple[str, ...]) -> dict[str, Array]:
+    """Matrices by their keys; InputError if one is missing or damaged."""
+    return {key: opencv_storage.matrix(path, key, values.get(key)) for key in keys}

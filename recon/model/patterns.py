@@ -4,16 +4,20 @@ A sequence is a list of parts, shown in order. Every pattern varies along one pr
 projector coordinate x in px (pixel centres at integers), with values from 0 to 1.
 """
 
-from typing import Annotated, Literal
+from collections.abc import Sequence
+from functools import partial
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, PlainValidator, model_validator
 
+from recon import registry
 from recon.model.rig import Part
 
 Axis = Literal["columns", "rows"]  # which projector coordinate the pattern encodes
-Unwrapping = Literal["centre_line", "gray", "heterodyne"]
+UNWRAPPINGS = "recon.structured_light.fringe_orders"  # a module each
+Unwrapping = Annotated[str, PlainValidator(partial(registry.known, UNWRAPPINGS))]
 Image = NDArray[np.float32]
 Side = Annotated[int, Field(ge=8, le=20000)]  # px
 
@@ -158,6 +162,24 @@ def _bits(periods: float) -> int:
 AnyPart = Annotated[Fringes | GrayCode | CentreLine | Uniform, Field(discriminator="kind")]
 
 
+AKind = TypeVar("AKind", bound=Part)
+
+
+def of_kind(parts: Sequence[AnyPart], kind: type[AKind], axis: Axis) -> list[AKind]:
+    """Those parts of a kind that vary along an axis."""
+    return [part for part in parts if isinstance(part, kind) and part.axis == axis]
+
+
+def fringes_and_guide(parts: Sequence[AnyPart], axis: Axis, unwrap: str, kind: type[AKind]) -> tuple[Fringes, AKind]:
+    """The one set of fringes of an axis, and the one part of a kind that unwraps it; ValueError if there are others."""
+    fringes, guides = of_kind(parts, Fringes, axis), of_kind(parts, kind, axis)
+    if len(fringes) != 1:
+        raise ValueError(f"parts: {unwrap} unwrapping of {axis} expects one set of fringes, found {len(fringes)}")
+    if len(guides) != 1:
+        raise ValueError(f"parts: {unwrap} unwrapping of {axis} expects one part of that kind, found {len(guides)}")
+    return fringes[0], guides[0]
+
+
 class Patterns(Part):
     """A sequence of patterns and how its fringes are unwrapped; of Gray code alone `unwrap` is `gray`, too.
 
@@ -174,37 +196,18 @@ class Patterns(Part):
     @model_validator(mode="after")
     def _consistent(self) -> "Patterns":
         if not self.axes:
-            code = " or a Gray code" if self.unwrap == "gray" else ""
+            code = " or a Gray code" if GrayCode in self.unwrapping.ALONE else ""
             raise ValueError(f"parts: expected at least one set of fringes{code}, found none")
         for axis in self.axes:
-            fringes = [part for part in self.parts if isinstance(part, Fringes) and part.axis == axis]
-            if not fringes:
+            if self.has_fringes(axis):
+                self.unwrapping.check(self.parts, axis)
+            else:
                 self._check_code_alone(axis)
-                continue
-            if self.unwrap == "heterodyne":
-                if len(fringes) < 2:
-                    raise ValueError(
-                        f"parts: heterodyne unwrapping of {axis} expects two or more sets of fringes, found {len(fringes)}"
-                    )
-                if len({part.pitch for part in fringes}) < len(fringes):
-                    pitches = ", ".join(f"{part.pitch:g}" for part in fringes)
-                    raise ValueError(f"parts: heterodyne unwrapping of {axis} expects different pitches, found {pitches} px")
-                continue
-            if len(fringes) != 1:
-                raise ValueError(f"parts: {self.unwrap} unwrapping of {axis} expects one set of fringes, found {len(fringes)}")
-            wanted = GrayCode if self.unwrap == "gray" else CentreLine
-            guides = [part for part in self.parts if isinstance(part, wanted) and part.axis == axis]
-            if len(guides) != 1:
-                raise ValueError(f"parts: {self.unwrap} unwrapping of {axis} expects one part of that kind, found {len(guides)}")
-            if isinstance(guides[0], GrayCode) and guides[0].pitch != fringes[0].pitch:
-                raise ValueError(
-                    f"parts: Gray code and fringes of {axis} expect one pitch, found {guides[0].pitch:g} and {fringes[0].pitch:g}"
-                )
         return self
 
     def _check_code_alone(self, axis: Axis) -> None:
         """Check that the code of an axis without fringes can be read: ValueError if there are two, or none has a threshold."""
-        codes = [part for part in self.parts if isinstance(part, GrayCode) and part.axis == axis]
+        codes = of_kind(self.parts, GrayCode, axis)
         if len(codes) > 1:
             raise ValueError(f"parts: Gray code of {axis} without fringes expects one part of that kind, found {len(codes)}")
         levels = {part.level for part in self.parts if isinstance(part, Uniform)}
@@ -234,10 +237,15 @@ class Patterns(Part):
         return self
 
     @property
+    def unwrapping(self) -> Any:
+        """The module of the unwrapping, with what `recon.structured_light.fringe_orders` asks of it."""
+        return registry.kind(UNWRAPPINGS, self.unwrap)
+
+    @property
     def axes(self) -> tuple[Axis, ...]:
         """The axes that are encoded, by fringes or by Gray code alone, columns first."""
         axes: tuple[Axis, ...] = ("columns", "rows")
-        encoding = Fringes | GrayCode if self.unwrap == "gray" else Fringes
+        encoding = (Fringes, *self.unwrapping.ALONE)
         return tuple(axis for axis in axes if any(isinstance(part, encoding) and part.axis == axis for part in self.parts))
 
     def on(self, size: tuple[int, int]) -> "Patterns":

@@ -197,9 +197,9 @@ def gather(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size
 def _around(centres: Array, reach: Array, patterns: Patterns, shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Rows and columns of the part of an image that holds the windows about all points, with a margin.
 
-    With a centre line, which may lie beside the board, it is the whole.
+    It is the whole where orders need it, as by a centre line, which may lie beside the board.
     """
-    if patterns.unwrap == "centre_line":
+    if patterns.unwrapping.WHOLE_IMAGE:
         return slice(0, shape[0]), slice(0, shape[1])
     known = np.isfinite(centres).all(axis=1) & np.isfinite(reach)
     if not known.any():

@@ -12,18 +12,16 @@ from numpy.typing import NDArray
 from recon import arguments
 from recon.compiled import kernel
 from recon.errors import InputError
-from recon.model.patterns import AnyPart, Axis, CentreLine, Fringes, GrayCode, Patterns, Uniform
-from recon.structured_light import frame_errors, gray_cells, gray_code, multi_frequency, plausibility, straightening
+from recon.model.patterns import AnyPart, Axis, Fringes, GrayCode, Patterns, Uniform
+from recon.structured_light import frame_errors, gray_cells, plausibility, straightening
 from recon.structured_light.gray_code import Orders
 from recon.structured_light.phase import DEFAULT_NOISE, FrameErrors, Fringe, Noise, estimate_noise, wrapped_phase
 from recon.structured_light.phase_bend import Bend, Hidden
-from recon.structured_light.unwrapping import continuity, spatial
+from recon.structured_light.shots import Mask, Shots, finest
 from recon.threads import in_threads
 
 Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 NoiseSource = Literal["given", "measured", "assumed"]
-Measured = tuple[Fringes, Fringe]
 
 DARKEST = 4.0  # DN of 255: default of the least modulation
 SMALLEST = 8  # px, an image's shorter side: the extent of the stencil of continuity
@@ -72,23 +70,6 @@ class Linearity(NamedTuple):
 
 
 LINEAR = Linearity()
-
-
-class _Shots(NamedTuple):
-    """Images of a sequence, and what is known of them."""
-
-    images: NDArray  # (n, h, w), DN
-    patterns: Patterns
-    errors: dict[int, FrameErrors]  # of each set of fringes, by the place of its first image
-    noise: Noise
-    least: float  # DN, of modulation
-    full: float  # DN
-    name: str
-    doubt: str  # of the noise where it is assumed, in words
-
-    def where(self, place: slice) -> str:
-        """Images of a part, for messages."""
-        return f"{self.name}: images {place.start} to {place.stop - 1}"
 
 
 class _AxisMap(NamedTuple):
@@ -177,7 +158,7 @@ def decode(
         if isinstance(part, Fringes)
     }
     noise, source = _noise(images, parts, errors, full, noise)
-    shots = _Shots(images, patterns, errors, noise, least, full, name, NOISIER if source == "assumed" else "")
+    shots = Shots(images, patterns, errors, noise, least, full, name, NOISIER if source == "assumed" else "")
     axes: dict[Axis, _AxisMap] = {
         axis: (_from_fringes if patterns.has_fringes(axis) else _from_code)(shots, axis) for axis in patterns.axes
     }
@@ -197,7 +178,7 @@ def decode(
     return ProjectorMap(columns[0], rows[0], columns[1], rows[1], *shown, *taken)
 
 
-def _from_fringes(shots: _Shots, axis: Axis) -> _AxisMap:
+def _from_fringes(shots: Shots, axis: Axis) -> _AxisMap:
     """Coordinates along an axis by the phase of its finest fringes and their orders."""
     sets, clipped = [], 0.0
     for part, place in shots.patterns.slices():
@@ -212,16 +193,16 @@ def _from_fringes(shots: _Shots, axis: Axis) -> _AxisMap:
     sets, bends, unknown = straightening.straighten(sets, status == Status.OK, length)
     linearity = Linearity(bends, unknown, clipped)
     plausibility.check_bends(bends, clipped, f"{shots.name}: fringes of {axis}")
-    part, fringe = min(sets, key=lambda pair: pair[0].pitch)
+    part, fringe = finest(sets)
     light = plausibility.suspected(bends, unknown, clipped)
-    orders, unreachable, counts = _orders(shots, axis, sets, status == Status.OK, light)
+    orders, unreachable, counts = shots.patterns.unwrapping.orders(shots, axis, sets, status == Status.OK, light)
     scale = Scale(float(part.zero(length)), part.pitch, length)
     x, sigma = _coordinates(fringe, orders, unreachable, status, scale)
     shown = (fringe.modulation, fringe.offset, fringe.phase)
     return _AxisMap(Coordinates(x, sigma, status), *shown, lit, counts, linearity)
 
 
-def _from_code(shots: _Shots, axis: Axis) -> _AxisMap:
+def _from_code(shots: Shots, axis: Axis) -> _AxisMap:
     """Coordinates along an axis by Gray code alone."""
     patterns, noise = shots.patterns, shots.noise
     ((code, place),) = [(p, place) for p, place in patterns.slices() if isinstance(p, GrayCode) and p.axis == axis]
@@ -275,46 +256,6 @@ def _judge(first, end, fringe: Fringe, least, status, lit):
             dark = modulation[v, u] < least or sigma[v, u] > WORST_SIGMA
             status[v, u] = max(status[v, u], SATURATED if saturated[v, u] else DARK if dark else OK)
             lit[v, u] &= sigma[v, u] < LIT_SIGMA
-
-
-def _orders(shots: _Shots, axis: Axis, sets: list[Measured], valid: Mask, light: str) -> tuple[Orders, Mask, dict[str, int]]:
-    """Fringe orders by the sequence's unwrapping, pixels out of the line's reach : (h, w) bool, and counts for the summary."""
-    patterns, name, length = shots.patterns, shots.name, shots.patterns.length(axis)
-    nowhere = np.zeros(valid.shape, bool)
-    part, fringe = min(sets, key=lambda pair: pair[0].pitch)
-    if patterns.unwrap == "heterodyne":
-        orders, clear = multi_frequency.fringe_order(sets, length)
-        plausibility.check_pitches(orders.trusted, valid & clear, fringe.sigma, light, f"{name}: fringes of {axis}")
-        return orders, nowhere, {}
-    guide, place = next((p, at) for p, at in patterns.slices() if isinstance(p, GrayCode | CentreLine) and p.axis == axis)
-    if isinstance(guide, CentreLine):
-        return _from_line(guide, shots.images[place.start], part, fringe, valid, length, axis, f"{name}: image {place.start}")
-    orders, residual = gray_code.fringe_order(shots.images[place], guide, part, fringe, length, shots.noise)
-    plausibility.check_code(
-        orders.order, residual, guide, part, fringe.phase, valid, length, light or shots.doubt, shots.where(place)
-    )
-    if not guide.complementary:  # a fifth of the pixels lies too near the period borders: fill in from both sides
-        cycles = fringe.phase * np.float32(1 / (2 * np.pi))
-        flags = continuity.continuity(cycles, fringe.sigma, valid)
-        known = orders.trusted & valid
-        orders = Orders(*continuity.carry(orders.order, known, cycles, fringe.sigma, flags, continuity.CLEAN, continuity.REACH))
-    return orders, nowhere, {}
-
-
-def _from_line(
-    line: CentreLine, image: NDArray, part: Fringes, fringe: Fringe, valid: Mask, length: int, axis: Axis, place: str
-) -> tuple[Orders, Mask, dict[str, int]]:
-    """Orders by the centre line; for rows all images are transposed, so that the line stands upright."""
-    plausibility.check_light(image, fringe, valid, place)
-    turned = axis == "rows"
-    if turned:
-        fringe = Fringe(*(np.ascontiguousarray(m.T) for m in fringe))
-        image, valid = np.ascontiguousarray(image.T), np.ascontiguousarray(valid.T)
-    turns = (line.middle(length) - part.zero(length)) / part.pitch
-    found = spatial.unwrap(fringe, valid, image, turns, line.width / part.pitch)
-    plausibility.check_line(found.sightings, found.votes, found.residual, place)
-    order, known, unreachable = (m.T if turned else m for m in (found.order, found.known, found.unreachable))
-    return Orders(order, known), unreachable, {"regions": found.regions, "islands": found.islands, "disputed": found.disputed}
 
 
 def _coordinates(

@@ -16,16 +16,17 @@ seconds.
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Annotated
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from pydantic import PlainValidator
 from rich.console import Console
 
+from recon import registry
 from recon.capture import (
     calibration_files,
-    camera_exports,
     manifest,
     meza2021,
     meza2021_sweep,
@@ -49,11 +50,18 @@ from recon.segmentation import mass_files
 from recon.segmentation.scan_masks import mask_of
 from sonotwin.verbs.surface import POINTS
 
+MEZA = "meza2021"
+
+
+def known_layout(name: object) -> object:
+    """The name of a layout of whole captures, or of a dialect of cameras that is written; else a refusal."""
+    return registry.one_of(name, [MEZA, *calibration_files.written()])
+
 
 class Config(Part):
     """Fields of `conf/export.yaml`."""
 
-    layout: Literal["meza2021", "kalibr", "ros", "mrcal", "slstudio"] = "meza2021"
+    layout: Annotated[str, PlainValidator(known_layout)] = MEZA
     capture: Path | None = None
     out: Path
     calibration: Path | None = None
@@ -85,7 +93,7 @@ def run(config: Config) -> None:
     given = (config.capture, config.calibration, config.surface, config.probe, config.masses)
     atomic.check_folder(config.out, "export", inputs=[path for path in given if path is not None])
     written = []
-    if config.layout != "meza2021":
+    if config.layout != MEZA:
         export_cameras(config, console)
         return
     held = manifest.read_manifest(config.source)
@@ -122,9 +130,10 @@ def export_cameras(config: Config, console: Console) -> None:
         optics = None if config.calibration is None else calibration_files.read(config.calibration)
     if optics is None:
         raise InputError(f"export: calibration: expected one of cameras for layout={config.layout}, found none")
+    dialect = registry.kind(calibration_files.DIALECTS, config.layout)
     with atomic.new_folder(config.out, "export") as folder:
-        names = camera_exports.WRITERS[config.layout](folder, optics)
-    devices = camera_exports.taken(config.layout, optics)
+        names = dialect.write(folder, optics)
+    devices = dialect.taken(optics)
     console.print(f"optics      {', '.join(devices)}: {', '.join(names)}", markup=False)
     lost = [name for name in optics.cameras if name not in devices] + ["the covariance"] * (optics.uncertainty is not None)
     if lost:

@@ -20,6 +20,7 @@ from recon.model.calibration import Calibration
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns, Uniform
 from recon.tracking import networks
 from sonotwin.cli import main
+from tests import added
 from tests.recon.tracking import films
 from tests.recon.tracking.stand_ins import Told
 
@@ -347,3 +348,114 @@ def test_the_page_measures(rig, tmp_path, monkeypatch):
     shutil.rmtree("shots")
     images.write_images([tmp_path / "shots" / f"{i}.png" for i in range(sequence.count)], photograph(sequence, optics))
     assert main(["surface", "images=shots", "patterns=sequence.yaml", "calibration=optics.yaml", "out=surface"]) == 0
+
+
+SINGLE_WAVE = '''
+"""One wave over the whole axis: its phase alone is the coordinate."""
+
+import numpy as np
+
+from recon.model.patterns import Fringes, of_kind
+from recon.structured_light.gray_code import Orders
+from recon.structured_light.shots import Ordered, finest
+
+WHOLE_IMAGE = False
+ALONE = ()
+
+
+def check(parts, axis):
+    """Check that a wave covers the axis."""
+    if len(of_kind(parts, Fringes, axis)) != 1:
+        raise ValueError("parts: single_wave unwrapping expects one set of fringes")
+
+
+def orders(shots, axis, sets, valid, light):
+    """The whole turn that brings each phase nearest to the middle of the axis."""
+    part, fringe = finest(sets)
+    length = shots.patterns.length(axis)
+    cycles = ((length - 1) / 2 - part.zero(length)) / part.pitch - fringe.phase / (2 * np.pi)
+    order = np.rint(cycles).astype(np.int32)
+    return Ordered(Orders(order, np.abs(cycles - order) < 0.5 - fringe.sigma), np.zeros(valid.shape, bool), {})
+'''
+
+
+def test_a_fourth_unwrapping_is_one_module(optics, tmp_path, monkeypatch, capsys):
+    """It is found by its name in a sequence's file, checks the parts, and decodes: the plane stands where it is."""
+    sequence = tmp_path / "wave.yaml"
+    text = "projector_size: [640, 400]\nunwrap: single_wave\nparts: [{kind: fringes, pitch: 720, steps: 16}]\n"
+    sequence.write_text(text)
+    with pytest.raises(sonotwin.InputError, match="expected 'centre_line', 'gray' or 'heterodyne', found 'single_wave'"):
+        sonotwin.read_patterns(sequence)
+    added.add(monkeypatch, tmp_path / "ours", "recon.structured_light.fringe_orders", "single_wave", SINGLE_WAVE)
+    patterns = sonotwin.read_patterns(sequence)
+    devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
+    writer.write_surface(tmp_path / "capture", {"cam1": photograph(patterns, optics)}, patterns, optics, devices)
+    assert main(["surface", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}"]) == 0
+    assert "unwrap      single wave" in capsys.readouterr().out
+    fit = primitives.fit_plane(trimesh.load(tmp_path / "out" / "surface.ply", process=False).vertices)
+    assert np.linalg.norm(np.cross(fit.shape.normal, TILT[:3, 2])) < 0.02
+    assert abs((fit.shape.point - TILT[:3, 3]) @ TILT[:3, 2]) < 0.3
+    sequence.write_text(text.replace("parts: [", "parts: [{kind: fringes, pitch: 12, steps: 8}, "))
+    with pytest.raises(sonotwin.InputError, match="single_wave unwrapping expects one set of fringes"):
+        sonotwin.read_patterns(sequence)
+
+
+ROWS = '''
+"""A text with a row a device: its name, size, focal lengths and centre, coefficients, and its pose, row by row in metres."""
+
+import numpy as np
+
+from recon.capture import camera_dialects
+from recon.capture.camera_dialects import MM, Stored
+
+
+def recognises(content):
+    """Whether the first words are those of the dialect."""
+    return any(text.startswith("rows of devices") for text in content.texts().values())
+
+
+def read(content, sizes):
+    """All devices."""
+    (text,) = content.texts().values()
+    found = {}
+    for line in text.splitlines()[1:]:
+        name, *words = line.split()
+        w, h, fx, fy, cx, cy, *rest = map(float, words)
+        pose = np.vstack([np.reshape(rest[5:], (3, 4)) * [1, 1, 1, MM], [0, 0, 0, 1]])
+        found[name] = Stored((int(w), int(h)), camera_dialects.pinhole(fx, fy, cx, cy), np.array(rest[:5]), pose)
+    return camera_dialects.of_metres(content.path, found)
+
+
+def write(folder, optics):
+    """Write one file."""
+    lines = ["rows of devices"]
+    for name, device in optics.cameras.items():
+        k = device.matrix
+        pose = device.camera_from_world[:3] / [1, 1, 1, MM]
+        numbers = [*device.size, k[0, 0], k[1, 1], k[0, 2], k[1, 2], *device.distortion, *pose.ravel()]
+        lines.append(" ".join([name, *(repr(float(number)) for number in numbers)]))
+    (folder / "rig.rows").write_text(chr(10).join(lines))
+    return ["rig.rows"]
+
+
+def taken(optics):
+    """All."""
+    return list(optics.cameras)
+'''
+
+
+def test_another_dialect_of_calibrations_is_one_module(optics, tmp_path, monkeypatch, capsys):
+    """`export` writes it by its name, `surface` reads it by its content, and the surface is that of the rig's own file."""
+    devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
+    patterns, capture = SEQUENCES["gray"], tmp_path / "capture"
+    writer.write_surface(capture, {"cam1": photograph(patterns, optics)}, patterns, optics, devices)
+    export = ["export", "layout=rows", f"capture={capture}", f"out={tmp_path / 'theirs'}"]
+    assert main(export) == 2
+    assert "expected 'meza2021', 'kalibr', 'mrcal', 'ros' or 'slstudio', found 'rows'" in capsys.readouterr().err
+    added.add(monkeypatch, tmp_path / "ours", calibration_files.DIALECTS, "rows", ROWS)
+    assert main(export) == 0
+    theirs = tmp_path / "theirs" / "rig.rows"
+    for name, given in {"a": [], "b": [f"calibration={theirs}"]}.items():
+        assert main(["surface", f"capture={capture}", f"out={tmp_path / name}", *given]) == 0
+    with np.load(tmp_path / "a" / "points.npz") as own, np.load(tmp_path / "b" / "points.npz") as other:
+        assert np.allclose(own["points"], other["points"], atol=1e-3, equal_nan=True)

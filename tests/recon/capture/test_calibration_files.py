@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from recon.capture import calibration_files, camera_exports, meza2021
+from recon import registry
+from recon.capture import calibration_files, meza2021
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
@@ -29,6 +30,10 @@ def device(name: str, seed: int, coefficients: int = 5) -> Camera:
 @pytest.fixture
 def optics() -> Calibration:
     return Calibration({"cam1": device("cam1", 1), "cam2": device("cam2", 2, 14), "projector": device("projector", 3, 8)})
+
+
+def dialect(name: str):
+    return registry.kind(calibration_files.DIALECTS, name)
 
 
 def uncertain(names: tuple[str, ...], seed: int = 0) -> Uncertainty:
@@ -186,7 +191,7 @@ def test_any_calibration_comes_back_from_other_programs_files(layout, data, tmp_
             pose[:3, :3] = np.eye(3)  # a pair that looks to opposite sides has no common image
         cameras[name] = Camera(data.draw(st.tuples(*[st.integers(8, 9000)] * 2)), matrix, k, pose)
     folder = tmp_path_factory.mktemp(layout)
-    names = camera_exports.WRITERS[layout](folder, Calibration(cameras))
+    names = dialect(layout).write(folder, Calibration(cameras))
     found = calibration_files.read(folder / names[0] if len(names) == 1 else folder).cameras
     assert list(found) == list(cameras)
     for name, camera in cameras.items():
@@ -208,12 +213,12 @@ def test_any_calibration_comes_back_from_other_programs_files(layout, data, tmp_
 def test_what_a_layout_has_no_place_for_is_refused(layout, coefficients, complaint, tmp_path):
     optics = Calibration({"cam1": device("cam1", 1, coefficients), "projector": device("projector", 3)})
     with pytest.raises(InputError, match=complaint):
-        camera_exports.WRITERS[layout](tmp_path, optics)
+        dialect(layout).write(tmp_path, optics)
     skew = device("cam1", 1, 4)
     skew.matrix[0, 1] = 0.5
     if layout != "slstudio":
         with pytest.raises(InputError, match=r"cam1.matrix: expected no skew, .* found 0.5"):
-            camera_exports.WRITERS[layout](tmp_path, Calibration({"cam1": skew, "projector": device("projector", 3, 4)}))
+            dialect(layout).write(tmp_path, Calibration({"cam1": skew, "projector": device("projector", 3, 4)}))
     assert not list(tmp_path.iterdir())
 
 
@@ -222,7 +227,7 @@ def test_a_rectified_pair_has_its_shift_along_x_and_one_focal_length(optics, tmp
     beside = rigid.from_rotation_vector([0.05, -0.2, 0.02], [-150, 20, 5])
     second = device("cam2", 4)
     few = Calibration({"cam1": device("cam1", 3), "cam2": Camera(second.size, second.matrix, second.distortion, beside)})
-    camera_exports.write_ros(tmp_path, few)
+    dialect("ros").write(tmp_path, few)
     files = [yaml.safe_load((tmp_path / f"{name}.yaml").read_text()) for name in few.cameras]
     projections = [np.reshape(file["projection_matrix"]["data"], (3, 4)) for file in files]
     turns = [np.reshape(file["rectification_matrix"]["data"], (3, 3)) for file in files]
@@ -470,7 +475,7 @@ def without(values, key):
         (lambda v: v | {"M4": "text"}, "M4: expected a matrix, found something else"),
         (
             lambda v: {"A": np.eye(3)},
-            f"expected {calibration_files.DIALECTS}, found A",
+            f"expected {calibration_files.EXPECTED}, found A",
         ),
     ],
 )
