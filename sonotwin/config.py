@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -32,12 +33,7 @@ def folder() -> Path:
 
 def groups(verb: str) -> dict[str, list[str]]:
     """Name the choices of each group that the verb's defaults list uses and that it takes, such as `{"rig": ["meza2021"]}`."""
-    import yaml
-
-    path = folder() / f"{verb}.yaml"
-    if not path.is_file():
-        return {}
-    defaults = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("defaults", [])
+    defaults = _own_fields(verb).get("defaults", [])
     entries = [key for entry in defaults if isinstance(entry, dict) for key in entry]
     names = [re.sub(r"^(override |optional )*/?|@.*$", "", entry) for entry in entries]
     found = {name: sorted(choice.stem for choice in (folder() / name).glob("*.yaml")) for name in names}
@@ -149,11 +145,21 @@ def _check_choice(verb: str, override: str) -> None:
 
 def _fields_named_like_groups(verb: str) -> set[str]:
     """Fields of a verb that share a group's name without being choices of it: Hydra would take `patterns=FILE` for a choice."""
+    return {field for field in _own_fields(verb) if (folder() / field).is_dir()} - set(groups(verb))
+
+
+def _own_fields(verb: str) -> dict[str, Any]:
+    """The fields of `conf/VERB.yaml` as they stand there; none of a verb without that file."""
+    path = folder() / f"{verb}.yaml"
+    return _parsed(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+@cache
+def _parsed(text: str) -> dict[str, Any]:
+    """Fields of a YAML text of `conf`, parsed once, though each override asks for them; not to be changed."""
     import yaml
 
-    path = folder() / f"{verb}.yaml"
-    fields = yaml.safe_load(path.read_text(encoding="utf-8")) or {} if path.is_file() else {}
-    return {field for field in fields if (folder() / field).is_dir()} - set(groups(verb))
+    return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {}
 
 
 def _plain_value(verb: str, field: str, value: str) -> object:
