@@ -8,6 +8,8 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from copy import deepcopy
+from functools import cache, lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -32,12 +34,7 @@ def folder() -> Path:
 
 def groups(verb: str) -> dict[str, list[str]]:
     """Name the choices of each group that the verb's defaults list uses and that it takes, such as `{"rig": ["meza2021"]}`."""
-    import yaml
-
-    path = folder() / f"{verb}.yaml"
-    if not path.is_file():
-        return {}
-    defaults = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("defaults", [])
+    defaults = _own_fields(verb).get("defaults", [])
     entries = [key for entry in defaults if isinstance(entry, dict) for key in entry]
     names = [re.sub(r"^(override |optional )*/?|@.*$", "", entry) for entry in entries]
     found = {name: sorted(choice.stem for choice in (folder() / name).glob("*.yaml")) for name in names}
@@ -84,8 +81,6 @@ def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
 
 def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
     """Compose `conf/VERB.yaml` with the overrides into a plain, resolved dictionary; raises InputError as `load` does."""
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
     from hydra.errors import ConfigCompositionException, MissingConfigException
     from omegaconf import MissingMandatoryValue, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -93,7 +88,7 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
     name = verb if (folder() / f"{verb}.yaml").is_file() else None
     plain = [override for override in overrides if override.partition("=")[0] in _fields_named_like_groups(verb)]
     files = {k: file for k, override in enumerate(overrides) if (file := _own_choice(verb, override)) is not None}
-    with TemporaryDirectory() if files else nullcontext("") as own, initialize_config_dir(str(folder()), version_base=None):
+    with TemporaryDirectory() if files else nullcontext("") as own:
         named = [_named(Path(own), k, files[k]) if k in files else override for k, override in enumerate(overrides)]
         quoted = [_literal_if_not_grammar(verb, override) for override in named if override not in plain]
         for override in quoted:
@@ -101,7 +96,7 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
         if files:
             quoted.append(f"hydra.searchpath=['{_escape(f'file://{own}')}']")
         try:
-            composed = hydra_compose(name, quoted)
+            composed = _composed(name, quoted)
             for override in plain:
                 field, _, value = override.partition("=")
                 OmegaConf.update(composed, field, _plain_value(verb, field, value))
@@ -115,7 +110,7 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
             unknown = re.search(r"Could not override '([^']+)'", str(error))
             if unknown is None:
                 raise InputError(f"{verb}: {_first_line(error)}") from error
-            known = OmegaConf.to_container(hydra_compose(name)) if name else {}
+            known = OmegaConf.to_container(_by_hydra(name, ())) if name else {}
             raise InputError(f"{verb}: {unknown[1]}: {_unknown_key(unknown[1], known)}") from error
         except MissingMandatoryValue as error:
             raise InputError(f"{verb}: {error.full_key}: needs a value; give {error.full_key}=...") from error
@@ -123,6 +118,46 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
             raise InputError(f"{verb}: {error.full_key}: {_first_line(error)}") from error
     assert isinstance(result, dict)
     return {str(key): value for key, value in result.items()}
+
+
+def _composed(name: str | None, overrides: Sequence[str]) -> Any:
+    """Compose a file of `conf` with overrides, as Hydra does, which takes most of its time for the choices.
+
+    Their composition is kept as long as no file of `conf` changes, and fields are put into a copy of it. Overrides of another
+    kind, and those that don't fit, go to Hydra itself.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    keys = [override.partition("=")[0] for override in overrides]
+    if not all(re.fullmatch(r"(?!hydra\b)\w+(\.\w+)*", key) for key in keys):
+        return _by_hydra(name, overrides)
+    choices = tuple(override for key, override in zip(keys, overrides, strict=True) if (folder() / key).is_dir())
+    files = ((path, path.stat()) for path in sorted(folder().rglob("*.yaml")))
+    composed = deepcopy(_chosen(name, choices, tuple((path, about.st_mtime_ns, about.st_size) for path, about in files)))
+    try:
+        for override in overrides:
+            if override not in choices:
+                field = OverridesParser.create().parse_override(override)
+                OmegaConf.update(composed, field.key_or_group, field.value(), merge=True)
+    except (HydraException, OmegaConfBaseException):
+        return _by_hydra(name, overrides)  # which names what is wrong
+    return composed
+
+
+@lru_cache(maxsize=64)
+def _chosen(name: str | None, choices: Sequence[str], state: object) -> Any:
+    """Compose a file of `conf` with choices alone; `state` is that of the files."""
+    return _by_hydra(name, choices)
+
+
+def _by_hydra(name: str | None, overrides: Sequence[str]) -> Any:
+    from hydra import compose, initialize_config_dir
+
+    with initialize_config_dir(str(folder()), version_base=None):
+        return compose(name, list(overrides))
 
 
 def _own_choice(verb: str, override: str) -> tuple[str, Path] | None:
@@ -161,11 +196,21 @@ def _check_choice(verb: str, override: str) -> None:
 
 def _fields_named_like_groups(verb: str) -> set[str]:
     """Fields of a verb that share a group's name without being choices of it: Hydra would take `patterns=FILE` for a choice."""
+    return {field for field in _own_fields(verb) if (folder() / field).is_dir()} - set(groups(verb))
+
+
+def _own_fields(verb: str) -> dict[str, Any]:
+    """The fields of `conf/VERB.yaml` as they stand there; none of a verb without that file."""
+    path = folder() / f"{verb}.yaml"
+    return _parsed(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+@cache
+def _parsed(text: str) -> dict[str, Any]:
+    """Fields of a YAML text of `conf`, parsed once, though each override asks for them; not to be changed."""
     import yaml
 
-    path = folder() / f"{verb}.yaml"
-    fields = yaml.safe_load(path.read_text(encoding="utf-8")) or {} if path.is_file() else {}
-    return {field for field in fields if (folder() / field).is_dir()} - set(groups(verb))
+    return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {}
 
 
 def _plain_value(verb: str, field: str, value: str) -> object:

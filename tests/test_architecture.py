@@ -3,7 +3,9 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -27,12 +29,30 @@ MAY_IMPORT = {
 }
 
 
-def imported(path: Path) -> set[str]:
-    """Top-level names of all modules that a file imports anywhere, in functions too."""
-    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    names |= {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
-    return {name.partition(".")[0] for name in names}
+class Source(NamedTuple):
+    """What these tests look at in a file."""
+
+    imported: set[str]  # top-level names of all modules that it imports anywhere, in functions too
+    compiled: dict[str, str]  # decorators of its compiled functions, by name
+    called_by_kernels: set[str]
+
+
+@cache
+def read(path: Path) -> Source:
+    """Parse a file, which takes long, once for all tests."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = {alias.name for node in imports if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module or "" for node in imports if isinstance(node, ast.ImportFrom)}
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.decorator_list]
+    texts = {node.name: ast.unparse(node.decorator_list[0]) for node in functions}
+    kernels = [node for node in functions if texts[node.name].startswith("kernel")]
+    calls = [node.func for function in kernels for node in ast.walk(function) if isinstance(node, ast.Call)]
+    return Source(
+        {name.partition(".")[0] for name in names},
+        {name: text for name, text in texts.items() if text.startswith(("njit", "kernel"))},
+        {call.id for call in calls if isinstance(call, ast.Name)},
+    )
 
 
 def modules(package: str) -> list[str]:
@@ -44,7 +64,7 @@ def modules(package: str) -> list[str]:
 @pytest.mark.parametrize("package", MAY_IMPORT)
 def test_imports_go_one_way(package):
     forbidden = (OURS | RENDERER) - MAY_IMPORT[package]
-    offences = {str(path): bad for path in (ROOT / package).rglob("*.py") if (bad := imported(path) & forbidden)}
+    offences = {str(path): bad for path in (ROOT / package).rglob("*.py") if (bad := read(path).imported & forbidden)}
     assert not offences
 
 
@@ -52,7 +72,7 @@ def test_imports_go_one_way(package):
 def test_what_is_imported_is_required(package):
     """A package of the development tools alone is missing where `make demo` has set up."""
     files = (ROOT / package).rglob("*.py")
-    foreign = {name for path in files for name in imported(path)} - OURS - set(sys.stdlib_module_names)
+    foreign = {name for path in files for name in read(path).imported} - OURS - set(sys.stdlib_module_names)
     assert not {name for name in foreign if installation.extra_of(name) not in NEEDS[package]}
 
 
@@ -92,31 +112,15 @@ def test_no_drawers():
     assert not [path for path in paths if path.stem in ("utils", "util", "common", "misc", "base", "helpers")]
 
 
-def decorators(path: Path) -> dict[str, str]:
-    """Decorators of a module's functions that are compiled, by name."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.decorator_list]
-    texts = {node.name: ast.unparse(node.decorator_list[0]) for node in functions}
-    return {name: text for name, text in texts.items() if text.startswith(("njit", "kernel"))}
-
-
-def called_by_kernels(path: Path) -> set[str]:
-    """Names that a module's kernels call."""
-    kernels = {name for name, text in decorators(path).items() if text.startswith("kernel")}
-    nodes = [node for node in ast.parse(path.read_text(encoding="utf-8")).body if getattr(node, "name", None) in kernels]
-    calls = [node.func for function in nodes for node in ast.walk(function) if isinstance(node, ast.Call)]
-    return {call.id for call in calls if isinstance(call, ast.Name)}
-
-
 def test_kernels_call_inlined_functions_and_kernels():
     """A plain compiled function takes options, such as whether references are counted, from whoever compiles it first."""
     paths = [path for package in ("recon", "twin", "scenes") for path in (ROOT / package).rglob("*.py")]
     plain = {
         name
         for path in paths
-        for name, text in decorators(path).items()
+        for name, text in read(path).compiled.items()
         if text.startswith("njit") and "inline='always'" not in text and "forceinline" not in text
     }
-    offences = {str(path): bad for path in paths if (bad := called_by_kernels(path) & plain)}
+    offences = {str(path): bad for path in paths if (bad := read(path).called_by_kernels & plain)}
     assert not offences
-    assert any(called_by_kernels(path) for path in paths)
+    assert any(read(path).called_by_kernels for path in paths)

@@ -55,6 +55,15 @@ def test_defaults_groups_and_fields():
     assert config.groups("surface") == {"rig": ["narrow", "wide"]}
 
 
+def test_files_that_change_are_read_again(conf, tmp_path):
+    """What choices give is kept between calls, and no field of an earlier call stays in it."""
+    assert load("rig.gamma=1.8", "pitch=18").pitch == 18
+    assert (load().rig.gamma, load().pitch) == (2.2, 12)
+    (tmp_path / "rig" / "narrow.yaml").write_text("gamma: 2.25\n")
+    (tmp_path / "surface.yaml").write_text(SURFACE.replace("pitch: 12", "pitch: 16"))
+    assert (load().rig.gamma, load().pitch) == (2.25, 16)
+
+
 @pytest.mark.parametrize(
     "path",
     [

@@ -1,5 +1,7 @@
 """`sonotwin surface`, from a capture or a bare folder to files, on the ideal image of a tilted plane."""
 
+import contextlib
+import io
 import json
 import re
 import shlex
@@ -39,7 +41,7 @@ SEQUENCES = {
 TILT = rigid.from_rotation_vector([0.2, -0.3, 0], [0, 0, 660])  # world from the plane z = 0
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def optics() -> Calibration:
     lens = np.array([-0.1, 0.2, 0.0005, -0.0005, 0])
     camera = Camera(SIZE, np.array([[830.0, 0, 158], [0, 832, 127], [0, 0, 1]]), lens)
@@ -61,32 +63,49 @@ def photograph(patterns: Patterns, optics: Calibration, name: str = "cam1", worl
     return np.clip(np.round(25 + 180 * seen + noise), 0, 255).astype(np.uint8)
 
 
-@pytest.fixture(params=SEQUENCES)
-def shots(request, optics, tmp_path) -> tuple[Path, np.ndarray, Patterns]:
-    patterns = SEQUENCES[request.param]
+def write_capture(folder: Path, patterns: Patterns, optics: Calibration) -> np.ndarray:
+    """A capture of the plane under a sequence, whose images are returned."""
     images = photograph(patterns, optics)
     devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
-    writer.write_surface(tmp_path / "capture", {"cam1": images}, patterns, optics, devices)
-    return tmp_path / "capture", images, patterns
+    writer.write_surface(folder, {"cam1": images}, patterns, optics, devices)
+    return images
 
 
-def test_the_interface_gives_the_verbs_points(shots, optics, tmp_path):
+@pytest.fixture(scope="module", params=SEQUENCES)
+def shots(request, optics, tmp_path_factory) -> tuple[Path, np.ndarray, Patterns]:
+    folder, patterns = tmp_path_factory.mktemp("shots") / "capture", SEQUENCES[request.param]
+    return folder, write_capture(folder, patterns, optics), patterns
+
+
+@pytest.fixture(scope="module")
+def measured(shots) -> tuple[Path, list[str]]:
+    """The folder of a capture's surface, and what was said."""
+    out = shots[0].parent / "surface"
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert main(["surface", f"capture={shots[0]}", f"out={out}"]) == 0
+    return out, said.getvalue().splitlines()
+
+
+@pytest.fixture
+def capture(optics, tmp_path) -> Path:
+    """A capture of one sequence, for tests that write to it or need no other."""
+    write_capture(tmp_path / "capture", SEQUENCES["centre_line"], optics)
+    return tmp_path / "capture"
+
+
+def test_the_interface_gives_the_verbs_points(shots, measured, optics):
     """From arrays in memory."""
-    folder, images, patterns = shots
-    assert main(["surface", f"capture={folder}", f"out={tmp_path / 'surface'}"]) == 0
+    _, images, patterns = shots
     camera, projector = optics.cameras["cam1"], optics.cameras["projector"]
     found = sonotwin.decode(images, patterns, camera="cam1")
     points = sonotwin.clean_surface(sonotwin.triangulate(found, camera, projector), camera, found.modulation)
-    with np.load(tmp_path / "surface" / "points.npz") as written:
+    with np.load(measured[0] / "points.npz") as written:
         assert np.allclose(points.points, written["points"], atol=1e-4, equal_nan=True)
         assert np.allclose(points.sigma, written["sigma"], rtol=1e-4, equal_nan=True)
 
 
-def test_a_capture_becomes_a_surface(shots, tmp_path, capsys):
-    folder = shots[0]
-    out = tmp_path / "surface"
-    assert main(["surface", f"capture={folder}", f"out={out}"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_a_capture_becomes_a_surface(shots, measured):
+    out, lines = measured
     assert [line.split()[0] for line in lines] == ["decode", "unwrap", "triangulate", "wrote"]
     assert sorted(path.name for path in out.iterdir()) == [
         ".sonotwin.json",
@@ -123,7 +142,7 @@ def test_a_surface_that_loses_most_of_its_points_is_warned_of(optics, tmp_path, 
     assert "warning     most of the points are unsure: does the calibration take points" in capsys.readouterr().out
 
 
-def test_a_bare_folder_gives_the_same(shots, optics, tmp_path):
+def test_a_bare_folder_gives_the_same(shots, measured, optics, tmp_path):
     folder, _, patterns = shots
     (tmp_path / "sequence.yaml").write_text(patterns.model_dump_json())
     calibration_files.write(tmp_path / "optics.yaml", optics)
@@ -133,8 +152,7 @@ def test_a_bare_folder_gives_the_same(shots, optics, tmp_path):
         f"calibration={tmp_path / 'optics.yaml'}",
     ]
     assert main(["surface", *source, f"out={tmp_path / 'a'}"]) == 0
-    assert main(["surface", f"capture={folder}", f"out={tmp_path / 'b'}"]) == 0
-    assert (tmp_path / "a" / "surface.ply").read_bytes() == (tmp_path / "b" / "surface.ply").read_bytes()
+    assert (tmp_path / "a" / "surface.ply").read_bytes() == (measured[0] / "surface.ply").read_bytes()
 
 
 def test_a_code_too_coarse_for_a_surface_is_refused_by_the_cause(optics, tmp_path, capsys):
@@ -184,37 +202,35 @@ def test_a_second_camera_shows_images_upside_down(optics, tmp_path, capsys, capl
     assert "cam2 isn't compared: it has no calibration" in capsys.readouterr().out
 
 
-def test_results_are_replaced_but_other_folders_are_not(shots, tmp_path, capsys):
-    folder = shots[0]
+def test_results_are_replaced_but_other_folders_are_not(capture, tmp_path, capsys):
     out = tmp_path / "surface"
     for _ in range(2):
-        assert main(["surface", f"capture={folder}", f"out={out}"]) == 0
+        assert main(["surface", f"capture={capture}", f"out={out}"]) == 0
     other = tmp_path / "other"
     other.mkdir()
     (other / "mine.txt").write_text("mine")
     capsys.readouterr()
-    assert main(["surface", f"capture={folder}", f"out={other}"]) == 2
+    assert main(["surface", f"capture={capture}", f"out={other}"]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and "found other files" in captured.err
     assert [path.name for path in other.iterdir()] == ["mine.txt"]
 
 
-def test_results_of_other_commands_are_left_alone(shots, tmp_path, capsys):
+def test_results_of_other_commands_are_left_alone(capture, tmp_path, capsys):
     """They have a metrics.json too. What is read is never written over, whatever lies beside it."""
-    folder = shots[0]
     for name in ("demo.json", "error_map.png", "manifest.json"):
         other = tmp_path / name.partition(".")[0]
         other.mkdir()
         (other / name).write_text("{}")
         (other / "metrics.json").write_text("{}")
-        assert main(["surface", f"capture={folder}", f"out={other}"]) == 2
+        assert main(["surface", f"capture={capture}", f"out={other}"]) == 2
         assert len(list(other.iterdir())) == 2
-    for out in (folder, folder.parent):
+    for out in (capture, capture.parent):
         (out / "points.npz").write_text("")
         capsys.readouterr()
-        assert main(["surface", f"capture={folder}", f"out={out}"]) == 2
+        assert main(["surface", f"capture={capture}", f"out={out}"]) == 2
         assert "expected a folder apart from what is read" in capsys.readouterr().err
-    assert (folder / "manifest.json").is_file()
+    assert (capture / "manifest.json").is_file()
 
 
 @pytest.mark.parametrize(
