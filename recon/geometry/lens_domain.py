@@ -36,7 +36,8 @@ def is_one_to_one(camera: Camera, margin: float = MARGIN) -> bool:
     with np.errstate(invalid="ignore"):
         outside = ((pixels < low) | (pixels > high)).any(axis=-1)
         outwards = np.einsum("dsi,di->ds", np.diff(pixels, axis=1), ways * focal) > 0
-        keeps = np.linalg.det(slopes) > LEAST_STRETCH * focal.prod()
+        stretch = slopes[..., 0, 0] * slopes[..., 1, 1] - slopes[..., 0, 1] * slopes[..., 1, 0]
+        keeps = stretch > LEAST_STRETCH * focal.prod()
     first = np.where(outside.any(axis=1), outside.argmax(axis=1), STEPS)
     before = np.arange(STEPS) < first[:, None]
     return bool(outside.any(axis=1).all() and (keeps | ~before).all() and (outwards | ~before[:, :-1]).all())

@@ -198,7 +198,7 @@ def _rank_correlation(depths: Array, heights: Array) -> float:
     """Spearman's, without its sign; 0 where either stays the same."""
     if np.ptp(depths) == 0 or np.ptp(heights) == 0:
         return 0.0
-    return abs(float(stats.spearmanr(depths, heights).statistic))
+    return abs(float(np.corrcoef(stats.rankdata([depths, heights], axis=1))[0, 1]))
 
 
 def _search(seconds: Array, depths: Array, moments: Array, heights: Array, search_s: tuple[float, float]) -> float:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,6 +36,15 @@ class Equations(NamedTuple):
     by_probe: slice  # parameters of the probe's turn and shift against its target
     by_wires: slice  # and of the wires' place
     known: Array  # (g,) information about each parameter from elsewhere, as the inverse of a variance
+
+
+class Course(NamedTuple):
+    """A movement's growth over the frames, and the adjustment of those that it is looked for in, if nothing moved."""
+
+    growth: Array  # (n,) from -1 to 1
+    frames: Mask  # (n,), of which k
+    spanned: Array  # (3 k, r) orthonormal columns: residuals that parameters may explain
+    left: Array  # (3 k,) residuals that they don't
 
 
 @dataclass(frozen=True)
@@ -79,7 +88,7 @@ def find(equations: Equations, used: Mask) -> Movement | None:
 
     used : (n,) frames that aren't outliers. Those of a whole end of the session may be right, and after a sudden movement.
     """
-    courses = list(_courses(used))
+    courses = list(_courses(equations, used))
     kinds = [found for what in (PROBE, WIRES) if (found := _likeliest(equations, what, courses, used)) is not None]
     if len(kinds) < 2:
         return kinds[0] if kinds else None
@@ -89,18 +98,24 @@ def find(equations: Equations, used: Mask) -> Movement | None:
     return wires if likelier else probe
 
 
-def _likeliest(equations: Equations, what: str, courses: list[tuple[Array, Mask]], used: Mask) -> Movement | None:
+def _likeliest(equations: Equations, what: str, courses: list[Course], used: Mask) -> Movement | None:
     """Of one kind, over all courses; None where noise may be all."""
-    fits = (_fitted(equations, what, course, frames, used, 2 * len(courses)) for course, frames in courses)
+    fits = (_fitted(equations, what, course, used, 2 * len(courses)) for course in courses)
     sure = [one for one in fits if one is not None and one.chance < CHANCE]
     return min(sure, key=lambda one: one.log_chance, default=None)
 
 
-def _courses(used: Mask) -> Iterator[tuple[Array, Mask]]:
-    """Courses : (n,) from -1 to 1, and the frames that each is looked for in."""
+def _courses(equations: Equations, used: Mask) -> Iterator[Course]:
+    """Even, and all at once after each frame, with the frames that each is looked for in."""
     n = len(used)
-    number = np.arange(n)
-    yield np.linspace(-1, 1, n), used
+    number, stills = np.arange(n), {}
+
+    def course(growth: Array, frames: Mask) -> Course:
+        if frames.tobytes() not in stills:
+            stills[frames.tobytes()] = _still(equations, frames)
+        return Course(growth, frames, *stills[frames.tobytes()])
+
+    yield course(np.linspace(-1, 1, n), used)
     for first in range(LEAST_FRAMES, n - LEAST_FRAMES + 1):
         after = number >= first
         frames = used.copy()
@@ -108,28 +123,40 @@ def _courses(used: Mask) -> Iterator[tuple[Array, Mask]]:
             if end.sum() >= LEAST_LOST and np.mean(~used[end]) > LOST:
                 frames |= end
         if min((frames & after).sum(), (frames & ~after).sum()) >= LEAST_FRAMES:
-            yield np.where(after, 1.0, -1.0), frames
+            yield course(np.where(after, 1.0, -1.0), frames)
 
 
-def _fitted(equations: Equations, what: str, course: Array, frames: Mask, used: Mask, trials: int) -> Movement | None:
+def _still(equations: Equations, frames: Mask) -> tuple[Array, Array]:
+    """Orthonormal columns : (3 n, r) that span the slopes of n frames, and the residuals : (3 n,) that no parameters explain."""
+    left = equations.residuals[frames].ravel()
+    columns, sizes, _ = np.linalg.svd(equations.slopes[frames].reshape(len(left), -1), full_matrices=False)
+    spanned = columns[:, sizes > np.finfo(float).eps * max(columns.shape) * sizes[0]]
+    return spanned, left - spanned @ (spanned.T @ left)
+
+
+def _fitted(equations: Equations, what: str, course: Course, used: Mask, trials: int) -> Movement | None:
     """The movement by least squares, and the chance of as good a fit by noise in any of some trials."""
     which = equations.by_probe if what == PROBE else equations.by_wires
-    slopes, left = equations.slopes[frames], equations.residuals[frames].ravel()
-    moving = np.concatenate([slopes, course[frames][:, None, None] * slopes[:, :, which]], axis=2)
-    n, g = len(slopes), slopes.shape[2]
-    moving = moving.reshape(3 * n, -1)
-    freedom, more = 3 * n - moving.shape[1], moving.shape[1] - g
+    frames, left = course.frames, course.left
+    slopes = equations.slopes[frames]
+    moving = (course.growth[frames][:, None, None] * slopes[:, :, which]).reshape(len(left), -1)
+    more = moving.shape[1]
+    unknowns = slopes.shape[2] + more
+    freedom = len(left) - unknowns
     if freedom < LEAST_FREEDOM:
         return None
-    before, _ = _rest(slopes.reshape(-1, g), left)
-    after, solution = _rest(moving, left)
-    if not _explained(left - moving @ solution, frames & ~used, frames):
+    moving -= course.spanned @ (course.spanned.T @ moving)  # what the parameters don't explain of it
+    solution = np.linalg.lstsq(moving, left)[0]
+    rest = left - moving @ solution
+    if not _explained(rest, frames & ~used, frames):
         return None
+    before, after = float(left @ left), float(rest @ rest)
+    chance = fdtrc(more, freedom, max(before - after, 0) / more / (after / freedom))
     return Movement(
         what,
-        growth=-solution[g:],
-        log_chance=float(np.log(trials) + f_distribution.logsf((before - after) / more / (after / freedom), more, freedom)),
-        evidence=-(3 * n * np.log(after) + moving.shape[1] * np.log(3 * n)) / 2,
+        growth=-solution,
+        log_chance=float(np.log(trials) + np.log(np.maximum(chance, np.finfo(float).tiny))),
+        evidence=-(len(left) * np.log(after) + unknowns * np.log(len(left))) / 2,
         frames=frames,
     )
 
@@ -139,9 +166,3 @@ def _explained(left: Array, doubtful: Mask, frames: Mask) -> bool:
     lengths = np.linalg.norm(left.reshape(-1, 3), axis=1)
     before = doubtful[frames]
     return not before.any() or bool(np.mean(lengths[before] < USUAL * np.median(lengths[~before])) > 1 - LOST / 2)
-
-
-def _rest(design: Array, left: Array) -> tuple[float, Array]:
-    """The least sum of squares of `left - design x`, and x."""
-    solution = np.linalg.lstsq(design, left)[0]
-    return float(np.sum((left - design @ solution) ** 2)), solution

@@ -124,6 +124,11 @@ class _Estimate:
         """Pixels : (n, 2) of the midpoint between the wires."""
         return sightings.pixels if sightings.beside is None else sightings.pixels - self.apart * sightings.beside
 
+    def arms(self, sightings: Sightings) -> Array:
+        """Vectors : (n, 3) mm, along the world's axes, from the target's origin to the places of these pixels."""
+        points = (self.pixels(sightings) * self.scale) @ self.target_from_image[:3, :2].T + self.target_from_image[:3, 3]
+        return np.einsum("nij,nj->ni", sightings.poses[:, :3, :3], points)
+
 
 def calibrate(
     sightings: Sightings,
@@ -282,24 +287,21 @@ def _with_wires(estimate: _Estimate, sightings: Sightings, inliers: Mask) -> Sig
 
 
 def _residuals(estimate: _Estimate, sightings: Sightings) -> Array:
-    points = ProbeCalibration(estimate.target_from_image, estimate.scale).to_target(estimate.pixels(sightings))
-    return np.einsum("nij,nj->ni", sightings.poses[:, :3, :3], points) + sightings.poses[:, :3, 3] - estimate.wire
+    return estimate.arms(sightings) + sightings.poses[:, :3, 3] - estimate.wire
 
 
 def _covariances(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
     """Of the residuals : (n, 3, 3) mm^2: the pose's, with its lever, and in the image's axes the crossing's."""
     n = len(sightings.pixels)
-    turns = sightings.poses[:, :3, :3]
-    points = ProbeCalibration(estimate.target_from_image, estimate.scale).to_target(estimate.pixels(sightings))
     pose = sightings.pose_covariance
     if pose is None:
         pose = np.diag([np.radians(noise.angle_deg) ** 2] * 3 + [noise.position_mm**2] * 3)
-    lever = rigid.slopes(np.einsum("nij,nj->ni", turns, points))
+    lever = rigid.slopes(estimate.arms(sightings))
     local = np.broadcast_to(FLOOR_MM**2 * np.eye(3), (n, 3, 3)).copy()
     pixel = np.eye(2) * noise.pixel_px**2 if sightings.pixel_covariance is None else sightings.pixel_covariance
     local[:, :2, :2] += pixel * np.outer(estimate.scale, estimate.scale)
     local[:, 2, 2] += (noise.slice_mm if sightings.slice_mm is None else sightings.slice_mm) ** 2
-    world_from_image = turns @ estimate.target_from_image[:3, :3]
+    world_from_image = sightings.poses[:, :3, :3] @ estimate.target_from_image[:3, :3]
     return lever @ pose @ np.swapaxes(lever, 1, 2) + world_from_image @ local @ np.swapaxes(world_from_image, 1, 2)
 
 
@@ -313,14 +315,16 @@ def _squared(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
 
 def _whitened(estimate: _Estimate, sightings: Sightings, noise: Noise) -> tuple[Array, Array]:
     """Slopes : (n, 3, 12) of the residuals and these : (n, 3), in standard deviations."""
-    turns, n = sightings.poses[:, :3, :3], len(sightings.pixels)
-    jacobian = turns @ point_equation.point_jacobian(estimate.target_from_image, estimate.scale, estimate.pixels(sightings))
-    beside = np.zeros((n, 2)) if sightings.beside is None else sightings.beside
-    apart = -np.einsum("nij,jk,nk->ni", turns, estimate.target_from_image[:3, :2] * estimate.scale, beside)
-    jacobian = np.concatenate([jacobian, np.broadcast_to(-np.eye(3), (n, 3, 3)), apart[..., None]], axis=-1)
-    residuals = _residuals(estimate, sightings)
-    whiten = np.linalg.inv(np.linalg.cholesky(_covariances(estimate, sightings, noise)))
-    return whiten @ jacobian, (whiten @ residuals[..., None])[..., 0]
+    turns = sightings.poses[:, :3, :3]
+    both = np.zeros((len(turns), 3, 13))  # slopes, and the residuals as last column
+    both[..., :8] = turns @ point_equation.point_jacobian(estimate.target_from_image, estimate.scale, estimate.pixels(sightings))
+    both[..., WIRE] = -np.eye(3)
+    if sightings.beside is not None:
+        beside = sightings.beside * estimate.scale
+        both[..., 11] = -np.einsum("nij,nj->ni", turns, beside @ estimate.target_from_image[:3, :2].T)
+    both[..., 12] = _residuals(estimate, sightings)
+    both = np.linalg.inv(np.linalg.cholesky(_covariances(estimate, sightings, noise))) @ both
+    return both[..., :12], both[..., 12]
 
 
 def _normal_equations(estimate: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> tuple[Array, Array, float]:
@@ -350,14 +354,21 @@ def _robust_start(sightings: Sightings, noise: Noise, rng: np.random.Generator) 
     """Least median of squares over closed forms: of all frames, and of random sixes. The best few are refined first."""
     n = len(sightings.pixels)
     draws = np.argsort(rng.random((DRAWS, n)), axis=1)[:, :MIN_FRAMES]
-    starts = [_Estimate(*point_equation.closed_form(sightings.poses, sightings.pixels))]
-    starts += [
-        _Estimate(*each)
-        for each in zip(*point_equation.closed_form(sightings.poses[draws], sightings.pixels[draws]), strict=True)
-    ]
-    medians = np.array([np.median((_residuals(start, sightings) ** 2).sum(axis=1)) for start in starts])
-    best = [_refined_on_half(starts[k], sightings, noise) for k in np.argsort(medians)[:5]]
+    whole = [each[None] for each in point_equation.closed_form(sightings.poses, sightings.pixels)]
+    drawn = point_equation.closed_form(sightings.poses[draws], sightings.pixels[draws])
+    starts = [np.concatenate(pair) for pair in zip(whole, drawn, strict=True)]
+    order = np.argsort(_medians(starts, sightings))[:5]
+    best = [_refined_on_half(_Estimate(*(each[k] for each in starts)), sightings, noise) for k in order]
     return min(best, key=lambda estimate: np.median(_squared(estimate, sightings, noise)))
+
+
+def _medians(starts: list[Array], sightings: Sightings) -> Array:
+    """Medians : (k,) mm^2 of the squared residuals of k starts: poses (k, 4, 4), scales (k, 2), wires (k, 3)."""
+    target_from_image, scale, wire = starts
+    plane = sightings.pixels * scale[:, None]
+    points = plane @ np.swapaxes(target_from_image[:, :3, :2], 1, 2) + target_from_image[:, None, :3, 3]
+    arms = np.einsum("nij,knj->kni", sightings.poses[:, :3, :3], points)
+    return np.median(((arms + sightings.poses[:, :3, 3] - wire[:, None]) ** 2).sum(axis=-1), axis=1)
 
 
 def _refined_on_half(start: _Estimate, sightings: Sightings, noise: Noise) -> _Estimate:

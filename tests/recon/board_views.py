@@ -5,6 +5,7 @@ import numpy as np
 
 from recon.geometry import rigid
 from recon.model.boards import AprilGrid, AsymmetricCircles, Charuco, SymmetricCircles
+from tests.recon import plane_views
 
 SUB = 4  # sub-pixels a pixel and axis
 
@@ -74,33 +75,46 @@ def _to_nearest(board, xy):
     if isinstance(board, SymmetricCircles):
         column = np.clip(np.rint(xy[..., 0] / step), 0, board.columns - 1)
         return np.hypot(xy[..., 0] - column * step, xy[..., 1] - row * step)
-    nearest = np.full(xy.shape[:-1], np.inf)
-    for nearby in (row - 1, row, row + 1):
-        odd = np.mod(nearby, 2)
-        column = np.clip(np.rint((xy[..., 0] / step - odd) / 2), 0, board.columns - 1)
-        away = np.hypot(xy[..., 0] - (2 * column + odd) * step, xy[..., 1] - nearby * step)
-        nearest = np.where((nearby >= 0) & (nearby < board.rows), np.minimum(nearest, away), nearest)
-    return nearest
+    across, along = np.rint((xy[..., 0] + xy[..., 1]) / (2 * step)), np.rint((xy[..., 0] - xy[..., 1]) / (2 * step))
+    column, row = across + along, across - along  # of the nearest place of the lattice: if it is none of the board, none is near
+    there = (row >= 0) & (row < board.rows) & (column >= 0) & (column < 2 * board.columns)
+    return np.where(there, np.hypot(xy[..., 0] - column * step, xy[..., 1] - row * step), np.inf)
+
+
+def _near_edges(board, at, pixel):
+    """Shares : (SUB h, SUB w) of sub-pixels, each by its place where an edge is near; else as its pixel's.
+
+    at : (h + 2, w + 2, 2) mm, seen by the pixels' centres and those around; pixel : mm, its footprint.
+    """
+    rough = shares(board, at[1:-1, 1:-1], 3 * pixel)
+    result = np.repeat(np.repeat(rough, SUB, axis=0), SUB, axis=1)
+    near = ((rough > 0) & (rough < 1)).astype(np.uint8)
+    v, u = np.nonzero(cv2.dilate(near, np.ones((3, 3), np.uint8)))  # beyond a board's border all is white at once
+    for j, dv in enumerate((np.arange(SUB) + 0.5) / SUB - 0.5):
+        for i, du in enumerate((np.arange(SUB) + 0.5) / SUB - 0.5):
+            beside, below = u + 1 + int(np.sign(du)), v + 1 + int(np.sign(dv))
+            here, there = ((1 - abs(du)) * at[row, u + 1] + abs(du) * at[row, beside] for row in (v + 1, below))
+            result[SUB * v + j, SUB * u + i] = shares(board, (1 - abs(dv)) * here + abs(dv) * there, pixel / SUB)
+    return result
 
 
 def view(board, camera, world_from_board, *, blur=0.7, dark=40.0, white=180.0, noise=0.0, rng=None, paint=None):
     """Grey image : (h, w) float DN; `paint` may change the sub-sampled brightness, given the board's coordinates."""
     width, height = camera.size
-    coarse = np.stack(np.meshgrid(np.linspace(-1, width, width + 2), np.linspace(-1, height, height + 2)), axis=-1)
-    board_from_world = rigid.invert(world_from_board)
-    rays = rigid.rotate(board_from_world, camera.rays(coarse))
-    origin = rigid.apply(board_from_world, camera.centre)
-    at = (origin + rays * (-origin[2] / rays[..., 2])[..., None])[..., :2]
-    fine = cv2.resize(at, None, fx=SUB, fy=SUB, interpolation=cv2.INTER_LINEAR)  # sub-pixels' centres, straight between pixels'
-    xy = fine[SUB:-SUB, SUB:-SUB]
-    along_v, along_u = np.diff(xy[:, :1], axis=0).mean(axis=(0, 1)), np.diff(xy[:1], axis=1).mean(axis=(0, 1))
-    footprint = np.sqrt(abs(along_u[0] * along_v[1] - along_u[1] * along_v[0]))
-    bright = dark + (white - dark) * shares(board, xy, footprint)
+    at = plane_views.places(camera, world_from_board, np.arange(-1.0, height + 1), np.arange(-1.0, width + 1))
+    along_v, along_u = (at[-2, 1] - at[1, 1]) / (height - 1), (at[1, -2] - at[1, 1]) / (width - 1)
+    pixel = np.sqrt(abs(along_u[0] * along_v[1] - along_u[1] * along_v[0]))
+    if paint is not None or isinstance(board, AprilGrid | Charuco):
+        xy = cv2.resize(at, None, fx=SUB, fy=SUB, interpolation=cv2.INTER_LINEAR)[SUB:-SUB, SUB:-SUB]
+        white_share = shares(board, xy, pixel / SUB)
+    else:
+        white_share = _near_edges(board, at, pixel)
+    bright = dark + (white - dark) * white_share
     if paint is not None:
         bright = paint(bright, xy)
     if blur:
         bright = cv2.GaussianBlur(bright.astype(np.float32), (0, 0), blur * SUB, borderType=cv2.BORDER_REPLICATE)
-    image = bright.reshape(height, SUB, width, SUB).mean(axis=(1, 3))
+    image = cv2.resize(np.float64(bright), (width, height), interpolation=cv2.INTER_AREA)  # the mean
     if noise:
         image = np.rint(image + rng.normal(0, noise, image.shape))
     return np.clip(image, 0, 255)

@@ -27,7 +27,9 @@ def photograph(
     adds 1/12 DN^2; the noise given is the sum.
     """
     oversample = 8
-    images = []
+    images, seen = [], {}
+    light, ambient = np.float32(light), np.float32(ambient)
+    read, gain = np.float32(noise.read_variance - 1 / 12), np.float32(noise.gain)
     for axis, binary, profile in patterns.profiles():
         length = patterns.length(axis)
         fine = np.repeat(np.asarray(profile, float) ** (1.0 if binary else gamma), oversample)
@@ -37,13 +39,25 @@ def photograph(
         if not binary:  # grey levels vary slowly: interpolate them, so that the map's truth isn't quantised to the raster
             fine = np.interp(places, np.arange(length), np.asarray(profile, float) ** gamma)
         fine = np.convolve(np.pad(fine, len(offsets) // 2, mode="edge"), kernel / kernel.sum(), mode="valid")
-        x = maps[axis]
-        level = np.interp(np.nan_to_num(x, nan=-1e9), places, fine, left=0, right=0)
-        level[np.isnan(x)] = 0
-        image = np.asarray(ambient) + np.asarray(light) * level
-        image = image + rng.normal(size=image.shape) * np.sqrt(np.maximum(noise.read_variance - 1 / 12 + noise.gain * image, 0))
+        if axis not in seen:
+            seen[axis] = _between(maps[axis], places)
+        number, share = seen[axis]
+        fine = np.append(fine, [0, 0]).astype(np.float32)  # the last two: what isn't lit
+        image = ambient + light * (fine[number] + share * (fine[number + 1] - fine[number]))
+        image = image + rng.standard_normal(image.shape) * np.sqrt(np.maximum(read + gain * image, 0))
         images.append(np.clip(np.rint(image), 0, 255).astype(np.uint8))
     return np.stack(images)
+
+
+def _between(x: NDArray, places: NDArray) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Number of the place before each coordinate x : (h, w), of evenly spaced ones, and the share of the step to the next.
+
+    Of coordinates beyond all places, and of NaN, it is the first of two more.
+    """
+    lit = (x >= places[0]) & (x <= places[-1])
+    steps = np.where(lit, (x - places[0]) / (places[1] - places[0]), len(places))
+    number = np.where(lit, np.minimum(steps.astype(int), len(places) - 2), len(places))
+    return number, (steps - number).astype(np.float32)
 
 
 def projector_map(

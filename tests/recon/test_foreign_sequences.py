@@ -67,10 +67,12 @@ def check(found, maps, least_share=0.98, border=3.0):
 
 @pytest.mark.parametrize("size", PROJECTORS, ids="{0[0]}x{0[1]}".format)
 @pytest.mark.parametrize("name", SEQUENCES)
-@pytest.mark.parametrize("interleaved", [False, True], ids=["axis by axis", "interleaved"])
-def test_the_whole_projector_decodes(rng, name, size, interleaved):
-    """Both axes from the first pixel to the last, on each projector; no order is wrong, and little is lost."""
-    patterns = sequence(name, size, interleaved)
+def test_the_whole_projector_decodes(rng, name, size):
+    """Both axes from the first pixel to the last, on each projector, half of them interleaved; no order is wrong, and little is
+    lost.
+    """
+    interleaved = (PROJECTORS.index(size) + list(SEQUENCES).index(name)) % 2
+    patterns = sequence(name, size, bool(interleaved))
     maps = across(size, (480, 640))
     found = decode(photograph(patterns, maps, rng), patterns, noise=Noise(0.5, 0.033))
     check(found, maps, 0.85 if name == "gray_pairs" else 0.98)
@@ -79,7 +81,7 @@ def test_the_whole_projector_decodes(rng, name, size, interleaved):
 @pytest.mark.parametrize("shape", [(480, 640), (2048, 2448), (211, 1031)], ids="{0[1]}x{0[0]}".format)
 def test_any_camera_size(rng, shape):
     """Other cameras, twelve bits: the same light in finer steps. Only a crop of a large image's rows carries light."""
-    patterns = sequence("gray_pairs", (1024, 768))
+    patterns = sequence("cue", (1024, 768))
     maps = across((1024, 768), (min(shape[0], 200), shape[1]))
     images = photograph(patterns, maps, rng).astype(np.uint16) * 16
     whole = np.full((len(images), *shape), 128, np.uint16)

@@ -17,7 +17,7 @@ from tests.recon.navigation import headless_browser
 
 
 def answer(address: str, path: str, **headers) -> tuple[int, bytes]:
-    connection = HTTPConnection(urlsplit(address).hostname, urlsplit(address).port, timeout=5)
+    connection = HTTPConnection(urlsplit(address).hostname, urlsplit(address).port, timeout=600)
     connection.request("GET", path, headers=headers)
     response = connection.getresponse()
     return response.status, response.read()

@@ -1,5 +1,6 @@
 """The target on paper, as the tracker finds it in the sheet at a printer's resolution."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,31 +11,33 @@ from recon.tracking import networks, photographs
 from tests.recon.artwork.rasters import INK, PAPER, raster, rigid_misfit
 
 
-@pytest.fixture
-def sheet(rig, tmp_path):
-    """The raster of a sheet with the target, and the size of its pixels, mm."""
+@pytest.fixture(scope="module")
+def sheet(rig, tmp_path_factory):
+    """The raster of a sheet with the target, and the size of its pixels, mm; and what the tracker finds in it."""
+    tmp_path = tmp_path_factory.mktemp("sheet")
     card = target_drawing.card_of(rig.target)
     laid = paper_sheet.lay_out(card.size, paper_sheet.PAPERS["a4"], 5.0)
     paper_sheet.write(tmp_path / "target.pdf", card, laid, 5.0, "target", ["in bold", target_drawing.in_words(rig.target)])
-    return raster(tmp_path / "target.pdf")
+    image, pixel = raster(tmp_path / "target.pdf")
+    return image, pixel, photographs.find(image, networks.load(), rig.target)
 
 
 def test_the_tracker_finds_it_true_to_scale(rig, sheet):
     """Centres by their names, distances and diameters within 0.02 mm; upright, with c2 above c0. A mirrored sheet is refused."""
-    image, pixel = sheet
-    view = photographs.find(image, networks.load(), rig.target)
+    image, pixel, view = sheet
     assert view.found, view.reason
     places = view.outlines.ellipses.centre * pixel * [1, -1]
     off, turn = rigid_misfit(places, circle_centres(rig.target)[:, :2])
     assert off < 0.02 and abs(turn) < 1e-4
     assert np.abs(2 * view.outlines.ellipses.semi_axes * pixel.mean() - rig.target.outer_diameter_mm).max() < 0.02
-    assert not photographs.find(np.ascontiguousarray(image[:, ::-1]), networks.load(), rig.target).found
+    small = cv2.resize(image, None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA)
+    assert photographs.find(small, networks.load(), rig.target).found
+    assert not photographs.find(np.ascontiguousarray(small[:, ::-1]), networks.load(), rig.target).found
 
 
 def test_rings_have_the_area_of_both_diameters(rig, sheet):
     """Of each ring, within what 0.02 mm of the inner diameter make; marks and letters lie farther off."""
-    image, pixel = sheet
-    view = photographs.find(image, networks.load(), rig.target)
+    image, pixel, view = sheet
     outer, inner = rig.target.outer_diameter_mm, rig.target.inner_diameter_mm
     ink = (PAPER - image.astype(float)) / (PAPER - INK)
     reach = int((outer / 2 + 1) / pixel.min())

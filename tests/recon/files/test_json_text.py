@@ -1,7 +1,6 @@
 """JSON of any origin gives plain values, or one line."""
 
 import json
-import time
 from pathlib import Path
 
 import pytest
@@ -10,6 +9,7 @@ from hypothesis import strategies as st
 
 from recon.errors import InputError
 from recon.files import json_text
+from tests.recon import bounded_work
 from tests.recon.files.mutations import damaged
 
 PLACE = Path("file.json")
@@ -38,10 +38,9 @@ def test_values_are_those_of_the_standard_library(tmp_path):
     ],
 )
 def test_odd_values_are_refused_at_once(text, complaint):
-    start = time.process_time()
-    with pytest.raises(InputError) as refusal:
+    with pytest.raises(InputError) as refusal, bounded_work.calls(1e4):
         json_text.parsed(PLACE, text)
-    assert str(refusal.value).startswith(f"file.json: {complaint}") and time.process_time() - start < 1
+    assert str(refusal.value).startswith(f"file.json: {complaint}")
 
 
 def test_a_large_file_is_refused_before_it_is_read(tmp_path):
@@ -56,12 +55,13 @@ WHOLE = (
 )
 
 
-@settings(max_examples=300, deadline=1000)
+@settings(max_examples=200, deadline=None)
 @given(data=st.data())
 def test_damaged_text_gives_values_or_one_line(data):
     spoilt = data.draw(damaged(WHOLE)).decode("utf-8", "replace")
     try:
-        value = json_text.parsed(PLACE, spoilt)
+        with bounded_work.calls(1e4):
+            value = json_text.parsed(PLACE, spoilt)
     except InputError as error:
         assert "\n" not in str(error)
     else:

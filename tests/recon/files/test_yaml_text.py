@@ -1,7 +1,6 @@
 """YAML of any origin gives plain values, or one line."""
 
 import math
-import time
 import tracemalloc
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from hypothesis import strategies as st
 
 from recon.errors import InputError
 from recon.files import yaml_text
+from tests.recon import bounded_work
 from tests.recon.files.mutations import damaged
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -68,13 +68,12 @@ def test_aliases_merges_and_odd_words():
 )
 def test_odd_values_are_refused_at_once(text, complaint):
     tracemalloc.start()
-    start = time.process_time()
-    with pytest.raises(InputError) as refusal:
+    with pytest.raises(InputError) as refusal, bounded_work.calls(2e6):
         yaml_text.loaded(PLACE, text)
-    seconds, (_, most) = time.process_time() - start, tracemalloc.get_traced_memory()
+    most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert str(refusal.value).startswith(f"file.yaml: {complaint}") and "\n" not in str(refusal.value)
-    assert seconds < 10 and most < 1e7  # memory is traced meanwhile, which takes ten times as long
+    assert most < 1e7
 
 
 WHOLE = (
@@ -82,10 +81,12 @@ WHOLE = (
 )
 
 
-@settings(max_examples=300, deadline=1000)
+@settings(max_examples=200, deadline=None)
 @given(data=st.data())
 def test_damaged_text_gives_values_or_one_line(data):
+    spoilt = data.draw(damaged(WHOLE)).decode("utf-8", "replace")
     try:
-        yaml_text.loaded(PLACE, data.draw(damaged(WHOLE)).decode("utf-8", "replace"))
+        with bounded_work.calls(1e5):
+            yaml_text.loaded(PLACE, spoilt)
     except InputError as error:
         assert "\n" not in str(error)

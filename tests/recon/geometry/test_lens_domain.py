@@ -43,9 +43,9 @@ def test_the_rigs_devices_are_sound(rig):
 
 
 def test_sound_lenses_are_those_whose_radius_rises_to_the_corner(rng):
-    """300 radial lenses of any strength, against their radius alone; no case nearer to the border than the steps are fine."""
+    """120 radial lenses of any strength, against their radius alone; no case nearer to the border than the steps are fine."""
     radii, found = np.linspace(0, 4.5 * CORNER, 20000), []
-    for _ in range(300):
+    for _ in range(120):
         k = rng.normal(0, 0.4, 6) / CORNER ** np.array([2, 4, 6, 2, 4, 6])
         square = radii**2
         top, bottom = (1 + square * (a + square * (b + square * c)) for a, b, c in (k[:3], k[3:]))
@@ -56,5 +56,5 @@ def test_sound_lenses_are_those_whose_radius_rises_to_the_corner(rng):
             continue  # nearly folded: areas shrink to a few per cent, which isn't accepted either
         camera = lens(k[0], k[1], 0, 0, k[2], *k[3:])
         found.append((is_one_to_one(camera, margin=0), bool(rises)))
-    assert len(found) > 200 and 40 < sum(rises for _, rises in found) < len(found) - 40
+    assert len(found) > 80 and 16 < sum(rises for _, rises in found) < len(found) - 16
     assert [k for k, (one, rises) in enumerate(found) if one != rises] == []

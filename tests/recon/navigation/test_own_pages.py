@@ -30,7 +30,7 @@ def answer(port: int, origin: str | None, host: str | None = None) -> int:
     from websockets.sync.client import connect
 
     try:
-        reached = socket.create_connection((LOOPBACK, port), 5)
+        reached = socket.create_connection((LOOPBACK, port), 600)
         with connect(f"ws://{host or LOOPBACK}:{port}", sock=reached, origin=origin, subprotocols=["viser-v0"]) as opened:
             return opened.response.status_code
     except InvalidStatus as refused:
@@ -39,7 +39,7 @@ def answer(port: int, origin: str | None, host: str | None = None) -> int:
 
 def page_status(port: int, host: str) -> int:
     """Status of the page itself, asked for by a name."""
-    connection = HTTPConnection(LOOPBACK, port, timeout=5)
+    connection = HTTPConnection(LOOPBACK, port, timeout=600)
     connection.request("GET", "/", headers={"Host": f"{host}:{port}"})
     return connection.getresponse().status
 

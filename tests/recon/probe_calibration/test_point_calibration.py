@@ -73,15 +73,15 @@ def test_five_calibrations_agree_and_are_right(rig, probe, rng, roll_deg):
 
 
 def test_the_covariance_is_honest(probe, frames, rng):
-    """Errors of 25 calibrations, normalised by their covariance, are chi-square with 8 degrees of freedom each."""
+    """Errors of 15 calibrations, normalised by their covariance, are chi-square with 8 degrees of freedom each."""
     total = 0.0
-    for _ in range(25):
+    for _ in range(15):
         made = calibrate(observe(probe, *frames, rng), SIZE, NOISE).calibration
         turn = Rotation.from_matrix(probe.target_from_image[:3, :3] @ made.target_from_image[:3, :3].T).as_rotvec()
         shift = probe.target_from_image[:3, 3] - made.target_from_image[:3, 3]
         error = np.concatenate([probe.scale - made.scale, turn, shift])
         total += error @ np.linalg.solve(made.uncertainty.covariance, error)
-    low, high = stats.chi2.ppf([0.0005, 0.9995], 8 * 25)
+    low, high = stats.chi2.ppf([0.0005, 0.9995], 8 * 15)
     assert low < total < high * 79 / 77  # the noise level itself is measured, from 79 degrees of freedom
 
 
@@ -123,7 +123,7 @@ def test_outliers_that_agree_with_each_other_are_still_outliers(probe, frames, r
 def test_few_good_frames_are_not_taken_for_outliers_of_each_other(probe, frames, count):
     """Twelve unknowns fit six frames by themselves: their residuals are small, and others' would look large beside them."""
     kept = []
-    for seed in range(20):
+    for seed in range(10):
         rng = np.random.default_rng([seed, count])
         some = rng.choice(len(frames[1]), count, replace=False)
         adjusted = calibrate(observe(probe, frames[0][some], frames[1][some], rng), SIZE, NOISE, max_sigma_mm=100)
@@ -314,14 +314,13 @@ def test_a_refusal_names_the_worst_frames_and_its_limit_is_a_setting(probe, fram
 
 
 @pytest.mark.parametrize("seed", range(12))
-@pytest.mark.parametrize("designed", [False, True])
-def test_a_bracket_to_any_side_is_calibrated_whatever_the_design(rig, seed, designed):
-    """Of any size, scale and attitude; a design of another bracket only makes a doubt of it."""
+def test_a_bracket_to_any_side_is_calibrated_whatever_the_design(rig, seed):
+    """Of any size, scale and attitude; a design of another bracket, given with every other, only makes a doubt of it."""
     rng = np.random.default_rng([5, seed])
     size, probe = foreign_probe(rng)
     design = rig.probe.target_from_image.matrix()
     sightings = observe(probe, *point_calibration.motion(size), rng)
-    found = calibrate(sightings, size, NOISE, design if designed else None).calibration
+    found = calibrate(sightings, size, NOISE, design if seed % 2 else None).calibration
     points = repeatability.five_points(size)
     away = np.linalg.norm(found.to_target(points) - probe.to_target(points), axis=1)
     sigma = np.sqrt(np.trace(point_calibration.point_covariance(found, points), axis1=1, axis2=2))

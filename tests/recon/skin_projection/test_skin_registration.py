@@ -35,9 +35,9 @@ def test_the_motion_is_found(rng):
 
 
 def test_predicted_errors_are_the_errors(rng):
-    """Errors of 200 motions, each of six normalised by its covariance, are standard normal: five sigma of their spread."""
+    """Errors of 70 motions, each of six normalised by its covariance, are standard normal: five sigma of their spread."""
     motion, normalised = MIDDLE @ MOTION @ rigid.invert(MIDDLE), []
-    for _ in range(200):
+    for _ in range(70):
         old, new = (breast(rng, rng.uniform(-0.5, 0.5, 2), step=1.6) for _ in range(2))
         found = register(old, new.apply_transform(motion))
         error = rigid.difference(found.new_from_old, motion)

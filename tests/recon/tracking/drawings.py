@@ -9,75 +9,95 @@ from recon.geometry.camera import Camera
 from recon.geometry.circle_outline import ellipses_of
 from recon.geometry.ellipses import Ellipses
 from recon.model import circle_layout
+from tests.recon import plane_views
 
 ELECTRONS = 7700 / 255  # a digital number
 DARK_E = 11.0
 BLACK_DN = 2.0
 LENS_PX = 0.55  # standard deviation in focus, of the lens with a little defocus
 SUBSAMPLES = 5  # a side
+BLURRED_PX = 6  # about the board: ten times the lens's blur
+STRIP = 64  # rows
 MARGIN_MM = 14.0  # of white about the discs' middles
 BOARD = np.array([[-MARGIN_MM, -MARGIN_MM], [25 + MARGIN_MM, 40 + MARGIN_MM]])  # mm, corners in the target's frame
 
 
-def reflectance(camera: Camera, poses, target, ground=0.25, black=0.04):
-    """Mean over poses, of what a camera sees : (h, w), white board 1, without blur but the pixels' own extent and motion."""
+def _part(camera: Camera, poses):
+    """The rows and columns of the image that may show the board at any of the poses, with what blurs into them; may be empty."""
     width, height = camera.size
-    image = np.full((height, width), ground)
     corners = np.array([[x, y, 0.0] for x in BOARD[:, 0] for y in BOARD[:, 1]])
     seen = np.concatenate([camera.project(rigid.apply(place, corners)) for place in poses])
-    left, top = np.clip(np.floor(seen.min(axis=0)).astype(int) - 3, 0, [width, height])
-    right, bottom = np.clip(np.ceil(seen.max(axis=0)).astype(int) + 4, 0, [width, height])
-    if right - left < 3 or bottom - top < 3:
-        return image
-    v, u = np.mgrid[top:bottom, left:right].astype(float)
-    rays = camera.rays(np.stack([u, v], axis=-1))
+    left, top = np.clip(np.floor(seen.min(axis=0)).astype(int) - BLURRED_PX, 0, [width, height])
+    right, bottom = np.clip(np.ceil(seen.max(axis=0)).astype(int) + BLURRED_PX + 1, 0, [width, height])
+    return np.s_[top:bottom, left:right]
+
+
+def reflectance(camera: Camera, poses, target, part, ground=0.25, black=0.04):
+    """Mean over poses, of what a camera sees in a part of its image, white board 1, blurred by pixels and motion alone."""
     count = SUBSAMPLES if len(poses) == 1 else 2
-    image[top:bottom, left:right] = np.mean(
-        [_board(camera, rays, place, target, ground, black, count) for place in poses], axis=0
-    )
-    return image
+    rows, columns = (np.arange(axis.start, axis.stop, dtype=float) for axis in part)
+    seen = (np.moveaxis(plane_views.places(camera, place, rows, columns), -1, 0) for place in poses)
+    return np.mean([_board(x, y, target, ground, black, count) for x, y in seen], axis=0)
 
 
-def _board(camera, rays, world_from_target, target, ground, black, count):
-    """Brightness : (h, w), by sub-pixels where an edge is near; elsewhere the whole pixel looks alike."""
-    x, y = _on_board(camera, world_from_target, rays)
+def _board(x, y, target, ground, black, count):
+    """Brightness : (h, w) at places x, y : (h, w) mm, by sub-pixels where an edge is near; elsewhere a pixel looks alike."""
     slopes = np.array([np.gradient(axis) for axis in (x, y)])  # of x and y, by v and u
     scale = np.hypot(slopes[0, 1], slopes[0, 0]) / count
     reach = np.hypot(*slopes).sum(axis=0) / 2 + scale  # mm, from a pixel's middle to what counts for its corners
+    part = (np.arange(count) + 0.5) / count - 0.5
+    middle, half = BOARD.mean(axis=0), (BOARD[1] - BOARD[0]) / 2
 
-    def brightness(px, py, scale):
-        inside = [np.clip((px - BOARD[0, 0]) / scale + 0.5, 0, 1), np.clip((BOARD[1, 0] - px) / scale + 0.5, 0, 1)]
-        inside += [np.clip((py - BOARD[0, 1]) / scale + 0.5, 0, 1), np.clip((BOARD[1, 1] - py) / scale + 0.5, 0, 1)]
-        ink = np.zeros_like(px)
-        for cx, cy, _ in circle_layout.circle_centres(target):
+    def sampled(brightness, near):
+        """Mean of a brightness over the sub-pixels of some pixels."""
+        px, py, *by = (axis[near] for axis in (x, y, *slopes[0], *slopes[1]))
+        width = scale[near]
+        return (
+            sum(brightness(px + dv * by[0] + du * by[1], py + dv * by[2] + du * by[3], width) for dv in part for du in part)
+            / count**2
+        )
+
+    def board(px, py, scale):
+        across = np.clip((half[0] - np.abs(px - middle[0])) / scale + 0.5, 0, 1)
+        return ground + (1 - ground) * across * np.clip((half[1] - np.abs(py - middle[1])) / scale + 0.5, 0, 1)
+
+    total = board(x, y, scale)
+    near = np.minimum(np.abs(np.abs(x - middle[0]) - half[0]), np.abs(np.abs(y - middle[1]) - half[1])) < reach
+    total[near] = sampled(board, near)
+    outer, inner = target.outer_diameter_mm / 2, target.inner_diameter_mm / 2
+    for cx, cy, _ in circle_layout.circle_centres(target):  # none lies near another, nor near the board's edge
+
+        def disc(px, py, scale, cx=cx, cy=cy):
             away = np.hypot(px - cx, py - cy)
-            outer = np.clip((target.outer_diameter_mm / 2 - away) / scale + 0.5, 0, 1)
-            ink += outer * np.clip((away - target.inner_diameter_mm / 2) / scale + 0.5, 0, 1)
-        board = np.prod(inside, axis=0)
-        return ground * (1 - board) + board * (1 - (1 - black) * ink)
+            return 1 - (1 - black) * np.clip((outer - away) / scale + 0.5, 0, 1) * np.clip((away - inner) / scale + 0.5, 0, 1)
 
-    near = np.minimum(np.abs(x[..., None] - BOARD[:, 0]), np.abs(y[..., None] - BOARD[:, 1])).min(axis=-1) < reach
-    for cx, cy, _ in circle_layout.circle_centres(target):
-        away = np.hypot(x - cx, y - cy)
-        for diameter in (target.outer_diameter_mm, target.inner_diameter_mm):
-            near |= np.abs(away - diameter / 2) < reach
-    total, part = brightness(x, y, scale), (np.arange(count) + 0.5) / count - 0.5
-    places = [
-        [axis[near] + dv * slope[0][near] + du * slope[1][near] for axis, slope in zip((x, y), slopes, strict=True)]
-        for dv in part
-        for du in part
-    ]
-    total[near] = sum(brightness(*place, scale[near]) for place in places) / count**2
+        about = np.nonzero((np.abs(x - cx) < outer + 1) & (np.abs(y - cy) < outer + 1))
+        away = np.hypot(x[about] - cx, y[about] - cy)
+        total[about] = np.where((away > inner) & (away < outer), black, total[about])
+        edge = np.minimum(np.abs(away - outer), np.abs(away - inner)) < reach[about]
+        near = tuple(index[edge] for index in about)
+        total[near] = sampled(disc, near)
     return total
 
 
 def frame(camera, poses, target, white=100.0, rng=None, lens=LENS_PX, ground=0.25, light=None):
-    """An 8-bit frame : (h, w) of poses : a list, over the exposure; noise if there is a generator, else float DN."""
-    sharp = reflectance(camera, poses, target, ground)
-    mean = white * gaussian_filter(sharp, lens, mode="nearest")
+    """An 8-bit frame : (h, w) of poses : a list, over the exposure; noise if there is a generator, else float DN.
+
+    What shows no board has noise that repeats itself every `STRIP` rows, unless it is lit unevenly.
+    """
+    width, height = camera.size
+    part = _part(camera, poses)
+    even = rng is not None and light is None
+    image = np.full((STRIP if even else height, width), white * ground)
+    if even:
+        image = np.tile(read_out(image, rng), (-(-height // STRIP), 1))[:height]
+    if image[part].size:
+        sharp = reflectance(camera, poses, target, part, ground)
+        seen = white * gaussian_filter(sharp, lens, mode="nearest")
+        image[part] = read_out(seen, rng) if even else seen
     if light is not None:
-        mean = mean * light
-    return mean + BLACK_DN if rng is None else read_out(mean, rng)
+        image = image * light
+    return image if even else image + BLACK_DN if rng is None else read_out(image, rng)
 
 
 def read_out(mean, rng):
@@ -109,11 +129,3 @@ def exposure(world_from_target, shift_mm, steps=15):
         place[:3, 3] += t * np.asarray(shift_mm)
         moved.append(place)
     return moved
-
-
-def _on_board(camera, world_from_target, rays):
-    """Where rays : (..., 3) meet the board's plane : two of (...) mm in the target's frame."""
-    local = rigid.rotate(rigid.invert(world_from_target), rays)
-    start = rigid.apply(rigid.invert(world_from_target), camera.centre)
-    along = -start[2] / local[..., 2]
-    return start[0] + along * local[..., 0], start[1] + along * local[..., 1]

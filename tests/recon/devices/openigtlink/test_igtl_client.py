@@ -17,7 +17,7 @@ from recon.devices.openigtlink.igtl_messages import Message, Raw, Text, Transfor
 from recon.devices.openigtlink.igtl_server import Server
 from tests.recon.devices.openigtlink.igtl_peers import TIME_NS, plus_frame, plus_image, pose, served
 
-WAIT_S = 10.0
+WAIT_S = 600.0  # for what comes at once unless it hangs
 
 
 @contextmanager
