@@ -1,13 +1,15 @@
 """Measure the errors of the twin and of the pipeline, beside their bars, the limits of physics and the paper's figures.
 
 Reads the rig and the pattern sequences from conf/, and real recordings where `real` names their folder. Writes GROUP.json into
-the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}, and figures; and the tables of the Markdown page
-that `document` names. Takes some minutes a group, and about an hour for tracking, for which a thousand pairs of frames are
+the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}, and figures. With `document=docs/accuracy.md` the
+group's rows are replaced in docs/accuracy.csv, with day and commit, and the page's table is made of all rows there by
+conf/bars/accuracy.yaml. Takes some minutes a group, and about an hour for tracking, for which a thousand pairs of frames are
 rendered, an hour for studies and three hours for sessions. Exit status 1 if a bar is missed.
 
     sonotwin accuracy only=optics
 """
 
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Literal, get_args
@@ -19,7 +21,7 @@ from recon.capture.surface_part import read_patterns
 from recon.errors import InputError
 from recon.model.rig import Part, Rig
 from sonotwin.config import folder
-from twin.accuracy import table_rows
+from twin.accuracy import kept_rows, table_rows
 from twin.conditions import Conditions
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
@@ -55,8 +57,8 @@ def run(config: Config) -> int:
     """
     groups = [config.only] if config.only else get_args(Group)
     if config.document:
-        for group in groups:
-            table_rows.check_place(config.document, group)
+        table_rows.check_place(config.document, kept_rows.MARK)
+        kept_rows.read(kept_rows.file_of(config.document))
     if config.real and not config.real.is_dir():
         raise InputError(f"accuracy: real: expected a folder of recordings, found none at {config.real}")
     config.out.mkdir(parents=True, exist_ok=True)
@@ -72,10 +74,25 @@ def run(config: Config) -> int:
             measured.append(row)
         table_rows.write(config.out / f"{group}.json", measured)
         if config.document:
-            table_rows.refresh(config.document, group, table_rows.table(measured, "limit"))
+            enter(config.document, group, measured)
         console.print(f"wrote {config.out / f'{group}.json'}", markup=False)
         met &= all(row.ok for row in measured)
     return 0 if met else 1
+
+
+def enter(document: Path, group: str, measured: Sequence[table_rows.Row]) -> None:
+    """Replace a group's rows in the file beside a document, and make the document's table anew."""
+    day, commit = table_rows.state(document.parent)
+    path = kept_rows.file_of(document)
+    rows = kept_rows.renewed(kept_rows.read(path), group, [kept_rows.kept(group, row, day, commit) for row in measured])
+    kept_rows.write(path, rows)
+    show(document)
+
+
+def show(document: Path) -> None:
+    """Make the table of a document of the file beside it."""
+    choices = kept_rows.read_choices(folder() / "bars" / "accuracy.yaml")
+    table_rows.enter(document, kept_rows.MARK, kept_rows.short_table(kept_rows.read(kept_rows.file_of(document)), choices))
 
 
 def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> table_rows.Setup:
