@@ -9,7 +9,6 @@ rendered, an hour for studies and three hours for sessions. Exit status 1 if a b
     sonotwin accuracy only=optics
 """
 
-from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Literal, get_args
@@ -59,6 +58,7 @@ def run(config: Config) -> int:
     if config.document:
         table_rows.check_place(config.document, kept_rows.MARK)
         kept_rows.read(kept_rows.file_of(config.document))
+        choices()
     if config.real and not config.real.is_dir():
         raise InputError(f"accuracy: real: expected a folder of recordings, found none at {config.real}")
     config.out.mkdir(parents=True, exist_ok=True)
@@ -74,25 +74,15 @@ def run(config: Config) -> int:
             measured.append(row)
         table_rows.write(config.out / f"{group}.json", measured)
         if config.document:
-            enter(config.document, group, measured)
+            kept_rows.enter(config.document, choices(), group, measured)
         console.print(f"wrote {config.out / f'{group}.json'}", markup=False)
         met &= all(row.ok for row in measured)
     return 0 if met else 1
 
 
-def enter(document: Path, group: str, measured: Sequence[table_rows.Row]) -> None:
-    """Replace a group's rows in the file beside a document, and make the document's table anew."""
-    day, commit = table_rows.state(document.parent)
-    path = kept_rows.file_of(document)
-    rows = kept_rows.renewed(kept_rows.read(path), group, [kept_rows.kept(group, row, day, commit) for row in measured])
-    kept_rows.write(path, rows)
-    show(document)
-
-
-def show(document: Path) -> None:
-    """Make the table of a document of the file beside it."""
-    choices = kept_rows.read_choices(folder() / "bars" / "accuracy.yaml")
-    table_rows.enter(document, kept_rows.MARK, kept_rows.short_table(kept_rows.read(kept_rows.file_of(document)), choices))
+def choices() -> list[kept_rows.Chosen]:
+    """Rows of the document's table, as conf/bars/accuracy.yaml has them."""
+    return kept_rows.read_choices(folder() / "bars" / "accuracy.yaml")
 
 
 def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> table_rows.Setup:

@@ -14,6 +14,7 @@ from re import search
 
 from recon.errors import InputError
 from recon.files import atomic, yaml_text
+from twin.accuracy import table_rows
 from twin.accuracy.table_rows import Row
 
 MARK = "rows"  # of the short table's place in a document
@@ -118,6 +119,24 @@ def _cell(value: str | float | bool | None) -> str:
     return ("no", "yes")[value] if isinstance(value, bool) else f"{value:.4g}"
 
 
+def enter(document: Path, choices: Sequence[Chosen], group: str, measured: Sequence[Row]) -> None:
+    """Replace a group's rows in the file beside a document, with today and the commit, and make the document's table anew.
+
+    The file is locked from reading to writing, so that two processes that enter different groups lose none.
+    """
+    day, commit = table_rows.state(document.parent)
+    path = file_of(document)
+    with atomic.new_file(path) as temporary:
+        rows = renewed(read(path), group, [kept(group, row, day, commit) for row in measured])
+        write(temporary, rows)
+        table_rows.enter(document, MARK, short_table(rows, choices))
+
+
+def show(document: Path, choices: Sequence[Chosen]) -> None:
+    """Make a document's table anew of the file beside it, after a change of the choices."""
+    table_rows.enter(document, MARK, short_table(read(file_of(document)), choices))
+
+
 def renewed(rows: Sequence[Kept], group: str, measured: Sequence[Kept]) -> list[Kept]:
     """Rows with those of a group replaced where they stood; a new group comes last."""
     place = next((k for k, row in enumerate(rows) if row.group == group), len(rows))
@@ -168,7 +187,7 @@ def _alone(row: Kept) -> Chosen:
 
 def _line(choice: Chosen, row: Kept | None, count: int) -> str:
     if row is None:
-        return f"| {choice.quantity} | {choice.conditions} | no such row | | | | |"
+        return f"| {choice.quantity} | {choice.conditions} | not measured | | | | |"
     found = search(r"[(;] ?paper(?:, [\w ]+)?: ([^);]+)", row.what)
     paper = " to ".join(dict.fromkeys(found[1].split(" to "))) if found else ""  # 0.04 to 0.04 is one figure
     figure = f"{row.measured:.4g} {row.unit}".strip() + (f", worst of {count}" if count > 1 else "")

@@ -1,6 +1,7 @@
 """Rows in a file: read as written, replaced a group at a time, shown misses first; and those of the docs."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +50,19 @@ def test_a_group_is_replaced_where_it_stood():
     new = [replace(ROWS[0], measured=1.0)]
     assert kept_rows.renewed(ROWS, "one", new) == [*new, *ROWS[2:]]
     assert kept_rows.renewed(ROWS[:2], "two", ROWS[2:]) == ROWS
+
+
+def test_groups_that_are_entered_at_once_lose_none(tmp_path):
+    """As when two commands measure different groups into one document."""
+    page = tmp_path / "page.md"
+    page.write_text("<!-- rows -->\n<!-- /rows -->\n")
+    groups = [f"group{k}" for k in range(8)]
+    choices = [Chosen(group, "", (f"{group} *",)) for group in groups]
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(lambda group: kept_rows.enter(page, choices, group, [Row("a", "x", 1.0, 2.0, None, "mm")]), groups))
+    rows = kept_rows.read(page.with_suffix(".csv"))
+    assert sorted(row.group for row in rows) == groups
+    assert kept_rows.short_table(rows, choices) in page.read_text() and "not measured" not in page.read_text()
 
 
 def test_the_worst_row_stands_for_its_choice():
