@@ -281,10 +281,15 @@ def _write_surface() -> int:
 
 
 def table(found: Sequence[Case]) -> list[str]:
-    """Lines of Markdown: a row a writer."""
-    lines = ["| writer | cases | done | refused by one line | lost or changed | errors |", "|---|---|---|---|---|---|"]
-    for writer in [*dict.fromkeys(one.writer for one in found), "all"]:
-        own = [one for one in found if writer in (one.writer, "all")]
-        done, refused, errors = (sum(one.status in some for one in own) for some in ((0, 1), (2,), (-1,)))
-        lines.append(f"| {writer} | {len(own)} | {done} | {refused} | {sum(len(one.lost) for one in own)} | {errors} |")
-    return lines
+    """Lines of Markdown: a row for all writers of equal counts."""
+    lines = ["| writers | cases | done | refused by one line | lost or changed | errors |", "|---|---|---|---|---|---|"]
+    alike: dict[tuple[int, ...], list[str]] = {}
+    for writer in dict.fromkeys(one.writer for one in found):
+        alike.setdefault(_counts([one for one in found if one.writer == writer]), []).append(writer)
+    alike.setdefault(_counts(found), []).append("all")
+    return [*lines, *(f"| {', '.join(writers)} | {' | '.join(map(str, counts))} |" for counts, writers in alike.items())]
+
+
+def _counts(found: Sequence[Case]) -> tuple[int, ...]:
+    done, refused, errors = (sum(one.status in some for one in found) for some in ((0, 1), (2,), (-1,)))
+    return len(found), done, refused, sum(len(one.lost) for one in found), errors

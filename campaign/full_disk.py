@@ -4,7 +4,6 @@ The disk is a small file system in memory, which only root can mount.
 """
 
 import os
-import re
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -124,10 +123,12 @@ def _used(disk: Path) -> int:
 
 
 def table(found: Sequence[Full]) -> list[str]:
-    """Lines of Markdown: a row a case."""
-    lines = ["| verb | room beside the old result | status | old result kept | leftovers | said |", "|---|---|---|---|---|---|"]
-    for one in found:
-        (said,) = re.findall(r"disk/.*", re.sub(r"\.\d+\.new", ".N.new", one.outcome.said))[-1:] or [""]
-        cells = [one.verb, f"{100 * one.share:.0f} %", one.outcome.status, "yes" if one.kept else "**no**", len(one.left)]
-        lines.append(f"| {' | '.join(map(str, cells))} | `{said[-90:]}` |")
+    """Lines of Markdown: a row a verb, its cells by the rooms tried."""
+    rooms = ", ".join(f"{100 * share:.0f} %" for share in dict.fromkeys(one.share for one in found))
+    lines = [f"| verb | status at {rooms} | old result kept | leftovers |", "|---|---|---|---|"]
+    for verb in dict.fromkeys(one.verb for one in found):
+        own = [one for one in found if one.verb == verb]
+        statuses = ", ".join(str(one.outcome.status) for one in own)
+        kept = ", ".join("yes" if one.kept else "**no**" for one in own)
+        lines.append(f"| {verb} | {statuses} | {kept} | {sum(len(one.left) for one in own)} |")
     return lines

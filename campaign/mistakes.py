@@ -175,11 +175,13 @@ def table(found: Sequence[Outcome]) -> list[str]:
     for verb, some in [*sorted(by_verb.items()), ("all", list(found))]:
         counts = [sum(one.outcome == kind for one in some) for kind in KINDS]
         lines.append(f"| {verb} | {len(some)} | {' | '.join(map(str, counts))} |")
-    silent: Mapping[tuple[str, str, str], list[float]] = defaultdict(list)
+    silent: Mapping[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for one in found:
         if one.outcome == "silently wrong":
-            silent[one.verb, one.kind, one.what].append(one.sigma)
-    lines += ["", "| wrong without a word | kind | verb | times | off, sigma |", "|---|---|---|---|---|"]
-    for (verb, kind, what), sigmas in sorted(silent.items(), key=lambda item: (-len(item[1]), item[0])):
-        lines.append(f"| {what} | {kind} | {verb} | {len(sigmas)} | {np.median(sigmas):.3g} |")
+            silent[one.kind, one.what][one.verb].append(one.sigma)
+    lines += ["", "| wrong without a word | kind | verbs, with the number of times | off, sigma, in each |", "|---|---|---|---|"]
+    for (kind, what), verbs in sorted(silent.items()):
+        times = ", ".join(f"{verb} {len(sigmas)}" for verb, sigmas in sorted(verbs.items()))
+        off = ", ".join(f"{np.median(sigmas):.3g}" for _, sigmas in sorted(verbs.items()))
+        lines.append(f"| {what} | {kind} | {times} | {off} |")
     return lines

@@ -13,7 +13,7 @@ from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))  # the packages beside these pages, whatever is installed
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]  # the packages beside these pages, whatever is installed
 
 project = "sonotwin"
 author = "The sonotwin authors"
@@ -111,6 +111,10 @@ def block_math(translator: nodes.NodeVisitor, node: nodes.math_block) -> None:
 
 def setup(app: Sphinx) -> None:
     """Connect the steps above."""
+    import site_pages  # of this folder
+
+    app.add_directive("accuracy-rows", site_pages.AccuracyRows)
+    app.add_directive("rooms", site_pages.Rooms)
     app.connect("autodoc-process-docstring", as_rst, priority=100)  # before napoleon
     app.connect("autodoc-process-signature", short_types)
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))

@@ -1,4 +1,4 @@
-"""The documentation: links and anchors lead somewhere, the map of the code is complete, the site builds without a warning."""
+"""The documentation: links and anchors lead somewhere, the list of modules is complete, the site builds without a warning."""
 
 import re
 import shlex
@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from sonotwin import config
+from twin.accuracy import kept_rows
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -19,7 +20,6 @@ PAGES = [
     *sorted((ROOT / "docs" / "users").glob("*.md")),
 ]
 PACKAGES = ("recon", "scenes", "twin", "trainers", "sonotwin")
-MAP = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 
 def anchors(page: Path) -> set[str]:
@@ -27,22 +27,6 @@ def anchors(page: Path) -> set[str]:
     text = re.sub(r"^(```|~~~).*?^\1", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
-
-
-def modules(package: str) -> set[str]:
-    """A package's modules as `folder/name`, from the root."""
-    paths = ((ROOT / package).rglob("*.py")) if (ROOT / package).is_dir() else ()
-    return {str(path.relative_to(ROOT).with_suffix("")) for path in paths if not path.stem.startswith("__")}
-
-
-def mapped() -> set[str]:
-    """The modules in the tables of section "The rooms", as `folder/name`."""
-    rooms = MAP[MAP.index("## The rooms") : MAP.index("## Types that cross a border")]
-    found = set()
-    for folder, files in re.findall(r"^\| `([\w/]+)` \| (.*) \|$", rooms, re.MULTILINE):
-        for item in files.split("; "):
-            found |= {f"{folder}/{name}" for name in re.findall(r"`(\w+)`", item.partition(": ")[0])}
-    return found
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -66,12 +50,30 @@ def test_every_page_is_on_the_site():
         assert str(name.with_suffix("")) in listed, page.name
 
 
+@pytest.fixture
+def site_pages(monkeypatch):
+    """docs/site_pages.py, which makes parts of the site."""
+    pytest.importorskip("sphinx")
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    return import_module("site_pages")
+
+
 @pytest.mark.parametrize("package", PACKAGES)
-def test_the_map_names_every_module(package):
-    """A new module gets its line in "The rooms" of docs/architecture.md, and one that is gone loses it."""
-    written = {name for name in mapped() if name.split("/")[0] == package}
-    assert modules(package) - written == set(), "not in docs/architecture.md"
-    assert written - modules(package) == set(), "in docs/architecture.md, but there is no such module"
+def test_the_rooms_name_every_module(package, site_pages):
+    """Each folder and module is on the site's list by a sentence of its docstring, in one line."""
+    rooms = site_pages.rooms(package)
+    named = {f"{folder}/{name}" for folder, modules in rooms.items() for name in modules if name != "."}
+    paths = {path.relative_to(ROOT).with_suffix("").as_posix() for path in (ROOT / package).rglob("*.py")}
+    assert named == {path for path in paths if not path.endswith("__init__")}
+    assert not [(folder, name) for folder, modules in rooms.items() for name, says in modules.items() if not 10 < len(says) < 300]
+
+
+def test_the_page_of_rows_has_each_row(site_pages):
+    """Text is escaped; a browser finds group and verdict in the row."""
+    rows = kept_rows.read(ROOT / "docs" / "accuracy.csv")
+    page = site_pages.rows_page(rows)
+    assert page.count("<tr data-group=") == len(rows) and page.count('data-met="no"') == sum(row.met is False for row in rows)
+    assert "<td>&lt;= 0.05</td>" in page and all(f"<option>{row.group}</option>" in page for row in rows)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.name != "CHANGELOG.md"], ids=lambda page: page.name)
@@ -136,4 +138,6 @@ def test_the_site_builds_without_a_warning(tmp_path):
     done = subprocess.run([*command, str(tmp_path / "site")], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "site" / "index.html").is_file()
+    assert "<td>calibration</td>" in (tmp_path / "site" / "docs" / "accuracy-rows.html").read_text()
+    assert "<code" in (tmp_path / "site" / "docs" / "rooms.html").read_text()
     assert "wrapped_phase" in (tmp_path / "site" / "docs/reference/packages/recon/recon.structured_light.html").read_text()

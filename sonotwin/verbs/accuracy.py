@@ -1,8 +1,9 @@
 """Measure the errors of the twin and of the pipeline, beside their bars, the limits of physics and the paper's figures.
 
 Reads the rig and the pattern sequences from conf/, and real recordings where `real` names their folder. Writes GROUP.json into
-the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}, and figures; and the tables of the Markdown page
-that `document` names. Takes some minutes a group, and about an hour for tracking, for which a thousand pairs of frames are
+the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}, and figures. With `document=docs/accuracy.md` the
+group's rows are replaced in docs/accuracy.csv, with day and commit, and the page's table is made of all rows there by
+conf/bars/accuracy.yaml. Takes some minutes a group, and about an hour for tracking, for which a thousand pairs of frames are
 rendered, an hour for studies and three hours for sessions. Exit status 1 if a bar is missed.
 
     sonotwin accuracy only=optics
@@ -19,7 +20,7 @@ from recon.capture.surface_part import read_patterns
 from recon.errors import InputError
 from recon.model.rig import Part, Rig
 from sonotwin.config import folder
-from twin.accuracy import table_rows
+from twin.accuracy import kept_rows, table_rows
 from twin.conditions import Conditions
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
@@ -55,8 +56,9 @@ def run(config: Config) -> int:
     """
     groups = [config.only] if config.only else get_args(Group)
     if config.document:
-        for group in groups:
-            table_rows.check_place(config.document, group)
+        table_rows.check_place(config.document, kept_rows.MARK)
+        kept_rows.read(kept_rows.file_of(config.document))
+        choices()
     if config.real and not config.real.is_dir():
         raise InputError(f"accuracy: real: expected a folder of recordings, found none at {config.real}")
     config.out.mkdir(parents=True, exist_ok=True)
@@ -72,10 +74,15 @@ def run(config: Config) -> int:
             measured.append(row)
         table_rows.write(config.out / f"{group}.json", measured)
         if config.document:
-            table_rows.refresh(config.document, group, table_rows.table(measured, "limit"))
+            kept_rows.enter(config.document, choices(), group, measured)
         console.print(f"wrote {config.out / f'{group}.json'}", markup=False)
         met &= all(row.ok for row in measured)
     return 0 if met else 1
+
+
+def choices() -> list[kept_rows.Chosen]:
+    """Rows of the document's table, as conf/bars/accuracy.yaml has them."""
+    return kept_rows.read_choices(folder() / "bars" / "accuracy.yaml")
 
 
 def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> table_rows.Setup:

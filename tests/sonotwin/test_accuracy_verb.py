@@ -1,12 +1,15 @@
 """`sonotwin accuracy`: what it writes, its exit status, and what it refuses before it measures."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from sonotwin.cli import main
-from twin.accuracy import optics_accuracy
+from twin.accuracy import kept_rows, optics_accuracy
 from twin.accuracy.table_rows import Row
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -23,15 +26,31 @@ def quick(monkeypatch):
 
 @pytest.mark.parametrize(("value", "status"), [(0.01, 0), (0.09, 1)])
 def test_rows_are_written_and_missed_bars_told(quick, value, status, tmp_path, capsys):
-    """JSON and table hold the figure either way; the exit status says whether the bar was met."""
+    """JSON, file of rows and table hold the figure; rows of other groups stay; the exit status says whether the bar was met."""
     quick(value)
     page = tmp_path / "page.md"
-    page.write_text("<!-- optics -->\n<!-- /optics -->\n")
+    page.write_text("<!-- rows -->\n<!-- /rows -->\n")
+    others = kept_rows.read(ROOT / "docs" / "accuracy.csv")
+    kept_rows.write(page.with_suffix(".csv"), others)
     assert main(["accuracy", "only=optics", f"out={tmp_path / 'out'}", f"document={page}"]) == status
     (record,) = json.loads((tmp_path / "out" / "optics.json").read_text())
     assert (record["measured"], record["ok"]) == (value, status == 0)
-    assert f"| {value} |" in page.read_text()
+    first, *rest = kept_rows.read(page.with_suffix(".csv"))
+    assert (first.measured, first.met, first.what) == (value, status == 0, "an error")
+    assert str(rest) == str([row for row in others if row.group != "optics"])
+    assert (f"| an error | optics, row a | {value} mm | <= 0.05 |  |  | **no** |" in page.read_text()) == (status == 1)
     assert ("MISS" in capsys.readouterr().out) == (status == 1)
+
+
+def test_a_broken_file_of_rows_is_refused_first(quick, tmp_path, capsys):
+    """It would be replaced else, and its figures lost."""
+    quick(0.01)
+    page = tmp_path / "page.md"
+    page.write_text("<!-- rows -->\n<!-- /rows -->\n")
+    page.with_suffix(".csv").write_text("a,b\n1,2\n")
+    assert main(["accuracy", "only=optics", f"out={tmp_path / 'out'}", f"document={page}"]) == 2
+    assert "page.csv: line 1: expected group,id,what" in capsys.readouterr().err
+    assert page.with_suffix(".csv").read_text() == "a,b\n1,2\n" and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -107,27 +107,37 @@ def refresh(document: Path, group: str, text: str) -> None:
     InputError
         If the document has no place for it.
     """
+    enter(document, group, f"{measured_line(document.parent)}\n\n{text}")
+
+
+def enter(document: Path, group: str, text: str) -> None:
+    """Replace what stands between `<!-- GROUP -->` and `<!-- /GROUP -->` in a document; raises InputError as `refresh` does."""
     check_place(document, group)
     before = document.read_text(encoding="utf-8")
     place = re.compile(rf"(<!-- {group} -->\n).*?(<!-- /{group} -->)", re.DOTALL)
-    new = f"{measured_line(document.parent)}\n\n{text}"
     with atomic.new_file(document) as temporary:
-        temporary.write_text(place.sub(lambda match: f"{match[1]}\n{new}\n\n{match[2]}", before), encoding="utf-8")
+        temporary.write_text(place.sub(lambda match: f"{match[1]}\n{text}\n\n{match[2]}", before), encoding="utf-8")
 
 
 def measured_line(folder: Path) -> str:
-    """Date of today, UTC, and commit of the folder: `Measured 2026-01-31 at 1a2b3c4.`, `+changes` if other files than pages
-    differ from it.
+    """The state of a folder in a sentence: `Measured 2026-01-31 at 1a2b3c4.`; without a commit the date alone."""
+    day, commit = state(folder)
+    return f"Measured {day} at {commit}." if commit else f"Measured {day}."
 
-    Outside a git repository, or without git, the date alone.
+
+def state(folder: Path) -> tuple[str, str]:
+    """Date of today, UTC, and commit of the folder, with `+changes` if other files than pages and their rows differ from it.
+
+    Outside a git repository, or without git, the commit is empty.
     """
-    day = f"Measured {datetime.now(UTC):%Y-%m-%d}"
+    day = f"{datetime.now(UTC):%Y-%m-%d}"
+    written = (":(top,exclude,glob)**/*.md", ":(top,exclude)docs/*.csv")
     try:
         commit = _git(folder, "rev-parse", "--short=7", "HEAD")
-        changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", ":/", ":(top,exclude,glob)**/*.md")
+        changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", ":/", *written)
     except (OSError, subprocess.CalledProcessError):
-        return f"{day}."
-    return f"{day} at {commit}{'+changes' if changed else ''}."
+        return day, ""
+    return day, f"{commit}{'+changes' if changed else ''}"
 
 
 def _git(folder: Path, *arguments: str) -> str:

@@ -1,0 +1,1 @@
+"""Virtual devices and a virtual hand: the rig that a recording is tried on."""

@@ -112,9 +112,12 @@ def meanings(figures: Sequence[Figure]) -> list[str]:
 
 
 def markdown(compared: Sequence[Compared]) -> str:
-    """The table as Markdown."""
-    lines = [f"| {' | '.join(HEAD)} |", f"|{'---|' * len(HEAD)}"]
-    return "\n".join([*lines, *(f"| {' | '.join(cells(one))} |" for one in compared)])
+    """The table as Markdown, without the columns of limit and prediction where no figure has one."""
+    without = set() if any(one.figure.limit for one in compared) else {"limit of noise"}
+    without |= set() if any(one.figure.predicted for one in compared) else {"predicted for ours"}
+    rows = [HEAD, *(cells(one) for one in compared)]
+    head, *lines = [[cell for name, cell in zip(HEAD, row, strict=True) if name not in without] for row in rows]
+    return "\n".join([f"| {' | '.join(head)} |", f"|{'---|' * len(head)}", *(f"| {' | '.join(line)} |" for line in lines)])
 
 
 def _reported(figure: Figure) -> str:

@@ -93,11 +93,13 @@ def test_a_figure_that_the_paper_lacks_is_neither_met_nor_missed():
 
 
 def test_a_table_in_markdown_has_a_row_a_figure_and_point():
-    compared = beside_paper.compare([PLANES, RADIUS], DONE)
+    compared = beside_paper.compare([PLANES, RADIUS, KNOWN], DONE)
     head, line, *rows = beside_paper.markdown(compared).split("\n")
     assert [cell.strip() for cell in head.strip("|").split("|")] == list(beside_paper.HEAD) and set(line) == {"|", "-"}
     assert [[cell.strip() for cell in row[1:-1].split("|")] for row in rows] == [beside_paper.cells(one) for one in compared]
     assert len({row.count("|") for row in (head, line, *rows)}) == 1
+    alone = beside_paper.markdown(beside_paper.compare([RADIUS], DONE)).split("\n")
+    assert "limit" not in alone[0] and "predicted" not in alone[0] and {row.count("|") for row in alone} == {8}
 
 
 @pytest.mark.parametrize(
