@@ -33,10 +33,11 @@ def is_one_to_one(camera: Camera, margin: float = MARGIN) -> bool:
     points = ways[:, None] * np.linspace(0, REACH * farthest, STEPS)[:, None]
     seen = linearise(own, np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=-1).reshape(-1, 3), ())
     pixels, slopes = seen.pixels.reshape(points.shape), seen.by_point[:, :, :2].reshape(*points.shape, 2)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         outside = ((pixels < low) | (pixels > high)).any(axis=-1)
         outwards = np.einsum("dsi,di->ds", np.diff(pixels, axis=1), ways * focal) > 0
-        keeps = np.linalg.det(slopes) > LEAST_STRETCH * focal.prod()
+        area = slopes[..., 0, 0] * slopes[..., 1, 1] - slopes[..., 0, 1] * slopes[..., 1, 0]
+        keeps = area > LEAST_STRETCH * focal.prod()
     first = np.where(outside.any(axis=1), outside.argmax(axis=1), STEPS)
     before = np.arange(STEPS) < first[:, None]
     return bool(outside.any(axis=1).all() and (keeps | ~before).all() and (outwards | ~before[:, :-1]).all())
