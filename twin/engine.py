@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, model_validator
 
 from recon.errors import InputError
-from recon.model.rig import Part
+from recon.model.part import Part
 
 Result = TypeVar("Result")
 Work = Callable[..., Result]

@@ -8,12 +8,23 @@ from pathlib import Path
 
 @cache
 def code_digest(*places: str | Path) -> str:
-    """Digest of all files of packages, by their names, and of folders, but of compiled code: of their names and content."""
+    """Digest of all files of packages, by their names, and of folders, but of compiled code: of their names and content.
+
+    What editors and programs put beside a file while they write it doesn't count: hidden names, and names without an ending or
+    with a tilde after it.
+    """
     found = hashlib.sha256()
     for root in map(_folder, places):
-        for path in sorted(path for path in root.rglob("*") if path.is_file() and "__pycache__" not in path.parts):
+        for path in sorted(path for path in root.rglob("*") if path.is_file() and _counts(path.relative_to(root))):
             found.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes() + b"\0")
     return found.hexdigest()[:12]
+
+
+def _counts(name: Path) -> bool:
+    """Whether a file may be code, or what code reads."""
+    if any(part == "__pycache__" or part.startswith(".") for part in name.parts):
+        return False
+    return bool(name.suffix) and not name.name.endswith("~")
 
 
 def _folder(place: str | Path) -> Path:

@@ -57,22 +57,24 @@ def linearise(camera: Camera, points: Array, names: Sequence[str]) -> Linearised
     local = turned + camera.camera_from_world[:3, 3]
     tilts = _tilt_slopes(camera.distortion[12:]) if camera.distortion.size > 12 else UNTILTED
     device = _Device(camera.matrix, camera.coefficients, tilts, camera.camera_from_world[:3, :3])
-    pixels, by_point, by_parameter = _derivatives(np.ascontiguousarray(turned), local, device)
+    pixels, by_point, by_parameter = _derivatives(np.ascontiguousarray(turned), local, device, len(names) > 0)
+    if not names:
+        return Linearised(pixels, by_point, np.empty((len(pixels), 2, 0)))
     return Linearised(pixels, by_point, by_parameter[..., [PARAMETERS.index(name) for name in names]])
 
 
 @njit
-def _derivatives(turned, local, device):
+def _derivatives(turned, local, device, parameters):
     """Pixels : (m, 2) of points turned to the camera and moved to it, with their derivatives.
 
     Returns
     -------
-    The pixels, and their derivatives by the point : (m, 2, 3) and by all PARAMETERS : (m, 2, 24).
+    The pixels, and their derivatives by the point : (m, 2, 3) and, where asked for, by all PARAMETERS : (m, 2, 24).
     """
     fx, skew, fy = device.matrix[0, 0], device.matrix[0, 1], device.matrix[1, 1]
     turn, t = device.turn, device.coefficients[12:].copy().reshape((3, 3))
     m = len(local)
-    pixels, by_point, by_parameter = np.empty((m, 2)), np.empty((m, 2, 3)), np.zeros((m, 2, TURNS + 6))
+    pixels, by_point, by_parameter = np.empty((m, 2)), np.empty((m, 2, 3)), np.zeros((m if parameters else 0, 2, TURNS + 6))
     slopes, by_local, by_coefficient = np.empty((2, 2)), np.empty((2, 3)), np.zeros((12, 2))
     for i in range(m):
         a, b, c = turned[i]
@@ -93,6 +95,9 @@ def _derivatives(turned, local, device):
             by_local[j, 2] = -(x * by_local[j, 0] + y * by_local[j, 1])
             for k in range(3):
                 by_point[i, j, k] = by_local[j, 0] * turn[0, k] + by_local[j, 1] * turn[1, k] + by_local[j, 2] * turn[2, k]
+        if not parameters:
+            continue
+        for j in range(2):
             by_parameter[i, j, TURNS] = by_local[j, 2] * b - by_local[j, 1] * c  # a turn moves the point by unit x point
             by_parameter[i, j, TURNS + 1] = by_local[j, 0] * c - by_local[j, 2] * a
             by_parameter[i, j, TURNS + 2] = by_local[j, 1] * a - by_local[j, 0] * b

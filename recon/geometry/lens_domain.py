@@ -33,7 +33,7 @@ def is_one_to_one(camera: Camera, margin: float = MARGIN) -> bool:
     points = ways[:, None] * np.linspace(0, REACH * farthest, STEPS)[:, None]
     seen = linearise(own, np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=-1).reshape(-1, 3), ())
     pixels, slopes = seen.pixels.reshape(points.shape), seen.by_point[:, :, :2].reshape(*points.shape, 2)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         outside = ((pixels < low) | (pixels > high)).any(axis=-1)
         outwards = np.einsum("dsi,di->ds", np.diff(pixels, axis=1), ways * focal) > 0
         stretch = slopes[..., 0, 0] * slopes[..., 1, 1] - slopes[..., 0, 1] * slopes[..., 1, 0]

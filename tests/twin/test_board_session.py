@@ -16,9 +16,10 @@ from recon.errors import InputError
 from recon.files import atomic
 from recon.geometry import rigid
 from recon.geometry.circle_projection import centre_offsets
-from recon.model.patterns import Fringes, GrayCode, Patterns
+from recon.model.patterns import CentreLine, Fringes, Patterns
 from scenes import board_poses
 from scenes.kinds import board
+from tests.twin.small_rigs import shrunk
 from twin import board_session
 from twin.board_session import Settings
 from twin.conditions import BoardPrint, Conditions
@@ -31,12 +32,8 @@ from twin.session import TWIN, Session
 
 PATTERNS = Patterns(
     projector_size=(1280, 800),
-    unwrap="gray",
-    parts=tuple(
-        part
-        for axis in ("columns", "rows")
-        for part in (Fringes(axis=axis, pitch=18, steps=3), GrayCode(axis=axis, pitch=18, bits=7))
-    ),
+    unwrap="centre_line",
+    parts=tuple(part for axis in ("columns", "rows") for part in (CentreLine(axis=axis), Fringes(axis=axis, pitch=18, steps=3))),
 )
 DESCRIBED = {"seed": 3}
 
@@ -46,22 +43,21 @@ def traced(*scene):
     return np.stack([*board_session.trace_near(*scene)])
 
 
-def shrunk(device, times: int):
-    """A camera with fewer, larger pixels."""
-    optics = device.optics.model_copy(update={
-        "size": tuple(length // times for length in device.optics.size),
-        "focal_px": tuple(f / times for f in device.optics.focal_px),
-        "centre_px": tuple((c - (times - 1) / 2) / times for c in device.optics.centre_px),
-    })  # fmt: skip
-    return device.model_copy(update={"optics": optics})
+@pytest.fixture(autouse=True, scope="module")
+def few_paths():
+    """For pixels at the board's sides, which nothing here looks at closely."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(board_session, "SIDE_SAMPLES", 4)
+        yield
 
 
 @pytest.fixture(scope="module")
 def settings(rig) -> Settings:
+    """Two poses of a small board before cameras of few pixels."""
     small = rig.model_copy(update={"cam1": shrunk(rig.cam1, 4), "cam2": shrunk(rig.cam2, 4)})
-    chosen = board_poses.Config(count=3, margin_px=4, seed=6)
+    chosen = board_poses.Config(count=2, margin_px=4, seed=6)
     tracing, shooting = Tracing(samples=4, room_lux=20.0), Shooting()
-    return Settings(small, board.Config(), chosen, PATTERNS, ("cam1", "cam2"), tracing, shooting, seed=3)
+    return Settings(small, board.Config(rows=7), chosen, PATTERNS, ("cam1", "cam2"), tracing, shooting, seed=3)
 
 
 def run(out: Path, settings: Settings, stop_after: int | None = None) -> list[int]:
@@ -139,15 +135,17 @@ def test_a_stopped_session_goes_on(session, settings, tmp_path):
     """The poses that were there are kept, and the set is the same bytes as one rendered in one go."""
     run(tmp_path, settings, stop_after=1)
     assert not (tmp_path / "capture").exists()
-    assert run(tmp_path, settings) == [1, 2]
+    assert run(tmp_path, settings) == [1]
     assert digest(tmp_path) == digest(session)
 
 
-def test_other_settings_start_anew(settings, tmp_path):
+def test_other_settings_start_anew(session, settings, tmp_path):
     """Poses of one session never mix with another's."""
-    run(tmp_path, settings, stop_after=1)
-    assert board_session.missing_poses(Session(tmp_path, "board", DESCRIBED), settings) == [1, 2]
-    assert board_session.missing_poses(Session(tmp_path, "board", {"seed": 4}), settings) == [0, 1, 2]
+    begun, done = Session(tmp_path, "board", DESCRIBED), board_part.read_board(session / "capture").pose(0)
+    assert board_session.missing_poses(begun, settings) == [0, 1]
+    board_session.write_pose(begun, 0, done.lit, {"cam1": done.fringes})
+    assert board_session.missing_poses(begun, settings) == [1]
+    assert board_session.missing_poses(Session(tmp_path, "board", {"seed": 4}), settings) == [0, 1]
 
 
 def test_changed_settings_of_an_unfinished_run_are_named(settings, tmp_path):
@@ -171,7 +169,8 @@ def test_what_is_far_from_the_board_is_the_room(settings, aperture_mm):
     near = traced(stage, optics, light, settings.tracing, 5)
     whole = render(stage.world, optics, stage.projector, light, settings.tracing, 5)
     assert near.shape == whole.shape and (whole[-1] < whole[-1].max() / 50).mean() > 0.3
-    np.testing.assert_allclose(near, whole, rtol=1e-5)
+    apart = ~np.isclose(near, whole, rtol=1e-5, atol=0).all(axis=0)
+    assert apart.sum() <= 1  # a path that ends on an edge of the mesh may be taken for one in the neighbour's shadow
 
 
 def test_a_flat_board_throws_no_shadow(settings):
@@ -190,18 +189,19 @@ def test_a_flat_board_throws_no_shadow(settings):
 def test_a_board_of_life_is_seen_as_it_is_bent_in_its_pose(settings):
     """Discs far from their design, of another shape in each pose, lie where the truth says, to the noise of small discs."""
     errors = BoardPrint(place_mm=0.2, stretch=0.002, diameter_mm=0.1, bow_mm=1.0, flex_mm=0.5)
-    lively = replace(settings, conditions=Conditions(board=errors))
+    lively = replace(settings, cameras=("cam1",), conditions=Conditions(board=errors))
     stage, placed = board_session.set_up(lively), board_session.place_all(lively)
     exposures, truth = board_session.set_exposures(stage, lively), board_session.board_truth(lively, placed)
     design = board.design(lively.board)
     camera = calibration_of(lively.rig).cameras["cam1"]
-    for number in range(2):
-        lit, _ = board_session.shoot_pose(stage, lively, exposures, number, placed[number])
-        found = detect(lit["cam1"], design, full=255.0).pixels
-        offsets = centre_offsets(camera, placed[number], board.printed_centres(lively.bent(number)), 4.5)
-        off = found - offsets - truth["pixels"][number, :, 0]
-        flat = camera.project(rigid.apply(placed[number], design.points()))
-        assert np.nanmedian(np.abs(off)) < 0.02 < 0.1 < np.nanmedian(np.abs(found - offsets - flat))
+    number = 1
+    lit, _ = board_session.shoot_pose(stage, lively, exposures, number, placed[number])
+    found = detect(lit["cam1"], design, full=255.0).pixels
+    offsets = centre_offsets(camera, placed[number], board.printed_centres(lively.bent(number)), 4.5)
+    off = found - offsets - truth["pixels"][number, :, 0]
+    flat = camera.project(rigid.apply(placed[number], design.points()))
+    assert np.nanmedian(np.abs(off)) < 0.02 < 0.1 < np.nanmedian(np.abs(found - offsets - flat))
+    assert np.abs(board.printed_centres(lively.bent(0)) - board.printed_centres(lively.bent(1))).max() > 0.1
 
 
 def test_a_board_out_of_sight_leaves_the_room(settings):
@@ -265,7 +265,10 @@ def test_a_glossy_board_glares(settings):
 
 
 def test_an_old_session_is_replaced(session, settings, tmp_path):
+    """By one of a single pose and camera."""
     shutil.copytree(session, tmp_path / "again")
-    run(tmp_path / "again", replace(settings, seed=9))
+    run(tmp_path / "again", replace(settings, cameras=("cam1",), poses=settings.poses.model_copy(update={"count": 1}), seed=9))
     assert sorted(path.name for path in (tmp_path / "again").iterdir()) == ["capture", "truth"]
-    assert digest(tmp_path / "again" / "capture") != digest(session / "capture")
+    again, old = digest(tmp_path / "again" / "capture"), digest(session / "capture")
+    assert set(again) < set(old) and again != {name: old[name] for name in again}
+    assert not [name for name in again if name.endswith(".png") and again[name] == old[name]]

@@ -1,6 +1,6 @@
 """Accuracy with boards that bow and are printed imprecisely, against the best fixed choice, which is told their tolerances."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,8 +62,11 @@ def rows(setup: Setup) -> list[Row]:
     return [*rows, Row("a", f"{what}: points in their 95 % region", inside, 0.9, 0.95, "", at_least=True)]
 
 
-def each(rig: Rig, seed: int) -> Mapping[str, Calibrated]:
-    """One board, its poses and their noise, calibrated by default and by fixed choices of shape and lens."""
+def each(rig: Rig, seed: int, names: Collection[str] | None = None) -> Mapping[str, Calibrated]:
+    """One board, its poses and their noise, calibrated by default and by fixed choices of shape and lens.
+
+    names : of choices; all if not given
+    """
     rng, truth, design = np.random.default_rng([seed, 5]), calibration_of(rig), board.design(board.Config())
     bow, off = _bow(seed), PRINTS_MM[seed % len(PRINTS_MM)]
     points = misshapen(design.points(), bow, off, rng)
@@ -81,6 +84,7 @@ def each(rig: Rig, seed: int) -> Mapping[str, Calibrated]:
     return {
         name: judged(calibrate(seen.sightings, design, seen.sizes, settings).adjustment.calibration, truth)
         for name, settings in choices.items()
+        if names is None or name in names
     }
 
 

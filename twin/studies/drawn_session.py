@@ -5,6 +5,7 @@ detectors is the real software: the calibration of the optics, poses from six ci
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -30,7 +31,7 @@ from scenes.board_poses import random_poses
 from scenes.kinds import board, crosswire
 from twin import conditions
 from twin.accuracy.board_sets import drawn
-from twin.conditions import Conditions
+from twin.conditions import BoardPrint, Conditions
 from twin.optics.surface_session import calibration_of
 from twin.ultrasound.echo_solids import body
 from twin.ultrasound.probe_path import WirePath, about_crossing, crossing
@@ -182,15 +183,22 @@ def calibrated_optics(
 
 def calibrated_board(rig: Rig, life: Conditions, noise: Noise, chosen: Poses, seed: int, where: WorkingRange = PAPER) -> Result:
     """The same, with the board's observations."""
+    return _calibrated(rig, life.board, noise.board_px, max(noise.drawn.board, SOME), chosen, seed, where)
+
+
+@lru_cache(maxsize=8)  # trials of a seed differ in much that a board doesn't see
+def _calibrated(
+    rig: Rig, errors: BoardPrint, board_px: float, times: float, chosen: Poses, seed: int, where: WorkingRange
+) -> Result:
     truth, config = calibration_of(rig), where.board(board.Config())
     design = board.design(config)
     poses = random_poses(
         where.poses(chosen).model_copy(update={"seed": chosen.seed + seed}), design, list(truth.cameras.values())
     )
-    printed = conditions.printed_board(config, life.board, seed)
-    points = np.stack([board.printed_centres(conditions.flexed(printed, life.board, seed, k)) for k in range(chosen.count)])
-    claimed = {name: noise.board_px * (0.75 if name == "projector" else 1) for name in truth.cameras}
-    seen = drawn(truth, design, poses, claimed, np.random.default_rng([seed, 20]), points, max(noise.drawn.board, SOME))
+    printed = conditions.printed_board(config, errors, seed)
+    points = np.stack([board.printed_centres(conditions.flexed(printed, errors, seed, k)) for k in range(chosen.count)])
+    claimed = {name: board_px * (0.75 if name == "projector" else 1) for name in truth.cameras}
+    seen = drawn(truth, design, poses, claimed, np.random.default_rng([seed, 20]), points, times)
     return calibrate(seen.sightings, design, seen.sizes)
 
 

@@ -154,7 +154,8 @@ def run_trial(key: str, name: str, settings: Settings, seed: int) -> tuple[str, 
     """
     if digest(name, settings, seed) != key:
         raise InputError(
-            f"engine: expected workers with the code and the libraries of this machine, found others at {gethostname()}"
+            f"engine: expected workers with the code and the libraries of this machine, found others at {gethostname()}; "
+            "was code edited since the study began? start it again"
         )
     measure = experiment(name).measure
     try:

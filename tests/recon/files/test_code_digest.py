@@ -52,10 +52,14 @@ def test_other_code_has_another_digest(tmp_path, changes):
     assert digest(package(tmp_path)) == before
 
 
-def test_compiled_code_and_places_do_not_count(tmp_path):
-    """What Python and Numba keep in __pycache__, and the folder that a package lies in."""
+def test_compiled_code_leftovers_and_places_do_not_count(tmp_path):
+    """What Python and Numba keep in __pycache__, what editors and `sed` write beside, and the folder that a package lies in."""
     before = digest(package(tmp_path))
-    assert digest(package(tmp_path, **{"__pycache__/phase.pyc": "x", "deep/er/__pycache__/b.nbi": "1"})) == before
+    for names in (
+        ("__pycache__/phase.pyc", "deep/er/__pycache__/b.nbi"),
+        (".phase.py.swp", "phase.py~", "sedAbC123", ".cache/a.py"),
+    ):
+        assert digest(package(tmp_path, **dict.fromkeys(names, "x"))) == before
     assert digest(package(tmp_path / "elsewhere")) == before
     assert len(before) == 12 and int(before, 16) >= 0
 

@@ -8,7 +8,7 @@ def test_the_shape_of_a_bowed_board_is_found(rig):
 
     One set's errors: of 39 parameters within chi-square's 99.9 %, of points that err together by three numbers likewise.
     """
-    seed = next(k for k in range(10, 30) if k % 4 == 3 and k % 7 % 3 == 1)
-    found = board_accuracy.each(rig, seed)
-    assert found["default"].form_mm < 0.005 < 0.1 * found["the true lens, taken as designed"].form_mm
+    seed, flat = next(k for k in range(10, 30) if k % 4 == 3 and k % 7 % 3 == 0), "the true lens, taken as designed"
+    found = board_accuracy.each(rig, seed, ("default", flat))
+    assert found["default"].form_mm < 0.005 < 0.1 * found[flat].form_mm
     assert 0.4 < found["default"].parameters < 2 and found["default"].points < 5.4

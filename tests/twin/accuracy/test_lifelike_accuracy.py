@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recon.optical_calibration.joint_calibration import calibrate
+from recon.optical_calibration.joint_calibration import Settings, calibrate
 from twin.accuracy import lifelike_accuracy, plane_and_sphere
 from twin.accuracy.baselines import opencv_peer
 from twin.conditions import BoardPrint
@@ -20,9 +20,10 @@ def test_the_form_of_a_bowed_plane_is_its_bow(rng):
 def test_a_print_shows_in_the_reprojection_as_large_as_it_is(rig):
     """Dots 0.02 mm off in x and y are 0.14 px off at 660 mm; 88 draws scatter by 8 %, and poses and lens take as much."""
     seen = lifelike_accuracy.sighted(rig, BoardPrint(place_mm=0.02), 5)
-    observations = calibrate(seen.sightings, seen.board, seen.sizes).observations
+    brown = Settings(distortion="brown")  # which of the models is of no account here
+    observations = calibrate(seen.sightings, seen.board, seen.sizes, brown).observations
     expected = 0.02 * np.sqrt(2) * rig.cam1.optics.focal_px[0] / 660
     assert 0.75 * expected < opencv_peer.reprojection_rms(observations, "cam1") < 1.25 * expected
     exact = lifelike_accuracy.sighted(rig, BoardPrint(), 5)
-    observations = calibrate(exact.sightings, exact.board, exact.sizes).observations
+    observations = calibrate(exact.sightings, exact.board, exact.sizes, brown).observations
     assert opencv_peer.reprojection_rms(observations, "cam1") < 0.01

@@ -11,6 +11,7 @@ from recon.geometry.camera import Camera
 from recon.model.patterns import CentreLine, Fringes, Patterns
 from scenes.catalogue import build_scene
 from scenes.scene_types import Material, Scene, Thing
+from tests.twin.small_rigs import cropped
 from twin.accuracy import optics_accuracy
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import LUMENS_PER_WATT, Tracing, render
@@ -102,9 +103,9 @@ def test_defocus_lowers_the_modulation_as_a_disc_does(depth):
 
 @pytest.fixture(scope="module", params=["plane", "breast"])
 def renders(rig, request):
-    """Ours and Mitsuba's: the centre line and two fringe images at an eighth of the size, 2000 blocks of pixels."""
+    """Ours and Mitsuba's: the centre line and two fringe images at an eleventh of the size, 2000 blocks of pixels in all."""
     return optics_accuracy.both_renders(
-        rig, build_scene({"kind": request.param}), 0.125, samples=32, repeats=8, patterns=(0, 2, 5)
+        rig, build_scene({"kind": request.param}), 0.09, samples=32, repeats=8, patterns=(0, 2, 5)
     )
 
 
@@ -125,7 +126,7 @@ def test_one_per_cent_would_be_seen(renders):
 
 def test_interreflection_matches_mitsuba(rig):
     """In a white groove, light of four reflections is Mitsuba's, and clearly more than direct light."""
-    camera, projector = ideal_rig(rig, 0.125)
+    camera, projector = ideal_rig(rig, 0.0625)
     light = Light.of(optics_accuracy.paper_surface(projector.camera.size), rig.projector)
     world, peer_world = build_world(groove()), mitsuba_scene(groove(), camera, projector, 16)
     direct = render(world, CameraOptics.pinhole(camera), projector, light, Tracing(samples=64), 0)[3].mean()
@@ -142,8 +143,12 @@ def test_interreflection_matches_mitsuba(rig):
 
 
 def test_phase_error_of_the_renderer(rig):
-    """16 samples a pixel leave a phase error below 0.005 projector px on a noise-free plane, lenses and distortion included."""
-    row = optics_accuracy.phase_error(rig, samples=16)
+    """16 samples a pixel leave a phase error below 0.005 projector px on a noise-free plane, lenses and distortion included.
+
+    In a quarter of the image, from near a corner to the middle.
+    """
+    part = rig.model_copy(update={"cam1": cropped(rig.cam1, (640, 512), (100, 80))})
+    row = optics_accuracy.phase_error(part, samples=16)
     assert row.ok, row
 
 

@@ -15,6 +15,7 @@ from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes
 from recon.structured_light.phase import Noise, wrapped_phase
 from scenes.catalogue import build_scene
+from tests.twin.small_rigs import shrunk
 from twin.accuracy.optics_accuracy import paper_surface
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Tracing, render
@@ -28,13 +29,7 @@ from twin.session import Session, TruthFolder
 @pytest.fixture(scope="module")
 def small_rig(rig):
     """The rig with images of a quarter of the size."""
-    optics = rig.cam1.optics
-    small = optics.model_copy(update={
-        "size": (320, 256),
-        "focal_px": tuple(f / 4 for f in optics.focal_px),
-        "centre_px": tuple((c - 1.5) / 4 for c in optics.centre_px),
-    })  # fmt: skip
-    return rig.model_copy(update={"cam1": rig.cam1.model_copy(update={"optics": small})})
+    return rig.model_copy(update={"cam1": shrunk(rig.cam1, 4)})
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d, uniform_filter1d
-from scipy.optimize import least_squares
 
 from recon.geometry import rigid
 from recon.geometry.primitives import Plane
@@ -177,29 +176,33 @@ def test_points_of_a_plane_are_off_by_the_columns_noise(rig, shape, rng):
 def test_no_pose_is_better_than_its_bound_and_least_squares_reach_it(rig, tolerance_mm, rng):
     """Of 400 noisy views of targets printed to a tolerance: the covariance of poses, to 9 %.
 
-    A plain least-squares fit of pose and lengths, where the tolerance holds the lengths.
+    A plain least-squares fit of pose and lengths, where the tolerance holds the lengths: Gauss and Newton, all views at once.
     """
     target = rig.target.model_copy(update={"tolerance_mm": tolerance_mm})
     cameras = rig.cam1.optics.camera(), rig.cam2.optics.camera()
     sigma = np.array([[0.05, 0.1, 0.05], [0.1, 0.05, 0.2]])
     lengths, spread = circle_layout.lengths(target), circle_layout.length_covariance(target) + 1e-8 * np.eye(3)
     weight = np.linalg.inv(np.linalg.cholesky(spread))
-    errors = []
-    for _ in range(400):
-        off = rng.multivariate_normal(np.zeros(3), spread)
-        seen = [centres(camera, np.zeros(6), lengths + off) + sigmas[:, None] * rng.standard_normal((3, 2))
-                for camera, sigmas in zip(cameras, sigma, strict=True)]  # fmt: skip
+    off = rng.multivariate_normal(np.zeros(3), spread, 400)
 
-        def residuals(change, seen=seen):
-            views = [
-                (centres(camera, change[:6], lengths + change[6:]) - places) / sigmas[:, None]
-                for camera, places, sigmas in zip(cameras, seen, sigma, strict=True)
-            ]
-            return np.concatenate([*(view.ravel() for view in views), weight @ change[6:]])
+    def residuals(change, seen):
+        """Of changes : (n, 9) of pose and lengths, in standard deviations : (n, 15)."""
+        views = (centres(cameras, change[:, :6], lengths + change[:, 6:]) - seen) / sigma[:, None, :, None]
+        return np.concatenate([np.swapaxes(views, 0, 1).reshape(len(change), -1), change[:, 6:] @ weight.T], axis=1)
 
-        errors.append(least_squares(residuals, np.zeros(9), method="lm", x_scale=SCALE).x[:6])
+    exact = centres(cameras, np.zeros((400, 6)), lengths + off)
+    seen = exact + sigma[:, None, :, None] * rng.standard_normal(exact.shape)
+    found = np.zeros((400, 9))
+    for _ in range(6):
+        off_by = residuals(found, seen)
+        slope = np.stack([(residuals(found + step, seen) - off_by) / step.sum() for step in 1e-3 * np.diag(SCALE)], axis=-1)
+        found = (
+            found - np.linalg.solve(np.swapaxes(slope, 1, 2) @ slope, np.einsum("nri,nr->ni", slope, off_by)[..., None])[..., 0]
+        )
+    left = np.einsum("nri,nr->ni", slope, residuals(found, seen))
+    assert np.abs(left * np.sqrt(np.diag(np.linalg.inv(slope[0].T @ slope[0])))).max() < 1e-3  # it is the least
     bound = closed_forms.pose_covariance(cameras, POSE, target, sigma)
-    whitened = np.linalg.solve(np.linalg.cholesky(bound), np.transpose(errors))
+    whitened = np.linalg.solve(np.linalg.cholesky(bound), found[:, :6].T)
     assert np.linalg.eigvalsh(np.cov(whitened)) == pytest.approx(1, abs=0.35)
     assert np.mean(whitened**2) == pytest.approx(1, abs=0.09)
 
@@ -207,8 +210,12 @@ def test_no_pose_is_better_than_its_bound_and_least_squares_reach_it(rig, tolera
 SCALE = np.array([1e-4, 1e-4, 1e-4, 0.01, 0.01, 0.1, 0.1, 0.1, 0.1])
 
 
-def centres(camera, change, lengths) -> np.ndarray:
-    return camera.project(rigid.apply(rigid.moved(POSE, change), circle_layout.BY_LENGTH @ lengths))
+def centres(cameras, changes, lengths) -> np.ndarray:
+    """Pixels : (2, n, 3, 2) of circles in both cameras, of n changes of the pose and n sets of lengths."""
+    poses = rigid.moved(np.broadcast_to(POSE, (len(changes), 4, 4)), changes)
+    on_target = np.moveaxis(circle_layout.BY_LENGTH @ lengths.T, -1, 0)
+    points = on_target @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    return np.stack([camera.project(points) for camera in cameras])
 
 
 def test_a_larger_target_is_seen_to_turn_better(rig):

@@ -66,9 +66,21 @@ def rows_of(html: str) -> list[list[str]]:
     return [[unescape(re.sub("<.*?>", "", cell)) for cell in re.findall(r"<t[hd].*?</t[hd]>", row, flags=re.S)] for row in rows]
 
 
-def test_a_page_is_complete(tmp_path):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A study's folder with its page and plots."""
+    made = tmp_path_factory.mktemp("study")
+    written(made, DONE, shown(made, DONE))
+    return made
+
+
+@pytest.fixture
+def page(folder) -> str:
+    return (folder / study_page.PAGE).read_text(encoding="utf-8")
+
+
+def test_a_page_is_complete(folder, page):
     """Elements are closed, nothing is fetched, commands and titles are there, and words of people are no HTML."""
-    page = written(tmp_path, DONE, shown(tmp_path, DONE))
     balance = Balance()
     balance.feed(page)
     assert not balance.open and not balance.fetched
@@ -77,7 +89,7 @@ def test_a_page_is_complete(tmp_path):
         "Pitch & light",
         "12 of 12 trials gave figures.",
         "sonotwin study name=sweep 'over={a: [1, 2]}'",
-        f"pandas.read_parquet('{tmp_path / 'table.parquet'}')",
+        f"pandas.read_parquet('{folder / 'table.parquet'}')",
         "<h2>Error, mm</h2>",
         "<h2>Turn, deg</h2>",
     ):
@@ -85,17 +97,15 @@ def test_a_page_is_complete(tmp_path):
     assert "Points without figures" not in page
 
 
-def test_each_figure_is_drawn_over_each_factor_and_kept(tmp_path):
-    page = written(tmp_path, DONE, shown(tmp_path, DONE))
+def test_each_figure_is_drawn_over_each_factor_and_kept(folder, page):
     names = {f"{figure}_over_{field}.png" for figure in LIMITS for field in ("rig_pitch", "light")}
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == names
-    assert all((tmp_path / "figures" / name).read_bytes().startswith(b"\x89PNG") and f"figures/{name}" in page for name in names)
+    assert {path.name for path in (folder / "figures").iterdir()} == names
+    assert all((folder / "figures" / name).read_bytes().startswith(b"\x89PNG") and f"figures/{name}" in page for name in names)
     assert page.count("<svg") == 4
 
 
-def test_the_table_has_medians_a_point(tmp_path):
+def test_the_table_has_medians_a_point(page):
     """Over seeds; in brackets what they are held against, which plots and the caption name."""
-    page = written(tmp_path, DONE, shown(tmp_path, DONE))
     head, *rows = rows_of(page)
     assert head == ["pitch", "light", "trials", "error, mm", "turn, deg"]
     assert rows[:2] == [["6", "dim", "3", "12 (1.5)", "0.5"], ["6", "<bright>", "3", "12 (1.5)", "0.5"]] and len(rows) == 4
@@ -104,7 +114,7 @@ def test_the_table_has_medians_a_point(tmp_path):
 
 def test_points_without_figures_are_named(tmp_path):
     trials = [*DONE, done({"rig.pitch": 40, "light": "dim"}, "coverage: found none", 7)]
-    page = text(written(tmp_path, trials, shown(tmp_path, trials)))
+    page = text(written(tmp_path, trials, [study_page.points(trials, OF, study_page.NO_NAMES)]))
     assert "12 of 13 trials gave figures." in page and "rig.pitch=40, light=dim, seed=7: coverage: found none" in page
     assert rows_of(page)[-1][:3] == ["40", "dim", "1"]
 

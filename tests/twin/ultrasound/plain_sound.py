@@ -9,7 +9,7 @@ from recon.geometry import rigid
 from scenes.acoustics import Tissue
 from twin.ultrasound.beam import OVERSAMPLING, STEP_MM, Beam
 from twin.ultrasound.echo_field import BESIDE_MM, field_like
-from twin.ultrasound.echo_solids import Body, Wire
+from twin.ultrasound.echo_solids import Body, Solid, Wire
 from twin.ultrasound.medium import hashed
 from twin.ultrasound.sound_paths import GRADIENT_MM, Paths
 from twin.ultrasound.surface_echoes import ACROSS_MM, ALONG_MM, PATCH_MM, RINGS, SUBLINES, TAPER
@@ -20,12 +20,12 @@ MARCH_MM = 0.05  # between places where a ray's tissue is looked up
 
 def distances(body: Body, points: np.ndarray) -> np.ndarray:
     """Signed distances : (k, n) of points : (n, 3) to the solids; 1e3 outside their grids."""
-    return np.array(
-        [
-            map_coordinates(one.distance.astype(float), ((points - one.origin) / one.spacing).T, order=1, cval=1e3)
-            for one in body.solids
-        ]
-    )
+    return np.array([distance(one, points) for one in body.solids])
+
+
+def distance(one: Solid, points: np.ndarray) -> np.ndarray:
+    """Signed distances : (n,) of points : (n, 3) to a solid; 1e3 outside its grid."""
+    return map_coordinates(one.distance, ((points - one.origin) / one.spacing).T, output=float, order=1, cval=1e3)
 
 
 def labels(body: Body, points: np.ndarray) -> np.ndarray:
@@ -36,7 +36,10 @@ def labels(body: Body, points: np.ndarray) -> np.ndarray:
 
 def distance_to(body: Body, solids: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Signed distances : (n,), each to a solid of its own."""
-    return distances(body, points)[solids, np.arange(len(points))]
+    found = np.empty(len(points))
+    for k in np.unique(solids):
+        found[solids == k] = distance(body.solids[k], points[solids == k])
+    return found
 
 
 def normals(body: Body, solids: np.ndarray, points: np.ndarray) -> np.ndarray:
