@@ -52,7 +52,7 @@ def both(place: Path, killed: Killed, first: tuple[str, ...], rounds: int) -> li
         folder = Path(name)
         sources.lay_out(folder, place, killed.folders)
         alone = []
-        for line in (first, killed.then):
+        for line in dict.fromkeys((first, killed.then)):
             outcome = commands.run((*line[:-1], f"out=alone{len(alone)}"), folder, LONGEST_S)
             if outcome.status:
                 raise RuntimeError(f"sonotwin {' '.join(line)}: {outcome.said}")

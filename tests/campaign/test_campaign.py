@@ -22,7 +22,7 @@ from campaign import (
 from campaign.sources import COMMANDS
 
 NAMES = {"ball", "scan", "skin", "volume"}
-COUNT = 70
+COUNT = 28  # two of each verb
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,8 @@ def test_mistakes_are_made_and_judged(place, tmp_path):
 
 @pytest.mark.slow
 def test_killed_commands_lose_nothing(place):
-    tallies = kills.run(place, moments=4, seed=3, workers=1, only=["surface", "sweep"])
+    """One that replaces a folder, by both signals; `reconstruct`, which goes on with its own, and recordings have theirs."""
+    tallies = kills.run(place, moments=3, seed=3, workers=1, only=["sweep"])
     assert all(tally.good for tally in tallies), tallies
 
 
@@ -88,8 +89,8 @@ def test_two_writers_dont_mix(place):
 @pytest.mark.slow
 def test_readers_survive_some_fuzzing(place):
     pytest.importorskip("atheris")
-    found = fuzzing.run(place, 600, only=["manifest", "track", "image"], workers=1, inputs=5000)
-    assert all(one.inputs >= 5000 and not one.faults for one in found), found
+    found = fuzzing.run(place, 600, only=["manifest", "image"], workers=1, inputs=2000)
+    assert all(one.inputs >= 2000 and not one.faults for one in found), found
 
 
 @pytest.mark.slow

@@ -319,7 +319,7 @@ def test_tables_are_the_same_bytes_from_any_number_of_threads(tmp_path):
     for count in ("1", "2"):
         threads = dict.fromkeys(("NUMBA_NUM_THREADS", "SONOTWIN_THREADS", "OMP_NUM_THREADS"), count)
         kept = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
-        fields = ["name=sweep", *SMALL, "over={noise.board_px: [0.004, 0.008]}", "seeds=1", f"out={tmp_path / count}"]
+        fields = ["name=sweep", *SMALL, "over={noise.board_px: [0.008]}", "seeds=1", f"out={tmp_path / count}"]
         subprocess.run([*COMMAND, *fields], env=kept | threads, check=True, capture_output=True)
         tables.append((tmp_path / count / "table.parquet").read_bytes())
     assert tables[0] == tables[1]

@@ -1,7 +1,5 @@
 """Are outlines drawn on the skin where they are, through projector, skin and camera; and does the measurement see it if not?"""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -17,10 +15,12 @@ def true_skin():
     return next(thing.mesh for thing in build_scene(light.BREAST).things if not thing.inside)
 
 
-def test_on_the_true_skin_light_lies_on_the_true_outlines(rig, true_skin):
-    """What is left is the camera's noise and half a pixel of the projector, 0.2 mm."""
-    errors = light.drawn(Setup(rig, {}), light.BREAST, true_skin, light.tumours(light.BREAST), None, "test")
+def test_on_the_true_skin_light_lies_on_the_true_outlines(rig, true_skin, tmp_path):
+    """What is left is the camera's noise and half a pixel of the projector, 0.2 mm. A picture is kept."""
+    setup = Setup(rig, {}, out=tmp_path)
+    errors = light.drawn(setup, light.BREAST, true_skin, light.tumours(light.BREAST), None, "test")
     assert np.median(errors.all) < 0.1 and np.quantile(errors.all, 0.95) < 0.2
+    assert (tmp_path / "live_skin_test.png").is_file()
 
 
 def test_a_projector_that_stands_elsewhere_is_noticed(rig, true_skin):
@@ -33,9 +33,3 @@ def test_a_projector_that_stands_elsewhere_is_noticed(rig, true_skin):
     picture = light.picture_of(off, true_skin, light.tumours(light.BREAST), None)
     errors = light.compared(Setup(rig, {}), light.BREAST, picture, "test")
     assert 0.3 < np.median(errors.all) < 1.0
-
-
-def test_figures_are_written_where_there_is_a_folder(rig, true_skin, tmp_path):
-    setup = replace(Setup(rig, {}), out=tmp_path)
-    light.drawn(setup, light.BREAST, true_skin, light.tumours(light.BREAST), light.EYE_MM, "test")
-    assert (tmp_path / "live_skin_test.png").is_file()
