@@ -77,8 +77,8 @@ usage: sonotwin VERB [field=value ...]
 {verbs}
 
 Fields and their defaults are in conf/VERB.yaml, shown by `sonotwin VERB --help`; nested ones are written with dots, and
-group=choice takes another file of a group: `rig=meza2021 rig.projector.gamma=1.0`. In a shell, put a path with blanks in
-quotes: `sonotwin surface "out=outputs/my run"`.
+group=choice takes another file of a group, or one of your own, which may begin with `defaults: [meza2021]`:
+`rig=ours.yaml rig.projector.gamma=1.0`. In a shell, put a path with blanks in quotes: `sonotwin surface "out=outputs/my run"`.
 """
 
 
