@@ -1,24 +1,33 @@
-"""From YAML files and overrides on the command line to a verb's validated `Config`.
+"""From defaults, YAML files and overrides on the command line to a verb's validated `Config`.
 
-The files are those of `conf/`: `conf/VERB.yaml` has a verb's fields, and each folder beside it is a group of choices. Hydra
-composes them; pydantic validates what comes out; the mistakes that either finds become one line each.
+A verb's fields, defaults, bounds and texts stand once, in its `Config`, from where Hydra's ConfigStore gets them; each folder
+of `conf/` is a group of choices. Hydra composes both; pydantic validates what comes out; the mistakes that either finds become
+one line each.
 """
 
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from textwrap import wrap
 from types import UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeGuard, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import to_jsonable_python
 
 from recon.errors import InputError, brief, did_you_mean, one_line, short
 from recon.files import yaml_text
 
 OF_ONE_VERB = {"devices/virtual": "record"}  # choices of a group that only this verb takes
+NEEDED = "???"  # Hydra's mark of a field that needs a value
+BESIDE, WIDTH = 26, 100  # columns before the descriptions of fields in a verb's help, and of these
 MOST_NAMES = 12  # of keys in a message
 MOST_DIGITS = 1000  # of a number; Hydra's parser can't take more than Python's own limit of some thousands
 Model = TypeVar("Model", bound=BaseModel)
@@ -31,15 +40,101 @@ def folder() -> Path:
     return inside if inside.is_dir() else package.parent / "conf"
 
 
-def groups(verb: str) -> dict[str, list[str]]:
-    """Name the choices of each group that the verb's defaults list uses and that it takes, such as `{"rig": ["meza2021"]}`."""
+@dataclass(frozen=True)
+class Choice:
+    """Marks a field of a verb's `Config` as a group of conf/: the usual choice in it, None for none."""
+
+    name: str | None
+
+
+def primary(verb: str) -> dict[str, Any]:
+    """What a verb starts from: its fields' defaults, ??? where a value is needed, and the list of its choices, as Hydra has them.
+
+    They are those of the verb's `Config`, or stand in conf/VERB.yaml; of a verb that has neither there are none.
+    """
     import yaml
 
     path = folder() / f"{verb}.yaml"
-    if not path.is_file():
+    if path.is_file():
+        return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    model = fields_of(verb)
+    if model is None:
         return {}
-    defaults = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("defaults", [])
-    entries = [key for entry in defaults if isinstance(entry, dict) for key in entry]
+    choices = [{name: choice.name} for name, field in model.model_fields.items() if (choice := _choice(field)) is not None]
+    values = {name: _plain(field) for name, field in model.model_fields.items() if _choice(field) is None}
+    return ({"defaults": [*choices, "_self_"]} if choices else {}) | values
+
+
+def fields_of(verb: str) -> type[BaseModel] | None:
+    """The verb's `Config`, None of what is no verb."""
+    name = f"sonotwin.verbs.{verb.replace('-', '_')}"
+    return import_module(name).Config if find_spec(name) is not None else None
+
+
+def shown(verb: str) -> str:
+    """A verb's fields in YAML with their units and reasons, as its help shows them: what needs a value first."""
+    path = folder() / f"{verb}.yaml"
+    if path.is_file():
+        return "\n".join(line for line in path.read_text(encoding="utf-8").splitlines() if line != f"# {path.name}")
+    model = fields_of(verb)
+    return "" if model is None else "\n".join(_shown(model, {}, ""))
+
+
+def _shown(model: type[BaseModel], values: Mapping[str, Any], before: str) -> Iterator[str]:
+    """Lines of a model's fields, by their values where they differ from its own defaults."""
+    fields = model.model_fields
+    choices = {name: choice for name, field in fields.items() if (choice := _choice(field)) is not None}
+    if choices:
+        yield "defaults:"
+        yield from (_beside(f"  - {name}: {choice.name or 'null'}", fields[name].description) for name, choice in choices.items())
+    plain = {name: values.get(name, _plain(field)) for name, field in fields.items() if name not in choices}
+    for name in sorted(plain, key=lambda name: plain[name] != NEEDED):
+        value, inner = plain[name], [one for one in _plain_types(fields[name].annotation) if _is_model(one)]
+        if isinstance(value, dict) and len(inner) == 1 and value:
+            yield _beside(f"{before}{name}:", fields[name].description)
+            yield from _shown(inner[0], value, f"{before}  ")
+            continue
+        if isinstance(value, dict) and len(_flow(value)) > WIDTH:
+            yield _beside(f"{before}{name}:", fields[name].description)
+            yield from (f"{before}  {key}: {_flow(each)}" for key, each in value.items())
+        else:
+            yield _beside(f"{before}{name}: {_flow(value)}", fields[name].description)
+
+
+def _flow(value: Any) -> str:
+    """A value in one line of YAML."""
+    import yaml
+
+    if value in ("", NEEDED):
+        return value or '""'
+    return yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000).removesuffix("...\n").strip()
+
+
+def _beside(field: str, text: str | None) -> str:
+    """A field with its description beside it, broken into lines."""
+    if not text:
+        return field
+    lines = wrap(" ".join(text.split()), WIDTH)
+    first, *others = lines if len(field) < BESIDE else ["", *lines]
+    return "\n".join([f"{field:{BESIDE}}# {first}".rstrip(" #"), *(f"{'':{BESIDE}}# {line}" for line in others)])
+
+
+def _choice(field: FieldInfo) -> Choice | None:
+    return next((one for one in field.metadata if isinstance(one, Choice)), None)
+
+
+def _plain(field: FieldInfo) -> Any:
+    """A field's default in plain values; of a model that needs some values, its own fields'."""
+    if not field.is_required():
+        return to_jsonable_python(field.get_default(call_default_factory=True))
+    if _is_model(field.annotation):
+        return {name: _plain(inner) for name, inner in field.annotation.model_fields.items()}
+    return NEEDED
+
+
+def groups(verb: str) -> dict[str, list[str]]:
+    """Name the choices of each group that the verb's defaults list uses and that it takes, such as `{"rig": ["meza2021"]}`."""
+    entries = [key for entry in primary(verb).get("defaults", []) if isinstance(entry, dict) for key in entry]
     names = [re.sub(r"^(override |optional )*/?|@.*$", "", entry) for entry in entries]
     found = {name: sorted(choice.stem for choice in (folder() / name).glob("*.yaml")) for name in names}
     return {name: [one for one in given if OF_ONE_VERB.get(f"{name}/{one}", verb) == verb] for name, given in found.items()}
@@ -51,7 +146,7 @@ def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
     Parameters
     ----------
     verb : str
-        Names `conf/VERB.yaml`; a verb without that file starts from no fields.
+        Names the fields that are composed; without any it starts from none.
     overrides : sequence of str
         Hydra's `field=value`, `group=choice`, `+new=value`, `~field`. A choice is a name in `conf/GROUP`, or the path of a YAML
         file of one's own with the same fields. A value that isn't in Hydra's grammar, such as a path
@@ -82,17 +177,20 @@ def _source(verb: str, overrides: Sequence[str], field: str) -> str:
 
 
 def compose(verb: str, overrides: Sequence[str], model: type[BaseModel] | None = None) -> dict[str, Any]:
-    """Compose `conf/VERB.yaml` with the overrides into a plain, resolved dictionary; raises InputError as `load` does.
+    """Compose a verb's fields with the overrides into a plain, resolved dictionary; raises InputError as `load` does.
 
     The model, where one is given, has the maps that take any names, and things of several kinds, of which another may be given.
     """
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
+    from hydra.core.config_store import ConfigStore
     from hydra.errors import ConfigCompositionException, MissingConfigException
     from omegaconf import MissingMandatoryValue, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    name = verb if (folder() / f"{verb}.yaml").is_file() else None
+    name = verb if primary(verb) else None
+    if name and not (folder() / f"{verb}.yaml").is_file():
+        ConfigStore.instance().store(name=verb, node=primary(verb))
     plain = [override for override in overrides if override.partition("=")[0] in _fields_named_like_groups(verb)]
     files = {k: file for k, override in enumerate(overrides) if (file := _own_choice(verb, override)) is not None}
     with TemporaryDirectory() if files else nullcontext("") as own, initialize_config_dir(str(folder()), version_base=None):
@@ -225,11 +323,7 @@ def _check_choice(verb: str, override: str) -> None:
 
 def _fields_named_like_groups(verb: str) -> set[str]:
     """Fields of a verb that share a group's name without being choices of it: Hydra would take `patterns=FILE` for a choice."""
-    import yaml
-
-    path = folder() / f"{verb}.yaml"
-    fields = yaml.safe_load(path.read_text(encoding="utf-8")) or {} if path.is_file() else {}
-    return {field for field in fields if (folder() / field).is_dir()} - set(groups(verb))
+    return {field for field in primary(verb) if (folder() / field).is_dir()} - set(groups(verb))
 
 
 def _plain_value(verb: str, field: str, value: str) -> object:
@@ -318,7 +412,7 @@ def _tags(model: type[BaseModel]) -> dict[str, tuple[Any, ...]]:
     return {name: get_args(one) for name, one in annotations.items() if get_origin(one) is Literal and len(get_args(one)) == 1}
 
 
-def _is_model(one: Any) -> bool:
+def _is_model(one: Any) -> TypeGuard[type[BaseModel]]:
     return isinstance(one, type) and issubclass(one, BaseModel)
 
 

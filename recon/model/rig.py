@@ -28,7 +28,7 @@ FOCAL_TOLERANCE = 0.05  # a lens's nominal focal length against the calibrated o
 class Part(BaseModel):
     """Base of settings and files' records: immutable, refuses unknown keys, and numbers that are endless or beyond reason."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
     @field_validator("*")
     @classmethod
