@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-from recon.capture import surface_part
 from recon.errors import InputError, did_you_mean, short, validated
-from recon.files import yaml_text
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 from sonotwin import config
@@ -16,7 +14,7 @@ def read_rig(source: str | Path = "meza2021") -> Rig:
     Parameters
     ----------
     source : str or Path
-        A name from `conf/rig`, or the path of a YAML file with the same fields.
+        A name from `conf/rig`, or the path of a YAML file with the same fields, or that starts from one: `defaults: [meza2021]`.
 
     Raises
     ------
@@ -24,12 +22,13 @@ def read_rig(source: str | Path = "meza2021") -> Rig:
         If there is no such file, it is not YAML, or a field is wrong.
     """
     path = file_of("rig", source)
-    return validated(Rig, yaml_text.read(path), path)
+    return validated(Rig, config.read_choice("rig", path), path)
 
 
 def read_patterns(source: str | Path = "paper_surface") -> Patterns:
     """Read a pattern sequence, by a name from `conf/patterns` or by the path of a YAML file; raises as `read_rig` does."""
-    return surface_part.read_patterns(file_of("patterns", source))
+    path = file_of("patterns", source)
+    return validated(Patterns, config.read_choice("patterns", path), path)
 
 
 def file_of(group: str, source: str | Path, field: str = "") -> Path:

@@ -76,9 +76,9 @@ usage: sonotwin VERB [field=value ...]
 
 {verbs}
 
-Fields and their defaults are in conf/VERB.yaml, shown by `sonotwin VERB --help`; nested ones are written with dots, and
-group=choice takes another file of a group: `rig=meza2021 rig.projector.gamma=1.0`. In a shell, put a path with blanks in
-quotes: `sonotwin surface "out=outputs/my run"`.
+`sonotwin VERB --help` shows a verb's fields with their defaults; nested ones are written with dots, and
+group=choice takes another file of a group, or one of your own, which may begin with `defaults: [meza2021]`:
+`rig=ours.yaml rig.projector.gamma=1.0`. In a shell, put a path with blanks in quotes: `sonotwin surface "out=outputs/my run"`.
 """
 
 
@@ -182,17 +182,19 @@ def _find(name: str) -> Verb:
 
 
 def _help(verb: Verb) -> str:
-    """Give the verb's docstring, its YAML and the choices of its groups, read without importing the verb."""
+    """Give the verb's docstring, its fields and the choices of its groups; a verb without fields isn't imported."""
     spec = find_spec(verb.module)
     if spec is None or spec.origin is None:
         raise InputError(f"{verb.name}: this installation lacks {verb.module}")
-    text = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or verb.summary
+    module = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
+    text = ast.get_docstring(module) or verb.summary
     parts = [f"usage: sonotwin {verb.name} [field=value ...]", text]
+    settings = next((node for node in module.body if isinstance(node, ast.ClassDef) and node.name == "Config"), None)
+    if settings is not None and not any(isinstance(node, ast.AnnAssign) for node in settings.body):
+        return "\n\n".join(parts)
     from sonotwin import config
 
-    path = config.folder() / f"{verb.name}.yaml"
-    if path.is_file():
-        parts.append(f"{path}:\n\n" + "".join(f"  {line}\n" for line in path.read_text(encoding="utf-8").splitlines()).rstrip())
+    parts.append("fields:\n\n" + "\n".join(f"  {line}".rstrip() for line in config.shown(verb.name).splitlines()))
     choices = config.groups(verb.name)
     if choices:
         parts.append("choices:\n\n" + "\n".join(f"  {group}={'|'.join(names)}" for group, names in choices.items()))

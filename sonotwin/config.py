@@ -1,25 +1,35 @@
-"""From YAML files and overrides on the command line to a verb's validated `Config`.
+"""From defaults, YAML files and overrides on the command line to a verb's validated `Config`.
 
-The files are those of `conf/`: `conf/VERB.yaml` has a verb's fields, and each folder beside it is a group of choices. Hydra
-composes them; pydantic validates what comes out; the mistakes that either finds become one line each.
+A verb's fields, defaults, bounds and texts stand once, in its `Config`, from where Hydra's ConfigStore gets them; each folder
+of `conf/` is a group of choices. Hydra composes both; pydantic validates what comes out; the mistakes that either finds become
+one line each.
 """
 
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
+from dataclasses import dataclass
 from functools import cache, lru_cache
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from textwrap import wrap
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeGuard, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import to_jsonable_python
 
 from recon.errors import InputError, brief, did_you_mean, one_line, short
 from recon.files import yaml_text
 
 OF_ONE_VERB = {"devices/virtual": "record"}  # choices of a group that only this verb takes
+NEEDED = "???"  # Hydra's mark of a field that needs a value
+BESIDE, WIDTH = 26, 100  # columns before the descriptions of fields in a verb's help, and of these
 MOST_NAMES = 12  # of keys in a message
 MOST_DIGITS = 1000  # of a number; Hydra's parser can't take more than Python's own limit of some thousands
 Model = TypeVar("Model", bound=BaseModel)
@@ -32,25 +42,114 @@ def folder() -> Path:
     return inside if inside.is_dir() else package.parent / "conf"
 
 
+@dataclass(frozen=True)
+class Choice:
+    """Marks a field of a verb's `Config` as a group of conf/: the usual choice in it, None for none."""
+
+    name: str | None
+
+
+def primary(verb: str) -> dict[str, Any]:
+    """What a verb starts from: its fields' defaults, ??? where a value is needed, and the list of its choices, as Hydra has them.
+
+    They are those of the verb's `Config`, or stand in conf/VERB.yaml; of a verb that has neither there are none.
+    """
+    path = folder() / f"{verb}.yaml"
+    return _parsed(path.read_text(encoding="utf-8")) if path.is_file() else _primary(verb)
+
+
+@cache
+def _parsed(text: str) -> dict[str, Any]:
+    """Fields of a YAML text of `conf`, parsed once, though each override asks for them; not to be changed."""
+    import yaml
+
+    return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {}
+
+
+@cache
+def _primary(verb: str) -> dict[str, Any]:
+    """What a verb starts from, by its `Config`; not to be changed."""
+    model = fields_of(verb)
+    if model is None:
+        return {}
+    choices = [{name: choice.name} for name, field in model.model_fields.items() if (choice := _choice(field)) is not None]
+    values = {name: _plain(field) for name, field in model.model_fields.items() if _choice(field) is None}
+    return ({"defaults": [*choices, "_self_"]} if choices else {}) | values
+
+
+def fields_of(verb: str) -> type[BaseModel] | None:
+    """The verb's `Config`, None of what is no verb."""
+    name = f"sonotwin.verbs.{verb.replace('-', '_')}"
+    return import_module(name).Config if find_spec(name) is not None else None
+
+
+def shown(verb: str) -> str:
+    """A verb's fields in YAML with their units and reasons, as its help shows them: what needs a value first."""
+    path = folder() / f"{verb}.yaml"
+    if path.is_file():
+        return "\n".join(line for line in path.read_text(encoding="utf-8").splitlines() if line != f"# {path.name}")
+    model = fields_of(verb)
+    return "" if model is None else "\n".join(_shown(model, {}, ""))
+
+
+def _shown(model: type[BaseModel], values: Mapping[str, Any], before: str) -> Iterator[str]:
+    """Lines of a model's fields, by their values where they differ from its own defaults."""
+    fields = model.model_fields
+    choices = {name: choice for name, field in fields.items() if (choice := _choice(field)) is not None}
+    if choices:
+        yield "defaults:"
+        yield from (_beside(f"  - {name}: {choice.name or 'null'}", fields[name].description) for name, choice in choices.items())
+    plain = {name: values.get(name, _plain(field)) for name, field in fields.items() if name not in choices}
+    for name in sorted(plain, key=lambda name: plain[name] != NEEDED):
+        value, inner = plain[name], [one for one in _plain_types(fields[name].annotation) if _is_model(one)]
+        if isinstance(value, dict) and len(inner) == 1 and value:
+            yield _beside(f"{before}{name}:", fields[name].description)
+            yield from _shown(inner[0], value, f"{before}  ")
+            continue
+        if isinstance(value, dict) and len(_flow(value)) > WIDTH:
+            yield _beside(f"{before}{name}:", fields[name].description)
+            yield from (f"{before}  {key}: {_flow(each)}" for key, each in value.items())
+        else:
+            yield _beside(f"{before}{name}: {_flow(value)}", fields[name].description)
+
+
+def _flow(value: Any) -> str:
+    """A value in one line of YAML."""
+    import yaml
+
+    if value in ("", NEEDED):
+        return value or '""'
+    return yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000).removesuffix("...\n").strip()
+
+
+def _beside(field: str, text: str | None) -> str:
+    """A field with its description beside it, broken into lines."""
+    if not text:
+        return field
+    lines = wrap(" ".join(text.split()), WIDTH)
+    first, *others = lines if len(field) < BESIDE else ["", *lines]
+    return "\n".join([f"{field:{BESIDE}}# {first}".rstrip(" #"), *(f"{'':{BESIDE}}# {line}" for line in others)])
+
+
+def _choice(field: FieldInfo) -> Choice | None:
+    return next((one for one in field.metadata if isinstance(one, Choice)), None)
+
+
+def _plain(field: FieldInfo) -> Any:
+    """A field's default in plain values; of a model that needs some values, its own fields'."""
+    if not field.is_required():
+        return to_jsonable_python(field.get_default(call_default_factory=True))
+    if _is_model(field.annotation):
+        return {name: _plain(inner) for name, inner in field.annotation.model_fields.items()}
+    return NEEDED
+
+
 def groups(verb: str) -> dict[str, list[str]]:
     """Name the choices of each group that the verb's defaults list uses and that it takes, such as `{"rig": ["meza2021"]}`."""
-    defaults = _own_fields(verb).get("defaults", [])
-    entries = [key for entry in defaults if isinstance(entry, dict) for key in entry]
+    entries = [key for entry in primary(verb).get("defaults", []) if isinstance(entry, dict) for key in entry]
     names = [re.sub(r"^(override |optional )*/?|@.*$", "", entry) for entry in entries]
     found = {name: sorted(choice.stem for choice in (folder() / name).glob("*.yaml")) for name in names}
     return {name: [one for one in given if OF_ONE_VERB.get(f"{name}/{one}", verb) == verb] for name, given in found.items()}
-
-
-def defaults(verb: str) -> dict[str, Any]:
-    """The fields of a verb as they are without overrides; `???` where one needs a value."""
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
-    from omegaconf import OmegaConf
-
-    with initialize_config_dir(str(folder()), version_base=None):
-        found = OmegaConf.to_container(hydra_compose(verb), resolve=True)
-    assert isinstance(found, dict)
-    return {str(key): value for key, value in found.items()}
 
 
 def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
@@ -59,7 +158,7 @@ def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
     Parameters
     ----------
     verb : str
-        Names `conf/VERB.yaml`; a verb without that file starts from no fields.
+        Names the fields that are composed; without any it starts from none.
     overrides : sequence of str
         Hydra's `field=value`, `group=choice`, `+new=value`, `~field`. A choice is a name in `conf/GROUP`, or the path of a YAML
         file of one's own with the same fields. A value that isn't in Hydra's grammar, such as a path
@@ -72,20 +171,33 @@ def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
     InputError
         One line that names the verb, the field, what was expected and what was found.
     """
-    composed = compose(verb, overrides)
+    composed = compose(verb, overrides, model)
     try:
         return model.model_validate(composed, context={"overrides": overrides})
     except ValidationError as error:
-        raise InputError(f"{verb}: {describe(error, model)}") from error
+        text = describe(error, model)
+        raise InputError(f"{_source(verb, overrides, text.partition(':')[0])}: {text}") from error
 
 
-def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
-    """Compose `conf/VERB.yaml` with the overrides into a plain, resolved dictionary; raises InputError as `load` does."""
+def _source(verb: str, overrides: Sequence[str], field: str) -> str:
+    """Where a field's value came from: the file of a choice of one's own, or else the verb's fields."""
+    group = field.partition(".")[0]
+    if any(override.lstrip("+~").startswith(f"{group}.") for override in overrides):
+        return verb
+    files = {key.rpartition("@")[2]: path for key, path in filter(None, (_own_choice(verb, each) for each in overrides))}
+    return str(files.get(group, verb))
+
+
+def compose(verb: str, overrides: Sequence[str], model: type[BaseModel] | None = None) -> dict[str, Any]:
+    """Compose a verb's fields with the overrides into a plain, resolved dictionary; raises InputError as `load` does.
+
+    The model, where one is given, has the maps that take any names, and things of several kinds, of which another may be given.
+    """
     from hydra.errors import ConfigCompositionException, MissingConfigException
     from omegaconf import MissingMandatoryValue, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    name = verb if (folder() / f"{verb}.yaml").is_file() else None
+    name = verb if primary(verb) else None
     plain = [override for override in overrides if override.partition("=")[0] in _fields_named_like_groups(verb)]
     files = {k: file for k, override in enumerate(overrides) if (file := _own_choice(verb, override)) is not None}
     with TemporaryDirectory() if files else nullcontext("") as own:
@@ -93,16 +205,27 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
         quoted = [_literal_if_not_grammar(verb, override) for override in named if override not in plain]
         for override in quoted:
             _check_choice(verb, override)
+        chosen = [override for override in quoted if _group(override) in groups(verb)]
         if files:
-            quoted.append(f"hydra.searchpath=['{_escape(f'file://{own}')}']")
+            chosen.append(_searched(own))
+            quoted.append(_searched(own))
+
+        def known() -> Any:
+            """The choices without any field that is given: what may stand there."""
+            return OmegaConf.to_container(_composed(name, chosen)) if name else {}
+
         try:
-            composed = _composed(name, quoted)
+            composed = _composed(name, [part for override in quoted for part in _fitted(override, model, known)])
             for override in plain:
                 field, _, value = override.partition("=")
                 OmegaConf.update(composed, field, _plain_value(verb, field, value))
             result = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         except MissingConfigException as error:
-            raise InputError(f"{verb}: {_missing_choice(verb, str(error.missing_cfg_file))}") from error
+            missing = str(error.missing_cfg_file)
+            sources = [path for key, path in files.values() if missing.startswith(f"{_group(key)}/")]
+            given = any(missing == f"{_group(override)}/{override.partition('=')[2]}" for override in quoted)
+            place = sources[0] if sources and not given else verb
+            raise InputError(f"{place}: {_missing_choice(verb, missing)}") from error
         except ConfigCompositionException as error:
             other = re.match(r"Error merging override ([^=]+)=(.*)", str(error))
             if other is not None:
@@ -110,8 +233,11 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
             unknown = re.search(r"Could not override '([^']+)'", str(error))
             if unknown is None:
                 raise InputError(f"{verb}: {_first_line(error)}") from error
-            known = OmegaConf.to_container(_by_hydra(name, ())) if name else {}
-            raise InputError(f"{verb}: {unknown[1]}: {_unknown_key(unknown[1], known)}") from error
+            chosen[:] = [override for override in chosen if override.partition("=")[0] != unknown[1]]  # such as rig@other
+            inner = re.search(r"Key '([^']+)' is not in struct", str(error.__cause__))
+            within = inner is not None and isinstance(_below(known(), unknown[1].split(".")), Mapping)
+            key = f"{unknown[1]}.{inner[1]}" if inner is not None and within else unknown[1]
+            raise InputError(f"{verb}: {key}: {_unknown_key(key, known())}") from error
         except MissingMandatoryValue as error:
             raise InputError(f"{verb}: {error.full_key}: needs a value; give {error.full_key}=...") from error
         except OmegaConfBaseException as error:
@@ -120,8 +246,17 @@ def compose(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
     return {str(key): value for key, value in result.items()}
 
 
+def defaults(verb: str) -> dict[str, Any]:
+    """The fields of a verb as they are without overrides; `???` where one needs a value."""
+    from omegaconf import OmegaConf
+
+    found = OmegaConf.to_container(_composed(verb, ()), resolve=True)
+    assert isinstance(found, dict)
+    return {str(key): value for key, value in found.items()}
+
+
 def _composed(name: str | None, overrides: Sequence[str]) -> Any:
-    """Compose a file of `conf` with overrides, as Hydra does, which takes most of its time for the choices.
+    """Compose a verb's fields with overrides, as Hydra does, which takes most of its time for the choices.
 
     Their composition is kept as long as no file of `conf` changes, and fields are put into a copy of it. Overrides of another
     kind, and those that don't fit, go to Hydra itself.
@@ -149,13 +284,16 @@ def _composed(name: str | None, overrides: Sequence[str]) -> Any:
 
 @lru_cache(maxsize=64)
 def _chosen(name: str | None, choices: Sequence[str], state: object) -> Any:
-    """Compose a file of `conf` with choices alone; `state` is that of the files."""
+    """Compose a verb's fields with choices alone; `state` is that of the files."""
     return _by_hydra(name, choices)
 
 
 def _by_hydra(name: str | None, overrides: Sequence[str]) -> Any:
     from hydra import compose, initialize_config_dir
+    from hydra.core.config_store import ConfigStore
 
+    if name and not (folder() / f"{name}.yaml").is_file():
+        ConfigStore.instance().store(name=name, node=primary(name))
     with initialize_config_dir(str(folder()), version_base=None):
         return compose(name, list(overrides))
 
@@ -166,6 +304,12 @@ def _own_choice(verb: str, override: str) -> tuple[str, Path] | None:
     path = Path(value.strip("'\""))
     if key.partition("@")[0] not in groups(verb) or path.suffix not in (".yaml", ".yml") or not path.is_file():
         return None
+    _checked(path)
+    return key, path
+
+
+def _checked(path: Path) -> dict[str, Any]:
+    """Content of a choice's file, with its list of the choices that it starts from."""
     content = yaml_text.read(path)  # which refuses what is no YAML, in one line
     if not isinstance(content, dict | None):
         raise InputError(f"{path}: expected a map of fields, found {brief(content)}")
@@ -174,13 +318,55 @@ def _own_choice(verb: str, override: str) -> tuple[str, Path] | None:
     choices = [name for one in entries for name in (one.values() if isinstance(one, dict) and len(one) == 1 else [one])]
     if not all(isinstance(name, str) for name in choices):
         raise InputError(f"{path}: defaults: expected a list of choices, found {brief(defaults)}")
-    return key, path
+    return content or {}
+
+
+def read_choice(group: str, path: Path) -> dict[str, Any]:
+    """Read the file of a choice, which may start from shipped ones as its `defaults` list them.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or no YAML, or starts from what the group doesn't have.
+    """
+    content = _checked(path)
+    if "defaults" not in content:
+        return content
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.errors import ConfigCompositionException, MissingConfigException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    with TemporaryDirectory() as own, initialize_config_dir(str(folder()), version_base=None):
+        try:
+            composed = hydra_compose(None, [f"+{_named(Path(own), 0, (group, path))}", _searched(own)])
+            found = OmegaConf.to_container(composed[group], resolve=True)
+        except MissingConfigException as error:
+            missing = str(error.missing_cfg_file).rpartition("/")[2]
+            names = sorted(choice.stem for choice in (folder() / group).glob("*.yaml"))
+            near = did_you_mean(missing, names)
+            raise InputError(f"{path}: defaults: expected one of {', '.join(names)}, found {short(missing)}{near}") from error
+        except (ConfigCompositionException, OmegaConfBaseException) as error:
+            raise InputError(f"{path}: {_first_line(error)}") from error
+    assert isinstance(found, dict)
+    return {str(key): value for key, value in found.items()}
+
+
+def _searched(place: str) -> str:
+    """The override that has Hydra look for choices in one more folder."""
+    return f"hydra.searchpath=['{_escape(f'file://{place}')}']"
+
+
+def _group(override: str) -> str:
+    """The group of an override that is a choice: `patterns` of `patterns@board_patterns=gray_surface`."""
+    return override.partition("=")[0].partition("@")[0].lstrip("+~")
 
 
 def _named(place: Path, number: int, choice: tuple[str, Path]) -> str:
     """An override that names a file of one's own, copied to where Hydra looks for the choices of its group."""
     key, path = choice
-    group, name = key.partition("@")[0], f"own{number}"
+    group, name = _group(key), f"own{number}"
     (place / group).mkdir(exist_ok=True)
     shutil.copyfile(path, place / group / f"{name}.yaml")
     return f"{key}={name}"
@@ -196,21 +382,7 @@ def _check_choice(verb: str, override: str) -> None:
 
 def _fields_named_like_groups(verb: str) -> set[str]:
     """Fields of a verb that share a group's name without being choices of it: Hydra would take `patterns=FILE` for a choice."""
-    return {field for field in _own_fields(verb) if (folder() / field).is_dir()} - set(groups(verb))
-
-
-def _own_fields(verb: str) -> dict[str, Any]:
-    """The fields of `conf/VERB.yaml` as they stand there; none of a verb without that file."""
-    path = folder() / f"{verb}.yaml"
-    return _parsed(path.read_text(encoding="utf-8")) if path.is_file() else {}
-
-
-@cache
-def _parsed(text: str) -> dict[str, Any]:
-    """Fields of a YAML text of `conf`, parsed once, though each override asks for them; not to be changed."""
-    import yaml
-
-    return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {}
+    return {field for field in primary(verb) if (folder() / field).is_dir()} - set(groups(verb))
 
 
 def _plain_value(verb: str, field: str, value: str) -> object:
@@ -227,16 +399,85 @@ def _plain_value(verb: str, field: str, value: str) -> object:
 
 def describe(error: ValidationError, model: type[BaseModel]) -> str:
     """Say the first of pydantic's complaints in one line: the field, what was expected, what was found, and how to mend it."""
-    first, *others = error.errors(include_url=False)
-    field = ".".join(str(part) for part in first["loc"])
+    first, *others = faults = error.errors(include_url=False)
+    if first["type"] == "missing":  # for want of which a misspelled field stands there
+        first = next((fault for fault in faults if fault["type"] == "extra_forbidden"), first)
+    way, _ = _place(model, first["loc"])
+    field = ".".join(way)
     match first["type"]:
         case "extra_forbidden":
-            text = f"{field}: {_unknown_key(field, dict.fromkeys(model.model_fields))}"
+            above, types = _place(model, first["loc"][:-1])
+            names = [name for one in types if _is_model(one) for name in one.model_fields]
+            text = f"{field}: {_expected(way[-1], names, above)}"
         case "missing":
             text = f"{field}: needs a value; give {field}=..."
         case _:
-            text = one_line(error)
+            text = re.sub(rf"^{re.escape('.'.join(map(str, first['loc'])))}(?=[.:])", lambda _: field, one_line(error))
     return text + (f" (and {len(others)} more)" if others else "")
+
+
+def _fitted(override: str, model: type[BaseModel] | None, known: Callable[[], Any]) -> list[str]:
+    """An override as Hydra takes it: maps of free names take new ones, and a thing of another kind replaces the old one."""
+    key, _, value = override.partition("=")
+    if model is None or not re.fullmatch(r"\w[\w.]*", key):
+        return [override]
+    parts = key.split(".")
+    types = _place(model, parts)[1]
+    if _free(_place(model, parts[:-1])[1]) or (value[:1] == "{" and _free(types)):
+        return [f"++{override}"]
+    kinds = {name: tags for one in types if _is_model(one) for name, tags in _tags(one).items()}
+    given = re.match(rf"\{{.*?\b({'|'.join(kinds)})\s*:\s*([\w-]+)", value) if kinds else None
+    if given is None or _below(known(), [*parts, given[1]]) == given[2]:
+        return [override]
+    return [f"++{key}=null", f"++{override}"]
+
+
+def _below(tree: Any, way: Sequence[str]) -> Any:
+    """The value at a place in nested maps, None where there is none."""
+    for part in way:
+        tree = tree.get(part) if isinstance(tree, Mapping) else None
+    return tree
+
+
+def _place(model: type[BaseModel], place: Sequence[str | int]) -> tuple[list[str], list[Any]]:
+    """Names on the way to a place in a model's values, without the kinds that pydantic puts between them; and the types there."""
+    names, types = list[str](), [model]
+    for part in place:
+        models = [one for one in types if _is_model(one)]
+        fields = [one.model_fields[part].annotation for one in models if part in one.model_fields]
+        kinds = [one for one in models if any(part in tags for tags in _tags(one).values())]
+        if not fields and kinds:
+            types = kinds
+            continue
+        inner = [get_args(one)[-1] for one in types if _free([one])]
+        inner += [each for one in types if get_origin(one) in (list, tuple) for each in get_args(one) if each is not ...]
+        types = [each for one in fields or inner for each in _plain_types(one)]
+        names.append(str(part))
+    return names, types
+
+
+def _plain_types(annotation: Any) -> list[Any]:
+    """The types that an annotation stands for, such as both models of `Annotated[A | B, ...] | None`."""
+    if get_origin(annotation) is Annotated:
+        return _plain_types(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, UnionType):
+        return [each for one in get_args(annotation) for each in _plain_types(one)]
+    return [annotation]
+
+
+def _tags(model: type[BaseModel]) -> dict[str, tuple[Any, ...]]:
+    """Fields of a model that have one possible value, by which it is told from others."""
+    annotations = {name: field.annotation for name, field in model.model_fields.items()}
+    return {name: get_args(one) for name, one in annotations.items() if get_origin(one) is Literal and len(get_args(one)) == 1}
+
+
+def _is_model(one: Any) -> TypeGuard[type[BaseModel]]:
+    return isinstance(one, type) and issubclass(one, BaseModel)
+
+
+def _free(types: Sequence[Any]) -> bool:
+    """Whether a map of any names is among types."""
+    return any(get_origin(one) is dict for one in types)
 
 
 def _literal_if_not_grammar(verb: str, override: str) -> str:
@@ -292,6 +533,8 @@ def _missing_choice(verb: str, file: str) -> str:
     example = folder() / group / f"{next(iter(names), 'own')}.yaml"
     if "/" in choice or choice.endswith((".yaml", ".yml")):
         return f"{expected}, or a YAML file, found none at {choice}; begin with a copy of {example}"
+    if Path(f"{choice}.yaml").is_file():
+        return f"{expected}, or a YAML file, found {choice}; did you mean {choice}.yaml?"
     return f"{expected}, found {choice}{did_you_mean(choice, names) or f'; a copy of {example} is given as {group}=FILE.yaml'}"
 
 
@@ -304,7 +547,11 @@ def _unknown_key(key: str, tree: Any) -> str:
         tree = tree[part]
         way.append(part)
     names = [str(name) for name in tree] if isinstance(tree, Mapping) else []
-    missing = key.split(".")[min(len(way), key.count("."))]
+    return _expected(key.split(".")[min(len(way), key.count("."))], names, way)
+
+
+def _expected(missing: str, names: Sequence[str], way: Sequence[str]) -> str:
+    """The keys below a way of names, in place of one that isn't among them, and the nearest of them."""
     near = did_you_mean(missing, names, ".".join([*way, ""]))
     if not names:
         return f"unknown key; expected none{' below ' + '.'.join(way) if way else ''}"

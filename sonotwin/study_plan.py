@@ -1,6 +1,8 @@
 """A study's plan: what conf/study says, what is given beside it, and the settings of each trial."""
 
+import re
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
@@ -9,7 +11,7 @@ from recon.errors import InputError, one_line, validated
 from recon.files import yaml_text
 from recon.model.rig import Part
 from sonotwin import choices
-from sonotwin.config import folder
+from sonotwin.config import folder, read_choice
 from twin.studies import experiments, factors, study_runs
 from twin.studies.beside_paper import Figure
 from twin.studies.error_budget import Budget
@@ -82,13 +84,18 @@ def changed(base: Mapping[str, Any], point: Point) -> Settings:
 
 
 def choice(name: str, value: str) -> Any:
-    """Content of a group's choice, such as `lifelike` of conditions, or of one part of it, such as `lifelike.sound`."""
-    file, _, part = value.partition(".")
-    path = folder() / GROUPS[name.split(factors.JOINT)[0]] / f"{file}.yaml"
+    """Content of a group's choice, such as `lifelike` of conditions, or of one part of it, such as `lifelike.sound`.
+
+    A YAML file of one's own is a choice, too: `ours.yaml`, `ours.yaml.sound`.
+    """
+    group = GROUPS[name.split(factors.JOINT)[0]]
+    own = re.match(r"(.+\.ya?ml)(?:\.(.+))?$", value)
+    file, part = (own[1], own[2]) if own else value.partition(".")[::2]
+    path = Path(file) if own else folder() / group / f"{file}.yaml"
     if not path.is_file():
-        names = ", ".join(sorted(each.stem for each in path.parent.glob("*.yaml")))
-        raise InputError(f"over: {name}: expected one of {names}, found {value}")
-    content = yaml_text.read(path)
+        names = ", ".join(sorted(each.stem for each in (folder() / group).glob("*.yaml")))
+        raise InputError(f"over: {name}: expected one of {names}, or a YAML file, found {value}")
+    content = read_choice(group, path)
     if not part:
         return content
     if part not in content:

@@ -11,23 +11,33 @@ from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty
 from recon.model.rig import Part, Rig, Target
 from recon.tracking import networks
 from recon.tracking.tracker import Tracker
+from sonotwin.config import Choice
 
 
 class TrackerFields(Part):
     """Fields of a verb that tracks the target."""
 
-    rig: Rig
+    rig: Annotated[Rig, Choice("meza2021")]
+    """of it, the target's design: distances and diameters of its circles, and their tolerance"""
     calibration: Path | None = None
+    """file of the devices' calibration, used instead of the capture's own"""
     drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
+    """px, standard deviation of principal points since the calibration: warmth, a turned mount; focal lengths by 4e-4 of it,
+    relative"""
     board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
+    """relative standard deviation of the scale of the board that the cameras were calibrated with, where the calibration has
+    less: of paper by moisture; 1e-5 of chrome on glass"""
     networks: Path | None = None
+    """folder of detector.onnx and segmenter.onnx; null for those that come with sonotwin"""
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
+    """cores for the networks, 0 for all; another number may change last digits"""
 
 
 class MeasuredTargetFields(TrackerFields):
     """Fields of a verb that tracks the target as it was measured, if it was."""
 
     target: Path | None = None
+    """file of `sonotwin calibrate-target`: the target as it was measured, instead of the design's"""
 
 
 def target_of(fields: MeasuredTargetFields) -> Target:

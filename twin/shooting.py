@@ -27,9 +27,12 @@ class Quality(Part):
 class FilmQuality(Part):
     """Rays a pixel of a film's frames, powers of two."""
 
-    view: int = Field(default=1, ge=1, le=256)  # of each cell
-    disc: int = Field(default=2, ge=1, le=256)  # of the circles' pixels
-    rim: int = Field(default=8, ge=2, le=1024)  # of those at their rims, and of all pixels of full frames
+    view: int = Field(default=1, ge=1, le=256)
+    """of cells of 4 px, and of 2 px about the target's board"""
+    disc: int = Field(default=2, ge=1, le=256)
+    """of each pixel of the circles"""
+    rim: int = Field(default=8, ge=2, le=1024)
+    """of those at their rims, and of every pixel of full frames"""
 
     _power_of_two = field_validator("view", "disc", "rim")(power_of_two)
 
@@ -38,12 +41,17 @@ class Shooting(Part):
     """Exposure of the tracking cameras."""
 
     exposure_s: Positive = 0.01
-    white_dn: Annotated[float, Field(gt=0, le=1000)] = 65.0  # brightness of the target's white, on the whole
-    gain: Positive = 1.0  # linear
+    """s; a tenth of a millimetre of blur at 10 mm/s"""
+    white_dn: Annotated[float, Field(gt=0, le=1000)] = 65.0
+    """of 255, brightness of the target's white on the whole: the paper's rig is as dark as that"""
+    gain: Positive = 1.0
+    """linear; 1 fills the range with the sensor's saturation charge"""
 
 
 class FrameShooting(Shooting):
     """Exposure, light and rendering of a sweep's frames."""
 
-    light: Literal["room", "projector"] = "room"  # lamps of a dim room, or the projector, fully on, in the dark
+    light: Literal["room", "projector"] = "room"
+    """room: some lamps, drawn by the seed; projector: the projector, fully on, in the dark"""
     quality: FilmQuality = FilmQuality()
+    """rays, powers of two; more are smoother and slower"""

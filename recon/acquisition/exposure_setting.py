@@ -21,10 +21,14 @@ ABOVE_BLACK = 0.02  # of full scale, that the brightest pixels must reach to say
 class Exposing(Part):
     """How long cameras expose."""
 
-    exposure_s: Positive | None = None  # if not given, set for what is seen: see level
-    level: Annotated[float, Field(gt=0, lt=1)] = 0.9  # of full scale, for the brightest thousandth of the pixels
-    gain: Positive = 1.0  # linear; 1 is the sensor's base gain
-    longest_s: Positive = 0.2  # of an exposure that is set: with a longer one a sequence takes minutes
+    exposure_s: Positive | None = None
+    """s; null sets it for what is seen, see level; of a sweep 0.01"""
+    level: Annotated[float, Field(gt=0, lt=1)] = 0.9
+    """of full scale, for the brightest thousandth of the pixels"""
+    gain: Positive = 1.0
+    """linear; 1 is the sensor's base gain"""
+    longest_s: Positive = 0.2
+    """s, of an exposure that is set for what is seen"""
 
 
 def set_exposure(camera: Camera, seen: Callable[[], NDArray], exposing: Exposing) -> float:

@@ -26,11 +26,16 @@ STEP_BLUR_PX = 0.6  # standard deviation by which the gradient's own differences
 class Limits(Part):
     """Limits beyond which a frame has a fault."""
 
-    saturated: Share = 0.005  # share of pixels at full scale
-    least_level: Share = 0.2  # of full scale, of the brightest thousandth of the pixels
-    most_blur_px: Positive = 2.5  # standard deviation of edges
-    least_contrast_dn: Positive = 5.0  # fringe modulation of 255, in the median of the lit pixels
-    least_lit: Share = 0.02  # share of the image that the projector lights
+    saturated: Share = 0.005
+    """share of the pixels at full scale"""
+    least_level: Share = 0.2
+    """of full scale, of the brightest thousandth of the pixels"""
+    most_blur_px: Positive = 2.5
+    """px, standard deviation of edges"""
+    least_contrast_dn: Positive = 5.0
+    """DN of 255, of fringes, in the median of what is lit"""
+    least_lit: Share = 0.02
+    """share of the image with fringes"""
 
 
 class Look(NamedTuple):

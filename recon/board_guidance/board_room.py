@@ -41,11 +41,16 @@ Angle = Annotated[float, Field(ge=0, lt=90)]
 class PoseLimits(Part):
     """Limits of poses, as a person gives them."""
 
-    depth_mm: Depths | None = None  # z of the board's middle; those at which all lenses are sharp enough if not given
-    volume_mm: Depths | None = None  # z of the volume that is measured later, where points count; in focus if not given
-    tilt_deg: Angle = 40.0  # largest angle between the board's normal and camera 1's axis
-    oblique_deg: Angle = 60.0  # largest angle between the board's normal and the view of any device
-    margin_px: NotNegative = 10.0  # that the board keeps from every image's border
+    depth_mm: Depths | None = None
+    """[nearest, farthest] mm, z of the board's middle; null: where all lenses are sharp enough, by the rig"""
+    volume_mm: Depths | None = None
+    """[nearest, farthest] mm, z of what will be measured, whose errors count; null: in focus"""
+    tilt_deg: Angle = 40.0
+    """deg, largest angle between the board's normal and camera 1's axis"""
+    oblique_deg: Angle = 60.0
+    """deg, largest angle between the board's normal and any device's view of it"""
+    margin_px: NotNegative = 10.0
+    """px, that the board keeps from every image's border"""
 
 
 @dataclass(frozen=True)

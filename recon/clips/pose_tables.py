@@ -35,13 +35,20 @@ Names = tuple[Column, ...]
 class Columns(Part):
     """Names of a table's columns, or their numbers from 1 where it has no header, and units of their values."""
 
-    time: Column | None  # None of a table with a row a frame of the clip
+    time: Column | None
+    """null where the table has a row a frame of the clip"""
     time_unit: Literal["s", "ms", "us", "ns"] = "s"
-    translation: Annotated[Names, Field(min_length=3, max_length=3)] | None = None  # x, y, z; none with a matrix of 12 or 16
+    """s, ms, us or ns"""
+    translation: Annotated[Names, Field(min_length=3, max_length=3)] | None = None
+    """three names, x, y, z; null with a matrix of 12 or 16"""
     length_unit: Literal["mm", "cm", "m"] = "mm"
-    quaternion: Annotated[Names, Field(min_length=4, max_length=4)] | None = None  # x, y, z, w
-    matrix: Names | None = None  # row by row: 9 of a rotation, 12 or 16 of a whole pose
-    inverted: bool = False  # the table holds target_from_world
+    """mm, cm or m"""
+    quaternion: Annotated[Names, Field(min_length=4, max_length=4)] | None = None
+    """four names, x, y, z, w; or instead of it"""
+    matrix: Names | None = None
+    """names row by row: 9 of a rotation, 12 or 16 of a whole pose"""
+    inverted: bool = False
+    """true where the table holds the tracker in the frame of the probe's target"""
 
     @model_validator(mode="after")
     def _one_rotation(self) -> "Columns":

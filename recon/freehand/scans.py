@@ -64,14 +64,27 @@ class ScansFields(SequenceFields):
     """Fields of a verb that places the B-scans of a capture or of a sequence in the world."""
 
     capture: Path | None = None
+    """a capture folder with a sweep"""
     sweep: str = ""
+    """its name, of a capture that holds several; "" takes the only one for the volume"""
     probe: Path | None = None
+    """the probe's calibration, probe.yaml or US_params.npz; takes the place of that of the capture or sequence"""
     lag_s: LagSeconds | None = None
+    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`; null takes none, to 0.1 s"""
     lag_sigma_s: NotNegative | None = None
+    """s, standard deviation of the former, 0 where that is given and 0.1 else, of which the places of pixels are uncertain; of
+    a capture only"""
     tissue_m_s: Speed | None = None
+    """m/s, of sound in what was scanned: 1540 on average, 1440 to 1480 in fat, 1450 in soft silicone, 1488 in water of 22 deg C.
+    Null leaves depths as of the speed that the probe's calibration holds for; a sequence's own: 1540"""
     tissue_sigma_m_s: SpeedSigma | None = None
+    """m/s, standard deviation of the former, of which masses' places are uncertain; null: 25 where that is given, as of tissue
+    that is known by its kind alone, and 50 else; fat has 1440 to 1480, glands 1510 to 1570"""
     image: FrameName | None = None
+    """frame of the sequence that its pixels are in; null is the configuration's, or else Image"""
     config: Path | None = None
+    """PLUS configuration (XML) that came with the sequence: its transforms, which go before the sequence's own, its
+    frames and clip, and its settings of the volume. What is given here goes before both"""
 
     @model_validator(mode="after")
     def _one_source(self) -> "ScansFields":

@@ -28,10 +28,17 @@ class SequenceFields(Part):
     """Fields of a verb that takes a sequence in place of a capture."""
 
     sequence: Path | None = None
+    """instead of a capture: a sequence of the PLUS toolkit, .igs.mha or .igs.nrrd"""
     tracker: Path | None = None
+    """the sequence of its poses, where the tracker's were saved in a file of their own: put at the images' times"""
     target: FrameName | None = None
+    """frame of the sequence that is fixed to the probe, in which its calibration is; null is Probe"""
     reference: FrameName | None = None
+    """frame of the sequence in which wires and bottom rest, and results are, such as Tracker, or LPS for where 3D Slicer shows
+    the sequence; null is a configuration's, or else Reference"""
     implausible: Implausible = "refuse"
+    """poses that no hand makes, and lengths that no scanner has: refuse leaves poses out, and refuses if they are many; take
+    uses all of them, with a warning"""
 
     @model_validator(mode="after")
     def _of_a_sequence(self) -> "SequenceFields":

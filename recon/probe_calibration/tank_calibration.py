@@ -23,19 +23,36 @@ class Settings(Part):
     """The water, the wires, the scanner's assumption, and settings of the method."""
 
     temperature_c: Finite | None = None
+    """deg C, of the water. Null leaves sy as measured, mm of this water a pixel: right for sweeps through the same water.
+    Given, depths are converted to medium_speed, for sweeps through tissue"""
     temperature_sigma_c: NotNegative = 1.0
+    """deg C, standard deviation of the thermometer, and of the water where it isn't; 2.8 m/s a degree at 22 deg C"""
     tank_speed: Speed | None = None
+    """m/s, of sound in the tank, in place of temperature_c: measured, or of another liquid"""
     tank_speed_sigma: SpeedSigma = 3.0
+    """m/s, its standard deviation"""
     assumed_speed: Speed = sound_in_water.SCANNER_SPEED
+    """m/s, by which the scanner turns delays into depths; nearly all take this mean of soft tissues"""
     medium_speed: Speed | None = None
+    """m/s, of what will be scanned; needs temperature_c or tank_speed. Null is assumed_speed; `freehand` and `segment` can
+    convert too"""
     face_row: Annotated[float, Field(ge=0, le=1e4)] | None = None
+    """px, row of the images at which echoes have no delay, from which depths count: on an uncropped screen that of the
+    B-scan's first row. Null is the clip's first row, 0 without a clip"""
     wire_radius_mm: NotNegative = 0.1
+    """mm; assumed, an ordinary fishing line. The echo comes from before the axis: 0.04 mm for nylon of this radius"""
     wire_radius_sigma_mm: NotNegative = 0.03
+    """mm, its standard deviation; assumed: lines of 0.14 to 0.26 mm are sold side by side"""
     wire_speed: Annotated[float, Field(ge=300, le=10000)] = 2600.0
+    """m/s, of sound in the wire; nylon. Steel makes 5900"""
     max_sigma_mm: Annotated[float, Field(gt=0, le=100)] = probe_checks.MAX_SIGMA_MM
+    """mm, greatest standard deviation, in any direction, of the place of a pixel; what is known less well is refused"""
     appearance: Appearance = Appearance()
+    """what a crossing looks like"""
     noise: Noise = Noise()
+    """standard deviations, per axis, of what has no covariance of its own; their proportions count"""
     seed: Annotated[int, Field(ge=0)] = 0
+    """of the random draws of frames for the robust start"""
 
     @field_validator("appearance", "noise")
     @classmethod

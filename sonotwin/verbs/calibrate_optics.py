@@ -53,13 +53,19 @@ CONTENTS = {
 
 
 class Config(Settings):
-    """Fields of `conf/calibrate-optics.yaml`: sources, target, and settings of the calibration."""
+    """Fields of `sonotwin calibrate-optics`: sources, target, and settings of the calibration."""
 
     capture: Path
+    """a capture folder whose manifest has a board part"""
     out: Path
+    """folder; gets optics.yaml, the rig authors' files, metrics.json, calibration.html"""
     truth: Path | None = None
+    """truth/ folder of a rendered capture; only the report compares with it"""
     devices: tuple[DeviceName, ...] | None = None
+    """that are calibrated, of cam1, cam2 and projector: [cam1,projector], [cam1]; null: all of the capture"""
     distortion: Literal["auto", ModelName] = "auto"  # as one list of choices, for the message
+    """none, radial1, radial2, decentred, brown, rational, thin_prism, tilted; auto takes, for each device, brown, or rational
+    if that predicts poses left out better"""
 
 
 def run(config: Config) -> None:

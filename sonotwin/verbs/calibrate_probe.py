@@ -19,6 +19,7 @@ target is seen, and bring the crossing near all corners of the image in turn.
 from collections.abc import Iterator
 from pathlib import Path
 from time import perf_counter
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,22 +40,33 @@ from recon.probe_calibration import crossing_frames, probe_figures, sound_in_wat
 from recon.probe_calibration.crossing_frames import CrossingFrames
 from recon.probe_calibration.tank_calibration import Result, Settings
 from sonotwin import choices
+from sonotwin.config import Choice
 
 PROBE = "probe.yaml"
 FRAMES = "frames.csv"
 
 
 class Config(SequenceFields, Settings):
-    """Fields of `conf/calibrate-probe.yaml`: sources, target, and all that is known beforehand."""
+    """Fields of `sonotwin calibrate-probe`: sources, target, and all that is known beforehand."""
 
-    rig: Rig
+    rig: Annotated[Rig, Choice("meza2021")]
+    """rig.probe is the design: where the bracket holds the probe to some 30 deg and 30 mm, the scanner's mm/px. Of another
+    probe give temperature_c, and with pairs rig.probe.image_size; its bracket needs no design"""
     out: Path
+    """folder; gets probe.yaml, US_params.npz, frames.csv, metrics.json"""
     capture: Path | None = None
+    """a capture folder with a sweep over the crossing of two wires at rest. Or else:"""
     sweep: str = ""
+    """its name, of a capture that holds several; "" takes the only one for the probe"""
     pairs: Path | None = None
+    """CSV file of poses and pixels, one pair a line: m00 to m23 of world_from_target in mm, u, v in px"""
     earlier: Path | None = None
+    """an earlier calibration of the same probe, probe.yaml: whether it moved in its bracket since"""
     clip: Rectangle | None = None
+    """[u, v, width, height] px, the part of each B-scan that is looked at, of an uncropped screen; null is all of it. The
+    calibration holds for the whole images all the same"""
     lag_s: LagSeconds = 0.0
+    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
 
     @model_validator(mode="after")
     def _one_source(self) -> "Config":

@@ -32,14 +32,20 @@ NO_COVARIANCE = "the cameras' calibration has no covariance: its errors are not 
 
 
 class Config(TrackerFields):
-    """Fields of `conf/calibrate-target.yaml`."""
+    """Fields of `sonotwin calibrate-target`."""
 
     capture: Path
+    """folder: frames of cam1 and cam2 with their time stamps, as docs/captures.md describes"""
     sweep: str = ""
+    """name of the sweep with these frames, of a capture that holds several"""
     out: Path
+    """folder: gets target.yaml and metrics.json"""
     most_poses: Annotated[int, Field(ge=target_poses.LEAST, le=10_000)] = 100
+    """evenly out of those that differ by 2 mm or 1 deg; 8 or more"""
     least_tilt_deg: Annotated[float, Field(ge=0, le=45)] = 5.0
+    """standard deviation of the directions in which it is seen; 0 takes any, the bow is unknown then"""
     least_range_mm: Annotated[float, Field(ge=0, le=1000)] = 20.0
+    """from the nearest pose to the farthest; 0 takes any: the cameras' errors are averaged less then"""
 
 
 def run(config: Config) -> None:

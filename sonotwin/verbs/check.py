@@ -46,23 +46,38 @@ SEED = 0  # of the points under the fringes
 
 
 class Config(MeasuredTargetFields):
-    """Fields of `conf/check.yaml`."""
+    """Fields of `sonotwin check`."""
 
     capture: Path
+    """folder: what it holds of these is checked: a film of the target, fringes before both cameras, a bottom"""
     out: Path
+    """folder: gets check.html, check.json"""
     log: Path | None = None
+    """file of all checks, a line each, that this one is added to, such as rig.jsonl; null keeps no log"""
     film: manifest.SweepNameOrNone = ""
+    """name of the sweep in which the target is moved about; "" takes the only one with frames and without B-scans"""
     bottom: manifest.SweepNameOrNone = ""
+    """name of the tracked sweep over a tank's bottom; "" takes the only one with B-scans and poses"""
     tracked: Path | None = None
+    """folder of sonotwin track, that has the bottom's poses; null: the capture has them itself"""
     implausible: Implausible = "refuse"
+    """poses that no hand makes: refuse leaves them out, and refuses if they are many; take uses all of them"""
     probe: Path | None = None
+    """file of the probe's calibration, used instead of the capture's own"""
     lag: Path | None = None
+    """file lag.json, of measure-lag; null leaves the scanner's clock unchecked"""
     alarm_sigma: Annotated[float, Field(ge=1, le=20)] = 3.2
+    """standard deviations beyond which a part has moved: one check of 120 by chance, over all six parts"""
     water_c: Annotated[float, Field(ge=0, le=95)] = 22.0
+    """deg C, of the tank"""
     water_sigma_c: NotNegative = 1.0
+    """deg C, its standard deviation: 0.2 % of depths each"""
     top_px: Annotated[int, Field(ge=0)] = 40
+    """rows at the probe's face that are left out, where reverberation ends"""
     speed_mm_s: Positive = 10.0
+    """of the hand, by which an error of the clock becomes one of place"""
     most_poses: Annotated[int, Field(ge=LEAST_POSES, le=10_000)] = 40
+    """of the target, evenly out of those that differ; 3 or more"""
 
 
 class Held(NamedTuple):

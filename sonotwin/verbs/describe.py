@@ -37,19 +37,29 @@ LEAST_PX = 8  # of an image's shorter side
 
 
 class Config(Part):
-    """Fields of `conf/describe.yaml`."""
+    """Fields of `sonotwin describe`."""
 
     model_config = ConfigDict(coerce_numbers_to_str=True)
 
     folder: Path
+    """of the images (PNG, BMP, TIFF, JPEG), in folders or not; they stay where they are"""
     out: Path
+    """the capture folder to write: a manifest that points at them, and the calibration"""
     board: dict[str, Any] | None = None
+    """a calibration board in several poses: kind, columns, rows and lengths in mm, see docs/captures.md; null: a surface"""
     patterns: str | None = None
+    """YAML file of the pattern sequence, or the name of one in conf/patterns; null: a board without fringes"""
     calibration: Path | None = None
+    """of cameras and projector, to be copied into the capture; a surface needs it, here or later"""
     files: str | tuple[str, ...] | None = None
+    """names of the images below folder, '<camera>/<pose>/<image>.png'; a list of several; null: as they are usually. <image>
+    is a number or a whole name, * anything; without <image> they are the lit ones; others are left out"""
     cameras: dict[Camera, str] | None = None
+    """words for <camera>: {cam1: left, cam2: right}; null: cam1, camera1 or left, and cam2, camera2 or right"""
     lit: tuple[str, ...] = ("lit", "white")
+    """in the place of <image>: names of the board's images in even light; a sole image of a pose is lit anyway"""
     bits: Literal[8, 10, 12] | None = None
+    """8, 10 or 12, of all cameras; null: 8, and of 16-bit images 10 or 12 by the brightest of a pose"""
 
     @field_validator("cameras")
     @classmethod

@@ -22,12 +22,16 @@ ERROR_MAP = "error_map.png"
 
 
 class Config(Part):
-    """Fields of `conf/evaluate.yaml`."""
+    """Fields of `sonotwin evaluate`."""
 
     surface: Path
+    """folder with the points.npz that `sonotwin surface` wrote"""
     truth: Path
+    """truth/ folder that `sonotwin render` wrote beside the capture"""
     out: Path | None = None
+    """folder; gets metrics.json and error_map.png; null is evaluation/ in the surface's folder"""
     camera: str = "cam1"
+    """whose view the surface was reconstructed from"""
 
 
 def run(config: Config) -> None:

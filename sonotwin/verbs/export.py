@@ -59,19 +59,30 @@ def known_layout(name: object) -> object:
 
 
 class Config(Part):
-    """Fields of `conf/export.yaml`."""
+    """Fields of `sonotwin export`."""
 
     layout: Annotated[str, PlainValidator(known_layout)] = MEZA
+    """meza2021: the rig authors' data sets; kalibr, ros, mrcal, slstudio: the calibration of cameras and projector"""
     capture: Path | None = None
+    """a capture folder, which meza2021 needs; of a sweep one with poses, as `sonotwin track` leaves it"""
     out: Path
+    """folder; gets SLdata/, USdata/ and the files of calibrations, as far as the capture has them"""
     calibration: Path | None = None
+    """file: cameras and projector, in place of the capture's own; enough for a calibration alone"""
     surface: Path | None = None
+    """folder of `sonotwin surface`, whose points make the mask; null takes all pixels"""
     sweep: str = ""
+    """its name, of a capture that holds several; "" takes the only one for the volume"""
     implausible: Implausible = "refuse"
+    """poses that no hand makes: refuse leaves them out, and refuses if they are many; take uses all of them"""
     probe: Path | None = None
+    """file: the probe's calibration, in place of the capture's own"""
     lag_s: LagSeconds = 0.0
+    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
     tissue_m_s: Speed | None = None
+    """m/s, of sound for which US_params.npz is to be right; null leaves it as the probe is calibrated"""
     masses: Path | None = None
+    """folder of `sonotwin segment`, whose masses make USmasks/; null writes none"""
 
     @property
     def source(self) -> Path:

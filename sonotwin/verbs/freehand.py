@@ -45,20 +45,37 @@ SIGMA, SEQUENCE = "sigma.nrrd", "sequence.igs.mha"
 
 
 class Config(ScansFields):
-    """Fields of `conf/freehand.yaml`: sources, target, and settings of the volume."""
+    """Fields of `sonotwin freehand`: sources, target, and settings of the volume."""
 
     out: Path
+    """folder; gets volume.nrrd, sigma.nrrd and sequence.igs.mha (of a capture), metrics.json"""
     spacing_mm: Annotated[float, Field(ge=0.01, le=100)] | None = None
+    """0.5 mm, of the voxels; 0.01 to 100"""
     extent: Extent | None = None
+    """principal: along the axes of the sweep, smaller if it runs across; aligned: along the world's, as in PLUS"""
     compounding: Compounding | None = None
+    """of the pixels in a voxel: mean, maximum, latest, weighted: the mean by `weights`"""
     interpolation: Interpolation | None = None
+    """nearest: a pixel counts for the nearest voxel; linear: by its distance for the eight around it"""
     clip: Rectangle | None = None
+    """[u, v, width, height] px, the part of each B-scan that is used; all of it. As far as the image goes, so that [0, 0,
+    9999, 9999] is all of it whatever the configuration has"""
     fan: Sector | None = None
+    """[u, v, first, last, left, right], the part of a curved array's B-scan that is used: where its sides meet, px, as a rule
+    above the image, v < 0; radii at which it begins and ends, px; angles of its sides from straight down, deg, the left one
+    negative. find: about what changes from image to image. none: all of it"""
     hole_voxels: Annotated[int, Field(ge=0, le=1000)] | None = None
+    """9, the longest stick across a hole, in voxels, both ends included; 0 leaves holes open"""
     hole_sticks: Annotated[int, Field(ge=1, le=len(hole_filling.STICKS))] | None = None
+    """1, the number of the shortest sticks that count"""
     arithmetic: Arithmetic | None = None
+    """floating; plus_full, plus_partial, plus_none: that of PLUS by its setting Optimization, bit by bit, whose mean is
+    rounded at each pixel and darker by some levels"""
     weights: Path | None = None
+    """of compounding=weighted: an image of 8 bits as large as the B-scans with the weights of their pixels, of which those of
+    0 don't count; PLUS's ImportanceMaskFilename"""
     most_gib: Annotated[float, Field(gt=0, le=1024)] = volume_compounding.MOST_BYTES / 2**30
+    """GiB of memory that the volume may take, at 10 bytes a voxel"""
 
     @property
     def given(self) -> dict[str, Any]:

@@ -32,30 +32,47 @@ from recon.model.probe import Speed
 from recon.model.rig import Part, Rig
 from recon.model.tracks import LagSeconds
 from recon.segmentation import containment, mass_files
+from sonotwin.config import Choice
 from sonotwin.verbs import freehand
 
 SCENE, PAGE, SLICER = "scene.glb", "scene.html", "slicer"
 
 
 class Config(Part):
-    """Fields of `conf/fuse.yaml`."""
+    """Fields of `sonotwin fuse`."""
 
-    rig: Rig
+    rig: Annotated[Rig, Choice("meza2021")]
+    """of it, the target's design, by which the probe is drawn"""
     capture: Path
+    """a capture folder with a sweep that has poses, as `sonotwin track` leaves it"""
     out: Path
+    """folder; gets scene.html, scene.glb, slicer/, metrics.json"""
     sweep: str = ""
+    """its name, of a capture that holds several; "" takes the only one for the volume"""
     implausible: Implausible = "refuse"
+    """poses that no hand makes: refuse leaves them out, and refuses if they are many; take uses all of them"""
     probe: Path | None = None
+    """file: the probe's calibration, in place of the capture's own"""
     lag_s: LagSeconds = 0.0
+    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
     tissue_m_s: Speed | None = None
+    """m/s, of sound in what was scanned; null leaves depths as the probe is calibrated"""
     surface: Path | None = None
+    """the skin, as of `sonotwin surface`, a .ply"""
     mask: Path | None = None
+    """image, not black where the skin is, in the image of the camera below: in place of what follows"""
     camera: Literal["cam1", "cam2"] = "cam1"
+    """whose image the mask is"""
     part_table: bool = True
+    """part the skin from the plane that it stands on; false shows all of the surface as skin"""
     masses: Path | None = None
+    """folder of `sonotwin segment`"""
     volume: Path | None = None
+    """folder of `sonotwin freehand`, for slicer/"""
     calibration: Path | None = None
+    """file: cameras and projector, in place of the capture's own"""
     scans: Annotated[int, Field(ge=0, le=1000)] = 12
+    """B-scans that are shown where they were taken, evenly through the sweep"""
 
     @model_validator(mode="after")
     def _mask_of_a_surface(self) -> "Config":

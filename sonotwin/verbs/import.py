@@ -38,15 +38,23 @@ Pixels = Annotated[int, Field(ge=8, le=20000)]
 
 
 class Config(Part):
-    """Fields of `conf/import.yaml`."""
+    """Fields of `sonotwin import`."""
 
     layout: Literal["meza2021"] = "meza2021"
+    """meza2021: the rig authors' data sets"""
     folder: Path
+    """folder with SLdata/, USdata/ and files of calibrations, as far as they are there"""
     out: Path
+    """the capture folder to write"""
     camera_hz: Positive = 30.0
+    """frames/s; their frames have no time stamps, and all devices' count as taken at once"""
     purpose: Purpose = "volume"
+    """of the sweep: probe, of crossed wires; latency, of a flat bottom; volume"""
     projector_size: tuple[Pixels, Pixels] = meza2021.PROJECTOR_SIZE
+    """px; their files don't store it"""
     speed_m_s: Speed | None = None
+    """m/s, of sound for which US_params.npz is right; their file doesn't say. Of wires in water of 22 deg C: 1488. null: as a
+    file of ours says, or its export, else 1540, with a warning"""
 
 
 def run(config: Config) -> None:

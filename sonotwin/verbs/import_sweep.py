@@ -38,17 +38,27 @@ Size = Annotated[int, Field(ge=8)]
 
 
 class Config(Part):
-    """Fields of `conf/import-sweep.yaml`."""
+    """Fields of `sonotwin import-sweep`."""
 
     clip: Path
+    """B-scans: a DICOM file of many frames, a video (mp4, avi, mov, mkv, ...), or a folder of images in natural order"""
     poses: Path
+    """the tracker's poses: a CSV table with a header, separated by commas, semicolons, tabs or blanks"""
     columns: Columns
+    """names of its columns, or their numbers from 1 where it has no header, and their units"""
     out: Path
+    """the capture folder to write"""
     rate_hz: Annotated[float, Field(ge=0.01, le=1e5)] | None = None
+    """frames/s; null: as the clip says"""
     starts_s: Annotated[float, Field(gt=-MOST_SECONDS, lt=MOST_SECONDS)] | None = None
+    """s, time of the first frame by the table's clock; null: the clip begins with the table. measure-lag finds the rest"""
     crop: Literal["auto", "whole"] | tuple[Least, Least, Size, Size] = "auto"
+    """auto: the B-scan's part, as the DICOM file says, else what changes from frame to frame; whole; or [u,v,width,height] in
+    px"""
     purpose: Purpose = "volume"
+    """of the sweep: probe, of crossed wires; latency, of a flat bottom; volume"""
     implausible: Implausible = "refuse"
+    """poses that no hand makes: refuse leaves them out, and refuses if they are many; take uses all of them"""
 
 
 def run(config: Config) -> None:

@@ -48,15 +48,22 @@ Array = NDArray[np.float64]
 
 
 class Config(SequenceFields):
-    """Fields of `conf/measure-lag.yaml`."""
+    """Fields of `sonotwin measure-lag`."""
 
     out: Path
+    """folder; gets lag.json, depths.csv, metrics.json"""
     capture: Path | None = None
+    """a capture folder with a sweep, up and down over a flat bottom. Or else:"""
     sweep: str = ""
+    """its name, of a capture that holds several; "" takes the only one for the latency"""
     clip: Rectangle | None = None
+    """[u, v, width, height] px, the part of each B-scan that is looked at, of an uncropped screen; null is all of it"""
     fan: Sector | None = None
+    """[u, v, first, last, left, right], a curved array's fan in the image, as of `sonotwin freehand`; or find"""
     search_s: tuple[Finite, Finite] = latency.SEARCH_S
+    """s, lags looked at; around the difference of the starts where the clocks have nothing in common"""
     top_px: Annotated[int, Field(ge=0)] = 40
+    """rows at the probe's face, from the clip's first or the fan's arc on, that are left out, where reverberation ends"""
 
     @field_validator("search_s")
     @classmethod

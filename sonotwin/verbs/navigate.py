@@ -40,6 +40,7 @@ from recon.navigation.publishing import Publisher, StillScene
 from recon.navigation.slicer_publisher import SlicerPublisher
 from recon.probe_calibration import sound_in_water
 from recon.tracking.tracker import Tracker
+from sonotwin.config import Choice
 from sonotwin.open_devices import Host, LiveDevices, of_a_laboratory, open_camera, open_scanner
 from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
 
@@ -50,37 +51,59 @@ class View(Part):
     """The page in the browser."""
 
     host: Host = LOOPBACK
+    """where it can be opened: on this computer alone; 0.0.0.0 lets all of the network in, without a password"""
     port: Annotated[int, Field(ge=0, le=65535)] = 8080
+    """of TCP, another one for a second page, or where another program has this one; 0 takes any that is free"""
 
 
 class Igtl(Part):
     """The OpenIGTLink server."""
 
     serve: bool = True
+    """false: none, where nobody watches in 3D Slicer, or PLUS has its port"""
     host: Host = LOOPBACK
+    """likewise; the protocol knows no password either"""
     port: Annotated[int, Field(ge=0, le=65535)] = PORT
+    """of TCP: the one registered for OpenIGTLink; give another beside a PlusServer; 0 takes any that is free"""
 
 
 class Config(MeasuredTargetFields):
-    """Fields of `conf/navigate.yaml`."""
+    """Fields of `sonotwin navigate`."""
 
-    devices: LiveDevices | None = None
+    devices: Annotated[LiveDevices | None, Choice(None)] = None
+    """basler: two cameras and a scanner; copy conf/devices/basler.yaml for those of a laboratory"""
     exposure_s: Positive = 0.01
+    """s, of cameras among the devices"""
     gain: Positive = 1.0
+    """linear; 1 is the sensor's base gain"""
     trigger: Literal["free", "hardware"] = "hardware"
+    """hardware: camera 1 runs free, its exposures trigger camera 2 by a wire; free: both run free"""
     capture: Path | None = None
+    """folder, instead of devices: cam1, cam2 and us are played back in real time, round and round"""
     sweep: str = ""
+    """name of the sweep with these, of a capture that holds several; "" takes the only one for the volume"""
     speed: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """of the playback, as a multiple of real time"""
     apart_s: Positive | None = None
+    """s, by which a device of the capture may begin or end after another; null: a tenth of the sweep, and 1 s"""
     probe: Path | None = None
+    """file: the probe's calibration, in place of the capture's own"""
     lag_s: LagSeconds = 0.0
+    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
     tissue_m_s: Speed | None = None
+    """m/s, of sound in what is scanned; null leaves depths as the probe is calibrated"""
     skin: Path | None = None
+    """the skin, as of `sonotwin surface`, a .ply"""
     part_table: bool = True
+    """leave out the plane that the skin stands on; false shows all of the surface"""
     masses: Path | None = None
+    """folder of `sonotwin segment`"""
     view: View = View()
+    """the page in the browser"""
     igtl: Igtl = Igtl()
+    """the OpenIGTLink server, for 3D Slicer"""
     seconds: Annotated[float, Field(gt=0)] | None = None
+    """s, after which it ends; null goes on until Ctrl-C"""
 
     @field_validator("devices", mode="before")
     @classmethod

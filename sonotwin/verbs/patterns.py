@@ -28,6 +28,7 @@ from recon.capture.manifest import axes_not_encoded
 from recon.files import atomic
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
+from sonotwin.config import Choice
 
 SHEET = "timing_sheet.csv"
 SEQUENCE = "patterns.yaml"
@@ -42,17 +43,26 @@ BOARD = "{kind: asymmetric_circles, columns: 4, rows: 11, spacing_mm: 15, diamet
 
 
 class Config(BaseModel):
-    """Fields of `conf/patterns.yaml`."""
+    """Fields of `sonotwin patterns`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
-    rig: Rig
-    patterns: Patterns
+    rig: Annotated[Rig, Choice("meza2021")]
+    """of it, the projector's size and gamma"""
+    patterns: Annotated[Patterns, Choice("paper_surface")]
+    """the sequence to write"""
     out: Path
+    """folder to write: images, timing_sheet.csv, patterns.yaml, README.txt"""
     linearise_gamma: Annotated[float, Field(ge=0.2, le=5)] | None = None
+    """of the projector, light = value^gamma: grey levels are written as value^(1/gamma), so that three or four steps aren't
+    bent, at a cost in dark levels of 8 bits; null: none, as the twin projects. Five steps or more cancel gamma, and
+    black-and-white patterns have none"""
     refresh_hz: Annotated[float, Field(gt=0, le=100_000)] = 60.0
+    """of the projector's input; within a period it makes grey of flashes"""
     delay_frames: Annotated[int, Field(ge=0, le=100)] = 1
+    """periods until an image that is sent is on the wall; displays take one or two"""
     exposure_s: Annotated[float, Field(gt=0, le=100)] | None = None
+    """of the cameras, s; null: a period of the projector. Whole periods see all flashes"""
 
     @model_validator(mode="after")
     def _fits(self) -> "Config":

@@ -24,6 +24,7 @@ from recon.errors import InputError
 from recon.files import atomic
 from recon.model.boards import AsymmetricCircles, Board
 from recon.model.rig import Rig, Target
+from sonotwin.config import Choice
 from sonotwin.verbs.describe import design
 
 USUAL = AsymmetricCircles(columns=4, rows=11, spacing_mm=15, diameter_mm=9)  # as conf/scene/board.yaml
@@ -34,16 +35,22 @@ Millimetres = Annotated[float, Field(gt=0, le=5000)]
 
 
 class Config(BaseModel):
-    """Fields of `conf/print.yaml`."""
+    """Fields of `sonotwin print`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
-    rig: Rig
+    rig: Annotated[Rig, Choice("meza2021")]
+    """of it, the target's lengths and the size of its board"""
     part: Literal["board", "target"]
+    """board, for cameras and projector; or target, for the probe"""
     out: Path
+    """the PDF to write"""
     board: dict[str, Any] | None = None
+    """kind, columns, rows and lengths in mm, as of `describe`; null: 11 rows of 4 discs of 9 mm, 15 mm apart"""
     paper: Paper | tuple[Millimetres, Millimetres] = "a4"
+    """a4, letter, a3, tabloid, a2, a1, a0, or [width,height] in mm; turned where that fits better"""
     margin_mm: Annotated[float, Field(ge=0, le=50)] = 5.0
+    """mm, border on which the printer doesn't print; ours: few laser printers need more"""
 
     @model_validator(mode="after")
     def _board_to_draw(self) -> "Config":

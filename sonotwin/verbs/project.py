@@ -54,6 +54,7 @@ from recon.skin_projection import (
 from recon.skin_projection.projector_image import Drawing, Lines, lit_share
 from recon.skin_projection.skin_curve import SkinCurve
 from recon.skin_projection.skin_registration import SkinShift
+from sonotwin.config import Choice
 from sonotwin.open_devices import LiveDevices, of_a_laboratory, open_projector
 
 PICTURE, CURVES, STRIPS, SCENE, EXPECTED = "projector.png", "curves.json", "curves.ply", "scene.glb", "expected_cam1.png"
@@ -64,28 +65,48 @@ LOOK_S = 1.0  # between looks at whether the picture is still on its display
 
 
 class Config(Part):
-    """Fields of `conf/project.yaml`."""
+    """Fields of `sonotwin project`."""
 
-    rig: Rig
+    rig: Annotated[Rig, Choice("meza2021")]
+    """of it, the projector's gamma, and the target's design, by which the probe is masked"""
     skin: Path
+    """the skin as it lies now, a .ply as of `sonotwin surface`"""
     calibration: Path
+    """file: the projector, and camera 1 for the picture of what it should see"""
     out: Path
+    """folder; gets projector.png, curves.json, curves.ply, scene.glb, expected_cam1.png, metrics.json"""
     masses: Path | None = None
+    """folder of `sonotwin segment`"""
     cut: Path | None = None
+    """a planned cut: curves or lines drawn in 3D Slicer, .mrk.json"""
     eye_mm: Vector | None = None
+    """[x, y, z] mm in the world: where the surgeon looks from; null draws along the skin's normal over each"""
     earlier_skin: Path | None = None
+    """the skin when masses and cut were found, a .ply: they are moved along with it to `skin`"""
     part_table: bool = True
+    """part the skins from the plane that they stand on; a table would hold still where the body moves"""
     capture: Path | None = None
+    """a capture folder with a sweep that has poses: one of its B-scans gets its line, and its probe no light"""
     sweep: str = ""
+    """its name, of a capture that holds several; "" takes the only one for the volume"""
     implausible: Implausible = "refuse"
+    """poses that no hand makes: refuse leaves them out, and refuses if they are many; take uses all of them"""
     scan: Annotated[int, Field(ge=0)] = 0
+    """number of the B-scan, from 0"""
     probe: Path | None = None
+    """file: the probe's calibration, in place of the capture's own"""
     lag_s: LagSeconds = 0.0
+    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
     margin_mm: NotNegative = probe_shadow.MARGIN_MM
+    """mm around the probe and its target that stay dark, too"""
     names_mm: Annotated[float, Field(ge=0, le=50)] = 5.0
+    """mm, height of the letters by which each mass is named beside its outline; 0 draws none"""
     lines: Lines = Lines()
+    """on the skin: width in mm, share of the projector's full light, [drawn, left out] in mm or null"""
     show: bool = False
-    devices: LiveDevices | None = None
+    """have the projector among the devices show projector.png until Ctrl-C, once it is written"""
+    devices: Annotated[LiveDevices | None, Choice(None)] = None
+    """to show the picture: basler, of which only the projector is opened; copy it for those of a laboratory"""
 
     @field_validator("devices", mode="before")
     @classmethod

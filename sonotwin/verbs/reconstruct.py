@@ -38,6 +38,7 @@ from recon.session import store
 from recon.session.store import Store, files_of
 from recon.tracking import networks
 from recon.tracking.results import POSES
+from sonotwin.config import Choice
 from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, fuse, measure_lag, segment, surface, track
 
 Drift = Annotated[float, Field(ge=0, le=10)]
@@ -48,29 +49,54 @@ SKIN = "surface.ply"
 
 
 class Config(Part):
-    """Fields of `conf/reconstruct.yaml`: source, target, and what is known beforehand."""
+    """Fields of `sonotwin reconstruct`: source, target, and what is known beforehand."""
 
-    rig: Rig
+    rig: Annotated[Rig, Choice("meza2021")]
+    """of it, the target's design, and rig.probe: where the bracket holds the probe, and the scanner's mm/px"""
     capture: Path
+    """a capture folder with any parts, as docs/captures.md describes"""
     out: Path
+    """folder; gets a folder a step, and metrics.json; what is there and made of the same is kept"""
     camera: str = "cam1"
+    """which camera's fringes the surface is made of"""
     calibration: Path | None = None
+    """file: cameras and projector, in place of those from the board or in the capture"""
     drift_px: Drift = DRIFT_PX
+    """px, standard deviation of principal points since the calibration: warmth, a turned mount; focal lengths by 4e-4 of it,
+    relative"""
     board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
+    """relative standard deviation of the scale of the board that the cameras were calibrated with, where the calibration has
+    less: of paper by moisture; 1e-5 of chrome on glass"""
     target: Path | None = None
+    """file of `sonotwin calibrate-target`: the target as it was measured, instead of the design's"""
     networks: Path | None = None
+    """folder of detector.onnx and segmenter.onnx; null for those that come with sonotwin"""
     probe: Path | None = None
+    """file: the probe's calibration, in place of that from crossed wires or in the capture"""
     lag_s: LagSeconds | None = None
+    """s, delay of the B-scans' time stamps, in place of that from a flat bottom"""
     lag_sigma_s: NotNegative = 0.0
+    """s, standard deviation of a lag_s that is given"""
     implausible: Implausible = "refuse"
+    """poses that no hand makes: refuse leaves them out, and refuses if they are many; take uses all of them. Likewise images
+    by light that make no scene"""
     temperature_c: Finite | None = None
+    """deg C, of the water about the wires; null leaves depths right for that water. Needed of another scanner"""
     tissue_m_s: Speed | None = None
+    """m/s, of sound in what was scanned: 1540 on average, 1440 to 1480 in fat, 1450 in soft silicone"""
     tissue_sigma_m_s: SpeedSigma | None = None
+    """m/s, standard deviation of the former; null: 25, of tissue that is known by its kind alone, or 50 without it"""
     spacing_mm: Positive = 0.5
+    """mm, of a volume's voxels"""
     find: Literal["masses", "tube", "nothing"] = "masses"
+    """in the B-scans: masses, darker than the tissue around them; tube, round, in water, and the body about it; nothing"""
     spread_mm: segment.Spreads = SPREAD_MM
+    """mm, of an echo along the array and in depth; as `sonotwin segment` takes it"""
     slice_mm: segment.Slice = SLICE_MM
+    """mm, likewise: depth and sigma of an echo across the image plane there; null leaves lobes as flat as they are found, and
+    edges of shadows sharp"""
     overlays: bool = False
+    """pictures of every pair of tracked frames, 0.1 MB and some hundredths of a second each"""
 
     @model_validator(mode="after")
     def _sigma_of_a_lag(self) -> "Config":

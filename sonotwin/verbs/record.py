@@ -8,8 +8,9 @@ replace=true. Later verbs take OUT itself: capture=OUT. All that was recorded is
 command is ended by Ctrl-C, by the system or by a lost cable; give it again to go on.
 
 `devices=virtual` has the twin stand in for every device, and for the person: `scene`, `path` and the other fields at the end of
-conf/record.yaml say what is before them. It takes as long as rendering takes: ten seconds a sequence and pose, a second a pair of
-frames, on two cores. Copy conf/devices/basler.yaml for a laboratory's own devices.
+this list say what is before them. It takes as long as rendering takes: ten seconds a sequence and pose, a second a pair of
+frames, on two cores. A laboratory's own devices stand in a YAML file
+that begins with `defaults: [basler]`: devices=ours.yaml.
 
     sonotwin record part=board patterns=paper_calibration out=outputs/session
     sonotwin record part=surface devices=basler calibration=optics.yaml out=outputs/session
@@ -42,10 +43,11 @@ from recon.capture.manifest import SCANNER, Device, Purpose, SweepNameOrNone, ax
 from recon.devices.interfaces import Trigger
 from recon.devices.pattern_player import Pattern, Stage, Streamed, Taking, Triggered
 from recon.errors import InputError, validated
-from recon.model.boards import Board
+from recon.model.boards import AsymmetricCircles, Board
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
 from recon.tracking import networks
+from sonotwin.config import Choice
 from sonotwin.open_devices import AnyDevices, Host, LiveDevices, Opened, open_still, open_sweep
 from sonotwin.terminal_operator import TerminalOperator
 from twin.session import CAPTURE, TRUTH
@@ -63,16 +65,22 @@ class PreviewFields(Part):
     """Where the page is served."""
 
     serve: bool = True
+    """a page with the images of all devices, and what is wrong with them"""
     host: Host = preview_server.LOOPBACK
+    """this computer alone sees it; another address shows it to the network, to everybody there"""
     port: Annotated[int, Field(ge=0, le=65535)] = 0
+    """0: any that is free; the address is printed"""
 
 
 class Triggering(Part):
     """How pattern and exposure come together."""
 
-    by: Trigger = "software"  # hardware: a wire from the projector, with each image of its display
-    wait_frames: Annotated[int, Field(ge=0, le=100)] = 1  # of cameras that aren't triggered by software, after a new pattern
-    timeout_s: Positive = 2.0  # after which a frame counts as lost
+    by: Trigger = "software"
+    """of a board or a surface: software; free; hardware: by wire, with each image of the projector's display"""
+    wait_frames: Annotated[int, Field(ge=0, le=100)] = 1
+    """frames left out after a new pattern, unless by software: see docs/live-projector.md"""
+    timeout_s: Positive = 2.0
+    """s, after which a frame counts as lost"""
 
     @property
     def taking(self) -> Taking:
@@ -83,35 +91,62 @@ class Triggering(Part):
 
 
 class Config(Part):
-    """Fields of `conf/record.yaml`."""
+    """Fields of `sonotwin record`."""
 
-    rig: Rig
-    devices: AnyDevices
-    patterns: Patterns
+    rig: Annotated[Rig, Choice("meza2021")]
+    """rig.target is looked for in the frames of a sweep; of virtual devices, the instruments themselves"""
+    devices: Annotated[AnyDevices, Choice("virtual")]
+    """virtual: the twin; basler: two cameras, a projector, a scanner; a YAML file of your own for those of a laboratory"""
+    patterns: Annotated[Patterns, Choice("paper_surface")]
+    """what the projector shows; of a board along both axes, such as paper_calibration"""
     part: Literal["board", "surface", "sweep"]
+    """board, surface or sweep"""
     out: Path
-    cameras: Annotated[list[Literal["cam1", "cam2"]], Field(min_length=1)]
-    calibration: Path | None
-    probe: Path | None
-    replace: bool
-    board: Board
-    count: Annotated[int, Field(ge=1, le=1000)]
-    reach: PoseLimits
-    name: SweepNameOrNone
-    purpose: Purpose | None
-    seconds: Positive | None
-    silent_s: Positive
-    exposing: Exposing
-    triggering: Triggering
-    limits: Limits
-    preview: PreviewFields
-    scene: dict
-    ultrasound: Transducer
-    path: AnyPath | None
-    tracing: dict
-    clocks: Clocks
-    frames: FrameShooting
-    seed: Annotated[int, Field(ge=0, lt=2**32)]
+    """the capture folder, a new one or one that grows"""
+    cameras: Annotated[list[Literal["cam1", "cam2"]], Field(min_length=1, default=["cam1", "cam2"])]
+    """of a board or a surface: which cameras take images; of a sweep both do"""
+    calibration: Path | None = None
+    """file: cameras and projector, copied into the capture"""
+    probe: Path | None = None
+    """file: the probe's calibration, copied into the capture"""
+    replace: bool = False
+    """true: a surface takes the place of the one that is there; the truth beside a rendered one won't fit any more"""
+    board: Board = AsymmetricCircles(columns=4, rows=11, spacing_mm=15.0, diameter_mm=9.0)
+    """the calibration board's design: kind, columns, rows and lengths, see docs/captures.md"""
+    count: Annotated[int, Field(ge=1, le=1000)] = 12
+    """poses of the board that are recorded, unless ended before; those of an earlier run come on top"""
+    reach: PoseLimits = PoseLimits()
+    """of the poses of the board that are asked for, by which that one is chosen that adds most"""
+    name: SweepNameOrNone = ""
+    """of a sweep, where a capture is to hold several, such as wires, bottom, scan"""
+    purpose: Purpose | None = None
+    """of a sweep: probe (crossed wires), latency (a flat bottom), volume (what is to be seen)"""
+    seconds: Positive | None = None
+    """s between a device's first and newest frame by their time stamps, after which a sweep ends; null: when it is ended"""
+    silent_s: Positive = 5.0
+    """s without a frame, after which a device counts as gone"""
+    exposing: Exposing = Exposing()
+    """of the cameras"""
+    triggering: Triggering = Triggering()
+    """by which a pattern and its images come together"""
+    limits: Limits = Limits()
+    """beyond which a frame is said to have a fault"""
+    preview: PreviewFields = PreviewFields()
+    """of what the devices see"""
+    scene: Annotated[dict, Choice("breast")]
+    """of virtual devices: what lies before them"""
+    ultrasound: Annotated[Transducer, Choice("linear")]
+    """of virtual devices: the array and the scanner"""
+    path: Annotated[AnyPath | None, Choice("stroke")]
+    """of virtual devices: how the probe is led"""
+    tracing: Annotated[dict, Choice("default")]
+    """of virtual devices: how light is traced"""
+    clocks: Clocks = Clocks()
+    """of virtual devices"""
+    frames: FrameShooting = FrameShooting()
+    """of virtual devices: frames of a sweep"""
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """of the poses to choose from; of virtual devices, of noise, hand, tissue: the same gives the same images"""
 
     @model_validator(mode="after")
     def _fits(self) -> "Config":

@@ -53,21 +53,41 @@ Slice = Annotated[tuple[tuple[NotNegative, Spread], ...] | None, AfterValidator(
 
 
 class Config(ScansFields):
-    """Fields of `conf/segment.yaml`."""
+    """Fields of `sonotwin segment`."""
 
     out: Path
+    """folder; gets mass0.ply ... or tube.ply and cover.ply, the same as .glb, overlays of some B-scans, metrics.json"""
     kind: Literal["masses", "tube"] = "masses"
+    """what is looked for: masses, darker than the tissue around them; tube, round, in water"""
     clip: Rectangle | None = None
+    """[u, v, width, height] px, the part of each B-scan that is looked at, of an uncropped screen; null is the
+    configuration's, or else all of it"""
     surface: Path | None = None
+    """the skin, as of `sonotwin surface`, a .ply: says whether each mass lies inside, and how deep; with kind=tube the round
+    body about the tube, of which diameter and wall are measured"""
     mass_m_s: Speed = SCANNER_SPEED
+    """m/s in the masses: 1510 to 1570 in those of the breast"""
     mass_sigma_m_s: SpeedSigma = 20.0
+    """m/s, standard deviation of the former, of which their volumes are uncertain"""
     dynamic_range_db: Annotated[float, Field(ge=20, le=120)] = 60.0
+    """dB from black to white, as set on the scanner"""
     diameter_mm: tuple[Positive, Positive] = (5.0, 36.0)
+    """mm, least and most, of a tube"""
     spread_mm: Spreads = SPREAD_MM
+    """mm, sigma of an echo's power along the array and in depth; both move a tube's bent wall, the first flattens masses'
+    lobes and blurs their shadows. These are the default array's. To measure them: the half-maximum width of a thin wire's
+    echo amplitude there, over 2.355 * sqrt(2)"""
     slice_mm: Slice = SLICE_MM
+    """mm, depth and sigma of an echo's power across the image plane there, which flattens masses' lobes; these are the default
+    array's. To measure it: the half-maximum width, across the plane, of the echo amplitude of a thin wire or of an inclined
+    sheet (IEC 61391-1) at some depths, over 2.355 * sqrt(2). [] takes an infinitely thin slice, and null leaves lobes as
+    flat as they are found, and edges of shadows sharp"""
     min_contrast_db: Annotated[float, Field(ge=0, le=120)] = 15.0
+    """dB, of a tube's wall above the water"""
     top_mm: Annotated[float, Field(ge=0, le=100)] = 2.5
+    """mm of ringing at the probe's face, left out when a tube is looked for"""
     overlays: Annotated[int, Field(ge=0, le=100)] = segmented_scans.OVERLAYS
+    """B-scans that are drawn with the outline"""
 
     @model_validator(mode="after")
     def _in_order(self) -> "Config":

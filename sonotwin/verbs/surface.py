@@ -35,16 +35,24 @@ MOSTLY = 0.8  # share of the triangulated points, beyond which those that are re
 
 
 class Config(Part):
-    """Fields of `conf/surface.yaml`: sources, target, and limits of the surface."""
+    """Fields of `sonotwin surface`: sources, target, and limits of the surface."""
 
     out: Path
+    """folder; gets surface.ply, surface.glb, points.npz, metrics.json"""
     capture: Path | None = None
+    """a capture folder, with its manifest.json; calibration takes the place of its own. Or else these three:"""
     images: Path | None = None
+    """folder of images (PNG, BMP, TIFF, JPEG), one a pattern, in natural order"""
     patterns: str | None = None
+    """YAML file of the pattern sequence, or the name of one in conf/patterns"""
     calibration: Path | None = None
+    """calibration file"""
     camera: str = "cam1"
+    """which camera's images"""
     implausible: Implausible = "refuse"
+    """images that make no scene of camera and projector, or that a second camera contradicts: refuse, or take, with a warning"""
     limits: surface_mesh.Limits = surface_mesh.Limits()
+    """what counts as surface; a sampling step is the width of a pixel at the point"""
 
 
 class Stopwatch:

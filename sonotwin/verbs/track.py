@@ -35,12 +35,16 @@ from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_o
 
 
 class Config(MeasuredTargetFields):
-    """Fields of `conf/track.yaml`."""
+    """Fields of `sonotwin track`."""
 
     capture: Path
+    """folder: frames of cam1 and cam2 with their time stamps, as docs/captures.md describes"""
     sweep: str = ""
+    """name of the sweep with these frames, of a capture that holds several"""
     out: Path
+    """folder: gets poses.csv, frames.csv, overlays/, metrics.json; and manifest.json if there are B-scans"""
     overlays: bool = True
+    """pictures of every pair of frames, 0.1 MB and some hundredths of a second each"""
 
 
 def run(config: Config) -> int:

@@ -49,7 +49,7 @@ def test_help_lists_verbs_in_order(capsys):
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_help_of_a_verb(verb, capsys):
-    """It comes within seconds, shows an example that can be typed, and each field of the YAML."""
+    """It comes within seconds, shows an example that can be typed, and each field with its default."""
     assert cli.main([verb, "--help"]) == 0
     text = capsys.readouterr().out
     assert text.startswith(f"usage: sonotwin {verb}")

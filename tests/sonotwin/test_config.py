@@ -1,11 +1,12 @@
 """From YAML and overrides to a validated configuration, and the one line for each way to get it wrong."""
 
+import re
 import tempfile
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import pytest
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from recon.errors import InputError
 from sonotwin import config
@@ -147,6 +148,91 @@ def test_a_choice_may_be_a_file_of_ones_own(tmp_path_factory, tmp_path):
         path.write_text(text)
         with pytest.raises(InputError, match=rf"^{path}: {found}"):
             load(f"rig={path}")
+
+
+def test_a_choice_of_ones_own_may_start_from_a_shipped_one(tmp_path, tmp_path_factory, monkeypatch):
+    """By a list of `defaults`, as Hydra has it; its own fields win. What is wrong in it is said of the file."""
+    place = tmp_path_factory.mktemp("own")
+    monkeypatch.chdir(place)
+    (tmp_path / "rig" / "wide.yaml").write_text("gamma: 1.0\noffset: 3.0\n")
+    model = create_model("Wide", __base__=Rig, offset=(float, 0.0))
+    whole = create_model("Whole", __base__=Surface, rig=(model, ...))
+    (place / "ours.yaml").write_text("defaults: [wide]\ngamma: 1.5\n")
+    rig = config.load("surface", ["capture=c", "rig=ours.yaml"], whole).rig
+    assert (rig.gamma, rig.offset) == (1.5, 3.0)
+    assert config.read_choice("rig", Path("ours.yaml")) == {"gamma": 1.5, "offset": 3.0}
+    with pytest.raises(InputError, match=r"^surface: rig: .*, found ours; did you mean ours.yaml\?$"):
+        load("rig=ours")
+    for text, line in (
+        ("defaults: [wyde]\n", "ours.yaml: rig: expected one of narrow, wide, found wyde; did you mean wide?"),
+        ("gama: 1\n", "ours.yaml: rig.gama: unknown key; expected one of gamma, offset; did you mean rig.gamma? (and 1 more)"),
+    ):
+        (place / "ours.yaml").write_text(text)
+        with pytest.raises(InputError) as caught:
+            config.load("surface", ["capture=c", "rig=ours.yaml"], whole)
+        assert str(caught.value) == line
+
+
+class Mono(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    kind: Literal["mono"]
+    gain: float = 1.0
+
+
+class Colour(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    kind: Literal["colour"]
+    white: float = 1.0
+
+
+class Lab(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    kind: Literal["lab"]
+    features: dict[str, int] = Field(default_factory=dict)
+    sensor: Annotated[Mono | Colour, Field(discriminator="kind")]
+
+
+class Twin(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    kind: Literal["twin"]
+    paced: bool = False
+
+
+class Record(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    devices: Annotated[Lab | Twin, Field(discriminator="kind")]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "found"),
+    [
+        (["devices=lab", "devices.features={Gain: 3}"], {"features": {"Gain": 3}}),
+        (["devices=lab", "devices.features.Gain=3"], {"features": {"Gain": 3}}),
+        (["devices=lab", "devices.sensor={gain: 2}"], {"sensor": Mono(kind="mono", gain=2)}),
+        (["devices=lab", "devices.sensor={kind: mono}"], {"sensor": Mono(kind="mono", gain=4)}),
+        (["devices=lab", "devices.sensor={kind: colour, white: 2}"], {"sensor": Colour(kind="colour", white=2)}),
+        (["devices=lab", "devices.sensr.gain=3"], "devices.sensr.gain: unknown key; expected one of kind, features, sensor; "),
+        (["devices=lab", "devices.sensor.gan=3"], "devices.sensor.gan: unknown key; expected one of kind, gain; "),
+        (["devices=lab", "devices.sensor={gan: 3}"], "devices.sensor.gan: unknown key; expected one of kind, gain; "),
+        (["devices=lab", "devices.sensor.gain=x"], "devices.sensor.gain: expected number, "),
+        (["devices=lab", "devices.features={Gain: x}"], "devices.features.Gain: expected integer, "),
+        (["devices=lab", "devices.paced=true"], "devices.paced: unknown key; expected one of kind, features, sensor"),
+        (["devices.sensor={kind: mono}"], "devices.sensor: unknown key; expected one of kind, paced"),
+        (["devices.features={Gain: 3}"], "devices.features: unknown key; expected one of kind, paced"),
+    ],
+)
+def test_fields_of_a_choice_are_those_of_the_one_that_is_chosen(overrides, found, tmp_path):
+    """Not of the usual choice; maps of free names take any, and a thing of another kind takes the whole place."""
+    (tmp_path / "record.yaml").write_text("defaults: [devices: twin, _self_]\n")
+    (tmp_path / "devices").mkdir()
+    (tmp_path / "devices" / "twin.yaml").write_text("kind: twin\npaced: false\n")
+    (tmp_path / "devices" / "lab.yaml").write_text("kind: lab\nfeatures: {}\nsensor: {kind: mono, gain: 4}\n")
+    if isinstance(found, str):
+        with pytest.raises(InputError, match=f"^record: {re.escape(found)}"):
+            config.load("record", overrides, Record)
+    else:
+        devices = config.load("record", overrides, Record).devices
+        assert {name: getattr(devices, name) for name in found} == found
 
 
 def test_a_choice_of_ones_own_is_found_whatever_the_temporary_folders_name(tmp_path_factory, monkeypatch):

@@ -1,5 +1,6 @@
-"""Defaults stand in the YAML files of conf/, where a person reads them, and in the models, which Python callers use: the same."""
+"""Defaults of verbs stand once, in their `Config`; those of choices stand in the files of conf/ and in the models: the same."""
 
+from collections.abc import Iterator
 from importlib import import_module
 
 import pytest
@@ -9,6 +10,7 @@ from pydantic_core import PydanticUndefined
 
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import parse_scene
+from sonotwin import config
 from sonotwin.cli import VERBS
 from sonotwin.config import compose, folder
 from twin.optics.light_transport import Tracing
@@ -55,6 +57,29 @@ def test_a_verbs_defaults_are_its_models(verb):
     known = set(model.model_fields) | set(Settings.model_fields if verb.name == "study" else ())
     assert written <= known
     assert not found
+
+
+def described(model: type[BaseModel], place: str) -> Iterator[str]:
+    """Fields without a text, of a model and of those within that stand in the verb's help."""
+    for name, field in model.model_fields.items():
+        if not field.description:
+            yield f"{place}.{name}"
+        if not any(isinstance(mark, config.Choice) for mark in field.metadata):
+            inner = [one for one in config._plain_types(field.annotation) if config._is_model(one)]
+            yield from described(inner[0], f"{place}.{name}") if len(inner) == 1 else ()
+
+
+@pytest.mark.parametrize("verb", sorted(set(VERBS) - set(WITH_YAML), key=VERBS.index), ids=lambda verb: verb.name)
+def test_each_field_says_its_unit_and_reason(verb):
+    """In the model alone, from which help and defaults are made; what a verb needs comes first."""
+    model = import_module(verb.module).Config
+    assert list(described(model, verb.name)) == []
+    text, start = config.shown(verb.name), config.primary(verb.name)
+    shown = yaml.safe_load(text) or {}
+    assert {name: value for name, value in shown.items() if name != "defaults"} == {
+        name: value for name, value in start.items() if name != "defaults"
+    }
+    assert shown.get("defaults", []) == start.get("defaults", ["_self_"])[:-1]
 
 
 CHOICES = [

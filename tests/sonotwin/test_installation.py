@@ -1,6 +1,7 @@
 """The doctor on sound and on damaged installations, the damage simulated."""
 
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -158,3 +159,32 @@ def test_two_distributions_in_one_folder_are_named(tmp_path, monkeypatch):
     found = {finding.what: finding for finding in installation._own_packages()}
     assert "twin" in found["sonotwin"].found and "recon" not in found["sonotwin"].found and found["recon"].state == "problem"
     assert "pip uninstall other-recon" in found["recon"].remedy
+
+
+@pytest.fixture
+def installed(tmp_path) -> Path:
+    """The packages as a wheel has them, `conf` inside the command's own."""
+    build = tomllib.loads(PYPROJECT.read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    for package in build["packages"]:
+        shutil.copytree(ROOT / package, tmp_path / "site" / package, ignore=shutil.ignore_patterns("__pycache__"))
+    for source, target in build["force-include"].items():
+        shutil.copytree(ROOT / source, tmp_path / "site" / target)
+    return tmp_path / "site"
+
+
+def test_a_users_own_files_are_found_from_anywhere_once_it_is_installed(installed, tmp_path):
+    """A copy of a shipped file, and one that starts from it, beside the user's data; none in the package."""
+    place = tmp_path / "at home"
+    place.mkdir()
+    shutil.copy(installed / "sonotwin" / "conf" / "patterns" / "paper_surface.yaml", place / "ours.yaml")
+    (place / "rig.yaml").write_text("defaults: [meza2021]\nprojector: {optics: {size: [640, 400]}}\n")
+    (place / "ours.yaml").write_text((place / "ours.yaml").read_text().replace("[1280, 800]", "[640, 400]"))
+    environment = os.environ | {"PYTHONPATH": str(installed)}
+    command = [sys.executable, "-m", "sonotwin", "patterns", "rig=rig.yaml", "patterns=ours.yaml", "out=images"]
+    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "") and "9 images of 640x400 px" in done.stdout
+    assert len(list((place / "images").glob("*.png"))) == 9
+    command[-2] = "patterns=ourz.yaml"
+    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and done.stderr.startswith("sonotwin: patterns: patterns: expected one of gray_alone, ")
+    assert str(installed / "sonotwin" / "conf" / "patterns") in done.stderr

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 Moves = Mapping[str, Callable[[Devices, np.random.Generator], Devices]]
 
 RIGS = 100
-ALARM_SIGMA = 3.2  # as conf/check.yaml has it
+ALARM_SIGMA = 3.2  # as `sonotwin check` has it
 TURN_DEG, SHIFT_MM, BEND_MM, LAG_S = 0.02, 0.1, 0.3, 0.01
 KNOWN_LAG_S, LAG_SIGMA_S, SPEED_MM_S = 0.05, 0.001, 10.0
 FACE_MM, SECONDS, CAMERA_HZ = (4.0, -2.0, 672.0), 10.0, 40.0  # of the array over the bottom

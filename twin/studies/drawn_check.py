@@ -30,7 +30,7 @@ from recon.tracking.pose_fit import Sighting, meet
 Array = NDArray[np.float64]
 Devices = Mapping[str, Camera]
 
-PAIRS = 40  # of the film: as many as conf/check.yaml takes
+PAIRS = 40  # of the film: as many as `sonotwin check` takes
 REACH_MM, DEPTHS_MM, TILT_DEG = (50.0, 40.0), (606.0, 713.0), 20.0  # of the target in it
 GROUND_MM, HEIGHT_MM, WIDTH_MM = 700.0, 45.0, 45.0  # of a mound under the fringes
 VIEW_PX = 60  # that the points keep from camera 1's border

@@ -29,10 +29,16 @@ class Clocks(Part):
     """Rates of scanner and cameras, and errors of their time stamps. Truth is the cameras' clock."""
 
     scanner_hz: Positive = 20.0
+    """images/s; usual at 5 cm with compounding; of wires one image a pose instead"""
     camera_hz: Positive = 40.0
-    lag_s: LagSeconds = 0.05  # of the scanner's stamps: stamped t, an image shows the probe as it stood at t - lag
-    scanner_jitter_s: Jitter = 0.002  # standard deviation of a stamp
+    """pairs of frames/s, or poses/s; assumed, a fifth of what the cameras could"""
+    lag_s: LagSeconds = 0.05
+    """s, delay of the scanner's time stamps: stamped t, an image shows the probe as it stood at t - lag; assumed, a frame
+    grabber's"""
+    scanner_jitter_s: Jitter = 0.002
+    """s, standard deviation of a stamp; assumed, a computer that isn't a real-time one"""
     camera_jitter_s: Jitter = 0.0
+    """s; the cameras are triggered"""
 
 
 class PoseNoise(Part):
