@@ -8,15 +8,15 @@ import pytest
 from recon.capture.board_part import read_board
 from sonotwin.cli import main
 
-HALF = [  # both cameras at half their size
-    "rig.cam1.sensor.pixel_um=9.6",
-    "rig.cam1.optics.size=[640,512]",
-    "rig.cam1.optics.focal_px=[1660.0,1665.5]",
-    "rig.cam1.optics.centre_px=[308.75,261.25]",
-    "rig.cam2.sensor.pixel_um=9.6",
-    "rig.cam2.optics.size=[640,512]",
-    "rig.cam2.optics.focal_px=[1659.0,1664.5]",
-    "rig.cam2.optics.centre_px=[305.75,258.75]",
+SMALL = [  # both cameras at a quarter of their size
+    "rig.cam1.sensor.pixel_um=19.2",
+    "rig.cam1.optics.size=[320,256]",
+    "rig.cam1.optics.focal_px=[830.0,832.75]",
+    "rig.cam1.optics.centre_px=[154.125,130.375]",
+    "rig.cam2.sensor.pixel_um=19.2",
+    "rig.cam2.optics.size=[320,256]",
+    "rig.cam2.optics.focal_px=[829.5,832.25]",
+    "rig.cam2.optics.centre_px=[152.625,129.125]",
 ]
 
 
@@ -87,11 +87,11 @@ def test_a_place_that_is_taken_is_refused_before_rendering(tmp_path, capsys):
 
 def test_both_cameras(tmp_path, capsys):
     """Each camera has its images and its truth; 10-bit images are announced as such."""
-    fields = [*HALF, "scene=plane", "tracing.samples=2", "cameras=[cam1,cam2]", "shooting.bits=10", "shooting.exposure_s=0.02"]
+    fields = [*SMALL, "scene=plane", "tracing.samples=2", "cameras=[cam1,cam2]", "shooting.bits=10", "shooting.exposure_s=0.02"]
     assert main(["render", f"out={tmp_path / 'out'}", *fields]) == 0
     manifest = json.loads((tmp_path / "out" / "capture" / "manifest.json").read_text())
     assert sorted(manifest["surface"]["images"]) == ["cam1", "cam2"]
-    assert manifest["devices"]["cam2"] == {"size": [640, 512], "bits": 10, "exposure_s": 0.02, "gain": 1.0}
+    assert manifest["devices"]["cam2"] == {"size": [320, 256], "bits": 10, "exposure_s": 0.02, "gain": 1.0}
     assert sorted(path.name for path in (tmp_path / "out" / "truth" / "surface").iterdir()) == ["cam1.npz", "cam2.npz"]
     assert "exposure 20.00 ms" in capsys.readouterr().out
 
@@ -99,12 +99,12 @@ def test_both_cameras(tmp_path, capsys):
 def test_a_board_in_poses(tmp_path, capsys):
     """Two poses with warp and print errors: what the reader finds, and the truth beside it."""
     fields = ["scene=board", "poses=demo", "poses.count=2", "patterns=paper_calibration", "cameras=[cam1,cam2]"]
-    fields += [*HALF, "tracing.samples=2", "scene.warp_mm=0.2", "scene.print_error_mm=0.02"]
+    fields += [*SMALL, "tracing.samples=2", "scene.warp_mm=0.2", "scene.print_error_mm=0.02"]
     assert main(["render", f"out={tmp_path / 'out'}", *fields]) == 0
     found = read_board(tmp_path / "out" / "capture")
     assert (found.poses, found.cameras) == (("00", "01"), ("cam1", "cam2"))
     pose = found.pose(1)
-    assert pose.fringes.shape == (50, 512, 640) and pose.lit["cam2"].shape == (512, 640)
+    assert pose.fringes.shape == (50, 256, 320) and pose.lit["cam2"].shape == (256, 320)
     truth = np.load(tmp_path / "out" / "truth" / "board.npz")
     assert truth["world_from_board"].shape == (2, 4, 4) and truth["pixels"].shape == (2, 44, 3, 2)
     apart = truth["points"] - found.board.points()
