@@ -57,6 +57,9 @@ def test_a_verbs_defaults_are_its_models(verb):
     known = set(model.model_fields) | set(Settings.model_fields if verb.name == "study" else ())
     assert written <= known
     assert not found
+    own = [model.model_fields[name] for name in model.__annotations__ if name in model.model_fields]
+    marks = [mark for field in own for mark in (field.description, config._choice(field)) if mark]
+    assert not marks, "texts and choices stand in YAML or in the model, not in both"
 
 
 def described(model: type[BaseModel], place: str) -> Iterator[str]:
