@@ -220,7 +220,7 @@ def test_what_was_known_of_a_rim_is_not_widened_with_its_noise(rng):
 def test_rims_that_are_bent_in_both_views_are_found_again(cameras, rig, rng, monkeypatch):
     """The other circles tell the pose, and that where they are: most that isn't found at first is, most as exactly as it says.
 
-    A rim bent by the edge beside it isn't always noticed: of 16 poses of three seeds 6 were 8 to 10 standard deviations off.
+    A rim bent by the edge beside it isn't always noticed: of 16 poses in three draws 6 were 8 to 10 standard deviations off.
     """
     second_look, squared, missed = covered_circle.sought_again, [], 0
     for _ in range(12):
