@@ -108,7 +108,7 @@ def test_a_closed_mesh_is_opened_to_the_cameras():
 
 
 def settings(**more) -> str:
-    parts = {"scene": {"kind": "breast"}, "clocks": {}, "seed": 3}
+    parts = {"scene": {"kind": "breast", "edge_mm": 5.0}, "clocks": {}, "seed": 3}
     composed = compose("sweep", ["out=none"])
     return json.dumps({name: composed[name] for name in ("rig", "ultrasound")} | parts | more)
 

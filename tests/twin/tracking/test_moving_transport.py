@@ -187,7 +187,9 @@ def test_light_of_several_sources_adds_up_in_their_shadows(bank):
     names = "lamp", "around", "projector"
     tiles = np.ravel_multi_index(np.indices(u.shape) // 6, np.array(u.shape) // 6 + 1).ravel()
     whole, *parts = (
-        np.array([np.bincount(tiles, light_of(bank, lit_by(take, *sources), 0, u, v, seed=4 * j + k).radiance) for k in range(4)])
+        np.array(
+            [np.bincount(tiles, light_of(bank, lit_by(take, *sources), 0, u, v, 16, seed=4 * j + k).radiance) for k in range(4)]
+        )
         for j, sources in enumerate((names, *((name,) for name in names)))
     )
     missing = whole.mean(axis=0) - sum(part.mean(axis=0) for part in parts)
