@@ -8,7 +8,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from recon.model.probe import Speed
 from recon.model.rig import Positive
-from scenes.acoustics import MADE_OF
+from scenes.acoustics import made_of
 from sonotwin.verbs import render
 from twin.optics import surface_session
 from twin.ultrasound.sweep_session import AnyPath
@@ -56,7 +56,7 @@ class Config(render.Config):
     @property
     def looks_inside(self) -> bool:
         """Whether there is a sweep: a path was given, and there is something to find."""
-        return self.path is not None and TUMOURS in MADE_OF.get(str(self.scene["kind"]), {})
+        return self.path is not None and TUMOURS in made_of(str(self.scene["kind"]))
 
     def model_post_init(self, context: Any) -> None:
         """Keep the overrides, which the steps pass on to their verbs."""
