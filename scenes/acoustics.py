@@ -7,6 +7,7 @@ tissue substitutes for ultrasound imaging, Ultrasound Med. Biol. 36(6); [K] Kaye
 
 from dataclasses import dataclass, replace
 
+from recon import registry
 from recon.errors import InputError
 from recon.probe_calibration.sound_in_water import speed_of_sound
 from scenes.scene_types import Scene, Thing
@@ -55,23 +56,13 @@ TISSUES = {
 }
 
 SOFT = ("gel", "silicone", "tumour", "gelatin", "cyst", "bright", "dark")  # of which the speed is that of tissue
+KINDS = "scenes.kinds"  # of scenes, a module each
 WATER_C = 22.0  # of the water above
 
-MADE_OF = {  # by the scene's kind, then by the thing's name without its number; "" is what surrounds them
-    "breast": {"": "gel", "breast": "silicone", "tumour": "tumour", "table": "wood"},
-    "cylinders": {"": "gel", "outer": "gelatin", "inner": "polymer", "table": "wood"},
-    "inner_cylinder": {"": "water", "inner": "polymer", "tank": "polymer"},
-    "crosswire": {"": "water", "wire": "nylon", "tank": "polymer"},
-    "tank": {"": "water", "tank": "polymer"},
-    "test_object": {
-        "": "gel",
-        "block": "gelatin",
-        "wire": "nylon",
-        "cyst": "cyst",
-        "bright": "bright",
-        "dark": "dark",
-    },
-}
+
+def made_of(kind: str) -> dict[str, str]:
+    """Tissues by the names of a kind's things without their number, `MADE_OF` in its module; "" is what surrounds them."""
+    return getattr(registry.kind(KINDS, kind), "MADE_OF", {}) if kind in registry.names(KINDS) else {}
 
 
 def surroundings(scene: Scene) -> Tissue:
@@ -96,15 +87,15 @@ def tissue_of(scene: Scene, thing: Thing) -> Tissue:
     InputError
         If nobody has said so.
     """
-    made_of, name = _table(scene), thing.name.rstrip("0123456789")
-    if name not in made_of:
-        raise InputError(
-            f"{scene.name}: {thing.name}: expected one of {', '.join(filter(None, made_of))}, found no tissue for it"
-        )
-    return TISSUES[made_of[name]]
+    known, name = _table(scene), thing.name.rstrip("0123456789")
+    if name not in known:
+        raise InputError(f"{scene.name}: {thing.name}: expected one of {', '.join(filter(None, known))}, found no tissue for it")
+    return TISSUES[known[name]]
 
 
 def _table(scene: Scene) -> dict[str, str]:
-    if scene.name not in MADE_OF:
-        raise InputError(f"scene: {scene.name}: expected one with acoustics ({', '.join(MADE_OF)}), found none for it")
-    return MADE_OF[scene.name]
+    table = made_of(scene.name)
+    if not table:
+        sounding = [name for name in registry.names(KINDS) if made_of(name)]
+        raise InputError(f"scene: {scene.name}: expected one with acoustics ({', '.join(sounding)}), found none for it")
+    return table

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from recon.files import yaml_text
 from recon.model.rig import Positive
-from scenes.acoustics import MADE_OF
+from scenes.acoustics import made_of
 from sonotwin import choices, config
 from sonotwin.verbs import render, sweep
 from twin.ultrasound.sweep_session import AnyPath
@@ -53,7 +53,7 @@ class Settings(render.Config):
     @property
     def looks_inside(self) -> bool:
         """Whether the scene is swept over: a path was given, and there is something to find."""
-        return self.path is not None and TUMOURS in MADE_OF.get(str(self.scene["kind"]), {})
+        return self.path is not None and TUMOURS in made_of(str(self.scene["kind"]))
 
 
 @dataclass(frozen=True)

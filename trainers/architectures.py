@@ -15,10 +15,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
+from recon.model import circle_layout
+
 Name = Literal["detector", "segmenter", "published_detector", "published_segmenter"]
 
 PIXELS, NO_PIXEL = 65, 64  # classes of a cell: its 64 pixels, and none
-IDENTITIES, NO_CIRCLE = 4, 3  # c0, c1, c2, and none
+IDENTITIES, NO_CIRCLE = circle_layout.COUNT + 1, circle_layout.COUNT  # c0, c1, c2, and none
 CELL = 8  # px, edge of a cell
 CELLS_A_CIRCLE = 200  # about, in what a detector trains with
 

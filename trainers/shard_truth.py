@@ -11,8 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
 
 from recon.errors import validated
 from recon.files import json_text
+from recon.model import circle_layout
 
-CIRCLES = 3
+CIRCLES = circle_layout.COUNT
 FARTHEST = 1e6  # px, or digital numbers: more is no measurement, and overflows in 32 bits
 
 Array = NDArray[np.float64]

@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 LENGTHS = ("c1_mm", "c2_aside_mm", "c2_mm")
 BY_LENGTH = np.zeros((3, 3, 3))  # derivatives of (circle, axis) by the three lengths
 BY_LENGTH[1, 0, 0] = BY_LENGTH[2, 0, 1] = BY_LENGTH[2, 1, 2] = 1
+COUNT = len(BY_LENGTH)  # of circles; whoever needs the number takes it from here
 NEGLIGIBLE = 1e-12  # of a variance, mm^2
 
 
@@ -27,6 +28,16 @@ def lengths(target: Target) -> Array:
 def circle_centres(target: Target) -> Array:
     """Centres : (3, 3) mm of the circles in the target's frame."""
     return BY_LENGTH @ lengths(target)
+
+
+def extent(target: Target) -> Array:
+    """Largest x and y : (2,) mm of the circles' centres; the smallest are those of c0."""
+    return circle_centres(target)[:, :2].max(axis=0)
+
+
+def middle(target: Target) -> Array:
+    """Place : (3,) mm in the target's frame about which the circles lie."""
+    return np.append(extent(target), 0.0) / 2
 
 
 class Circles(NamedTuple):
@@ -42,7 +53,7 @@ class Circles(NamedTuple):
 
 
 def circles(target: Target) -> Circles:
-    """The outer rims of all three."""
+    """The outer rims of all circles."""
     return laid_out(lengths(target), target.outer_diameter_mm, np.array(target.curvature_per_m))
 
 

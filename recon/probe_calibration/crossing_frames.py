@@ -49,12 +49,14 @@ def look(
     pose_covariance: Array | None = None,
     appearance: Appearance | None = None,
     corner: tuple[int, int] = (0, 0),
+    phantom: str = point_calibration.CROSSED_WIRES,
 ) -> CrossingFrames:
     """Find the crossing in n B-scans, taken one by one, at poses : (n, 4, 4) with a covariance : (n, 6, 6).
 
     size, corner : of the whole images, and the column and row of the first pixel of the parts that are looked at; px.
+    phantom : module of `recon.probe_calibration.phantoms` that finds it.
     """
-    sightings, crossings = point_calibration.from_images(images, poses, appearance)
+    sightings, crossings = point_calibration.from_images(images, poses, appearance, phantom)
     sightings = replace(sightings, pixels=sightings.pixels + corner)
     whole = tuple(replace(crossing, pixel=crossing.pixel + corner) for crossing in crossings)
     frames = CrossingFrames(name, size, sightings, numbers, whole, corner[1])

@@ -27,16 +27,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from recon import arguments
+from recon import arguments, registry
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.levenberg_marquardt import descend
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
-from recon.probe_calibration import cross_wire, movement, open_movement, point_equation, probe_checks, wires
+from recon.probe_calibration import movement, open_movement, point_equation, probe_checks, wires
 from recon.probe_calibration.cross_wire import Appearance, Crossing
 from recon.probe_calibration.movement import Equations, Movement
 
+PHANTOMS, CROSSED_WIRES = "recon.probe_calibration.phantoms", "crossed_wires"  # a module each; the usual one
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Size = tuple[int, int]  # width, height, px
@@ -211,9 +212,11 @@ def calibrate(
 
 
 def from_images(
-    images: Iterable[NDArray], poses: Array, appearance: Appearance | None = None
+    images: Iterable[NDArray], poses: Array, appearance: Appearance | None = None, phantom: str = CROSSED_WIRES
 ) -> tuple[Sightings, list[Crossing]]:
     """Find the crossing in B-scans : n of (h, w), tracked at poses : (n, 4, 4), NaN where the target wasn't found.
+
+    phantom : module of `recon.probe_calibration.phantoms` that finds it
 
     Returns
     -------
@@ -223,7 +226,8 @@ def from_images(
         Of all frames: the crossing, or the reason why the frame was rejected.
     """
     tracked = np.isfinite(poses).all(axis=(1, 2))
-    found = [cross_wire.find(image, appearance) for image in images]
+    find = registry.kind(PHANTOMS, phantom).find
+    found = [find(image, appearance) for image in images]
     found = [each if known else replace(each, reason=each.reason or NO_POSE) for each, known in zip(found, tracked, strict=True)]
     good = [k for k, each in enumerate(found) if each.found]
     pixels = np.array([found[k].pixel for k in good]).reshape(-1, 2)

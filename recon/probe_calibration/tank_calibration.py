@@ -2,11 +2,13 @@
 
 import dataclasses
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, PlainValidator, field_validator, model_validator
 
+from recon import registry
 from recon.errors import InputError
 from recon.model.probe import SPEEDS, ProbeCalibration, Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Part, Probe
@@ -15,6 +17,7 @@ from recon.probe_calibration.cross_wire import Appearance
 from recon.probe_calibration.crossing_frames import CrossingFrames
 from recon.probe_calibration.point_calibration import Adjustment, Noise
 
+Phantom = Annotated[str, PlainValidator(partial(registry.known, point_calibration.PHANTOMS))]
 ORDINARY_C = 22.0  # of water, where no temperature is given
 SAME_WIDTH = 0.05  # relative difference of sx, which no sound changes, within which a B-scan is of the rig's scanner
 
@@ -39,6 +42,8 @@ class Settings(Part):
     face_row: Annotated[float, Field(ge=0, le=1e4)] | None = None
     """px, row of the images at which echoes have no delay, from which depths count: on an uncropped screen that of the
     B-scan's first row. Null is the clip's first row, 0 without a clip"""
+    phantom: Phantom = point_calibration.CROSSED_WIRES
+    """what the tank holds: a module of recon/probe_calibration/phantoms, which finds its one point in a B-scan"""
     wire_radius_mm: NotNegative = 0.1
     """mm; assumed, an ordinary fishing line. The echo comes from before the axis: 0.04 mm for nylon of this radius"""
     wire_radius_sigma_mm: NotNegative = 0.03

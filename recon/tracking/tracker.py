@@ -21,6 +21,7 @@ from recon.geometry.circle_outline import ellipses_of
 from recon.geometry.ellipses import Ellipses, joined
 from recon.model import circle_layout
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty, in_use
+from recon.model.circle_layout import COUNT
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, views
 from recon.tracking.circle_detector import Window
@@ -254,8 +255,11 @@ class Tracker:
 
     def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str) -> Tracking:
         """From six rough ellipses, off by a share of a disc at most, to the pose."""
-        outlines = measure_both(*frames, rough, np.arange(6) >= 3, reach_px(rough, reach), self.target)
-        halves = [covered_circle.completed(*each, self.target) for each in zip(frames, (outlines[:3], outlines[3:]), strict=True)]
+        outlines = measure_both(*frames, rough, np.arange(2 * COUNT) >= COUNT, reach_px(rough, reach), self.target)
+        halves = [
+            covered_circle.completed(*each, self.target)
+            for each in zip(frames, (outlines[:COUNT], outlines[COUNT:]), strict=True)
+        ]
         seen = (self._judged(0, halves[0]), self._judged(1, halves[1]))
         return self._settled(frames, seen, how)
 
@@ -301,10 +305,10 @@ class Tracker:
         """From six rough ellipses to the pose, by the segmenter."""
         cuts = [
             circle_segmenter.patches(frame, at, circle_segmenter.step_for(at, self.target))
-            for frame, at in zip(frames, (rough.centre[:3], rough.centre[3:]), strict=True)
+            for frame, at in zip(frames, (rough.centre[:COUNT], rough.centre[COUNT:]), strict=True)
         ]
         masks = networks.segment(np.concatenate([cut.images for cut in cuts]))
-        halves = [circle_segmenter.read(half, cut) for half, cut in zip((masks[:3], masks[3:]), cuts, strict=True)]
+        halves = [circle_segmenter.read(half, cut) for half, cut in zip((masks[:COUNT], masks[COUNT:]), cuts, strict=True)]
         if min(np.isfinite(half.centre[:, 0]).sum() for half in halves) < 2:
             return before
         return self._fitted(frames, joined(halves), circle_segmenter.OFF, "segmented")

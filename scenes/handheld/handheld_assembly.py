@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.model import circle_layout
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import Probe, Target
 from scenes.handheld import lofts
@@ -56,14 +57,14 @@ def held(rng: np.random.Generator, target: Target, ranges: Ranges | None = None)
     target_from_body, probe, beside = _probe_pose(probe_rng, board, ranges)
     parts += [_moved(part, target_from_body) for part in parts_of(probe, lens(probe_rng), probe_rng)]
     parts += _bracket(bracket_rng, board, probe, target_from_body)
-    discs = np.array([[0, 0], [target.c1_mm, 0], [0, target.c2_mm]])
+    discs = circle_layout.circle_centres(target)[:, :2]
     if holder == "hand":
         parts += grip(holder_rng, probe, target_from_body, beside, lambda balls: covers(balls, board))
     elif holder == "pinch":
         parts += pinch(holder_rng, board, discs, target.outer_diameter_mm / 2, beside)
     elif holder == "robot":
         parts += robot(holder_rng, probe, target_from_body, beside)
-    covered = discs[cable_rng.integers(3)] if cable_in_front else None
+    covered = discs[cable_rng.integers(len(discs))] if cable_in_front else None
     parts += _cable(cable_rng, probe, target_from_body, beside, covered, target.outer_diameter_mm / 2)
     return tuple(parts)
 
@@ -84,7 +85,7 @@ def as_designed(rng: np.random.Generator, target: Target, probe: Probe, eyes: Ar
         If no housing for such an array stands clear of the board.
     """
     board_rng, probe_rng, bracket_rng, holder_rng, cable_rng = rng.spawn(5)
-    middle, half = np.array([target.c1_mm, target.c2_mm]) / 2, np.array(target.board_mm) / 2
+    middle, half = circle_layout.middle(target)[:2], np.array(target.board_mm) / 2
     board, parts = build_board(board_rng, middle - half, middle + half, Ranges.thickness_mm)
     array_mm = probe.scale_mm_per_px[0] * (probe.image_size[0] - 1)
     face = rigid.transform(IMAGE_FROM_BODY, [array_mm / 2, 0, 0])

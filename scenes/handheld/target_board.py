@@ -7,6 +7,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.geometry import rigid
+from recon.model import circle_layout
 from recon.model.rig import Target
 from scenes.handheld import lofts
 from scenes.handheld.mesh_parts import Part
@@ -44,7 +45,7 @@ def draw_front(rng: np.random.Generator, target: Target, spread: float) -> tuple
     spread : largest relative change of each side.
     """
     room = target.outer_diameter_mm / 2 + MARGIN_MM
-    needed_low, needed_high = -room * np.ones(2), np.array([target.c1_mm, target.c2_mm]) + room
+    needed_low, needed_high = -room * np.ones(2), circle_layout.extent(target) + room
     size = np.maximum(np.array(target.board_mm) * rng.uniform(1 - spread, 1 + spread, 2), needed_high - needed_low)
     low = needed_high - size + rng.beta(1.5, 1.5, 2) * (needed_low - needed_high + size)
     return low, low + size

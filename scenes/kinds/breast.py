@@ -22,6 +22,8 @@ from scenes.scene_types import Material, Scene, Thing
 from scenes.table import table
 from scenes.tumour import tumour
 
+MADE_OF = {"": "gel", "breast": "silicone", "tumour": "tumour", "table": "wood"}  # for ultrasound; see `scenes.acoustics`
+
 Array = rigid.Array
 
 APART_MM = 1.0  # of tissue between two tumours

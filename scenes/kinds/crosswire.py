@@ -13,6 +13,8 @@ from scenes import solid_meshes
 from scenes.kinds.tank import bottom
 from scenes.scene_types import Material, Scene, Thing
 
+MADE_OF = {"": "water", "wire": "nylon", "tank": "polymer"}  # for ultrasound; see `scenes.acoustics`
+
 
 class Config(Part):
     """Nylon line crossed at a right angle. The paper gives no diameters; 0.2 mm is an ordinary fishing line."""

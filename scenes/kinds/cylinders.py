@@ -11,6 +11,8 @@ from scenes.noise import Seed
 from scenes.scene_types import Material, Scene, Thing
 from scenes.table import table
 
+MADE_OF = {"": "gel", "outer": "gelatin", "inner": "polymer", "table": "wood"}  # for ultrasound; see `scenes.acoustics`
+
 
 class Config(Part):
     """The cylinders of Meza et al. 2021, section 3."""

@@ -9,6 +9,8 @@ from scenes import solid_meshes
 from scenes.kinds.tank import bottom
 from scenes.scene_types import Material, Scene, Thing
 
+MADE_OF = {"": "water", "inner": "polymer", "tank": "polymer"}  # for ultrasound; see `scenes.acoustics`
+
 
 class Config(Part):
     """A cylinder along x under water."""

@@ -8,6 +8,8 @@ from recon.model.rig import Finite, Fraction, Part, Positive
 from scenes import solid_meshes
 from scenes.scene_types import Material, Scene, Thing
 
+MADE_OF = {"": "water", "tank": "polymer"}  # for ultrasound; see `scenes.acoustics`
+
 THICKNESS_MM = 10.0
 
 

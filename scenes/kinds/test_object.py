@@ -8,6 +8,15 @@ from recon.model.rig import Finite, Fraction, Part, Positive
 from scenes import solid_meshes
 from scenes.scene_types import Material, Scene, Thing
 
+MADE_OF = {
+    "": "gel",
+    "block": "gelatin",
+    "wire": "nylon",
+    "cyst": "cyst",
+    "bright": "bright",
+    "dark": "dark",
+}  # for ultrasound; see `scenes.acoustics`
+
 
 class Config(Part):
     """All targets run along y, so that a section of constant y shows them as points and discs."""

@@ -138,7 +138,7 @@ def look(config: Config, console: Console) -> CrossingFrames:
                 yield clip.cut(image)
 
         return crossing_frames.look(
-            sweep.name, images(), sweep.size, sweep.frames, poses, covariance, config.appearance, clip.corner
+            sweep.name, images(), sweep.size, sweep.frames, poses, covariance, config.appearance, clip.corner, config.phantom
         )
 
 

@@ -16,6 +16,7 @@ from recon.capture import probe_files, sweep_tables
 from recon.geometry import rigid
 from recon.probe_calibration import point_calibration, probe_checks, repeatability, sound_in_water
 from sonotwin.cli import main
+from tests import added
 from tests.recon import bscans, probe_motions, sweep_sets
 
 LAG_S = 0.03
@@ -322,3 +323,37 @@ def test_other_folders_are_not_replaced(capture, tmp_path, capsys):
     )
     assert "apart from what is read" in complaint(capsys, f"capture={capture}", f"out={capture.parent}")
     assert len(list(out.iterdir())) == 2
+
+
+BEAD = '''
+"""A bead on a thread: one round spot, its middle the mean of the pixels near its top."""
+
+import numpy as np
+
+from recon.probe_calibration.cross_wire import Appearance, Crossing
+
+NOTHING = np.full(2, np.nan)
+
+
+def find(image, appearance):
+    """The bead, below the face's ringing."""
+    look = appearance or Appearance()
+    level = np.asarray(image, float)[look.top_px :]
+    rise = level.max() - np.median(level)
+    if rise < 255 / look.dynamic_range_db * 2 * look.min_contrast_db:
+        return Crossing(NOTHING, np.full((2, 2), np.nan), np.nan, "no bead")
+    v, u = np.nonzero(level > level.max() - 0.3 * rise)
+    return Crossing(np.array([u.mean(), v.mean() + look.top_px]), np.eye(2), rise * look.dynamic_range_db / 255)
+'''
+
+
+def test_another_phantom_is_one_module(capture, rig, tmp_path, monkeypatch, capsys):
+    """Its finder is found by the name in `phantom`, and its point calibrates the probe."""
+    fields = [f"capture={capture}", f"out={tmp_path / 'out'}", f"lag_s={LAG_S}", "phantom=bead"]
+    assert main(["calibrate-probe", *fields]) == 2
+    assert "phantom: expected 'crossed_wires', found 'bead'" in capsys.readouterr().err
+    added.add(monkeypatch, tmp_path / "ours", point_calibration.PHANTOMS, "bead", BEAD)
+    calibrate(*fields)
+    found, true = probe_files.read(tmp_path / "out" / "probe.yaml"), sweep_sets.probe_in_water(rig)
+    pixels = repeatability.five_points(bscans.SIZE)
+    assert np.linalg.norm(found.to_target(pixels) - true.to_target(pixels), axis=1).max() < 1.0

@@ -16,8 +16,10 @@ from scenes.scene_types import Scene
 from sonotwin import config
 from sonotwin.cli import main
 from sonotwin.verbs.sweep import Config, led_along
+from tests import added
 from twin.evaluation import track_errors
 from twin.session import Session, describe
+from twin.ultrasound import scan_lines
 
 PARTS = (CentreLine(), Fringes(pitch=12, steps=4))
 
@@ -209,3 +211,100 @@ def test_the_frames_of_a_filmed_sweep_show_board_and_table(filmed):
     image = cv2.imread(str(filmed / "capture" / "sweep" / "scan" / "cam1" / "0002.png"), cv2.IMREAD_GRAYSCALE)
     assert image.shape == (1024, 1280)
     assert np.percentile(image, 99) > 80 and np.percentile(image, 20) < 30
+
+
+PHASED = '''
+"""A phased array: a small flat face, whose lines are steered as from one place a little behind it."""
+
+import numpy as np
+from pydantic import Field
+
+from recon.model.rig import Part
+
+
+class Face(Part):
+    """Steered lines from a narrow face."""
+
+    sector_deg: float = Field(ge=1, le=170)
+    lines: int = Field(ge=16, le=2048)
+    behind_mm: float = Field(gt=0)
+    foot_mm: float
+
+    @property
+    def pitch_mm(self):
+        """On the arc about the place behind."""
+        return self.behind_mm * np.deg2rad(self.sector_deg) / (self.lines - 1)
+
+    @property
+    def bend(self):
+        """Of that arc."""
+        return 1 / self.behind_mm
+
+    @property
+    def sagitta_mm(self):
+        """Of that arc."""
+        return float(self.behind_mm * (1 - np.cos(np.deg2rad(self.sector_deg / 2))))
+
+    @property
+    def chord_mm(self):
+        """Of that arc."""
+        return float(2 * self.behind_mm * np.sin(np.deg2rad(self.sector_deg / 2)))
+'''
+
+
+SIZE, PIXEL = (150, 120), 0.4  # px, mm
+
+
+@pytest.fixture
+def phased(tmp_path) -> list[str]:
+    """Fields of a sweep by a phased array, whose module isn't there yet."""
+    size, pixel = SIZE, PIXEL
+    array = tmp_path / "phased.yaml"
+    face = "{sector_deg: 70, lines: 96, behind_mm: 3, foot_mm: 12}"
+    figures = "frequency_mhz: 3.5\nbandwidth: [0.6, 0.5]\ntransmit_focus_mm: 40\naperture_mm: 12\nreverberations: 0\n"
+    figures += "scatterers_per_mm3: 1\nreceive_f_number: 3\nelevation_mm: 8\nelevation_focus_mm: 40\n"
+    array.write_text(f"image_size: {list(size)}\nscale_mm_per_px: [{pixel}, {pixel}]\nphased: {face}\n{figures}")
+    given = [
+        "scene=tank",
+        "path=bob",
+        f"ultrasound={array}",
+        "path.seconds=2",
+        "clocks.scanner_hz=2",
+        "clocks.camera_hz=10",
+    ]
+    given += ["path.hand.shift_mm=0", "path.hand.turn_deg=0"]
+    given += [f"rig.probe.image_size={list(size)}".replace(" ", ""), f"rig.probe.scale_mm_per_px=[{pixel},{pixel}]"]
+    return [*given, f"out={tmp_path / 'out'}"]
+
+
+def test_a_phased_array_is_one_module(phased, tmp_path, monkeypatch, capsys):
+    """Its lines fan out by 70 degrees from a place 3 mm behind the middle of its face."""
+    assert main(["sweep", *phased]) == 2
+    assert "ultrasound.phased: expected no such field" in capsys.readouterr().err
+    added.add(monkeypatch, tmp_path / "ours", "twin.ultrasound.faces", "phased", PHASED)
+    array = config.load("sweep", phased, Config).ultrasound
+    lines = scan_lines.lines_of(array)
+    ends = scan_lines.world_from_lines(lines, np.eye(4), np.array([0, 2 * lines.middle_mm]))
+    assert np.rad2deg(np.arctan2(ends[:, 0, 1], ends[:, 1, 1])) == pytest.approx([-35, 35])
+    assert rigid.apply(ends[0], np.array([0, -3.0, 0])) == pytest.approx(np.array([0, -3.0, 0]), abs=1e-9)
+    assert array.foot_mm == 12 and lines.count == 96
+
+
+@pytest.mark.slow
+def test_a_phased_array_sees_a_mirror_squarely(phased, tmp_path, monkeypatch):
+    """A tank's flat bottom is straight, where it is, and brightest where lines meet it squarely; nothing is beside the fan."""
+    size, pixel = SIZE, PIXEL
+    added.add(monkeypatch, tmp_path / "ours", "twin.ultrasound.faces", "phased", PHASED)
+    assert main(["sweep", *phased]) == 0
+    image = next(iter(read_sweep(tmp_path / "out" / "capture").images())).astype(float)
+    pose = np.load(tmp_path / "out" / "truth" / "sweep" / "sweep.npz")["world_from_image"][0]
+    middle = size[0] // 2
+    row = (700 - pose[2, 3]) / (pose[2, 1] * pixel)
+    assert abs(image[20:, middle].argmax() + 20 - row * 1540 / 1488.3) < 2, "sound in water is slower than the scanner assumes"
+    v, u = np.indices(image.shape) * pixel
+    beside = np.abs(u - pixel * (size[0] - 1) / 2) > 1 + np.tan(np.deg2rad(35)) * (v + 3)
+    assert not image[beside].any() and beside.mean() > 0.2, "nothing is shown beside the fan"
+    across = image[20:, 26:124]
+    assert np.ptp(across.argmax(axis=0)) <= 2, "lines that fan out show a flat bottom straight"
+    strength = across.max(axis=0)
+    assert strength[[0, -1]].max() < 0.75 * strength[45:53].min(), "and a mirror most brightly where they meet it squarely"

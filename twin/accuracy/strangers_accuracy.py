@@ -21,10 +21,11 @@ from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import scans
 from twin.ultrasound.echo_solids import body
+from twin.ultrasound.faces.curved import Face
 from twin.ultrasound.probe_path import Bob, WirePath, about_crossing
 from twin.ultrasound.sweep_session import calibration_of
 from twin.ultrasound.timed_sweep import Clocks, PoseNoise
-from twin.ultrasound.transducer import CurvedArray, Transducer
+from twin.ultrasound.transducer import Transducer
 
 SEED = 20
 SCANNERS = (  # image size px, width of the array and depth mm, MHz
@@ -109,7 +110,7 @@ def fans(setup: Setup) -> list[Row]:
 
 def curved(like: Transducer, radius: float, sector: float, mhz: float) -> tuple[Transducer, Fan]:
     """A curved array that shows FAN_DEPTH_MM, and its fan in the image."""
-    face = CurvedArray(radius_mm=radius, sector_deg=sector, lines=256)
+    face = Face(radius_mm=radius, sector_deg=sector, lines=256)
     half, pixel = np.deg2rad(sector / 2), 0.25
     size = (int(2 * (radius + FAN_DEPTH_MM) * np.sin(half) / pixel) + 9, int((FAN_DEPTH_MM + face.sagitta_mm) / pixel) + 1)
     fields = {"curved": face, "image_size": size, "scale_mm_per_px": (pixel, pixel), "frequency_mhz": mhz}

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from recon.capture.manifest import CAMERAS, Device
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.model import circle_layout
 from recon.model.calibration import Calibration
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig, Target, Vector
@@ -114,7 +115,7 @@ def lead(path: HandPath, target: Target, eyes: Array, seed: int, errors: conditi
     times = np.linspace(0, path.seconds, len(places) + 1)
     middle, turn = (CubicSpline(times, np.vstack([rows, rows[:1]]), bc_type="periodic") for rows in (places, turns))
     facing = _facing(eyes - places.mean(axis=0), path.roll_deg)
-    return Way(middle, turn, facing, np.array([target.c1_mm, target.c2_mm, 0]) / 2, conditions.trembling(errors, seed))
+    return Way(middle, turn, facing, circle_layout.middle(target), conditions.trembling(errors, seed))
 
 
 def _facing(towards: Array, roll_deg: float) -> Array:

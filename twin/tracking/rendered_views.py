@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry import rigid
+from recon.model import circle_layout
+from recon.model.circle_layout import COUNT
 from recon.model.rig import CameraDevice, Rig, Target
 from recon.threads import mapped
 from twin.sensor import Exposure, digitise, number_per_electron, read_out
@@ -143,7 +145,7 @@ def _rendered(
     for i, take in enumerate(takes):
         for camera, device in enumerate(take.cameras):
             first = _patch_origins(take, camera, truths[i][camera])
-            circles = range(3) if take.present else [NO_CIRCLE] * 3
+            circles = range(COUNT) if take.present else [NO_CIRCLE] * COUNT
             patches = [
                 Window(device.optics.size, tuple(first[c].tolist()), (PATCH, PATCH), quality.patch, c, circle)
                 for c, circle in enumerate(circles)
@@ -160,7 +162,7 @@ def _rendered(
         for camera, device in enumerate(take.cameras):
             at = 4 * (2 * i + camera)  # an image and its three patches
             views.append(pictures[i][camera].image(numbers[at]))
-            patches.append(np.stack(numbers[at + 1 : at + 4]).reshape(3, PATCH, PATCH))
+            patches.append(np.stack(numbers[at + 1 : at + 1 + COUNT]).reshape(COUNT, PATCH, PATCH))
             seen = pieces[at + 1 : at + 4]
             told.append(
                 replace(
@@ -178,9 +180,9 @@ def _patch_origins(take: Take, camera: int, truth: ViewTruth) -> NDArray[np.int6
     """Where patches begin : (3, 2) px, about the circles as a detector that is a pixel off would place them; or anywhere."""
     rng = np.random.default_rng([take.noise_seed, camera])
     size = np.array(take.cameras[camera].optics.size)
-    coarse = np.rint(np.nan_to_num(truth.centres) / (size / VIEW) + rng.uniform(-1, 1, (3, 2))) * (size / VIEW)
+    coarse = np.rint(np.nan_to_num(truth.centres) / (size / VIEW) + rng.uniform(-1, 1, (COUNT, 2))) * (size / VIEW)
     if not take.present or not np.isfinite(truth.centres).all():
-        coarse = rng.uniform([0, 0], size, (3, 2))
+        coarse = rng.uniform([0, 0], size, (COUNT, 2))
     return np.rint(np.clip(coarse, 0, size - 1)).astype(int) - HALF
 
 
@@ -206,7 +208,7 @@ def _electrons(take: Take, device: CameraDevice, rig: Rig) -> float:
 def white_radiance(take: Take, rig: Rig) -> float:
     """Radiance of the target's white in the middle, nothing in the way."""
     pose, lighting = take.motion.world_from_target, take.lighting
-    place = pose[:3, 3] + pose[:3, :3] @ [rig.target.c1_mm / 2, rig.target.c2_mm / 2, 0]
+    place = pose[:3, 3] + pose[:3, :3] @ circle_layout.middle(rig.target)
     ways = np.vstack([lighting.lamps[:, :3], rig.projector.optics.camera().centre]) - place
     distance2 = (ways**2).sum(axis=1)
     cosine = np.maximum(ways @ pose[:3, 2] / np.sqrt(distance2), DARKEST)

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
+from recon.model import circle_layout
 from recon.model.rig import CameraDevice, Lens, Rig, Sensor
 from scenes.handheld.mesh_parts import SLOTS
 from twin.tracking.sampling_ranges import CameraRanges, DataRanges, LightRanges, PoseRanges, TargetRanges
@@ -195,7 +196,7 @@ def _described(to_world: Array, device: CameraDevice):
 def _pose(ranges: PoseRanges, rig: Rig, cameras: tuple[CameraDevice, CameraDevice], rng: np.random.Generator) -> Array:
     """A pose whose middle lies in both cameras' views, mostly; the target's face is turned towards them."""
     views = [device.optics.camera() for device in cameras]
-    middle_target = np.array([rig.target.c1_mm, rig.target.c2_mm, 0]) / 2
+    middle_target = circle_layout.middle(rig.target)
     anywhere = rng.random() < OUTSIDE_SHARE
     eyes = (views[0].centre + views[1].centre) / 2
     pose = np.eye(4)
@@ -294,7 +295,7 @@ def _surfaces(rng: np.random.Generator) -> Array:
 
 def _print(ranges: TargetRanges, rig: Rig, rng: np.random.Generator) -> Print:
     flawed = rng.random() < ranges.flaw_share
-    low, high = np.array([-14.0, -14.0]), np.array([rig.target.c1_mm + 14, rig.target.c2_mm + 14])
+    low, high = np.array([-14.0, -14.0]), circle_layout.extent(rig.target) + 14
     scratches, spots = np.zeros((SCRATCHES, 6)), np.zeros((SPOTS, 4))
     for scratch in scratches[: rng.integers(SCRATCHES + 1) * flawed]:
         start = rng.uniform(low, high)

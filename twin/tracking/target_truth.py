@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.circle_layout import circle_centres
+from recon.model import circle_layout
+from recon.model.circle_layout import COUNT, circle_centres
 from recon.model.rig import CameraDevice, Target
 from twin.tracking.samples import Motion, Take
 
@@ -25,17 +26,17 @@ class ViewTruth:
     ellipses: Array  # (3, 5) of the outer outlines: middle u, v, semi-axes a >= b px, angle rad of a from u towards v
     inside: NDArray[np.bool_]  # (3,) whether the whole disc lies in the image
     blur_px: Array  # (3,) length of a centre's path over the exposure
-    visible: Array = field(default_factory=lambda: np.zeros(3))  # part of each disc, 0 to 1: in the image, nothing before it
+    visible: Array = field(default_factory=lambda: np.zeros(COUNT))  # part of each disc, 0 to 1: in the image, nothing before it
     white_dn: float = float("nan")  # brightness of the target's white, without noise
-    patch_origins: NDArray[np.int64] = field(default_factory=lambda: np.zeros((3, 2), int))
+    patch_origins: NDArray[np.int64] = field(default_factory=lambda: np.zeros((COUNT, 2), int))
 
 
 def view_truth(take: Take, device: CameraDevice, late: float, target: Target) -> ViewTruth:
     """Ground truth of a take's target in one camera, which exposes later by a share of the exposure."""
     camera = device.optics.camera()
     if not take.present:
-        nothing = np.full((3, 2), np.nan)
-        return ViewTruth(camera, nothing, np.full((3, 5), np.nan), np.zeros(3, bool), np.full(3, np.nan))
+        nothing = np.full((COUNT, 2), np.nan)
+        return ViewTruth(camera, nothing, np.full((COUNT, 5), np.nan), np.zeros(COUNT, bool), np.full(COUNT, np.nan))
     motion, model = take.motion.later(late), circle_centres(target)
     pose = motion.world_from_target
     rims = camera.project(rigid.apply(pose, outline(model, target.outer_diameter_mm / 2)))
@@ -56,7 +57,7 @@ def outline(centres: Array, radius: float) -> Array:
 def board_corners(target: Target) -> Array:
     """Corners : (4, 3) mm of the board's face, its middle at the circles' middle."""
     half = np.array(target.board_mm) / 2
-    middle = np.array([target.c1_mm, target.c2_mm]) / 2
+    middle = circle_layout.middle(target)[:2]
     return np.column_stack([middle + half * [[-1, -1], [1, -1], [1, 1], [-1, 1]], np.zeros(4)])
 
 

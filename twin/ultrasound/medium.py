@@ -76,7 +76,7 @@ def _lattice(body: Body, transducer: Transducer, beam: Beam, pose: Array) -> Lat
     axes = _axes(pose)
     low, high = _box(transducer, beam, pose, edge)
     face_from_world = np.ascontiguousarray(rigid.invert(pose)[:3])
-    half = _half_thickness(beam, pose, axes[2], edge, transducer.curved is not None)
+    half = _half_thickness(beam, pose, axes[2], edge, transducer.face is not None)
     return Lattice(edge, axes, low, high, face_from_world, half, strength.astype(np.float32), turns)
 
 
@@ -90,9 +90,9 @@ def _box(transducer: Transducer, beam: Beam, pose: Array, edge: float) -> tuple[
     """First and last cell of the box around the slice."""
     deepest = beam.depth_step_mm * (len(beam.core_mm) - 1)
     x, y = np.array([-BESIDE_MM, transducer.width_mm + BESIDE_MM]), np.array([0.0, deepest])
-    if transducer.curved is not None:
-        aside = transducer.foot_mm / 2 * (1 + deepest / transducer.curved.radius_mm) + BESIDE_MM
-        x, y = np.array([-aside, aside]), np.array([-transducer.curved.sagitta_mm - BESIDE_MM, deepest])
+    if (face := transducer.face) is not None:
+        aside = face.chord_mm / 2 * (1 + deepest * face.bend) + BESIDE_MM
+        x, y = np.array([-aside, aside]), np.array([-face.sagitta_mm - BESIDE_MM, deepest])
     z = np.array([-1.0, 1.0]) * float(beam.core_mm.max())
     corners = np.stack(np.meshgrid(x, y, z), axis=-1).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
     low, high = corners.min(axis=0) / edge, corners.max(axis=0) / edge

@@ -37,14 +37,15 @@ class Lines(NamedTuple):
 
 def lines_of(transducer: Transducer) -> Lines:
     """The lines of a transducer."""
-    if transducer.curved is None:
+    face = transducer.face
+    if face is None:
         return Lines(transducer.image_size[0], transducer.scale_mm_per_px[0], 0.0)
-    return Lines(transducer.curved.lines, transducer.curved.pitch_mm, 1 / transducer.curved.radius_mm)
+    return Lines(face.lines, face.pitch_mm, face.bend)
 
 
 def world_from_face(transducer: Transducer, world_from_image: Array) -> Array:
     """Pose of the face's frame : (..., 4, 4)."""
-    if transducer.curved is None:
+    if transducer.face is None:
         return world_from_image
     return world_from_image @ rigid.transform(np.eye(3), (*transducer.face_mm, 0.0))
 
@@ -82,7 +83,7 @@ def converted(shown: NDArray, transducer: Transducer, order: int) -> NDArray:
 
     order : 0 for the nearest value, 1 for linear interpolation
     """
-    if transducer.curved is None:
+    if transducer.face is None:
         return shown
     lines, (sx, sy) = lines_of(transducer), transducer.scale_mm_per_px
     width, height = transducer.image_size

@@ -1,41 +1,31 @@
-"""A linear or curved array and the scanner behind it: their figures, with units."""
+"""An array and the scanner behind it: their figures, with units."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
+from recon import registry
+from recon.errors import brief, one_line
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig
 
 Array = NDArray[np.float64]
+FACES = "twin.ultrasound.faces"  # a module each
 Bandwidth = Annotated[float, Field(ge=0.05, le=1.5)]
 
 
-class CurvedArray(Part):
-    """The face of a curved array: an arc, whose lines leave it at right angles, evenly spaced."""
-
-    radius_mm: Annotated[float, Field(ge=5, le=500)]
-    sector_deg: Annotated[float, Field(ge=1, le=170)]  # between the first line and the last
-    lines: Annotated[int, Field(ge=16, le=2048)]
-
-    @property
-    def pitch_mm(self) -> float:
-        """From line to line on the face."""
-        return self.radius_mm * np.deg2rad(self.sector_deg) / (self.lines - 1)
-
-    @property
-    def sagitta_mm(self) -> float:
-        """By which the middle of the face stands out before its ends."""
-        return float(self.radius_mm * (1 - np.cos(np.deg2rad(self.sector_deg / 2))))
-
-
 class Transducer(Part):
-    """A linear or curved array, its beams, and the scanner's processing of the echoes; as conf/ultrasound/linear.yaml has it."""
+    """An array, its beams, and the scanner's processing of the echoes; as conf/ultrasound/linear.yaml has it.
+
+    A field beyond these names the array's face, such as `curved`; see `twin.ultrasound.faces`. A linear array has none: its face
+    is as wide as the image, another begins in the image's first row.
+    """
+
+    model_config = ConfigDict(extra="allow")
 
     image_size: tuple[Annotated[int, Field(ge=16, le=4096)], Annotated[int, Field(ge=16, le=4096)]] = (321, 408)
     scale_mm_per_px: tuple[Positive, Positive] = (0.1229, 0.1225)  # sx, sy of the scanner, at its assumed speed
-    curved: CurvedArray | None = None  # a linear array's face is as wide as the image, a curved one's begins in its first row
     assumed_speed: Annotated[float, Field(ge=300, le=5000)] = 1540.0  # m/s
     frequency_mhz: Annotated[float, Field(ge=0.5, le=40)] = 7.5
     bandwidth: tuple[Bandwidth, Bandwidth] = (0.5, 0.4)  # -6 dB of an echo, over the frequency: at the face, at the image's end
@@ -58,6 +48,23 @@ class Transducer(Part):
     dynamic_range_db: Annotated[float, Field(ge=10, le=120)] = 60.0
     bits: Annotated[int, Field(ge=1, le=8)] = 8
 
+    @model_validator(mode="before")
+    @classmethod
+    def _one_face(cls, fields: Any) -> Any:
+        others = {name: fields[name] for name in fields if name not in cls.model_fields} if isinstance(fields, dict) else {}
+        there, faces = registry.names(FACES), {}
+        for name, value in others.items():
+            if name not in there:
+                raise ValueError(f"{name}: expected no such field, found {brief(value)}")
+            try:
+                faces |= {} if value is None else {name: registry.kind(FACES, name).Face.model_validate(value)}
+            except ValidationError as error:
+                said = one_line(error)
+                raise ValueError(f"{name}{': ' if said.startswith('expected') else '.'}{said}") from None
+        if len(faces) > 1:
+            raise ValueError(f"{list(faces)[1]}: expected one face, found {' and '.join(faces)}")
+        return {name: value for name, value in fields.items() if name not in others} | faces if others else fields
+
     @model_validator(mode="after")
     def _depth(self) -> "Transducer":
         if self.scale_mm_per_px[1] > 2 * self.wavelength_mm:
@@ -69,6 +76,11 @@ class Transducer(Part):
             found = f"{self.scale_mm_per_px[1] * (self.image_size[1] - 1):g} mm, with {self.face_mm[1]:g} mm of the face's arc"
             raise ValueError(f"image_size: expected an image deeper than the face's arc by 1 mm or more, found {found}")
         return self
+
+    @property
+    def face(self) -> Any:
+        """The `Face` of an array that isn't linear; None of a linear one."""
+        return next(iter((self.model_extra or {}).values()), None)
 
     @property
     def wavelength_mm(self) -> float:
@@ -93,19 +105,17 @@ class Transducer(Part):
     @property
     def face_mm(self) -> tuple[float, float]:
         """The middle of the face in the image's frame, x and y."""
-        return self.width_mm / 2, 0.0 if self.curved is None else self.curved.sagitta_mm
+        return self.width_mm / 2, 0.0 if self.face is None else self.face.sagitta_mm
 
     @property
     def foot_mm(self) -> float:
         """Width of the face, from end to end."""
-        if self.curved is None:
-            return self.width_mm
-        return float(2 * self.curved.radius_mm * np.sin(np.deg2rad(self.curved.sector_deg / 2)))
+        return self.width_mm if self.face is None else self.face.foot_mm
 
     @property
     def rows_mm(self) -> Array:
         """Shown depth of the rows : (h,), those of a linear array's image."""
-        rows = self.image_size[1] if self.curved is None else int(self.depth_mm / self.scale_mm_per_px[1]) + 1
+        rows = self.image_size[1] if self.face is None else int(self.depth_mm / self.scale_mm_per_px[1]) + 1
         return self.scale_mm_per_px[1] * np.arange(rows)
 
     def axial_sigma_mm(self, depth_mm: Array) -> Array:

@@ -20,15 +20,16 @@ from tests.twin.ultrasound.test_medium import correlation, echoes
 from twin.ultrasound import bscan_truth, scan_lines
 from twin.ultrasound.bscan import scan
 from twin.ultrasound.echo_solids import Body, solid
+from twin.ultrasound.faces import curved
 from twin.ultrasound.sound_paths import follow
-from twin.ultrasound.transducer import CurvedArray, Transducer
+from twin.ultrasound.transducer import Transducer
 
 FIGURES = QUIET | {"frequency_mhz": 5.0, "transmit_focus_mm": 35.0, "elevation_focus_mm": 35.0, "scatterers_per_mm3": 20.0}
 CURVED = Transducer(
     **FIGURES,
     image_size=(440, 360),
     scale_mm_per_px=(0.2, 0.2),
-    curved=CurvedArray(radius_mm=40.0, sector_deg=60.0, lines=257),
+    curved=curved.Face(radius_mm=40.0, sector_deg=60.0, lines=257),
 )
 LINES = scan_lines.lines_of(CURVED)
 LINEAR = Transducer(**FIGURES, image_size=(LINES.count, 334), scale_mm_per_px=(LINES.pitch_mm, 0.2))
@@ -169,5 +170,5 @@ def test_the_image_is_a_fan_that_the_pipeline_finds(speckle):
 def test_what_no_image_can_hold_is_refused():
     with pytest.raises(ValueError, match="image_size: expected an image deeper than the face's arc"):
         Transducer(
-            image_size=(440, 60), scale_mm_per_px=(0.1, 0.1), curved=CurvedArray(radius_mm=60.0, sector_deg=90.0, lines=64)
+            image_size=(440, 60), scale_mm_per_px=(0.1, 0.1), curved=curved.Face(radius_mm=60.0, sector_deg=90.0, lines=64)
         )
