@@ -30,7 +30,12 @@ MODULES = {  # where a package isn't imported by the name that it is installed b
     "pyyaml": "yaml",
     "scikit-image": "skimage",
 }
-BROUGHT_BY = {"drjit": "mitsuba", "omegaconf": "hydra", "websockets": "viser"}  # imported by us, required by what we require
+BROUGHT_BY = {
+    "pydantic_core": "pydantic",
+    "drjit": "mitsuba",
+    "omegaconf": "hydra",
+    "websockets": "viser",
+}  # imported by us, required by what we require
 
 
 @dataclass(frozen=True)
