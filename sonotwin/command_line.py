@@ -17,12 +17,15 @@ def words(verb: str, settings: BaseModel) -> list[str]:
 
 
 def fields(verb: str, settings: BaseModel) -> list[str]:
-    """Overrides of a verb's defaults, those of groups first; of a group the choice that is nearest, and what differs from it."""
+    """Overrides of a verb's defaults, those of groups first, then what needs a value.
+
+    Of a group this is the choice that is nearest, and what differs from it.
+    """
     groups, usual, found = config.groups(verb), config.defaults(verb), list[str]()
     known_fields: dict[str, Any] = type(settings).model_fields
     types = {name: TypeAdapter(Annotated[field.annotation, field]) for name, field in known_fields.items()}
     values = settings.model_dump(mode="json")
-    for name in sorted(values, key=lambda name: name not in groups):
+    for name in sorted(values, key=lambda name: 0 if name in groups else 1 if usual.get(name) == config.NEEDED else 2):
         known = usual.get(name, ABSENT)
         default = known_fields[name].get_default(call_default_factory=True) if known is ABSENT else known
         if name not in groups or values[name] == _parsed(types[name], known):

@@ -19,11 +19,11 @@ target is seen, and bring the crossing near all corners of the image in turn.
 from collections.abc import Iterator
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import model_validator
+from pydantic import PrivateAttr, model_validator
 from rich.console import Console
 
 from recon.capture import probe_files, sweep_part, sweep_tables
@@ -44,6 +44,7 @@ from sonotwin.config import Choice
 
 PROBE = "probe.yaml"
 FRAMES = "frames.csv"
+OF_THE_SCALE = "rig.probe.scale_mm_per_px"
 
 
 class Config(SequenceFields, Settings):
@@ -68,6 +69,8 @@ class Config(SequenceFields, Settings):
     lag_s: LagSeconds = 0.0
     """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
 
+    _given: frozenset[str] = PrivateAttr(frozenset())  # names of fields that were given
+
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
         given = [name for name in ("capture", "sequence", "pairs") if getattr(self, name) is not None]
@@ -78,11 +81,16 @@ class Config(SequenceFields, Settings):
                 raise ValueError(f"{name}: expected none with pairs, which come without images and times, found {value}")
         return self
 
+    def model_post_init(self, context: Any) -> None:
+        """Keep what was given of the rig: a scale that was given counts, even where it is the usual one."""
+        if context:
+            self._given = frozenset(each.lstrip("+~").partition("=")[0] for each in context["overrides"])
+
     @property
     def scanner_sy(self) -> float | None:
         """The scanner's mm/px in depth: as given; NaN where only the size was, so of another scanner; None for the rig's."""
         given, usual = self.rig.probe, choices.read_rig().probe
-        if given.scale_mm_per_px != usual.scale_mm_per_px:
+        if self._given & {"rig", "rig.probe", OF_THE_SCALE} or given.scale_mm_per_px != usual.scale_mm_per_px:
             return given.scale_mm_per_px[1]
         return None if given.image_size == usual.image_size else np.nan
 

@@ -159,7 +159,7 @@ SWEEP = "over={noise.speed_mm_s: [5, 10]}"
         ([*OURS, "over={conditions.skin.wet: [0, 1]}"], "over: conditions.skin.wet: expected a field that of=chain reads,"),
         ([*OURS, SWEEP, "document=nowhere.md"], "nowhere.md: expected a Markdown file, found none"),
         ([*OURS, "over=5"], "over: expected dictionary, found 5"),
-        ([*OURS, "over={conditions: [lifelik]}"], "over: conditions: expected one of ideal, lifelike, found lifelik"),
+        ([*OURS, "over={conditions: [lifelik]}"], "over: conditions: expected one of ideal, lifelike, or a YAML file, found"),
         ([*OURS, SWEEP, "seeds=0"], "seeds: expected greater than or equal to 1, found 0"),
         ([*OURS, SWEEP, "fill=halton"], "fill: expected 'sobol' or 'latin', found 'halton'"),
         ([*OURS, SWEEP, "sead=3"], "; did you mean seeds?"),

@@ -48,7 +48,7 @@ def folders(tmp_path_factory):
         rows.append([times[k], k, k, int(not reason), "" if reason else "predicted", *[""] * 6, reason])
         cv2.imwrite(str(track / results.OVERLAYS / f"{k:04d}.jpg"), np.full((64, 160, 3), 100, np.uint8))
     sweep_tables.write_rows(track / results.FRAMES, results.COLUMNS, rows)
-    return film, track
+    return film / "truth", track
 
 
 @pytest.fixture(scope="module")
@@ -85,18 +85,18 @@ def test_one_sentence_tells_the_result(figures):
 
 
 def test_a_track_without_pictures_is_told_without(folders, figures, tmp_path):
-    film, track = folders
+    truth, track = folders
     bare = tmp_path / "bare"
     bare.mkdir()
     for name in (results.POSES, results.FRAMES):
         (bare / name).write_bytes((track / name).read_bytes())
-    assert "<img" not in "".join(track_report.section(track_report.read(film, bare), figures, swept=False).blocks)
+    assert "<img" not in "".join(track_report.section(track_report.read(truth, bare), figures, swept=False).blocks)
 
 
 def test_tables_that_dont_fit_are_refused(folders, tmp_path):
-    film, track = folders
+    truth, track = folders
     (tmp_path / results.POSES).write_bytes((track / results.POSES).read_bytes())
     lines = (track / results.FRAMES).read_text().splitlines(keepends=True)
     (tmp_path / results.FRAMES).write_text("".join(lines[:-1]))
     with pytest.raises(InputError, match="expected 8 frames, found 7"):
-        track_report.read(film, tmp_path)
+        track_report.read(truth, tmp_path)
