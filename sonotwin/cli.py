@@ -192,9 +192,12 @@ def _help(verb: Verb) -> str:
     settings = next((node for node in module.body if isinstance(node, ast.ClassDef) and node.name == "Config"), None)
     if settings is not None and not any(isinstance(node, ast.AnnAssign) for node in settings.body):
         return "\n\n".join(parts)
+    from recon import interrupts
     from sonotwin import config
 
-    parts.append("fields:\n\n" + "\n".join(f"  {line}".rstrip() for line in config.shown(verb.name).splitlines()))
+    with interrupts.held_back():  # while the verb is imported
+        shown = config.shown(verb.name)
+    parts.append("fields:\n\n" + "\n".join(f"  {line}".rstrip() for line in shown.splitlines()))
     choices = config.groups(verb.name)
     if choices:
         parts.append("choices:\n\n" + "\n".join(f"  {group}={'|'.join(names)}" for group, names in choices.items()))

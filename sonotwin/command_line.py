@@ -1,5 +1,6 @@
 """Command lines that are printed from settings: the fields of a verb that differ from its defaults, choices of groups by name."""
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
@@ -29,11 +30,12 @@ def fields(verb: str, settings: BaseModel) -> list[str]:
         known = usual.get(name, ABSENT)
         default = known_fields[name].get_default(call_default_factory=True) if known is ABSENT else known
         if name not in groups or values[name] == _parsed(types[name], known):
-            found += _differences(name, values[name], _parsed(types[name], default))
+            found += _differences(name, values[name], _parsed(types[name], default), known)
             continue
         choices = {one: yaml_text.read(config.folder() / name / f"{one}.yaml") for one in groups[name]}
-        parsed = {one: _parsed(types[name], content.get(name, content)) for one, content in choices.items()}  # "none" has a null
-        apart = {one: list(_differences(name, values[name], content)) for one, content in parsed.items()}
+        written = {one: content.get(name, content) for one, content in choices.items()}  # "none" has a null
+        parsed = {one: _parsed(types[name], content) for one, content in written.items()}
+        apart = {one: list(_differences(name, values[name], parsed[one], written[one])) for one in choices}
         nearest = min(apart, key=lambda one: (len(" ".join(apart[one])), one))
         found += [*([] if parsed[nearest] == _parsed(types[name], known) else [f"{name}={nearest}"]), *apart[nearest]]
     return found
@@ -47,35 +49,32 @@ def _parsed(kind: TypeAdapter, value: Any) -> Any:
         return value
 
 
-def _differences(name: str, value: Any, default: Any) -> Iterator[str]:
-    """Overrides, leaf by leaf, that make the value of its default."""
+def _differences(name: str, value: Any, default: Any, written: Any) -> Iterator[str]:
+    """Overrides, leaf by leaf, that make the value of its default; `+` where YAML leaves that to the model."""
     if value == default:
         return
     if not (isinstance(value, Mapping) and isinstance(default, Mapping)):
-        yield f"{name}={_text(value)}"
+        yield f"{'+' if written is ABSENT else ''}{name}={_text(value)}"
         return
+    inner = written if isinstance(written, Mapping) else {}
     for key in value:
-        if key in default:
-            yield from _differences(f"{name}.{key}", value[key], default[key])
-        else:
-            yield f"+{name}.{key}={_text(value[key])}"
-    yield from (f"~{name}.{key}" for key in default if key not in value)
+        yield from _differences(f"{name}.{key}", value[key], default.get(key, ABSENT), inner.get(key, ABSENT))
+    yield from (f"~{name}.{key}" for key in inner if key not in value)
 
 
 def _text(value: Any) -> str:
-    """A value in Hydra's grammar."""
+    """A value in Hydra's grammar, which reads it as the same again."""
     match value:
         case None:
             return "null"
         case bool():
             return str(value).lower()
-        case float():
-            return f"{value:.15g}"
+        case int() | float():
+            return repr(value)
         case Mapping():
             return "{" + ",".join(f"{key}:{_text(one)}" for key, one in value.items()) + "}"
         case list() | tuple():
             return "[" + ",".join(map(_text, value)) + "]"
-        case "":
-            return '""'
         case _:
-            return str(value)
+            plain = re.fullmatch(r"[\w./@%-][\w./@%: -]*(?<! )", str(value)) and config.reads_as_text(str(value))
+            return str(value) if plain else "'" + config.escape(str(value)) + "'"

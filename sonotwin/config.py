@@ -5,6 +5,8 @@ of `conf/` is a group of choices. Hydra composes both; pydantic validates what c
 one line each.
 """
 
+import ast
+import inspect
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,9 +16,11 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
+from secrets import token_hex
 from tempfile import TemporaryDirectory
-from textwrap import wrap
+from textwrap import dedent, wrap
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeGuard, TypeVar, Union, get_args, get_origin
 
@@ -94,23 +98,36 @@ def shown(verb: str) -> str:
 
 def _shown(model: type[BaseModel], values: Mapping[str, Any], before: str) -> Iterator[str]:
     """Lines of a model's fields, by their values where they differ from its own defaults."""
-    fields = model.model_fields
+    fields, texts = model.model_fields, described(model)
     choices = {name: choice for name, field in fields.items() if (choice := _choice(field)) is not None}
     if choices:
         yield "defaults:"
-        yield from (_beside(f"  - {name}: {choice.name or 'null'}", fields[name].description) for name, choice in choices.items())
+        yield from (_beside(f"  - {name}: {choice.name or 'null'}", texts.get(name)) for name, choice in choices.items())
     plain = {name: values.get(name, _plain(field)) for name, field in fields.items() if name not in choices}
     for name in sorted(plain, key=lambda name: plain[name] != NEEDED):
         value, inner = plain[name], [one for one in _plain_types(fields[name].annotation) if _is_model(one)]
         if isinstance(value, dict) and len(inner) == 1 and value:
-            yield _beside(f"{before}{name}:", fields[name].description)
+            yield _beside(f"{before}{name}:", texts.get(name))
             yield from _shown(inner[0], value, f"{before}  ")
             continue
         if isinstance(value, dict) and len(_flow(value)) > WIDTH:
-            yield _beside(f"{before}{name}:", fields[name].description)
+            yield _beside(f"{before}{name}:", texts.get(name))
             yield from (f"{before}  {key}: {_flow(each)}" for key, each in value.items())
         else:
-            yield _beside(f"{before}{name}: {_flow(value)}", fields[name].description)
+            yield _beside(f"{before}{name}: {_flow(value)}", texts.get(name))
+
+
+def described(model: type[BaseModel]) -> dict[str, str]:
+    """Texts of a model's fields: the strings below them, which are read for help alone, as that takes a while."""
+    texts = dict[str, str]()
+    for each in reversed(model.__mro__):
+        if issubclass(each, BaseModel) and each is not BaseModel:
+            (made,) = ast.parse(dedent(inspect.getsource(each))).body
+            assert isinstance(made, ast.ClassDef)
+            for field, below in pairwise(made.body):
+                if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+                    texts[ast.unparse(field.target)] = inspect.cleandoc(str(below.value.value))
+    return texts
 
 
 def _flow(value: Any) -> str:
@@ -318,6 +335,8 @@ def _checked(path: Path) -> dict[str, Any]:
     choices = [name for one in entries for name in (one.values() if isinstance(one, dict) and len(one) == 1 else [one])]
     if not all(isinstance(name, str) for name in choices):
         raise InputError(f"{path}: defaults: expected a list of choices, found {brief(defaults)}")
+    if "_self_" in choices[:-1]:
+        raise InputError(f"{path}: defaults: expected _self_ last, as the file's own fields count, found it before {choices[-1]}")
     return content or {}
 
 
@@ -330,7 +349,7 @@ def read_choice(group: str, path: Path) -> dict[str, Any]:
         If the file is missing or no YAML, or starts from what the group doesn't have.
     """
     content = _checked(path)
-    if "defaults" not in content:
+    if "defaults" not in content and "${" not in path.read_text(encoding="utf-8"):
         return content
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
@@ -355,7 +374,7 @@ def read_choice(group: str, path: Path) -> dict[str, Any]:
 
 def _searched(place: str) -> str:
     """The override that has Hydra look for choices in one more folder."""
-    return f"hydra.searchpath=['{_escape(f'file://{place}')}']"
+    return f"hydra.searchpath=['{escape(f'file://{place}')}']"
 
 
 def _group(override: str) -> str:
@@ -366,7 +385,7 @@ def _group(override: str) -> str:
 def _named(place: Path, number: int, choice: tuple[str, Path]) -> str:
     """An override that names a file of one's own, copied to where Hydra looks for the choices of its group."""
     key, path = choice
-    group, name = _group(key), f"own{number}"
+    group, name = _group(key), f"own{number}_{token_hex(4)}"  # which no file of one's own can name by mistake
     (place / group).mkdir(exist_ok=True)
     shutil.copyfile(path, place / group / f"{name}.yaml")
     return f"{key}={name}"
@@ -500,7 +519,7 @@ def _literal_if_not_grammar(verb: str, override: str) -> str:
             raise InputError(f"{verb}: {override}: can't be read as field=value: {_first_line(error)}") from error
     except (ValueError, RecursionError) as error:  # of numbers of thousands of digits, and of brackets as deep
         raise InputError(f"{verb}: {key}: expected a value, found {short(value)}, which can't be read") from error
-    return f"{key}='{_escape(value)}'"
+    return f"{key}='{escape(value)}'"
 
 
 def _balanced(value: str) -> bool:
@@ -519,7 +538,18 @@ def _balanced(value: str) -> bool:
     return not open_ones and not quote
 
 
-def _escape(text: str) -> str:
+def reads_as_text(text: str) -> bool:
+    """Whether a value on a command line is read as the text that it is, not as a number, null or a switch."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        return OverridesParser.create().parse_override(f"x={text}").value() == text
+    except HydraException:
+        return True  # which is quoted where it is given
+
+
+def escape(text: str) -> str:
     """Escape text for single quotes: in Hydra's grammar backslashes count only in front of a quote."""
     return re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), text)
 

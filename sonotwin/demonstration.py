@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from recon.capture import calibration_files
-from recon.capture.manifest import image_name
+from recon.capture.manifest import MANIFEST, image_name, read_manifest, sweep_part
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
@@ -19,7 +19,7 @@ from recon.model.probe import Speed
 from sonotwin import command_line, pipeline, rendered_session
 from sonotwin.config import defaults
 from sonotwin.pipeline import Step
-from sonotwin.rendered_session import BOTTOM, SCAN, WATER_C, Rendering
+from sonotwin.rendered_session import BOTTOM, SCAN, WATER_C, WIRES, Rendering
 from sonotwin.verbs import calibrate_optics, calibrate_probe, evaluate, film, fuse, reconstruct, render, surface, track
 from twin import board_session
 from twin.evaluation import session_errors, sweep_errors, track_errors
@@ -79,6 +79,7 @@ class Config(rendered_session.Settings):
         """Settings by which the session is reconstructed."""
         return reconstruct.Config(
             rig=self.rig,
+            scale_given=True,
             capture=self.out / CAPTURE,
             out=self.out / RESULT,
             camera=self.cameras[0],
@@ -101,6 +102,16 @@ class Config(rendered_session.Settings):
         own = {"rig": self.rig, "conditions": self.conditions, "seed": self.seed, "frames": self.film_frames}
         filmed = film.Config.model_validate(defaults("film") | own | {"out": self.out / "film"})
         return filmed, track.Config(rig=self.rig, capture=self.out / "film" / CAPTURE, out=self.out / "track")
+
+
+def check_place(config: Config) -> None:
+    """Check, before any work, that no part of a capture would be lost that no demonstration makes; InputError if one would."""
+    place = config.out / CAPTURE
+    if (place / MANIFEST).is_file():
+        made = {"surface", "board", *(sweep_part(name) for name in (WIRES, BOTTOM, SCAN))}
+        if others := sorted(read_manifest(place).contents.keys() - made):
+            expected = "nothing or the capture of an earlier demonstration"
+            raise InputError(f"{place}: expected {expected}, found {others[0]} in it; give another out")
 
 
 def commands(config: Config) -> list[str]:

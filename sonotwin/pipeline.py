@@ -53,6 +53,8 @@ def play(
         If a step contradicts a figure of an earlier one.
     """
     atomic.check_filled_folder(folder, DEMO)
+    for name, writer in afresh.items():
+        atomic.check_folder(folder / name, writer)
     files = [metrics.FILE, *(name for step in steps for name in step.makes)]
     for name in files:
         atomic.check_listed(folder, name, DEMO)

@@ -6,6 +6,7 @@ render theirs here.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +15,7 @@ from pydantic import Field, model_validator
 from recon.files import yaml_text
 from recon.model.rig import Positive
 from scenes.acoustics import made_of
-from sonotwin import choices, config
+from sonotwin import choices
 from sonotwin.verbs import render, sweep
 from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.timed_sweep import Clocks
@@ -26,7 +27,7 @@ WATER_C, WATER_SIGMA_M_S = (
 )  # of the tank, as `scenes.acoustics` has it; and of water whose temperature is known to half a degree
 WIRES, BOTTOM, SCAN, TUBE = "wires", "bottom", "scan", "tube"  # names of sweeps
 RESTING_HZ = 5.0  # pairs of frames, while the probe is held still for each B-scan of the wires
-BOTTOM_HZ = 20.0  # pairs of frames at most, over the flat bottom
+TANK_HZ = 20.0  # pairs of frames along the inner cylinder, whose tank takes no more
 TUMOURS = "tumour"  # what the things are called that ultrasound looks for
 INNER_MM = (4.0, -2.0, 670.29)  # the inner cylinder's centre, where conf/scene/cylinders.yaml has it
 
@@ -73,8 +74,11 @@ class Rendering:
             render.run(self.settings)
 
 
-def parts(chosen: Settings, out: Path) -> Iterator[Rendering]:
-    """All parts of a session, in their order: the scene first, of which there is soon something to see."""
+def parts(chosen: Settings, out: Path, bottom_hz: float = inf) -> Iterator[Rendering]:
+    """All parts of a session, in their order: the scene first, of which there is soon something to see.
+
+    bottom_hz : pairs of frames at most, over the flat bottom
+    """
     images = f"render {chosen.patterns.count} images of the scene and its truth"
     yield Rendering("render", images, "render", skin(chosen, out))
     if chosen.poses is not None:
@@ -89,7 +93,7 @@ def parts(chosen: Settings, out: Path) -> Iterator[Rendering]:
     )
     bob = choice("path", "bob") | {"seconds": chosen.bottom_s}
     bottom = {"scene": choice("scene", "tank"), "ultrasound": _in_water(chosen), "path": bob}
-    slower = clocks.model_copy(update={"camera_hz": min(clocks.camera_hz, BOTTOM_HZ)})
+    slower = clocks.model_copy(update={"camera_hz": min(clocks.camera_hz, bottom_hz)})
     yield _swept(chosen, out, BOTTOM, "render a flat bottom, up and down", bottom, slower)
     scan = {"scene": chosen.scene, "ultrasound": chosen.ultrasound, "path": chosen.path}
     yield _swept(chosen, out, SCAN, "render a sweep over the scene: B-scans, frames, and their truth", scan, clocks)
@@ -125,7 +129,7 @@ def cylinders(chosen: Settings, out: Path) -> Iterator[Rendering]:
     along = {"start_mm": (-19.35, -2), "end_mm": (27.35, -2), "turn_deg": 90, "standoff_mm": 17}
     scene = choice("scene", "inner_cylinder") | {"centre_mm": list(INNER_MM)}
     fields = {"scene": scene, "ultrasound": _in_water(chosen), "path": choice("path", "stroke") | along}
-    clocks = chosen.clocks.model_copy(update={"camera_hz": min(chosen.clocks.camera_hz, BOTTOM_HZ)})
+    clocks = chosen.clocks.model_copy(update={"camera_hz": TANK_HZ})
     yield _swept(chosen, out, TUBE, "render a sweep along the inner cylinder", fields, clocks)
 
 
@@ -144,12 +148,6 @@ def _in_water(chosen: Settings) -> Transducer:
     in_water = Transducer.model_validate(choice("ultrasound", "water"))
     same = {"image_size": chosen.ultrasound.image_size, "scale_mm_per_px": chosen.ultrasound.scale_mm_per_px}
     return Transducer.model_validate(in_water.model_dump() | same)
-
-
-def usual(**own: object) -> Settings:
-    """The settings of the demonstration's session, but for some."""
-    known = {name: value for name, value in config.defaults("demo").items() if name in Settings.model_fields}
-    return Settings.model_validate(known | own)
 
 
 def choice(group: str, name: str) -> dict:

@@ -43,6 +43,7 @@ LENGTHS = {  # of the cylinders: figure, what it is the error of, its bar and th
 MARK = "_true_extent_mm"  # of a tumour's figures, one a tumour
 PACKAGES = ("recon", "scenes", "twin", "sonotwin")
 TISSUE_M_S = 1450.0  # of the phantom's silicone
+BOTTOM_HZ = 20.0  # pairs of frames over the flat bottom
 
 
 def measurements(setup: Setup) -> list[Measurement]:
@@ -80,7 +81,7 @@ def session(work: Path, conditions: str, seed: int) -> tuple[bool, Metrics]:
     Returns whether all steps were done, and the figures.
     """
     chosen = settings(conditions, seed)
-    for part in rendered_session.parts(chosen, work / "session"):
+    for part in rendered_session.parts(chosen, work / "session", BOTTOM_HZ):
         part.run()
     truth = (work / "session" / "truth").rename(work / "truth")
     by = reconstruction(chosen, BOARD_SCALE[conditions], work / "session", work / "result")
@@ -93,11 +94,11 @@ def session(work: Path, conditions: str, seed: int) -> tuple[bool, Metrics]:
 
 
 def settings(conditions: str, seed: int) -> Settings:
-    """A session's settings: as many poses as in Meza et al. 2021, and the cameras' usual rate over the scene."""
-    usual = rendered_session.usual(
-        conditions=choice("conditions", conditions), poses=choice("poses", POSES), bottom_s=6.0, seed=seed
-    )
-    return usual.model_copy(update={"clocks": usual.clocks.model_copy(update={"camera_hz": Clocks().camera_hz})})
+    """A session's settings, which no default of the demonstration's changes; as many poses as in Meza et al. 2021."""
+    groups = {"rig": RIG, "scene": "breast", "patterns": "paper_surface", "tracing": "default", "poses": POSES, "path": "raster"}
+    groups |= {"ultrasound": "linear", "conditions": conditions}
+    own = {"cameras": ["cam1"], "shooting": {}, "clocks": Clocks(), "wires": 40, "bottom_s": 6.0, "seed": seed, "out": "session"}
+    return Settings.model_validate({group: choice(group, name) for group, name in groups.items()} | own)
 
 
 def reconstruction(chosen: Settings, board_scale: float, session: Path, out: Path) -> reconstruct.Config:

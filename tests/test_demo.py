@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recon.capture import manifest
 from recon.errors import InputError
 from recon.files import atomic
 from recon.tracking import networks
@@ -161,6 +162,27 @@ def test_a_run_that_was_killed_leaves_nothing_to_the_next(tmp_path):
     assert sorted(path.name for path in folder.iterdir()) == [".sonotwin.json", "demo.json"]  # no old report beside a new capture
     pipeline.play([step(folder, "render"), report], folder, {}, silent, afresh)
     assert sorted(path.name for path in folder.iterdir()) == [".sonotwin.json", "demo.json", "metrics.json", "report.html"]
+
+
+def test_a_folder_with_a_changed_file_is_refused_before_anything_is_removed(tmp_path):
+    folder = tmp_path / "demo"
+    pipeline.play([step(folder, "render")], folder, {}, silent)
+    with atomic.new_folder(folder / "truth", "the twin") as truth:
+        for name in ("a.json", "b.json"):
+            (truth / name).write_text("{}")
+    (folder / "truth" / "a.json").write_text("annotated")
+    with pytest.raises(InputError, match="changed since"):
+        pipeline.play([step(folder, "render")], folder, {}, silent, {"truth": "the twin"})
+    assert {path.name for path in (folder / "truth").glob("*.json")} == {"a.json", "b.json", ".sonotwin.json"}
+
+
+def test_a_sweep_of_ones_own_in_the_capture_is_no_part_of_a_demonstration(tmp_path, capsys):
+    """It is named before any work, and stays."""
+    parts = {"sweeps": {"mine": {"images": {"us": "sweep/mine/us"}}}, "devices": {"us": {"size": [16, 16]}}}
+    (tmp_path / "demo" / "capture").mkdir(parents=True)
+    (tmp_path / "demo" / "capture" / "manifest.json").write_text(json.dumps({"schema": manifest.SCHEMA} | parts))
+    assert main(["demo", f"out={tmp_path / 'demo'}"]) == 2
+    assert "found sweep/mine in it" in capsys.readouterr().err
 
 
 def test_hidden_files_of_others_stay(tmp_path):

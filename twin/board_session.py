@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from recon.capture import calibration_files, writer
 from recon.capture.manifest import MANIFEST, OPTICS, BoardPart, Device, read_manifest
+from recon.errors import InputError
 from recon.files import atomic, written_files
 from recon.geometry import rigid
 from recon.model.patterns import Patterns
@@ -303,9 +304,10 @@ def take_over(kept: Session, session: Session) -> None:
     if is_finished(session):
         return
     session.check()
-    read = read_manifest(kept.capture)
-    assert read.board is not None
-    with session.write(kept.truth.scene()) as (capture, truth):
+    with atomic.alone(kept.out / "board"), session.write(kept.truth.scene()) as (capture, truth):
+        read = read_manifest(kept.capture)
+        if read.board is None or not is_finished(kept):
+            raise InputError(f"{kept.out}: expected the board's images as they were rendered, found others: of another run?")
         truth.write_optics(calibration_files.read(kept.truth.folder / OPTICS))
         shutil.copyfile(kept.truth.folder / "board.npz", truth.folder / "board.npz")
         atomic.link_tree(kept.capture / "board", capture.folder / "board")

@@ -55,8 +55,8 @@ def cameras_beside(folder: Path, camera: str) -> list[str]:
     return [] if part is None else [name for name in part.images if name != camera]
 
 
-def read_bare(images_dir: Path, patterns_file: Path, calibration_file: Path, camera: str = "cam1") -> SurfaceCapture:
-    """Read the images of a folder, in natural order (2.png before 10.png), with patterns and calibration from elsewhere.
+def read_bare(images_dir: Path, patterns: Patterns, calibration_file: Path, camera: str = "cam1") -> SurfaceCapture:
+    """Read the images of a folder, in natural order (2.png before 10.png), with a calibration from elsewhere.
 
     8-bit images count as 8 bits; in 16-bit images the bits (10 or 12) follow from the largest value.
 
@@ -66,12 +66,11 @@ def read_bare(images_dir: Path, patterns_file: Path, calibration_file: Path, cam
         As `read_surface`; also if the number of images differs from the number of patterns.
     """
     images_dir = Path(images_dir)
-    patterns = read_patterns(patterns_file)
     if not images_dir.is_dir():
         raise InputError(f"{images_dir}: expected a folder of images, found {'a file' if images_dir.exists() else 'nothing'}")
     paths = image_files(images_dir)
     if len(paths) != patterns.count:
-        raise InputError(f"{images_dir}: expected {patterns.count} images, one a pattern of {patterns_file}, found {len(paths)}")
+        raise InputError(f"{images_dir}: expected {patterns.count} images, one a pattern, found {len(paths)}")
     first = decode_image(paths[0], read_bytes(paths[0]))
     (height, width), deep = first.shape[:2], first.dtype.itemsize > 1
     optics = calibration_files.read_for(Path(calibration_file), {camera: (width, height), "projector": patterns.projector_size})

@@ -19,7 +19,7 @@ LARGEST_BY_UNIT = {"_mm": 1e6, "_px": 1e6, "_deg": 1e4, "_hz": 1e6, "_db": 1e3} 
 class Part(BaseModel):
     """Base of settings and files' records: immutable, refuses unknown keys, and numbers that are endless or beyond reason."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @field_validator("*")
     @classmethod

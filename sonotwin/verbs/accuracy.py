@@ -58,7 +58,7 @@ def run(config: Config) -> int:
     if config.document:
         table_rows.check_place(config.document, kept_rows.MARK)
         kept_rows.read(kept_rows.file_of(config.document))
-        choices()
+    shown = choices() if config.document else []  # as they are before hours of work
     if config.real and not config.real.is_dir():
         raise InputError(f"accuracy: real: expected a folder of recordings, found none at {config.real}")
     config.out.mkdir(parents=True, exist_ok=True)
@@ -74,7 +74,7 @@ def run(config: Config) -> int:
             measured.append(row)
         table_rows.write(config.out / f"{group}.json", measured)
         if config.document:
-            kept_rows.enter(config.document, choices(), group, measured)
+            kept_rows.enter(config.document, shown, group, measured)
         console.print(f"wrote {config.out / f'{group}.json'}", markup=False)
         met &= all(row.ok for row in measured)
     return 0 if met else 1

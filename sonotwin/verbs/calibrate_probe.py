@@ -16,14 +16,14 @@ target is seen, and bring the crossing near all corners of the image in turn.
     sonotwin calibrate-probe pairs=pairs.csv rig.probe.image_size=[640,480] temperature_c=22.4 out=outputs/probe
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PrivateAttr, model_validator
+from pydantic import ValidationInfo, model_validator
 from rich.console import Console
 
 from recon.capture import probe_files, sweep_part, sweep_tables
@@ -69,7 +69,8 @@ class Config(SequenceFields, Settings):
     lag_s: LagSeconds = 0.0
     """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
 
-    _given: frozenset[str] = PrivateAttr(frozenset())  # names of fields that were given
+    scale_given: bool = False
+    """whether rig.probe.scale_mm_per_px is the scanner's even where it is the usual rig's; true by itself where it is given"""
 
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
@@ -81,18 +82,24 @@ class Config(SequenceFields, Settings):
                 raise ValueError(f"{name}: expected none with pairs, which come without images and times, found {value}")
         return self
 
-    def model_post_init(self, context: Any) -> None:
-        """Keep what was given of the rig: a scale that was given counts, even where it is the usual one."""
-        if context:
-            self._given = frozenset(each.lstrip("+~").partition("=")[0] for each in context["overrides"])
+    @model_validator(mode="before")
+    @classmethod
+    def _knows_what_was_given(cls, values: Any, info: ValidationInfo) -> Any:
+        given = bool(info.context) and gives_scale(info.context["overrides"])
+        return {**values, "scale_given": True} if given and isinstance(values, dict) else values
 
     @property
     def scanner_sy(self) -> float | None:
         """The scanner's mm/px in depth: as given; NaN where only the size was, so of another scanner; None for the rig's."""
         given, usual = self.rig.probe, choices.read_rig().probe
-        if self._given & {"rig", "rig.probe", OF_THE_SCALE} or given.scale_mm_per_px != usual.scale_mm_per_px:
+        if self.scale_given or given.scale_mm_per_px != usual.scale_mm_per_px:
             return given.scale_mm_per_px[1]
         return None if given.image_size == usual.image_size else np.nan
+
+
+def gives_scale(overrides: Iterable[str]) -> bool:
+    """Whether overrides give the scanner's scale, alone or with the rig."""
+    return any(each.lstrip("+~").partition("=")[0] in ("rig", "rig.probe", OF_THE_SCALE) for each in overrides)
 
 
 def run(config: Config) -> None:

@@ -25,6 +25,9 @@ from twin.evaluation import sweep_errors
 from twin.evaluation.surface_errors import things
 from twin.session import CAPTURE, TRUTH, TWIN
 
+# Folders of 0.1.0's demonstrations, beside which a new one writes.
+EARLIER = ("calibration", "surface", "sweep", "wires", "bottom", "lag", "probe", "volume", "tumours", "scene", "poses")
+
 
 def run(config: Config) -> None:
     """Play the steps, then print a summary in some lines.
@@ -41,6 +44,11 @@ def run(config: Config) -> None:
     parse_scene(config.scene)
     if config.poses is not None:
         board_session.check_place(config.board)
+    demonstration.check_place(config)
+    if earlier := [name for name in EARLIER if (config.out / name).is_dir()]:
+        console.print(
+            f"stale       {', '.join(earlier)} in {config.out}: of an earlier version, and no part of this result", markup=False
+        )
     found = pipeline.play(
         demonstration.steps(config),
         config.out,

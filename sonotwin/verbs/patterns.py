@@ -45,7 +45,7 @@ BOARD = "{kind: asymmetric_circles, columns: 4, rows: 11, spacing_mm: 15, diamet
 class Config(BaseModel):
     """Fields of `sonotwin patterns`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Annotated[Rig, Choice("meza2021")]
     """of it, the projector's size and gamma"""

@@ -37,7 +37,7 @@ Millimetres = Annotated[float, Field(gt=0, le=5000)]
 class Config(BaseModel):
     """Fields of `sonotwin print`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rig: Annotated[Rig, Choice("meza2021")]
     """of it, the target's lengths and the size of its board"""

@@ -18,9 +18,9 @@ left out, or if none could be done.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 from rich.console import Console
 
 from recon.capture import calibration_files, lag_files, manifest, probe_files, target_files
@@ -39,6 +39,7 @@ from recon.session.store import Store, files_of
 from recon.tracking import networks
 from recon.tracking.results import POSES
 from sonotwin.config import Choice
+from sonotwin.config import folder as conf
 from sonotwin.verbs import calibrate_optics, calibrate_probe, freehand, fuse, measure_lag, segment, surface, track
 
 Drift = Annotated[float, Field(ge=0, le=10)]
@@ -98,6 +99,15 @@ class Config(Part):
     overlays: bool = False
     """pictures of every pair of tracked frames, 0.1 MB and some hundredths of a second each"""
 
+    scale_given: bool = False
+    """whether rig.probe.scale_mm_per_px is the scanner's even where it is the usual rig's; true by itself where it is given"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _knows_what_was_given(cls, values: Any, info: ValidationInfo) -> Any:
+        given = bool(info.context) and calibrate_probe.gives_scale(info.context["overrides"])
+        return {**values, "scale_given": True} if given and isinstance(values, dict) else values
+
     @model_validator(mode="after")
     def _sigma_of_a_lag(self) -> "Config":
         if self.lag_sigma_s and self.lag_s is None:
@@ -148,7 +158,7 @@ def run(config: Config) -> int:
     """
     console = Console(soft_wrap=True, highlight=False)
     sources = Sources(config, manifest.read_manifest(config.capture))
-    code = code_digest("recon", "sonotwin")
+    code = code_digest("recon", "sonotwin", conf())
     steps = Store(config.out, lambda line: console.print(line, style="bold cyan", markup=False), code)
     given = [path for path in (config.calibration, config.target, config.probe, config.networks) if path is not None]
     check(sources)
@@ -281,7 +291,7 @@ def calibrated_probe(steps: Store, sources: Sources, tracked: Mapping[str, Path 
     if tracked[name] is None or lag is None:
         return steps.fail("probe", NO_LAG if lag is None else f"no poses of the sweep {name}; give probe=...")
     fields = {"rig": config.rig, "capture": tracked[name], "sweep": name, "lag_s": lag.lag_s}
-    fields |= {"implausible": config.implausible, "temperature_c": config.temperature_c}
+    fields |= {name: getattr(config, name) for name in ("implausible", "temperature_c", "scale_given")}
     does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
     files = (calibrate_probe.PROBE, calibrate_probe.FRAMES)
     made = steps.do("probe", does, calibrate_probe, fields, files, made_of)

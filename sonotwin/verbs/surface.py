@@ -177,7 +177,7 @@ def read(config: Config) -> SurfaceCapture:
     if config.images is None or config.patterns is None or config.calibration is None:
         found = ", ".join(given) or "none of them"
         raise InputError(f"surface: expected capture, or images with patterns and calibration, found {found}")
-    return surface_part.read_bare(config.images, choices.file_of("patterns", config.patterns), config.calibration, config.camera)
+    return surface_part.read_bare(config.images, choices.read_patterns(config.patterns), config.calibration, config.camera)
 
 
 def sources(config: Config) -> list[Path]:

@@ -15,7 +15,9 @@ import pytest
 from recon.capture import probe_files, sweep_tables
 from recon.geometry import rigid
 from recon.probe_calibration import point_calibration, probe_checks, repeatability, sound_in_water
+from sonotwin import config
 from sonotwin.cli import main
+from sonotwin.verbs import calibrate_probe, reconstruct
 from tests import added
 from tests.recon import bscans, probe_motions, sweep_sets
 
@@ -357,3 +359,18 @@ def test_another_phantom_is_one_module(capture, rig, tmp_path, monkeypatch, caps
     found, true = probe_files.read(tmp_path / "out" / "probe.yaml"), sweep_sets.probe_in_water(rig)
     pixels = repeatability.five_points(bscans.SIZE)
     assert np.linalg.norm(found.to_target(pixels) - true.to_target(pixels), axis=1).max() < 1.0
+
+
+@pytest.mark.parametrize(("given", "sy"), [
+    ([], None),
+    (["rig.probe.image_size=[640,480]"], np.nan),
+    (["rig.probe.image_size=[640,480]", "rig.probe.scale_mm_per_px=[0.1229,0.1225]"], 0.1225),
+    (["rig=meza2021"], 0.1225),
+    (["rig.probe.scale_mm_per_px=[0.1,0.2]"], 0.2),
+])  # fmt: skip
+def test_a_scale_that_was_given_counts_in_reconstruct_too(given, sy, tmp_path):
+    own = config.load("calibrate-probe", [*given, "pairs=p.csv", "out=o"], calibrate_probe.Config)
+    whole = config.load("reconstruct", [*given, "capture=c", "out=o"], reconstruct.Config)
+    passed = calibrate_probe.Config(rig=whole.rig, scale_given=whole.scale_given, pairs="p.csv", out="o")
+    for one in (own, passed):
+        assert one.scanner_sy is None if sy is None else one.scanner_sy == pytest.approx(sy, nan_ok=True)

@@ -17,6 +17,12 @@ from sonotwin.config import load
     ("segment", ["capture=c", "out=o", "slice_mm=[[4,0.9],[8,0.6]]", "diameter_mm=[5,20.5]"]),
     ("calibrate-optics", ["capture=c", "out=o", "devices=[cam1,projector]"]),
     ("demo", ["path=none", "poses=none", "rig.cam1.optics.size=[640,512]"]),
+    ("demo", ["path=stroke", "+path.strokes=2", "tissue_m_s=1450.000000000001"]),
+    ("sweep", ["out='2024'", "+path.step_seconds=1.0"]),
+    ("sweep", ["out='null'"]),
+    ("sweep", ["out=' a '"]),
+    ("sweep", ["out=it's 50 %, {new}"]),
+    ("print", ["part=board", "out='3'"]),
 ])  # fmt: skip
 def test_printed_fields_give_the_same_settings(verb, fields):
     model = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}").Config

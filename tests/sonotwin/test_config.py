@@ -165,6 +165,10 @@ def test_a_choice_of_ones_own_may_start_from_a_shipped_one(tmp_path, tmp_path_fa
         load("rig=ours")
     for text, line in (
         ("defaults: [wyde]\n", "ours.yaml: rig: expected one of narrow, wide, found wyde; did you mean wide?"),
+        (
+            "defaults: [_self_, wide]\n",
+            "ours.yaml: defaults: expected _self_ last, as the file's own fields count, found it before wide",
+        ),
         ("gama: 1\n", "ours.yaml: rig.gama: unknown key; expected one of gamma, offset; did you mean rig.gamma? (and 1 more)"),
     ):
         (place / "ours.yaml").write_text(text)

@@ -57,15 +57,16 @@ def test_a_verbs_defaults_are_its_models(verb):
     known = set(model.model_fields) | set(Settings.model_fields if verb.name == "study" else ())
     assert written <= known
     assert not found
-    own = [model.model_fields[name] for name in model.__annotations__ if name in model.model_fields]
-    marks = [mark for field in own for mark in (field.description, config._choice(field)) if mark]
+    own, texts = [name for name in model.__annotations__ if name in model.model_fields], config.described(model)
+    marks = [mark for name in own for mark in (texts.get(name), config._choice(model.model_fields[name])) if mark]
     assert not marks, "texts and choices stand in YAML or in the model, not in both"
 
 
 def described(model: type[BaseModel], place: str) -> Iterator[str]:
     """Fields without a text, of a model and of those within that stand in the verb's help."""
+    texts = config.described(model)
     for name, field in model.model_fields.items():
-        if not field.description:
+        if not texts.get(name):
             yield f"{place}.{name}"
         if not any(isinstance(mark, config.Choice) for mark in field.metadata):
             inner = [one for one in config._plain_types(field.annotation) if config._is_model(one)]

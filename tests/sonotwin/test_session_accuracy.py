@@ -107,7 +107,7 @@ def test_another_rig_is_refused(rig):
 def test_the_parts_of_a_session_are_of_one_rig_under_the_same_conditions(tmp_path, kind):
     """All write into one capture, by one seed; its sweeps have the names that rows go by, and both cylinders are the same."""
     chosen = session_accuracy.settings(kind, 3)
-    settings = [part.settings for part in rendered_session.parts(chosen, tmp_path)]
+    settings = [part.settings for part in rendered_session.parts(chosen, tmp_path, session_accuracy.BOTTOM_HZ)]
     assert all((each.seed, each.add, each.rig, each.conditions) == (3, True, chosen.rig, chosen.conditions) for each in settings)
     assert [each.name for each in settings[2:]] == ["wires", "bottom", "scan"] and all(each.filmed for each in settings[2:])
     by_light, by_sound = (part.settings for part in rendered_session.cylinders(chosen, tmp_path))

@@ -227,7 +227,7 @@ def bare(tmp_path, optics) -> tuple[Path, Path, Path]:
     (tmp_path / "shots" / "notes.txt").write_text("not an image")
     (tmp_path / "patterns.yaml").write_text(PATTERNS.model_dump_json())  # JSON is YAML
     calibration_files.write(tmp_path / "optics.yaml", optics)
-    return tmp_path / "shots", tmp_path / "patterns.yaml", tmp_path / "optics.yaml"
+    return tmp_path / "shots", surface_part.read_patterns(tmp_path / "patterns.yaml"), tmp_path / "optics.yaml"
 
 
 def test_a_bare_folder_is_read_in_natural_order(bare):
@@ -268,9 +268,9 @@ def test_faults_of_a_bare_folder(bare):
         "parts: []": "projector_size: expected a value, found none",
         "projector_size: [.nan, 2]\nunwrap: gray\nparts: []": r"projector_size.0: expected a finite number",
     }.items():
-        patterns.with_name("bad.yaml").write_text(content)
+        (bad := optics.with_name("bad.yaml")).write_text(content)
         with pytest.raises(InputError, match=f"bad.yaml: {complaint}"):
-            surface_part.read_bare(images, patterns.with_name("bad.yaml"), optics)
+            surface_part.read_patterns(bad)
     (images / "shot7.png").unlink()
-    with pytest.raises(InputError, match=r"shots: expected 5 images, one a pattern of .*patterns.yaml, found 4"):
+    with pytest.raises(InputError, match="shots: expected 5 images, one a pattern, found 4"):
         surface_part.read_bare(images, patterns, optics)
