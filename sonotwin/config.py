@@ -309,10 +309,14 @@ def _by_hydra(name: str | None, overrides: Sequence[str]) -> Any:
     from hydra import compose, initialize_config_dir
     from hydra.core.config_store import ConfigStore
 
+    store = ConfigStore.instance()
     if name and not (folder() / f"{name}.yaml").is_file():
-        ConfigStore.instance().store(name=name, node=primary(name))
-    with initialize_config_dir(str(folder()), version_base=None):
-        return compose(name, list(overrides))
+        store.store(name=name, node=primary(name))
+    try:
+        with initialize_config_dir(str(folder()), version_base=None):
+            return compose(name, list(overrides))
+    finally:
+        store.repo.pop(f"{name}.yaml", None)  # a file of that name in another folder would be overlooked
 
 
 def _own_choice(verb: str, override: str) -> tuple[str, Path] | None:
