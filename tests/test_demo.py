@@ -77,7 +77,7 @@ def test_a_small_demonstration_runs_through(tmp_path, capsys):
     assert all((Path(folder) / name).exists() for folder, names in (line.groups() for line in wrote) for name in names.split(","))
     assert (out / "surface.ply").read_bytes() == (out / "result" / "surface" / "surface.ply").read_bytes()
     report = html.unescape((out / "report.html").read_text(encoding="utf-8"))
-    assert f"sonotwin render '{SMALL[0]}' 'rig.cam1.optics.focal_px=[1660,1665.5]'" in report and "conditions=lifelike" in report
+    assert f"sonotwin render '{SMALL[0]}' '{SMALL[1]}'" in report and "conditions=lifelike" in report
     last = printed[-5:]
     assert [line.split()[0] for line in last] == ["measured", "accuracy", "calibrated", "coverage", "look"]
     assert str(out / "report.html") in last[-1]
