@@ -1,8 +1,6 @@
 """A demonstration: a session is rendered, reconstructed from its images alone, compared with its truth, and reported."""
 
-import os
 import shlex
-import shutil
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -164,7 +162,8 @@ def reconstruct_session(config: Config) -> None:
     if reconstruct.run(config.reconstruction):
         raise InputError(f"{config.out / RESULT}: expected all steps, found some that could not be done, as said above")
     for name in MESHES:
-        _offer(config.out / RESULT / "surface" / name, config.out, name)
+        with atomic.listed_file(config.out, name, pipeline.DEMO) as temporary:
+            atomic.link_file(config.out / RESULT / "surface" / name, temporary)
 
 
 def compare(config: Config) -> Metrics:
@@ -176,9 +175,8 @@ def compare(config: Config) -> Metrics:
         found = calibration_files.read(result / "optics" / calibrate_optics.OPTICS)
         figures |= metrics.read(result / "optics" / metrics.FILE) | session_errors.optics(found, truth)
     figures |= metrics.read(result / "surface" / metrics.FILE)
-    figures |= metrics.read(
-        config.out / EVALUATION / metrics.FILE
-    )  # its prediction is of points that have a truth, by true normals
+    # what evaluation predicts, in place of the surface's own, is of points that have a truth, by true normals
+    figures |= metrics.read(config.out / EVALUATION / metrics.FILE)
     if config.looks_inside:
         figures |= _named(result / "probe", "probe") | _named(result / "latency", "lag")
         figures |= _named(result / "volume" / SCAN, "volume") | _named(result / "poses" / SCAN, "track")
@@ -237,12 +235,3 @@ def _named(folder: Path, part: str) -> Metrics:
     read = metrics.read(folder / metrics.FILE)
     kept = {name.removeprefix(f"{part}_"): value for name, value in read.items() if not name.startswith("seconds_")}
     return {f"{part}_{name}": value for name, value in kept.items()}
-
-
-def _offer(source: Path, folder: Path, name: str) -> None:
-    """Give a file a second place, without a second copy where the file system can do that."""
-    with atomic.listed_file(folder, name, pipeline.DEMO) as temporary:
-        try:
-            os.link(source, temporary)
-        except OSError:
-            shutil.copyfile(source, temporary)

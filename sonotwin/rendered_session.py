@@ -12,10 +12,9 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from recon.files import yaml_text
 from recon.model.rig import Positive
 from scenes.acoustics import made_of
-from sonotwin import choices
+from sonotwin import choices, config
 from sonotwin.verbs import render, sweep
 from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.timed_sweep import Clocks
@@ -152,4 +151,4 @@ def _in_water(chosen: Settings) -> Transducer:
 
 def choice(group: str, name: str) -> dict:
     """The fields of a choice of conf/."""
-    return yaml_text.read(choices.file_of(group, name))
+    return config.read_choice(group, choices.file_of(group, name))

@@ -5,7 +5,6 @@ finished set then takes its place as `OUT/capture/` and `OUT/truth/`.
 """
 
 import math
-import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -309,7 +308,7 @@ def take_over(kept: Session, session: Session) -> None:
         if read.board is None or not is_finished(kept):
             raise InputError(f"{kept.out}: expected the board's images as they were rendered, found others: of another run?")
         truth.write_optics(calibration_files.read(kept.truth.folder / OPTICS))
-        shutil.copyfile(kept.truth.folder / "board.npz", truth.folder / "board.npz")
+        atomic.link_file(kept.truth.folder / "board.npz", truth.folder / "board.npz")
         atomic.link_tree(kept.capture / "board", capture.folder / "board")
         capture.add_board(read.board, read.devices_of("board"))
 

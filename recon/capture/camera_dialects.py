@@ -15,7 +15,7 @@ Sources: the wikis and sources of Kalibr and SLStudio, ROS's sensor_msgs/CameraI
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -68,6 +68,10 @@ class Content:
             if file not in self._texts:
                 self._texts[file] = _text(file)
         return {file: text for file in files if (text := self._texts[file]) is not None}
+
+    def of_cameras(self, tells: Callable[[str], bool]) -> dict[Path, str]:
+        """Texts of one camera each: of the file, or of a folder's, those of which a dialect tells that they are its own."""
+        return {file: text for file, text in self.texts(*OF_FILES).items() if tells(text)}
 
     @property
     def is_matlab(self) -> bool:

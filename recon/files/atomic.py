@@ -242,25 +242,27 @@ def _put_back(paths: Sequence[Path]) -> None:
         _remove(path)
 
 
+def link_file(source: str | Path, target: str | Path) -> None:
+    """Give a file a second place, which is free: as a hard link, or as a copy where the file system has no links."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
 def link_tree(source: Path, target: Path, leave_out: Collection[str] = ()) -> None:
-    """Let a folder hold the files of another too: as hard links, or as copies where the file system has no links.
+    """Let a folder hold the files of another too, as of `link_file`.
 
     Parameters
     ----------
     leave_out : files and folders in `source`, as paths relative to it; lists of what sonotwin wrote are always left out
     """
 
-    def link(file: str, name: str) -> None:
-        try:
-            os.link(file, name)
-        except OSError:
-            shutil.copy2(file, name)
-
     def left_out(folder: str, names: list[str]) -> list[str]:
         here = Path(folder).relative_to(source)
         return [name for name in names if name == LIST or (here / name).as_posix() in leave_out]
 
-    shutil.copytree(source, target, copy_function=link, ignore=left_out, dirs_exist_ok=True)
+    shutil.copytree(source, target, copy_function=link_file, ignore=left_out, dirs_exist_ok=True)
 
 
 def remove_leftovers(path: Path) -> None:

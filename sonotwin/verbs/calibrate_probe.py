@@ -16,7 +16,7 @@ target is seen, and bring the crossing near all corners of the image in turn.
     sonotwin calibrate-probe pairs=pairs.csv rig.probe.image_size=[640,480] temperature_c=22.4 out=outputs/probe
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -34,7 +34,7 @@ from recon.freehand import sequence_sweep
 from recon.freehand.sequence_sweep import SequenceFields, SequenceSweep
 from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Rectangle
-from recon.model.rig import Rig
+from recon.model.rig import Part, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import crossing_frames, probe_figures, sound_in_water, tank_calibration
 from recon.probe_calibration.crossing_frames import CrossingFrames
@@ -47,7 +47,21 @@ FRAMES = "frames.csv"
 OF_THE_SCALE = "rig.probe.scale_mm_per_px"
 
 
-class Config(SequenceFields, Settings):
+class ScaleFields(Part):
+    """The field of a verb that reads rig.probe's scale, which counts otherwise where it was given."""
+
+    scale_given: bool = False
+    """whether rig.probe.scale_mm_per_px is the scanner's even where it is the usual rig's; true by itself where it is given"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _knows_what_was_given(cls, values: Any, info: ValidationInfo) -> Any:
+        names = {each.lstrip("+~").partition("=")[0] for each in (info.context or {}).get("overrides", ())}
+        given = names & {"rig", "rig.probe", OF_THE_SCALE} and isinstance(values, dict)
+        return {**values, "scale_given": True} if given else values
+
+
+class Config(ScaleFields, SequenceFields, Settings):
     """Fields of `sonotwin calibrate-probe`: sources, target, and all that is known beforehand."""
 
     rig: Annotated[Rig, Choice("meza2021")]
@@ -69,9 +83,6 @@ class Config(SequenceFields, Settings):
     lag_s: LagSeconds = 0.0
     """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
 
-    scale_given: bool = False
-    """whether rig.probe.scale_mm_per_px is the scanner's even where it is the usual rig's; true by itself where it is given"""
-
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
         given = [name for name in ("capture", "sequence", "pairs") if getattr(self, name) is not None]
@@ -82,12 +93,6 @@ class Config(SequenceFields, Settings):
                 raise ValueError(f"{name}: expected none with pairs, which come without images and times, found {value}")
         return self
 
-    @model_validator(mode="before")
-    @classmethod
-    def _knows_what_was_given(cls, values: Any, info: ValidationInfo) -> Any:
-        given = bool(info.context) and gives_scale(info.context["overrides"])
-        return {**values, "scale_given": True} if given and isinstance(values, dict) else values
-
     @property
     def scanner_sy(self) -> float | None:
         """The scanner's mm/px in depth: as given; NaN where only the size was, so of another scanner; None for the rig's."""
@@ -95,11 +100,6 @@ class Config(SequenceFields, Settings):
         if self.scale_given or given.scale_mm_per_px != usual.scale_mm_per_px:
             return given.scale_mm_per_px[1]
         return None if given.image_size == usual.image_size else np.nan
-
-
-def gives_scale(overrides: Iterable[str]) -> bool:
-    """Whether overrides give the scanner's scale, alone or with the rig."""
-    return any(each.lstrip("+~").partition("=")[0] in ("rig", "rig.probe", OF_THE_SCALE) for each in overrides)
 
 
 def run(config: Config) -> None:

@@ -18,9 +18,9 @@ left out, or if none could be done.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
-from pydantic import Field, ValidationInfo, model_validator
+from pydantic import Field, model_validator
 from rich.console import Console
 
 from recon.capture import calibration_files, lag_files, manifest, probe_files, target_files
@@ -30,7 +30,7 @@ from recon.files import atomic, metrics
 from recon.files.code_digest import code_digest
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE
 from recon.model.probe import Speed, SpeedSigma
-from recon.model.rig import Finite, NotNegative, Part, Positive, Rig
+from recon.model.rig import Finite, NotNegative, Positive, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
@@ -49,7 +49,7 @@ NO_LAG = "latency failed; give lag_s"
 SKIN = "surface.ply"
 
 
-class Config(Part):
+class Config(calibrate_probe.ScaleFields):
     """Fields of `sonotwin reconstruct`: source, target, and what is known beforehand."""
 
     rig: Annotated[Rig, Choice("meza2021")]
@@ -98,15 +98,6 @@ class Config(Part):
     edges of shadows sharp"""
     overlays: bool = False
     """pictures of every pair of tracked frames, 0.1 MB and some hundredths of a second each"""
-
-    scale_given: bool = False
-    """whether rig.probe.scale_mm_per_px is the scanner's even where it is the usual rig's; true by itself where it is given"""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _knows_what_was_given(cls, values: Any, info: ValidationInfo) -> Any:
-        given = bool(info.context) and calibrate_probe.gives_scale(info.context["overrides"])
-        return {**values, "scale_given": True} if given and isinstance(values, dict) else values
 
     @model_validator(mode="after")
     def _sigma_of_a_lag(self) -> "Config":

@@ -20,12 +20,12 @@ LISTED = re.compile(rf"\[\s*(?:{NUMBER}\s*(?:,\s*{NUMBER}\s*)*,?\s*)?\]")
 
 def recognises(content: Content) -> bool:
     """Whether a file of the folder, or the file itself, names a lens model."""
-    return bool(_texts(content))
+    return bool(content.of_cameras(is_model))
 
 
 def read(content: Content, sizes: Sizes) -> Calibration:
     """All devices, a file each, by their poses."""
-    texts = _texts(content)
+    texts = content.of_cameras(is_model)
     if not content.path.is_dir():
         (text,) = texts.values()
         return camera_dialects.of_metres(content.path, camera_dialects.in_world({WORLD: _mrcal(content.path, text)}))
@@ -37,10 +37,6 @@ def read(content: Content, sizes: Sizes) -> Calibration:
 def taken(optics: Calibration) -> Sequence[str]:
     """All devices."""
     return list(optics.cameras)
-
-
-def _texts(content: Content) -> dict[Path, str]:
-    return {file: text for file, text in content.texts(*camera_dialects.OF_FILES).items() if is_model(text)}
 
 
 def is_model(text: str) -> bool:

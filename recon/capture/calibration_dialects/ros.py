@@ -30,12 +30,12 @@ class Rectified(NamedTuple):
 
 def recognises(content: Content) -> bool:
     """Whether a file of the folder, or the file itself, has a camera's matrix."""
-    return bool(_texts(content))
+    return bool(content.of_cameras(is_camera_info))
 
 
 def read(content: Content, sizes: Sizes) -> Calibration:
     """A camera, or a pair of them by their rectification."""
-    texts = _texts(content)
+    texts = content.of_cameras(is_camera_info)
     if not content.path.is_dir():
         (text,) = texts.values()
         return camera_dialects.of_metres(content.path, {WORLD: _ros(content.path, text).stored})
@@ -47,13 +47,9 @@ def taken(optics: Calibration) -> Sequence[str]:
     return pair(optics)
 
 
-def _texts(content: Content) -> dict[Path, str]:
-    found = content.texts(*camera_dialects.OF_FILES).items()
-    return {
-        file: text
-        for file, text in found
-        if re.search(r"^camera_matrix\s*:", text, re.MULTILINE) and not kalibr.is_camchain(text)
-    }
+def is_camera_info(text: str) -> bool:
+    """Whether a text has a camera's matrix, and is no camchain."""
+    return re.search(r"^camera_matrix\s*:", text, re.MULTILINE) is not None and not kalibr.is_camchain(text)
 
 
 def write(folder: Path, optics: Calibration) -> list[str]:
