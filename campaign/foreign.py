@@ -17,7 +17,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from campaign import full_disk, sources
+from campaign import full_disk, results, sources
 from campaign.sources import Command
 from recon.capture.manifest import MANIFEST
 from recon.files import written_files
@@ -283,13 +283,11 @@ def _write_surface() -> int:
 def table(found: Sequence[Case]) -> list[str]:
     """Lines of Markdown: a row for all writers of equal counts."""
     lines = ["| writers | cases | done | refused by one line | lost or changed | errors |", "|---|---|---|---|---|---|"]
-    alike: dict[tuple[int, ...], list[str]] = {}
-    for writer in dict.fromkeys(one.writer for one in found):
-        alike.setdefault(_counts([one for one in found if one.writer == writer]), []).append(writer)
-    alike.setdefault(_counts(found), []).append("all")
-    return [*lines, *(f"| {', '.join(writers)} | {' | '.join(map(str, counts))} |" for counts, writers in alike.items())]
+    writers = dict.fromkeys(one.writer for one in found)
+    rows = [(writer, _counts([one for one in found if one.writer == writer])) for writer in writers]
+    return [*lines, *results.alike([*rows, ("all", _counts(found))])]
 
 
-def _counts(found: Sequence[Case]) -> tuple[int, ...]:
+def _counts(found: Sequence[Case]) -> str:
     done, refused, errors = (sum(one.status in some for one in found) for some in ((0, 1), (2,), (-1,)))
-    return len(found), done, refused, sum(len(one.lost) for one in found), errors
+    return f"{len(found)} | {done} | {refused} | {sum(len(one.lost) for one in found)} | {errors}"

@@ -123,12 +123,13 @@ def _used(disk: Path) -> int:
 
 
 def table(found: Sequence[Full]) -> list[str]:
-    """Lines of Markdown: a row a verb, its cells by the rooms tried."""
+    """Lines of Markdown: a row for all verbs with the same outcome, its cells by the rooms tried."""
     rooms = ", ".join(f"{100 * share:.0f} %" for share in dict.fromkeys(one.share for one in found))
     lines = [f"| verb | status at {rooms} | old result kept | leftovers |", "|---|---|---|---|"]
+    rows = []
     for verb in dict.fromkeys(one.verb for one in found):
         own = [one for one in found if one.verb == verb]
         statuses = ", ".join(str(one.outcome.status) for one in own)
         kept = ", ".join("yes" if one.kept else "**no**" for one in own)
-        lines.append(f"| {verb} | {statuses} | {kept} | {sum(len(one.left) for one in own)} |")
-    return lines
+        rows.append((verb, f"{statuses} | {kept} | {sum(len(one.left) for one in own)}"))
+    return [*lines, *results.alike(rows)]

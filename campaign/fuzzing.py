@@ -97,10 +97,15 @@ def _cause(said: str) -> str:
 
 
 def table(found: Sequence[Fuzzed]) -> list[str]:
-    """Lines of Markdown: a row a reader."""
-    lines = ["| reader | s | inputs | edges covered | faults |", "|---|---|---|---|---|"]
-    for one in found:
-        lines.append(f"| {one.reader} | {one.seconds:.0f} | {one.inputs} | {one.edges} | {'; '.join(sorted(set(one.faults)))} |")
+    """Lines of Markdown: a row a reader with a fault, and one of the others."""
+    lines = ["| reader | s of each | inputs | edges covered by each | faults |", "|---|---|---|---|---|"]
+    good = [one for one in found if not one.faults]
+    rows = [(one.reader, [one]) for one in found if one.faults] + ([(f"{len(good)} readers", good)] if good else [])
+    for name, some in rows:
+        seconds, edges = [round(one.seconds) for one in some], [one.edges for one in some]
+        faults = "; ".join(sorted({fault for one in some for fault in one.faults})) or "none"
+        ranges = (f"{min(of)} to {max(of)}" if len(some) > 1 else str(of[0]) for of in (seconds, edges))
+        lines.append(f"| {name} | {next(ranges)} | {sum(one.inputs for one in some)} | {next(ranges)} | {faults} |")
     return lines
 
 

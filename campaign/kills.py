@@ -150,7 +150,8 @@ def table(tallies: Sequence[Tally]) -> list[str]:
     """Lines of Markdown: a row a command and signal."""
     faults = ["neither old nor new", "orphans", "other bytes in the end", "leftovers", "failed to go on"]
     lines = [f"| verb | signal | kills | ended before | {' | '.join(faults)} |", "|---" * 9 + "|"]
+    rows = []
     for one in tallies:
         counts = [len(one.torn), one.orphans, len(one.other_bytes), len(one.left), len(one.failed)]
-        lines.append(f"| {one.verb} | {one.signal} | {one.kills} | {one.completed} | {' | '.join(map(str, counts))} |")
-    return lines
+        rows.append((one.verb, f"{one.signal} | {one.kills} | {one.completed} | {' | '.join(map(str, counts))}"))
+    return [*lines, *results.alike(rows)]

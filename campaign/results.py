@@ -18,6 +18,14 @@ TIMES = re.compile(
 HIDDEN = re.compile(r"\..*\.(new|old)(\..*)?$|\..*\.(lock|occupied|part)$")  # temporaries and locks
 
 
+def alike(rows: Iterable[tuple[str, str]]) -> list[str]:
+    """Lines of Markdown, one for all names whose cells are equal."""
+    names: dict[str, list[str]] = {}
+    for name, cells in rows:
+        names.setdefault(cells, []).append(name)
+    return [f"| {', '.join(dict.fromkeys(some))} | {cells} |" for cells, some in names.items()]
+
+
 def digests(folder: Path) -> dict[str, str]:
     """Digest of each file in a folder that holds no times, by its relative path; none of hidden ones."""
     found = {}

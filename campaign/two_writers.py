@@ -80,10 +80,11 @@ def _at_once(lines: Sequence[tuple[str, ...]], folder: Path) -> tuple[tuple[int,
 
 
 def table(pairs: Sequence[Pair]) -> list[str]:
-    """Lines of Markdown: a row a pair."""
+    """Lines of Markdown: a row for all pairs with the same outcome."""
     lines = ["| verb | statuses | result of one alone | leftovers | refusal |", "|---|---|---|---|---|"]
+    rows = []
     for pair in pairs:
         refusal = next((said.strip().splitlines()[-1] for said in pair.said if said.strip()), "")
         statuses = " and ".join(map(str, pair.statuses))
-        lines.append(f"| {pair.verb} | {statuses} | {'yes' if pair.right else '**no**'} | {len(pair.left)} | `{refusal[-90:]}` |")
-    return lines
+        rows.append((pair.verb, f"{statuses} | {'yes' if pair.right else '**no**'} | {len(pair.left)} | `{refusal[-90:]}`"))
+    return [*lines, *results.alike(rows)]
