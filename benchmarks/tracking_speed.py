@@ -133,7 +133,7 @@ def eager(detector: str, segmenter: str) -> Networks:
 
     modules = []
     for name, kind in ((detector, "detector"), (segmenter, "segmenter")):
-        module = network(cast(Name, name))
+        module = network(cast(Name, name), circles=3)
         if not name.startswith("published"):
             load(nets.WEIGHTS / f"{kind}.safetensors", module)
         modules.append(module.eval())

@@ -30,6 +30,7 @@ from pydantic_core import to_jsonable_python
 
 from recon.errors import InputError, brief, did_you_mean, one_line, short
 from recon.files import yaml_text
+from recon.model.part import Kinds
 
 OF_ONE_VERB = {"devices/virtual": "record"}  # choices of a group that only this verb takes
 NEEDED = "???"  # Hydra's mark of a field that needs a value
@@ -480,11 +481,13 @@ def _place(model: type[BaseModel], place: Sequence[str | int]) -> tuple[list[str
 
 
 def _plain_types(annotation: Any) -> list[Any]:
-    """The types that an annotation stands for, such as both models of `Annotated[A | B, ...] | None`."""
+    """The types that an annotation stands for, such as both models of `Annotated[A | B, ...] | None`, or all kinds of a thing."""
     if get_origin(annotation) is Annotated:
         return _plain_types(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
         return [each for one in get_args(annotation) for each in _plain_types(one)]
+    if isinstance(annotation, type) and issubclass(annotation, Kinds) and annotation.is_any():
+        return annotation.models()
     return [annotation]
 
 

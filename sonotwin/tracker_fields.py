@@ -1,7 +1,7 @@
 """The tracker as the fields of verbs."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -29,6 +29,9 @@ class TrackerFields(Part):
     less: of paper by moisture; 1e-5 of chrome on glass"""
     networks: Path | None = None
     """folder of detector.onnx and segmenter.onnx; null for those that come with sonotwin"""
+    naming: Literal["networks", "geometry"] = "networks"
+    """by which a circle gets its name: networks that were trained for this kind of target; or its place among the others alone,
+    with any networks: slower, and of covered circles fewer are found"""
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
     """cores for the networks, 0 for all; another number may change last digits"""
 
@@ -59,7 +62,8 @@ def make_tracker(
     Raises
     ------
     InputError
-        If a network is missing, or isn't one.
+        If a network is missing, isn't one, or is of another kind of target.
     """
-    loaded = networks.load(fields.networks or networks.WEIGHTS, fields.threads)
+    folder, by_geometry = fields.networks or networks.WEIGHTS, fields.naming == "geometry"
+    loaded = networks.load(folder, fields.threads, target.kind, by_geometry)
     return Tracker(cameras, target, loaded, bits, known, fields.drift_px, fields.board_scale)

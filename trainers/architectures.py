@@ -1,8 +1,9 @@
 """The networks of the tracker: those as published, with the published names of their weights, and smaller, faster ones of ours.
 
 A detector takes grey/255 (n, 1, h, w), h and w multiples of 8, and gives logits of where a circle's centre is, (n, 65, h/8, w/8):
-pixel 8 row + column of a cell, or 64 for none; and of which circle it is, (n, 4, h/8, w/8): c0, c1, c2 or none. A segmenter takes
-patches (n, 1, h, w), h and w multiples of 8, and gives logits (n, 1, h, w) of the filled outer disc at the middle of each.
+pixel 8 row + column of a cell, or 64 for none; and of which circle it is, (n, circles + 1, h/8, w/8): c0, c1 and on, or none. A
+segmenter takes patches (n, 1, h, w), h and w multiples of 8, and gives logits (n, 1, h, w) of the filled outer disc at the middle
+of each.
 
 Source of the published ones: Meza et al. 2021, MarkerPose; the detector's layout is that of DeTone et al. 2018, SuperPoint.
 """
@@ -15,28 +16,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
-from recon.model import circle_layout
-
 Name = Literal["detector", "segmenter", "published_detector", "published_segmenter"]
 
 PIXELS, NO_PIXEL = 65, 64  # classes of a cell: its 64 pixels, and none
-IDENTITIES, NO_CIRCLE = circle_layout.COUNT + 1, circle_layout.COUNT  # c0, c1, c2, and none
 CELL = 8  # px, edge of a cell
 CELLS_A_CIRCLE = 200  # about, in what a detector trains with
 
 
-def network(name: Name) -> nn.Module:
-    """A network with fresh weights, from torch's global generator."""
-    module = {
-        "detector": Detector,
-        "segmenter": Segmenter,
-        "published_detector": PublishedDetector,
-        "published_segmenter": PublishedSegmenter,
-    }[name]()
-    if is_detector(name):  # most cells show nothing; without knowing that from the start the first hundred steps learn just this
-        with torch.no_grad():
-            bias = module.get_parameter("convD.3.bias" if name.startswith("published") else "detection.3.bias")
-            bias[NO_PIXEL] = math.log(NO_PIXEL * CELLS_A_CIRCLE)
+def network(name: Name, circles: int) -> nn.Module:
+    """A network with fresh weights, from torch's global generator, for a target of some circles."""
+    if not is_detector(name):
+        return {"segmenter": Segmenter, "published_segmenter": PublishedSegmenter}[name]()
+    module = {"detector": Detector, "published_detector": PublishedDetector}[name](circles=circles)
+    with torch.no_grad():  # most cells show nothing; without that from the start the first hundred steps learn just this
+        bias = module.get_parameter("convD.3.bias" if name.startswith("published") else "detection.3.bias")
+        bias[NO_PIXEL] = math.log(NO_PIXEL * CELLS_A_CIRCLE)
     return module
 
 
@@ -61,17 +55,17 @@ class DoubleConv(nn.Module):
 class PublishedDetector(nn.Module):
     """The published detector."""
 
-    def __init__(self) -> None:
+    def __init__(self, circles: int) -> None:
         super().__init__()
         self.conv1 = DoubleConv(1, 64)
         self.conv2 = DoubleConv(64, 64)
         self.conv3 = DoubleConv(64, 128)
         self.conv4 = DoubleConv(128, 128)
         self.convD = nn.Sequential(*_convolution(128, 256), nn.Conv2d(256, PIXELS, 1))
-        self.convC = nn.Sequential(*_convolution(128, 256), nn.Conv2d(256, IDENTITIES, 1))
+        self.convC = nn.Sequential(*_convolution(128, 256), nn.Conv2d(256, circles + 1, 1))
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """(n, 1, h, w) to logits (n, 65, h/8, w/8) of the place and (n, 4, h/8, w/8) of the identity."""
+        """(n, 1, h, w) to logits (n, 65, h/8, w/8) of the place and (n, circles + 1, h/8, w/8) of the identity."""
         features = self.conv1(image)
         for stage in (self.conv2, self.conv3, self.conv4):
             features = stage(max_pool2d(features, 2))
@@ -124,7 +118,7 @@ class Detector(nn.Module):
     Its field of view reaches 15 cells to each side, 120 px: the whole target from each circle, as one circle looks like another.
     """
 
-    def __init__(self, channels: int = 80) -> None:
+    def __init__(self, circles: int, channels: int = 80) -> None:
         super().__init__()
         self.stem = nn.Sequential(
             *_convolution(1, 16, stride=2),
@@ -133,10 +127,10 @@ class Detector(nn.Module):
         )
         self.trunk = nn.Sequential(*(Residual(channels, dilations) for dilations in ((1, 2), (4, 4), (2, 1))))
         self.detection = nn.Sequential(*_convolution(channels, channels, 1), nn.Conv2d(channels, PIXELS, 1))
-        self.identity = nn.Sequential(*_convolution(channels, channels, 1), nn.Conv2d(channels, IDENTITIES, 1))
+        self.identity = nn.Sequential(*_convolution(channels, channels, 1), nn.Conv2d(channels, circles + 1, 1))
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """(n, 1, h, w) to logits (n, 65, h/8, w/8) of the place and (n, 4, h/8, w/8) of the identity."""
+        """(n, 1, h, w) to logits (n, 65, h/8, w/8) of the place and (n, circles + 1, h/8, w/8) of the identity."""
         features = self.trunk(self.stem(image))
         return self.detection(features), self.identity(features)
 

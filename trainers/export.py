@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from recon.errors import InputError, brief, reason
 from recon.files import atomic
+from recon.tracking.networks import TRAINED_FOR
 from trainers.architectures import Name, is_detector, weights_of
 from trainers.shard_reader import PATCH, VIEW
 
@@ -132,8 +133,8 @@ def _read(path: Path) -> dict[Any, Any]:
         raise InputError(f"{path}: expected weights as safetensors, found a damaged file: {reason(error)}") from None
 
 
-def save_onnx(path: Path, network: nn.Module, name: Name) -> None:
-    """Write ONNX with free batch, height and width, and make sure that ONNX Runtime gives the same answers.
+def save_onnx(path: Path, network: nn.Module, name: Name, kind: str) -> None:
+    """Write ONNX with free batch, height and width, for a kind of target, and make sure of ONNX Runtime's answers.
 
     Raises
     ------
@@ -159,8 +160,16 @@ def save_onnx(path: Path, network: nn.Module, name: Name) -> None:
                 opset_version=OPSET,
                 dynamo=False,
             )
+        with temporary.open("ab") as file:
+            file.write(_metadata(TRAINED_FOR, kind))
         _check(temporary, network, example)
         _check(temporary, network, example[:1, :, : height // 2 // 8 * 8, : width // 2 // 8 * 8])
+
+
+def _metadata(key: str, value: str) -> bytes:
+    """An entry of `metadata_props`, field 14 of ONNX's ModelProto, which may stand at a file's end; of short texts."""
+    entry = b"".join(bytes([field << 3 | 2, len(text)]) + text.encode("ascii") for field, text in ((1, key), (2, value)))
+    return bytes([14 << 3 | 2, len(entry)]) + entry
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 
-from trainers.architectures import CELL, IDENTITIES, NO_CIRCLE, NO_PIXEL
+from trainers.architectures import CELL, NO_PIXEL
 
 SEEN = 0.35  # of its disc, least that a circle is labelled with
 HIDDEN = 0.05  # of its disc, most that a circle is nothing with; in between either answer is right
@@ -25,7 +25,7 @@ class Labels:
     """Classes of the cells of n views."""
 
     pixel: Tensor  # (n, h/8, w/8) int64: 8 row + column, 64 for none, IGNORED
-    identity: Tensor  # (n, h/8, w/8) int64: 0, 1, 2, 3 for none, IGNORED
+    identity: Tensor  # (n, h/8, w/8) int64: 0, 1 and on, the number of circles for none, IGNORED
 
 
 def label_offset(scale: Tensor) -> Tensor:
@@ -34,7 +34,7 @@ def label_offset(scale: Tensor) -> Tensor:
 
 
 def seen_in_view(centres: Tensor, scale: Tensor) -> Tensor:
-    """Where a view shows centres (n, 3, 2) of full resolution, px of the view; scale : (n, 2)."""
+    """Where a view shows centres (n, circles, 2) of full resolution, px of the view; scale : (n, 2)."""
     return (centres + 0.5) / scale[:, None] - 0.5
 
 
@@ -43,16 +43,16 @@ def labels(places: Tensor, visible: Tensor, size: tuple[int, int]) -> Labels:
 
     Parameters
     ----------
-    places : (n, 3, 2) float, px
-        Coarse places of c0, c1, c2, not yet rounded, NaN where there is no target.
-    visible : (n, 3) float
+    places : (n, circles, 2) float, px
+        Coarse places of c0, c1 and on, not yet rounded, NaN where there is no target.
+    visible : (n, circles) float
         Fraction of each disc that is seen.
     size : (width, height) of the views, px, multiples of 8
     """
     width, height = size
     n = len(places)
     pixel = torch.full((n, height // CELL, width // CELL), NO_PIXEL)
-    identity = torch.full_like(pixel, NO_CIRCLE)
+    identity = torch.full_like(pixel, places.shape[1])
     known = torch.isfinite(places).all(-1)
     nearest = torch.where(known[..., None], places, torch.full_like(places, -1e6)).round().long()
     inside = known & (nearest >= 0).all(-1) & (nearest[..., 0] < width) & (nearest[..., 1] < height)
@@ -80,8 +80,8 @@ def detector_loss(detection: Tensor, identity: Tensor, wanted: Labels) -> Tensor
     """
     place = cross_entropy(detection, wanted.pixel, ignore_index=IGNORED, reduction="sum")
     circles = ((wanted.pixel != NO_PIXEL) & (wanted.pixel != IGNORED)).sum()
-    weight = identity.new_ones(IDENTITIES)
-    weight[NO_CIRCLE] = NONE_WEIGHT
+    weight = identity.new_ones(identity.shape[1])
+    weight[-1] = NONE_WEIGHT
     kind = cross_entropy(identity, wanted.identity, weight, ignore_index=IGNORED)
     return place / (circles + len(detection)) + kind
 

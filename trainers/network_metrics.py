@@ -1,7 +1,7 @@
 """Figures of merit of a network on whole validation views and patches, decoded as in the tracker.
 
 A detector's answer becomes circles as published: softmax over a cell's classes, scores of all pixels, of those within 4 px of
-each other the best, above 0.015 the best three, each with the identity that its cell says.
+each other the best, above 0.015 the best, as many as the target has, each with the identity that its cell says.
 """
 
 import math
@@ -16,7 +16,6 @@ from torch.nn.functional import max_pool2d, pixel_shuffle
 from trainers.architectures import NO_PIXEL
 from trainers.labels import HIDDEN, SEEN
 from trainers.shard_reader import Patches, Views
-from trainers.shard_truth import CIRCLES
 
 Array = NDArray[np.float64]
 Metrics = dict[str, float | int]
@@ -37,8 +36,8 @@ BATCH = 16
 class Peaks:
     """Circles found in one view, the best first."""
 
-    places: NDArray[np.int64]  # (m, 2) px of the view, m <= 3
-    identities: NDArray[np.int64]  # (m,) 0, 1, 2, or 3 for none
+    places: NDArray[np.int64]  # (m, 2) px of the view, m <= circles
+    identities: NDArray[np.int64]  # (m,) 0, 1 and on, or the number of circles for none
     scores: Array  # (m,)
 
 
@@ -55,7 +54,7 @@ def decode(detection: Tensor, identity: Tensor) -> list[Peaks]:
     result = []
     for view, kind, peak in zip(scores, kinds, (scores == best) & (scores > SCORE), strict=True):
         v, u = torch.nonzero(peak, as_tuple=True)
-        order = torch.argsort(view[v, u], descending=True, stable=True)[:CIRCLES]
+        order = torch.argsort(view[v, u], descending=True, stable=True)[: identity.shape[1] - 1]
         v, u = v[order], u[order]
         result.append(Peaks(torch.stack([u, v], 1).numpy(), kind[v, u].numpy(), view[v, u].numpy()))
     return result
@@ -66,8 +65,8 @@ def measure_detector(network: nn.Module, views: Views) -> Metrics:
     """Figures of a detector.
 
     `recall`: of circles seen well enough, those found within 4 px with the right identity, and for each identity; `all_three`: of
-    views that show the whole target, those with three right circles, and by the white's digital number and by blur; errors of
-    place against the exact coarse place, in px of the view and of full resolution (along u); `wrong`: of found circles in views
+    views that show the whole target, those with all circles right, and by the white's digital number and by blur; errors of place
+    against the exact coarse place, in px of the view and of full resolution (along u); `wrong`: of found circles in views
     of a target, those that are none of it or have another's identity; `false_per_empty_view`: circles found where there is none.
     """
     network.eval()
@@ -75,7 +74,7 @@ def measure_detector(network: nn.Module, views: Views) -> Metrics:
     errors = np.stack(
         [_errors(found, centres / scale) for found, centres, scale in zip(peaks, views.centres, views.scale, strict=True)]
     )
-    named, anyhow = errors[:, 0], errors[:, 1]  # (n, 3) px, to the circle found by that name, and by any
+    named, anyhow = errors[:, 0], errors[:, 1]  # (n, circles) px, to the circle found by that name, and by any
     places = (views.centres + 0.5) / views.scale[:, None] - 0.5
     with np.errstate(invalid="ignore"):
         held = ((places >= -0.5) & (places < np.array(views.images.shape[:0:-1]) - 0.5)).all(-1)
@@ -91,8 +90,8 @@ def measure_detector(network: nn.Module, views: Views) -> Metrics:
         "views": len(views),
         "recall": _share(right[counts]),
         "identity_accuracy": _share(right[counts & located]),
-        **{f"recall_c{k}": _share(right[:, k][counts[:, k]]) for k in range(CIRCLES)},
-        **{f"identity_accuracy_c{k}": _share(right[:, k][(counts & located)[:, k]]) for k in range(CIRCLES)},
+        **{f"recall_c{k}": _share(right[:, k][counts[:, k]]) for k in range(right.shape[1])},
+        **{f"identity_accuracy_c{k}": _share(right[:, k][(counts & located)[:, k]]) for k in range(right.shape[1])},
         "place_median_px": float(np.median(hits)) if len(hits) else math.nan,
         "place_median_full_px": float(np.median(full)) if len(full) else math.nan,
         "place_95_full_px": float(np.percentile(full, 95)) if len(full) else math.nan,
@@ -155,8 +154,8 @@ def _grey(images: NDArray[np.uint8]) -> Tensor:
 
 
 def _errors(found: Peaks, places: Array) -> Array:
-    """Distances (2, 3) of true coarse places to the nearest circle found with the right identity, and to that with any."""
-    result = np.full((2, CIRCLES), np.inf)
+    """Distances (2, circles) of true coarse places to the nearest circle found with the right identity, and to that with any."""
+    result = np.full((2, len(places)), np.inf)
     for k, place in enumerate(places):
         distances = np.linalg.norm(found.places - place, axis=1)
         result[0, k] = min(distances[found.identities == k], default=np.inf)

@@ -4,6 +4,7 @@ Images in memory cost no decoding during the training. What is larger than memor
 by its place: the same images either way, whatever the order.
 """
 
+import functools
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -14,11 +15,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import registry
 from recon.capture.image_formats import decode_image
-from recon.errors import InputError, validated
+from recon.errors import InputError, short, validated
 from recon.files import json_text, tar_members
+from recon.model import circle_layout
+from recon.model.rig import Target
 from trainers.shard_truth import (
-    CIRCLES,
     Array,
     Count,
     Facts,
@@ -49,10 +52,10 @@ class Views:
 
     images: Images  # (2 n, 240, 320)
     scale: Array  # (2 n, 2) px of full resolution a px of a view, along u and v
-    centres: Array  # (2 n, 3, 2) px of full resolution
-    visible: Array  # (2 n, 3) fraction of each outer disc that is seen
-    inside: NDArray[np.bool_]  # (2 n, 3) whether the whole disc is in the image
-    blur: Array  # (2 n, 3) px of full resolution
+    centres: Array  # (2 n, circles, 2) px of full resolution
+    visible: Array  # (2 n, circles) fraction of each outer disc that is seen
+    inside: NDArray[np.bool_]  # (2 n, circles) whether the whole disc is in the image
+    blur: Array  # (2 n, circles) px of full resolution
     white: Array  # (2 n,) digital number of the target's white
     sample: NDArray[np.int64]  # (2 n,) which sample a view is of
 
@@ -67,14 +70,14 @@ class Views:
 
 @dataclass(frozen=True)
 class Patches:
-    """Patches of n samples, six each."""
+    """Patches of n samples, one a circle and view: m."""
 
-    images: Images  # (6 n, 120, 120)
-    masks: Images  # (6 n, 120, 120) 255 within the outer disc
-    ellipses: Array  # (6 n, 5) u, v in px of the patch, semi-axes in px, angle in rad; NaN without a target
-    visible: Array  # (6 n,) fraction of the disc that is seen
-    white: Array  # (6 n,) digital number of the target's white
-    sample: NDArray[np.int64]  # (6 n,) which sample a patch is of
+    images: Images  # (m, 120, 120)
+    masks: Images  # (m, 120, 120) 255 within the outer disc
+    ellipses: Array  # (m, 5) u, v in px of the patch, semi-axes in px, angle in rad; NaN without a target
+    visible: Array  # (m,) fraction of the disc that is seen
+    white: Array  # (m,) digital number of the target's white
+    sample: NDArray[np.int64]  # (m,) which sample a patch is of
 
     def __len__(self) -> int:
         return len(self.images)
@@ -93,7 +96,10 @@ def read_views(folders: Sequence[Path], tell: Tell = lambda count: None, partial
         In one line, where a set is missing, damaged or, unless `partial`, incomplete, or a sample is in two of them. Damage of
         images shows when they are decoded.
     """
-    index = _read(folders, [f"cam{k}.png" for k in VIEWS], SampleTruth, facts, tell, partial)
+    circles = circles_of(folders)
+    index = _read(
+        folders, [f"cam{k}.png" for k in VIEWS], SampleTruth, lambda views: facts(views, circles), circles, tell, partial
+    )
     known = Facts(*index.columns)
     return Views(
         index.images(slice(None), _view, VIEW, 1),
@@ -108,20 +114,21 @@ def read_views(folders: Sequence[Path], tell: Tell = lambda count: None, partial
 
 
 def read_patches(folders: Sequence[Path], tell: Tell = lambda count: None, partial: bool = False) -> Patches:
-    """All six patches of every sample, with their masks; otherwise as `read_views`."""
+    """All patches of every sample, with their masks; otherwise as `read_views`."""
+    circles = circles_of(folders)
 
     def convert(views: Sequence[PatchTruth]) -> tuple[Array, ...]:
-        return *facts(views), ellipses_in_patches(views)
+        return *facts(views, circles), ellipses_in_patches(views, circles)
 
-    index = _read(
-        folders, [f"{kind}{k}.png" for kind in ("patches", "masks") for k in VIEWS], PatchedTruth, convert, tell, partial
-    )
+    ends = [f"{kind}{k}.png" for kind in ("patches", "masks") for k in VIEWS]
+    index = _read(folders, ends, PatchedTruth, convert, circles, tell, partial)
     *known, ellipses = index.columns
-    visible, white = Facts(*known).visible.reshape(-1), np.repeat(Facts(*known).white, CIRCLES)
+    visible, white = Facts(*known).visible.reshape(-1), np.repeat(Facts(*known).white, circles)
     images, masks = (
-        index.images(which, _patches, (PATCH, PATCH), CIRCLES) for which in (slice(len(VIEWS)), slice(len(VIEWS), None))
+        index.images(which, functools.partial(_patches, circles=circles), (PATCH, PATCH), circles)
+        for which in (slice(len(VIEWS)), slice(len(VIEWS), None))
     )
-    return Patches(images, masks, ellipses, visible, white, np.arange(len(white)) // (CIRCLES * len(VIEWS)))
+    return Patches(images, masks, ellipses, visible, white, np.arange(len(white)) // (circles * len(VIEWS)))
 
 
 def split(data: Some, validation: float) -> tuple[Some, Some]:
@@ -199,7 +206,13 @@ class _Shard(NamedTuple):
 
 
 def _read(
-    folders: Sequence[Path], ends: Sequence[str], model: type[SampleTruth], convert: Callable, tell: Tell, partial: bool
+    folders: Sequence[Path],
+    ends: Sequence[str],
+    model: type[SampleTruth],
+    convert: Callable,
+    circles: int,
+    tell: Tell,
+    partial: bool,
 ) -> _Index:
     """Read the truth of all samples, and find the members with these ends of their names."""
     shards: list[Path] = []
@@ -208,11 +221,11 @@ def _read(
     for folder in folders:
         before = count
         for shard in _shards_of(folder):
-            parts.append(_scan(shard, len(shards), ends, model, convert))
+            parts.append(_scan(shard, len(shards), ends, model, convert, circles))
             shards.append(shard)
             count += len(parts[-1].identities)
             tell(count)
-        expected = None if partial else _promised(folder)
+        expected = None if partial else _settings(folder).samples
         if expected is not None and expected != count - before:
             found = f"found {count - before} in shards; partial=true takes these"
             raise InputError(f"{folder}: expected {expected} samples as of dataset.json, {found}")
@@ -229,7 +242,7 @@ def _shards_of(folder: Path) -> list[Path]:
     return shards
 
 
-def _scan(path: Path, number: int, ends: Sequence[str], model: type[SampleTruth], convert: Callable) -> _Shard:
+def _scan(path: Path, number: int, ends: Sequence[str], model: type[SampleTruth], convert: Callable, circles: int) -> _Shard:
     views: list[ViewTruth] = []
     places: list[list[tuple[int, int, int]]] = []
     identities: list[int] = []
@@ -240,6 +253,10 @@ def _scan(path: Path, number: int, ends: Sequence[str], model: type[SampleTruth]
         _, offset, size = members["json"]
         content = tar_members.read(path, offset, size)
         truth = parse(f"{path}: {key}.json", content, model)
+        for view in truth.views:
+            if view.circles not in (None, circles):
+                found = f"{view.circles}; dataset.json beside it names the target, rig.target.kind"
+                raise InputError(f"{path}: {key}.json: expected {circles} circles a view, found {found}")
         views.extend(truth.views)
         places.append([(number, members[end].offset, members[end].size) for end in ends])
         identities.append(identity(truth, content))
@@ -262,19 +279,55 @@ def _check_apart(shards: Sequence[Path], parts: Sequence[_Shard]) -> None:
         )
 
 
-class _Promise(Known):
+class _Kind(Known):
+    kind: str = Target.USUAL
+
+
+class _Rig(Known):
+    target: _Kind = _Kind()
+
+
+class _Settings(Known):
+    """What counts here of a data set's settings."""
+
     samples: Count | None = None
+    rig: _Rig = _Rig()
 
 
-def _promised(folder: Path) -> int | None:
-    """Number of samples by the data set's own count, or None."""
+def _settings(folder: Path) -> _Settings:
+    """Settings of a data set; the usual ones where its folder has none."""
     path = folder / "dataset.json"
     if not os.path.lexists(path):
-        return None
+        return _Settings()
     try:
-        return validated(_Promise, json_text.read(path), path).samples
+        return validated(_Settings, json_text.read(path), path)
     except InputError as error:
         raise InputError(f"{error}; expected a data set's settings") from None
+
+
+def kind_of(folders: Sequence[Path]) -> str:
+    """The kind of target that data sets show, a module of `recon.model.targets`.
+
+    Raises
+    ------
+    InputError
+        If two show different ones, or one that isn't known.
+    """
+    kinds = {folder: _settings(folder).rig.target.kind for folder in folders}
+    first, there = folders[0], registry.names(Target.PACKAGE)
+    for folder, kind in kinds.items():
+        if kind not in there:
+            raise InputError(f"{folder}: rig.target.kind: expected one of {', '.join(there)}, found {short(kind)}")
+        if kind != kinds[first]:
+            raise InputError(
+                f"{folder}: expected samples of {kinds[first]} as in {first}, found those of {kind}: train one for each"
+            )
+    return kinds[first]
+
+
+def circles_of(folders: Sequence[Path]) -> int:
+    """Number of the circles of the target that data sets show."""
+    return circle_layout.count(Target.named(kind_of(folders)))
 
 
 def _view(place: str, content: bytes) -> Grey:
@@ -283,9 +336,9 @@ def _view(place: str, content: bytes) -> Grey:
     return (image if image.shape[::-1] == VIEW else cv2.resize(image, VIEW))[None]
 
 
-def _patches(place: str, content: bytes) -> Grey:
-    """Patches or masks of one view : (3, 120, 120)."""
-    return _grey_image(place, content, (PATCH, CIRCLES * PATCH)).reshape(CIRCLES, PATCH, PATCH)
+def _patches(place: str, content: bytes, circles: int) -> Grey:
+    """Patches or masks of one view : (circles, 120, 120)."""
+    return _grey_image(place, content, (PATCH, circles * PATCH)).reshape(circles, PATCH, PATCH)
 
 
 def _grey_image(place: str, content: bytes, size: tuple[int, int] | None) -> Grey:

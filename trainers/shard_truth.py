@@ -11,9 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
 
 from recon.errors import validated
 from recon.files import json_text
-from recon.model import circle_layout
+from recon.geometry.pose_hypotheses import POINTS
 
-CIRCLES = circle_layout.COUNT
 FARTHEST = 1e6  # px, or digital numbers: more is no measurement, and overflows in 32 bits
 
 Array = NDArray[np.float64]
@@ -43,25 +42,46 @@ class ViewTruth(Known):
     """What one camera sees; without a target before it all but the camera may be null."""
 
     camera: Size
-    centres: tuple[Place, Place, Place] | None
-    visible: tuple[Share, Share, Share] | None = None
-    inside: tuple[StrictBool, StrictBool, StrictBool] | None = None
-    blur_px: tuple[Length, Length, Length] | None = None
+    centres: Annotated[tuple[Place, ...], Field(min_length=POINTS)] | None
+    visible: tuple[Share, ...] | None = None
+    inside: tuple[StrictBool, ...] | None = None
+    blur_px: tuple[Length, ...] | None = None
     white_dn: Length | None = None
 
     @model_validator(mode="after")
     def _complete(self) -> "ViewTruth":
-        for name in ("visible", "inside", "blur_px") if self.centres is not None else ():
-            if getattr(self, name) is None:
-                raise ValueError(f"{name}: expected three values, as there are centres, found none")
+        expected = None if self.centres is None else len(self.centres)
+        for name in ("visible", "inside", "blur_px") if expected is not None else ():
+            found = getattr(self, name)
+            if found is None or len(found) != expected:
+                given = "none" if found is None else len(found)
+                raise ValueError(f"{name}: expected {expected} values, as there are centres, found {given}")
         return self
+
+    @property
+    def circles(self) -> int | None:
+        """Number of the target's circles; None of a view that shows none."""
+        return None if self.centres is None else len(self.centres)
 
 
 class PatchTruth(ViewTruth):
     """The same with the patches' places."""
 
-    patch_origins: tuple[Place, Place, Place]
-    ellipses: tuple[Ellipse, Ellipse, Ellipse] | None
+    patch_origins: Annotated[tuple[Place, ...], Field(min_length=POINTS)]
+    ellipses: tuple[Ellipse, ...] | None
+
+    @model_validator(mode="after")
+    def _of_all_circles(self) -> "PatchTruth":
+        for name in ("centres", "ellipses"):
+            found, expected = getattr(self, name), len(self.patch_origins)
+            if found is not None and len(found) != expected:
+                raise ValueError(f"{name}: expected {expected} values, as there are patches, found {len(found)}")
+        return self
+
+    @property
+    def circles(self) -> int:
+        """Number of the target's circles."""
+        return len(self.patch_origins)
 
 
 class SampleTruth(Known):
@@ -93,19 +113,19 @@ class Facts(NamedTuple):
     """What is known of n views. Without a target centres are NaN and the rest is 0."""
 
     size: Array  # (n, 2) px, width and height in full resolution
-    centres: Array  # (n, 3, 2) px of full resolution
-    visible: Array  # (n, 3) fraction of each outer disc that is seen
-    inside: NDArray[np.bool_]  # (n, 3)
-    blur: Array  # (n, 3) px of full resolution
+    centres: Array  # (n, circles, 2) px of full resolution
+    visible: Array  # (n, circles) fraction of each outer disc that is seen
+    inside: NDArray[np.bool_]  # (n, circles)
+    blur: Array  # (n, circles) px of full resolution
     white: Array  # (n,) digital number of the target's white
 
 
-def facts(views: Sequence[ViewTruth]) -> Facts:
-    """Arrays of some views' truth."""
+def facts(views: Sequence[ViewTruth], circles: int) -> Facts:
+    """Arrays of some views' truth, of a target of some circles."""
     there = np.array([view.centres is not None for view in views])
-    nothing = (0.0,) * CIRCLES
-    centres = np.full((len(views), CIRCLES, 2), np.nan)
-    centres[there] = np.reshape([view.centres for view in views if view.centres is not None], (-1, CIRCLES, 2))
+    nothing = (0.0,) * circles
+    centres = np.full((len(views), circles, 2), np.nan)
+    centres[there] = np.reshape([view.centres for view in views if view.centres is not None], (-1, circles, 2))
     visible, inside, blur = (
         np.array([getattr(view, name) or nothing for view in views], float) for name in ("visible", "inside", "blur_px")
     )
@@ -119,9 +139,9 @@ def facts(views: Sequence[ViewTruth]) -> Facts:
     )
 
 
-def ellipses_in_patches(views: Sequence[PatchTruth]) -> Array:
-    """Ellipses (3 n, 5) of views' discs as their patches show them; NaN without a target."""
-    ellipses = np.full((len(views), CIRCLES, 5), np.nan)
+def ellipses_in_patches(views: Sequence[PatchTruth], circles: int) -> Array:
+    """Ellipses (circles n, 5) of views' discs as their patches show them; NaN without a target."""
+    ellipses = np.full((len(views), circles, 5), np.nan)
     for ellipse, view in zip(ellipses, views, strict=True):
         if view.ellipses is not None:
             ellipse[:] = view.ellipses

@@ -117,10 +117,9 @@ def printed(target: Target, errors: Print, *key: int) -> Target:
     rng = np.random.default_rng([*key, PRINT_STREAM])
     wider = errors.diameter_mm * rng.standard_normal()
     scatter = circle_layout.length_covariance(target.model_copy(update={"tolerance_mm": errors.place_mm, "covariance_mm2": None}))
-    c1, aside, c2 = rng.multivariate_normal(circle_layout.lengths(target), scatter).tolist()
+    target = circle_layout.with_lengths(target, rng.multivariate_normal(circle_layout.lengths(target), scatter))
     outer, inner = target.outer_diameter_mm + wider, target.inner_diameter_mm - wider
-    changed = {"c1_mm": c1, "c2_aside_mm": aside, "c2_mm": c2, "outer_diameter_mm": outer, "inner_diameter_mm": inner}
-    return target.model_copy(update=changed)
+    return target.model_copy(update={"outer_diameter_mm": outer, "inner_diameter_mm": inner})
 
 
 def printed_board(design: board.Config, errors: BoardPrint, *key: int) -> board.Config:

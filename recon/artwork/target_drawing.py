@@ -1,4 +1,4 @@
-"""The probe's target as a card to print: three black annuli, as `rig.target` describes them.
+"""The probe's target as a card to print: black annuli, as `rig.target` describes them.
 
 The target's frame is seen from its front: x to the right, y upwards, c0 below at the left. On the card the circles stand in the
 middle.
@@ -30,14 +30,17 @@ def card_of(target: Target) -> Card:
         found, expected = (f"{x:g}x{y:g}" for x, y in (target.board_mm, least.tolist()))
         raise InputError(f"rig.target.board_mm: expected {expected} mm or more around these circles, found {found} mm")
     middles = centres - (low + high) / 2 + np.array(target.board_mm) / 2
-    outer, inner = (np.column_stack([middles, np.full(3, d / 2)]) for d in (target.outer_diameter_mm, target.inner_diameter_mm))
+    outer, inner = (
+        np.column_stack([middles, np.full(len(middles), d / 2)]) for d in (target.outer_diameter_mm, target.inner_diameter_mm)
+    )
     return Card(target.board_mm, (Ink(False, outer), Ink(True, inner)))
 
 
 def in_words(target: Target) -> str:
     """A target's lengths on one line."""
-    aside = f" and {target.c2_aside_mm:g} mm aside" if target.c2_aside_mm else ""
+    _, (c1, _), *others = circle_centres(target)[:, :2].tolist()
+    above = [f"c{k} {y:g} mm above" + (f" and {x:g} mm aside" if x else "") for k, (x, y) in enumerate(others, start=2)]
     return (
-        f"target, c1 {target.c1_mm:g} mm right of c0, c2 {target.c2_mm:g} mm above{aside}, "
+        f"target, c1 {c1:g} mm right of c0, {', '.join(above)}, "
         f"diameters {target.outer_diameter_mm:g} and {target.inner_diameter_mm:g} mm"
     )

@@ -1,7 +1,7 @@
 """Files of the measured target, `target.yaml`: OpenCV FileStorage YAML.
 
-`schema`; `c1_mm`, `c2_aside_mm`, `c2_mm`, places of the circles as in `recon.model.circle_layout`; `outer_diameter_mm`;
-`curvature_per_m` (xx, xy, yy); and `parameters`, the names of all seven, with their `covariance`.
+`schema`; the lengths of the target's kind, `c1_mm`, `c2_aside_mm`, `c2_mm` and on, as `recon.model.circle_layout` has them;
+`outer_diameter_mm`; `curvature_per_m` (xx, xy, yy); and `parameters`, the names of all these, with their `covariance`.
 """
 
 from pathlib import Path
@@ -13,25 +13,32 @@ from pydantic import ValidationError
 
 from recon.errors import InputError, one_line, short
 from recon.files import opencv_storage
-from recon.model.circle_layout import LENGTHS
 from recon.model.rig import Target
 
 Array = NDArray[np.float64]
 
 SCHEMA = "sonotwin-target/1"
-LENGTHS_AND_DIAMETER = (*LENGTHS, "outer_diameter_mm")
 CURVATURE = "curvature_per_m"
-PARAMETERS = (*LENGTHS_AND_DIAMETER, *(f"curvature_{axes}_per_m" for axes in ("xx", "xy", "yy")))
+
+
+def lengths_and_diameter(target: Target) -> tuple[str, ...]:
+    """Names of the circles' lengths, and of their diameter."""
+    return (*target.LENGTHS, "outer_diameter_mm")
+
+
+def parameters(target: Target) -> tuple[str, ...]:
+    """Names of all that is measured."""
+    return (*lengths_and_diameter(target), *(f"curvature_{axes}_per_m" for axes in ("xx", "xy", "yy")))
 
 
 def write(path: Path, target: Target, covariance: Array) -> None:
-    """Write a measured target with the covariance : (7, 7) of PARAMETERS, whole or not at all. The suffix should be `.yaml`."""
+    """Write a measured target with the covariance : (p, p) of `parameters`, whole or not at all. The suffix should be `.yaml`."""
     storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     storage.write("schema", SCHEMA)
-    for name in LENGTHS_AND_DIAMETER:
+    for name in lengths_and_diameter(target):
         storage.write(name, float(getattr(target, name)))
     storage.write(CURVATURE, np.array(target.curvature_per_m).reshape(1, 3))
-    opencv_storage.write_covariance(storage, PARAMETERS, covariance)
+    opencv_storage.write_covariance(storage, parameters(target), covariance)
     opencv_storage.save(path, storage)
 
 
@@ -47,20 +54,21 @@ def read(path: Path, design: Target) -> Target:
     if stored.get("schema") != SCHEMA:
         found = short(stored["schema"]) if isinstance(stored.get("schema"), str) else "none"
         raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
-    values: dict[str, object] = {name: _number(path, name, stored.get(name)) for name in LENGTHS_AND_DIAMETER}
+    values: dict[str, object] = {name: _number(path, name, stored.get(name)) for name in lengths_and_diameter(design)}
     curvature = opencv_storage.matrix(path, CURVATURE, stored.get(CURVATURE))
     if curvature.size != 3 or not np.isfinite(curvature).all():
         raise InputError(f"{path}: {CURVATURE}: expected three numbers, xx, xy and yy, found {short(str(curvature.tolist()))}")
     names = opencv_storage.names(stored)
-    if names is None or sorted(names) != sorted(PARAMETERS):
+    expected = parameters(design)
+    if names is None or sorted(names) != sorted(expected):
         found = short(" ".join(names or ["none"]))
-        raise InputError(f"{path}: parameters: expected {' '.join(PARAMETERS)}, found {found}")
+        raise InputError(f"{path}: parameters: expected {' '.join(expected)}, as of rig.target, found {found}")
     covariance = opencv_storage.covariance(path, stored, len(names))
-    of_lengths = [names.index(name) for name in LENGTHS]
+    of_lengths = [names.index(name) for name in design.LENGTHS]
     values[CURVATURE] = curvature.ravel().tolist()
     values["covariance_mm2"] = covariance[np.ix_(of_lengths, of_lengths)].tolist()
     try:
-        return Target.model_validate(design.model_dump() | values)
+        return type(design).model_validate(design.model_dump() | values)
     except ValidationError as error:
         raise InputError(f"{path}: {one_line(error)}") from None
 

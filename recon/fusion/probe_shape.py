@@ -5,6 +5,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.geometry import rigid
+from recon.model import circle_layout
 from recon.model.circle_layout import circle_centres
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import Target
@@ -19,7 +20,7 @@ STRUT_MM = 4.0  # radius of the bracket
 def of(target: Target, probe: ProbeCalibration, width: int) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
     """Board, bracket and housing; and the circles' ink. The array's face is the middle of B-scans `width` px wide, at row 0."""
     x, y = target.board_mm
-    middle = np.array([target.c1_mm / 2, target.c2_mm / 2, -BOARD_MM / 2])
+    middle = circle_layout.middle(target) - [0, 0, BOARD_MM / 2]
     board = trimesh.creation.box([x, y, BOARD_MM], rigid.transform(np.eye(3), middle))
     array = (width - 1) * probe.scale[0]
     wider, length, thick = HOUSING_MM

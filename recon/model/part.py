@@ -2,9 +2,20 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from recon import registry
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -30,6 +41,47 @@ class Part(BaseModel):
             if not abs(number) <= most:
                 raise ValueError(f"expected numbers of up to {most:g}, found {number:g}")
         return value
+
+
+class Kinds(Part):
+    """A thing of several kinds: each a module of a package, found by its name, with a subclass `Kind` of the thing's class.
+
+    A `Kind` has the field `kind`, a literal of its module's name. What is read as the thing becomes the kind that it names.
+    """
+
+    PACKAGE: ClassVar[str]
+    USUAL: ClassVar[str] = ""  # where none is named; empty where one must be
+
+    kind: str
+
+    @classmethod
+    def is_any(cls) -> bool:
+        """Whether this is the thing, not one of its kinds."""
+        return Kinds in cls.__bases__
+
+    @classmethod
+    def named(cls, kind: str) -> type[Self]:
+        """The class of a kind that is there."""
+        return registry.kind(cls.PACKAGE, kind).Kind
+
+    @classmethod
+    def models(cls) -> list[type[Self]]:
+        """The kinds."""
+        return [module.Kind for module in registry.kinds(cls.PACKAGE).values()]
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _of_its_kind(cls, value: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if not cls.is_any() or not isinstance(value, Mapping):
+            return handler(value)
+        name = value.get("kind", cls.USUAL or None)
+        if name in (there := registry.names(cls.PACKAGE)):
+            return cls.named(name).model_validate(value)
+        fault: Any = {"type": "union_tag_not_found", "input": value, "ctx": {"discriminator": "'kind'"}}
+        if name is not None:
+            expected = {"tag": str(name), "expected_tags": ", ".join(map(repr, there))}
+            fault |= {"type": "union_tag_invalid", "ctx": fault["ctx"] | expected}
+        raise ValidationError.from_exception_data(cls.__name__, [fault])
 
 
 def _decimals(value: Any) -> Iterator[float]:

@@ -3,16 +3,18 @@
 World is the frame of camera 1. Every field has a unit; nonsense is refused with the field's name.
 """
 
-from typing import Annotated, Self
+from itertools import permutations
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_serializer, model_validator
 
 from recon.geometry import rigid
 from recon.geometry.camera import DISTORTION_LENGTHS, Camera
 from recon.model.lengths import TARGET_CIRCLE, TARGET_STEP
-from recon.model.part import Finite, Fraction, NotNegative, Part, Positive, Vector
+from recon.model.part import Finite, Fraction, Kinds, NotNegative, Part, Positive, Vector
 
+LEAST_ASYMMETRY_MM = 2.0  # by which a target turned must miss itself, that its circles can be told apart
 FOCAL_TOLERANCE = 0.05  # a lens's nominal focal length against the calibrated one
 
 
@@ -107,26 +109,51 @@ class ProjectorDevice(Part):
     contrast: Annotated[float, Field(gt=1)]  # full on / full off; sets the black level
 
 
-class Target(Part):
-    """The probe's planar target of three circles: c0 the origin, c1 on the x axis, c2 on the y axis or a little beside it."""
+class Target(Kinds):
+    """The probe's planar target of any number of circles, whose places are known by lengths; see `recon.model.circle_layout`.
 
-    c1_mm: Positive
-    c2_mm: Positive  # along y
-    c2_aside_mm: Finite = 0.0  # along x
+    Which lengths there are, its kind tells: a module of `recon.model.targets`.
+    """
+
+    PACKAGE = "recon.model.targets"
+    USUAL = "three_circles"
+    LENGTHS: ClassVar[tuple[str, ...]]  # names of fields: c1, then c2 aside (along x) and c2 (along y), and so on
+
     outer_diameter_mm: Positive
     inner_diameter_mm: Positive
     board_mm: tuple[Positive, Positive]  # width, height
     curvature_per_m: Vector = (0.0, 0.0, 0.0)  # of a bowed board: d2z/dx2, d2z/dxdy, d2z/dy2
     tolerance_mm: Annotated[float, Field(ge=0, le=5)] = 0.1  # of each circle's place along each axis, one standard deviation
-    covariance_mm2: tuple[Vector, Vector, Vector] | None = None  # of c1, c2_aside, c2 as measured; instead of the tolerance
+    covariance_mm2: tuple[tuple[Finite, ...], ...] | None = None  # of the lengths as measured; instead of the tolerance
     unusual: bool = False  # lengths that no usual target has, such as circles of less than 2.5 mm, are meant
+
+    @model_serializer(mode="plain")
+    def _own_fields_first(self) -> dict[str, Any]:
+        own = [name for name in type(self).model_fields if name not in Target.model_fields]
+        usual = {"kind"} if self.kind == self.USUAL else set()
+        return {name: getattr(self, name) for name in (*own, *Target.model_fields) if name not in usual}
 
     @model_validator(mode="after")
     def _usual_lengths(self) -> Self:
-        for name, usual in (("c1_mm", TARGET_STEP), ("c2_mm", TARGET_STEP), ("outer_diameter_mm", TARGET_CIRCLE)):
-            fault = usual.fault(getattr(self, name))
+        sides = [name for name in self.LENGTHS if "aside" not in name]
+        for name, usual in (*((side, TARGET_STEP) for side in sides), ("outer_diameter_mm", TARGET_CIRCLE)):
+            fault = usual.fault(abs(getattr(self, name)))
             if fault and not self.unusual:
                 raise ValueError(f"{name}: expected {usual}, found {fault} If it is right, give unusual=true with it")
+        return self
+
+    @model_validator(mode="after")
+    def _names_can_be_told(self) -> Self:
+        c1, *others = (getattr(self, name) for name in self.LENGTHS)
+        places = np.array([0, c1, *map(complex, others[::2], others[1::2])])
+        places = places - places.mean()
+        for order in list(permutations(range(len(places))))[1:]:
+            turn = np.vdot(places, turned := places[list(order)])
+            if np.abs(turned - places * turn / max(abs(turn), 1e-9)).max() < LEAST_ASYMMETRY_MM and not self.unusual:
+                raise ValueError(
+                    f"{self.LENGTHS[-1]}: expected circles that no turn maps onto each other to {LEAST_ASYMMETRY_MM:g} mm, "
+                    f"found c0 on c{order[0]}'s place: which is which can't be seen. If it is right, give unusual=true with it"
+                )
         return self
 
     @field_validator("inner_diameter_mm")
@@ -139,11 +166,13 @@ class Target(Part):
 
     @field_validator("covariance_mm2")
     @classmethod
-    def _covariance(cls, value: tuple[Vector, Vector, Vector] | None) -> tuple[Vector, Vector, Vector] | None:
+    def _covariance(cls, value: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
         if value is not None:
-            matrix = np.array(value)
+            rows, count = [list(row) for row in value], len(cls.LENGTHS)
+            matrix = np.array(rows if [len(row) for row in rows] == [count] * count else np.full((count, count), np.nan))
             if not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix).min() < -1e-12 * np.trace(matrix):
-                raise ValueError(f"expected a covariance of c1, c2_aside and c2, found {matrix.tolist()}")
+                *first, last = (name.removesuffix("_mm") for name in cls.LENGTHS)
+                raise ValueError(f"expected a covariance of {', '.join(first)} and {last}, found {rows}")
         return value
 
 

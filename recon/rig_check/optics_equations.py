@@ -1,8 +1,9 @@
 """Equations of cameras and projector against each other: a target moved about before both cameras, and fringes that both see.
 
-Each pair of frames gives twelve numbers for a pose of six; each point of a surface two pixels and the projector's coordinates in
-both cameras' maps, for a place of three. The rest tells whether the devices are where they were calibrated. Vertical fringes show
-neither a motion of the projector along them nor that of camera 2 across its epipolar lines; the latter the target shows.
+Each pair of frames gives four numbers a circle for a pose of six; each point of a surface two pixels and the projector's
+coordinates in both cameras' maps, for a place of three. The rest tells whether the devices are where they were calibrated.
+Vertical fringes show neither a motion of the projector along them nor that of camera 2 across its epipolar lines; the latter the
+target shows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
@@ -29,7 +31,7 @@ Array = NDArray[np.float64]
 
 CAMERAS, PROJECTOR, TARGET = ("cam1", "cam2"), "projector", "target"
 USUAL_MOTION = np.repeat([np.deg2rad(0.03), 0.1], 3)  # rad and mm: a mount that creeps, a touch; larger ones show all the better
-USUAL_LENGTHS = np.full(3, 0.3)  # mm: another print, a bent board
+USUAL_LENGTH = 0.3  # mm: another print, a bent board
 EXACT_PX = 1e-4  # of a camera's pixel at which a map is read
 ROUNDS = 3  # of a pose's fit
 OUTLYING = 5.0  # standard deviations, after the scale of all
@@ -59,7 +61,7 @@ class Rows(NamedTuple):
 
     residuals: Array  # (m,)
     by_optics: Array  # (m, g) by the calibration's parameters and all motions
-    by_length: Array  # (m, 3) by the target's lengths, mm
+    by_length: Array  # (m, 2 n - 3) by the target's lengths, mm
 
     def over(self, factor: float) -> "Rows":
         """The same with noise that is larger by a factor."""
@@ -73,40 +75,42 @@ def parameters(known: Uncertainty, devices: Sequence[str]) -> tuple[str, ...]:
 
 
 def of_film(pairs: Sequence[tuple[Sighting, Sighting]], target: Target, names: Sequence[str]) -> Rows:
-    """Equations of n pairs of frames that show all six circles: six each."""
+    """Equations of n pairs of frames that show all circles in both views: of n circles 4 n - 6 each."""
     rows = [_of_pair(pair, target, names) for pair in pairs]
     free = fault_tests.eliminated(*(np.stack(each) for each in zip(*rows, strict=True)))
-    return Rows(free[..., 0].ravel(), free[..., 1 : 1 + len(names)].reshape(-1, len(names)), free[..., -3:].reshape(-1, 3))
+    by_length = free[..., 1 + len(names) :]
+    return Rows(
+        free[..., 0].ravel(), free[..., 1 : 1 + len(names)].reshape(-1, len(names)), by_length.reshape(-1, by_length.shape[-1])
+    )
 
 
 def _of_pair(pair: tuple[Sighting, Sighting], target: Target, names: Sequence[str]) -> tuple[Array, Array]:
-    """Slopes by the pose : (12, 6), and the rest : (12, 1 + g + 3), in standard deviations."""
+    """Slopes by the pose : (4 n, 6), and the rest : (4 n, 1 + g + 2 n - 3), in standard deviations."""
     model, circles = circle_layout.circle_centres(target), circle_layout.circles(target)
     pose = aligned(model, meet([view.camera for view in pair], [view.centres for view in pair])[0])
-    whiten = np.zeros((12, 12))
-    for k, noise in enumerate(one for view in pair for one in view.covariance):
-        whiten[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.linalg.inv(np.linalg.cholesky(noise))
+    whiten = block_diag(*(np.linalg.inv(np.linalg.cholesky(noise)) for view in pair for noise in view.covariance))
     for _ in range(ROUNDS):
         by_pose, missing = _by_pose(pair, pose, circles)
         pose = rigid.moved(pose, np.linalg.lstsq(whiten @ by_pose, whiten @ missing)[0])
     by_pose, missing = _by_pose(pair, pose, circles)
     points = rigid.apply(pose, circles.centres)
-    by_point = np.concatenate([slopes_at(view.camera, points) for view in pair])  # (6, 2, 3)
-    by_length = (by_point @ np.concatenate([pose[:3, :3] @ circle_layout.BY_LENGTH] * 2)).reshape(12, 3)
+    by_point = np.concatenate([slopes_at(view.camera, points) for view in pair])  # (2 n, 2, 3)
+    by_length = by_point @ np.concatenate([pose[:3, :3] @ circle_layout.by_length(target)] * 2)
+    by_length = by_length.reshape(len(whiten), -1)
     cameras = {name: view.camera for name, view in zip(CAMERAS, pair, strict=True)}
     by_optics = projection_slopes(cameras, [points, points], names)
     return whiten @ by_pose, whiten @ np.column_stack([missing, by_optics, by_length])
 
 
 def _by_pose(pair: tuple[Sighting, Sighting], pose: Array, circles: Circles) -> tuple[Array, Array]:
-    """Slopes : (12, 6) of the ellipses' centres by the pose, and their residuals : (12,) px."""
+    """Slopes : (4 n, 6) of the ellipses' centres by the pose, and their residuals : (4 n,) px."""
     points, arms = rigid.apply(pose, circles.centres), rigid.rotate(pose, circles.centres)
     slopes = [slopes_at(view.camera, points) @ rigid.slopes(arms) for view in pair]
     missing = [view.centres - ellipses_of(view.camera, pose, *circles)[0] for view in pair]
-    return np.concatenate(slopes).reshape(12, 6), np.concatenate(missing).ravel()
+    return np.concatenate(slopes).reshape(-1, 6), np.concatenate(missing).ravel()
 
 
-def of_fringes(matches: Matches, cameras: Mapping[str, Camera], names: Sequence[str]) -> Rows:
+def of_fringes(matches: Matches, cameras: Mapping[str, Camera], target: Target, names: Sequence[str]) -> Rows:
     """Equations of m points: one each with fringes along one axis of the projector, three with both."""
     axes, (m, k) = list(matches.axes), matches.first.shape
     points = points_by_light(matches.pixels, matches.first, matches.axes, cameras)
@@ -124,7 +128,7 @@ def of_fringes(matches: Matches, cameras: Mapping[str, Camera], names: Sequence[
     sigma = np.concatenate([np.full((m, 2), EXACT_PX), matches.sigma.reshape(m, 2 * k)], axis=1)[..., None]
     free = fault_tests.eliminated(rows[0] / sigma, np.concatenate([missing[..., None], rows[1]], axis=2) / sigma)
     by_optics = free[..., 1:].reshape(-1, len(names))
-    return Rows(free[..., 0].ravel(), by_optics, np.zeros((len(by_optics), 3)))
+    return Rows(free[..., 0].ravel(), by_optics, np.zeros((len(by_optics), len(target.LENGTHS))))
 
 
 def points_by_light(pixels: Array, shown: Array, axes: Sequence[int], cameras: Mapping[str, Camera]) -> Array:
@@ -156,7 +160,9 @@ def _equations(rows: Rows, target: Target, known: Uncertainty, names: Sequence[s
         columns = [list(names).index(f"{device}.{name}") for name in MOTION if f"{device}.{name}" in names]
         if columns:
             faults[device] = Fault(rows.by_optics[:, columns], USUAL_MOTION)
-    return Equations(rows.residuals, spread, faults | {TARGET: Fault(rows.by_length, USUAL_LENGTHS)})
+    return Equations(
+        rows.residuals, spread, faults | {TARGET: Fault(rows.by_length, np.full(rows.by_length.shape[1], USUAL_LENGTH))}
+    )
 
 
 def agreeing(rows: Rows, target: Target, known: Uncertainty, names: Sequence[str], each: int) -> Rows:

@@ -68,7 +68,7 @@ def of_optics(seen: Optics, calibration: Calibration, known: Uncertainty, target
     fringes = None
     if seen.matches is not None:
         each = 2 * len(seen.matches.axes) - 1
-        fringes = optics_equations.of_fringes(seen.matches, cameras, names)
+        fringes = optics_equations.of_fringes(seen.matches, cameras, target, names)
         fringes = optics_equations.agreeing(fringes, target, known, names, each)
     findings = fault_tests.find(optics_equations.assembled(film, fringes, target, known, names), alarm_sigma)
     axes = (0,) if seen.matches is None else seen.matches.axes
@@ -78,7 +78,7 @@ def of_optics(seen: Optics, calibration: Calibration, known: Uncertainty, target
         for device in findings
         if device != TARGET
     }
-    effects[TARGET] = np.eye(3)[None]
+    effects[TARGET] = np.eye(len(target.LENGTHS))[None]
     return _verdicts(findings, effects, (*CAMERAS, PROJECTOR, TARGET))
 
 
@@ -136,7 +136,12 @@ def described(part: str, motion: Array) -> str:
     if part == CLOCK:
         return f"{1e3 * motion[0]:+.1f} ms"
     if part == TARGET:
-        return "c1 {:+.2f}, c2 {:+.2f} aside and {:+.2f} mm along".format(*motion)
+        c1, *others = motion.tolist()
+        sides = [
+            f"c{k} {x:+.2f} aside and {y:+.2f} mm along"
+            for k, (x, y) in enumerate(zip(others[::2], others[1::2], strict=True), 2)
+        ]
+        return ", ".join([f"c1 {c1:+.2f}", *sides])
     turn, shift = np.degrees(np.linalg.norm(motion[:3])), np.linalg.norm(motion[3:])
     return f"turned by {turn:.3f} deg, shifted by {shift:.2f} mm"
 

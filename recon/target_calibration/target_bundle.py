@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from recon import arguments
-from recon.capture import target_files
 from recon.geometry import camera_jacobian, rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_outline import ellipses_of
@@ -28,11 +27,10 @@ from recon.tracking.tracker import Tracking
 
 Array = NDArray[np.float64]
 
-NAMES = target_files.PARAMETERS
-TARGET_STEPS = np.array([1e-2] * 4 + [1e-1] * 3)  # of derivatives by differences, mm and 1/m
+LENGTH_STEP, CURVATURE_STEP = 1e-2, 1e-1  # of derivatives by differences, mm and 1/m
 POSE_STEPS = np.array([1e-4] * 3 + [1e-2] * 3)  # rad, mm
 POSE = len(POSE_STEPS)
-CENTRES, SHAPES = 4 * circle_layout.COUNT, 6 * circle_layout.COUNT  # numbers of a pair: 2 and 3 of a circle in each view
+DIAMETER = -4  # of the target's parameters: after the lengths, before the bow's three
 SHAPE_FLOOR = 3e-4  # of a disc's size: error of a shape that noise doesn't explain, before it is measured
 RIM_BIAS = 2e-4  # of a disc's size, by which the model of a rim may put all rims too far in or out
 LEAST_VARIANCE = 1e-9  # of a principal axis of the cameras' correlation
@@ -53,7 +51,7 @@ class Adjusted:
     """The target as measured."""
 
     target: Target  # with the covariance of its lengths
-    covariance: Array  # (7, 7) of NAMES
+    covariance: Array  # (p, p) of `target_files.parameters`
     noise: Noise
     centre_rms_px: float
     shape_rms_px: float
@@ -82,7 +80,7 @@ class _Devices(NamedTuple):
 
 
 class _Unknowns(NamedTuple):
-    target: Array  # (7,) of NAMES
+    target: Array  # (p,) of `target_files.parameters`
     optics: Array  # (g,) change of the cameras
     poses: Array  # (n, 4, 4) mm
 
@@ -112,7 +110,7 @@ def calibrate(
     Parameters
     ----------
     tracked : n results of a tracker's steps
-        Taken one by one; those in which all six rims are whole count, of poses that differ, in even light if these are enough.
+        Taken one by one; those in which all rims are whole count, of poses that differ, in even light if these are enough.
     cameras : the tracker's
     design : where to start; its inner diameter and board stay.
     optics : of the cameras as they are now, `Tracker.optics_in_use`; None of exact ones.
@@ -153,20 +151,21 @@ def adjust(pairs: Sequence[Seen], design: Target, optics: Uncertainty | None) ->
         used = (levels < OUTLYING * typical).all(axis=1)
         noise = Noise(max(float(typical[0]), 1.0), float(typical[1]))
     system, _ = _linearised(_some(pairs, used), devices, noise, unknowns._replace(poses=unknowns.poses[used]))
-    covariance = np.linalg.inv(_reduced(system)[0])[: len(NAMES), : len(NAMES)]
-    covariance[3, 3] += (RIM_BIAS * design.outer_diameter_mm) ** 2
-    residuals = _residuals(pairs, devices, unknowns)[used]
-    centres, shapes = (float(np.sqrt(np.mean(part**2))) for part in (residuals[:, :CENTRES], residuals[:, CENTRES:]))
+    known = len(unknowns.target)
+    covariance = np.linalg.inv(_reduced(system)[0])[:known, :known]
+    covariance[DIAMETER, DIAMETER] += (RIM_BIAS * design.outer_diameter_mm) ** 2
+    parts = _split(_residuals(pairs, devices, unknowns)[used])
+    centres, shapes = (float(np.sqrt(np.mean(part**2))) for part in parts)
     target = _measured_target(unknowns.target, covariance, design)
     return Adjusted(target, covariance, noise, centres, shapes, used, tuple(pairs))
 
 
 def _measured_target(values: Array, covariance: Array, design: Target) -> Target:
-    """The design with the values : (7,) of NAMES, and the covariance : (7, 7) of the lengths."""
-    c1, aside, c2, diameter, *curvature = values.tolist()
-    lengths = tuple(tuple(row) for row in covariance[:3, :3].tolist())
-    update = {"c1_mm": c1, "c2_aside_mm": aside, "c2_mm": c2, "outer_diameter_mm": diameter}
-    return design.model_copy(update={**update, "curvature_per_m": tuple(curvature), "covariance_mm2": lengths})
+    """The design with the values : (p,) of its parameters, and the covariance : (p, p) of the lengths."""
+    *lengths, diameter, xx, xy, yy = values.tolist()
+    known = tuple(tuple(row) for row in covariance[:DIAMETER, :DIAMETER].tolist())
+    update = {"outer_diameter_mm": diameter, "curvature_per_m": (xx, xy, yy), "covariance_mm2": known}
+    return circle_layout.with_lengths(design, np.array(lengths)).model_copy(update=update)
 
 
 def _devices(cameras: Sequence[Camera], optics: Uncertainty | None) -> _Devices:
@@ -197,8 +196,8 @@ def _fitted(pairs: Sequence[Seen], used: NDArray[np.bool_], devices: _Devices, n
 
 
 def predicted(cameras: Sequence[Camera], pose: Array, target: Array) -> Array:
-    """The six ellipses of a target : (7,) of NAMES, as (30,) px, all centres and then all shapes, view by view."""
-    circles = circle_layout.laid_out(target[:3], float(target[3]), target[4:])
+    """Ellipses of n circles of a target : (p,) of its parameters, as (10 n,) px: all centres, then all shapes, view by view."""
+    circles = circle_layout.laid_out(target[:DIAMETER], float(target[DIAMETER]), target[DIAMETER + 1 :])
     seen = [ellipses_of(camera, pose, *circles) for camera in cameras]
     return np.concatenate([centres.ravel() for centres, _ in seen] + [_numbers(shapes) for _, shapes in seen])
 
@@ -213,7 +212,7 @@ def _numbers(shapes: Array | None) -> Array:
 
 
 def _residuals(pairs: Sequence[Seen], devices: _Devices, unknowns: _Unknowns) -> Array:
-    """Of n pairs : (n, 30) px."""
+    """Of m pairs of n circles in each view : (m, 10 n) px."""
     cameras = devices.changed(unknowns.optics)
     shown = [predicted(cameras, pose, unknowns.target) for pose in unknowns.poses]
     return np.stack([_measured(pair) for pair in pairs]) - shown
@@ -221,14 +220,15 @@ def _residuals(pairs: Sequence[Seen], devices: _Devices, unknowns: _Unknowns) ->
 
 def _linearised(pairs: Sequence[Seen], devices: _Devices, noise: Noise, unknowns: _Unknowns) -> tuple[_System, float]:
     """Normal equations at an estimate, and the sum of squares; the cameras' change is measured as zero, once."""
-    known, optics = len(NAMES), unknowns.optics
+    known, optics = len(unknowns.target), unknowns.optics
+    steps = np.repeat([LENGTH_STEP, CURVATURE_STEP], [known - 3, 3])
     shared, right = np.diag(np.repeat([0.0, 1.0], [known, len(optics)])), np.append(np.zeros(known), -optics)
     changed = [(devices.changed(optics + one), devices.changed(optics - one)) for one in np.eye(len(optics))]
     cameras, cost = devices.changed(optics), float(optics @ optics)
     own, own_right, mixed = [], [], []
     for pair, pose, residual in zip(pairs, unknowns.poses, _residuals(pairs, devices, unknowns), strict=True):
         by_pose = _slopes(POSE_STEPS, lambda d, pose=pose: predicted(cameras, rigid.moved(pose, d), unknowns.target))
-        by_target = _slopes(TARGET_STEPS, lambda d, pose=pose: predicted(cameras, pose, unknowns.target + d))
+        by_target = _slopes(steps, lambda d, pose=pose: predicted(cameras, pose, unknowns.target + d))
         shown = [[predicted(both, pose, unknowns.target) for both in pair_of] for pair_of in changed]
         by_shared = np.column_stack([by_target, *((more - less) / 2 for more, less in shown)])
         information = np.linalg.inv(_covariance(pair, noise))
@@ -247,7 +247,7 @@ def _slopes(steps: Array, function: Callable[[Array], Array]) -> Array:
 
 
 def _covariance(pair: Seen, noise: Noise) -> Array:
-    """Covariance : (30, 30) px^2 of a pair's numbers: a shape is about as exact as its centre."""
+    """Covariance : (10 n, 10 n) px^2 of a pair's numbers: a shape is about as exact as its centre."""
     centres = block_diag(*(one for view in pair.views for one in view.covariance))
     shapes = []
     for view in pair.views:
@@ -260,8 +260,15 @@ def _levels(pairs: Sequence[Seen], residuals: Array) -> Array:
     """RMS : (n, 2) of each pair's centres and shapes over their prediction; of a pose's six numbers each takes off three."""
     whiten = [np.linalg.inv(np.linalg.cholesky(_covariance(pair, Noise()))) for pair in pairs]
     normal = np.stack([one @ residual for one, residual in zip(whiten, residuals, strict=True)])
-    squares = (normal[:, :CENTRES] ** 2).sum(axis=1) / (CENTRES - POSE), (normal[:, CENTRES:] ** 2).sum(axis=1) / SHAPES
-    return np.sqrt(np.column_stack(squares))
+    centres, shapes = _split(normal)
+    free = centres.shape[1] - POSE, shapes.shape[1]
+    return np.sqrt(np.column_stack([(part**2).sum(axis=1) / count for part, count in zip((centres, shapes), free, strict=True)]))
+
+
+def _split(numbers: Array) -> tuple[Array, Array]:
+    """Centres' and shapes' : (m, 4 n) and (m, 6 n) of pairs' numbers : (m, 10 n)."""
+    centres, shapes = np.split(numbers, [numbers.shape[1] * 2 // 5], axis=1)
+    return centres, shapes
 
 
 def _reduced(system: _System) -> tuple[Array, Array]:
@@ -285,5 +292,5 @@ def _solved(_: _Unknowns, system: _System, damping: float) -> tuple[Array, Array
 
 def _moved(unknowns: _Unknowns, step: tuple[Array, Array]) -> _Unknowns:
     shared, poses = step
-    target, optics = np.split(shared, [len(NAMES)])
+    target, optics = np.split(shared, [len(unknowns.target)])
     return _Unknowns(unknowns.target + target, unknowns.optics + optics, rigid.moved(unknowns.poses, poses))

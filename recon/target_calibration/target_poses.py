@@ -1,4 +1,4 @@
-"""Pairs of frames from which the target is measured: both cameras see all three circles whole, in poses that differ."""
+"""Pairs of frames from which the target is measured: both cameras see all circles whole, in poses that differ."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,7 +24,7 @@ Fault = Literal["without a pose", "with a covered circle", "with a rim that is c
 
 @dataclass(frozen=True)
 class Seen:
-    """A pair of frames with all six circles."""
+    """A pair of frames with all circles in both views."""
 
     views: tuple[Sighting, Sighting]
     world_from_target: Array  # (4, 4) mm, as the tracker found it
@@ -47,7 +47,7 @@ class Collected:
 
 
 def collect(tracked: Iterable[Tracking], cameras: tuple[Camera, Camera]) -> Collected:
-    """Pairs of a film, taken one by one, in which all six circles are whole, and numbers of the others."""
+    """Pairs of a film, taken one by one, in which all circles are whole, and numbers of the others."""
     seen, faults, apart = list[Seen](), Counter[Fault](), list[float | None]()
     for found in tracked:
         arguments.of_kind("tracked", found, Tracking, way="sonotwin.Tracker.step gives them")
@@ -58,7 +58,7 @@ def collect(tracked: Iterable[Tracking], cameras: tuple[Camera, Camera]) -> Coll
 
 
 def whole(found: Tracking, cameras: tuple[Camera, Camera]) -> Seen | Fault:
-    """The pair if all six rims are whole and sharp; else the fault."""
+    """The pair if all rims are whole and sharp; else the fault."""
     if not found.found:
         return "without a pose"
     if not found.pose.used.all():
@@ -126,7 +126,7 @@ def check(pairs: Sequence[Seen], name: str, collected: Collected, least_tilt_deg
         If pairs, tilts or distances are missing, with what to do.
     """
     if len(pairs) < LEAST:
-        expected = f"{LEAST} poses in which both cameras see all three circles whole"
+        expected = f"{LEAST} poses in which both cameras see all circles whole"
         raise InputError(f"{name}: expected {expected}, found {len(pairs)}{collected.told}")
     missing = []
     if (tilt := tilt_deg(pairs)) < least_tilt_deg:

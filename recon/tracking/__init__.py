@@ -1,1 +1,1 @@
-"""Optical tracking of the probe by its planar target of three circles."""
+"""Optical tracking of the probe by its planar target of circles."""

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 APART = 4  # px of the detector's image: of two maxima nearer than that the higher one counts
 LEAST_SCORE = 0.015
-MOST = 12  # candidates of a window; the target needs three
+MOST = 12  # candidates of a window; a target needs three or four
 FRAME = (1280, 1024)  # width, height, px, of the cameras that the networks know: to these a window is scaled
 LEAST_PX = 16.0  # of the frame, of the diameter of a circle that is looked for
 SEEN_PX = 36.0  # of a window at the size of FRAME, of the smallest circle that the network finds in it
@@ -97,7 +97,7 @@ class Candidates:
 
     points: Array  # (n, 2) px of the frame
     scores: Array  # (n,) probability of a circle there
-    identity: Array  # (n, 4) probabilities of c0, c1, c2, none
+    identity: Array  # (n, circles + 1) probabilities of c0, c1 and on, and of none
 
     def apart_from(self, places: Array, near: float) -> "Candidates":
         """Those farther than `near` (px) from all places : (m, 2)."""
@@ -124,7 +124,7 @@ def network_image(frame: NDArray) -> NDArray[np.float32]:
 
 
 def read(detection: NDArray, identity: NDArray, shape: tuple[int, ...]) -> Candidates:
-    """Candidates from logits : (65, 30, 40) and (4, 30, 40), in px of a frame of (h, w)."""
+    """Candidates from logits : (65, 30, 40) and (circles + 1, 30, 40), in px of a frame of (h, w)."""
     rows, columns = detection.shape[1:]
     within = _softmax(np.asarray(detection, float))[:-1].reshape(CELL, CELL, rows, columns)
     score = within.transpose(2, 0, 3, 1).reshape(rows * CELL, columns * CELL).astype(np.float32)

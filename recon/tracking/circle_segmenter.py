@@ -34,7 +34,7 @@ class Patches:
 
 
 def rough_ellipses(image: NDArray, points: Array, networks: Networks, target: Target) -> Ellipses:
-    """Ellipses of the discs about points : (3, 2) px of c0, c1, c2, to a pixel or two; NaN where there is none, or no point."""
+    """Ellipses about points : (n, 2) px of c0, c1 and on, to a pixel or two; NaN where there is none, or no point."""
     cut = patches(image, points, step_for(points, target))
     found = read(networks.segment(cut.images), cut)
     there = np.isfinite(points).all(axis=1)
@@ -42,7 +42,7 @@ def rough_ellipses(image: NDArray, points: Array, networks: Networks, target: Ta
 
 
 def step_for(points: Array, target: Target) -> float:
-    """Scale of patches that hold the discs and show them large enough, from the distances of two or three circles : (3, 2) px."""
+    """Scale of patches that hold the discs and show them large enough, from the distances of two or more circles : (n, 2) px."""
     affine = affinity(points, target)
     scale = np.linalg.svd(affine, compute_uv=False)[0] if np.isfinite(affine).all() else stretch(points, target)
     wide = scale * target.outer_diameter_mm

@@ -2,7 +2,7 @@
 
 Two discs tell the view's affinity all but exactly: it takes a circle to their ellipses, which leaves a turn, and one centre to
 the other, which settles it. Their distance must be that of the circles that they are taken for; which end is which it can't tell.
-The third place follows, as exactly as a view is affine: to 2 px in the median, 7 px at most for the rig. So does the shape there,
+A third place follows, as exactly as a view is affine: to 2 px in the median, 7 px at most for the rig. So does the shape there,
 which a rim of which half is covered doesn't tell by itself.
 
 Where both views together give no pose, rims of which but a part is seen may be the edge of what covers them. Whole ellipses of
@@ -12,7 +12,7 @@ There the others are sought a second time, held so closely that another edge bes
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import groupby, product
+from itertools import combinations, groupby, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,13 @@ from recon.geometry import pose_hypotheses, rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_outline import ellipses_of, slopes_at
 from recon.geometry.ellipses import Ellipses
+from recon.geometry.pose_hypotheses import POINTS
 from recon.model.calibration import Uncertainty
 from recon.model.circle_layout import circle_centres, circles
 from recon.model.rig import Target
-from recon.tracking.identity import ALIKE
+from recon.tracking.identity import ALIKE, affinity_of
 from recon.tracking.pose import APART_MM, same
-from recon.tracking.pose_fit import NAMES, Sighting, TargetPose, meet, refined
+from recon.tracking.pose_fit import Sighting, TargetPose, meet, refined
 from recon.tracking.rim_fit.sectors import STEEP
 from recon.tracking.rims import WHOLE, Known, Outlines, measure_covered, reach_px
 
@@ -46,13 +47,17 @@ INK = 0.15  # of a ring's contrast: a middle that is no brighter is ink, and thi
 
 
 def completed(image: NDArray, outlines: Outlines, target: Target) -> Outlines:
-    """Three rims of an image; a missing one is sought again at the place that the other two predict."""
-    which = missing(outlines.found)
-    if which is None:
+    """The rims of an image; missing ones are sought again at the places that two others or more predict."""
+    found = outlines.found
+    if found.all() or found.sum() < 2:
         return outlines
-    rough = third(outlines.ellipses, which, target)
-    again = measure_covered(image, rough, reach_px(rough, REACH), Known(np.inf, SHAPE), target)
-    return outlines.replaced(which, again) if alike(again, outlines) else outlines
+    completed = outlines
+    for which in np.flatnonzero(~found):
+        rough = further(outlines.ellipses, found, which, target)
+        again = measure_covered(image, rough, reach_px(rough, REACH), Known(np.inf, SHAPE), target)
+        if alike(again, outlines):
+            completed = completed.replaced(which, again)
+    return completed
 
 
 def sought_again(
@@ -101,7 +106,11 @@ def _counted(pair: Sequence[Outlines]) -> list[list[Outlines]]:
     All selections of as many rims are tried or none, so that a rival of what is found isn't missed.
     """
     choices = [list(choice) for choice in product(*(list(_fewer(outlines)) for outlines in pair))]
-    several = sorted((choice for choice in choices if FEWEST <= _number(choice) < 2 * len(NAMES)), key=_number, reverse=True)
+    several = sorted(
+        (choice for choice in choices if FEWEST <= _number(choice) < sum(len(rims.reasons) for rims in pair)),
+        key=_number,
+        reverse=True,
+    )
     fewest = _number(several[min(TRIALS, len(several)) - 1]) if several else FEWEST
     return [choice for choice in several if _number(choice) >= fewest]
 
@@ -135,12 +144,13 @@ def named_poses(
 
 
 def _starts(pair: Sequence[Outlines], cameras: Sequence[Camera], target: Target) -> list[Array]:
-    """Poses that one view allows, that with all three circles if there is one."""
+    """Poses that one view allows, that with more circles."""
     k = int(np.argmax([outlines.found.sum() for outlines in pair]))
-    centres, which = pair[k].ellipses.centre.copy(), missing(pair[k].found)
-    if which is not None:
-        centres[which] = third(pair[k].ellipses, which, target).centre[0]
-    return pose_hypotheses.poses(cameras[k], centres, circle_centres(target)) if np.isfinite(centres).all() else []
+    centres, found = pair[k].rings.centre.copy(), pair[k].found
+    if found.sum() == POINTS - 1:
+        which = int(np.argmin(found))
+        centres[which] = further(pair[k].ellipses, found, which, target).centre[0]
+    return pose_hypotheses.poses(cameras[k], centres, circle_centres(target))
 
 
 def _meeting(pair: Sequence[Outlines], cameras: Sequence[Camera]) -> bool:
@@ -156,23 +166,24 @@ def _whole(pair: Sequence[Outlines], cameras: Sequence[Camera]) -> list[Sighting
 
 
 def _orders(found: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """Orders of three circles: as they are; with two that are found exchanged; with one that is found under each name."""
-    if found.all():
-        return [np.arange(3)]
+    """Orders of n circles: as they are; with two that are found exchanged; with one that is found under each name."""
+    as_they_are = np.arange(len(found))
+    if found.sum() >= POINTS:
+        return [as_they_are]
     if found.sum() == 1:
-        return [np.roll(np.arange(3), k) for k in range(3)]
-    return [np.arange(3), exchanged(found)]
+        return [np.roll(as_they_are, k) for k in as_they_are]
+    return [as_they_are, exchanged(found)]
 
 
 def exchanged(found: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The order of three circles with the two that are found exchanged."""
-    order = np.arange(3)
+    """The order of n circles with the two that are found exchanged."""
+    order = np.arange(len(found))
     order[found] = order[found][::-1]
     return order
 
 
 def _sought(image: NDArray, outlines: Outlines, camera: Camera, pose: TargetPose, target: Target) -> Outlines:
-    """Three rims of an image; those missing are sought again where a pose has them, hidden middle or not."""
+    """The rims of an image; those missing are sought again where a pose has them, hidden middle or not."""
     expected = Ellipses(*ellipses_of(camera, pose.world_from_target, *circles(target)))
     sigma = _place_sigma(camera, pose, target)
     for which in np.flatnonzero(~outlines.found):
@@ -185,45 +196,42 @@ def _sought(image: NDArray, outlines: Outlines, camera: Camera, pose: TargetPose
 
 
 def _place_sigma(camera: Camera, pose: TargetPose, target: Target) -> Array:
-    """Standard deviations : (3,) px, along the worse axis, of where a pose has the circles."""
+    """Standard deviations : (n,) px, along the worse axis, of where a pose has the circles."""
     centres, place = circle_centres(target), pose.world_from_target
     slopes = slopes_at(camera, rigid.apply(place, centres)) @ rigid.slopes(rigid.rotate(place, centres))
     return np.sqrt(np.linalg.eigvalsh(slopes @ pose.total @ np.swapaxes(slopes, 1, 2))[:, -1])
 
 
-def missing(found: NDArray[np.bool_]) -> int | None:
-    """Which one of three is not found, if the other two are."""
-    return int(np.argmin(found)) if found.sum() == 2 else None
-
-
 def named_and_completed(image: NDArray, outlines: Outlines, target: Target) -> Outlines:
-    """Three rims of an image, as `completed`, where names aren't sure: two that are found may be others, or exchanged."""
+    """The rims of an image, as `completed`, where names aren't sure: two that are found may be others, or exchanged."""
     named = by_distance(outlines, target)
     whole = completed(image, named, target)
-    if missing(whole.found) is None:
+    if whole.found.sum() != POINTS - 1:
         return whole
     other = completed(image, named[exchanged(named.found)], target)
-    return other if other.found.all() else whole
+    return other if other.found.sum() >= POINTS else whole
 
 
 def by_distance(outlines: Outlines, target: Target) -> Outlines:
-    """Three rims of an image, of which two are found: in other names, if those that they have ask for another distance."""
-    which = missing(outlines.found)
-    if which is None:
+    """The rims of an image, of which two are found: in other names, if those that they have ask for another distance."""
+    found = np.flatnonzero(outlines.found)
+    if len(found) != POINTS - 1:
         return outlines
-    off = np.abs([_log_stretch(outlines.ellipses[np.flatnonzero(outlines.found)], unseen, target) for unseen in range(3)])
-    unseen = int(np.argmin(off))
-    if off[which] <= ALIKE or off[unseen] > ALIKE:
+    two, pairs = outlines.ellipses[found], list(combinations(range(len(outlines.reasons)), 2))
+    off = [abs(_log_stretch(two, pair, target)) for pair in pairs]
+    best = int(np.argmin(off))
+    if off[pairs.index(tuple(found.tolist()))] <= ALIKE or off[best] > ALIKE:
         return outlines
-    order = np.arange(3)
-    order[[which, unseen]] = unseen, which
+    order = np.arange(len(outlines.reasons))
+    for new, old in zip(sorted({*pairs[best]} - {*found}), sorted({*found} - {*pairs[best]}), strict=True):
+        order[[new, old]] = old, new
     return outlines[order]
 
 
-def _log_stretch(two: Ellipses, unseen: int, target: Target) -> float:
-    """Logarithm of the distance of two discs, by their sizes and tilts, over that of the circles other than `unseen`."""
-    side = np.delete(circle_centres(target)[:, :2], unseen, axis=0)
-    return float(np.log(np.linalg.norm(_untilted(two, target)) / np.linalg.norm(side[1] - side[0])))
+def _log_stretch(two: Ellipses, names: tuple[int, int], target: Target) -> float:
+    """Logarithm of the distance of two discs, by their sizes and tilts, over that of the circles of two names."""
+    first, second = circle_centres(target)[names, :2]
+    return float(np.log(np.linalg.norm(_untilted(two, target)) / np.linalg.norm(second - first)))
 
 
 def _untilted(two: Ellipses, target: Target) -> Array:
@@ -231,12 +239,19 @@ def _untilted(two: Ellipses, target: Target) -> Array:
     return np.linalg.solve(two.shape.mean(axis=0) * 2 / target.outer_diameter_mm, two.centre[1] - two.centre[0])
 
 
-def third(ellipses: Ellipses, which: int, target: Target) -> Ellipses:
-    """The ellipse, one, of circle number `which`, from the other two of three; NaN if their distance is another one."""
+def further(ellipses: Ellipses, found: NDArray[np.bool_], which: int, target: Target) -> Ellipses:
+    """The ellipse, one, of circle number `which`, from those of `found` : (n,), two or more.
+
+    NaN if they are two of another distance than the target's.
+    """
     places = circle_centres(target)[:, :2]
-    a, b = (k for k in range(3) if k != which)
+    if found.sum() >= POINTS:
+        shape, centres = ellipses.shape[found].mean(axis=0), ellipses.centre[found]
+        arm = affinity_of(centres, places[found]) @ (places[which] - places[found].mean(axis=0))
+        return Ellipses((centres.mean(axis=0) + arm)[None], shape[None])
+    a, b = np.flatnonzero(found).tolist()
     two = ellipses[np.array([a, b])]
-    if abs(_log_stretch(two, which, target)) > ALIKE:
+    if abs(_log_stretch(two, (a, b), target)) > ALIKE:
         return Ellipses(np.full((1, 2), np.nan), np.full((1, 2, 2), np.nan))
     shape, untilted, side = two.shape.mean(axis=0), _untilted(two, target), places[b] - places[a]
     # the target's y points up, the image's v down: of the two turns the one that mirrors
@@ -248,7 +263,7 @@ def third(ellipses: Ellipses, which: int, target: Target) -> Ellipses:
 
 
 def alike(again: Outlines, outlines: Outlines) -> bool:
-    """Whether a rim, one, is a ring as the other two of three are: of ink as dark, and with a middle that isn't ink.
+    """Whether a rim, one, is a ring as those that are found are: of ink as dark, and with a middle that isn't ink.
 
     A middle that something hides tells nothing else, and a fingertip beside the target, which is round too, must not pass.
     """

@@ -11,17 +11,21 @@ from onnxruntime.capi import onnxruntime_pybind11_state as runtime  # pyrefly: i
 
 from recon.errors import InputError, reason
 from recon.files.regular import read_bytes
+from recon.model import circle_layout
+from recon.model.rig import Target
 
 Floats = NDArray[np.float32]
 
 WEIGHTS = Path(__file__).parent / "weights"
 DETECTOR_SIZE = (320, 240)  # width, height, px
 MOST_BYTES = 1 << 28  # of a network
+TRAINED_FOR = "target"  # of a network's metadata: the kind of target; older files have none, and are of three circles
+THREE_CIRCLES = "three_circles"
 CELL = 8  # px, of the detector's output
 PATCH = 120  # px
 Interface = tuple[dict[str, tuple[int | None, ...]], dict[str, tuple[int | None, ...]]]
 
-DETECTOR: Interface = ({"image": (None, 1, 240, 320)}, {"detection": (None, 65, 30, 40), "identity": (None, 4, 30, 40)})
+DETECTOR: Interface = ({"image": (None, 1, 240, 320)}, {"detection": (None, 65, 30, 40), "identity": (None, None, 30, 40)})
 SEGMENTER: Interface = ({"patch": (None, 1, PATCH, PATCH)}, {"mask": (None, 1, PATCH, PATCH)})
 FAULTS = (runtime.InvalidProtobuf, runtime.InvalidGraph, runtime.InvalidArgument, runtime.Fail, runtime.NotImplemented,
           runtime.NoModel, runtime.NoSuchFile, runtime.RuntimeException)  # fmt: skip
@@ -31,7 +35,10 @@ class Networks(Protocol):
     """Whatever detects circles in a frame and segments them in patches."""
 
     def detect(self, images: Floats) -> tuple[Floats, Floats]:
-        """Images : (n, 240, 320) of 0 to 1, to logits of places : (n, 65, 30, 40) and of identities : (n, 4, 30, 40)."""
+        """Images : (n, 240, 320) of 0 to 1, to logits of places : (n, 65, 30, 40) and of identities : (n, circles + 1, 30, 40).
+
+        Of the latter the last one is that of no circle.
+        """
         ...
 
     def segment(self, patches: Floats) -> Floats:
@@ -45,10 +52,13 @@ class OnnxNetworks:
 
     detector: onnxruntime.InferenceSession
     segmenter: onnxruntime.InferenceSession
+    unnamed: int | None = None  # circles of a target of which the detector doesn't know the names: all are as likely
 
     def detect(self, images: Floats) -> tuple[Floats, Floats]:
         """See `Networks`."""
         detection, identity = self.detector.run(list(DETECTOR[1]), {"image": np.ascontiguousarray(images[:, None], np.float32)})
+        if self.unnamed is not None:
+            identity = np.zeros((len(images), self.unnamed + 1, *np.shape(detection)[2:]), np.float32)
         return np.asarray(detection), np.asarray(identity)
 
     def segment(self, patches: Floats) -> Floats:
@@ -56,18 +66,29 @@ class OnnxNetworks:
         return np.asarray(self.segmenter.run(["mask"], {"patch": np.ascontiguousarray(patches[:, None], np.float32)})[0])[:, 0]
 
 
-def load(folder: Path = WEIGHTS, threads: int = 0) -> OnnxNetworks:
+def load(folder: Path = WEIGHTS, threads: int = 0, kind: str = THREE_CIRCLES, by_geometry: bool = False) -> OnnxNetworks:
     """Load `detector.onnx` and `segmenter.onnx`, to run on `threads` cores, 0 for all.
+
+    Parameters
+    ----------
+    kind : of target that is to be found, a module of `recon.model.targets`
+    by_geometry : whether the detector's names of circles don't count, as one's of another kind of target
 
     Raises
     ------
     InputError
-        If a file is missing, isn't a network, or is another one.
+        If a file is missing, isn't a network, is another one, or was trained for another kind of target.
     """
-    folder = Path(folder)
-    return OnnxNetworks(
-        session(folder / "detector.onnx", DETECTOR, threads), session(folder / "segmenter.onnx", SEGMENTER, threads)
-    )
+    detector, segmenter = (Path(folder) / name for name in ("detector.onnx", "segmenter.onnx"))
+    found, circles = session(detector, DETECTOR, threads), circle_layout.count(Target.named(kind))
+    trained = found.get_modelmeta().custom_metadata_map.get(TRAINED_FOR, THREE_CIRCLES)
+    if not by_geometry and trained != kind:
+        way = f"train it with a data set of {kind}, or give naming=geometry: circles' names by their places alone"
+        raise InputError(f"{detector}: expected a detector of {kind}, as rig.target is, found one of {trained}; {way}")
+    named = {node.name: node.shape[1] for node in found.get_outputs()}["identity"]
+    if not by_geometry and isinstance(named, int) and named != circles + 1:
+        raise InputError(f"{detector}: expected {circles + 1} identities of {kind}, found {named}")
+    return OnnxNetworks(found, session(segmenter, SEGMENTER, threads), circles if by_geometry else None)
 
 
 def session(path: Path, interface: Interface, threads: int = 0) -> onnxruntime.InferenceSession:

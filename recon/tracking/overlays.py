@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.tracking.frames import grey
-from recon.tracking.pose_fit import NAMES, TargetPose
+from recon.tracking.pose_fit import TargetPose
 from recon.tracking.views import View
 
 FRACTION = 4  # bits of sub-pixels that cv2 draws with
-COLOURS = ((80, 80, 255), (80, 220, 80), (255, 140, 60))  # BGR; of c0, c1, c2 and of x, y, z
+COLOURS = ((80, 80, 255), (80, 220, 80), (255, 140, 60))  # BGR; of c0, c1, c2, and again; and of x, y, z
 BAD = (0, 160, 255)
 AXIS_MM = 20.0
 FULL = 220.0  # of 255, to which a dark image is brightened
@@ -28,7 +28,7 @@ def drawn(image: NDArray, view: View, pose: TargetPose | None = None, camera: Ca
         If it isn't an image.
     """
     picture = _picture(image)
-    for k in range(len(NAMES)):
+    for k in range(len(view.outlines.reasons)):
         _ring(picture, view, k)
     if pose is not None and camera is not None and pose.found:
         _axes(picture, pose, camera)
@@ -49,12 +49,12 @@ def _ring(picture: NDArray[np.uint8], view: View, k: int) -> None:
     centre, shape = view.outlines.ellipses.centre[k], view.outlines.ellipses.shape[k]
     if not (np.isfinite(centre).all() and np.isfinite(shape).all()):
         return
-    colour = COLOURS[k] if view.outlines.found[k] else BAD
+    colour = COLOURS[k % len(COLOURS)] if view.outlines.found[k] else BAD
     angles = np.linspace(0, 2 * np.pi, 90, endpoint=False)
     points = centre + np.column_stack([np.cos(angles), np.sin(angles)]) @ shape
     cv2.polylines(picture, [_fixed(points)], True, colour, 1, cv2.LINE_AA, FRACTION)
     cv2.circle(picture, tuple(int(x) for x in _fixed(centre)), 2 << FRACTION, colour, -1, cv2.LINE_AA, FRACTION)
-    _text(picture, NAMES[k], tuple(int(x) for x in centre + np.array([6, -6])), colour)
+    _text(picture, f"c{k}", tuple(int(x) for x in centre + np.array([6, -6])), colour)
 
 
 def _axes(picture: NDArray[np.uint8], pose: TargetPose, camera: Camera) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
+from recon.model import circle_layout
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter, identity, views
 from recon.tracking.frames import grey
@@ -11,7 +12,7 @@ from recon.tracking.networks import Networks
 from recon.tracking.rims import Outlines, measure, reach_px
 from recon.tracking.views import View
 
-TRIALS = 10  # triples of a level that are looked at
+TRIALS = 10  # namings of a level that are looked at
 PRINTED = 0.25  # by which discs may be larger or smaller than the target's
 
 
@@ -23,23 +24,23 @@ def find(image: NDArray, networks: Networks, target: Target, bits: int | None = 
     try:
         image = grey(image, bits)
     except InputError as error:
-        return views.nothing(str(error))
+        return views.nothing(str(error), circle_layout.count(target))
     count, likeliest = 0, None
     for windows in circle_detector.levels((image.shape[1], image.shape[0])):
         seen = circle_detector.detect([image] * len(windows), windows, networks)
         count += sum(len(candidates.points) for candidates in seen)
         choices = [
-            triple for each, window in zip(seen, windows, strict=True) for triple in identity.triples(each, target, window.width)
+            naming for each, window in zip(seen, windows, strict=True) for naming in identity.namings(each, target, window.width)
         ]
-        for triple in sorted(choices, key=lambda triple: -triple.score)[:TRIALS]:
-            rough = circle_segmenter.rough_ellipses(image, triple.points, networks, target)
+        for naming in sorted(choices, key=lambda naming: -naming.score)[:TRIALS]:
+            rough = circle_segmenter.rough_ellipses(image, naming.points, networks, target)
             outlines = measure(image, rough, reach_px(rough, circle_segmenter.OFF), target)
             outlines = views.renamed(outlines, target)
             view = views.judged(outlines, _as_printed(outlines, target))
             if view.found:
                 return view
             likeliest = likeliest or view
-    return likeliest or views.nothing(f"{count} places like circles, no three that lie like the target's")
+    return likeliest or views.absent(count, circle_layout.count(target))
 
 
 def _as_printed(outlines: Outlines, target: Target) -> Target:

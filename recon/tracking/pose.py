@@ -1,12 +1,13 @@
-"""The target's pose from its three circles in two views, with its covariance, or the reason why there is none.
+"""The target's pose from its circles in two views, with its covariance, or the reason why there is none.
 
-Six centres are twelve numbers for a pose of six: the other six tell whether it is the target that is seen, with the right names
-and through the right cameras. One circle may be missing in one view: then four are left, and two poses may fit, of which the
-ellipses' shapes tell one.
+Centres of three circles in both views are twelve numbers for a pose of six: the other six tell whether it is the target that is
+seen, with the right names and through the right cameras. Three circles in one view and two in the other are enough: then four are
+left, and two poses may fit, of which the ellipses' shapes tell one.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +15,14 @@ from scipy.special import chdtri
 
 from recon.geometry import pose_hypotheses, rigid
 from recon.geometry.circle_outline import ellipses_of
+from recon.geometry.pose_hypotheses import POINTS
 from recon.model import circle_layout
 from recon.model.calibration import Uncertainty
 from recon.model.rig import Target
-from recon.tracking.pose_fit import NAMES, SHAPES, SUSPICIOUS, Sighting, TargetPose, lost, meet, refined
+from recon.tracking.pose_fit import SHAPES, SUSPICIOUS, Sighting, TargetPose, lost, meet, refined
 
 Array = NDArray[np.float64]
 
-PAIRS = ("c0-c1", "c0-c2", "c1-c2")
 GROSS_MM = 4.0  # by which distances between centres may be off, before the fit: a sixth of the least
 APART_MM = 4.0  # by which two views' rays of one centre may miss each other
 SIZES = 0.12  # of a disc's size, by which shapes may differ from the pose's
@@ -42,7 +43,7 @@ def estimate(first: Sighting, second: Sighting, target: Target, optics: Uncertai
     """
     views = (first, second)
     found = _chosen(_fits(views, target, optics), views, target)
-    doubtful, suspicious = np.stack([view.doubtful for view in views]), False
+    doubtful, suspicious = np.stack([np.broadcast_to(view.doubtful, view.seen.shape) for view in views]), False
     if not (found.misfit < chdtri(found.freedom, SUSPICIOUS)):
         suspicious = np.isnan(found.misfit)
         fewer = [fit for each in _without_one(views) for fit in _fits(each, target, optics)]
@@ -73,7 +74,7 @@ def _fits(views: tuple[Sighting, Sighting], target: Target, optics: Uncertainty 
     """A pose of each start, or the reason why there is none."""
     model, (first, second) = circle_layout.circle_centres(target), views
     both = first.seen & second.seen
-    if both.sum() < 2 or not (first.seen.all() or second.seen.all()):
+    if both.sum() < 2 or max(first.seen.sum(), second.seen.sum()) < POINTS:
         return [lost("fewer circles than a pose needs: three in one view, two in the other")]
     points, gaps = meet([first.camera, second.camera], [first.centres, second.centres])
     apart = np.abs(gaps)
@@ -81,13 +82,13 @@ def _fits(views: tuple[Sighting, Sighting], target: Target, optics: Uncertainty 
         return [lost("a centre whose rays do not meet in front of the cameras")]
     if apart[both].max() > APART_MM:
         worst = int(np.where(both, apart, 0).argmax())
-        return [lost(f"rays that miss each other: of {NAMES[worst]} by {apart[worst]:.1f} mm; other circles, or cameras swapped")]
+        return [lost(f"rays that miss each other: of c{worst} by {apart[worst]:.1f} mm; other circles, or cameras swapped")]
     expected, found = distances(model), distances(points)
     if np.nanmax(np.abs(found - expected)) > GROSS_MM:
-        pairs = [k for k in range(3) if np.isfinite(found[k])]
-        shown = ", ".join(f"{PAIRS[k]} {found[k]:.1f} mm, expected {expected[k]:.1f}" for k in pairs)
+        pairs = zip(combinations(range(len(model)), 2), found, expected, strict=True)
+        shown = ", ".join(f"c{a}-c{b} {far:.1f} mm, expected {wanted:.1f}" for (a, b), far, wanted in pairs if np.isfinite(far))
         return [lost(f"circles not as far apart as the target's: {shown}")]
-    starts = [aligned(model, points)] if both.all() else _starts(views, model)
+    starts = [aligned(model[both], points[both])] if both.sum() >= POINTS else _starts(views, model)
     return [refined(start, views, target, optics) for start in starts] or [lost("no pose shows three circles so")]
 
 
@@ -98,11 +99,11 @@ def exchanged(first: Sighting, second: Sighting, target: Target, optics: Uncerta
 
 
 def allowed(sighting: Sighting, covered: NDArray[np.bool_], target: Target) -> bool:
-    """Whether some pose gives three circles of one view the centres and the shapes that they have, exactly if one is covered.
+    """Whether some pose gives the circles of one view the centres and the shapes that they have, exactly if one is covered.
 
-    covered : (3,) of which but a part of the rim is seen.
+    covered : (n,) of which but a part of the rim is seen.
     """
-    poses = _starts([sighting], circle_layout.circle_centres(target)) if sighting.seen.all() else []
+    poses = _starts([sighting], circle_layout.circle_centres(target)) if sighting.seen.sum() >= POINTS else []
     likely = [pose for pose in poses if _like(*_off_shapes(pose, [sighting], [sighting.seen], target), SIZES_ALONE)]
     if not covered.any():
         return bool(likely)
@@ -110,8 +111,8 @@ def allowed(sighting: Sighting, covered: NDArray[np.bool_], target: Target) -> b
 
 
 def _starts(views: Sequence[Sighting], model: Array) -> list[Array]:
-    """Poses that the view of all three circles allows."""
-    whole = next(view for view in views if view.seen.all())
+    """Poses that the view of more circles allows."""
+    whole = max(views, key=lambda view: view.seen.sum())
     return pose_hypotheses.poses(whole.camera, whole.centres, model)
 
 
@@ -142,10 +143,10 @@ def _like(off: Array, sigma: Array, share: float) -> bool:
 
 def _off_shapes(pose: Array, views: Sequence[Sighting], used: Iterable[NDArray[np.bool_]], target: Target) -> tuple[Array, Array]:
     """Relative shape residuals of ellipses against a pose : (m, 3), and their standard deviations : (m, 1)."""
-    off, sigma, all_three = [np.zeros((0, 3))], [np.zeros((0, 1))], circle_layout.circles(target)
+    off, sigma, every = [np.zeros((0, 3))], [np.zeros((0, 1))], circle_layout.circles(target)
     for view, circles in zip(views, used, strict=True):
         if view.shapes is not None:
-            expected = ellipses_of(view.camera, pose, *all_three.some(circles))[1]
+            expected = ellipses_of(view.camera, pose, *every.some(circles))[1]
             size = np.trace(expected, axis1=1, axis2=2)[:, None] / 2
             off.append((view.shapes[circles] - expected)[:, [0, 0, 1], [0, 1, 1]] / size)
             rim = np.trace(view.covariance[circles], axis1=1, axis2=2)[:, None] / size**2  # a shape's is about its centre's
@@ -168,5 +169,6 @@ def aligned(model: Array, points: Array) -> Array:
 
 
 def distances(points: Array) -> Array:
-    """Of the pairs PAIRS of three points : (..., 3, n), to (..., 3)."""
-    return np.linalg.norm(points[..., [1, 2, 2], :] - points[..., [0, 0, 1], :], axis=-1)
+    """Of all pairs of n points : (..., n, d), to (..., n (n - 1) / 2)."""
+    first, second = np.triu_indices(points.shape[-2], 1)
+    return np.linalg.norm(points[..., second, :] - points[..., first, :], axis=-1)

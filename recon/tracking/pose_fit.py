@@ -20,6 +20,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_outline import ellipses_of, slopes_at
 from recon.geometry.levenberg_marquardt import Rules, descend
+from recon.geometry.pose_hypotheses import POINTS
 from recon.model import circle_layout
 from recon.model.calibration import Uncertainty, projection_covariance
 from recon.model.circle_layout import Circles
@@ -27,7 +28,6 @@ from recon.model.rig import Target
 
 Array = NDArray[np.float64]
 
-NAMES = ("c0", "c1", "c2")
 RULES = Rules(damping=0, rounding=1e-6, converged=0, steps=20)  # two or three steps from where rays meet, more from one view
 SETTLED = 1e-4  # squared standard deviations of the last step
 IMPLAUSIBLE = 1e-6  # chance of a misfit so large, by chi-square, below which it isn't the target
@@ -46,28 +46,28 @@ class Sighting:
     """The circles in one view."""
 
     camera: Camera
-    centres: Array  # (3, 2) px, of the ellipses, in the order of NAMES; NaN where one isn't seen
-    covariance: Array  # (3, 2, 2) px^2
-    shapes: Array | None = None  # (3, 2, 2) px, of the ellipses, as ellipses.Ellipses has them; None if they aren't known
-    doubtful: NDArray[np.bool_] = field(default_factory=partial(np.zeros, 3, bool))  # (3,) as in rims.Outlines
-    joint: Array | None = None  # (3, 5, 5) px^2, of x, y, a, b, c, as in rims.Outlines; None if only that of centres is known
+    centres: Array  # (n, 2) px, of the ellipses of c0, c1 and on; NaN where one isn't seen
+    covariance: Array  # (n, 2, 2) px^2
+    shapes: Array | None = None  # (n, 2, 2) px, of the ellipses, as ellipses.Ellipses has them; None if they aren't known
+    doubtful: NDArray[np.bool_] = field(default_factory=partial(np.zeros, 1, bool))  # (n,) as in rims.Outlines, or (1,) of all
+    joint: Array | None = None  # (n, 5, 5) px^2, of x, y, a, b, c, as in rims.Outlines; None if only that of centres is known
     counted: int = CENTRE  # numbers of each ellipse that a pose is fitted to: its centre, or the whole
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """Which circles are seen : (3,)."""
+        """Which circles are seen : (n,)."""
         return np.isfinite(self.centres).all(axis=1)
 
     @cached_property
     def measured(self) -> Array:
-        """Numbers of the n circles seen that count : (n, 2 or 5) px."""
-        shapes = np.full((len(NAMES), 2, 2), np.nan) if self.shapes is None else self.shapes
+        """Numbers of the m circles seen that count : (m, 2 or 5) px."""
+        shapes = np.full((len(self.centres), 2, 2), np.nan) if self.shapes is None else self.shapes
         return _numbers(self.centres, shapes)[self.seen, : self.counted]
 
     @cached_property
     def noise(self) -> Array:
-        """Their covariances : (n, 2 or 5, 2 or 5) px^2, of a shape with what blur and gradients leave of it."""
-        joint = np.zeros((len(NAMES), 5, 5)) if self.joint is None else self.joint.copy()
+        """Their covariances : (m, 2 or 5, 2 or 5) px^2, of a shape with what blur and gradients leave of it."""
+        joint = np.zeros((len(self.centres), 5, 5)) if self.joint is None else self.joint.copy()
         joint[:, :CENTRE, :CENTRE] = self.covariance
         if self.shapes is not None:
             size = np.trace(self.shapes, axis1=1, axis2=2) / 2
@@ -78,23 +78,23 @@ class Sighting:
         return joint[self.seen, : self.counted, : self.counted]
 
     def only(self, which: NDArray[np.bool_]) -> "Sighting":
-        """The same with no other circles seen than some : (3,)."""
+        """The same with no other circles seen than some : (n,)."""
         return replace(self, centres=np.where(which[:, None], self.centres, np.nan))
 
     def without(self, which: int) -> "Sighting":
         """The same with one circle not seen."""
-        return self.only(np.arange(len(NAMES)) != which)
+        return self.only(np.arange(len(self.centres)) != which)
 
     def by_shapes(self) -> "Sighting":
         """The same, of which whole ellipses count."""
         return replace(self, counted=WHOLE)
 
 
-class Triangle(NamedTuple):
-    """The three centres as two views triangulate them, the offsets of ellipses' centres taken off, without the design."""
+class Triangulated(NamedTuple):
+    """The n centres as two views triangulate them, the offsets of ellipses' centres taken off, without the design."""
 
-    lengths_mm: Array  # (3,) as `circle_layout.LENGTHS`
-    gaps_mm: Array  # (3,) by which both rays miss each other, along their common normal
+    lengths_mm: Array  # (2 n - 3,) as `circle_layout.lengths`
+    gaps_mm: Array  # (n,) by which both rays miss each other, along their common normal
 
 
 @dataclass(frozen=True)
@@ -108,11 +108,13 @@ class TargetPose:
     misfit: float  # squared normalised residuals, chi-square with `freedom` degrees; NaN where it isn't told
     reason: str | None = None
     freedom: int = PARAMETERS  # numbers that were measured beyond the pose's own
-    used: NDArray[np.bool_] = field(default_factory=partial(np.ones, (2, 3), bool))  # (2, 3) of each view's circles, fitted to
+    used: NDArray[np.bool_] = field(
+        default_factory=partial(np.ones, (2, 1), bool)
+    )  # (2, n) of each view's circles, fitted to; (2, 1) of all
     shared: Array = field(
         default_factory=partial(np.zeros, (6, 6))
     )  # the same by tolerances of target and cameras: like in all pairs
-    triangle: Triangle | None = None  # of six circles, also where they fit no pose
+    triangle: Triangulated | None = None  # of all circles in both views, also where they fit no pose
     merging: bool = False  # with another pose that fits, so that its error isn't linear in the centres'
 
     @property
@@ -126,10 +128,10 @@ class TargetPose:
         return self.covariance + self.shared
 
 
-def lost(reason: str, misfit: float = np.nan, triangle: Triangle | None = None) -> TargetPose:
+def lost(reason: str, misfit: float = np.nan, triangle: Triangulated | None = None) -> TargetPose:
     """No pose, for a reason."""
     nothing = np.full((6, 6), np.nan)
-    used = np.zeros((2, 3), bool)
+    used = np.zeros((2, 1), bool)
     return TargetPose(np.full((4, 4), np.nan), nothing, misfit, reason, used=used, shared=nothing, triangle=triangle)
 
 
@@ -146,7 +148,7 @@ class _Problem(NamedTuple):
     views: Sequence[Sighting]
     whiten: Array  # (m, m) by which residuals of the m coordinates seen become independent, of variance 1
     circles: Circles  # by design
-    by_deviation: Array  # (3, 3, k) mm, as `circle_layout.deviations`
+    by_deviation: Array  # (n, 3, k) mm, as `circle_layout.deviations`
 
 
 def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Uncertainty | None = None) -> TargetPose:
@@ -175,8 +177,9 @@ def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Unc
         return lost(MISFITTING)
     guess = _moved(guess, step)
     misfit, freedom = float(np.sum((residual - design @ step) ** 2)), len(noise) - PARAMETERS
-    triangle = _triangle(guess, problem)
-    if not misfit < chdtri(freedom, IMPLAUSIBLE if freedom == PARAMETERS else SUSPICIOUS):
+    triangle = _triangulated(guess, problem)
+    every = len(noise) == 2 * CENTRE * len(circles.centres)  # circle, by its centre in both views
+    if not misfit < chdtri(freedom, IMPLAUSIBLE if every else SUSPICIOUS):
         times = np.sqrt(misfit / freedom)
         reason = f"a misfit of centres: {times:.0f} times their uncertainty; other circles, or cameras swapped or moved"
         return lost(reason, misfit, triangle)
@@ -188,7 +191,7 @@ def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Unc
     covariance = by_centre @ noise @ by_centre.T
     shared = by_centre @ cameras @ by_centre.T + by_deviation @ by_deviation.T
     merging = False
-    if freedom < PARAMETERS:  # of five centres
+    if any(view.counted == CENTRE and view.seen.sum() < POINTS for view in views):
         step, bend = _bend(guess, problem)
         merging = not abs(bend @ step) < CURVED * (step @ step)
         shared = shared + 2 * np.outer(bend, bend)[:PARAMETERS, :PARAMETERS]  # 2 is the variance of a normal number's square
@@ -286,7 +289,7 @@ def _settled(system: tuple[Array, Array], step: Array) -> bool:
 def _bend(guess: _Guess, problem: _Problem) -> tuple[Array, Array]:
     """Standard deviation along the least certain direction : (6 + k,), and the second order's shift over it : (6 + k,).
 
-    With one circle missing, two tilts may fit, and merge where the other view sees the target face on: there the shift is large.
+    By two circles in one view two tilts fit, and merge where the other view sees the target face on: the shift is large there.
     Source: Bates and Watts 1980 (parameter-effects curvature).
     """
     design, residual = _linearised(guess, problem)
@@ -296,9 +299,9 @@ def _bend(guess: _Guess, problem: _Problem) -> tuple[Array, Array]:
     return step, directions.T @ (left.T @ ((ahead + behind) / 2 - residual) / singular)
 
 
-def _triangle(guess: _Guess, problem: _Problem) -> Triangle | None:
-    """The triangle of six circles; None where one isn't seen."""
-    if sum(np.count_nonzero(view.seen) for view in problem.views) < 2 * len(NAMES):
+def _triangulated(guess: _Guess, problem: _Problem) -> Triangulated | None:
+    """The circles' places as both views show them; None where one isn't seen."""
+    if len(problem.views) < 2 or not all(view.seen.all() for view in problem.views):
         return None
     circles = _placed(guess, problem)
     points = rigid.apply(guess.world_from_target, circles.centres)
@@ -310,7 +313,10 @@ def _triangle(guess: _Guess, problem: _Problem) -> Triangle | None:
     x, side = met[1] - met[0], met[2] - met[0]
     c1 = float(np.linalg.norm(x))
     aside = float(side @ x) / c1
-    return Triangle(np.array([c1, aside, np.sqrt(side @ side - aside**2)]), gaps)
+    lengths = [c1, aside, np.sqrt(side @ side - aside**2)]
+    for further in met[3:] - met[0]:
+        lengths += [further @ x / c1, further @ (side - x * aside / c1) / lengths[2]]
+    return Triangulated(np.array(lengths), gaps)
 
 
 def meet(cameras: Sequence[Camera], pixels: Sequence[Array]) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from recon.capture.stereo_frames import Film, Pair
 from recon.geometry.camera import Camera
 from recon.model.tracks import Track
 from recon.tracking import overlays
-from recon.tracking.pose_fit import Triangle
+from recon.tracking.pose_fit import Triangulated
 from recon.tracking.tracker import Tracking
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ class Step:
     world_from_target: Array  # (4, 4) mm; NaN if it wasn't found
     covariance: Array  # (6, 6) by the pair's noise, as in tracks.Track
     shared: Array  # (6, 6) by tolerances of target and cameras
-    triangle: Triangle | None  # of six circles
+    triangle: Triangulated | None  # of all circles in both views
     how: str | None  # as of Tracking
     reason: str | None  # None where the target was found
     blur_px: tuple[float, float]  # the longest of each view

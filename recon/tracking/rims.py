@@ -84,6 +84,14 @@ class Outlines:
         return np.array([reason is None for reason in self.reasons], bool)
 
     @property
+    def rings(self) -> Ellipses:
+        """The ellipses of those that are rings, NaN of the others."""
+        return Ellipses(
+            np.where(self.found[:, None], self.ellipses.centre, np.nan),
+            np.where(self.found[:, None, None], self.ellipses.shape, np.nan),
+        )
+
+    @property
     def contrast(self) -> Array:
         """Of white and black : (n,) DN."""
         return self.outside - self.inside
@@ -94,9 +102,8 @@ class Outlines:
         return self.contrast / (self.outside + self.inside)
 
     def sighting(self, camera: Camera) -> Sighting:
-        """The sighting for the pose estimate, of rims in the order of NAMES."""
-        centres = np.where(self.found[:, None], self.ellipses.centre, np.nan)
-        return Sighting(camera, centres, self.covariance, self.ellipses.shape, self.doubtful, self.joint)
+        """The sighting for the pose estimate, of the rims of c0, c1 and on."""
+        return Sighting(camera, self.rings.centre, self.covariance, self.ellipses.shape, self.doubtful, self.joint)
 
     def without(self, which: Container[int]) -> "Outlines":
         """The same with some rims left out."""

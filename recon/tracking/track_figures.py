@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from recon.files.metrics import Metrics, shown
 from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model import circle_layout
-from recon.model.circle_layout import LENGTHS
 from recon.model.rig import Target
 from recon.tracking.results import Step
 from recon.tracking.tracker import EXCHANGED, is_beside
@@ -32,13 +31,13 @@ CAUSES = {  # of views without the target, by a part of their reason, the first 
     "a contrast of|an uncertainty of": "too little contrast",
     "of its rim seen|no white middle": "circles covered, or cut off",
     "no rim": "no rims where circles are expected",
-    r"\d of 3 circles|places like circles": "no three circles like the target's, of 16 px and more",
+    r"\d of \d circles|places like circles": "no circles like the target's, of 16 px and more",
 }
 MEASURE = "measure it with calibrate-target"
 MOVED = "a camera was moved after its calibration, or that is of others; calibrate-optics anew"
 
 
-def measure(steps: Sequence[Step]) -> Metrics:
+def measure(steps: Sequence[Step], target: Target) -> Metrics:
     """Figures of a track, each named with its unit; frames a second are of the tracker alone, in its median frame."""
     found = [step for step in steps if step.found]
     sigma = np.array([step.sigmas for step in found]).reshape(-1, 2)
@@ -51,7 +50,7 @@ def measure(steps: Sequence[Step]) -> Metrics:
         "sigma_median_mm": float(typical[0]),
         "sigma_median_deg": float(typical[1]),
         "shared_median_mm": float(np.median([step.shared_sigmas[0] for step in found])) if found else np.nan,
-        **_triangle(steps),
+        **_triangulated(steps, target),
         "frames_per_s": 1 / max(float(np.median([step.seconds for step in steps])), 1e-9),
     }
 
@@ -81,12 +80,13 @@ def _lost(steps: Sequence[Step]) -> Iterator[str]:
             yield f"{name}: {', '.join(f'{why} ({number})' for why, number in counted)}"
 
 
-def _triangle(steps: Sequence[Step]) -> Metrics:
+def _triangulated(steps: Sequence[Step], target: Target) -> Metrics:
     """Medians of the target's lengths and of the rays' gap, as both cameras triangulate them."""
     known = [step.triangle for step in steps if step.triangle is not None]
-    lengths = np.median([one.lengths_mm for one in known], axis=0) if known else np.full(3, np.nan)
+    lengths = np.median([one.lengths_mm for one in known], axis=0) if known else np.full(len(target.LENGTHS), np.nan)
     gap = float(np.median([one.gaps_mm.mean() for one in known])) if known else np.nan
-    return {f"triangulated_{name}": float(value) for name, value in zip(LENGTHS, lengths, strict=True)} | {"ray_gap_mm": gap}
+    named = {f"triangulated_{name}": float(value) for name, value in zip(target.LENGTHS, lengths, strict=True)}
+    return named | {"ray_gap_mm": gap}
 
 
 def causes(steps: Sequence[Step], target: Target) -> Iterator[str]:
@@ -109,7 +109,7 @@ def causes(steps: Sequence[Step], target: Target) -> Iterator[str]:
     alike = np.abs(off) > np.maximum(OFF_MM, ALIKE * spread)
     if not alike.any():
         return
-    names = (name.removesuffix("_mm").replace("_", " ") for name in LENGTHS)
+    names = (name.removesuffix("_mm").replace("_", " ") for name in target.LENGTHS)
     found = ", ".join(f"{name} by {value:+.2f} mm" for name, value, one in zip(names, off, alike, strict=True) if one)
     tolerance = np.sqrt(np.diag(circle_layout.length_covariance(target)))
     if (np.abs(off) > BEYOND * tolerance).any() and target.covariance_mm2 is not None:
@@ -148,7 +148,7 @@ def kinds(reasons: Sequence[str | None]) -> list[tuple[str, int]]:
 def kind(reason: str) -> str:
     """A reason without its details."""
     if reason.startswith("camera ") and "expected an image" not in reason:
-        return "no camera sees all three circles"
+        return "no camera sees enough circles"
     return re.sub(r"^camera \d: ", "", re.split(r"[;:] (?!expected an image)", reason)[0])
 
 
@@ -159,6 +159,6 @@ def views_of(reason: str) -> dict[str, str]:
 
 
 def cause(reason: str) -> str:
-    """The cause, in a few words, that a view doesn't show three circles."""
+    """The cause, in a few words, that a view doesn't show the circles."""
     told = next((words for part, words in CAUSES.items() if re.search(part, reason)), None)
     return told or re.split(r"[;:]", reason)[0]

@@ -21,12 +21,11 @@ from recon.geometry.circle_outline import ellipses_of
 from recon.geometry.ellipses import Ellipses, joined
 from recon.model import circle_layout
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty, in_use
-from recon.model.circle_layout import COUNT
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, views
 from recon.tracking.circle_detector import Window
 from recon.tracking.frames import grey
-from recon.tracking.identity import Triple
+from recon.tracking.identity import Naming
 from recon.tracking.networks import Networks
 from recon.tracking.pose import estimate, exchanged, same
 from recon.tracking.pose_fit import Sighting, TargetPose, lost
@@ -44,11 +43,11 @@ FORGOTTEN_FRAMES = 4.0  # the same without times
 EXCHANGED = "cameras exchanged: as camera 2's and camera 1's these views show the target"
 GONE_S, GONE_FRAMES = 0.5, 15.0  # for which the last poses tell where it has gone
 LOOK_S, LOOK_FRAMES = 1.0, 30.0  # after which a second target is looked for again, while one is followed
-OTHERS = 4  # triples that are looked at then
+OTHERS = 4  # namings that are looked at then
 APART_DISCS = 1.0  # least distance of two targets, in circles' diameters
 NO_NETWORKS = "no networks to find it by"
 SPARSE = 16  # rows, of which one is compared to know two cameras' images for the same one
-TRIALS = 10  # triples of both views that are looked at
+TRIALS = 10  # namings of both views that are looked at
 ALL_LEVELS = 16  # frames without the target, after which it is looked for at any size again
 
 
@@ -108,6 +107,11 @@ class Tracker:
         """Uncertainty of the cameras as they are now: of their calibration, and by drift and the board's scale since."""
         return in_use(self.optics, dict(zip(CAMERAS, self.cameras, strict=True)), self.board_scale, self.drift_px)
 
+    @cached_property
+    def count(self) -> int:
+        """Number of the target's circles."""
+        return circle_layout.count(self.target)
+
     def step(self, left: NDArray, right: NDArray, time_s: float | None = None) -> Tracking:
         """Track one pair of frames, camera 1's and camera 2's. Never raises on what they show.
 
@@ -119,7 +123,7 @@ class Tracker:
         try:
             frames = self._frames(left, right)
         except InputError as error:
-            return Tracking(lost(str(error)), (views.nothing(str(error)), views.nothing(str(error))), seconds=watch.seconds)
+            return Tracking(lost(str(error)), 2 * (views.nothing(str(error), self.count),), seconds=watch.seconds)
         watch.stop("frames")
         result = None
         if self._past and 0 < now - self._past[-1][0] <= limit:
@@ -134,7 +138,7 @@ class Tracker:
             result = self._detected(frames, self.networks)
             watch.stop("detect")
         if result is None:
-            seen = (views.nothing(NO_NETWORKS), views.nothing(NO_NETWORKS))
+            seen = 2 * (views.nothing(NO_NETWORKS, self.count),)
             result = Tracking(lost(views.unseen(seen)), seen)
         if result.found:
             if self.networks is not None and self._is_due(result, now, LOOK_FRAMES if time_s is None else LOOK_S):
@@ -186,14 +190,14 @@ class Tracker:
         places = [(k, window) for k, each in enumerate(windows) for window in each]
         seen = circle_detector.detect([frames[k] for k, _ in places], [window for _, window in places], networks)
         choices = [
-            (k, triple)
+            (k, naming)
             for (k, window), candidates in zip(places, seen, strict=True)
-            for triple in identity.triples(candidates.apart_from(known[k].centre, wide / 2), self.target, window.width)
-            if np.isfinite(triple.points).all()
+            for naming in identity.namings(candidates.apart_from(known[k].centre, wide / 2), self.target, window.width)
+            if np.isfinite(naming.points).all()
         ]
         found: list[Tracking] = []
-        for k, triple in sorted(choices, key=lambda choice: -choice[1].score)[:OTHERS]:
-            view = self._seen_at(frames, networks, k, triple)
+        for k, naming in sorted(choices, key=lambda choice: -choice[1].score)[:OTHERS]:
+            view = self._seen_at(frames, networks, k, naming)
             again = self._confirmed(frames, k, view) if view.found else None
             if again is not None and all(self._differ(again, other) for other in (result, *found)):
                 found.append(again)
@@ -246,19 +250,19 @@ class Tracker:
         return rigid.moved(pose, ahead * rigid.difference(earlier, pose))
 
     def _rough(self, world_from_target: Array) -> Ellipses:
-        """Six ellipses, three a view, of a pose."""
+        """Ellipses of a pose, camera 1's and then camera 2's."""
         return joined([self._expected(k, world_from_target) for k in (0, 1)])
 
     def _expected(self, k: int, world_from_target: Array) -> Ellipses:
-        """Three ellipses that camera k should show of a pose."""
+        """Ellipses that camera k should show of a pose."""
         return Ellipses(*ellipses_of(self.cameras[k], world_from_target, *circle_layout.circles(self.target)))
 
     def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str) -> Tracking:
-        """From six rough ellipses, off by a share of a disc at most, to the pose."""
-        outlines = measure_both(*frames, rough, np.arange(2 * COUNT) >= COUNT, reach_px(rough, reach), self.target)
+        """From rough ellipses of both views, off by a share of a disc at most, to the pose."""
+        outlines = measure_both(*frames, rough, np.arange(2 * self.count) >= self.count, reach_px(rough, reach), self.target)
         halves = [
             covered_circle.completed(*each, self.target)
-            for each in zip(frames, (outlines[:COUNT], outlines[COUNT:]), strict=True)
+            for each in zip(frames, (outlines[: self.count], outlines[self.count :]), strict=True)
         ]
         seen = (self._judged(0, halves[0]), self._judged(1, halves[1]))
         return self._settled(frames, seen, how)
@@ -302,13 +306,15 @@ class Tracker:
         return views.unconfirmed(seen[0], self.cameras[0], self.target), views.unconfirmed(seen[1], self.cameras[1], self.target)
 
     def _segmented(self, frames: Frames, networks: Networks, rough: Ellipses, before: Tracking) -> Tracking:
-        """From six rough ellipses to the pose, by the segmenter."""
+        """From rough ellipses of both views to the pose, by the segmenter."""
         cuts = [
             circle_segmenter.patches(frame, at, circle_segmenter.step_for(at, self.target))
-            for frame, at in zip(frames, (rough.centre[:COUNT], rough.centre[COUNT:]), strict=True)
+            for frame, at in zip(frames, (rough.centre[: self.count], rough.centre[self.count :]), strict=True)
         ]
         masks = networks.segment(np.concatenate([cut.images for cut in cuts]))
-        halves = [circle_segmenter.read(half, cut) for half, cut in zip((masks[:COUNT], masks[COUNT:]), cuts, strict=True)]
+        halves = [
+            circle_segmenter.read(half, cut) for half, cut in zip((masks[: self.count], masks[self.count :]), cuts, strict=True)
+        ]
         if min(np.isfinite(half.centre[:, 0]).sum() for half in halves) < 2:
             return before
         return self._fitted(frames, joined(halves), circle_segmenter.OFF, "segmented")
@@ -345,49 +351,49 @@ class Tracker:
         places = [(k, window) for k, each in enumerate(windows) for window in each]
         seen = circle_detector.detect([frames[k] for k, _ in places], [window for _, window in places], networks)
         choices = [
-            (k, triple)
+            (k, naming)
             for (k, window), candidates in zip(places, seen, strict=True)
-            for triple in identity.triples(candidates, self.target, window.width)
+            for naming in identity.namings(candidates, self.target, window.width)
         ]
         counts = [sum(len(each.points) for (k, _), each in zip(places, seen, strict=True) if k == view) for view in (0, 1)]
         likeliest: dict[int, View] = {}
-        settled: dict[int, Triple] = {}
-        for k, triple in sorted(choices, key=lambda choice: -choice[1].score)[:TRIALS]:
-            if k in settled and triple.within(settled[k]):
+        settled: dict[int, Naming] = {}
+        for k, naming in sorted(choices, key=lambda choice: -choice[1].score)[:TRIALS]:
+            if k in settled and naming.within(settled[k]):
                 continue
-            view = self._seen_at(frames, networks, k, triple)
+            view = self._seen_at(frames, networks, k, naming)
             if k not in likeliest or _shown(view) > _shown(likeliest[k]):
                 likeliest[k] = view
             if view.found:
-                settled[k] = triple
+                settled[k] = naming
                 others = self._opposite_views(frames, k, view)
                 results = [self._posed((view, other) if k == 0 else (other, view), "detected") for other in others]
                 if any(result.found for result in results):
                     return min((one for one in results if one.found), key=_rank)
                 likeliest.update((1 - k, other) for other in others if other.found)
-        first, second = (likeliest.get(k, views.nothing(views.absent(count))) for k, count in enumerate(counts))
+        first, second = (likeliest.get(k, views.absent(count, self.count)) for k, count in enumerate(counts))
         return views.in_light(first, frames[0]), views.in_light(second, frames[1])
 
     def _opposite_views(self, frames: Frames, k: int, view: View) -> list[View]:
         """Views of the other camera at the circles that each pose hypothesis of camera k's view predicts."""
-        poses = pose_hypotheses.poses(self.cameras[k], view.outlines.ellipses.centre, circle_layout.circle_centres(self.target))
+        poses = pose_hypotheses.poses(self.cameras[k], view.outlines.rings.centre, circle_layout.circle_centres(self.target))
         expected = [self._expected(1 - k, pose) for pose in poses]
         return [self._judged(1 - k, self._view(frames, 1 - k, rough, FOLLOWED)) for rough in expected]
 
-    def _seen_at(self, frames: Frames, networks: Networks, k: int, triple: Triple) -> View:
-        """View of one camera at predicted places of its three circles."""
-        rough = circle_segmenter.rough_ellipses(frames[k], triple.points, networks, self.target)
+    def _seen_at(self, frames: Frames, networks: Networks, k: int, naming: Naming) -> View:
+        """View of one camera at predicted places of its circles."""
+        rough = circle_segmenter.rough_ellipses(frames[k], naming.points, networks, self.target)
         rims = measure(frames[k], rough, reach_px(rough, circle_segmenter.OFF), self.target)
         rims = covered_circle.named_and_completed(frames[k], rims, self.target)
         view, wide = self._judged(k, views.renamed(rims, self.target, self.cameras[k])), views.diameter(rough)
         return replace(view, reason=views.too_small(wide)) if not view.found and wide < circle_detector.LEAST_PX else view
 
     def _judged(self, k: int, outlines: Outlines) -> View:
-        """Camera k's view of three rims."""
+        """Camera k's view of some rims."""
         return views.judged(outlines, self.target, self.cameras[k])
 
     def _view(self, frames: Frames, k: int, rough: Ellipses, reach: float) -> Outlines:
-        """Camera k's rims, from three rough ellipses."""
+        """Camera k's rims, from rough ellipses."""
         return covered_circle.completed(frames[k], measure(frames[k], rough, reach_px(rough, reach), self.target), self.target)
 
 

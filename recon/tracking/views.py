@@ -1,4 +1,4 @@
-"""The target in one camera: its three rims, or the reason why they aren't found."""
+"""The target in one camera: its rims, or the reason why they aren't found."""
 
 from dataclasses import dataclass, replace
 
@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from recon.geometry.camera import Camera
 from recon.geometry.ellipses import Ellipses
+from recon.geometry.pose_hypotheses import POINTS
 from recon.model.rig import Target
 from recon.tracking import identity
 from recon.tracking.circle_detector import LEAST_PX
 from recon.tracking.pose import allowed
-from recon.tracking.pose_fit import NAMES
 from recon.tracking.rims import ELSEWHERE, WHOLE, Outlines
 
 Array = NDArray[np.float64]
@@ -22,55 +22,54 @@ NEAR = 0.6  # of a disc's size, by which it differs from an affine view's where 
 
 @dataclass(frozen=True)
 class View:
-    """The three circles of one view, in the order of NAMES. In one of two views a circle may be told by the pose alone."""
+    """The circles of one view, c0 and on. In one of two views a circle may be told by the pose alone."""
 
-    outlines: Outlines  # of 3
+    outlines: Outlines  # of n
     reason: str | None = None  # why this isn't the target
 
     @property
     def found(self) -> bool:
-        """Whether it is known where all three circles are."""
+        """Whether it is known where the circles are: three at least."""
         return self.reason is None
 
     @property
     def useful(self) -> bool:
         """Whether it can go into a pose: two rings are not compared with each other, the pose does that."""
-        return self.found or self.outlines.found.sum() == 2
+        return self.found or self.outlines.found.sum() == POINTS - 1
 
     @property
     def blur_px(self) -> Array:
-        """Lengths : (3,) of the circles' paths over the exposure; NaN of one that isn't seen."""
+        """Lengths : (n,) of the circles' paths over the exposure; NaN of one that isn't seen."""
         return np.where(self.outlines.found, np.linalg.norm(self.outlines.motion, axis=1), np.nan)
 
 
-def nothing(reason: str) -> View:
-    """No circles, for a reason."""
-    numbers, pairs = np.full(3, np.nan), np.full((3, 2), np.nan)
+def nothing(reason: str, count: int) -> View:
+    """None of some circles, for a reason."""
+    numbers, pairs = np.full(count, np.nan), np.full((count, 2), np.nan)
     outlines = Outlines(
-        Ellipses(pairs, np.full((3, 2, 2), np.nan)),
-        joint=np.full((3, 5, 5), np.nan),
+        Ellipses(pairs, np.full((count, 2, 2), np.nan)),
+        joint=np.full((count, 5, 5), np.nan),
         inside=numbers,
         outside=numbers,
         middle=numbers,
         noise=numbers,
         motion=pairs,
         seen=numbers,
-        doubtful=np.zeros(3, bool),
-        uneven=np.zeros(3, bool),
-        reasons=(reason,) * 3,
+        doubtful=np.zeros(count, bool),
+        uneven=np.zeros(count, bool),
+        reasons=(reason,) * count,
     )
     return View(outlines, reason)
 
 
 def judged(outlines: Outlines, target: Target, camera: Camera | None = None) -> View:
-    """A view of three rims: the target if all are rings, of the sizes that their distances imply.
+    """A view of rims: the target if three or more are rings, of the sizes that their distances imply.
 
     camera : by which sizes may differ by perspective; None of a view that counts as affine.
     """
-    bad = [f"{name}: {reason}" for name, reason in zip(NAMES, outlines.reasons, strict=True) if reason is not None]
-    if bad:
-        return View(outlines, "; ".join(bad))
-    off = identity.disagreement(outlines.ellipses, target)
+    if outlines.found.sum() < POINTS:
+        return View(outlines, "; ".join(f"c{k}: {reason}" for k, reason in enumerate(outlines.reasons) if reason is not None))
+    off = identity.disagreement(outlines.rings, target)
     if not np.isfinite(off):
         return View(outlines, "circles of which the names are mirrored")
     if off > identity.ALIKE and not (camera is not None and off < NEAR and _in_perspective(outlines, camera, target)):
@@ -79,13 +78,13 @@ def judged(outlines: Outlines, target: Target, camera: Camera | None = None) -> 
 
 
 def _in_perspective(outlines: Outlines, camera: Camera, target: Target) -> bool:
-    """Whether some pose gives all three rims their places and shapes."""
-    return allowed(outlines.sighting(camera), outlines.seen < WHOLE, target)
+    """Whether some pose gives all rims their places and shapes."""
+    return allowed(outlines.sighting(camera), outlines.found & (outlines.seen < WHOLE), target)
 
 
 def unconfirmed(view: View, camera: Camera, target: Target) -> View:
     """A view that the other one doesn't confirm: shapes must be those of a pose, and no rim may be another thing's edge."""
-    if not view.found or allowed(view.outlines.sighting(camera), view.outlines.seen < WHOLE, target):
+    if not view.found or _in_perspective(view.outlines, camera, target):
         return view
     return replace(view, reason="circles of shapes that no pose gives them")
 
@@ -96,7 +95,7 @@ def gone(view: View, expected: Ellipses, size: tuple[int, int]) -> View:
         return view
     beyond = ~((expected.centre > 0) & (expected.centre < np.array(size) - 1)).all(axis=1)
     if beyond.any():
-        return replace(view, reason=f"out of view: {', '.join(np.array(NAMES)[beyond])}")
+        return replace(view, reason=f"out of view: {', '.join(f'c{k}' for k in np.flatnonzero(beyond))}")
     wide = diameter(expected)
     return replace(view, reason=too_small(wide)) if wide < LEAST_PX else view
 
@@ -106,12 +105,15 @@ def in_light(view: View, frame: NDArray) -> View:
     if view.outlines.found.any():
         return view
     low, high = np.percentile(frame[::8, ::8], (1, 99.5))
-    return nothing(f"too dark, or even: grey levels over {high - low:.0f} of 255") if high - low < DARK_DN else view
+    if high - low >= DARK_DN:
+        return view
+    return nothing(f"too dark, or even: grey levels over {high - low:.0f} of 255", len(view.outlines.reasons))
 
 
-def absent(count: int) -> str:
-    """Why a number of places like circles isn't the target."""
-    return f"{count} of 3 circles" if count < 3 else f"{count} places like circles, no three that lie like the target's"
+def absent(places: int, count: int) -> View:
+    """None of some circles, for a number of places like circles that aren't the target."""
+    few = f"{places} of {count} circles"
+    return nothing(few if places < count else f"{places} places like circles, no {count} that lie like the target's", count)
 
 
 def too_small(wide: float) -> str:
@@ -148,11 +150,11 @@ def doubted(pair: tuple[View, View], reason: str | None) -> tuple[View, View]:
 
 
 def renamed(outlines: Outlines, target: Target, camera: Camera | None = None) -> Outlines:
-    """The same rims in the order of the target's geometry, if all are rings; close to a camera, that of a pose."""
-    if not outlines.found.all():
+    """The same rims in the order of the target's geometry, if three or more are rings; close to a camera, that of a pose."""
+    if outlines.found.sum() < POINTS:
         return outlines
-    order, off = identity.named(outlines.ellipses, target)
+    order, off = identity.named(outlines.rings, target)
     if camera is None or not identity.ALIKE < off < np.inf:
         return outlines[order]
-    turned = [outlines[np.roll(order, k)] for k in range(3)]
+    turned = [outlines[np.roll(order, k)] for k in range(len(order))]
     return next((one for one in turned if _in_perspective(one, camera, target)), turned[0])

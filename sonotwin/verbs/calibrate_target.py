@@ -75,7 +75,7 @@ def run(config: Config) -> None:
     for line in target_figures.found(adjusted):
         console.print(line, markup=False)
     figures = target_figures.measure(adjusted, design)
-    for line in target_figures.describe(figures):
+    for line in target_figures.describe(figures, design):
         console.print(line, markup=False)
     if film.optics is None:
         console.print(f"warning     {NO_COVARIANCE}", markup=False)

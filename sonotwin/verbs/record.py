@@ -268,7 +268,7 @@ def sweep(config: Config, recording: Recording, console: Console, say: Say, show
         calibrations(config, recording, {name: device.size for name, device in devices.items()})
         if opened.scanner is not None:
             devices[SCANNER] = Device(size=opened.scanner.size)
-        judge = target_judge(networks.load(threads=1), config.rig.target)
+        judge = target_judge(networks.load(threads=1, kind=config.rig.target.kind), config.rig.target)
         record_sweep(recording, opened.pairs, opened.scanner, devices, operator, plan, dict.fromkeys(cameras, judge), say, show)
 
 

@@ -68,7 +68,7 @@ def run(config: Config) -> int:
     with atomic.new_folder(config.out, "track") as folder:
         start = perf_counter()
         steps = follow(film, tracker, folder if config.overlays else None, console)
-        figures = track_figures.measure(steps)
+        figures = track_figures.measure(steps, target)
         for line in (*track_figures.describe(steps, figures), *track_figures.causes(steps, target)):
             console.print(line, markup=False)
         results.write_poses(folder, film, steps)

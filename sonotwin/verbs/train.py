@@ -29,6 +29,8 @@ from recon.errors import InputError, short
 from recon.files import atomic, json_text, metrics
 from recon.files.metrics import Metrics, shown
 from recon.files.occupied import occupied
+from recon.model import circle_layout
+from recon.model.rig import Target
 from trainers import export, fit, free_memory, shard_reader
 from trainers.architectures import Name, is_detector, network
 from trainers.checkpoints import TRAIN
@@ -137,7 +139,8 @@ def _train(config: Config, console: Console) -> None:
     goes_on = check_resumed(config)
     torch.set_num_threads(config.threads or cores.usable())
     torch.manual_seed(config.seed)
-    module = network(config.network)
+    kind = shard_reader.kind_of([*config.data, *(config.validation_data or ())])
+    module = network(config.network, circle_layout.count(Target.named(kind)))
     if config.init is not None:
         export.load(config.init, module)
     train, validation = read(config, console)
@@ -152,7 +155,7 @@ def _train(config: Config, console: Console) -> None:
         figures = fit.measure(fitted.network, validation)
     console.print(f"validate    {describe(figures)}", markup=False)
     with console.status("writing"):
-        write(config, fitted, figures)
+        write(config, fitted, figures, kind)
     console.print(f"wrote       {config.out}/{{{','.join(names_of(config))}}}", markup=False)
 
 
@@ -235,7 +238,7 @@ def describe(figures: Metrics) -> str:
     if "recall" in figures:
         return (
             f"{shown(100 * figures['recall'], '.1f', ' %')} of circles found with their identity, "
-            f"{shown(100 * figures['all_three'], '.1f', ' %')} of views with all three, "
+            f"{shown(100 * figures['all_three'], '.1f', ' %')} of views with all circles, "
             f"median {shown(figures['place_median_full_px'], '.2f', ' px')} off in full resolution, "
             f"{shown(figures['false_per_empty_view'], '.2f')} false circles an empty view"
         )
@@ -257,10 +260,10 @@ def weights_file(config: Config, suffix: str) -> Path:
     return (config.out / config.network.removeprefix("published_")).with_suffix(suffix)
 
 
-def write(config: Config, fitted: Fitted, figures: Metrics) -> None:
-    """Write the network, its figures and curves."""
+def write(config: Config, fitted: Fitted, figures: Metrics, kind: str) -> None:
+    """Write the network for a kind of target, its figures and curves."""
     with atomic.listed_file(config.out, weights_file(config, ".onnx").name, TRAIN) as temporary:
-        export.save_onnx(temporary, fitted.network, config.network)
+        export.save_onnx(temporary, fitted.network, config.network, kind)
     for suffix in (".safetensors", ".pt"):
         with atomic.listed_file(config.out, weights_file(config, suffix).name, TRAIN) as temporary:
             export.save(temporary, fitted.network)

@@ -42,7 +42,7 @@ def drawn(rig, poses, tmp_path_factory) -> Path:
 @pytest.fixture
 def told(rig, poses, monkeypatch) -> Told:
     stand_in = Told(films.centres(rig, poses[0]))
-    monkeypatch.setattr(networks, "load", lambda folder, threads: stand_in)
+    monkeypatch.setattr(networks, "load", lambda *_: stand_in)
     return stand_in
 
 
@@ -54,7 +54,7 @@ def test_the_target_is_measured_and_poses_are_exact_with_it(drawn, poses, told, 
     assert lines[0] == "found       9 of 9 pairs whole, 9 poses that differ"
     assert "has no covariance" in lines[-2]
     found = target_files.read(out / "target.yaml", rig.target)
-    off = circle_layout.lengths(found) - [ACTUAL[name] for name in circle_layout.LENGTHS]
+    off = circle_layout.lengths(found) - [ACTUAL[name] for name in rig.target.LENGTHS]
     assert np.abs(off).max() < 0.005 and abs(found.outer_diameter_mm - 18.04) < 0.01
     assert np.all(np.abs(off) < 4 * np.sqrt(np.diag(found.covariance_mm2)))
     assert json.loads((out / "metrics.json").read_text())["pairs_used"] == 9
@@ -78,7 +78,7 @@ def test_the_interface_gives_the_verbs_figures(drawn, told, rig, tmp_path):
     found = sonotwin.calibrate_target(tracked, film.cameras, rig.target, tracker.optics_in_use, most_poses=8)
     figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
     sigmas = np.sqrt(np.diag(found.covariance))
-    for name, sigma in zip(target_files.LENGTHS_AND_DIAMETER, sigmas, strict=False):
+    for name, sigma in zip(target_files.lengths_and_diameter(rig.target), sigmas, strict=False):
         assert figures[name] == pytest.approx(getattr(found.target, name), rel=1e-9)
         assert figures[f"sigma_{name}"] == pytest.approx(sigma, rel=1e-9)
     assert figures["pairs_used"] == found.used.sum() == len(found.pairs) == 8 and len(found.collected.seen) == COUNT
@@ -115,7 +115,7 @@ def test_a_film_in_uneven_light_will_do_if_there_is_no_other(rig, poses, told, t
     assert main(["calibrate-target", f"capture={tmp_path / 'dim'}", f"out={tmp_path / 'target'}"]) == 0
     assert "9 poses that differ, 9 of them in uneven light: less exact" in capsys.readouterr().out
     found = target_files.read(tmp_path / "target" / "target.yaml", rig.target)
-    off = circle_layout.lengths(found) - [ACTUAL[name] for name in circle_layout.LENGTHS]
+    off = circle_layout.lengths(found) - [ACTUAL[name] for name in rig.target.LENGTHS]
     assert np.all(np.abs(off) < 4 * np.sqrt(np.diag(found.covariance_mm2))) and np.abs(off).max() < 0.05
 
 
@@ -139,4 +139,4 @@ def test_what_is_wrong_is_said_in_one_line(drawn, told, tmp_path, capsys):
 def test_a_film_too_short_is_refused(rig, told, tmp_path, capsys):
     capture = films.film(tmp_path / "capture", rig, np.random.default_rng(4), count=2)
     assert main(["calibrate-target", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 2
-    assert "expected 8 poses in which both cameras see all three circles whole, found" in capsys.readouterr().err
+    assert "expected 8 poses in which both cameras see all circles whole, found" in capsys.readouterr().err

@@ -53,7 +53,7 @@ def recorded(rig, tmp_path_factory) -> Path:
 def moments(rig, monkeypatch):
     """All that is shown, with a detector that is told where the target is at first."""
     shown, publish = [], BrowserView.publish
-    monkeypatch.setattr(networks, "load", lambda folder, threads: Told(films.centres(rig, films.places(1)[0])))
+    monkeypatch.setattr(networks, "load", lambda *_: Told(films.centres(rig, films.places(1)[0])))
     monkeypatch.setattr(BrowserView, "publish", lambda view, moment: (shown.append(moment), publish(view, moment)))
     return shown
 

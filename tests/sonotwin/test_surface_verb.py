@@ -323,7 +323,7 @@ def test_the_page_tracks(rig, tmp_path, monkeypatch):
     (manifest,) = (text for text in blocks("json") if "sweep/cam2" in text)
     (tmp_path / "session" / "manifest.json").write_text(manifest, encoding="utf-8")
     stand_in = Told(films.centres(rig, films.places(1)[0]))
-    monkeypatch.setattr(networks, "load", lambda folder, threads: stand_in)
+    monkeypatch.setattr(networks, "load", lambda *_: stand_in)
     monkeypatch.chdir(tmp_path)
     (command,) = commands("track")
     assert main(command) == 0

@@ -22,7 +22,7 @@ def drawn(rig, tmp_path_factory) -> Path:
 @pytest.fixture
 def told(rig, monkeypatch) -> Told:
     stand_in = Told(films.centres(rig, films.places(1)[0]))
-    monkeypatch.setattr(networks, "load", lambda folder, threads: stand_in)
+    monkeypatch.setattr(networks, "load", lambda *_: stand_in)
     return stand_in
 
 
@@ -75,7 +75,7 @@ def test_exchanged_cameras_are_named_and_no_pose_is_a_failure(rig, monkeypatch, 
     """The frames of one camera in the other's folder: nothing is found, and that isn't passed over."""
     pairs = ((right, left) for left, right in films.draw(rig, films.places(2), np.random.default_rng(4)))
     captures.write_film(tmp_path / "crossed", pairs, films.stamps(2), films.optics(rig), films.devices(rig), "crossed")
-    monkeypatch.setattr(networks, "load", lambda folder, threads: Told(films.centres(rig, films.places(1)[0])[::-1]))
+    monkeypatch.setattr(networks, "load", lambda *_: Told(films.centres(rig, films.places(1)[0])[::-1]))
     assert main(["track", f"capture={tmp_path / 'crossed'}", f"out={tmp_path / 'out'}", "overlays=false"]) == 1
     told = capsys.readouterr()
     assert "found       0 of 2 frames, 2 not: cameras exchanged (2)" in told.out

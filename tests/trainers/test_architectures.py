@@ -50,14 +50,14 @@ PUBLISHED = {
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_weights_have_the_published_names_and_shapes(name):
-    assert {key: tuple(value.shape) for key, value in network(name).state_dict().items()} == PUBLISHED[name]
+    assert {key: tuple(value.shape) for key, value in network(name, 3).state_dict().items()} == PUBLISHED[name]
 
 
 @pytest.mark.parametrize("name", ["detector", "published_detector"])
 @pytest.mark.parametrize(("width", "height"), [(320, 240), (160, 96)])
 def test_detectors_answer_for_each_cell(name, width, height):
     with torch.no_grad():
-        detection, identity = network(name).eval()(torch.rand(1, 1, height, width))
+        detection, identity = network(name, 3).eval()(torch.rand(1, 1, height, width))
     assert detection.shape == (1, 65, height // 8, width // 8)
     assert identity.shape == (1, 4, height // 8, width // 8)
 
@@ -65,7 +65,7 @@ def test_detectors_answer_for_each_cell(name, width, height):
 @pytest.mark.parametrize("name", ["segmenter", "published_segmenter"])
 def test_segmenters_answer_for_each_pixel(name):
     with torch.no_grad():
-        assert network(name).eval()(torch.rand(2, 1, 120, 120)).shape == (2, 1, 120, 120)
+        assert network(name, 3).eval()(torch.rand(2, 1, 120, 120)).shape == (2, 1, 120, 120)
 
 
 def reach(module, size, middle):
@@ -81,7 +81,7 @@ def reach(module, size, middle):
 def test_our_detector_sees_the_whole_target_from_each_circle():
     """c1 and c2 are 47 mm apart, 60 px at the rig's distance; nearer by 1.6 it is 95 px."""
     torch.manual_seed(0)
-    assert reach(Detector(), 320, 20) >= 100
+    assert reach(Detector(3), 320, 20) >= 100
 
 
 def test_our_segmenter_sees_a_whole_disc_from_its_middle():

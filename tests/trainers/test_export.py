@@ -15,7 +15,7 @@ from trainers.export import load, save, save_onnx
 def trained(name, seed=0):
     """A network whose norms have statistics, as after some steps."""
     torch.manual_seed(seed)
-    module = network(name).train()
+    module = network(name, 3).train()
     with torch.no_grad():
         for _ in range(3):
             module(torch.rand(2, 1, 64, 64))
@@ -25,7 +25,7 @@ def trained(name, seed=0):
 @pytest.mark.parametrize("name", ["detector", "segmenter", "published_segmenter"])
 def test_onnx_runtime_agrees_at_any_size(name, tmp_path):
     module = trained(name)
-    save_onnx(tmp_path / "network.onnx", module, name)
+    save_onnx(tmp_path / "network.onnx", module, name, "three_circles")
     session = onnxruntime.InferenceSession(str(tmp_path / "network.onnx"), providers=["CPUExecutionProvider"])
     assert onnx.load(tmp_path / "network.onnx").opset_import[0].version >= 17
     outputs = [value.name for value in session.get_outputs()]
@@ -54,7 +54,7 @@ def test_published_files_of_older_torch_are_read(tmp_path):
     module = trained("published_segmenter")
     old = {f"module.{name}": value for name, value in module.state_dict().items() if "num_batches" not in name}
     torch.save(old, tmp_path / "old.pt")
-    other = network("published_segmenter")
+    other = network("published_segmenter", 3)
     load(tmp_path / "old.pt", other)
     assert torch.equal(other.up1.double_conv[0].weight, module.up1.double_conv[0].weight)
 
@@ -72,7 +72,7 @@ def test_other_files_are_refused_in_one_line(tmp_path):
         ("none.pt", "expected weights, .safetensors or .pt, found none"),
     ):
         with pytest.raises(InputError, match=message) as caught:
-            load(tmp_path / name, network("published_segmenter"))
+            load(tmp_path / name, network("published_segmenter", 3))
         assert str(caught.value).startswith(str(tmp_path / name)) and "\n" not in str(caught.value)
 
 
@@ -111,7 +111,7 @@ FIRST = "level1.double_conv.0.weight"  # 8 x 1 x 3 x 3
 def test_what_is_no_state_of_the_network_is_named(tmp_path, content, message, recwarn):
     torch.save(content, tmp_path / "weights.pt")
     with pytest.raises(InputError, match=message) as caught:
-        load(tmp_path / "weights.pt", network("segmenter"))
+        load(tmp_path / "weights.pt", network("segmenter", 3))
     assert str(caught.value).isprintable() and len(str(caught.value)) < 400
     assert not recwarn.list
 
@@ -119,7 +119,7 @@ def test_what_is_no_state_of_the_network_is_named(tmp_path, content, message, re
 @pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
 def test_damage_at_random_ends_in_a_line(tmp_path, rng, suffix, recwarn):
     path = tmp_path / f"weights{suffix}"
-    save(path, network("segmenter"))
+    save(path, network("segmenter", 3))
     whole = path.read_bytes()
     for _ in range(60):
         content = bytearray(whole)
@@ -127,7 +127,7 @@ def test_damage_at_random_ends_in_a_line(tmp_path, rng, suffix, recwarn):
             content[place] = rng.integers(256)
         path.write_bytes(content[: rng.integers(len(content))] if rng.random() < 0.2 else content)
         try:
-            load(path, network("segmenter"))
+            load(path, network("segmenter", 3))
         except InputError as error:
             assert str(error).isprintable() and len(str(error)) < 400
     assert not recwarn.list

@@ -28,7 +28,7 @@ def plan(name, steps, **changes):
 
 def small(name):
     torch.manual_seed(0)
-    return Detector(8) if name == "detector" else Segmenter((4, 4, 4))
+    return Detector(3, 8) if name == "detector" else Segmenter((4, 4, 4))
 
 
 @pytest.fixture(autouse=True)
@@ -144,7 +144,7 @@ def test_a_small_detector_learns_the_drawn_targets(write, tmp_path):
     train, held = split(in_memory(read_views([write(tmp_path / "set", 120, sizes=(2.2, 3.4))])), 0.1)
     torch.manual_seed(0)
     asked = plan("detector", 2500, batch=16, crop_px=96, learning_rate=4e-3)
-    fitted = fit.fit(Detector(32), train, held, asked, tmp_path, lambda *_: None)
+    fitted = fit.fit(Detector(3, 32), train, held, asked, tmp_path, lambda *_: None)
     figures = fit.measure(fitted.network, held)
     assert figures["recall"] > 0.8
     assert figures["identity_accuracy"] > 0.8

@@ -117,8 +117,11 @@ def _truth(change):
         ),
         (lambda truth: truth["views"][0].update(centres=[[1e308, 0]] * 3), r"views\.0\.centres\.0\.0: expected less than"),
         (lambda truth: truth["views"][1].update(visible=[float("nan")] * 3), "expected finite numbers, found NaN"),
-        (lambda truth: truth["views"][1].update(visible=[1.0, 1.0]), r"views\.1\.visible\.2: expected a value, found none"),
-        (lambda truth: truth["views"][1].update(visible=None), r"views\.1\.visible: expected three values, as there are centres"),
+        (
+            lambda truth: truth["views"][1].update(visible=[1.0, 1.0]),
+            r"views\.1\.visible: expected 3 values, as there are centres, found 2",
+        ),
+        (lambda truth: truth["views"][1].update(visible=None), r"views\.1\.visible: expected 3 values, as there are centres"),
         (lambda truth: truth["views"][1].update(white_dn="BIG"), "expected JSON, found it damaged: a number of 10000 digits"),
         (lambda truth: truth["views"][1]["camera"].update(size=[0, 1024]), r"views\.1\.camera\.size\.0: expected greater than"),
         (lambda truth: truth["views"][1].update(ellipses=[[1, 2, -3, 4, 5]] * 3), r"views\.1\.ellipses\.0\.2: expected greater"),

@@ -63,7 +63,7 @@ def rows(setup: Setup, networks: Networks) -> list[Row]:
         Row("e", f"{of}: rotation before, median", _median(before, "turn_deg"), None, _median([exact], "turn_deg"), "deg"),
         *(
             Row("e", f"{of}: error of {name.removesuffix('_mm')} as measured, largest", error, 0.01, None, "mm")
-            for name, error in zip(circle_layout.LENGTHS, largest.tolist(), strict=True)
+            for name, error in zip(actual.LENGTHS, largest.tolist(), strict=True)
         ),
         Row("e", f"{of}: squared error of the lengths over covariance, chi-square of 3: mean", lengths, 8.0, 3.0, ""),
         *_honest(f"{of}: after", after),
@@ -87,12 +87,10 @@ def false_rows(setup: Setup, networks: Networks) -> list[Row]:
 def misprinted(actual: Target, seed: int) -> Target:
     """A design from which each circle of the actual target is off, anywhere within a disc."""
     rng = np.random.default_rng([seed, 3])
-    angle, away = rng.uniform(0, 2 * np.pi, 3), ERROR_MM * np.sqrt(rng.uniform(0, 1, 3))
+    count = circle_layout.count(actual)
+    angle, away = rng.uniform(0, 2 * np.pi, count), ERROR_MM * np.sqrt(rng.uniform(0, 1, count))
     places = circle_layout.circle_centres(actual)[:, :2] + away[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    x, side = places[1] - places[0], places[2] - places[0]
-    c1 = float(np.linalg.norm(x))
-    lengths = {"c1_mm": c1, "c2_aside_mm": float(side @ x) / c1, "c2_mm": float(x[0] * side[1] - x[1] * side[0]) / c1}
-    return actual.model_copy(update=lengths)
+    return circle_layout.with_lengths(actual, circle_layout.lengths_between(places))
 
 
 def seen(shown: Sequence[Shown], design: Target, networks: Networks) -> list[target_poses.Seen]:

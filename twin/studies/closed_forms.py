@@ -112,14 +112,15 @@ def pose_covariance(cameras: tuple[Camera, Camera], pose: Array, target: Target,
     Parameters
     ----------
     pose : (4, 4), world_from_target
-    sigma_px : (2, 3), standard deviation of a circle's centre in u and in v, in each camera
+    sigma_px : (2, n), standard deviation of a circle's centre in u and in v, in each camera
     """
     circles = circle_layout.circle_centres(target)
     world = rigid.apply(pose, circles)
-    by_length = np.einsum("ij,njk->nik", pose[:3, :3], circle_layout.BY_LENGTH)
+    by_length = np.einsum("ij,njk->nik", pose[:3, :3], circle_layout.by_length(target))
     slopes = np.concatenate([rigid.slopes(world - pose[:3, 3]), by_length], axis=-1)
-    information = np.zeros((9, 9))
-    information[6:, 6:] = np.linalg.inv(circle_layout.length_covariance(target) + EXACT_MM2 * np.eye(3))
+    unknowns = slopes.shape[-1]
+    information = np.zeros((unknowns, unknowns))
+    information[6:, 6:] = np.linalg.inv(circle_layout.length_covariance(target) + EXACT_MM2 * np.eye(unknowns - 6))
     for camera, sigmas in zip(cameras, sigma_px, strict=True):
         seen = linearise(camera, world, ()).by_point @ slopes / sigmas[:, None, None]
         information += np.einsum("nij,nik->jk", seen, seen)

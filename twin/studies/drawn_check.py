@@ -88,8 +88,8 @@ def drawn_film(
         for name in CAMERAS:
             centres, shapes = ellipses_of(true[name], pose, *circles)
             inside = ((centres > 40) & (centres < np.array(true[name].size) - 40)).all()
-            seen = centres + sigma_px * rng.standard_normal((3, 2))
-            views.append((inside, Sighting(known[name], seen, np.tile(sigma_px**2 * np.eye(2), (3, 1, 1)), shapes)))
+            seen = centres + sigma_px * rng.standard_normal(centres.shape)
+            views.append((inside, Sighting(known[name], seen, np.tile(sigma_px**2 * np.eye(2), (len(seen), 1, 1)), shapes)))
         if all(inside for inside, _ in views):
             pairs.append((views[0][1], views[1][1]))
     return pairs
@@ -97,11 +97,10 @@ def drawn_film(
 
 def measured(printed: Target, sigma_mm: float, rng: np.random.Generator) -> Target:
     """A target as it was measured, each of its lengths to a standard deviation."""
-    lengths = {
-        name: getattr(printed, name) + sigma_mm * float(rng.standard_normal()) for name in ("c1_mm", "c2_aside_mm", "c2_mm")
-    }
-    variances = tuple(tuple(row) for row in (sigma_mm**2 * np.eye(3)).tolist())
-    return printed.model_copy(update={**lengths, "covariance_mm2": variances})
+    lengths = circle_layout.lengths(printed)
+    found = circle_layout.with_lengths(printed, lengths + sigma_mm * rng.standard_normal(len(lengths)))
+    variances = tuple(tuple(row) for row in (sigma_mm**2 * np.eye(len(lengths))).tolist())
+    return found.model_copy(update={"covariance_mm2": variances})
 
 
 def drawn_matches(true: Devices, known: Devices, axes: tuple[int, ...], sigma_px: float, rng: np.random.Generator) -> Matches:

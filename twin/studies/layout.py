@@ -58,7 +58,7 @@ def least_turn(before: Array, after: Array) -> Array:
 
 def _scaled(rig: Rig, scale: float):
     target = rig.target
-    lengths = ("c1_mm", "c2_mm", "c2_aside_mm", "outer_diameter_mm", "inner_diameter_mm")
+    lengths = (*target.LENGTHS, "outer_diameter_mm", "inner_diameter_mm")
     width, height = target.board_mm
     return target.model_copy(
         update={name: scale * getattr(target, name) for name in lengths} | {"board_mm": (scale * width, scale * height)}

@@ -21,7 +21,7 @@ def measure(settings: Settings, seed: int) -> Metrics:
     rig, film = laid_out(settings.rig, settings.layout), settings.film
     setup = Setup(rig, {}, frames=settings.ranges)
     shown = tracking_frames.study(setup, seed, film.frames, film.white_dn, film.blur_px, film.rays)
-    known = networks.load()
+    known = networks.load(kind=settings.rig.target.kind)
     takes, errors = [], []
     for take, frames in shown:
         takes.append(take)

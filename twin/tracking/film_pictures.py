@@ -167,9 +167,10 @@ def most_rays(quality: FilmQuality) -> int:
     return max(TILE**2 * quality.view, quality.disc, quality.rim)
 
 
-def visible_shares(lanes: Lanes, light: Light) -> Array:
-    """Uncovered share of each disc's area within the image : (3,)."""
-    seen, disc = (np.bincount(lanes.circle, part / lanes.samples, NO_CIRCLE + 1)[:NO_CIRCLE] for part in (light.seen, light.disc))
+def visible_shares(lanes: Lanes, light: Light, count: int) -> Array:
+    """Uncovered share of each disc's area within the image : (n,) of a number of circles."""
+    of_one = lanes.circle != NO_CIRCLE
+    seen, disc = (np.bincount(lanes.circle[of_one], (part / lanes.samples)[of_one], count) for part in (light.seen, light.disc))
     return seen / np.maximum(disc, 1)
 
 

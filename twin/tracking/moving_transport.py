@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.model.circle_layout import circle_centres
 from recon.model.rig import Rig, Target
 from scenes.handheld.mesh_parts import SLOTS
 from twin.optics.sampling import PairedPoints
@@ -36,7 +37,7 @@ LIFT_MM = 0.05  # of a shadow ray's start off the surface, more than the coordin
 ROOM_MM = 300.0  # things farther than this don't keep a point from the light that comes from all around
 FRESNEL = 0.04  # of a glossy coat at right angles
 TARGET, POSTER = SLOTS.index("target"), SLOTS.index("poster")
-NO_CIRCLE = 3
+NO_CIRCLE = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
@@ -221,9 +222,10 @@ class _Path:
         return place.x, place.y, self.present & (ray.d.z < 0) & (distance > 0)
 
     def _within_circle(self, x, y, circle) -> mi.Bool:
-        cx = dr.select(circle == 1, self.target.c1_mm, dr.select(circle == 2, self.target.c2_aside_mm, 0.0))
-        cy = dr.select(circle == 2, self.target.c2_mm, 0.0)
-        return (circle < NO_CIRCLE) & ((x - cx) ** 2 + (y - cy) ** 2 < (self.target.outer_diameter_mm / 2) ** 2)
+        cx, cy = mi.Float(0), mi.Float(0)
+        for number, (there_x, there_y, _) in enumerate(circle_centres(self.target).tolist()):
+            cx, cy = dr.select(circle == number, there_x, cx), dr.select(circle == number, there_y, cy)
+        return (circle != NO_CIRCLE) & ((x - cx) ** 2 + (y - cy) ** 2 < (self.target.outer_diameter_mm / 2) ** 2)
 
     def _banked(self, ray: mi.Ray3f) -> mi.Ray3f:
         return mi.Ray3f(ray.o + self.body_at, ray.d)

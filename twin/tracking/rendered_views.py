@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from recon.geometry import rigid
 from recon.model import circle_layout
-from recon.model.circle_layout import COUNT
 from recon.model.rig import CameraDevice, Rig, Target
 from recon.threads import mapped
 from twin.sensor import Exposure, digitise, number_per_electron, read_out
@@ -42,7 +41,7 @@ class Frames:
 class Sample(Frames):
     """One sample's images: of the views, too."""
 
-    patches: Grey  # (2, 3, 120, 120)
+    patches: Grey  # (2, n, 120, 120)
 
 
 class Shot(NamedTuple):
@@ -101,7 +100,9 @@ def render_film(bank: Bank, rig: Rig, takes: Sequence[Take], quality: FilmQualit
     parts = [light.part(slice(a, b)) for a, b in pairwise(starts)]
 
     def finished(shot: Shot, picture: FilmPicture, block: Lanes, part: Light) -> tuple[Grey, ViewTruth]:
-        shares = visible_shares(block, part) * inside_share(shot.truth.ellipses, shot.device.optics.size)
+        shares = visible_shares(block, part, len(shot.truth.ellipses)) * inside_share(
+            shot.truth.ellipses, shot.device.optics.size
+        )
         truth = replace(shot.truth, visible=shares, white_dn=_white(part, [slice(None)], shot.take, shot.device, rig))
         return _exposed(picture.radiance(part), shot, rig), truth
 
@@ -140,12 +141,13 @@ def _rendered(
     grid: BitGrid | None = None,
 ) -> list[Sample]:
     """One launch for all images and patches of all takes; then the sensors, image by image."""
+    count = circle_layout.count(rig.target)
     truths = [[view_truth(take, *seen, rig.target) for seen in zip(take.cameras, take.late, strict=True)] for take in takes]
     blocks, origins = [], []
     for i, take in enumerate(takes):
         for camera, device in enumerate(take.cameras):
             first = _patch_origins(take, camera, truths[i][camera])
-            circles = range(COUNT) if take.present else [NO_CIRCLE] * COUNT
+            circles = range(count) if take.present else [NO_CIRCLE] * count
             patches = [
                 Window(device.optics.size, tuple(first[c].tolist()), (PATCH, PATCH), quality.patch, c, circle)
                 for c, circle in enumerate(circles)
@@ -160,10 +162,10 @@ def _rendered(
     for i, take in enumerate(takes):
         views, patches, told = [], [], []
         for camera, device in enumerate(take.cameras):
-            at = 4 * (2 * i + camera)  # an image and its three patches
+            at = (1 + count) * (2 * i + camera)  # an image and a patch each circle
             views.append(pictures[i][camera].image(numbers[at]))
-            patches.append(np.stack(numbers[at + 1 : at + 1 + COUNT]).reshape(COUNT, PATCH, PATCH))
-            seen = pieces[at + 1 : at + 4]
+            patches.append(np.stack(numbers[at + 1 : at + 1 + count]).reshape(count, PATCH, PATCH))
+            seen = pieces[at + 1 : at + 1 + count]
             told.append(
                 replace(
                     truths[i][camera],
@@ -177,12 +179,12 @@ def _rendered(
 
 
 def _patch_origins(take: Take, camera: int, truth: ViewTruth) -> NDArray[np.int64]:
-    """Where patches begin : (3, 2) px, about the circles as a detector that is a pixel off would place them; or anywhere."""
+    """Where patches begin : (n, 2) px, about the circles as a detector that is a pixel off would place them; or anywhere."""
     rng = np.random.default_rng([take.noise_seed, camera])
     size = np.array(take.cameras[camera].optics.size)
-    coarse = np.rint(np.nan_to_num(truth.centres) / (size / VIEW) + rng.uniform(-1, 1, (COUNT, 2))) * (size / VIEW)
+    coarse = np.rint(np.nan_to_num(truth.centres) / (size / VIEW) + rng.uniform(-1, 1, truth.centres.shape)) * (size / VIEW)
     if not take.present or not np.isfinite(truth.centres).all():
-        coarse = rng.uniform([0, 0], size, (COUNT, 2))
+        coarse = rng.uniform([0, 0], size, truth.centres.shape)
     return np.rint(np.clip(coarse, 0, size - 1)).astype(int) - HALF
 
 
@@ -236,7 +238,7 @@ def _unit_pattern(height: int, width: int, serial: int) -> tuple[NDArray[np.floa
 
 
 def _visible(light: Light, pieces) -> NDArray[np.float64]:
-    """Uncovered share of each disc's area within the image : (3,)."""
+    """Uncovered share of each disc's area within the image : (n,)."""
     return np.array([light.seen[piece].sum() / max(light.disc[piece].sum(), 1) for piece in pieces], float)
 
 

@@ -1,6 +1,6 @@
 """Ground truth of a target in a view: projected centres, outlines, blur, visibility."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model import circle_layout
-from recon.model.circle_layout import COUNT, circle_centres
+from recon.model.circle_layout import circle_centres
 from recon.model.rig import CameraDevice, Target
 from twin.tracking.samples import Motion, Take
 
@@ -22,29 +22,29 @@ class ViewTruth:
     """One view's truth in the middle of the exposure; NaN throughout without a target."""
 
     camera: Camera
-    centres: Array  # (3, 2) px, the circles' projected centres
-    ellipses: Array  # (3, 5) of the outer outlines: middle u, v, semi-axes a >= b px, angle rad of a from u towards v
-    inside: NDArray[np.bool_]  # (3,) whether the whole disc lies in the image
-    blur_px: Array  # (3,) length of a centre's path over the exposure
-    visible: Array = field(default_factory=lambda: np.zeros(COUNT))  # part of each disc, 0 to 1: in the image, nothing before it
+    centres: Array  # (n, 2) px, the circles' projected centres
+    ellipses: Array  # (n, 5) of the outer outlines: middle u, v, semi-axes a >= b px, angle rad of a from u towards v
+    inside: NDArray[np.bool_]  # (n,) whether the whole disc lies in the image
+    blur_px: Array  # (n,) length of a centre's path over the exposure
+    visible: Array  # (n,) part of each disc, 0 to 1: in the image, nothing before it; 0 before it is rendered
+    patch_origins: NDArray[np.int64]  # (n, 2) px; 0 before it is rendered
     white_dn: float = float("nan")  # brightness of the target's white, without noise
-    patch_origins: NDArray[np.int64] = field(default_factory=lambda: np.zeros((COUNT, 2), int))
 
 
 def view_truth(take: Take, device: CameraDevice, late: float, target: Target) -> ViewTruth:
     """Ground truth of a take's target in one camera, which exposes later by a share of the exposure."""
-    camera = device.optics.camera()
+    camera, model = device.optics.camera(), circle_centres(target)
+    visible, origins = np.zeros(len(model)), np.zeros((len(model), 2), int)
     if not take.present:
-        nothing = np.full((COUNT, 2), np.nan)
-        return ViewTruth(camera, nothing, np.full((COUNT, 5), np.nan), np.zeros(COUNT, bool), np.full(COUNT, np.nan))
-    motion, model = take.motion.later(late), circle_centres(target)
+        numbers, inside = np.full((len(model), 5), np.nan), np.zeros(len(model), bool)
+        return ViewTruth(camera, numbers[:, :2], numbers, inside, numbers[:, 0], visible, origins)
+    motion = take.motion.later(late)
     pose = motion.world_from_target
     rims = camera.project(rigid.apply(pose, outline(model, target.outer_diameter_mm / 2)))
     low, high = rims.min(axis=1), rims.max(axis=1)
     inside = ((low >= 0) & (high <= np.array(camera.size) - 1)).all(axis=1)
-    return ViewTruth(
-        camera, camera.project(rigid.apply(pose, model)), ellipse_rows(rims), inside, path_length(motion, camera, model)
-    )
+    centres, paths = camera.project(rigid.apply(pose, model)), path_length(motion, camera, model)
+    return ViewTruth(camera, centres, ellipse_rows(rims), inside, paths, visible, origins)
 
 
 def outline(centres: Array, radius: float) -> Array:

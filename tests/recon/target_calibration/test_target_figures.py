@@ -16,7 +16,7 @@ def test_figures_and_lines(rig, rng):
     assert (figures["pairs"], figures["pairs_used"]) == (4, 3)
     assert figures["sigma_c2_aside_mm"] == 0.02 and figures["design_c1_mm"] == 25
     assert np.isclose(figures["bow_across_mm"], 0.4e-3 * 60**2 / 8) and np.isclose(figures["bow_along_mm"], -0.2e-3 * 65**2 / 8)
-    lines = list(target_figures.describe(figures))
+    lines = list(target_figures.describe(figures, rig.target))
     assert lines[0] == "adjust      3 of 4 poses; residuals of centres 0.0110 px, 1.20 times the predicted noise"
     assert lines[1] == "c1          25.1000 ± 0.0100 mm, by design 25: +100 um"
     assert lines[2].startswith("c2 aside    -0.0500 ± 0.0200 mm, by design 0: -50 um")

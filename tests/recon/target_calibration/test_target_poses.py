@@ -84,5 +84,5 @@ def test_what_is_missing_is_named(cameras, rig, rng):
 
 
 def test_pairs_that_are_not_whole_are_not_taken(cameras):
-    nothing = views.nothing("no rim")
+    nothing = views.nothing("no rim", 3)
     assert target_poses.whole(Tracking(pose_fit.lost("none"), (nothing, nothing)), cameras) == "without a pose"

@@ -47,7 +47,7 @@ def test_the_third_place_follows_from_two_discs(cameras, rig, rng, which):
     away = []
     for _ in range(40):
         true = drawings.shown(cameras[0], drawings.facing(rng), rig.target)
-        told = covered_circle.third(true, which, rig.target)
+        told = covered_circle.further(true, np.arange(3) != which, which, rig.target)
         away.append(np.linalg.norm(told.centre[0] - true.centre[which]))
         assert np.abs(told.shape[0] - true.shape[which]).max() < 0.15 * np.trace(true.shape[which]) / 2
     assert np.median(away) < 5 and max(away) < 10
@@ -56,7 +56,7 @@ def test_the_third_place_follows_from_two_discs(cameras, rig, rng, which):
 def test_two_discs_as_far_apart_as_others_tell_no_third(cameras, rig, rng):
     """c0 and c2 are 40 mm apart, c0 and c1 25."""
     true = drawings.shown(cameras[0], drawings.facing(rng), rig.target)
-    assert np.isnan(covered_circle.third(true[np.array([0, 2, 1])], 1, rig.target).centre).all()
+    assert np.isnan(covered_circle.further(true[np.array([0, 2, 1])], np.arange(3) != 1, 1, rig.target).centre).all()
 
 
 @pytest.mark.parametrize("which", [0, 1, 2])
@@ -72,7 +72,7 @@ def test_a_target_with_a_middle_that_is_hidden_is_found(cameras, rig, rng, which
     error = found.pose.world_from_target[:3, 3] - place[:3, 3]
     assert np.linalg.norm(error) < 0.1
     assert error @ np.linalg.solve(found.pose.covariance[3:, 3:], error) < 20
-    monkeypatch.setattr(covered_circle, "missing", lambda found: None)
+    monkeypatch.setattr(covered_circle, "completed", lambda image, outlines, target: outlines)
     monkeypatch.setattr(covered_circle, "sought_again", lambda *_: ())
     assert "no white middle" in followed(cameras, rig.target, place, frames).pose.reason
 

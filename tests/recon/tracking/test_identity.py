@@ -21,7 +21,7 @@ def candidates(points, names):
 
 def test_the_likeliest_triple_is_that_of_the_names(centres, rig, rng):
     beside = np.vstack([centres, rng.uniform(0, 1000, (4, 2))])
-    found = identity.triples(candidates(beside, (0, 1, 2, 3, 3, 3, 3)), rig.target, 1280)
+    found = identity.namings(candidates(beside, (0, 1, 2, 3, 3, 3, 3)), rig.target, 1280)
     np.testing.assert_array_equal(found[0].points, centres)
     assert sorted((each.score for each in found), reverse=True) == [each.score for each in found]
 
@@ -29,15 +29,15 @@ def test_the_likeliest_triple_is_that_of_the_names(centres, rig, rng):
 @pytest.mark.parametrize("unseen", [0, 1, 2])
 def test_two_candidates_leave_one_unseen(centres, rig, unseen):
     names = [k for k in range(3) if k != unseen]
-    found = identity.triples(candidates(centres[names], names), rig.target, 1280)
+    found = identity.namings(candidates(centres[names], names), rig.target, 1280)
     expected = centres.copy()
     expected[unseen] = np.nan
     np.testing.assert_array_equal(found[0].points, expected)
-    whole = identity.triples(candidates(centres, range(3)), rig.target, 1280)[0]
+    whole = identity.namings(candidates(centres, range(3)), rig.target, 1280)[0]
     assert found[0].within(whole) and not whole.within(found[0])
 
 
 def test_with_fewer_or_far_apart_there_is_none(centres, rig):
     for count in (0, 1):
-        assert not identity.triples(candidates(centres[:count], range(count)), rig.target, 1280)
-    assert not identity.triples(candidates([[100, 100], [1200, 900]], (0, 1)), rig.target, 1280)
+        assert not identity.namings(candidates(centres[:count], range(count)), rig.target, 1280)
+    assert not identity.namings(candidates([[100, 100], [1200, 900]], (0, 1)), rig.target, 1280)

@@ -5,7 +5,7 @@ import pytest
 
 from recon.errors import InputError
 from recon.geometry.ellipses import Ellipses
-from recon.model.rig import Target
+from recon.model.targets import three_circles
 from recon.tracking import circle_detector, circle_segmenter, identity, networks
 from recon.tracking.frames import grey
 from tests.recon.tracking.stand_ins import Told
@@ -114,7 +114,7 @@ def test_coarse_patches_hold_large_discs_where_they_are():
     """A disc of 170 px, drawn and segmented by its darkness: centre and size come back in the image's pixels."""
     v, u = np.mgrid[:700, :900]
     image = np.where((u - 420.3) ** 2 + (v - 333.6) ** 2 < 85**2, 20, 200).astype(np.uint8)
-    target = Target(c1_mm=25, c2_mm=40, outer_diameter_mm=18, inner_diameter_mm=7.2, board_mm=(60, 65))
+    target = three_circles.Kind(c1_mm=25, c2_mm=40, outer_diameter_mm=18, inner_diameter_mm=7.2, board_mm=(60, 65))
     scale = 170 / 18
     points = np.array([[420.0, 334.0], [420.0, 334.0 + 25 * scale], [420.0 + 40 * scale, 334.0]])
     assert circle_segmenter.step_for(points, target) == 2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.tracking import track_figures
-from recon.tracking.pose_fit import Triangle
+from recon.tracking.pose_fit import Triangulated
 from recon.tracking.results import Step
 from recon.tracking.track_figures import kind, kinds
 from recon.tracking.tracker import EXCHANGED
@@ -24,7 +24,7 @@ def test_reasons_are_put_together():
     assert kinds(reasons)[0] == ("only camera 1 sees the target", 2)
     assert [kind(str(reason)) for reason in reasons[3:]] == [
         "a misfit of centres",
-        "no camera sees all three circles",
+        "no camera sees enough circles",
         "rays that miss each other",
     ]
     assert kinds([f"reason {letter}" for letter in "aabcdef"])[-1] == ("others", 2)
@@ -34,7 +34,7 @@ def steps(rng, lengths, gap_mm, count=12, noise_mm=0.005):
     """Steps without poses, of six circles each."""
     nothing = np.full((6, 6), np.nan)
     triangles = [
-        Triangle(np.array(lengths) + noise_mm * rng.standard_normal(3), gap_mm + noise_mm * rng.standard_normal(3))
+        Triangulated(np.array(lengths) + noise_mm * rng.standard_normal(3), gap_mm + noise_mm * rng.standard_normal(3))
         for _ in range(count)
     ]
     return [Step(0, np.full((4, 4), np.nan), nothing, nothing, one, None, "a misfit", (0.0, 0.0), 0.01) for one in triangles]
@@ -78,8 +78,8 @@ def test_exchanged_cameras_and_true_causes_are_told_of_a_film(rig, rng):
     )
     lines = [*track_figures.causes([*crossed, gone], rig.target)]
     assert lines[0].startswith("warning     cameras exchanged? In 3 of 4 pairs")
-    told = track_figures.describe([gone], track_figures.measure([gone]))
-    assert told[0] == "found       0 of 1 frames, 1 not: no camera sees all three circles (1)"
+    told = track_figures.describe([gone], track_figures.measure([gone], rig.target))
+    assert told[0] == "found       0 of 1 frames, 1 not: no camera sees enough circles (1)"
     assert told[1:3] == ["lost        camera 1: circles out of view (1)", "lost        camera 2: circles of less than 16 px (1)"]
     assert kind("camera 2: expected an image of 1280x1024, found 640x512") == "expected an image of 1280x1024, found 640x512"
 

@@ -23,7 +23,7 @@ TRUTH = replace(view_truth(TAKE, RIG.cam1, 0.0, RIG.target), visible=np.ones(3),
 
 
 def found(centres: np.ndarray) -> views.View:
-    nothing = views.nothing("nothing")
+    nothing = views.nothing("nothing", 3)
     outlines = replace(nothing.outlines, ellipses=Ellipses(centres, np.tile(40.0 * np.eye(2), (3, 1, 1))))
     return views.View(outlines)
 
@@ -36,16 +36,16 @@ def test_right_exchanged_and_other_circles_are_told_apart():
     assert swapped.exchanged and not swapped.right
     elsewhere = score(found(centres + 200.0), TRUTH, True)
     assert elsewhere.found and not elsewhere.right and not elsewhere.exchanged
-    missed = score(views.nothing("dark"), TRUTH, True)
+    missed = score(views.nothing("dark", 3), TRUTH, True)
     assert missed.shows_target and not missed.found and not missed.right
 
 
 def test_a_hidden_or_cut_target_is_not_asked_for():
-    hidden = score(views.nothing(""), replace(TRUTH, visible=np.array([1, 0.4, 1])), True)
+    hidden = score(views.nothing("", 3), replace(TRUTH, visible=np.array([1, 0.4, 1])), True)
     assert not hidden.shows_target and not hidden.covered
-    partly = score(views.nothing(""), replace(TRUTH, visible=np.array([1, 0.7, 1])), True)
+    partly = score(views.nothing("", 3), replace(TRUTH, visible=np.array([1, 0.7, 1])), True)
     assert partly.covered and not partly.shows_target
-    assert not score(views.nothing(""), replace(TRUTH, inside=np.array([True, False, True])), True).shows_target
+    assert not score(views.nothing("", 3), replace(TRUTH, inside=np.array([True, False, True])), True).shows_target
     empty = score(found(TRUTH.ellipses[:, :2]), TRUTH, False)
     assert empty.empty and empty.found and not empty.right and not empty.shows_target
 

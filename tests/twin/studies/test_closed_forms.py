@@ -187,10 +187,10 @@ def test_no_pose_is_better_than_its_bound_and_least_squares_reach_it(rig, tolera
 
     def residuals(change, seen):
         """Of changes : (n, 9) of pose and lengths, in standard deviations : (n, 15)."""
-        views = (centres(cameras, change[:, :6], lengths + change[:, 6:]) - seen) / sigma[:, None, :, None]
+        views = (centres(cameras, change[:, :6], lengths + change[:, 6:], target) - seen) / sigma[:, None, :, None]
         return np.concatenate([np.swapaxes(views, 0, 1).reshape(len(change), -1), change[:, 6:] @ weight.T], axis=1)
 
-    exact = centres(cameras, np.zeros((400, 6)), lengths + off)
+    exact = centres(cameras, np.zeros((400, 6)), lengths + off, target)
     seen = exact + sigma[:, None, :, None] * rng.standard_normal(exact.shape)
     found = np.zeros((400, 9))
     for _ in range(6):
@@ -210,10 +210,10 @@ def test_no_pose_is_better_than_its_bound_and_least_squares_reach_it(rig, tolera
 SCALE = np.array([1e-4, 1e-4, 1e-4, 0.01, 0.01, 0.1, 0.1, 0.1, 0.1])
 
 
-def centres(cameras, changes, lengths) -> np.ndarray:
+def centres(cameras, changes, lengths, target) -> np.ndarray:
     """Pixels : (2, n, 3, 2) of circles in both cameras, of n changes of the pose and n sets of lengths."""
     poses = rigid.moved(np.broadcast_to(POSE, (len(changes), 4, 4)), changes)
-    on_target = np.moveaxis(circle_layout.BY_LENGTH @ lengths.T, -1, 0)
+    on_target = np.moveaxis(circle_layout.by_length(target) @ lengths.T, -1, 0)
     points = on_target @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
     return np.stack([camera.project(points) for camera in cameras])
 

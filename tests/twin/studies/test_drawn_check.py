@@ -42,7 +42,7 @@ def test_equations_of_an_exact_rig_leave_nothing(rig, calibration, known, rng):
     assert np.abs(optics_equations.of_film(film, rig.target, names).residuals).max() < 1e-3
     matches = drawn_check.drawn_matches(calibration.cameras, calibration.cameras, (0, 1), 1e-9, rng)
     matches = matches._replace(sigma=np.full_like(matches.sigma, 0.01))
-    assert np.abs(optics_equations.of_fringes(matches, calibration.cameras, names).residuals).max() < 1e-3
+    assert np.abs(optics_equations.of_fringes(matches, calibration.cameras, rig.target, names).residuals).max() < 1e-3
 
 
 @pytest.mark.parametrize("moved", ["", "cam1", "cam2", "projector"])

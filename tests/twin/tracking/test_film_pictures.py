@@ -27,7 +27,7 @@ def light_of(radiance, plain=None):
 
 def truth_of(rows, blur=0.0):
     rows = np.array(rows, float)
-    return ViewTruth(None, rows[:, :2], rows, np.ones(3, bool), np.full(3, blur))
+    return ViewTruth(None, rows[:, :2], rows, np.ones(3, bool), np.full(3, blur), np.zeros(3), np.zeros((3, 2), int))
 
 
 CORNERS = np.array([[20.0, 20], [300, 20], [300, 240], [20, 240]])
@@ -113,5 +113,5 @@ def test_shares_are_those_of_the_area(rig):
     disc = np.where(inside, lanes.samples, 0).astype(np.float32)
     seen = np.where((lanes.circle == 0) & (lanes.u < 80), 0, disc)
     zero = np.zeros_like(disc)
-    shares = visible_shares(lanes, Light(zero, zero, disc, seen, zero, zero))
-    assert shares == pytest.approx([0.5, 1.0, 0.0], abs=0.03) and NO_CIRCLE == 3
+    shares = visible_shares(lanes, Light(zero, zero, disc, seen, zero, zero), 3)
+    assert shares == pytest.approx([0.5, 1.0, 0.0], abs=0.03)

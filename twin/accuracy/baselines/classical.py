@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from recon.board_detection import discs
 from recon.geometry.ellipses import Ellipses, root
+from recon.model import circle_layout
 from recon.model.rig import Target
 
 Array = NDArray[np.float64]
@@ -43,7 +44,7 @@ LEAST_SIGNAL = 4.0  # contrast over noise
 class Circles:
     """The three circles in an image, or why they are not found."""
 
-    centres: Array  # (3, 2) px of the outer outlines' ellipses, in the order of pose_fit.NAMES; NaN if not found
+    centres: Array  # (3, 2) px of the outer outlines' ellipses, c0, c1, c2; NaN if not found
     covariance: Array  # (3, 2, 2) px^2
     ellipses: Ellipses | None = None  # the outer outlines
     reason: str | None = None
@@ -109,7 +110,8 @@ def _misfit(centres: Array, shapes: Array, target: Target) -> Array:
     """
     x, y = centres[..., 1, :] - centres[..., 0, :], centres[..., 2, :] - centres[..., 0, :]
     front = x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0] < -1.0
-    from_target = np.stack([x / target.c1_mm, y / target.c2_mm], axis=-1) * target.outer_diameter_mm / 2  # px a radius
+    c1, c2 = circle_layout.extent(target)
+    from_target = np.stack([x / c1, y / c2], axis=-1) * target.outer_diameter_mm / 2  # px a radius
     from_target = np.where(front[..., None, None], from_target, np.diag([1.0, -1.0]))
     back = np.linalg.inv(from_target)[..., None, :, :] @ shapes  # takes the unit circle to itself, if it is the target
     lengths = np.linalg.svd(back, compute_uv=False)

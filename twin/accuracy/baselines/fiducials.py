@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
+from recon.model import circle_layout
 from recon.model.rig import Target
 from recon.tracking.pose_fit import PARAMETERS, TargetPose, lost
 
@@ -131,7 +132,7 @@ def _board(target: Target, dictionary: int, modules: int) -> Board:
         raise ValueError(f"board_mm: expected room for {SIDE}x{SIDE} markers of {modules} modules, found {target.board_mm}")
     size = scale * modules
     left, low = (_spread(count, size) for count in (columns, rows))
-    middle = np.array([target.c1_mm, target.c2_mm]) / 2
+    middle = circle_layout.middle(target)[:2]
     origin = middle - np.array([columns, rows]) * CELL_MM / 2
     cells = np.ones((rows, columns), np.uint8)
     corners = []
